@@ -1,0 +1,66 @@
+"""Simulated time, the ladder of step sizes, how often something is due, and the progress line."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Callable
+
+log = logging.getLogger("eddies")
+
+
+class Clock:
+    """Counts steps and simulated time up to `end`."""
+
+    def __init__(self, end: float, time: float = 0.0) -> None:
+        self.end, self.time, self.steps = end, time, 0
+
+    @property
+    def running(self) -> bool:
+        """Whether time is left; a remainder that is only round-off of the sum of steps is not."""
+        return self.time < self.end - 1e-9 * max(abs(self.end), 1.0)
+
+    def tick(self, step: float) -> None:
+        """Advance by one step."""
+        self.steps += 1
+        self.time += step
+
+
+def ladder_step(largest: float, bound: float) -> float:
+    """The largest of largest * 2^-m, m = 0, 1, ..., that does not exceed `bound`."""
+    if not bound > 0:
+        raise ValueError(f"time step bound {bound} is not positive: the flow is no longer finite")
+    return largest if bound >= largest else largest * 2.0 ** -math.ceil(math.log2(largest / bound))
+
+
+class ProgressLine:
+    """Logs one line every few seconds of wall time: how far, and how long it will still take.
+
+    `describe` returns what is worth reading of the state at that moment; it is called by the rank that reports only,
+    so it must not communicate.
+    """
+
+    def __init__(self, stage: str, describe: Callable[[], str], interval: float = 5.0) -> None:
+        self.stage, self.describe, self.interval = stage, describe, interval
+        self._started = self._last = time.perf_counter()
+
+    def __call__(self, done: float, step: int) -> None:
+        """Report if it is time; `done` is the finished fraction of the stage in [0, 1], `step` the steps so far."""
+        now = time.perf_counter()
+        if now - self._last < self.interval or done <= 0:
+            return
+        self._last = now
+        elapsed = now - self._started
+        log.info("%s  step %d  %s  %.3f s/step  %.0f %%  %s left", self.stage, step, self.describe(),
+                 elapsed / max(step, 1), 100 * done, duration(elapsed * (1 - done) / done))
+
+
+def duration(seconds: float) -> str:
+    """Seconds in words a person reads: 42 s, 3 min 20 s, 2 h 05 min."""
+    seconds = max(int(round(seconds)), 0)
+    if seconds < 60:
+        return f"{seconds} s"
+    if seconds < 3600:
+        return f"{seconds // 60} min {seconds % 60:02d} s"
+    return f"{seconds // 3600} h {seconds % 3600 // 60:02d} min"

@@ -1,0 +1,56 @@
+"""Deterministic linear forcing of the largest scales with a prescribed rate of energy injection."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from eddies.flow.spectral_grid import SpectralGrid
+from eddies.parallel.reduction import global_sum
+
+
+class LinearForcing:
+    """f(k) = A u_s(k) for 0 < |k| < k_f with A = rate / sum |u_s|^2, so that the mean of u.f is `injection_rate`.
+
+    u_s is the solenoidal part of the velocity. After Lundgren (2003) and Petersen and Livescu (2010), with the
+    amplitude set at every evaluation. `wavenumber` is k_f.
+
+    The few forced modes are collected on all ranks in one message. Their mirror images in the plane kx = 0 are made
+    exact conjugates there: otherwise round-off in the part that no real field has would be amplified by the forcing.
+    """
+
+    def __init__(self, grid: SpectralGrid, injection_rate: float, wavenumber: float) -> None:
+        self.grid, self.injection_rate = grid, injection_rate
+        self.reach = reach = min(int(np.ceil(wavenumber)) - 1, grid.cutoff)
+        signed = np.arange(-reach, reach + 1)
+        kx, ky, kz = np.arange(reach + 1)[None, None, :], signed[None, :, None], signed[:, None, None]
+        self._wavevector = [np.broadcast_to(axis, (len(signed), len(signed), reach + 1)) for axis in (kx, ky, kz)]
+        squared = kx**2 + ky**2 + kz**2
+        self._forced = (squared > 0) & (squared < wavenumber**2)
+        self._inverse_squared = 1.0 / np.where(squared > 0, squared, 1)
+        self._multiplicity = np.where(kx == 0, 1, 2)
+        # Where the forced modes of this rank stand in its spectral array, and in the small block.
+        own_ky = grid.index[1].ravel()
+        self._own_rows = np.flatnonzero(np.abs(own_ky) <= reach)
+        self._block_rows = own_ky[self._own_rows] + reach
+        self._planes = signed % grid.modes
+
+    def add(self, velocity: np.ndarray, tendency: np.ndarray) -> None:
+        """Add the force to the velocity components of `tendency` in place; both (3, kz, ky, kx), Fourier space."""
+        block = self._forced_modes(velocity)
+        energy = float(np.sum(self._multiplicity * np.abs(block) ** 2))
+        if energy == 0.0 and self.injection_rate > 0:
+            raise ValueError("the velocity has no energy at the forced wavenumbers: linear forcing cannot inject any")
+        force = (self.injection_rate / energy if energy > 0 else 0.0) * block
+        where = np.ix_(range(3), self._planes, self._own_rows, range(self.reach + 1))
+        tendency[where] += force[:, :, self._block_rows, :].astype(tendency.dtype)
+
+    def _forced_modes(self, velocity: np.ndarray) -> np.ndarray:
+        """Solenoidal velocity of the forced modes on every rank: (3, 2 reach + 1, 2 reach + 1, reach + 1)."""
+        block = np.zeros((3, *self._forced.shape), np.complex128)
+        own = velocity[np.ix_(range(3), self._planes, self._own_rows, range(self.reach + 1))]
+        block[:, :, self._block_rows] = own
+        block = global_sum(self.grid.decomposition.comm, block)
+        block[..., 0] = (block[..., 0] + block[:, ::-1, ::-1, 0].conj()) / 2
+        along = sum(k * component for k, component in zip(self._wavevector, block)) * self._inverse_squared
+        block -= np.stack([k * along for k in self._wavevector])
+        return block * self._forced

@@ -1,0 +1,81 @@
+"""Initial states: random solenoidal turbulence, and the flows with known solutions."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from eddies.flow.operators import pressure, project
+from eddies.flow.spectral_grid import SpectralGrid
+from eddies.parallel.reduction import global_sum
+
+
+def random_velocity(grid: SpectralGrid, seed: int, amplitude: float, peak_wavenumber: float) -> np.ndarray:
+    """Gaussian solenoidal velocity with the spectrum E(k) ~ k^4 exp(-2 (k / k_p)^2); (3, kz, ky, kx).
+
+    `amplitude` is the rms of one component. Random numbers are keyed by (seed, ky, kz) and drawn along kx, so the
+    field depends neither on the number of ranks nor on the resolution. Every shell carries exactly its energy.
+    """
+    velocity = project(grid, _gaussian_modes(grid, seed))
+    velocity[:, grid.index_squared == 0] = 0
+    shell = np.rint(np.sqrt(grid.index_squared)).astype(int)
+    shells = int(np.ceil(np.sqrt(3) * grid.cutoff)) + 1
+    density = 0.5 * grid.multiplicity * (np.abs(velocity) ** 2).sum(axis=0)
+    energy = global_sum(grid.decomposition.comm, np.bincount(shell.ravel(), density.ravel(), minlength=shells))
+    k = np.arange(shells)
+    target = k**4 * np.exp(-2 * (k / peak_wavenumber) ** 2)
+    target *= 1.5 * amplitude**2 / target[energy > 0].sum()
+    scale = np.sqrt(np.divide(target, energy, out=np.zeros(shells), where=energy > 0))
+    return (velocity * scale[shell]).astype(grid.complex)
+
+
+def _gaussian_modes(grid: SpectralGrid, seed: int) -> np.ndarray:
+    """Complex normal numbers for each mode and component, conjugate in mirror modes: (3, kz, ky, kx)."""
+    def line(ky: int, kz: int) -> np.ndarray:
+        # Negative wavenumbers are folded to odd numbers, because seeds must not be negative.
+        fold = [2 * k if k >= 0 else -2 * k - 1 for k in (ky, kz)]
+        numbers = np.random.default_rng([seed, *fold]).standard_normal((grid.cutoff + 1, 3, 2))
+        return (numbers[..., 0] + 1j * numbers[..., 1]).T
+
+    modes = np.empty((3, *grid.spectral_shape), complex)
+    for column, ky in enumerate(grid.index[1].ravel()):
+        for row, kz in enumerate(grid.index[2].ravel()):
+            modes[:, row, column] = line(ky, kz)
+            if (ky, kz) < (0, 0):
+                modes[:, row, column, 0] = line(-ky, -kz)[:, 0].conj()
+    return modes
+
+
+def taylor_green(grid: SpectralGrid, amplitude: float) -> np.ndarray:
+    """Taylor-Green vortex (sin x cos y cos z, -cos x sin y cos z, 0), energy amplitude^2 / 8."""
+    x, y, z = grid.coordinates()
+    u = np.sin(x) * np.cos(y) * np.cos(z)
+    v = -np.cos(x) * np.sin(y) * np.cos(z)
+    return _transformed(grid, amplitude, [u, v, 0.0])
+
+
+def abc(grid: SpectralGrid, amplitude: float, wavenumber: int) -> np.ndarray:
+    """Arnold-Beltrami-Childress flow with A = B = C; vorticity = k velocity, so it decays as exp(-nu k^2 t)."""
+    x, y, z = (wavenumber * axis for axis in grid.coordinates())
+    return _transformed(grid, amplitude, [np.sin(z) + np.cos(y), np.sin(x) + np.cos(z), np.sin(y) + np.cos(x)])
+
+
+def shear_wave(grid: SpectralGrid, amplitude: float, wavenumber: int) -> np.ndarray:
+    """u_x = sin(k y), an exact solution of both fluids that decays as exp(-nu k^2 t)."""
+    _, y, _ = grid.coordinates()
+    return _transformed(grid, amplitude, [np.sin(wavenumber * y), 0.0, 0.0])
+
+
+def sound_wave_density(grid: SpectralGrid, amplitude: float, wavenumber: int) -> np.ndarray:
+    """ln(rho / rho_0) = amplitude cos(k x) of a standing sound wave that starts from rest; (kz, ky, kx)."""
+    x, _, _ = grid.coordinates()
+    return grid.forward(np.broadcast_to(amplitude * np.cos(wavenumber * x), (1, *grid.physical_shape)))[0]
+
+
+def balanced_density(grid: SpectralGrid, velocity: np.ndarray, sound_speed: float) -> np.ndarray:
+    """s = p / c^2 with the incompressible pressure of the velocity, so that the start makes no sound; (kz, ky, kx)."""
+    return pressure(grid, velocity) / sound_speed**2
+
+
+def _transformed(grid: SpectralGrid, amplitude: float, components: list) -> np.ndarray:
+    field = np.stack([np.broadcast_to(np.asarray(c, grid.real), grid.physical_shape) for c in components])
+    return grid.forward(amplitude * field)

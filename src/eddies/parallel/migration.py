@@ -1,0 +1,117 @@
+"""Particles change rank: to the slab that contains them, or to the rank that stores their id."""
+
+from __future__ import annotations
+
+import numpy as np
+from mpi4py import MPI
+
+from eddies.parallel.reduction import global_sum
+from eddies.parallel.slab import SlabDecomposition, block_starts
+
+
+class ParticleLossError(RuntimeError):
+    """Particles were lost or duplicated in a migration."""
+
+
+class Redistribution:
+    """Sends each row to a given rank; planned once, then applied to any column.
+
+    Parameters
+    ----------
+    comm : communicator
+    destination : int array (n,), the rank each row goes to.
+
+    Received rows are ordered by the rank they come from, then as they stood there. One rank sends nothing.
+    """
+
+    def __init__(self, comm: MPI.Comm, destination: np.ndarray) -> None:
+        self.comm = comm
+        if comm.size == 1:
+            return
+        self._order = np.argsort(destination, kind="stable")
+        self._sent = np.bincount(destination, minlength=comm.size)
+        self._received = np.empty_like(self._sent)
+        comm.Alltoall(self._sent, self._received)
+
+    def apply(self, column: np.ndarray) -> np.ndarray:
+        """The rows of `column` (n, ...) that belong to this rank after the exchange: (m, ...), same type."""
+        column = np.asarray(column)
+        if self.comm.size == 1:
+            return column.copy()
+        row_bytes = column.dtype.itemsize * int(np.prod(column.shape[1:], dtype=np.int64))
+        sent = np.ascontiguousarray(column[self._order])
+        received = np.empty((int(self._received.sum()), *column.shape[1:]), column.dtype)
+        self.comm.Alltoallv(
+            [sent.view(np.uint8).reshape(-1) if sent.size else np.empty(0, np.uint8), self._sent * row_bytes, MPI.BYTE],
+            [received.reshape(-1).view(np.uint8), self._received * row_bytes, MPI.BYTE],
+        )
+        return received
+
+
+class Migration(Redistribution):
+    """Sends each particle to the slab that holds its z coordinate; `positions` (n, 3) lie in [0, length)."""
+
+    def __init__(self, decomposition: SlabDecomposition, positions: np.ndarray) -> None:
+        super().__init__(decomposition.comm, decomposition.owner_of(np.asarray(positions)[:, 2]))
+
+
+def wrap(positions: np.ndarray, length: float) -> np.ndarray:
+    """Positions moved by whole periods into [0, length)."""
+    wrapped = np.mod(positions, length)
+    # The remainder of a tiny negative number rounds to `length` itself.
+    wrapped[wrapped >= length] = 0.0
+    return wrapped
+
+
+def census(comm: MPI.Comm, ids: np.ndarray) -> tuple[int, int, int]:
+    """Number of particles on all ranks, the sum of their ids, and the exclusive-or of their ids."""
+    count, total = global_sum(comm, np.array([len(ids), ids.sum()], np.int64))
+    parity = np.array(np.bitwise_xor.reduce(ids) if len(ids) else 0, np.int64)
+    if comm.size > 1:
+        comm.Allreduce(MPI.IN_PLACE, parity, op=MPI.BXOR)
+    return int(count), int(total), int(parity)
+
+
+def migrate(decomposition: SlabDecomposition, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """All columns of a particle set after each particle moved to the slab that contains it.
+
+    `columns` holds at least `id` (n,) and `position` (n, 3); positions are wrapped into the box first.
+    Raises ParticleLossError when count, id sum or id parity differ before and after.
+    """
+    columns = {**columns, "position": wrap(columns["position"], decomposition.length)}
+    if decomposition.size == 1:
+        return columns
+    before = census(decomposition.comm, columns["id"])
+    migration = Migration(decomposition, columns["position"])
+    moved = {name: migration.apply(column) for name, column in columns.items()}
+    after = census(decomposition.comm, moved["id"])
+    if before != after:
+        raise ParticleLossError(f"migration changed (count, id sum, id parity) from {before} to {after}")
+    return moved
+
+
+def id_block(comm: MPI.Comm, total: int) -> tuple[int, int]:
+    """First id and end of the contiguous block of `total` ids that this rank stores."""
+    starts = block_starts(total, comm.size)
+    return int(starts[comm.rank]), int(starts[comm.rank + 1])
+
+
+class IdOrder:
+    """Brings particles, wherever they are, into blocks of consecutive ids, one block a rank.
+
+    `ids` (n,) are this rank's; the ids of all ranks are 0 ... total - 1, each once. `start` and `stop` bound the
+    block that `apply` returns in order of id.
+    """
+
+    def __init__(self, comm: MPI.Comm, ids: np.ndarray, total: int) -> None:
+        self.start, self.stop = id_block(comm, total)
+        owner = np.searchsorted(block_starts(total, comm.size), ids, side="right") - 1
+        self._redistribution = Redistribution(comm, owner)
+        received = self._redistribution.apply(ids)
+        self._order = np.argsort(received)
+        if not np.array_equal(received[self._order], np.arange(self.start, self.stop)):
+            raise ParticleLossError(f"ids {self.start} to {self.stop - 1} are not each present exactly once")
+
+    def apply(self, column: np.ndarray) -> np.ndarray:
+        """This rank's block of `column` (n, ...), ordered by id: (stop - start, ...)."""
+        return self._redistribution.apply(column)[self._order]

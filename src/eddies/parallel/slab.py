@@ -1,0 +1,45 @@
+"""The one block rule by which grid planes and particles are shared among ranks."""
+
+from __future__ import annotations
+
+import numpy as np
+from mpi4py import MPI
+
+
+def block_starts(total: int, parts: int) -> np.ndarray:
+    """First index of each of `parts` consecutive blocks of `total` items, and `total` itself; shape (parts + 1,).
+
+    The first `total % parts` blocks hold one item more than the others.
+    """
+    sizes = np.full(parts, total // parts)
+    sizes[: total % parts] += 1
+    return np.concatenate([[0], np.cumsum(sizes)])
+
+
+class SlabDecomposition:
+    """Slabs of a periodic cube of side `length`, cut along z into blocks of `planes` equal layers.
+
+    Grid planes and particles follow the same rule, so that a particle and the grid planes around it are on the
+    same rank. `start`, `stop` and `count` are this rank's planes; `lower` and `upper` its bounds in z.
+    """
+
+    def __init__(self, comm: MPI.Comm, length: float, planes: int) -> None:
+        self.comm, self.rank, self.size = comm, comm.rank, comm.size
+        self.length, self.planes = float(length), int(planes)
+        self.spacing = self.length / self.planes
+        self.starts = block_starts(self.planes, self.size)
+        self.start, self.stop = int(self.starts[self.rank]), int(self.starts[self.rank + 1])
+        self.count = self.stop - self.start
+        self.lower, self.upper = self.start * self.spacing, self.stop * self.spacing
+        self.below, self.above = (self.rank - 1) % self.size, (self.rank + 1) % self.size
+        self._owner = np.repeat(np.arange(self.size), np.diff(self.starts))
+
+    def owner_of(self, z: np.ndarray) -> np.ndarray:
+        """Rank that owns each coordinate `z` in [0, length); same shape as `z`."""
+        plane = np.floor(np.asarray(z) / self.spacing).astype(np.int64)
+        # z just below `length` may round up to the plane that does not exist.
+        return self._owner[np.clip(plane, 0, self.planes - 1)]
+
+    def thinnest(self) -> int:
+        """Number of planes of the thinnest slab."""
+        return int(np.diff(self.starts).min())
