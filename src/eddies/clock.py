@@ -11,15 +11,25 @@ log = logging.getLogger("eddies")
 
 
 class Clock:
-    """Counts steps and simulated time up to `end`."""
+    """Counts steps and simulated time, up to `end` or until it is stopped."""
 
-    def __init__(self, end: float, time: float = 0.0) -> None:
+    def __init__(self, end: float = math.inf, time: float = 0.0) -> None:
         self.end, self.time, self.steps = end, time, 0
 
     @property
+    def remaining(self) -> float:
+        """Time left; a remainder that is only round-off of the sum of steps counts as none."""
+        left = self.end - self.time
+        return left if left > 1e-9 * max(self.time, 1.0) else 0.0
+
+    @property
     def running(self) -> bool:
-        """Whether time is left; a remainder that is only round-off of the sum of steps is not."""
-        return self.time < self.end - 1e-9 * max(abs(self.end), 1.0)
+        """Whether time is left."""
+        return self.remaining > 0
+
+    def stop(self) -> None:
+        """End here."""
+        self.end = self.time
 
     def tick(self, step: float) -> None:
         """Advance by one step."""

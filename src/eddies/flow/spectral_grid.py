@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pyfftw
 
+from eddies.parallel.migration import Redistribution
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.transpose import Transpose
@@ -43,7 +44,7 @@ class SpectralGrid:
     def _wavenumbers(self) -> None:
         unit = 2 * np.pi / self.decomposition.length
         signed = np.concatenate([np.arange(self.cutoff + 1), np.arange(-self.cutoff, 0)])
-        start = self._transpose.y_starts[self.decomposition.rank]
+        start = self.column_starts[self.decomposition.rank]
         local = signed[start : start + self._transpose.y_count]
         #: integer wavenumbers of each axis, shaped to broadcast over (kz, ky, kx)
         self.index = (np.arange(self.cutoff + 1)[None, None, :], local[None, :, None], signed[:, None, None])
@@ -62,6 +63,11 @@ class SpectralGrid:
     def spectral_shape(self) -> tuple[int, int, int]:
         """Shape (kz, ky_local, kx) of one component in Fourier space on this rank."""
         return (self.modes, self._transpose.y_count, self.cutoff + 1)
+
+    @property
+    def column_starts(self) -> np.ndarray:
+        """First ky, in storage order, of each rank, and their number: (ranks + 1,)."""
+        return self._transpose.y_starts
 
     def coordinates(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """x, y, z of this rank's grid points, shaped to broadcast over (z_local, y, x)."""
@@ -145,3 +151,19 @@ class SpectralGrid:
     def _plan_z(self, name: str, components: int) -> pyfftw.FFTW:
         column = pyfftw.empty_aligned((components, self.cells, *self.spectral_shape[1:]), self.complex)
         return pyfftw.FFTW(column, column, axes=(1,), direction=f"FFTW_{name.split()[0].upper()}", flags=("FFTW_ESTIMATE",))
+
+
+def restrict(fine: SpectralGrid, coarse: SpectralGrid, spectral: np.ndarray) -> np.ndarray:
+    """The modes of a field (c, kz, ky, kx) on `fine` that `coarse`, with an equal or smaller cutoff, keeps."""
+    if coarse.cutoff > fine.cutoff:
+        raise ValueError(f"cannot restrict modes up to {fine.cutoff} to a grid with modes up to {coarse.cutoff}")
+    K = coarse.cutoff
+    planes = np.concatenate([np.arange(K + 1), np.arange(fine.modes - K, fine.modes)])
+    ky = fine.index[1].ravel()
+    kept = np.abs(ky) <= K
+    # Both grids cut the same ascending list of ky into blocks, so rows arrive in the order in which they are stored.
+    position = np.where(ky >= 0, ky, ky + coarse.modes)[kept]
+    owner = np.searchsorted(coarse.column_starts, position, side="right") - 1
+    rows = np.moveaxis(spectral[:, planes][:, :, kept, : K + 1], 2, 0)
+    moved = Redistribution(fine.decomposition.comm, owner).apply(rows)
+    return np.ascontiguousarray(np.moveaxis(moved, 0, 2)).astype(coarse.complex, copy=False)

@@ -1,0 +1,88 @@
+"""The statistics of a flow over time, and its energy budget."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from eddies.clock import Clock
+from eddies.flow.courant import FlowDiverged
+from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid
+from eddies.flow.statistics import (
+    compressible_budget, energy_spectrum, gradient_moments, incompressible_budget, turbulence_scales,
+)
+
+
+class FlowHistory:
+    """An observer that measures a flow every few steps; one row a sample in `rows`.
+
+    Also integrates the energy budget: `budget_error` is |E(t) - E(0) - integral of (injection - dissipation)| over
+    the dissipated energy (over E(0) where nothing is dissipated).
+    """
+
+    def __init__(self, fluid: IncompressibleFluid | CompressibleFluid, every: int = 4) -> None:
+        self.fluid, self.every = fluid, every
+        self.rows: list[dict[str, float]] = []
+        self._injected = self._dissipated = 0.0
+        self._wall, self._steps = time.perf_counter(), 0
+
+    def __call__(self, state: np.ndarray, clock: Clock) -> None:
+        """Take a sample if one is due, and at the end."""
+        if clock.steps % self.every == 0 or not clock.running:
+            self.sample(state, clock)
+
+    def sample(self, state: np.ndarray, clock: Clock) -> dict[str, float]:
+        """Measure now, add the row and return it. Raises FlowDiverged if the flow is no longer finite."""
+        row = self._measure(state)
+        if not np.isfinite(row["total_energy"]):
+            raise FlowDiverged(f"the energy is no longer finite at step {clock.steps}, time {clock.time:.6g}: "
+                               "lower [time] courant or max_step, or raise [flow] viscosity or cells")
+        if self.rows:
+            last, elapsed = self.rows[-1], clock.time - self.rows[-1]["time"]
+            self._injected += elapsed * row["injection_rate"]
+            self._dissipated += elapsed / 2 * (last["dissipation_rate"] + row["dissipation_rate"])
+            row["turnovers"] = last["turnovers"] + elapsed / row["eddy_turnover_time"]
+        else:
+            row["turnovers"] = 0.0
+        now, steps = time.perf_counter(), max(clock.steps - self._steps, 1)
+        row |= {"time": clock.time, "time_step": (clock.time - self.rows[-1]["time"]) / steps if self.rows else 0.0,
+                "seconds_per_step": (now - self._wall) / steps}
+        self._wall, self._steps = now, clock.steps
+        self.rows.append(row)
+        return row
+
+    @property
+    def budget_error(self) -> float:
+        """Normalised error of the energy budget from the first sample to the last."""
+        first, last = self.rows[0]["total_energy"], self.rows[-1]["total_energy"]
+        defect = abs(last - first - self._injected + self._dissipated)
+        scale = self._dissipated if self._dissipated > 0 else first
+        return defect / scale if scale > 0 else defect
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """All rows as columns."""
+        return {name: np.array([row[name] for row in self.rows]) for name in self.rows[0]}
+
+    def describe(self) -> str:
+        """The last sample in a few words."""
+        row = self.rows[-1]
+        return (f"t {row['time']:.3f} ({row['turnovers']:.2f} turnovers)  dt {row['time_step']:.4f}  "
+                f"energy {row['energy']:.4f}  dissipation {row['dissipation_rate']:.4f}  "
+                f"Re_lambda {row['reynolds_lambda']:.1f}")
+
+    def _measure(self, state: np.ndarray) -> dict[str, float]:
+        fluid, grid = self.fluid, self.fluid.grid
+        velocity = state[:3]
+        if isinstance(fluid, CompressibleFluid):
+            row = compressible_budget(grid, state, fluid.viscosity, fluid.sound_speed)
+        else:
+            row = incompressible_budget(grid, velocity, fluid.viscosity)
+        _, spectrum = energy_spectrum(grid, velocity)
+        row["energy"] = float(spectrum.sum())
+        row |= turbulence_scales(spectrum, row["dissipation_rate"], fluid.viscosity, grid.cutoff)
+        row["skewness"], row["flatness"] = gradient_moments(grid, velocity)
+        row["injection_rate"] = fluid.forcing.injection_rate if fluid.forcing is not None else 0.0
+        if isinstance(fluid, CompressibleFluid):
+            row["mach_turbulent"] = float(np.sqrt(2 * row["energy"]) / fluid.sound_speed)
+        return row

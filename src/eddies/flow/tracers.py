@@ -1,0 +1,89 @@
+"""Fluid particles that follow the filtered velocity of a simulation."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from eddies.flow.filtering import gaussian_transfer
+from eddies.flow.interpolation import SplineInterpolation
+from eddies.flow.spectral_grid import SpectralGrid
+from eddies.parallel.migration import id_block, migrate, wrap
+from eddies.parallel.slab import SlabDecomposition
+
+
+def random_positions(seed: int, total: int, start: int, stop: int, length: float) -> np.ndarray:
+    """Uniformly random positions (stop - start, 3) of the particles with ids start ... stop - 1.
+
+    The numbers are keyed by id (a counter-based generator, jumped ahead), so they do not depend on the ranks.
+    """
+    # Philox yields four 64-bit numbers per counter value; one counter value a particle leaves each its own.
+    generator = np.random.Generator(np.random.Philox(key=[seed, total]).advance(start))
+    return length * generator.random((stop - start, 4))[:, :3]
+
+
+def lattice_positions(seed: int, per_side: int, start: int, stop: int, length: float) -> np.ndarray:
+    """Positions of ids start ... stop - 1 on a cubic lattice, each displaced at random by up to a quarter cell."""
+    ids = np.arange(start, stop)
+    cell = length / per_side
+    corner = np.stack([ids % per_side, ids // per_side % per_side, ids // per_side**2], axis=1)
+    jitter = random_positions(seed, per_side**3, start, stop, 1.0) - 0.5
+    return wrap((corner + 0.5 + 0.5 * jitter) * cell, length)
+
+
+def release(decomposition: SlabDecomposition, seed: int, per_side: int, placement: str) -> dict[str, np.ndarray]:
+    """Ids and positions of per_side^3 new particles, each on the rank whose slab holds it."""
+    total = per_side**3
+    start, stop = id_block(decomposition.comm, total)
+    if placement == "random":
+        positions = random_positions(seed, total, start, stop, decomposition.length)
+    else:
+        positions = lattice_positions(seed, per_side, start, stop, decomposition.length)
+    return migrate(decomposition, {"id": np.arange(start, stop, dtype=np.int64), "position": positions})
+
+
+class FilteredField:
+    """The Gaussian-filtered velocity and density of a state, at any point."""
+
+    def __init__(self, grid: SpectralGrid, filter_width: float, interpolation: str) -> None:
+        self.grid = grid
+        self.transfer = gaussian_transfer(grid.wavenumber_squared, filter_width).astype(grid.real)
+        self.spline = SplineInterpolation(grid, interpolation)
+
+    def velocity_coefficients(self, state: np.ndarray) -> np.ndarray:
+        """Spline coefficients of the filtered velocity of a state."""
+        return self.spline.coefficients(self.transfer * state[:3])
+
+    def density_modes(self, state: np.ndarray) -> np.ndarray:
+        """Fourier coefficients (1, kz, ky, kx) of the filtered density exp(s); of density 1 in an incompressible flow."""
+        if len(state) == 4:
+            return self.transfer * self.grid.forward(np.exp(self.grid.backward(state[3:])))
+        modes = np.zeros((1, *self.grid.spectral_shape), self.grid.complex)
+        modes[:, self.grid.index_squared == 0] = 1
+        return modes
+
+
+class TracerParticles:
+    """Advection dx/dt = v(x, t) by the filtered velocity with Heun's method, second order in time.
+
+    `columns` holds this rank's `id`, `position` and `velocity` (the filtered velocity at the particle, now).
+    """
+
+    def __init__(self, field: FilteredField, columns: dict[str, np.ndarray], state: np.ndarray) -> None:
+        self.field = field
+        self.decomposition = field.grid.decomposition
+        velocity = field.spline.at(field.velocity_coefficients(state), columns["position"])
+        self.columns = {**columns, "velocity": velocity}
+
+    def advance(self, state: np.ndarray, step: float) -> None:
+        """Move on by one step, to the time of `state`, the flow one step later."""
+        coefficients = self.field.velocity_coefficients(state)
+        position, velocity = self.columns["position"], self.columns["velocity"]
+        predicted = position + step * velocity
+        position = position + step / 2 * (velocity + self.field.spline.at(coefficients, predicted))
+        velocity = self.field.spline.at(coefficients, position)
+        self.columns = migrate(self.decomposition, {**self.columns, "position": position, "velocity": velocity})
+
+    def density(self, state: np.ndarray) -> np.ndarray:
+        """Filtered density (n,) at the particles."""
+        coefficients = self.field.spline.coefficients(self.field.density_modes(state))
+        return self.field.spline.at(coefficients, self.columns["position"])[:, 0]

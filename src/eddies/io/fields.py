@@ -1,0 +1,61 @@
+"""Series of fields on a regular grid, written slab by slab."""
+
+from collections.abc import Mapping
+from functools import cached_property
+
+import h5py
+import numpy as np
+
+from eddies.io.hdf5 import append_frame, find_group, growing_dataset, write_attributes
+
+
+class FieldWriter:
+    """Adds fields on cells^3 points to /fields/NAME, in float32. Making one and every `append` are
+    collective.
+
+    Args:
+        file: an open product.
+        name: the group under /fields.
+        cells: grid points along each side; point i lies at i L / cells.
+        variables: number of components of each variable, such as {"velocity": 3, "density": 1}.
+    """
+
+    def __init__(self, file: h5py.File, name: str, cells: int, variables: Mapping[str, int]) -> None:
+        group = file.create_group(f"fields/{name}")
+        write_attributes(group, {"cells": cells})
+        self._time = growing_dataset(group, "time", (), np.float64)
+        self._variables = {variable: growing_dataset(group, variable, (components, *[cells] * 3), np.float32)
+                           for variable, components in variables.items()}
+
+    def append(self, time: float, start_plane: int, variables: Mapping[str, np.ndarray]) -> None:
+        """Add a field: this rank holds planes start_plane, ... of every variable, (components, z, y, x); z
+        may be 0."""
+        append_frame(self._time, np.array(time), ())
+        for variable, dataset in self._variables.items():
+            append_frame(dataset, variables[variable], (0, start_plane, 0, 0))
+
+
+class FieldSeries:
+    """Reads /fields/NAME of an open product; ProductError if there is none."""
+
+    def __init__(self, file: h5py.File, name: str) -> None:
+        self._group = find_group(file, f"fields/{name}")
+
+    @cached_property
+    def times(self) -> np.ndarray:
+        """Time of each field, (frames,)."""
+        return self._group["time"][()]
+
+    @property
+    def cells(self) -> int:
+        """Grid points along each side."""
+        return int(self._group.attrs["cells"])
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """Names of the stored variables."""
+        return tuple(name for name in self._group if name != "time")
+
+    def read(self, index: int, variable: str, start: int = 0, stop: int | None = None) -> np.ndarray:
+        """Planes start to stop of a variable, (components, stop - start, y, x)."""
+        return self._group[variable][index, :, start:stop]

@@ -1,0 +1,212 @@
+"""Products: HDF5 files that are complete or absent, say what they are, and are written by all ranks together.
+
+A product is written under a temporary name, marked complete, closed, and only then renamed, so a file under
+its final name is never half written. Writing uses parallel HDF5 when there is more than one rank; reading
+opens the file on every rank by itself. """
+
+import json
+import math
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from mpi4py import MPI
+
+from eddies.io.provenance import environment
+
+CHUNK_BYTES = 2**20
+REMEDIES = {"ground_truth": "dns", "kernel": "train-kernel", "model": "train", "rollout": "simulate"}
+
+# Files whose writing was broken off by an exception. Closing one is collective, so it must not happen when
+# Python drops the last reference on one rank alone; they stay open until the process ends.
+_abandoned: list[h5py.File] = []
+
+
+class ProductError(RuntimeError):
+    """A product is missing, unfinished, damaged or of the wrong kind: the text names the file and what to
+    do."""
+
+
+@contextmanager
+def create_product(comm: MPI.Comm, path: str | Path, kind: str,
+                   provenance: Mapping[str, Any]) -> Iterator[h5py.File]:
+    """Write a product of some kind, all ranks together; the file appears under `path` once the block ends
+    well.
+
+    `provenance` (JSON-able: the scene's text, its fingerprint, ...) is stored with the versions of all
+    libraries, the number of ranks and the date. An exception inside the block leaves whatever stood under
+    `path` untouched.
+
+    Raises:
+        ProductError: the file cannot be made, or there are several ranks and HDF5 is not parallel.
+    """
+    path = Path(path)
+    partial = path.with_name(path.name + ".partial")
+    file = _create(comm, partial)
+    origin = json.dumps({**environment(comm.size), **provenance})
+    write_attributes(file, {"kind": kind, "complete": False, "provenance": _from_first_rank(comm, origin)})
+    try:
+        yield file
+    except BaseException:
+        if comm.size == 1:
+            file.close()
+        else:
+            _abandoned.append(file)
+        raise
+    file.attrs["complete"] = True
+    file.close()
+    if comm.rank == 0:
+        os.replace(partial, path)
+    comm.Barrier()
+
+
+@contextmanager
+def open_product(comm: MPI.Comm, path: str | Path, kind: str | None) -> Iterator[h5py.File]:
+    """Read a complete product of the expected kind (None: any). All ranks call it; if one cannot open it,
+    all raise.
+
+    Raises:
+        ProductError: no such file, truncated or not HDF5, unfinished, or of another kind.
+    """
+    file, problem = None, ""
+    try:
+        file = _open_checked(Path(path), kind)
+    except ProductError as error:
+        problem = str(error)
+    failures = np.array([bool(problem)], np.int64)
+    if comm.size > 1:
+        comm.Allreduce(MPI.IN_PLACE, failures, MPI.SUM)
+    if failures[0]:
+        if file is not None:
+            file.close()
+        raise ProductError(problem or f"{path}: {failures[0]} of {comm.size} ranks cannot open this file")
+    with file:
+        yield file
+
+
+def product_fingerprint(path: str | Path) -> str | None:
+    """The scene's fingerprint stored in a complete product; None if there is no such product or it has
+    none."""
+    try:
+        with h5py.File(path, "r") as file:
+            return read_provenance(file).get("fingerprint") if file.attrs.get("complete", False) else None
+    except (OSError, ValueError, KeyError):
+        return None
+
+
+def read_provenance(file: h5py.File) -> dict[str, Any]:
+    """Where an open product comes from: scene text, fingerprint, versions, ranks, date."""
+    return json.loads(file.attrs["provenance"])
+
+
+def write_attributes(group: h5py.Group, values: Mapping[str, Any]) -> None:
+    """Write numbers, strings and short lists of numbers as attributes; the same on every rank."""
+    for name, value in values.items():
+        group.attrs[name] = value
+
+
+def write_table(file: h5py.Group, name: str, columns: Mapping[str, Any]) -> None:
+    """Write small arrays, equal on all ranks, as the datasets of a group; all ranks call it."""
+    group = file.create_group(name)
+    for column, values in columns.items():
+        group.create_dataset(column, data=np.asarray(values))
+
+
+def read_table(file: h5py.Group, name: str) -> dict[str, np.ndarray]:
+    """Read what `write_table` wrote; ProductError names the tables there are if this one is not among
+    them."""
+    group = find_group(file, name)
+    return {column: dataset[()] for column, dataset in group.items() if isinstance(dataset, h5py.Dataset)}
+
+
+def find_group(file: h5py.Group, name: str) -> h5py.Group:
+    """The group `name`; ProductError lists its neighbours if there is none."""
+    group = file.get(name)
+    if not isinstance(group, h5py.Group):
+        present = ", ".join(file) or "nothing"
+        raise ProductError(f"{file.file.filename}: holds no {name}; {file.name} holds: {present}")
+    return group
+
+
+def growing_dataset(group: h5py.Group, name: str, frame_shape: tuple[int, ...], dtype: Any) -> h5py.Dataset:
+    """An empty dataset (frames, *frame_shape) to which frames are added, in chunks of at most about 1 MiB.
+
+    A chunk holds as much of one frame as fits, or many frames of a single value. All ranks call it.
+    """
+    chunk, largest = [1024] if not frame_shape else [1], CHUNK_BYTES // np.dtype(dtype).itemsize
+    for axis, extent in enumerate(frame_shape):
+        below = math.prod(frame_shape[axis + 1:])
+        chunk.append(max(1, min(extent, largest // max(below, 1))))
+    return group.create_dataset(name, (0, *frame_shape), dtype, maxshape=(None, *frame_shape),
+                                chunks=tuple(chunk))
+
+
+def append_frame(dataset: h5py.Dataset, block: np.ndarray, offset: tuple[int, ...]) -> None:
+    """Add a frame to a growing dataset; this rank writes `block` at `offset` within it.
+
+    Collective: every rank calls it, also with an empty block.
+    """
+    frame = dataset.shape[0]
+    dataset.resize(frame + 1, axis=0)
+    block = np.asarray(block, dataset.dtype, order="C")[None]
+    in_file, in_memory = dataset.id.get_space(), h5py.h5s.create_simple(block.shape)
+    if block.size:
+        in_file.select_hyperslab((frame, *offset), block.shape)
+    else:
+        in_file.select_none()
+        in_memory.select_none()
+    dataset.id.write(in_memory, in_file, block, dxpl=_collective(dataset.file))
+
+
+def _collective(file: h5py.File) -> h5py.h5p.PropDXID:
+    transfer = h5py.h5p.create(h5py.h5p.DATASET_XFER)
+    if file.driver == "mpio":
+        transfer.set_dxpl_mpio(h5py.h5fd.MPIO_COLLECTIVE)
+    return transfer
+
+
+def _create(comm: MPI.Comm, path: Path) -> h5py.File:
+    if comm.size > 1 and not h5py.get_config().mpi:
+        raise ProductError(
+            f"{path}: this h5py is built without MPI, so {comm.size} ranks cannot write one file; run on "
+            "one, or build it: `CC=mpicc HDF5_MPI=ON pip install --no-binary=h5py --no-build-isolation h5py`")
+    try:
+        if comm.size > 1:
+            return h5py.File(path, "w", driver="mpio", comm=comm)
+        return h5py.File(path, "w")
+    except OSError as error:
+        raise ProductError(f"{path}: cannot be written: {error}; check the directory") from None
+
+
+def _open_checked(path: Path, kind: str | None) -> h5py.File:
+    remedy = f"run `eddies {REMEDIES[kind]} SCENE` first" if kind in REMEDIES else "make it first"
+    if not path.is_file():
+        raise ProductError(f"{path}: no such file; {remedy}")
+    try:
+        file = h5py.File(path, "r")
+    except OSError as error:
+        message = f"{path}: damaged or not an HDF5 file ({error}); delete it and make it again"
+        raise ProductError(message) from None
+    found, complete = file.attrs.get("kind", "unknown"), bool(file.attrs.get("complete", False))
+    if complete and kind in (None, found):
+        return file
+    file.close()
+    if kind not in (None, found):
+        raise ProductError(f"{path}: is of kind {found}, expected {kind}: {remedy}")
+    raise ProductError(f"{path}: unfinished, its writer was stopped: {remedy}")
+
+
+def _from_first_rank(comm: MPI.Comm, text: str) -> str:
+    """Rank 0's text on every rank: attributes must be equal everywhere, and clocks are not."""
+    if comm.size == 1:
+        return text
+    encoded = np.frombuffer(text.encode(), np.uint8)
+    length = np.array([len(encoded)], np.int64)
+    comm.Bcast(length)
+    content = encoded.copy() if comm.rank == 0 else np.empty(length[0], np.uint8)
+    comm.Bcast(content)
+    return content.tobytes().decode()

@@ -1,0 +1,98 @@
+"""Particle trajectories in the H5MD 1.1 layout (de Buyl, Colberg & Höfling, Comput. Phys. Commun. 185, 1546).
+
+Row k of every frame belongs to the particle with id k, so a frame needs no sorting to be compared with
+another. """
+
+from collections.abc import Mapping
+from functools import cached_property
+
+import h5py
+import numpy as np
+
+import eddies
+from eddies.io.hdf5 import append_frame, find_group, growing_dataset, write_attributes
+
+
+class TrajectoryWriter:
+    """Adds frames of `total` particles to /particles/NAME. Making one and every `append` are collective.
+
+    Args:
+        file: an open product.
+        name: the group under /particles.
+        total: number of particles over all ranks.
+        length: edge of the periodic cube.
+        columns: shape of one particle's value by column, such as {"position": (3,), "density": ()}.
+        dtype: of every column in the file.
+    """
+
+    def __init__(self, file: h5py.File, name: str, total: int, length: float,
+                 columns: Mapping[str, tuple[int, ...]], dtype: str | np.dtype) -> None:
+        _write_header(file)
+        self._group = file.create_group(f"particles/{name}")
+        box = self._group.create_group("box")
+        box.create_dataset("edges", data=np.full(3, length))
+        write_attributes(box, {"dimension": 3, "boundary": np.array([b"periodic"] * 3)})
+        self._group.create_dataset("id", data=np.arange(total))
+        self._step = growing_dataset(self._group, "step", (), np.int64)
+        self._time = growing_dataset(self._group, "time", (), np.float64)
+        self._columns = {column: self._element(column, (total, *shape), dtype)
+                         for column, shape in columns.items()}
+
+    def append(self, step: int, time: float, start: int, columns: Mapping[str, np.ndarray]) -> None:
+        """Add a frame: this rank holds rows start, start + 1, ... of every column, (n, ...) in order of id;
+        n may be 0."""
+        append_frame(self._step, np.array(step), ())
+        append_frame(self._time, np.array(time), ())
+        for column, dataset in self._columns.items():
+            append_frame(dataset, columns[column], (start,) + (0,) * (dataset.ndim - 2))
+
+    def _element(self, column: str, frame_shape: tuple[int, ...], dtype: str | np.dtype) -> h5py.Dataset:
+        element = self._group.create_group(column)
+        # Hard links: all elements share their times.
+        element["step"], element["time"] = self._step, self._time
+        return growing_dataset(element, "value", frame_shape, dtype)
+
+
+class Trajectory:
+    """Reads /particles/NAME of an open product; ProductError if there is none."""
+
+    def __init__(self, file: h5py.File, name: str) -> None:
+        self._group = find_group(file, f"particles/{name}")
+
+    @cached_property
+    def times(self) -> np.ndarray:
+        """Time of each frame, (frames,)."""
+        return self._group["time"][()]
+
+    @cached_property
+    def steps(self) -> np.ndarray:
+        """Step number of each frame, (frames,)."""
+        return self._group["step"][()]
+
+    @property
+    def total(self) -> int:
+        """Number of particles."""
+        return self._group["id"].shape[0]
+
+    @property
+    def length(self) -> float:
+        """Edge of the periodic cube."""
+        return float(self._group["box/edges"][0])
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the stored columns."""
+        return tuple(name for name in self._group if f"{name}/value" in self._group)
+
+    def read(self, frame: int, column: str, start: int = 0, stop: int | None = None) -> np.ndarray:
+        """Rows start to stop of a column at a frame, (stop - start, ...), in order of id."""
+        return find_group(self._group, column)["value"][frame, start:stop]
+
+
+def _write_header(file: h5py.File) -> None:
+    if "h5md" in file:
+        return
+    header = file.create_group("h5md")
+    write_attributes(header, {"version": np.array([1, 1])})
+    write_attributes(header.create_group("author"), {"name": "unknown"})
+    write_attributes(header.create_group("creator"), {"name": "eddies", "version": eddies.__version__})

@@ -1,0 +1,57 @@
+"""Trained weights: plain tensors with a description, checked when they are read. Nothing is pickled."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+from eddies.io.hdf5 import ProductError, create_product, open_product, read_table, write_table
+
+
+def save_weights(comm: MPI.Comm, path: str | Path, kind: str, description: Mapping[str, Any],
+                 tensors: Mapping[str, np.ndarray], provenance: Mapping[str, Any],
+                 tables: Mapping[str, Mapping[str, np.ndarray]] | None = None) -> None:
+    """Write rank 0's tensors, a JSON-able description and small tables as one product; all ranks call it."""
+    if comm.rank == 0:
+        with create_product(MPI.COMM_SELF, path, kind, {"ranks": comm.size, **provenance}) as file:
+            file.attrs["description"] = json.dumps(dict(description))
+            file.attrs["tensors"] = json.dumps({name: _signature(tensor) for name, tensor in tensors.items()})
+            write_table(file, "weights", tensors)
+            for name, columns in (tables or {}).items():
+                write_table(file, name, columns)
+    comm.Barrier()
+
+
+def load_weights(comm: MPI.Comm, path: str | Path, kind: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Description and tensors of a product; all ranks call it, and all get everything.
+
+    Raises:
+        ProductError: besides the reasons of `open_product`, a tensor is missing, or differs in shape, type or
+            content from what was written, or is not finite.
+    """
+    with open_product(comm, path, kind) as file:
+        description, expected = json.loads(file.attrs["description"]), json.loads(file.attrs["tensors"])
+        tensors = read_table(file, "weights")
+    for name in sorted(expected.keys() | tensors.keys()):
+        if name not in tensors or name not in expected or _signature(tensors[name]) != expected[name]:
+            raise ProductError(f"{path}: tensor {name} is not what was written; file damaged, train again")
+        if not np.isfinite(tensors[name]).all():
+            raise ProductError(f"{path}: tensor {name} holds values that are not finite; train again")
+    return description, tensors
+
+
+def load_tables(path: str | Path) -> dict[str, dict[str, np.ndarray]]:
+    """The tables saved with the weights, by name; sends nothing. ProductError if the file is not a complete
+    product."""
+    with open_product(MPI.COMM_SELF, path, None) as file:
+        return {name: read_table(file, name) for name in file if name != "weights"}
+
+
+def _signature(tensor: np.ndarray) -> dict[str, Any]:
+    tensor = np.ascontiguousarray(tensor)
+    digest = hashlib.sha256(tensor).hexdigest()
+    return {"shape": list(tensor.shape), "type": tensor.dtype.str, "sha256": digest}

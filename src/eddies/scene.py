@@ -1,0 +1,105 @@
+"""A scene: the description of a flow and of what is to be learned from it, as read from one TOML file.
+
+A section that is optional and absent is None, and then nothing is built for it.
+"""
+
+import difflib
+import hashlib
+import json
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+
+from eddies.scene_checks import first_inconsistency
+from eddies.scene_reader import apply_overrides, parse_document, read_section, read_text, write_section
+from eddies.scene_sections import (BOX_LENGTH, Flow, Forcing, Initial, Kernel, Model, Simulation, SpinUp,
+                                   Time, Tracers, Training)
+from eddies.scene_values import SceneError, choice, integer, section, text
+
+__all__ = ["BOX_LENGTH", "STAGES", "Scene", "SceneError", "builtin_scenes", "load_scene", "Flow", "Forcing",
+           "Initial", "Kernel", "Model", "Simulation", "SpinUp", "Time", "Tracers", "Training"]
+
+STAGES = ("dns", "train-kernel", "train", "simulate", "report")
+BUILT_IN = Path(__file__).with_name("scenes")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene:
+    """A whole scene; making one checks that its sections fit together (SceneError)."""
+
+    name: str = text("names the run; absent: the file's name", default="scene")
+    title: str = text("one line for lists and reports", default="untitled scene")
+    seed: int = integer("of every random number", default=1, at_least=0)
+    device: str = choice("where particles are computed", "cpu", "cuda", default="cpu")
+    flow: Flow = section(Flow)
+    initial: Initial = section(Initial, default=Initial())
+    forcing: Forcing | None = section(Forcing, default=None)
+    time: Time = section(Time, default=Time())
+    spin_up: SpinUp | None = section(SpinUp, default=None)
+    tracers: Tracers | None = section(Tracers, default=None)
+    kernel: Kernel | None = section(Kernel, default=None)
+    model: Model | None = section(Model, default=None)
+    training: Training | None = section(Training, default=None)
+    simulation: Simulation | None = section(Simulation, default=None)
+
+    def __post_init__(self) -> None:
+        problem = first_inconsistency(self)
+        if problem:
+            raise SceneError(problem)
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """The stages that this scene asks for, in the order in which they run."""
+        needs = {"train-kernel": self.kernel, "train": self.model, "simulate": self.simulation}
+        return tuple(stage for stage in STAGES if needs.get(stage, self) is not None)
+
+    def to_toml(self) -> str:
+        """The scene as a TOML text with a comment on every key; reading it back gives an equal scene."""
+        lines = write_section(self)
+        for field in fields(self):
+            part = getattr(self, field.name)
+            if "section" in field.metadata and part is not None:
+                lines += ["", f"[{field.name}]", *write_section(part)]
+        return "\n".join(lines) + "\n"
+
+    def fingerprint(self, stage: str) -> str:
+        """SHA-256 over the settings that a stage's product depends on: its own sections and those before
+        it."""
+        reads = {"dns": ("seed", "flow", "initial", "forcing", "time", "spin_up", "tracers"),
+                 "train-kernel": ("kernel",), "train": ("model", "training"), "simulate": ("simulation",)}
+        settings = asdict(self)
+        keys = [key for earlier in STAGES[:STAGES.index(stage) + 1] for key in reads.get(earlier, ())]
+        return hashlib.sha256(json.dumps([[key, settings[key]] for key in keys]).encode()).hexdigest()
+
+
+def load_scene(name_or_path: str | Path, overrides: list[str] | tuple[str, ...] = ()) -> Scene:
+    """Read a built-in scene by name, or a TOML file by path, and write overrides "section.key=value" over it.
+
+    Raises:
+        SceneError: names the file (or --set), the section and the key, what is allowed and what to do.
+    """
+    path = _find(str(name_or_path))
+    keys: set[str] = set()
+    try:
+        document = {"name": path.stem, **parse_document(read_text(path))}
+        keys = apply_overrides(document, list(overrides))
+        return read_section(Scene, document)
+    except SceneError as error:
+        origin = f"{path}, --set" if error.key in keys else path
+        raise SceneError(f"{origin}: {error}", error.key) from None
+
+
+def builtin_scenes() -> list[tuple[str, str]]:
+    """Name and title of every scene that comes with the package, by name."""
+    return [(path.stem, parse_document(read_text(path))["title"]) for path in sorted(BUILT_IN.glob("*.toml"))]
+
+
+def _find(name_or_path: str) -> Path:
+    names = sorted(path.stem for path in BUILT_IN.glob("*.toml"))
+    if name_or_path in names:
+        return BUILT_IN / f"{name_or_path}.toml"
+    if Path(name_or_path).is_file():
+        return Path(name_or_path)
+    near = difflib.get_close_matches(name_or_path, names, n=1)
+    advice = f"did you mean {near[0]}? " if near else ""
+    raise SceneError(f"{name_or_path}: no such scene; {advice}give the path of a TOML file, or one of "
+                     f"{', '.join(names)}")

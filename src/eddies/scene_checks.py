@@ -1,0 +1,149 @@
+"""Whether the sections of a scene fit together: settings that are each allowed but make no sense side by
+side.
+
+Each function yields the problems of one subject in words: what was given, why it cannot be, and what to do.
+They run when a scene is made, before any work. """
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from itertools import chain
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from eddies.scene import Scene
+
+# The initial flows that read a key; the others read no such key.
+INITIAL_KEYS = {
+    "amplitude": ("random", "taylor-green", "abc", "shear-wave", "sound-wave"),
+    "peak_wavenumber": ("random",), "wavenumber": ("abc", "shear-wave", "sound-wave"), "path": ("file",)}
+
+
+def first_inconsistency(scene: Scene) -> str | None:
+    """The first problem found, or None."""
+    subjects = (flow_problems, initial_problems, time_problems, tracer_problems, section_problems,
+                support_problems, training_problems, simulation_problems)
+    return next(chain.from_iterable(subject(scene) for subject in subjects), None)
+
+
+def flow_problems(scene: Scene) -> Iterator[str]:
+    """The fluid and its sound speed; forcing within the resolved scales."""
+    flow = scene.flow
+    if flow.fluid == "compressible" and flow.sound_speed is None:
+        yield "[flow] sound_speed: this key is missing; a compressible fluid needs a number above 0"
+    if flow.fluid == "incompressible" and flow.sound_speed is not None:
+        yield (f"[flow] sound_speed = {flow.sound_speed:g}: an incompressible fluid has none; remove it or "
+               'set fluid = "compressible"')
+    if scene.forcing and scene.forcing.wavenumber > flow.cells / 3:
+        yield (f"[forcing] wavenumber = {scene.forcing.wavenumber:g}: {flow.cells} cells resolve wavenumbers "
+               f"up to {flow.cells / 3:.3g}; lower it or raise [flow] cells")
+
+
+def initial_problems(scene: Scene) -> Iterator[str]:
+    """Keys that only some initial flows read; waves within the resolved scales."""
+    initial, defaults = scene.initial, type(scene.initial)()
+    if initial.kind == "file" and initial.path is None:
+        yield '[initial] path: this key is missing; kind = "file" needs the path of an HDF5 file'
+    if initial.kind == "sound-wave" and scene.flow.fluid != "compressible":
+        yield '[initial] kind = "sound-wave": needs sound; set [flow] fluid = "compressible"'
+    for key, kinds in INITIAL_KEYS.items():
+        value = getattr(initial, key)
+        if value != getattr(defaults, key) and initial.kind not in kinds:
+            yield (f'[initial] {key} = {value}: only read with kind = {" or ".join(kinds)}, not '
+                   f'"{initial.kind}"; remove the key')
+    highest = {"random": initial.peak_wavenumber}.get(initial.kind, initial.wavenumber)
+    if highest > scene.flow.cells / 3:
+        yield (f"[initial] wavenumber {highest:g}: {scene.flow.cells} cells resolve wavenumbers up to "
+               f"{scene.flow.cells / 3:.3g}; lower it or raise [flow] cells")
+
+
+def time_problems(scene: Scene) -> Iterator[str]:
+    """One run time, and a forcing that acts in it."""
+    duration = scene.time.duration
+    if scene.tracers is None and duration is None:
+        yield "[time] duration: this key is missing; without [tracers] it is the run time, a number above 0"
+    if scene.tracers is not None and duration is not None:
+        yield (f"[time] duration = {duration:g}: with [tracers] the run time is [tracers] turnovers; "
+               "remove one of the two")
+    if scene.forcing and scene.tracers and scene.spin_up is None:
+        yield ("[forcing]: acts only before the tracers start, and there is no [spin_up]; add [spin_up] "
+               "turnovers or remove [forcing]")
+
+
+def tracer_problems(scene: Scene) -> Iterator[str]:
+    """Stored fields no finer than the simulation."""
+    tracers = scene.tracers
+    if tracers and tracers.cells > scene.flow.cells:
+        given = "" if tracers.field_cells else " (from particles_per_side)"
+        yield (f"[tracers] field_cells = {tracers.cells}{given}: must be at most [flow] cells = "
+               f"{scene.flow.cells}; lower field_cells or raise cells")
+
+
+def section_problems(scene: Scene) -> Iterator[str]:
+    """Which sections need which others."""
+    needs = {"kernel": ("tracers",), "model": ("tracers", "kernel", "training"), "training": ("model",),
+             "simulation": ("model",)}
+    for name, others in needs.items():
+        for other in others:
+            if getattr(scene, name) is not None and getattr(scene, other) is None:
+                yield f"[{name}]: needs a section [{other}], which the scene lacks; add it or remove [{name}]"
+    if scene.model and scene.flow.fluid != "compressible":
+        yield ('[model]: learns from the density, which an incompressible flow does not have; set [flow] '
+               'fluid = "compressible" and sound_speed, or remove [model]')
+
+
+def support_problems(scene: Scene) -> Iterator[str]:
+    """A particle must not see another one and its periodic image: support and skin stay below half the
+    cube."""
+    if scene.kernel and scene.tracers:
+        skin = scene.simulation.skin if scene.simulation else 0.0
+        reach = scene.kernel.support(scene.tracers.particles) * (1 + skin)
+        if reach >= math.pi:
+            yield (f"[kernel] neighbors = {scene.kernel.neighbors:g}: {scene.tracers.particles} particles "
+                   f"reach {reach:.3g} with the skin, and half the cube is {math.pi:.3g}; lower neighbors or "
+                   "raise [tracers] particles_per_side")
+
+
+def training_problems(scene: Scene) -> Iterator[str]:
+    """Steps, rates and weights that contradict each other."""
+    training = scene.training
+    if training is None:
+        return
+    if training.combined_steps > training.steps:
+        yield (f"[training] combined_steps = {training.combined_steps}: must be at most steps = "
+               f"{training.steps}, of which they are the last")
+    if training.final_learning_rate > training.learning_rate:
+        yield (f"[training] final_learning_rate = {training.final_learning_rate:g}: must be at most "
+               f"learning_rate = {training.learning_rate:g}")
+    if scene.tracers and training.batch > scene.tracers.particles:
+        yield (f"[training] batch = {training.batch}: must be at most the number of particles, "
+               f"{scene.tracers.particles}; lower it or raise [tracers] particles_per_side")
+    later = training.field_weight + training.velocity_kl_weight + training.acceleration_kl_weight
+    if (later > 0) != (training.combined_steps > 0):
+        yield (f"[training] combined_steps = {training.combined_steps}: they are the steps that use "
+               "field_weight, velocity_kl_weight and acceleration_kl_weight; give both the steps and a "
+               "weight above 0, or neither")
+
+
+def simulation_problems(scene: Scene) -> Iterator[str]:
+    """Frames that fall on steps and on the frames of the ground truth."""
+    simulation = scene.simulation
+    if simulation is None or scene.tracers is None:
+        return
+    frame = simulation.frame_interval
+    if not _is_multiple(frame, simulation.step):
+        yield (f"[simulation] frame_interval = {frame:g}: must be a whole multiple of step = "
+               f"{simulation.step:g}; change either")
+    if not _is_multiple(frame, scene.tracers.frame_interval):
+        yield (f"[simulation] frame_interval = {frame:g}: must be a whole multiple of [tracers] "
+               f"frame_interval = {scene.tracers.frame_interval:g}, so that truth and model are stored at "
+               "the same times")
+    if simulation.start is None and scene.training and scene.training.window == 1:
+        yield ("[simulation] start: this key is missing; the training window is the whole ground truth, so "
+               "there is nothing after it; give start, or a smaller [training] window")
+
+
+def _is_multiple(interval: float, unit: float) -> bool:
+    ratio = interval / unit
+    return round(ratio) >= 1 and abs(ratio - round(ratio)) < 1e-9 * ratio

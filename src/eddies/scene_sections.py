@@ -1,0 +1,165 @@
+"""The sections of a scene, each a frozen dataclass whose fields declare their keys.
+
+A declaration gives what the key means, which values are allowed, and the default. Lengths are in units of the
+cube [0, 2 pi)^3, the mean density is 1, and times are in the unit that follows from lengths and velocities.
+"""
+
+import math
+from dataclasses import dataclass
+
+from eddies.scene_values import choice, integer, integers, number, text
+
+BOX_LENGTH = 2 * math.pi
+
+
+@dataclass(frozen=True, kw_only=True)
+class Flow:
+    """The fluid and the grid on which the direct numerical simulation resolves it."""
+
+    fluid: str = choice("equations of motion", "incompressible", "compressible")
+    cells: int = integer("grid cells along each side of the cube", at_least=8)
+    viscosity: float = number("kinematic viscosity", at_least=0)
+    sound_speed: float | None = number("speed of sound, compressible fluid only", default=None, above=0)
+    precision: str = choice("of the grid arrays", "float64", "float32", default="float64")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Initial:
+    """The velocity, and with a compressible fluid the density, at time 0."""
+
+    kind: str = choice("initial flow", "random", "taylor-green", "abc", "shear-wave", "sound-wave", "file",
+                       default="random")
+    amplitude: float = number("of velocity, random: rms of a component; sound-wave: of ln density",
+                              default=1.0, above=0)
+    peak_wavenumber: float = number("wavenumber of the spectrum's peak, random only", default=3.0, above=0)
+    wavenumber: int = integer("waves in the cube; abc, shear-wave, sound-wave only", default=1, at_least=1)
+    path: str | None = text("HDF5 file to start from, kind file only", default=None)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Forcing:
+    """Linear solenoidal forcing of the largest scales at a prescribed power."""
+
+    injection_rate: float = number("power injected per unit mass", at_least=0)
+    wavenumber: float = number("modes with 0 < |k| < this are forced", default=2.0, above=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Time:
+    """The time step and, without tracers, the run time."""
+
+    stepper: str = choice("time stepping method", "etdrk4", "rk4", default="etdrk4")
+    courant: float = number("Courant number of the step (advective; rk4 also acoustic)", default=0.8, above=0)
+    max_step: float = number("largest step; smaller ones are this over a power of two", default=0.05, above=0)
+    step: float | None = number("fixed step instead", default=None, above=0)
+    duration: float | None = number("run time after spin-up, without tracers only", default=None, above=0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpinUp:
+    """The time before tracers are released, in which forced turbulence becomes stationary."""
+
+    turnovers: float = number("large-eddy turnovers", above=0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tracers:
+    """Particles that follow the filtered flow: the ground truth of learning."""
+
+    particles_per_side: int = integer("the number of particles is the cube of this", at_least=2)
+    placement: str = choice("where the particles start", "random", "lattice", default="random")
+    filter_width: float | None = number("of the Gaussian filter; absent: twice the mean spacing",
+                                        default=None, above=0, below=BOX_LENGTH)
+    interpolation: str = choice("splines from grid to particles", "cubic", "quintic", default="cubic")
+    turnovers: float = number("large-eddy turnovers to follow the particles", above=0)
+    frame_interval: float = number("time between stored frames", above=0)
+    field_cells: int | None = integer("grid of the stored fields; absent: 1.5 x particles_per_side, even",
+                                      default=None, at_least=4)
+    field_every: int = integer("frames per stored field", default=5, at_least=1)
+
+    @property
+    def particles(self) -> int:
+        """Number of particles N."""
+        return self.particles_per_side**3
+
+    @property
+    def spacing(self) -> float:
+        """Mean spacing L / N^(1/3) of the particles."""
+        return BOX_LENGTH / self.particles_per_side
+
+    @property
+    def width(self) -> float:
+        """Filter width d in use: as given, or twice the mean particle spacing."""
+        return 2 * self.spacing if self.filter_width is None else self.filter_width
+
+    @property
+    def cells(self) -> int:
+        """Cells along each side of the stored fields: as given, or 1.5 particles_per_side rounded to even."""
+        return 2 * round(0.75 * self.particles_per_side) if self.field_cells is None else self.field_cells
+
+
+@dataclass(frozen=True, kw_only=True)
+class Kernel:
+    """The smoothing kernel W, learned by reconstructing the filtered field from the particles."""
+
+    neighbors: float = number("mean number of particles within the support", default=60.0, at_least=8)
+    hidden: tuple[int, ...] = integers("widths of the network's tanh layers", default=(20, 20, 20, 20),
+                                       at_least=1)
+    cutoff: str = choice("factor that ends the kernel at its support", "smooth", "sigmoid", default="smooth")
+    gradient_weight: float = number("weight of the velocity gradient in the loss", default=1.0, at_least=0)
+    normalization_weight: float = number("weight of the sum over particles being 1", default=0.0, at_least=0)
+    steps: int = integer("optimiser steps", at_least=1)
+    points: int = integer("grid points drawn per step", default=2048, at_least=1)
+    learning_rate: float = number("of the optimiser", default=2e-3, above=0)
+
+    def support(self, particles: int) -> float:
+        """Radius h of the ball that holds `neighbors` of `particles` on average: n = N (4/3) pi h^3 / L^3."""
+        return BOX_LENGTH * (self.neighbors / particles / (4 / 3 * math.pi)) ** (1 / 3)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Model:
+    """The form of the pair force, of the density closure and of the eddy viscosity."""
+
+    basis: str = choice("of the pair sum; corrected: times the inverse moment matrix", "paper", "corrected",
+                        default="corrected")
+    closure: str = choice("where the density comes from", "poisson", "learned-density", "paper-density",
+                          default="poisson")
+    hidden: tuple[int, ...] = integers("widths of the pair network's layers", default=(16, 16), at_least=1)
+    eddy_viscosity: str = choice("explicit eddy viscosity between pairs", "none", "two-sided", "monaghan",
+                                 default="none")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Training:
+    """How the pair force is fitted to the tracers: first to trajectories, then to all losses together."""
+
+    window: float = number("fraction of the ground truth that is used, the rest stays unseen", default=0.5,
+                           above=0, at_most=1)
+    frames: int = integer("frames of the window to draw from", at_least=2)
+    batch: int = integer("particles per step", at_least=1)
+    steps: int = integer("optimiser steps", at_least=1)
+    learning_rate: float = number("of the optimiser, at the start", default=5e-3, above=0)
+    final_learning_rate: float = number("of the optimiser, at the end", default=1e-4, above=0)
+    precision: str = choice("of the training", "float32", "float64", default="float32")
+    trajectory_weight: float = number("weight of the trajectory loss", default=1.0, at_least=0)
+    field_weight: float = number("weight of the field loss", default=0.0, at_least=0)
+    velocity_kl_weight: float = number("weight of the divergence of velocity PDFs", default=0.0, at_least=0)
+    acceleration_kl_weight: float = number("the same for acceleration PDFs", default=0.0, at_least=0)
+    combined_steps: int = integer("steps at the end that use every loss", default=0, at_least=0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Simulation:
+    """The run of the learned model, without the direct simulation."""
+
+    integrator: str = choice("time stepping of the particles", "verlet", "rk2", "rk4", default="verlet")
+    step: float = number("time step", above=0)
+    turnovers: float = number("large-eddy turnovers to simulate", above=0)
+    start: float | None = number("as a fraction of the ground truth; absent: where the training window ends",
+                                 default=None, at_least=0, below=1)
+    frame_interval: float = number("time between stored frames", above=0)
+    skin: float = number("extra reach of the neighbour list, in supports", default=0.1, at_least=0, at_most=1)
+    precision: str = choice("of the forces", "float32", "float64", default="float32")
+    injection: float | str = number("large-scale forcing power per mass; dissipation: as the flow loses",
+                                    default="none", words=("none", "dissipation"), above=0)

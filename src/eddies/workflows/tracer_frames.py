@@ -1,0 +1,86 @@
+"""What the ground truth stores of tracers: id-ordered frames, filtered fields, spectra and reference scales."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from eddies.clock import Clock
+from eddies.flow.spectral_grid import SpectralGrid, restrict
+from eddies.flow.statistics import energy_spectrum
+from eddies.flow.tracers import TracerParticles
+from eddies.io.fields import FieldWriter
+from eddies.io.hdf5 import write_table
+from eddies.io.trajectories import TrajectoryWriter
+from eddies.parallel.migration import IdOrder
+from eddies.parallel.reduction import global_sum
+from eddies.parallel.slab import SlabDecomposition
+from eddies.scene import Tracers
+
+
+class TracerFrames:
+    """Stores frames of tracers and accumulates the reference scales over all particles and frames.
+
+    Times are counted from the release. The acceleration and density rate scales are those of differences between
+    successive frames, along the trajectories.
+    """
+
+    def __init__(self, file, tracers: TracerParticles, settings: Tracers, released_at: float) -> None:
+        self.file, self.tracers, self.settings, self.released_at = file, tracers, settings, released_at
+        fine = tracers.field.grid
+        slab = SlabDecomposition(fine.decomposition.comm, fine.decomposition.length, settings.cells)
+        self.coarse = SpectralGrid(slab, fine.precision, min(fine.cutoff, (settings.cells - 1) // 2))
+        self._trajectory = TrajectoryWriter(file, "tracers", settings.particles, slab.length,
+                                            {"position": (3,), "velocity": (3,), "density": ()}, np.float64)
+        self._fields = FieldWriter(file, "filtered", settings.cells, {"velocity": 3, "density": 1})
+        self._frames = 0
+        self._last: dict[str, np.ndarray] = {}
+        self._squares = {"velocity": 0.0, "density": 0.0, "acceleration": 0.0, "density_rate": 0.0}
+        self._spectra: dict[str, list] = {"time": [], "energy": [], "filtered": []}
+
+    def store(self, state: np.ndarray, clock: Clock) -> None:
+        """Store a frame, and every few frames the filtered fields and spectra."""
+        time = clock.time - self.released_at
+        order = IdOrder(self.coarse.decomposition.comm, self.tracers.columns["id"], self.settings.particles)
+        frame = {"position": order.apply(self.tracers.columns["position"]),
+                 "velocity": order.apply(self.tracers.columns["velocity"]),
+                 "density": order.apply(self.tracers.density(state))}
+        self._trajectory.append(clock.steps, time, order.start, frame)
+        self._accumulate(frame)
+        if self._frames % self.settings.field_every == 0:
+            self._store_fields(state, time)
+        self._frames += 1
+
+    def scales(self) -> dict[str, float]:
+        """Reference scales: root mean squares over particles and frames, of one component where there are three."""
+        total = self.settings.particles
+        frames, pairs = total * self._frames, total * max(self._frames - 1, 1)
+        squares = {name: float(global_sum(self.coarse.decomposition.comm, value)) for name, value in self._squares.items()}
+        return {"velocity_rms": np.sqrt(squares["velocity"] / (3 * frames)),
+                "density_mean": 1.0,
+                "density_rms": np.sqrt(squares["density"] / frames),
+                "acceleration_rms": np.sqrt(squares["acceleration"] / (3 * pairs)),
+                "density_rate_rms": np.sqrt(squares["density_rate"] / pairs)}
+
+    def write_spectra(self) -> None:
+        """Write the table of DNS and filtered energy spectra."""
+        wavenumber = np.arange(len(self._spectra["energy"][0]))
+        write_table(self.file, "spectra", {"wavenumber": wavenumber} | {k: np.array(v) for k, v in self._spectra.items()})
+
+    def _accumulate(self, frame: dict[str, np.ndarray]) -> None:
+        self._squares["velocity"] += np.sum(frame["velocity"] ** 2)
+        self._squares["density"] += np.sum((frame["density"] - 1) ** 2)
+        if self._last:
+            interval = self.settings.frame_interval
+            self._squares["acceleration"] += np.sum((frame["velocity"] - self._last["velocity"]) ** 2) / interval**2
+            self._squares["density_rate"] += np.sum((frame["density"] - self._last["density"]) ** 2) / interval**2
+        self._last = frame
+
+    def _store_fields(self, state: np.ndarray, time: float) -> None:
+        field = self.tracers.field
+        velocity = field.transfer * state[:3]
+        modes = np.concatenate([velocity, field.density_modes(state)])
+        physical = self.coarse.backward(restrict(field.grid, self.coarse, modes))
+        self._fields.append(time, self.coarse.decomposition.start, {"velocity": physical[:3], "density": physical[3:]})
+        self._spectra["time"].append(time)
+        self._spectra["energy"].append(energy_spectrum(field.grid, state[:3])[1])
+        self._spectra["filtered"].append(energy_spectrum(field.grid, velocity)[1])

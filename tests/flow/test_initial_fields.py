@@ -1,0 +1,51 @@
+import numpy as np
+import pytest
+
+from eddies.flow import initial_fields
+from eddies.flow.operators import divergence, pressure
+from eddies.flow.spectral_grid import SpectralGrid, restrict
+from eddies.flow.statistics import energy_spectrum, gradient_moments
+from eddies.parallel.slab import SlabDecomposition
+
+
+def make_grid(comm, cells):
+    return SpectralGrid(SlabDecomposition(comm, 2 * np.pi, cells))
+
+
+@pytest.mark.mpi(1, 2)
+def test_random_field_is_solenoidal_real_and_has_its_spectrum(comm):
+    grid = make_grid(comm, 24)
+    velocity = initial_fields.random_velocity(grid, 5, amplitude=0.7, peak_wavenumber=3.0)
+    assert np.abs(divergence(grid, velocity)).max(initial=0) < 1e-15
+    assert np.abs(grid.forward(grid.backward(velocity)) - velocity).max(initial=0) < 1e-15
+    k, spectrum = energy_spectrum(grid, velocity)
+    shape = k**4 * np.exp(-2 * (k / 3.0) ** 2)
+    assert spectrum.sum() == pytest.approx(1.5 * 0.7**2, rel=1e-12)
+    assert np.allclose(spectrum[:8] / spectrum[3], shape[:8] / shape[3], rtol=1e-12)
+
+
+@pytest.mark.mpi(1)
+def test_random_field_does_not_depend_on_the_resolution(comm):
+    coarse, fine = make_grid(comm, 32), make_grid(comm, 48)
+    velocities = [initial_fields.random_velocity(grid, 5, 1.0, 2.0) for grid in (coarse, fine)]
+    # Shells beyond the coarse cutoff hold next to nothing, so the common normalisation hardly differs.
+    inner = np.sqrt(coarse.index_squared) < coarse.cutoff
+    difference = restrict(fine, coarse, velocities[1]) - velocities[0]
+    assert np.abs(difference[:, inner]).max() < 1e-6
+
+
+@pytest.mark.mpi(1)
+def test_gaussian_field_has_no_skewness_and_flatness_three(comm):
+    grid = make_grid(comm, 48)
+    skewness, flatness = gradient_moments(grid, initial_fields.random_velocity(grid, 5, 1.0, 6.0))
+    # Sampling error of about a thousand independent eddies.
+    assert abs(skewness) < 0.05 and abs(flatness - 3) < 0.2
+
+
+@pytest.mark.mpi(1, 2)
+def test_pressure_of_the_taylor_green_vortex(comm):
+    grid = make_grid(comm, 16)
+    x, y, z = grid.coordinates()
+    exact = (np.cos(2 * x) + np.cos(2 * y)) * (np.cos(2 * z) + 2) / 16
+    found = grid.backward(pressure(grid, initial_fields.taylor_green(grid, 1.0))[None])[0]
+    assert np.abs(found - exact).max(initial=0) < 1e-15

@@ -1,0 +1,52 @@
+import numpy as np
+import pytest
+
+from eddies.parallel.halo import HaloError, HaloExchange
+from eddies.parallel.migration import migrate
+from eddies.parallel.reduction import global_sum
+from eddies.parallel.slab import SlabDecomposition
+
+LENGTH = 2 * np.pi
+WIDTH = 0.8
+
+
+def slab_particles(comm, total=300, squeeze=1.0):
+    random = np.random.default_rng(4)
+    position = random.uniform(0, LENGTH, (total, 3))
+    position[:, 2] *= squeeze
+    own = np.arange(total) % comm.size == comm.rank
+    slab = SlabDecomposition(comm, LENGTH, 17)
+    return slab, migrate(slab, {"id": np.arange(total)[own], "position": position[own]}), position
+
+
+@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.parametrize("squeeze", [1.0, 0.2], ids=["everywhere", "on one rank"])
+def test_ghosts_are_exactly_the_images_within_the_width(comm, squeeze):
+    slab, particles, position = slab_particles(comm, squeeze=squeeze)
+    halo = HaloExchange(slab, particles["position"], WIDTH)
+    expected = []
+    if comm.size > 1:
+        for shift in (-LENGTH, 0.0, LENGTH):
+            z = position[:, 2] + shift
+            near = ((z >= slab.lower - WIDTH) & (z < slab.lower)) | ((z >= slab.upper) & (z < slab.upper + WIDTH))
+            expected += [(i, z[i]) for i in np.flatnonzero(near)]
+    found = zip(halo.forward(particles["id"]), halo.forward_positions(particles["position"])[:, 2])
+    assert np.allclose(sorted(found), sorted(expected), atol=1e-12) if expected else halo.count == 0
+
+
+@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.parametrize("squeeze", [1.0, 0.2], ids=["everywhere", "on one rank"])
+def test_adjoint_identity(comm, squeeze):
+    slab, particles, _ = slab_particles(comm, squeeze=squeeze)
+    halo = HaloExchange(slab, particles["position"], WIDTH)
+    random = np.random.default_rng(comm.rank)
+    x, y = random.standard_normal((len(particles["id"]), 2)), random.standard_normal((halo.count, 2))
+    left, right = global_sum(comm, np.array([np.vdot(halo.forward(x), y), np.vdot(x, halo.adjoint(y))]))
+    assert left == pytest.approx(right, rel=1e-13, abs=1e-13)
+
+
+@pytest.mark.mpi(3)
+def test_a_slab_thinner_than_the_halo_is_refused_with_the_usable_ranks(comm):
+    slab = SlabDecomposition(comm, LENGTH, 8)
+    with pytest.raises(HaloError, match="at most 2 ranks"):
+        HaloExchange(slab, np.empty((0, 3)), 4 * slab.spacing)

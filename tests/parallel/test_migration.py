@@ -1,0 +1,52 @@
+import numpy as np
+import pytest
+
+from eddies.parallel.migration import IdOrder, ParticleLossError, census, migrate, wrap
+from eddies.parallel.slab import SlabDecomposition
+
+LENGTH = 2 * np.pi
+
+
+def scattered(comm, total, seed=3):
+    """Particles dealt to the ranks without regard to where they are, some of them outside the box."""
+    random = np.random.default_rng(seed)
+    position = random.uniform(-LENGTH, 2 * LENGTH, (total, 3))
+    own = np.arange(total) % comm.size == comm.rank
+    return {"id": np.arange(total)[own], "position": position[own], "tensor": (position[own, :, None] * [1.0, 2.0]),
+            "flag": position[own, 0].astype(np.float32)}, position
+
+
+@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.parametrize("total", [100, 1, 0])
+def test_every_particle_arrives_where_it_is_with_all_its_columns(comm, total):
+    columns, position = scattered(comm, total)
+    slab = SlabDecomposition(comm, LENGTH, 7)
+    moved = migrate(slab, columns)
+    assert np.all((moved["position"][:, 2] >= slab.lower) & (moved["position"][:, 2] < slab.upper))
+    assert np.array_equal(moved["position"], wrap(position[moved["id"]], LENGTH))
+    assert np.array_equal(moved["tensor"], position[moved["id"]][:, :, None] * [1.0, 2.0])
+    assert moved["flag"].dtype == np.float32
+    assert census(comm, moved["id"])[0] == total
+
+
+@pytest.mark.mpi(1, 2, 3)
+def test_order_by_id_restores_the_ids_from_any_distribution(comm):
+    columns, position = scattered(comm, 50)
+    order = IdOrder(comm, columns["id"], 50)
+    assert np.array_equal(order.apply(columns["position"]), position[order.start : order.stop])
+
+
+@pytest.mark.mpi(1, 2)
+def test_a_missing_particle_is_noticed(comm):
+    ids = np.arange(10)[np.arange(10) % comm.size == comm.rank]
+    with pytest.raises(ParticleLossError):
+        IdOrder(comm, np.where(ids == 4, 3, ids), 10) if comm.size == 1 else _on_all(comm, ids)
+
+
+def _on_all(comm, ids):
+    # The ids of both ranks are spoiled, so that both raise and neither is left waiting.
+    IdOrder(comm, np.where(ids == 2 + comm.rank, 7 - comm.rank, ids), 10)
+
+
+def test_wrapping_never_returns_the_upper_bound():
+    assert wrap(np.array([-1e-20, LENGTH, -LENGTH]), LENGTH).tolist() == [0.0, 0.0, 0.0]
