@@ -1,0 +1,18 @@
+#!/usr/bin/env bash
+# EDDIES_SCENE=hit bsub < jobs/lsf.sh
+# Submit from the checkout, or set EDDIES_CHECKOUT to it. Load your cluster's modules first, as for set-up.
+#BSUB -J eddies
+#BSUB -n 16
+#BSUB -W 4:00
+#BSUB -o eddies.%J.log
+# SIGUSR1 five minutes before the limit: the ranks write a checkpoint and exit with 75, which queues the job again.
+#BSUB -wa USR1
+#BSUB -wt 5
+#BSUB -Q 75
+launcher=(mpirun)
+resubmit=(true)
+
+# ---- the same for every scheduler
+set -euo pipefail
+cd "${PBS_O_WORKDIR:-$PWD}"
+source "${EDDIES_CHECKOUT:-$PWD}/jobs/run.sh"

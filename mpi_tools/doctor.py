@@ -1,0 +1,124 @@
+"""Say what every rank has, and whether messages and parallel files work between them.
+
+    python mpi_tools/launch.py -- .venv/bin/python mpi_tools/doctor.py
+
+One line a rank, then a ring test: every rank sends to the next and checks each number that it gets. The exit
+code is the number of complaints, at most 100.
+"""
+
+import importlib
+import os
+import platform
+import tempfile
+from pathlib import Path
+
+from mpi4py import MPI
+import numpy as np
+
+RING_NUMBERS = 1 << 20
+RING_ROUNDS = 20
+
+
+def versions() -> tuple[str, list[str]]:
+    """Versions of the libraries that eddies needs, and what is missing of them."""
+    found, missing = [], []
+    for name in ("numpy", "h5py", "pyfftw", "torch", "matplotlib"):
+        try:
+            module = importlib.import_module(name)
+        except ImportError as error:
+            missing.append(f"{name} cannot be imported ({error})")
+            continue
+        found.append(f"{name} {module.__version__}")
+        if name == "h5py":
+            parallel = module.get_config().mpi
+            found[-1] += f" (HDF5 {module.version.hdf5_version}, {'mpio' if parallel else 'serial'})"
+            if not parallel:
+                missing.append("h5py without MPI: run mpi_tools/bootstrap.sh, or build it with HDF5_MPI=ON")
+        elif name == "pyfftw":
+            found[-1] += f" (FFTW {module.fftw_version})"
+        elif name == "torch":
+            found[-1] += f" ({module.get_num_threads()} threads, {accelerator(module)})"
+    return ", ".join(found), missing
+
+
+def accelerator(torch) -> str:
+    """Name of the GPU that a rank on this host would use."""
+    if not torch.cuda.is_available():
+        return "no GPU"
+    return f"{torch.cuda.device_count()} x {torch.cuda.get_device_name(0)}"
+
+
+def ring_bandwidth(comm: MPI.Comm) -> tuple[float, list[str]]:
+    """Bandwidth (bytes / s) to the next rank while all send at once, and what arrived wrong."""
+    above, below = (comm.rank + 1) % comm.size, (comm.rank - 1) % comm.size
+    outgoing = comm.rank + np.arange(RING_NUMBERS, dtype=float)
+    incoming = np.empty_like(outgoing)
+    comm.Barrier()
+    start = MPI.Wtime()
+    for _ in range(RING_ROUNDS):
+        comm.Sendrecv(outgoing, above, 0, incoming, below, 0)
+    seconds = MPI.Wtime() - start
+    wrong = np.count_nonzero(incoming != below + np.arange(RING_NUMBERS, dtype=float))
+    complaints = [f"{wrong} of {RING_NUMBERS} numbers from rank {below} are wrong"] if wrong else []
+    return RING_ROUNDS * outgoing.nbytes / seconds, complaints
+
+
+def parallel_file(comm: MPI.Comm) -> list[str]:
+    """Complaints about a file in the current folder that all ranks write together."""
+    import h5py
+    name = np.zeros(64, np.uint8)
+    if comm.rank == 0:
+        handle, path = tempfile.mkstemp(prefix="doctor-", suffix=".h5", dir=".")
+        os.close(handle)
+        name[:len(path)] = np.frombuffer(path.encode(), np.uint8)
+    comm.Bcast(name)
+    path = Path(name[name > 0].tobytes().decode())
+    with h5py.File(path, "w", driver="mpio", comm=comm) as file:
+        rows = file.create_dataset("rank", (comm.size,), int)
+        with rows.collective:
+            rows[comm.rank] = comm.rank
+    with h5py.File(path, "r", driver="mpio", comm=comm) as file:
+        good = np.array_equal(file["rank"][:], np.arange(comm.size))
+    comm.Barrier()
+    if comm.rank == 0:
+        path.unlink()
+    return [] if good else ["a file written by all ranks together reads back wrong"]
+
+
+def total(comm: MPI.Comm, number: int) -> int:
+    """Sum over the ranks."""
+    result = np.zeros(1, int)
+    comm.Allreduce(np.array([number]), result)
+    return int(result[0])
+
+
+def print_in_turn(comm: MPI.Comm, text: str) -> None:
+    """Rank 0 prints the text of every rank, in order, up to 2000 bytes of each."""
+    mine = np.frombuffer(text.encode()[:2000].ljust(2000), np.uint8)
+    texts = np.empty((comm.size, mine.size), np.uint8)
+    comm.Gather(mine, texts)
+    if comm.rank == 0:
+        print(*(row.tobytes().decode(errors="replace").rstrip() for row in texts), sep="\n", flush=True)
+
+
+def main() -> int:
+    comm = MPI.COMM_WORLD
+    libraries, complaints = versions()
+    bandwidth, wrong = ring_bandwidth(comm)
+    complaints += wrong
+    # A rank without parallel h5py would leave the others waiting in the collective calls.
+    if comm.size > 1 and total(comm, len(complaints)) == 0:
+        complaints += parallel_file(comm)
+    line = (f"rank {comm.rank} of {comm.size} on {platform.node()}: {len(os.sched_getaffinity(0))} cores, "
+            f"OMP_NUM_THREADS {os.environ.get('OMP_NUM_THREADS', 'unset')}, "
+            f"{MPI.Get_library_version().split(',')[0].strip()}, {libraries}, "
+            f"{bandwidth / 1e9:.2f} GB/s to rank {(comm.rank + 1) % comm.size}")
+    print_in_turn(comm, "\n".join([line, *(f"  rank {comm.rank}: {complaint}" for complaint in complaints)]))
+    count = total(comm, len(complaints))
+    if comm.rank == 0:
+        print(f"{count} complaints" if count else "all is well", flush=True)
+    return min(count, 100)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

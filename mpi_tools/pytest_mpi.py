@@ -1,0 +1,250 @@
+"""Pytest plugin: `@pytest.mark.mpi(1, 2, 3)` runs a test under mpirun on each of these numbers of ranks.
+
+    @pytest.mark.mpi(1, 2, timeout=30)
+    def test_sum(comm):
+        assert comm.allreduce(1) == comm.size
+
+The pytest process that the user starts (outer) never initialises MPI: Open MPI 4 cannot start mpirun from
+a process that has. It starts one `mpirun -n RANKS python -m pytest MODULE` (inner) for the selected tests of
+a module with the same number of ranks and reports each of them from the JSON lines that every rank writes.
+Where the ranks disagree about a test, or it lasts longer than its time limit, that mpirun ends and a new one
+runs the tests after it. `tmp_path` is one folder for all ranks of a test; `tmp_path_factory` is not shared.
+"""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import pytest
+
+from mpi_tools.launch import mpi_environment, mpirun_command
+
+TIMEOUT = 120.0  # seconds for one test on all its ranks
+STALL = 60.0     # seconds without a result, beyond the time limit, after which mpirun itself is given up
+
+
+def pytest_addoption(parser):
+    parser.addoption("--mpi-run", metavar="DIR", help="of the plugin itself: be a rank of the run in DIR")
+
+
+def pytest_configure(config):
+    config.addinivalue_line("markers", "mpi(*ranks, timeout=120): run under mpirun on these numbers of ranks")
+    folder = config.getoption("--mpi-run")
+    if folder:
+        from mpi_tools.pytest_mpi_rank import InnerRun
+        config.pluginmanager.register(InnerRun(Path(folder)), "mpi-inner")
+    else:
+        import mpi4py
+        mpi4py.rc.initialize = mpi4py.rc.finalize = False
+        config.pluginmanager.register(OuterRun(config), "mpi-outer")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_generate_tests(metafunc):
+    marker = metafunc.definition.get_closest_marker("mpi")
+    if marker is None:
+        return
+    if not marker.args or not all(isinstance(ranks, int) and ranks > 0 for ranks in marker.args):
+        pytest.fail(f"mpi{marker.args}: positive numbers of ranks are expected", pytrace=False)
+    metafunc.fixturenames.append("mpi_ranks")
+    metafunc.parametrize("mpi_ranks", marker.args, ids="mpi-{}".format, indirect=True)
+
+
+@pytest.fixture
+def mpi_ranks(request):
+    """Number of ranks of this run of the test."""
+    return request.param
+
+
+@pytest.fixture(scope="session")
+def comm(pytestconfig):
+    """MPI.COMM_WORLD of the inner run."""
+    if not pytestconfig.getoption("--mpi-run"):
+        pytest.fail("the fixture comm needs @pytest.mark.mpi(RANKS, ...) on the test", pytrace=False)
+    from mpi4py import MPI
+    return MPI.COMM_WORLD
+
+
+@pytest.fixture
+def tmp_path(request, pytestconfig, tmp_path):
+    """As in pytest, but one folder for all ranks of an MPI test."""
+    folder = pytestconfig.getoption("--mpi-run")
+    if not folder:
+        return tmp_path
+    shared = Path(folder, "tmp", "".join(c if c.isalnum() else "-" for c in request.node.name))
+    shared.mkdir(parents=True, exist_ok=True)
+    return shared
+
+
+class OuterRun:
+    """Puts an `MpiItem` in the place of each marked test and keeps the mpirun of the module at hand."""
+
+    def __init__(self, config):
+        self.config = config
+        self.run = None
+        self.waiting = {}  # (module, ranks) -> items still to be reported, in order
+
+    @pytest.hookimpl(trylast=True)
+    def pytest_collection_modifyitems(self, items):
+        items[:] = [MpiItem.replace(item, self) if item.get_closest_marker("mpi") else item for item in items]
+        modules = list(dict.fromkeys(item.path for item in items))
+        items.sort(key=lambda item: (modules.index(item.path), getattr(item, "ranks", 0)))
+        for item in items:
+            if isinstance(item, MpiItem):
+                self.waiting.setdefault((item.path, item.ranks), []).append(item)
+
+    def records(self, item) -> list[dict]:
+        """Records of all ranks for a test; where no mpirun reaches it, one starts with it."""
+        group = self.waiting[item.path, item.ranks]
+        del group[:group.index(item)]
+        if self.run is None or not self.run.reaches(item):
+            self.close()
+            self.run = RankRun(self.config, item.ranks, group)
+            self.run.reaches(item)
+        return self.run.records(item)
+
+    def close(self):
+        if self.run is not None:
+            self.run.close()
+            self.run = None
+
+    def pytest_sessionfinish(self):
+        self.close()
+
+
+class RankFailure(Exception):
+    """A test failed on some rank; the text is the report."""
+
+
+class MpiItem(pytest.Item):
+    """Stands for a test function that another mpirun executes."""
+
+    @classmethod
+    def replace(cls, function, outer):
+        item = cls.from_parent(function.parent, name=function.name)
+        marker = function.get_closest_marker("mpi")
+        item.outer, item.ranks = outer, function.callspec.params["mpi_ranks"]
+        item.timeout = float(marker.kwargs.get("timeout", TIMEOUT))
+        item.place = function.reportinfo()
+        return item
+
+    def runtest(self):
+        records = self.outer.records(self)
+        for record in records:
+            for title, text in record["sections"]:
+                stream, phase = title.split()[1:]  # "Captured stdout call"
+                self.add_report_section(phase, f"{stream} of rank {record['rank']}", text)
+        failed = [record for record in records if record["outcome"] == "failed"]
+        if failed:
+            # The traceback of the first rank that raised, or where all of them stood.
+            raised = [record for record in failed if record["phase"]][:1]
+            raise RankFailure("\n".join(self.describe(record) for record in raised or failed))
+        skipped = next((record for record in records if record["outcome"] == "skipped"), None)
+        if skipped:
+            leave = pytest.xfail if skipped["expected"] else pytest.skip
+            leave(skipped["text"].removeprefix("Skipped: "))
+
+    def describe(self, record: dict) -> str:
+        verb = f"failed in {record['phase']}" if record["phase"] else "did not finish"
+        return f"rank {record['rank']} of {self.ranks} {verb}\n{record['text']}"
+
+    def repr_failure(self, excinfo):
+        return str(excinfo.value) if isinstance(excinfo.value, RankFailure) else super().repr_failure(excinfo)
+
+    def reportinfo(self):
+        return self.place
+
+
+class RankRun:
+    """One mpirun of tests of one module on a number of ranks."""
+
+    def __init__(self, config, ranks: int, items: list[MpiItem]):
+        self.ranks, self.items = ranks, list(items)
+        self.folder = Path(tempfile.mkdtemp(prefix="pytest-mpi-"))
+        (self.folder / "tests.json").write_text(json.dumps({item.nodeid: item.timeout for item in items}))
+        self.output = open(self.folder / "output", "w+b")
+        shown = config.option.capture == "no"
+        inner = [sys.executable, "-m", "pytest", str(items[0].path), f"--mpi-run={self.folder}", "-q",
+                 "--color=no", "-p", "mpi_tools.pytest_mpi", "-p", "no:cacheprovider",
+                 f"--rootdir={config.rootpath}", f"--tb={config.option.tbstyle}",
+                 *(["-c", str(config.inipath)] if config.inipath else []), *(["-s"] if shown else [])]
+        # A failed run has no checkpoint to write: its ranks are killed sooner than those of a job.
+        path = [str(Path(__file__).parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
+        environment = mpi_environment(ranks) | {"OMPI_MCA_odls_base_sigkill_timeout": "1",
+                                                "PYTHONPATH": os.pathsep.join(path)}
+        self.process = subprocess.Popen(
+            mpirun_command(ranks, inner), cwd=config.invocation_params.dir, env=environment,
+            stdin=subprocess.DEVNULL, stdout=None if shown else self.output, stderr=subprocess.STDOUT,
+            start_new_session=True)
+
+    def entries(self, item: MpiItem, event: str) -> dict[int, dict]:
+        """What the ranks have written about the "start" or the "end" of a test so far."""
+        found = {}
+        for rank in range(self.ranks):
+            path = self.folder / f"{rank}.jsonl"
+            for line in path.read_text().splitlines(keepends=True) if path.exists() else ():
+                if line.endswith("\n") and json.loads(line).get(event) == item.nodeid:
+                    found[rank] = json.loads(line)
+        return found
+
+    def wait(self, item: MpiItem, event: str, ranks: int) -> dict[int, dict]:
+        """Entries of the event once so many ranks have written one, or the run has ended."""
+        give_up = time.monotonic() + item.timeout + STALL
+        while len(self.entries(item, event)) < ranks and self.process.poll() is None:
+            if time.monotonic() > give_up:
+                self.stop()
+            time.sleep(0.02)
+        return self.entries(item, event)
+
+    def reaches(self, item: MpiItem) -> bool:
+        """Waits until some rank starts the test; whether one did."""
+        return item in self.items and bool(self.wait(item, "start", ranks=1))
+
+    def records(self, item: MpiItem) -> list[dict]:
+        """Waits until all ranks have ended the test, or the run has; one record a rank."""
+        ended = self.wait(item, "end", self.ranks)
+        return [ended[rank] if rank in ended else self.lost(rank, item) for rank in range(self.ranks)]
+
+    def lost(self, rank: int, item: MpiItem) -> dict:
+        """Record of a rank that never ended the test: the stack that it left, or the output of the run."""
+        path = self.folder / f"{rank}.stack"
+        stack = path.read_text().splitlines() if path.exists() else []
+        # Of the stack, innermost call first, only what lies inside of the test.
+        ours = [index for index, line in enumerate(stack) if "_pytest" in line]
+        stack = stack[:ours[0]] if ours else stack
+        if stack and stack[0].startswith("Timeout"):
+            text = f"not at its end after the time limit of {item.timeout:g} s:\n"
+        elif stack:
+            text = "not at its end when the others had ended:\n"
+        else:
+            self.output.seek(0)
+            stack = self.output.read().decode(errors="replace").splitlines()[-60:]
+            text = "died; output of the run:\n"
+        return {"rank": rank, "outcome": "failed", "phase": None, "text": text + "\n".join(stack),
+                "sections": []}
+
+    def stop(self):
+        """Ends mpirun and with it its ranks."""
+        for number in (signal.SIGTERM, signal.SIGKILL):
+            if self.process.poll() is None:
+                os.killpg(self.process.pid, number)
+                try:
+                    self.process.wait(10)
+                except subprocess.TimeoutExpired:
+                    pass
+
+    def close(self):
+        """Gives a run that is through the time to end by itself, stops any other, removes the folder."""
+        through = len(self.entries(self.items[-1], "end")) == self.ranks
+        try:
+            self.process.wait(10 if through else 0)
+        except subprocess.TimeoutExpired:
+            self.stop()
+        self.output.close()
+        shutil.rmtree(self.folder, ignore_errors=True)

@@ -1,0 +1,80 @@
+"""The inner half of the plugin `pytest_mpi`: one rank of `mpirun -n RANKS python -m pytest MODULE`."""
+
+import faulthandler
+import json
+import os
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+GRACE = 3.0  # seconds that the other ranks get to end a test that has failed on one
+
+
+class InnerRun:
+    """Runs the tests named in FOLDER/tests.json on this rank and writes FOLDER/RANK.jsonl."""
+
+    def __init__(self, folder: Path):
+        # Of its own: what a failing test leaves unreceived on COMM_WORLD cannot be mistaken on this one.
+        self.comm = MPI.COMM_WORLD.Dup()
+        self.timeouts = json.loads((folder / "tests.json").read_text())
+        self.results = open(folder / f"{self.comm.rank}.jsonl", "w", buffering=1)
+        self.stack = open(folder / f"{self.comm.rank}.stack", "w")
+        # mpirun ends the ranks of an aborted run with SIGTERM: each then says where it was.
+        faulthandler.register(signal.SIGTERM, file=self.stack, chain=True)
+
+    @pytest.hookimpl(tryfirst=True)
+    def pytest_collection_modifyitems(self, items):
+        collected = {item.nodeid: item for item in items}
+        items[:] = [collected[nodeid] for nodeid in self.timeouts]
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_protocol(self, item):
+        timeout = self.timeouts[item.nodeid]
+        self.reports = []
+        self.write(start=item.nodeid)
+        faulthandler.dump_traceback_later(timeout, exit=True, file=self.stack)
+        handled = yield
+        record = self.record()
+        self.write(end=item.nodeid, **record)
+        wait = GRACE if record["outcome"] == "failed" else timeout
+        faulthandler.dump_traceback_later(wait, exit=True, file=self.stack)
+        agree = self.agree(record["outcome"])
+        faulthandler.cancel_dump_traceback_later()
+        if not agree:
+            os._exit(0)  # MPI_Finalize could wait for what a failed rank has never received
+        return handled
+
+    def pytest_runtest_logreport(self, report):
+        self.reports.append(report)
+
+    def pytest_sessionfinish(self, session, exitstatus):
+        if exitstatus == pytest.ExitCode.TESTS_FAILED:
+            # mpirun would abort the ranks that are still on their way out.
+            session.exitstatus = pytest.ExitCode.OK
+
+    def record(self) -> dict:
+        """Outcome of the test on this rank: the first of setup, call and teardown that did not pass."""
+        report = next((r for r in self.reports if not r.passed), self.reports[-1])
+        return {"rank": self.comm.rank, "outcome": report.outcome, "phase": report.when,
+                "text": reason(report), "expected": hasattr(report, "wasxfail"),
+                "sections": self.reports[-1].sections}
+
+    def agree(self, outcome: str) -> bool:
+        """Whether all ranks had this outcome; returns when all have ended the test."""
+        code = ["passed", "skipped", "failed"].index(outcome)
+        mine, both = np.array([code, -code]), np.empty(2, int)
+        self.comm.Allreduce(mine, both, op=MPI.MAX)
+        return both[0] == -both[1]
+
+    def write(self, **entry):
+        self.results.write(json.dumps(entry) + "\n")
+
+
+def reason(report) -> str:
+    """Traceback, or why the test was skipped or expected to fail."""
+    if hasattr(report, "wasxfail"):
+        return report.wasxfail
+    return report.longrepr[2] if report.skipped else report.longreprtext

@@ -1,0 +1,19 @@
+"""Error norms of predictions against a known truth."""
+
+import numpy as np
+
+
+def normalized_l2(prediction: np.ndarray, truth: np.ndarray) -> float:
+    """Normalised L2 error |prediction - truth| / |truth| over all entries; a prediction of zero scores
+    exactly 1.
+
+    Arrays have the same shape, any number of dimensions. Raises ValueError on unlike shapes or a truth of
+    zero norm.
+    """
+    prediction, truth = np.asarray(prediction, dtype=float), np.asarray(truth, dtype=float)
+    if prediction.shape != truth.shape:
+        raise ValueError(f"prediction has shape {prediction.shape}, truth {truth.shape}: they must be equal")
+    norm = np.linalg.norm(truth.ravel())
+    if norm == 0:
+        raise ValueError("the truth is zero everywhere: a normalised error has no meaning")
+    return float(np.linalg.norm((prediction - truth).ravel()) / norm)

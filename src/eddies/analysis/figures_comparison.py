@@ -1,0 +1,188 @@
+"""The rollout's part of the report: its figures, and the numbers at the last common time with the truth."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from eddies.analysis import figures_rollout, figures_statistics
+from eddies.analysis import rollout_comparison as comparison
+from eddies.analysis.errors import normalized_l2
+from eddies.analysis.figures import png
+from eddies.analysis.page import Metric, Section
+from eddies.analysis.rollout_comparison import CommonFrames, Frames, Pair
+from eddies.analysis.spectra import spectrum_error, vorticity
+
+MAIN = ("turnovers", "energy_ratio", "velocity_error", "spectrum_error", "velocity_kl", "acceleration_kl",
+        "qr_kl")
+TRUTH_NAMES = {"filtered": "filtered DNS", "truth": "true tracers"}
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """A rollout as stored, with what it is compared with.
+
+    attributes: of the group `rollout`; model, truth: trajectories; fields: the series "model", "truth" and
+    "filtered"; length: box edge; filter_width and eulerian (table `spectra`): of the ground truth, or None.
+    """
+
+    attributes: Mapping[str, float | str]
+    model: Frames
+    truth: Frames
+    fields: Mapping[str, Frames]
+    length: float
+    filter_width: float | None
+    eulerian: Mapping[str, np.ndarray] | None
+
+    @property
+    def turnover(self) -> float:
+        """Eddy turnover time T, the unit of time in the figures."""
+        return float(self.attributes["eddy_turnover_time"])
+
+    @property
+    def status(self) -> str:
+        """How it ended: "complete", or "stopped: reason"."""
+        return str(self.attributes["status"])
+
+
+def section(run: Rollout) -> Section:
+    """The rollout: figures 4 to 9 and Lagrangian statistics; `run` is read frame by frame."""
+    broken = comparison.first_broken_time(run.model)
+    common = CommonFrames.of(run.model, run.truth, broken)
+    last = float(common.times[-1])
+    text = (f"Closure {run.attributes['closure']}, integrator {run.attributes['integrator']}, time step "
+            f"{float(run.attributes['time_step']):.3g}. T = {run.turnover:.3g} is the eddy turnover time. "
+            f"Numbers are at the last common time of model and true tracers, {last / run.turnover:.3g} T.")
+    notices = _notices(run, last, broken)
+    shown = Section("rollout", "Rollout against the truth", text, notices=notices, main=MAIN)
+    shown.metrics += [
+        Metric("status", "status", run.status),
+        Metric("stable", "stable to the end", run.status == "complete" and not np.isfinite(broken)),
+        Metric("turnovers", "eddy turnovers run", float(run.attributes["turnovers"])),
+        Metric("last_common_time", "last common time / T", last / run.turnover),
+    ]
+    _add_planes(shown, run, last)
+    _add_particles(shown, run, common)
+    _add_invariants(shown, run, common)
+    _add_spectra(shown, run, last)
+    return shown
+
+
+def _notices(run: Rollout, last: float, broken: float) -> list[str]:
+    end, turnover = run.model.times[-1], run.turnover
+    notices = []
+    if run.status != "complete":
+        notices.append(f"The rollout {run.status} (last frame at {end / turnover:.3g} T).")
+    if np.isfinite(broken):
+        notices.append(f"The model is not finite from {broken / turnover:.3g} T on: earlier frames count.")
+    elif end > last + 1e-6:
+        notices.append(f"The true tracers end at {last / turnover:.3g} T and the model at "
+                       f"{end / turnover:.3g} T: what comes after is not compared.")
+    return notices
+
+
+def _add_planes(shown: Section, run: Rollout, last: float) -> None:
+    name = "filtered" if "filtered" in run.fields else "truth"
+    model, truth = run.fields["model"], run.fields[name]
+    common = CommonFrames.of(model, truth, _just_after(last))
+    planes = [_plane_of_first_component(model, truth, common, index) for index in common.spread(4)]
+    shown.add_figure(
+        "figure-4-velocity", "Velocity over time",
+        png(figures_rollout.velocity_planes(planes, run.turnover, TRUTH_NAMES[name])),
+        f"u_x in the plane z = π: {TRUTH_NAMES[name]} above, the model through the learned kernel below. "
+        f"Relative difference in the last plane: {normalized_l2(planes[-1].model, planes[-1].truth):.3f}.")
+    fields = comparison.particle_pair(model, truth, common, common.times.size - 1, "velocity")
+    rotation = Pair(fields.time, _magnitude(vorticity(fields.model)), _magnitude(vorticity(fields.truth)))
+    energy = Pair(fields.time, _magnitude(fields.model) ** 2 / 2, _magnitude(fields.truth) ** 2 / 2)
+    ratios = [pair.model.mean() / pair.truth.mean() for pair in (rotation, energy)]
+    shown.add_figure(
+        "figure-5-vorticity-energy", "Vorticity and kinetic energy",
+        png(figures_rollout.vorticity_and_energy(rotation, energy, TRUTH_NAMES[name])),
+        f"Plane z = π at t = {fields.time / run.turnover:.2f} T. Mean over the plane, model / truth: "
+        f"vorticity {ratios[0]:.2f}, energy {ratios[1]:.2f}.")
+
+
+def _add_particles(shown: Section, run: Rollout, common: CommonFrames) -> None:
+    errors = comparison.error_series(run.model, run.truth, common)
+    final = {name: float(values[-1]) for name, values in errors.items()}
+    model = comparison.particle_series(run.model, np.arange(run.model.times.size), run.length)
+    truth = comparison.particle_series(run.truth, common.truth, run.length)
+    ratio = float(model["energy"][common.model[-1]] / truth["energy"][-1])
+    shown.metrics += [
+        Metric("energy_ratio", "particle kinetic energy, model / truth", ratio),
+        Metric("velocity_error", "velocity error by particle (normalised L2)", final["velocity_error"]),
+        Metric("velocity_kl", "KL divergence of the velocity PDF", final["velocity_kl"]),
+        Metric("acceleration_kl", "KL divergence of the acceleration PDF", final["acceleration_kl"]),
+    ]
+    pairs = {column: [comparison.particle_pair(run.model, run.truth, common, index, column)
+                      for index in common.spread(3)] for column in comparison.EDGES}
+    shown.add_figure(
+        "figure-6-pdfs", "PDFs of velocity and acceleration",
+        png(figures_statistics.particle_pdfs(pairs, run.turnover)),
+        "All components, centred and divided by the truth's standard deviation at the time; values beyond "
+        f"the axis count in its last bins. Last time: KL {final['velocity_kl']:.2g} (velocity), "
+        f"{final['acceleration_kl']:.2g} (acceleration).")
+    shown.add_figure(
+        "figure-9-errors", "Rollout over time",
+        png(figures_rollout.errors_over_time(model, truth, errors, run.turnover)),
+        f"At the last common time the model has {ratio:.3f} of the truth's energy and a velocity error of "
+        f"{final['velocity_error']:.3f} (dotted: 1, as large as the velocity itself).")
+    shown.add_figure(
+        "lagrangian", "Lagrangian statistics",
+        png(figures_rollout.lagrangian({"truth": truth, "model": model}, run.turnover)),
+        "Correlation of the velocity with that at the start, and spreading of nearest neighbours in units of "
+        "their mean-square separation. Correlation at the last common time: "
+        f"{truth['correlation'][-1]:.3f} (truth), {model['correlation'][common.model[-1]]:.3f} (model).")
+
+
+def _add_invariants(shown: Section, run: Rollout, common: CommonFrames) -> None:
+    statistics = comparison.invariant_statistics(run.model, run.truth, common)
+    shown.metrics.append(Metric("qr_kl", "KL divergence of the Q–R joint PDF", statistics.divergence))
+    shown.add_figure(
+        "figure-7-invariants", "Invariants Q and R of the velocity gradient",
+        png(figures_statistics.invariant_plane(statistics)),
+        f"Joint PDF at t = {common.times[-1] / run.turnover:.2f} T (isolines half a decade apart, smoothed "
+        f"over one bin for drawing; KL {statistics.divergence:.2g} from raw bins) and mean motion over all "
+        "frames until then. Orange: Vieillefosse line. Both are in units of the truth's ⟨Q_w⟩ = ⟨W:W⟩/2.")
+
+
+def _add_spectra(shown: Section, run: Rollout, last: float) -> None:
+    model, truth = run.fields["model"], run.fields["truth"]
+    common = CommonFrames.of(model, truth, _just_after(last))
+    series = [comparison.spectra_pair(model, truth, common, index) for index in common.spread(3)]
+    at = series[-1]
+    caption = "Model and true tracers through the learned kernel; the DNS at the nearest stored time."
+    cutoff, half, whole = None, None, None
+    if run.filter_width is not None:
+        cutoff = np.pi / run.filter_width
+        half, whole = (spectrum_error(at.wavenumber, at.model, at.truth, max(1.0, largest))
+                       for largest in (cutoff / 2, cutoff))
+        caption += (f" Relative L2 difference at t = {at.time / run.turnover:.2f} T: {half:.3f} up to k_d/2, "
+                    f"{whole:.3f} up to k_d = π/d = {cutoff:.3g}.")
+    missing = "the filter width is in ground_truth.h5, which is not here"
+    shown.metrics += [
+        Metric("spectrum_error", "spectrum error, 1 ≤ k ≤ k_d/2 (relative L2)", half, missing),
+        Metric("spectrum_error_resolved", "spectrum error, 1 ≤ k ≤ k_d (relative L2)", whole, missing),
+        Metric("filter_wavenumber", "filter wavenumber k_d = π/d", cutoff, missing),
+    ]
+    start = float(run.attributes["start_time"])
+    figure = figures_rollout.energy_spectra(series, run.eulerian, start, run.turnover, cutoff)
+    shown.add_figure("figure-8-spectra", "Energy spectra over time", png(figure), caption)
+
+
+def _plane_of_first_component(model: Frames, truth: Frames, common: CommonFrames, index: int) -> Pair:
+    """u_x [y, x] of both in the plane z = pi."""
+    planes = []
+    for series, frame in ((model, common.model[index]), (truth, common.truth[index])):
+        middle = series.cells // 2
+        planes.append(series.read(int(frame), "velocity", middle, middle + 1)[0, 0])
+    return Pair(float(common.times[index]), *planes)
+
+
+def _magnitude(field: np.ndarray) -> np.ndarray:
+    """Magnitude of a vector field (3, n, n, n) in the plane z = pi."""
+    return np.linalg.norm(field[:, field.shape[1] // 2], axis=0)
+
+
+def _just_after(time: float) -> float:
+    return time + 1e-6 * max(1.0, abs(time))

@@ -1,0 +1,132 @@
+"""Figures of the trained pair-force model: a-priori errors and PDFs (the paper's Fig. 3) and its training."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from eddies.analysis.figures import (
+    DNS, FOURTH, GUIDE, MODEL, SECOND, TRUTH, legend_below, letter, panels, png, styled,
+)
+from eddies.analysis.page import Metric, Section
+from eddies.analysis.pdfs import bin_edges, bin_probabilities, gaussian, kl_divergence, pdf, standardized
+
+ERRORS = (  # column of the table, label, colour, line style, marker
+    ("acceleration_error", "model, acceleration", MODEL, "-", "o"),
+    ("closure_acceleration_error", "model, density from closure", FOURTH, "-", "s"),
+    ("density_rate_error", "model, density rate", SECOND, "-", "^"),
+    ("pressure_gradient_error", "exact filtered pressure gradient", DNS, "--", None),
+)
+LOSSES = (
+    ("loss", "total", DNS), ("trajectory_loss", "trajectory $L_t$", MODEL),
+    ("field_loss", "field $L_f$", TRUTH), ("velocity_kl_loss", "velocity KL", SECOND),
+    ("acceleration_kl_loss", "acceleration KL", FOURTH),
+)
+EDGES = bin_edges(8, 65)  # of the PDFs, in standard deviations of the truth
+METRICS = {  # key in the report: column of the table, label
+    "acceleration_error": ("acceleration_error", "a-priori acceleration error"),
+    "density_rate_error": ("density_rate_error", "a-priori density rate error"),
+    "filtered_pressure_gradient_error": (
+        "pressure_gradient_error", "error of the exact filtered pressure gradient"),
+    "closure_acceleration_error": ("closure_acceleration_error", "acceleration error, closure's density"),
+}
+
+
+@styled
+def a_priori(table: Mapping[str, np.ndarray], acceleration: Mapping[str, np.ndarray],
+             density_rate: Mapping[str, np.ndarray] | None) -> Figure:
+    """Errors over the delay after training, and PDFs of truth and prediction at the last frame.
+
+    table: columns (frames,); acceleration: truth and predicted (m, 3); density_rate: the same (m,), or None.
+    """
+    figure, axes = panels(1, 2 if density_rate is None else 3, (3.9, 3.5))
+    _errors_panel(axes[0, 0], table)
+    _pdf_panel(axes[0, 1], acceleration, "Acceleration", r"$a$")
+    if density_rate is not None:
+        _pdf_panel(axes[0, 2], density_rate, "Density rate", r"$\dot\rho$")
+    letter(axes.flat)
+    return figure
+
+
+@styled
+def training_history(history: Mapping[str, np.ndarray]) -> Figure:
+    """Losses and validation error over the training step."""
+    figure, axes = panels(1, 2, (5.0, 3.2))
+    for name, label, colour in LOSSES:
+        if np.any(history[name] > 0):
+            axes[0, 0].semilogy(history["step"], _positive(history[name]), color=colour, label=label,
+                                linewidth=1.2)
+    axes[0, 0].set(title="Losses", xlabel="training step", ylabel="loss")
+    legend_below(axes[0, 0], 3)
+    measured = np.isfinite(history["validation_error"])
+    axes[0, 1].plot(history["step"][measured], history["validation_error"][measured], color=MODEL, marker="o",
+                    markersize=3)
+    axes[0, 1].set(title="Error on unseen frames", xlabel="training step", ylim=(0, None),
+                   ylabel="normalised L2, acceleration")
+    letter(axes.flat)
+    return figure
+
+
+def _positive(values: np.ndarray) -> np.ndarray:
+    return np.where(np.asarray(values) > 0, values, np.nan)
+
+
+def _errors_panel(axis: Axes, table: Mapping[str, np.ndarray]) -> None:
+    delay = table["delay"]
+    axis.axhline(1, color=GUIDE, linestyle=":", linewidth=1.2)
+    axis.annotate("no model", (1, 1), xycoords=("axes fraction", "data"), xytext=(-2, 3),
+                  textcoords="offset points", ha="right", fontsize=9, color="#5a5a5a")
+    if delay.min() < 0:
+        axis.axvspan(delay.min() - 0.03 * np.ptp(delay), 0, color="#eeeeee", zorder=0)
+        axis.annotate("training", (delay.min(), 0.01), xycoords=("data", "axes fraction"), fontsize=9,
+                      color="#5a5a5a", va="bottom")
+    for column, label, colour, style, marker in ERRORS:
+        if np.isfinite(table[column]).any():
+            axis.plot(delay, table[column], color=colour, linestyle=style, marker=marker, markersize=4,
+                      label=label)
+    top = max(1.1, 1.05 * max(np.nanmax(table[c]) for c, *_ in ERRORS if np.isfinite(table[c]).any()))
+    axis.set(title="A-priori error", xlabel="delay after the training window", ylabel="normalised L2 error",
+             ylim=(0, top))
+    legend_below(axis, 1)
+
+
+def _pdf_panel(axis: Axes, sample: Mapping[str, np.ndarray], title: str, symbol: str) -> None:
+    truth = sample["truth"]
+    edges = EDGES
+    centres = (edges[1:] + edges[:-1]) / 2
+    axis.semilogy(centres, gaussian(centres), color=GUIDE, linestyle=":", label="Gaussian")
+    axis.semilogy(centres, _positive(pdf(standardized(truth), edges)), color=TRUTH, label="truth")
+    axis.semilogy(centres, _positive(pdf(standardized(sample["predicted"], truth), edges)), color=MODEL,
+                  linestyle="none", marker="o", markersize=3.5, markerfacecolor="none", label="model")
+    smallest = 0.3 / truth.size / (edges[1] - edges[0])
+    axis.set(title=f"{title} PDF", xlabel=f"{symbol} / standard deviation of the truth", ylabel="PDF",
+             ylim=(smallest, 2))
+    legend_below(axis, 3)
+
+
+def section(description: Mapping[str, object], table: Mapping[str, np.ndarray],
+            acceleration: Mapping[str, np.ndarray], density_rate: Mapping[str, np.ndarray] | None,
+            history: Mapping[str, np.ndarray]) -> Section:
+    """The pair-force model: a-priori figures and the errors at the last frame, from the tables."""
+    last = int(np.argmax(table["delay"]))
+    at = {name: float(values[last]) for name, values in table.items()}
+    missing = f"the closure {description['closure']} does not have it"
+    metrics = [Metric(key, label, at[column], missing) for key, (column, label) in METRICS.items()]
+    metrics.append(Metric("delay", "delay of these errors after the training window", at["delay"]))
+    text = (f"Basis {description['basis']}, closure {description['closure']}. A-priori: the model sees the "
+            "true particles of a frame. Numbers are of the last frame, "
+            f"{at['delay']:.3g} after the training window.")
+    shown = Section("model", "Pair-force model", text, metrics=metrics,
+                    main=("acceleration_error", "filtered_pressure_gradient_error"))
+    truth, predicted = acceleration["truth"], acceleration["predicted"]
+    divergence = kl_divergence(bin_probabilities(standardized(truth), EDGES),
+                               bin_probabilities(standardized(predicted, truth), EDGES))
+    shown.add_figure(
+        "figure-3-a-priori", "A-priori errors and PDFs", png(a_priori(table, acceleration, density_rate)),
+        f"At the last frame the acceleration error is {at['acceleration_error']:.3f}; that of the exact "
+        f"filtered pressure gradient alone is {at['pressure_gradient_error']:.3f}, that of no model 1. KL "
+        f"divergence of the acceleration PDF {divergence:.2g}. Grey: frames of the training window.")
+    shown.add_figure("model-training", "Training of the model", png(training_history(history)),
+                     f"{int(history['step'][-1])} steps.")
+    return shown

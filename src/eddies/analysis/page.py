@@ -1,0 +1,168 @@
+"""The report as one self-contained HTML page, with its metrics as JSON. Knows nothing of what it shows."""
+
+import base64
+import html
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+Number = float | int | bool | str | dict | None
+
+CSS = """
+:root{--ink:#1d2733;--soft:#5b6774;--line:#dfe4ea;--accent:#0072b2;--back:#f5f7f9}
+*{box-sizing:border-box}
+body{margin:0;background:var(--back);color:var(--ink);font:16px/1.55 system-ui,sans-serif}
+header,main{max-width:1080px;margin:0 auto;padding:1rem}
+h1{font-size:1.7rem;margin:.6rem 0 .2rem}
+h2{font-size:1.25rem;margin:0 0 .6rem}h3{font-size:1rem;margin:1.2rem 0 .4rem}
+.soft{color:var(--soft)}
+nav{display:flex;flex-wrap:wrap;gap:.3rem 1.1rem;margin-top:.6rem}a{color:var(--accent);text-decoration:none}
+section{background:#fff;border:1px solid var(--line);border-radius:8px;padding:1.1rem;margin:0 0 1.1rem}
+.tiles{display:grid;grid-template-columns:repeat(auto-fit,minmax(145px,1fr));gap:.6rem}
+.tile{border:1px solid var(--line);border-radius:6px;padding:.55rem .7rem}
+.tile b{display:block;font-size:1.3rem;font-variant-numeric:tabular-nums}
+.tile span{font-size:.82rem;color:var(--soft)}
+figure{margin:1.3rem 0}img{display:block;max-width:100%;height:auto;margin:0 auto}
+figcaption{font-size:.9rem;color:var(--soft);margin-top:.4rem}figcaption b{color:var(--ink)}
+.wide{overflow-x:auto}
+table{border-collapse:collapse;font-size:.92rem;width:100%}
+td,th{text-align:left;padding:.3rem .8rem .3rem 0;border-bottom:1px solid var(--line);vertical-align:top}
+td.number{font-variant-numeric:tabular-nums;white-space:nowrap}
+.notice{border-left:4px solid #d55e00;background:#fdf3ec;padding:.6rem .8rem;margin:.6rem 0}
+pre{overflow-x:auto;background:var(--back);padding:.8rem;font-size:.85rem;border-radius:6px}
+"""
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One number of the report: key in metrics.json, name on the page, value, or why there is none."""
+
+    key: str
+    label: str
+    value: Number
+    reason: str = ""
+
+    def __post_init__(self):
+        if isinstance(self.value, float) and not math.isfinite(self.value):
+            object.__setattr__(self, "value", None)
+            object.__setattr__(self, "reason", self.reason or "not a finite number")
+        elif self.value is None and not self.reason:
+            object.__setattr__(self, "reason", "not measured in this run")
+
+
+@dataclass(frozen=True)
+class Illustration:
+    """A figure as it stands on the page: file name without ending, PNG bytes, caption with its numbers."""
+
+    name: str
+    title: str
+    image: bytes
+    caption: str
+
+
+@dataclass
+class Section:
+    """A part of the page, and of metrics.json under `key`; notices are what must not be missed."""
+
+    key: str
+    title: str
+    text: str = ""
+    notices: list[str] = field(default_factory=list)
+    illustrations: list[Illustration] = field(default_factory=list)
+    metrics: list[Metric] = field(default_factory=list)
+    main: Sequence[str] = ()  # keys of the metrics shown at the top of the page
+
+    def add_figure(self, name: str, title: str, image: bytes, caption: str) -> None:
+        """Put a figure (PNG) after those that are there."""
+        self.illustrations.append(Illustration(name, title, image, caption))
+
+    def value(self, key: str) -> Number:
+        """The value of one metric."""
+        return next(metric.value for metric in self.metrics if metric.key == key)
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """What the run was: name, one line on it, the scene's text, and a row per product (header first)."""
+
+    name: str
+    summary: str
+    scene: str
+    products: Sequence[Sequence[str]]
+
+
+def metrics_json(sections: Sequence[Section]) -> str:
+    """All metrics by section, as strict JSON: what is missing is null."""
+    table = {section.key: {metric.key: metric.value for metric in section.metrics} for section in sections}
+    return json.dumps(table, indent=2, allow_nan=False) + "\n"
+
+
+def shown(value: Number) -> str:
+    """A number with four significant digits, for people."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {shown(part)}" for name, part in value.items())
+    return str(value)
+
+
+def render_page(run: RunRecord, sections: Sequence[Section]) -> str:
+    """The whole page as HTML text that needs no other file."""
+    links = "".join(f'<a href="#{section.key}">{_text(section.title)}</a>' for section in sections)
+    body = "".join(_section(section) for section in sections)
+    return (
+        '<!DOCTYPE html><html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width,initial-scale=1">'
+        f"<title>{_text(run.name)}</title><style>{CSS}</style></head><body>"
+        f'<header><h1>{_text(run.name)}</h1><div class="soft">{_text(run.summary)}</div><nav>{links}'
+        f'<a href="#run">The run</a></nav></header><main>{_tiles(sections)}{body}{_run(run)}</main>'
+        "</body></html>\n"
+    )
+
+
+def _text(text: str) -> str:
+    return html.escape(str(text))
+
+
+def _tiles(sections: Sequence[Section]) -> str:
+    chosen = [metric for section in sections for metric in section.metrics
+              if metric.key in section.main and metric.value is not None]
+    tiles = "".join(
+        f'<div class="tile"><b>{_text(shown(metric.value))}</b><span>{_text(metric.label)}</span></div>'
+        for metric in chosen)
+    return f'<section class="tiles">{tiles}</section>' if tiles else ""
+
+
+def _section(section: Section) -> str:
+    notices = "".join(f'<div class="notice">{_text(notice)}</div>' for notice in section.notices)
+    figures = "".join(_illustration(illustration) for illustration in section.illustrations)
+    text = f"<p>{_text(section.text)}</p>" if section.text else ""
+    return (f'<section id="{section.key}"><h2>{_text(section.title)}</h2>{text}{notices}{figures}'
+            f"{_metric_table(section.metrics)}</section>")
+
+
+def _illustration(illustration: Illustration) -> str:
+    data = base64.b64encode(illustration.image).decode()
+    return (f'<figure><img alt="{_text(illustration.title)}" src="data:image/png;base64,{data}">'
+            f"<figcaption><b>{_text(illustration.title)}.</b> {_text(illustration.caption)}</figcaption>"
+            "</figure>")
+
+
+def _metric_table(metrics: Sequence[Metric]) -> str:
+    rows = "".join(
+        f'<tr><td>{_text(metric.label)}</td>'
+        + (f'<td class="soft">not available: {_text(metric.reason)}</td>' if metric.value is None
+           else f'<td class="number">{_text(shown(metric.value))}</td>') + "</tr>"
+        for metric in metrics)
+    return f'<h3>Numbers</h3><div class="wide"><table>{rows}</table></div>' if rows else ""
+
+
+def _run(run: RunRecord) -> str:
+    header, *rows = run.products
+    head = "".join(f"<th>{_text(cell)}</th>" for cell in header)
+    body = "".join("<tr>" + "".join(f"<td>{_text(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+    return (f'<section id="run"><h2>The run</h2><div class="wide"><table><tr>{head}</tr>{body}</table></div>'
+            f"<details><summary>The scene as used</summary><pre>{_text(run.scene)}</pre></details></section>")

@@ -1,0 +1,182 @@
+"""A rollout of the particle model compared with the true tracers: time series, PDFs, invariants, spectra.
+
+Trajectories and field series are objects with `.times` and `.read(frame, column)`, so frames are read one by
+one and never all held at once. `CommonFrames` pairs the frames of model and truth; the truth may end earlier.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from eddies.analysis.errors import normalized_l2
+from eddies.analysis.lagrangian import neighbor_dispersion, velocity_correlation
+from eddies.analysis.pdfs import bin_edges, bin_probabilities, kl_divergence, standardized
+from eddies.analysis.spectra import energy_spectrum
+from eddies.analysis.velocity_gradients import ConditionalVelocity, InvariantBins, enstrophy_scale, invariants
+
+# Bins of the PDFs, in standard deviations of the truth.
+EDGES = {"velocity": bin_edges(5, 60), "acceleration": bin_edges(8, 80)}
+FOLLOWED = 1500  # particles whose neighbours are searched and whose pairs are followed
+
+
+class Frames(Protocol):
+    """A trajectory or a field series as stored."""
+
+    times: np.ndarray
+
+    def read(self, frame: int, column: str, start: int = 0, stop: int | None = None) -> np.ndarray:
+        """Rows (or planes) start to stop of one column (or field variable) of one frame."""
+
+
+@dataclass(frozen=True)
+class CommonFrames:
+    """Frames of model and truth at the same times: indices and times, all (m,)."""
+
+    model: np.ndarray
+    truth: np.ndarray
+    times: np.ndarray
+
+    @classmethod
+    def of(cls, model: Frames, truth: Frames, until: float = np.inf) -> "CommonFrames":
+        """Pair the frames before `until` whose times agree to 1e-6; raises ValueError if there is none."""
+        gap = np.abs(model.times[:, None] - truth.times[None, :])
+        same = gap <= 1e-6 * max(1.0, np.ptp(model.times))
+        rows, columns = np.nonzero(same & (model.times < until)[:, None])
+        if rows.size == 0:
+            raise ValueError("model and truth have no finite frame at a common time: nothing to compare")
+        return cls(rows, columns, model.times[rows])
+
+    def spread(self, count: int) -> np.ndarray:
+        """At most `count` positions in this list, evenly spread from the first to the last."""
+        return np.unique(np.rint(np.linspace(0, self.times.size - 1, count)).astype(int))
+
+
+@dataclass(frozen=True)
+class Pair:
+    """One quantity of model and truth at one time."""
+
+    time: float
+    model: np.ndarray
+    truth: np.ndarray
+
+
+def first_broken_time(model: Frames) -> float:
+    """Time of the first frame with a velocity or acceleration that is not finite; infinity without one."""
+    for frame, time in enumerate(model.times):
+        if not all(np.isfinite(model.read(frame, column)).all() for column in ("velocity", "acceleration")):
+            return float(time)
+    return np.inf
+
+
+def particle_pair(model: Frames, truth: Frames, common: CommonFrames, index: int, column: str) -> Pair:
+    """Column of both at the common frame `index`, rows in id order."""
+    return Pair(float(common.times[index]), model.read(int(common.model[index]), column),
+                truth.read(int(common.truth[index]), column))
+
+
+def particle_series(frames: Frames, chosen: Sequence[int], length: float) -> dict[str, np.ndarray]:
+    """Columns over the chosen frames of one run: time, energy 1/2 <v.v>, density_rms, and two Lagrangian
+    statistics.
+
+    correlation: of v with the first frame. dispersion: of pairs of neighbours among the first particles, in
+    units of their mean-square separation.
+    """
+    first = frames.read(int(chosen[0]), "velocity")
+    rows = []
+    for frame in map(int, chosen):
+        velocity = frames.read(frame, "velocity")
+        rows.append((0.5 * np.mean(np.sum(velocity**2, axis=1)), np.std(frames.read(frame, "density")),
+                     velocity_correlation(first, velocity)))
+    columns = dict(zip(("energy", "density_rms", "correlation"), np.array(rows).T))
+    followed = np.stack([frames.read(int(frame), "position", 0, FOLLOWED) for frame in chosen])
+    columns["dispersion"] = neighbor_dispersion(followed, length)
+    return {"time": frames.times[np.asarray(chosen)], **columns}
+
+
+def error_series(model: Frames, truth: Frames, common: CommonFrames) -> dict[str, np.ndarray]:
+    """Columns over the common frames: time, velocity_error (normalised L2), velocity_kl, acceleration_kl."""
+    rows = []
+    for index in range(common.times.size):
+        velocity = particle_pair(model, truth, common, index, "velocity")
+        acceleration = particle_pair(model, truth, common, index, "acceleration")
+        rows.append((velocity.time, normalized_l2(velocity.model, velocity.truth),
+                     pdf_divergence(velocity, EDGES["velocity"]),
+                     pdf_divergence(acceleration, EDGES["acceleration"])))
+    names = ("time", "velocity_error", "velocity_kl", "acceleration_kl")
+    return dict(zip(names, np.array(rows).T))
+
+
+def pdf_divergence(pair: Pair, edges: np.ndarray) -> float:
+    """Forward KL divergence of the PDFs of all components, both standardised by the truth."""
+    return kl_divergence(bin_probabilities(standardized(pair.truth), edges),
+                         bin_probabilities(standardized(pair.model, pair.truth), edges))
+
+
+@dataclass(frozen=True)
+class SpectraAt:
+    """Reconstructed energy spectra at one time: wavenumber and energies, all (shells,)."""
+
+    time: float
+    wavenumber: np.ndarray
+    model: np.ndarray
+    truth: np.ndarray
+
+
+def spectra_pair(model: Frames, truth: Frames, common: CommonFrames, index: int) -> SpectraAt:
+    """Spectra of both reconstructed velocity fields at a common field frame."""
+    fields = particle_pair(model, truth, common, index, "velocity")
+    wavenumber, energy = energy_spectrum(np.asarray(fields.model, dtype=float))
+    _, reference = energy_spectrum(np.asarray(fields.truth, dtype=float))
+    return SpectraAt(fields.time, wavenumber, energy, reference)
+
+
+@dataclass(frozen=True)
+class InvariantStatistics:
+    """Q-R statistics of both runs: cell probabilities at one time, and the mean motion until then."""
+
+    bins: InvariantBins
+    model: np.ndarray
+    truth: np.ndarray
+    model_flow: ConditionalVelocity | None
+    truth_flow: ConditionalVelocity | None
+
+    @property
+    def divergence(self) -> float:
+        """Forward KL divergence of the joint PDFs."""
+        return kl_divergence(self.truth, self.model)
+
+
+def invariant_statistics(model: Frames, truth: Frames, common: CommonFrames) -> InvariantStatistics:
+    """Joint PDF of (Q, R) at the last common frame and conditional mean (dQ/dt, dR/dt) over all common
+    frames.
+
+    Both runs are normalised by the truth's <Q_w> at the time, so a wrong amplitude of the model shows. The
+    flow is None with fewer than two common frames.
+    """
+    last = particle_pair(model, truth, common, common.times.size - 1, "velocity_gradient")
+    scale = enstrophy_scale(last.truth)
+    model_plane, truth_plane = (_normalized_invariants(run, scale) for run in (last.model, last.truth))
+    bins = InvariantBins.covering(*truth_plane)
+    flows = _conditional_flows(model, truth, common, bins) if common.times.size > 1 else (None, None)
+    probabilities = bins.probabilities(*model_plane), bins.probabilities(*truth_plane)
+    return InvariantStatistics(bins, *probabilities, *flows)
+
+
+def _normalized_invariants(gradient: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
+    second, third = invariants(gradient)
+    return second / scale, third / scale**1.5
+
+
+def _conditional_flows(model: Frames, truth: Frames, common: CommonFrames,
+                       bins: InvariantBins) -> tuple[ConditionalVelocity, ConditionalVelocity]:
+    flows = ConditionalVelocity(bins.coarser()), ConditionalVelocity(bins.coarser())
+    before = particle_pair(model, truth, common, 0, "velocity_gradient")
+    for index in range(1, common.times.size):
+        after = particle_pair(model, truth, common, index, "velocity_gradient")
+        scale = (enstrophy_scale(before.truth) + enstrophy_scale(after.truth)) / 2
+        flows[0].add(before.model, after.model, after.time - before.time, scale)
+        flows[1].add(before.truth, after.truth, after.time - before.time, scale)
+        before = after
+    return flows

@@ -1,0 +1,100 @@
+"""Invariants of the velocity gradient tensor: the Q-R plane and the mean motion in it (Eqs. 16-17)."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from eddies.analysis.pdfs import joint_probabilities
+
+
+def anisotropic_part(gradient: np.ndarray) -> np.ndarray:
+    """A* = A - 1/3 Tr(A) I for gradients (..., 3, 3)."""
+    trace = np.trace(gradient, axis1=-2, axis2=-1)
+    return gradient - trace[..., None, None] / 3 * np.eye(3)
+
+
+def invariants(gradient: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Q = -1/2 Tr(A* A*) and R = -1/3 Tr(A* A* A*), A_ij = dv_i/dx_j (Eqs. 16-17), each (...)."""
+    traceless = anisotropic_part(gradient)
+    squared = traceless @ traceless
+    second = -np.trace(squared, axis1=-2, axis2=-1) / 2
+    third = -np.einsum("...ij,...ji->...", squared, traceless) / 3
+    return second, third
+
+
+def enstrophy_scale(gradient: np.ndarray) -> float:
+    """<Q_w> = <W_ij W_ij> / 2 with W the antisymmetric part: the unit of Q; that of R is its power 3/2."""
+    rotation = (gradient - np.swapaxes(gradient, -1, -2)) / 2
+    return float(np.mean(np.sum(rotation**2, axis=(-2, -1))) / 2)
+
+
+def vieillefosse_line(third_invariant: np.ndarray) -> np.ndarray:
+    """Q of the zero-discriminant line 27/4 R^2 + Q^3 = 0, for given R."""
+    return -np.cbrt(27 / 4 * np.asarray(third_invariant) ** 2)
+
+
+@dataclass(frozen=True)
+class InvariantBins:
+    """Shared bins of the plane: edges of Q / <Q_w> and of R / <Q_w>^(3/2)."""
+
+    second: np.ndarray
+    third: np.ndarray
+
+    @classmethod
+    def covering(cls, second: np.ndarray, third: np.ndarray, quantile: float = 0.999) -> "InvariantBins":
+        """Symmetric ranges that hold this fraction of the sample; 12 to 64 bins, as its size allows."""
+        bins = int(np.clip(round(second.size ** (1 / 3)), 12, 64))
+        limits = [np.quantile(np.abs(values), quantile) for values in (second, third)]
+        return cls(*(np.linspace(-limit, limit, bins + 1) for limit in limits))
+
+    def probabilities(self, second: np.ndarray, third: np.ndarray) -> np.ndarray:
+        """Probability of each cell (Q bins, R bins); outliers count in the outer cells."""
+        return joint_probabilities(second, third, self.second, self.third)
+
+    def coarser(self) -> "InvariantBins":
+        """The same ranges in at most 18 bins, for conditional means, which need more particles a cell."""
+        edges = min(18, self.second.size - 1) + 1
+        return InvariantBins(*(np.linspace(fine[0], fine[-1], edges) for fine in (self.second, self.third)))
+
+    def density(self, probabilities: np.ndarray) -> np.ndarray:
+        """Joint PDF from cell probabilities."""
+        return probabilities / np.outer(np.diff(self.second), np.diff(self.third))
+
+
+@dataclass
+class ConditionalVelocity:
+    """Mean (dQ/dt, dR/dt) of Lagrangian particles on condition of (Q, R): sums over bins, filled step by
+    step.
+
+    Rates are in units <Q_w>^(3/2) and <Q_w>^2; particles outside the bins are left out.
+    """
+
+    bins: InvariantBins
+    count: np.ndarray = field(init=False)
+    second_rate: np.ndarray = field(init=False)
+    third_rate: np.ndarray = field(init=False)
+
+    def __post_init__(self):
+        shape = (self.bins.second.size - 1, self.bins.third.size - 1)
+        self.count, self.second_rate, self.third_rate = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+
+    def add(self, before: np.ndarray, after: np.ndarray, interval: float, scale: float) -> None:
+        """Add the particles of two successive frames: gradients (n, 3, 3) in the same order, `interval`
+        apart.
+
+        The rate is the difference over the interval and belongs to the mean of both frames (second order).
+        `scale` is <Q_w>.
+        """
+        (q0, r0), (q1, r1) = invariants(before), invariants(after)
+        middle = (q0 + q1) / 2 / scale, (r0 + r1) / 2 / scale**1.5
+        edges = (self.bins.second, self.bins.third)
+        rates = (q1 - q0) / interval / scale**1.5, (r1 - r0) / interval / scale**2
+        self.count += np.histogram2d(*middle, edges)[0]
+        self.second_rate += np.histogram2d(*middle, edges, weights=rates[0])[0]
+        self.third_rate += np.histogram2d(*middle, edges, weights=rates[1])[0]
+
+    def mean(self, at_least: int) -> tuple[np.ndarray, np.ndarray]:
+        """Mean (dQ/dt, dR/dt) per cell, NaN where fewer than `at_least` particles passed."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            means = self.second_rate / self.count, self.third_rate / self.count
+        return tuple(np.where(self.count >= at_least, mean, np.nan) for mean in means)

@@ -1,0 +1,159 @@
+"""The command `eddies`: reads the command line, runs the stages of a scene, and turns errors into messages.
+
+This is where the communicator of the job enters; everything below gets it as an argument.
+"""
+
+import argparse
+import contextlib
+import os
+import signal
+import sys
+import time
+import traceback
+from importlib import import_module
+from pathlib import Path
+
+import eddies
+from eddies.logs import configure_logging
+from eddies.scene import SceneError, builtin_scenes, load_scene
+
+BAD_INPUT = 2
+PATIENCE = 5.0  # seconds that a rank waits for the others to come to the same error
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one command; returns the exit code: 0 done, 2 bad input. Any other error ends the whole job with
+    1."""
+    # Before numpy and torch are imported: they would start a thread for every core, in every rank.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    from mpi4py import MPI
+    comm, exit_comm = MPI.COMM_WORLD, MPI.COMM_WORLD.Dup()
+    try:
+        configure_logging(comm.rank)
+        options = parse_arguments(arguments, comm.rank)
+        options.command(options, comm)
+        return 0
+    except KeyboardInterrupt:
+        return 128 + signal.SIGINT
+    except Exception as error:
+        return end_with_error(error, exit_comm)
+
+
+def end_with_error(error: Exception, comm) -> int:
+    """Report an error once and end on all ranks, even if the others know nothing of it; returns the exit
+    code.
+
+    A mistake in the input is met by all ranks: rank 0 says so in a line. An error that stays on some ranks,
+    or is none of the user's, ends the job by MPI_Abort, because the other ranks may wait for this one for
+    ever. """
+    mistake = is_users_mistake(error)
+    text = f"eddies: error: {error}\n" if mistake else "".join(traceback.format_exception(error))
+    together = (mistake or comm.size == 1) and all_arrive(comm)
+    if not together or comm.rank == 0:
+        prefix = f"rank {comm.rank}: " if not together else ""
+        sys.stdout.flush()
+        sys.stderr.write("".join(f"{prefix}{line}" for line in text.splitlines(keepends=True)))
+        sys.stderr.flush()
+    code = BAD_INPUT if mistake else 1
+    if not together:
+        comm.Abort(code)
+    return code
+
+
+def is_users_mistake(error: Exception) -> bool:
+    """Whether the text of an error tells the user what to do, so that no traceback is wanted."""
+    from eddies.io.hdf5 import ProductError
+    from eddies.parallel.halo import HaloError
+    return isinstance(error, (SceneError, ProductError, HaloError))
+
+
+def all_arrive(comm) -> bool:
+    """Whether all ranks call this within PATIENCE seconds of each other."""
+    request, deadline = comm.Ibarrier(), time.monotonic() + PATIENCE
+    while not request.Test():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.01)
+    return True
+
+
+def parse_arguments(arguments: list[str] | None, rank: int) -> argparse.Namespace:
+    """The options of the command line; help and usage errors are printed by rank 0 alone."""
+    with contextlib.ExitStack() as stack:
+        if rank > 0:
+            silence = stack.enter_context(open(os.devnull, "w"))
+            stack.enter_context(contextlib.redirect_stdout(silence))
+            stack.enter_context(contextlib.redirect_stderr(silence))
+        return build_parser().parse_args(arguments)
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Sub-commands and their options."""
+    parser = argparse.ArgumentParser(prog="eddies", description=eddies.__doc__,
+                                     epilog="EDDIES_LOG = debug, info or warning sets what is logged.")
+    parser.add_argument("--version", action="version", version=f"eddies {eddies.__version__}")
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+    stages = {"run": "every stage of the scene, in order",
+              "dns": "ground truth: direct simulation, filter, tracers",
+              "train-kernel": "the smoothing kernel",
+              "train": "the pair-force model",
+              "simulate": "the trained model, without the direct simulation"}
+    for name, about in stages.items():
+        command = commands.add_parser(name, help=about, description=about)
+        add_scene_options(command)
+        command.add_argument("--output", type=Path, metavar="DIR", help="run directory (default: runs/NAME)")
+        command.add_argument("--resume", action="store_true",
+                             help="skip stages whose product is complete and was made with the same settings")
+        command.set_defaults(command=run_command, stage=name)
+    report = commands.add_parser("report", help="figures, one page and metrics.json of a run directory")
+    report.add_argument("run", type=Path, metavar="RUN", help="a run directory, such as runs/tiny")
+    report.set_defaults(command=report_command)
+    check = commands.add_parser("check", help="derived numbers, memory, ranks and time; writes nothing")
+    add_scene_options(check)
+    check.set_defaults(command=check_command)
+    scenes = commands.add_parser("scenes", help="the built-in scenes, a line each; or one with all settings")
+    scenes.add_argument("scene", nargs="?", metavar="SCENE", help="print this scene, defaults included")
+    scenes.set_defaults(command=scenes_command)
+    return parser
+
+
+def add_scene_options(parser: argparse.ArgumentParser) -> None:
+    """The scene and changes to it."""
+    parser.add_argument("scene", metavar="SCENE", help="name of a built-in scene, or path of a TOML file")
+    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", dest="overrides",
+                        help="change a key of the scene; repeatable")
+
+
+def run_command(options: argparse.Namespace, comm) -> None:
+    """One stage of a scene, or all that it has."""
+    from eddies.stages import run_stages
+    scene = load_scene(options.scene, options.overrides)
+    directory = options.output or Path("runs") / scene.name
+    stages = scene.stages if options.stage == "run" else (options.stage,)
+    run_stages(stages, scene, comm, directory, options.resume)
+
+
+def report_command(options: argparse.Namespace, comm) -> None:
+    """The report of a run directory."""
+    if not options.run.is_dir():
+        raise SceneError(f"{options.run}: no such directory; give a run directory, such as runs/tiny")
+    import_module("eddies.workflows.report").run(options.run, comm)
+
+
+def check_command(options: argparse.Namespace, comm) -> None:
+    """Derived numbers and estimates of a scene."""
+    scene = load_scene(options.scene, options.overrides)
+    import_module("eddies.workflows.check").run(scene, comm)
+
+
+def scenes_command(options: argparse.Namespace, comm) -> None:
+    """The built-in scenes, or one scene in full."""
+    if options.scene:
+        text = load_scene(options.scene).to_toml()
+    else:
+        scenes = builtin_scenes()
+        width = max(len(name) for name, _ in scenes)
+        text = "".join(f"{name:{width}}  {title}\n" for name, title in scenes)
+    if comm.rank == 0:
+        sys.stdout.write(text)

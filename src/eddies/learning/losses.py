@@ -1,0 +1,52 @@
+"""Losses of Eqs. 12 to 15, each as this rank's share of a global mean; and the divergence of histograms."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from eddies.parallel.reduction import global_sum
+from eddies.particles.particle_set import as_numpy
+
+
+def mean_square_share(error: Tensor, scale: float, total: int) -> Tensor:
+    """This rank's share of the mean of |error|^2 / scale^2 over `total` rows and all components: a scalar.
+
+    `total` is the global number of rows; shares add up to the mean (Eq. 12 with each component scaled to one).
+    """
+    components = error.shape[1] if error.dim() > 1 else 1
+    return (error / scale).square().sum() / (components * total)
+
+
+class _GlobalSum(torch.autograd.Function):
+    """Sum over ranks. Every rank holds the whole result and the same loss of it, so the gradient of a rank's
+    contribution is that of the sum."""
+
+    @staticmethod
+    def forward(ctx, values: Tensor, comm) -> Tensor:
+        return torch.from_numpy(global_sum(comm, as_numpy(values))).to(values.device)
+
+    @staticmethod
+    def backward(ctx, gradient: Tensor) -> tuple[Tensor, None]:
+        return gradient, None
+
+
+def soft_histogram(comm, values: Tensor, bins: int, reach: float) -> Tensor:
+    """Global histogram of `values` (any shape) over [-reach, reach], mass 1, differentiable: (bins,).
+
+    Each value spreads its mass linearly over the two nearest bin centres. Values beyond the ends count at the ends, so
+    no mass is lost. Collective.
+    """
+    position = (values.flatten().clamp(-reach, reach) + reach) * ((bins - 1) / (2 * reach))
+    lower = position.detach().floor().clamp(max=bins - 2).long()
+    fraction = position - lower
+    counts = torch.zeros(bins, dtype=values.dtype, device=values.device)
+    counts = counts.index_add(0, lower, 1 - fraction).index_add(0, lower + 1, fraction)
+    counts = _GlobalSum.apply(counts, comm)
+    return counts / counts.sum()
+
+
+def kullback_leibler(truth: Tensor, predicted: Tensor, floor: float = 1e-6) -> Tensor:
+    """sum_k P log(P / Q) of two histograms (bins,) (Eq. 14). `floor` is added to every bin of both."""
+    truth, predicted = (truth + floor) / (truth + floor).sum(), (predicted + floor) / (predicted + floor).sum()
+    return (truth * torch.log(truth / predicted)).sum()

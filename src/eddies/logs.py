@@ -1,0 +1,38 @@
+"""Log lines of a parallel run: rank 0 reports, the other ranks only warn and say which rank they are."""
+
+import logging
+import os
+import sys
+
+from eddies.scene import SceneError
+
+LEVELS = {"debug": logging.DEBUG, "info": logging.INFO, "warning": logging.WARNING}
+
+
+def configure_logging(rank: int) -> None:
+    """Send the logger "eddies" to standard output; `EDDIES_LOG` = debug, info or warning sets rank 0's level.
+
+    Raises:
+        SceneError: EDDIES_LOG is none of these.
+    """
+    name = os.environ.get("EDDIES_LOG", "info")
+    if name not in LEVELS:
+        raise SceneError(f"EDDIES_LOG = {name}: must be one of {', '.join(LEVELS)}")
+    handler = logging.StreamHandler(sys.stdout)
+    handler.setFormatter(_RankFormatter(rank))
+    logger = logging.getLogger("eddies")
+    logger.handlers, logger.propagate = [handler], False
+    logger.setLevel(LEVELS[name] if rank == 0 else max(LEVELS[name], logging.WARNING))
+
+
+class _RankFormatter(logging.Formatter):
+    """Messages as they are on rank 0; "rank 3: " before those of others; the level before warnings and
+    errors."""
+
+    def __init__(self, rank: int) -> None:
+        super().__init__()
+        self._prefix = f"rank {rank}: " if rank else ""
+
+    def format(self, record: logging.LogRecord) -> str:
+        level = f"{record.levelname.lower()}: " if record.levelno >= logging.WARNING else ""
+        return f"{self._prefix}{level}{super().format(record)}"

@@ -1,0 +1,66 @@
+"""Recognising a simulation that has gone wrong, and saying where."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from eddies.particles.particle_set import ParticleSet
+from eddies.particles.periodic_box import PeriodicBox
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Largest magnitudes a sound state can have: `speed`, and `density_deviation` from `density_mean`."""
+
+    speed: float
+    density_mean: float
+    density_deviation: float
+
+
+def find_fault(
+    particles: ParticleSet, limits: Limits, box: PeriodicBox, step: int, rank: int
+) -> str | None:
+    """What is wrong with the first faulty particle of this rank, or None.
+
+    Faulty are values that are not finite, and those beyond the limits. The description has the step, rank,
+    particle id, position, velocity, density, and the nearest other particle of this rank.
+    """
+    position, velocity, density = particles.position, particles.velocity, particles.density
+    speed = torch.linalg.vector_norm(velocity, dim=1)
+    deviation = (density - limits.density_mean).abs()
+    # Comparisons with NaN are false, so what is asked is whether a particle is sound.
+    sound = (speed <= limits.speed) & (deviation <= limits.density_deviation) & torch.isfinite(position).all(1)
+    if bool(sound.all()):
+        return None
+    row = int(torch.nonzero(~sound)[0])
+    return (
+        f"step {step}, rank {rank}, particle {int(particles.id[row])}: {_complaint(particles, limits, row)}; "
+        f"position {_numbers(position[row])}, velocity {_numbers(velocity[row])}, "
+        f"density {float(density[row]):.6g}, {_nearest(particles, box, row)}"
+    )
+
+
+def _complaint(particles: ParticleSet, limits: Limits, row: int) -> str:
+    columns = (particles.position, particles.velocity, particles.density)
+    if not all(bool(torch.isfinite(column[row]).all()) for column in columns):
+        return "not finite"
+    if float(torch.linalg.vector_norm(particles.velocity[row])) > limits.speed:
+        return f"faster than {limits.speed:.6g}"
+    return f"density farther than {limits.density_deviation:.6g} from {limits.density_mean:.6g}"
+
+
+def _nearest(particles: ParticleSet, box: PeriodicBox, row: int) -> str:
+    difference = box.displacement(particles.position, particles.position[row])
+    distance = torch.linalg.vector_norm(difference, dim=1)
+    distance[row] = torch.inf
+    distance = torch.where(torch.isnan(distance), torch.inf, distance)
+    other = int(torch.argmin(distance))
+    if not torch.isfinite(distance[other]):
+        return "no other particle to measure a distance to"
+    return f"nearest particle {int(particles.id[other])} at a distance of {float(distance[other]):.6g}"
+
+
+def _numbers(values: torch.Tensor) -> str:
+    return "(" + ", ".join(f"{value:.6g}" for value in values.tolist()) + ")"

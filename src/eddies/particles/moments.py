@@ -1,0 +1,64 @@
+"""Moment matrices of each particle's neighbourhood, by which differences of particles become derivatives."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+# Rows of the six different entries of a symmetric 3 x 3 matrix: xx, xy, xz, yy, yz, zz.
+ENTRIES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+
+def weight(distance: Tensor, cutoff: float) -> Tensor:
+    """w = (1 - q^2)^2 of q = distance/cutoff: smooth, and zero with zero slope from q = 1 on."""
+    q = distance / cutoff
+    return torch.clamp(1 - q * q, min=0) ** 2
+
+
+def expected_weight(neighbors: float) -> float:
+    """Sum of w over `neighbors` particles spread evenly within the cutoff: 3 int q^2 w dq = 8/35 of them."""
+    return neighbors * 8 / 35
+
+
+def expected_moment(neighbors: float, cutoff: float) -> float:
+    """Diagonal entry of sum w x x^T for even neighbours: int q^4 w dq = 8/315 of cutoff^2 each."""
+    return neighbors * cutoff**2 * 8 / 315
+
+
+def products(a: Tensor, b: Tensor) -> list[Tensor]:
+    """The entries a_i b_j of parallel vectors a, b (3, m): six (m,)."""
+    return [a[i] * b[j] for i, j in ENTRIES]
+
+
+def symmetric_products(a: Tensor, b: Tensor) -> list[Tensor]:
+    """The entries of (a b^T + b a^T)/2 for any vectors (3, m): six (m,)."""
+    return [a[i] * b[j] if i == j else 0.5 * (a[i] * b[j] + a[j] * b[i]) for i, j in ENTRIES]
+
+
+def invert_symmetric(matrix: Tensor) -> Tensor:
+    """Inverses of symmetric positive definite 3 x 3 matrices, as six entries (6, n) each, in closed form."""
+    xx, xy, xz, yy, yz, zz = matrix
+    cofactors = torch.stack(
+        [
+            yy * zz - yz * yz,
+            xz * yz - xy * zz,
+            xy * yz - xz * yy,
+            xx * zz - xz * xz,
+            xy * xz - xx * yz,
+            xx * yy - xy * xy,
+        ]
+    )
+    return cofactors / (xx * cofactors[0] + xy * cofactors[1] + xz * cofactors[2])
+
+
+def apply_symmetric(matrix: Tensor, vectors: Tensor) -> Tensor:
+    """Products of symmetric matrices (6, n) with vectors (3, n): (3, n)."""
+    xx, xy, xz, yy, yz, zz = matrix
+    x, y, z = vectors
+    return torch.stack([xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z])
+
+
+def contract_symmetric(a: Tensor, b: Tensor) -> Tensor:
+    """Full contraction a_ij b_ij of symmetric matrices (6, n): (n,)."""
+    product = a * b
+    return product[0] + product[3] + product[5] + 2 * (product[1] + product[2] + product[4])

@@ -1,0 +1,194 @@
+"""The learned pair force, Eqs. 3 and 4, and the learned rates of density."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from eddies.particles import moments
+from eddies.particles.dense_network import DenseNetwork
+from eddies.particles.eddy_viscosity import EddyViscosity
+from eddies.particles.pairs import Pairs
+from eddies.particles.periodic_box import safe_norm
+from eddies.particles.reference_scales import ReferenceScales
+
+BASES = ("paper", "corrected")
+CLOSURES = ("poisson", "learned-density", "paper-density")
+EDDY_VISCOSITIES = ("none", *EddyViscosity.FORMS)
+# Added to moment matrices and sums of weights, as a fraction of their values for evenly spread neighbours:
+# they stay invertible without neighbours or with coplanar ones, at a bias of a tenth of a percent elsewhere.
+REGULARISATION = 1e-3
+
+
+class PairModel(nn.Module):
+    """Rates of change of velocity and density as sums over neighbours, from one small network (Eqs. 3 and 4).
+
+    Lengths are in units of the filter width d, velocities of v_rms, density fluctuations of rho_rms. With
+    x = (x_i - x_j)/d, v = (v_i - v_j)/v_rms and rho' = (rho - rho_0)/rho_rms, the network turns the
+    invariants (rho'_i, rho'_j, |x|, |v|, x.v) into NN_1, NN_2 and, if the closure learns one, a density flux
+    NN_rho. Every pair is weighted by w = (1 - q^2)^2, q = r/h, so that all rates are smooth where a neighbour
+    enters or leaves.
+
+    dv_i/dt = a_rms A_i with
+        A_i = 1/n (sum_j w (NN_1 + Pi) x + sum_j w NN_2 v)                          basis "paper"
+        A_i = M_i^-1 sum_j w (NN_1 + Pi) x + sum_j w NN_2 v / sum_j w               basis "corrected"
+    where n is the expected number of neighbours and M_i = sum_j w x x^T.
+
+    Parameters
+    ----------
+    scales : measured scales of the flow.
+    cutoff : h, the radius of interaction.
+    neighbors : n, the expected number of particles within the cutoff.
+    hidden : widths of the tanh layers.
+    basis : "paper" or "corrected".
+    closure : "poisson": no density rate, the density is given; "paper-density": r_rms/n sum_j w NN_rho, r_rms
+        the rms of the density rate; "learned-density": -a rho_0 div v + b (c/h) (mean_j rho_j - rho_i) + the
+        same flux, with the divergence from moment-corrected differences, the mean weighted by w, and a, b
+        learned.
+    eddy_viscosity : "none" (Pi = 0 and no parameters), "two-sided" or "monaghan".
+    seed : of the initial weights.
+
+    The module is in double precision until it is converted. Raises ValueError for an unknown choice.
+    """
+
+    reads = ("velocity", "density")
+
+    def __init__(
+        self,
+        scales: ReferenceScales,
+        cutoff: float,
+        neighbors: float,
+        hidden: Sequence[int] = (16, 16),
+        basis: str = "corrected",
+        closure: str = "poisson",
+        eddy_viscosity: str = "none",
+        seed: int = 1,
+    ) -> None:
+        super().__init__()
+        _require("basis", basis, BASES)
+        _require("closure", closure, CLOSURES)
+        _require("eddy_viscosity", eddy_viscosity, EDDY_VISCOSITIES)
+        self.scales, self.cutoff, self.neighbors, self.hidden = scales, cutoff, neighbors, tuple(hidden)
+        self.basis, self.closure, self.eddy_viscosity = basis, closure, eddy_viscosity
+        self.network = DenseNetwork(5, hidden, 2 if closure == "poisson" else 3, seed)
+        if eddy_viscosity != "none":
+            self.viscosity = EddyViscosity(eddy_viscosity)
+        if closure == "learned-density":
+            # The factors a and b of the divergence and of the density's relaxation.
+            self.density_factors = nn.Parameter(torch.tensor([1.0, 0.4], dtype=torch.float64))
+
+    @property
+    def width(self) -> int:
+        """Most numbers that are held for a pair at once, for choosing how many pairs to take together."""
+        return max(self.hidden)
+
+    def forward(self, pairs: Pairs, columns: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Rates at the receivers of `pairs`.
+
+        `columns` holds the local `velocity` (s, 3) and `density` (s,), owned then ghosts. Returns "velocity",
+        the acceleration (count, 3), and "density", its rate (count,), if the closure learns one. The
+        receivers' own rows are not their neighbours.
+        """
+        x, v, own_density, other_density = self._dimensionless(pairs, columns)
+        distance, approach = pairs.distance / self.scales.length, (x * v).sum(0)
+        features = torch.stack([own_density, other_density, distance, safe_norm(v, dim=0), approach])
+        outputs = self.network(features)
+        push, drag = outputs[0], outputs[1]
+        if self.eddy_viscosity != "none":
+            push = push + self.viscosity(distance, approach)
+        w = moments.weight(pairs.distance, self.cutoff)
+        terms = {"push": [(w * push) * x], "drag": [(w * drag) * v]}
+        if self._needs_moment:
+            weighted_x = w * x
+            terms |= {"weight": [w], "moment": moments.products(weighted_x, x)}
+        if self.closure == "learned-density":
+            terms["strain"] = moments.symmetric_products(weighted_x, v)
+            terms["contrast"] = [w * (other_density - own_density)]
+        if self.closure != "poisson":
+            terms["flux"] = [w * outputs[2]]
+        return self._rates(_sum_together(pairs, terms))
+
+    def _dimensionless(self, pairs: Pairs, columns: dict[str, Tensor]) -> tuple[Tensor, ...]:
+        """x and v (3, m), rho'_i and rho'_j (m,) of the pairs."""
+        scales, dtype = self.scales, pairs.displacement.dtype
+        velocity, density = columns["velocity"], columns["density"]
+        v = (pairs.at_receivers(velocity) - pairs.at_senders(velocity)).T.to(dtype) / scales.velocity
+        own, other = (
+            (column - scales.density_mean).to(dtype) / scales.density
+            for column in (pairs.at_receivers(density), pairs.at_senders(density))
+        )
+        return pairs.displacement.T / scales.length, v, own, other
+
+    @property
+    def _needs_moment(self) -> bool:
+        return self.basis == "corrected" or self.closure == "learned-density"
+
+    def _rates(self, sums: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Rates from the sums over neighbours, each (components, count)."""
+        if self._needs_moment:
+            inverse, total = self._inverse_moment(sums["moment"]), self._total_weight(sums["weight"])
+        if self.basis == "corrected":
+            acceleration = moments.apply_symmetric(inverse, sums["push"]) + sums["drag"] / total
+        else:
+            acceleration = (sums["push"] + sums["drag"]) / self.neighbors
+        rates = {"velocity": self.scales.acceleration * acceleration.T}
+        if self.closure != "poisson":
+            rates["density"] = self.scales.density_rate / self.neighbors * sums["flux"][0]
+        if self.closure == "learned-density":
+            divergence = moments.contract_symmetric(inverse, sums["strain"])
+            contrast = (sums["contrast"] / total)[0]
+            rates["density"] = rates["density"] + self._structured_rate(divergence, contrast)
+        return rates
+
+    def _structured_rate(self, divergence: Tensor, contrast: Tensor) -> Tensor:
+        """-a rho_0 div v + b (c/h) (mean rho_j - rho_i) from dimensionless divergence and contrast."""
+        scales = self.scales
+        compression, relaxation = self.density_factors
+        return (
+            -compression * scales.density_mean * scales.velocity / scales.length * divergence
+            + relaxation * scales.sound_speed / self.cutoff * scales.density * contrast
+        )
+
+    def _inverse_moment(self, moment: Tensor) -> Tensor:
+        expected = moments.expected_moment(self.neighbors, self.cutoff / self.scales.length)
+        diagonal = moment.new_tensor([1, 0, 0, 1, 0, 1]).unsqueeze(1)
+        return moments.invert_symmetric(moment + REGULARISATION * expected * diagonal)
+
+    def _total_weight(self, weight: Tensor) -> Tensor:
+        return weight + REGULARISATION * moments.expected_weight(self.neighbors)
+
+    def state_description(self) -> dict:
+        """Everything but the weights, ready for JSON; `from_description` is the inverse."""
+        return {
+            "scales": self.scales.to_dict(),
+            "support": self.cutoff,
+            "neighbors": self.neighbors,
+            "hidden": list(self.hidden),
+            "basis": self.basis,
+            "closure": self.closure,
+            "eddy_viscosity": self.eddy_viscosity,
+        }
+
+    @classmethod
+    def from_description(cls, description: dict) -> PairModel:
+        """A model with initial weights, to be given those saved with the description by `load_state_dict`.
+
+        To use a model on another flow, replace the description's scales by that flow's.
+        """
+        settings = dict(description)
+        scales = ReferenceScales.from_dict(settings.pop("scales"))
+        return cls(scales, settings.pop("support"), **settings)
+
+
+def _require(name: str, value: str, choices: Sequence[str]) -> None:
+    if value not in choices:
+        raise ValueError(f'{name} "{value}": one of {", ".join(choices)}')
+
+
+def _sum_together(pairs: Pairs, terms: dict[str, list[Tensor]]) -> dict[str, Tensor]:
+    """Sums over neighbours of terms, lists of (m,) or (3, m), in one pass: (components, count) by name."""
+    rows = {name: [torch.atleast_2d(row) for row in term] for name, term in terms.items()}
+    sums = pairs.sum(torch.cat([row for term in rows.values() for row in term]).T).T
+    return dict(zip(rows, sums.split([sum(map(len, term)) for term in rows.values()])))

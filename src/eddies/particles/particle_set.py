@@ -1,0 +1,54 @@
+"""The particles a rank owns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class ParticleSet:
+    """Columns of the particles owned by this rank, one row a particle; ghosts are never part of it.
+
+    Parameters
+    ----------
+    id : int64 (n,), unique over all ranks.
+    position : (n, 3), x, y, z; in double precision.
+    velocity : (n, 3).
+    density : (n,).
+
+    Raises ValueError if the columns differ in length or a shape is wrong.
+    """
+
+    id: Tensor
+    position: Tensor
+    velocity: Tensor
+    density: Tensor
+
+    def __post_init__(self) -> None:
+        count = len(self.id)
+        expected = {"id": (count,), "position": (count, 3), "velocity": (count, 3), "density": (count,)}
+        for name, needed in expected.items():
+            shape = tuple(getattr(self, name).shape)
+            if shape != needed:
+                raise ValueError(f"particle {name} of shape {shape}: {needed} is needed")
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+    def to_numpy(self) -> dict[str, np.ndarray]:
+        """The columns by name, detached, as arrays of the host."""
+        return {field.name: as_numpy(getattr(self, field.name)) for field in fields(self)}
+
+    @classmethod
+    def from_numpy(cls, columns: dict[str, np.ndarray], device: torch.device | str = "cpu") -> ParticleSet:
+        """Inverse of `to_numpy`; columns that are no part of a particle set are left out."""
+        return cls(**{field.name: torch.as_tensor(columns[field.name]).to(device) for field in fields(cls)})
+
+
+def as_numpy(tensor: Tensor) -> np.ndarray:
+    """The values of a tensor as an array of the host, without its history."""
+    return tensor.detach().cpu().numpy()

@@ -1,0 +1,170 @@
+"""Smoothing kernels W(r) of compact support: SPH's own, tabulated ones, and the learned kernel of Eq. 7.
+
+Every kernel has unit integral over space, W in units of 1/length^3, and is exactly zero for r >= support.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from eddies.particles.dense_network import DenseNetwork
+
+# Sharpness C of the paper's sigmoid (Eq. 7): half its value is reached at r = h, a tenth lost at r = 0.89 h.
+SIGMOID_SHARPNESS = 20.0
+
+
+class SmoothingKernel(Protocol):
+    """W(r) and dW/dr for distances of any shape, zero for r >= `support`."""
+
+    support: float
+
+    def value(self, distance: Tensor) -> Tensor: ...
+
+    def derivative(self, distance: Tensor) -> Tensor: ...
+
+
+class _Polynomial:
+    """Kernel from a shape W h^3 and its slope, functions of q = r/h on [0, 1)."""
+
+    def __init__(self, support: float) -> None:
+        self.support = support
+
+    def value(self, distance: Tensor) -> Tensor:
+        """W(r) in 1/length^3, same shape as `distance`."""
+        q = torch.clamp(distance / self.support, max=1)
+        return self._shape(q) / self.support**3
+
+    def derivative(self, distance: Tensor) -> Tensor:
+        """dW/dr in 1/length^4, same shape as `distance`."""
+        q = torch.clamp(distance / self.support, max=1)
+        return self._slope(q) / self.support**4
+
+
+class CubicSpline(_Polynomial):
+    """Cubic B-spline kernel of Monaghan & Lattanzio (1985), zero at r >= h."""
+
+    def _shape(self, q: Tensor) -> Tensor:
+        return 8 / math.pi * torch.where(q < 0.5, 1 - 6 * q**2 * (1 - q), 2 * (1 - q) ** 3)
+
+    def _slope(self, q: Tensor) -> Tensor:
+        return 48 / math.pi * torch.where(q < 0.5, q * (3 * q - 2), -((1 - q) ** 2))
+
+
+class WendlandC2(_Polynomial):
+    """Wendland C2 kernel (Wendland 1995; Dehnen & Aly 2012) in three dimensions, zero at r >= h."""
+
+    def _shape(self, q: Tensor) -> Tensor:
+        return 21 / (2 * math.pi) * (1 - q) ** 4 * (1 + 4 * q)
+
+    def _slope(self, q: Tensor) -> Tensor:
+        return -210 / math.pi * q * (1 - q) ** 3
+
+
+class HermiteKernel:
+    """Kernel tabulated on uniform knots q = r/h = 0 ... 1, cubic Hermite (C1) in between.
+
+    Parameters
+    ----------
+    support : h.
+    values, slopes : (knots,), the dimensionless W h^3 and d(W h^3)/dq; what is computed is differentiable in
+        both.
+    """
+
+    def __init__(self, support: float, values: Tensor, slopes: Tensor) -> None:
+        if values.dim() != 1 or values.shape != slopes.shape or len(values) < 2:
+            raise ValueError(f"kernel table {(*values.shape,)}, {(*slopes.shape,)}: not two equal columns")
+        self.support, self.values, self.slopes = support, values, slopes
+        self.cells = len(values) - 1
+        start, rise = values[:-1], values[1:] - values[:-1]
+        first, last = slopes[:-1] / self.cells, slopes[1:] / self.cells
+        self._coefficients = (start, first, 3 * rise - 2 * first - last, first + last - 2 * rise)
+
+    def value(self, distance: Tensor) -> Tensor:
+        """W(r) in 1/length^3, same shape as `distance`."""
+        inside, t, (a, b, c, d) = self._locate(distance)
+        value = a + t * (b + t * (c + t * d))
+        return torch.where(inside, value, torch.zeros_like(value)) / self.support**3
+
+    def derivative(self, distance: Tensor) -> Tensor:
+        """dW/dr in 1/length^4, same shape as `distance`."""
+        inside, t, (_, b, c, d) = self._locate(distance)
+        slope = (b + t * (2 * c + t * (3 * d))) * self.cells
+        return torch.where(inside, slope, torch.zeros_like(slope)) / self.support**4
+
+    def _locate(self, distance: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
+        """Whether each distance is inside, its place in [0, 1] within its cell, and the cell's cubic."""
+        position = distance * (self.cells / self.support)
+        cell = torch.clamp(position.detach().to(torch.int64), 0, self.cells - 1)
+        flat = cell.flatten()
+        cubic = [coefficient.index_select(0, flat).reshape(cell.shape) for coefficient in self._coefficients]
+        return distance < self.support, torch.clamp(position - cell, max=1), cubic
+
+
+class KernelNetwork(nn.Module):
+    """The learned kernel of Eq. 7, W(r) = alpha NN(r/h) g(r/h), with unit integral by construction.
+
+    Parameters
+    ----------
+    support : h.
+    hidden : widths of the tanh layers.
+    cutoff : "smooth": g = (1 - q^2)^2, exactly zero with zero slope at q = r/h = 1; or "sigmoid", the paper's
+        g = 1/(1 + exp(C (q - 1))), which is 1/2 at q = 1, so that the kernel ends there with a jump.
+    seed : of the initial weights.
+
+    The network sees 2 q^2 - 1, so W is an even function of q: smooth at r = 0, with no slope there, as the
+    gradient of a reconstructed field needs. The output layer starts small around 1, so that W starts near g,
+    a bell shape that is positive everywhere.
+    """
+
+    def __init__(
+        self, support: float, hidden: Sequence[int] = (20, 20, 20, 20), cutoff: str = "smooth", seed: int = 1
+    ) -> None:
+        super().__init__()
+        if cutoff not in ("smooth", "sigmoid"):
+            raise ValueError(f'kernel cutoff "{cutoff}": "smooth" or "sigmoid"')
+        self.support, self.cutoff = support, cutoff
+        self.network = DenseNetwork(1, hidden, 1, seed)
+        with torch.no_grad():
+            self.network.weights[-1].mul_(0.1)
+            self.network.biases[-1].fill_(1.0)
+
+    def _unnormalised(self, knots: int) -> HermiteKernel:
+        reference = self.network.weights[0]
+        q = torch.linspace(0, 1, knots, dtype=reference.dtype, device=reference.device).unsqueeze(0)
+        shape, slope = self.network.with_tangent(2 * q * q - 1, 4 * q)
+        if self.cutoff == "smooth":
+            bell, bell_slope = (1 - q * q) ** 2, -4 * q * (1 - q * q)
+        else:
+            bell = torch.sigmoid(SIGMOID_SHARPNESS * (1 - q))
+            bell_slope = -SIGMOID_SHARPNESS * bell * (1 - bell)
+        return HermiteKernel(self.support, (shape * bell)[0], (slope * bell + shape * bell_slope)[0])
+
+    def integral(self, knots: int = 129) -> Tensor:
+        """1/alpha, the integral of NN g over space; the loss of Eq. 11 on it keeps alpha near one."""
+        return integral(self._unnormalised(knots))
+
+    def table(self, knots: int = 129) -> HermiteKernel:
+        """The kernel tabulated at `knots` points, with unit integral; differentiable in the weights."""
+        kernel = self._unnormalised(knots)
+        alpha = 1 / integral(kernel)
+        return HermiteKernel(self.support, alpha * kernel.values, alpha * kernel.slopes)
+
+
+def integral(kernel: SmoothingKernel) -> Tensor:
+    """Integral of a kernel over space, 4 pi int r^2 W dr, by Gauss-Legendre quadrature, 4 points a panel.
+
+    Exact for the kernels here, polynomials of degree 5 or less in each panel.
+    """
+    tabulated = isinstance(kernel, HermiteKernel)
+    values, panels = (kernel.values, kernel.cells) if tabulated else (torch.empty(0, dtype=torch.float64), 64)
+    nodes, weights = (torch.as_tensor(part).to(values) for part in np.polynomial.legendre.leggauss(4))
+    width = kernel.support / panels
+    starts = torch.arange(panels, dtype=nodes.dtype, device=nodes.device).unsqueeze(1)
+    distance = (starts + (nodes + 1) / 2) * width
+    return 4 * math.pi * (distance**2 * kernel.value(distance) * weights).sum() * (width / 2)

@@ -1,0 +1,128 @@
+"""What a rank sees around its particles: ghosts and the neighbour list, kept up to date."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from eddies.parallel.halo import HaloExchange
+from eddies.parallel.migration import migrate
+from eddies.parallel.reduction import any_rank, global_max
+from eddies.parallel.slab import SlabDecomposition
+from eddies.particles.ghosts import exchange_ghost_positions, exchange_ghosts
+from eddies.particles.neighbor_list import NeighborList
+from eddies.particles.particle_set import ParticleSet, as_numpy
+from eddies.particles.periodic_box import PeriodicBox
+
+
+@dataclass(frozen=True)
+class LocalParticles:
+    """The particles a rank sees at one moment: its own rows, then the ghosts.
+
+    Parameters
+    ----------
+    position : (s, 3); on several ranks z is not periodic here, and ghosts stand where they are seen from.
+    columns : the columns that were asked for, (s, ...).
+    halo : for further columns, with `ghosts.exchange_ghosts`.
+    box : the box in which differences of these positions are taken.
+    builds : changes whenever rows of ghosts do.
+    """
+
+    position: Tensor
+    columns: dict[str, Tensor]
+    halo: HaloExchange
+    box: PeriodicBox
+    builds: int
+
+
+class Surroundings:
+    """Halo and neighbour list of the particles of a decomposition.
+
+    Parameters
+    ----------
+    decomposition : slabs.
+    length : side of the periodic box.
+    list_cutoff : radius of the neighbour list; zero: there is none.
+    halo_cutoff : how far a rank must see beyond its particles, at least `list_cutoff`.
+    skin : extra radius of both. They hold until some particle of any rank has moved by half of it.
+
+    All methods are collective. Raises HaloError when slabs are thinner than the halo.
+    """
+
+    def __init__(
+        self,
+        decomposition: SlabDecomposition,
+        length: float,
+        list_cutoff: float,
+        halo_cutoff: float,
+        skin: float,
+    ) -> None:
+        self.decomposition, self.halo_cutoff, self.skin = decomposition, halo_cutoff, skin
+        self.box = PeriodicBox(length, periodic_z=decomposition.size == 1)
+        self.neighbors = NeighborList(self.box, list_cutoff, skin) if list_cutoff > 0 else None
+        self.builds = 0
+        self.forget()
+
+    def forget(self) -> None:
+        """Build anew at the next occasion."""
+        self._ids: Tensor | None = None
+
+    def outdated(self, particles: ParticleSet) -> bool:
+        """Whether, on any rank, these are other particles or one has moved by more than half the skin."""
+        changed = particles.id is not self._ids
+        if not changed and len(particles):
+            moved = self.box.displacement(particles.position.detach(), self._built_at)
+            changed = float((moved * moved).sum(-1).max()) > (self.skin / 2) ** 2
+        return any_rank(self.decomposition.comm, changed)
+
+    def settle(self, columns: dict[str, Tensor]) -> dict[str, Tensor]:
+        """All columns after each particle moved to the rank of its slab, ordered by place, then by id.
+
+        The order depends on nothing but ids and positions, and keeps neighbours close in memory.
+        """
+        device = columns["id"].device
+        moved = migrate(self.decomposition, {name: as_numpy(column) for name, column in columns.items()})
+        cells = max(int(self.box.length / self.halo_cutoff), 1)
+        x, y, z = np.minimum((moved["position"].T * (cells / self.box.length)).astype(np.int64), cells - 1)
+        order = np.lexsort((moved["id"], x, y, z))
+        return {name: torch.from_numpy(column[order]).to(device) for name, column in moved.items()}
+
+    def update(self, particles: ParticleSet) -> None:
+        """Make halo and list fit the particles.
+
+        No particle changes rank: where one has left its slab, the halo becomes wider by the farthest it strayed.
+        """
+        if not self.outdated(particles):
+            return
+        strayed = float(global_max(self.decomposition.comm, self._strayed(particles.position)))
+        width = self.halo_cutoff + self.skin + strayed
+        self.halo = HaloExchange(self.decomposition, as_numpy(particles.position), width)
+        self._ids, self._built_at = particles.id, particles.position.detach().clone()
+        self.builds += 1
+        if self.neighbors is not None:
+            with torch.no_grad():
+                position = self._with_ghosts(particles.position, exchange_ghost_positions)
+            self.neighbors.build(position[: len(particles)], position, exclude_self=True)
+
+    def local(self, particles: ParticleSet, names: set[str]) -> LocalParticles:
+        """Positions and the named columns with ghosts, as of now."""
+        # Stored component by component, as the gathering of pairs wants it.
+        position = self._with_ghosts(particles.position, exchange_ghost_positions).T.contiguous().T
+        columns = {name: self.column(getattr(particles, name)) for name in sorted(names)}
+        return LocalParticles(position, columns, self.halo, self.box, self.builds)
+
+    def column(self, owned: Tensor) -> Tensor:
+        """A column (n, ...) of owned particles followed by its ghost rows."""
+        return self._with_ghosts(owned, exchange_ghosts)
+
+    def _with_ghosts(self, owned: Tensor, exchange) -> Tensor:
+        return owned if self.decomposition.size == 1 else torch.cat([owned, exchange(self.halo, owned)])
+
+    def _strayed(self, position: Tensor) -> float:
+        slab, z = self.decomposition, position[:, 2].detach()
+        if slab.size == 1 or not len(z):
+            return 0.0
+        return max(slab.lower - float(z.min()), float(z.max()) - slab.upper, 0.0)

@@ -1,0 +1,103 @@
+"""Runs the stages of a scene in a run directory: what is needed first, what is done already, how long each
+took."""
+
+import json
+import logging
+import time
+from collections.abc import Sequence
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+
+from eddies.clock import duration
+from eddies.io.hdf5 import open_product, product_fingerprint
+from eddies.scene import Scene, SceneError
+
+log = logging.getLogger("eddies")
+
+# The product of each stage, in order: kind, then file name. A stage reads the products before its own.
+PRODUCTS = {"dns": ("ground_truth", "ground_truth.h5"), "train-kernel": ("kernel", "kernel.h5"),
+            "train": ("model", "model.h5"), "simulate": ("rollout", "rollout.h5")}
+
+
+def run_stages(stages: Sequence[str], scene: Scene, comm, directory: Path, resume: bool) -> None:
+    """Run stages of a scene, all ranks together, and record the wall time of each in stage_seconds.json.
+
+    With `resume`, stages whose product is complete and was made with the same settings are skipped, up to
+    the first one that has to run.
+
+    Raises:
+        SceneError: the scene lacks a section that a stage is about, or the directory cannot be written.
+        ProductError: a stage that is not among `stages` has not left the product that they start from.
+    """
+    check_inputs(stages, scene, comm, directory)
+    prepare_directory(scene, comm, directory)
+    for stage in stages:
+        resume = resume and is_done(stage, scene, comm, directory)
+        if resume:
+            log.info("%s: skipped, %s is complete and made with the same settings", stage, PRODUCTS[stage][1])
+            continue
+        log.info("%s: starts on %d %s", stage, comm.size, "rank" if comm.size == 1 else "ranks")
+        start = time.perf_counter()
+        workflow = import_module(f"eddies.workflows.{stage.replace('-', '_')}")
+        if stage == "report":
+            workflow.run(directory, comm)
+        else:
+            workflow.run(scene, comm, directory)
+        comm.Barrier()
+        record_seconds(stage, time.perf_counter() - start, comm, directory)
+
+
+def check_inputs(stages: Sequence[str], scene: Scene, comm, directory: Path) -> None:
+    """Refuse stages that the scene does not have, or whose inputs are missing; warn of inputs of another
+    scene."""
+    for stage in stages:
+        if stage not in scene.stages:
+            section = {"train-kernel": "kernel", "train": "model", "simulate": "simulation"}[stage]
+            raise SceneError(f"{scene.name}: has no [{section}], which `eddies {stage}` is about; add it")
+    order = list(PRODUCTS)
+    for needed in order[:order.index(stages[0])] if stages[0] in order else ():
+        kind, name = PRODUCTS[needed]
+        with open_product(comm, directory / name, kind):
+            pass
+        if product_fingerprint(directory / name) != scene.fingerprint(needed) and comm.rank == 0:
+            log.warning("%s was made with other settings than this scene's; `eddies %s` would make it anew",
+                        directory / name, needed)
+
+
+def prepare_directory(scene: Scene, comm, directory: Path) -> None:
+    """Make the run directory and write the scene as used into it; if rank 0 cannot, all ranks raise."""
+    problem = None
+    if comm.rank == 0:
+        try:
+            directory.mkdir(parents=True, exist_ok=True)
+            (directory / "scene.toml").write_text(scene.to_toml(), encoding="utf-8")
+        except OSError as error:
+            problem = error.strerror
+    if verdict_of_first_rank(problem is not None, comm):
+        raise SceneError(f"{directory}: cannot be written ({problem}); choose another --output")
+
+
+def is_done(stage: str, scene: Scene, comm, directory: Path) -> bool:
+    """Whether the product of a stage is complete and was made with the same settings, as rank 0 sees it."""
+    if stage not in PRODUCTS:
+        return False
+    fingerprint = product_fingerprint(directory / PRODUCTS[stage][1])
+    return verdict_of_first_rank(fingerprint == scene.fingerprint(stage), comm)
+
+
+def verdict_of_first_rank(verdict: bool, comm) -> bool:
+    """Rank 0's answer on every rank."""
+    shared = np.array([verdict], np.int8)
+    comm.Bcast(shared)
+    return bool(shared[0])
+
+
+def record_seconds(stage: str, seconds: float, comm, directory: Path) -> None:
+    """Log the wall time of a stage and keep it in stage_seconds.json, which holds the last of each stage."""
+    log.info("%s: took %s", stage, duration(seconds))
+    if comm.rank == 0:
+        path = directory / "stage_seconds.json"
+        known = json.loads(path.read_text()) if path.exists() else {}
+        path.write_text(json.dumps({**known, stage: round(seconds, 3)}, indent=2) + "\n")

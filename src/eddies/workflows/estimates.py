@@ -1,0 +1,166 @@
+"""What a scene is expected to become: its turbulence, time steps, ranks, memory and wall time, before it is
+run."""
+
+import math
+import time
+from dataclasses import dataclass, replace
+
+from eddies.clock import Clock, ladder_step
+from eddies.scene import BOX_LENGTH, Initial, Scene
+from eddies.time_stepping import STEPPERS
+from eddies.workflows.dns import build_fluid, build_step_limit, initial_state
+
+DISSIPATION_CONSTANT = 0.5   # C_eps = eps L / u'^3 of developed turbulence
+PEAK_SPEED = 7.0             # max(|u| + |v| + |w|) over u' in turbulence: four rms in each component at worst
+EXACT_PEAK_SPEED = {"taylor-green": 1.0, "abc": 3 * math.sqrt(2), "shear-wave": 1.0}  # over the amplitude
+GHOST_PLANES = {"cubic": 3, "quintic": 4}
+FLOW_BYTES = {"compressible": 920, "incompressible": 410}  # per cell in float64, measured from 48^3 to 128^3
+PROCESS_BYTES = 90e6         # of a rank before it holds any field
+PROBE_CELLS = 64
+
+
+@dataclass(frozen=True)
+class ExpectedTurbulence:
+    """Turbulence that a scene is expected to develop, from u' and eps; L from eps = C_eps u'^3 / L."""
+
+    velocity_rms: float
+    dissipation_rate: float
+    viscosity: float
+
+    @property
+    def turnover_time(self) -> float:
+        """T = L / u'."""
+        return DISSIPATION_CONSTANT * self.velocity_rms**2 / self.dissipation_rate
+
+    @property
+    def kolmogorov_length(self) -> float:
+        """eta = (nu^3 / eps)^(1/4)."""
+        return (self.viscosity**3 / self.dissipation_rate) ** 0.25
+
+    @property
+    def kolmogorov_time(self) -> float:
+        """t_eta = (nu / eps)^(1/2)."""
+        return math.sqrt(self.viscosity / self.dissipation_rate)
+
+    @property
+    def reynolds_lambda(self) -> float:
+        """Re_lambda = u' lambda / nu with lambda = (15 nu u'^2 / eps)^(1/2)."""
+        return self.velocity_rms**2 * math.sqrt(15 / (self.viscosity * self.dissipation_rate))
+
+
+def largest_wavenumber(scene: Scene) -> int:
+    """k_max kept by the 2/3 rule: the largest integer below cells / 3."""
+    return (scene.flow.cells - 1) // 3
+
+
+def expected_turbulence(scene: Scene) -> ExpectedTurbulence | None:
+    """Turbulence kept up by the forcing, or that decays from a random start; None where it cannot be
+    foreseen.
+
+    The integral scale is taken as sqrt(2 pi) / k with k of the forcing or of the initial peak, which is
+    exact for the initial spectrum and holds within some 10 % for forced turbulence. """
+    if scene.flow.viscosity == 0:
+        return None
+    if scene.forcing and scene.forcing.injection_rate > 0:
+        integral_scale = math.sqrt(2 * math.pi) / scene.forcing.wavenumber
+        dissipation_rate = scene.forcing.injection_rate
+        velocity_rms = (dissipation_rate * integral_scale / DISSIPATION_CONSTANT) ** (1 / 3)
+        return ExpectedTurbulence(velocity_rms, dissipation_rate, scene.flow.viscosity)
+    if scene.initial.kind == "random":
+        integral_scale = math.sqrt(2 * math.pi) / scene.initial.peak_wavenumber
+        dissipation_rate = DISSIPATION_CONSTANT * scene.initial.amplitude**3 / integral_scale
+        return ExpectedTurbulence(scene.initial.amplitude, dissipation_rate, scene.flow.viscosity)
+    return None
+
+
+def peak_speed(scene: Scene) -> float | None:
+    """Expected largest |u| + |v| + |w|; None for a flow from a file without forcing."""
+    initial, turbulence = scene.initial, expected_turbulence(scene)
+    if turbulence:
+        return PEAK_SPEED * turbulence.velocity_rms
+    if initial.kind == "random":
+        return PEAK_SPEED * initial.amplitude
+    if initial.kind == "sound-wave":
+        return initial.amplitude * scene.flow.sound_speed
+    return EXACT_PEAK_SPEED[initial.kind] * initial.amplitude if initial.kind in EXACT_PEAK_SPEED else None
+
+
+def expected_step(scene: Scene) -> tuple[float, str] | None:
+    """The time step of the direct simulation and what limits it; None if the speed cannot be foreseen."""
+    settings, speed = scene.time, peak_speed(scene)
+    if settings.step is not None:
+        return settings.step, "fixed by [time] step"
+    if speed is None:
+        return None
+    sound = scene.flow.sound_speed if settings.stepper == "rk4" and scene.flow.sound_speed else 0.0
+    bound = settings.courant * BOX_LENGTH / scene.flow.cells / (speed + sound)
+    if bound >= settings.max_step:
+        return settings.max_step, "limited by [time] max_step"
+    limit = "sound, which rk4 must resolve" if sound > speed else "advection"
+    return ladder_step(settings.max_step, bound), f"limited by {limit}: at most {bound:.3g}"
+
+
+def run_time(scene: Scene) -> float | None:
+    """Physical time that the direct simulation covers; None where the turnover time cannot be foreseen."""
+    turnovers = sum(part.turnovers for part in (scene.spin_up, scene.tracers) if part)
+    turbulence = expected_turbulence(scene)
+    if turnovers and turbulence is None:
+        return None
+    return (turnovers * turbulence.turnover_time if turnovers else 0.0) + (scene.time.duration or 0.0)
+
+
+def most_ranks(scene: Scene) -> dict[str, int]:
+    """The largest number of ranks that each part of a run can use, by what limits it."""
+    limits = {"a grid plane each": scene.flow.cells}
+    if scene.tracers:
+        splines = scene.tracers.interpolation
+        ghosts = GHOST_PLANES[splines]
+        limits[f"{ghosts} ghost planes of the {splines} splines"] = scene.flow.cells // ghosts
+    if scene.tracers and scene.kernel:
+        reach = particle_reach(scene)
+        cells = scene.tracers.cells
+        planes = math.ceil(reach / (BOX_LENGTH / cells) - 1e-9)
+        limits[f"slabs no thinner than the particles' reach {reach:.3g}"] = max(cells // planes, 1)
+    return limits
+
+
+def particle_reach(scene: Scene) -> float:
+    """How far a particle sees: the kernel's support and the skin of the neighbour list."""
+    skin = scene.simulation.skin if scene.simulation else 0.0
+    return scene.kernel.support(scene.tracers.particles) * (1 + skin)
+
+
+def flow_bytes(scene: Scene) -> float:
+    """Memory of the direct simulation over all ranks."""
+    single = 0.5 if scene.flow.precision == "float32" else 1.0
+    return FLOW_BYTES[scene.flow.fluid] * single * scene.flow.cells**3
+
+
+def pair_bytes(scene: Scene) -> float:
+    """Memory of the pair force over all ranks: list, displacement, distance, and three copies of every
+    activation."""
+    pairs = scene.tracers.particles * scene.kernel.neighbors * (1 + scene.simulation.skin) ** 3
+    item = 4 if scene.simulation.precision == "float32" else 8
+    return pairs * (16 + 4 * item + 3 * item * (5 + sum(scene.model.hidden) + 3))
+
+
+def probe_seconds_per_step(scene: Scene, comm, steps: int = 3) -> float:
+    """Wall seconds of one step of the direct simulation on these ranks, from a few steps.
+
+    A grid beyond PROBE_CELLS is not set up; the time of the smaller one is scaled by n^3 log n.
+    """
+    cells = min(scene.flow.cells, PROBE_CELLS)
+    probe = replace(scene, flow=replace(scene.flow, cells=cells), initial=Initial(kind="taylor-green"),
+                    time=replace(scene.time, duration=1.0), spin_up=None, tracers=None, kernel=None,
+                    model=None, training=None, simulation=None)
+    fluid = build_fluid(probe, comm)
+    stepper, state = STEPPERS[scene.time.stepper](fluid), initial_state(probe, fluid)
+    step = build_step_limit(probe, fluid.grid)(state, Clock(end=probe.time.duration))
+    state = stepper(state, step)  # the first step also plans transforms and makes tables
+    comm.Barrier()
+    start = time.perf_counter()
+    for _ in range(steps):
+        state = stepper(state, step)
+    comm.Barrier()
+    work = scene.flow.cells**3 * math.log(scene.flow.cells) / (cells**3 * math.log(cells))
+    return work * (time.perf_counter() - start) / steps

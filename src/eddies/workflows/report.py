@@ -1,0 +1,167 @@
+"""The report of a run: the paper's figures from the run's own products, one page, and the numbers as JSON.
+
+Every product is optional; a section appears for what there is. Rank 0 does the work, the others wait.
+"""
+
+import json
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from eddies.analysis import figures_comparison, figures_flow, figures_kernel, figures_model
+from eddies.analysis.page import Metric, RunRecord, Section, metrics_json, render_page, shown
+from eddies.analysis.spectra import energy_spectrum, vorticity
+from eddies.io.fields import FieldSeries
+from eddies.io.hdf5 import ProductError, find_group, open_product, read_provenance, read_table
+from eddies.io.trajectories import Trajectory
+
+log = logging.getLogger("eddies")
+
+STAGES = {"ground_truth": "dns", "kernel": "train-kernel", "model": "train", "rollout": "simulate"}
+ROLLOUT_COST = {"seconds_per_step": "rollout, seconds per step", "particles": "particles of the rollout",
+                "ranks": "ranks of the rollout"}
+
+
+@dataclass
+class Run:
+    """What has been read so far: provenance and wall seconds by product, and what later sections need."""
+
+    provenance: dict[str, dict[str, Any]] = field(default_factory=dict)
+    seconds: dict[str, float | None] = field(default_factory=dict)
+    cost: list[Metric] = field(default_factory=list)
+    filter_width: float | None = None
+    eulerian: dict[str, np.ndarray] | None = None
+
+
+def run(directory: str | Path, comm) -> None:
+    """Write report/index.html, report/figures/*.png and report/metrics.json of a run directory; all ranks
+    call it.
+
+    Raises ProductError if the directory holds no product, or a damaged one.
+    """
+    alone = comm.Split(comm.rank)
+    if comm.rank == 0:
+        _write_report(Path(directory), alone)
+    alone.Free()
+    comm.Barrier()
+
+
+def _write_report(directory: Path, alone) -> None:
+    record, sections = Run(), []
+    readers = {"ground_truth": _read_flow, "kernel": _read_kernel, "model": _read_model,
+               "rollout": _read_rollout}
+    for kind, read in readers.items():
+        path = directory / f"{kind}.h5"
+        if path.exists():
+            with open_product(alone, path, kind) as file:
+                record.provenance[kind] = read_provenance(file)
+                record.seconds[kind] = _stage_seconds(file)
+                sections.append(read(file, record))
+            log.info("report: %s, %d figures", sections[-1].title, len(sections[-1].illustrations))
+    if not sections:
+        raise ProductError(f"{directory}: holds none of {', '.join(f'{kind}.h5' for kind in readers)}; "
+                           "run `eddies dns SCENE` first")
+    sections.append(_cost_section(record))
+    _write_files(directory / "report", _run_record(directory, record), sections)
+    _log_main_numbers(sections)
+
+
+def _read_flow(file, record: Run) -> Section:
+    reference, statistics = _attributes(file, "reference"), read_table(file, "statistics")
+    traced = "released_at" in reference
+    name = "filtered" if traced else "final"
+    velocity = FieldSeries(file, name).read(-1, "velocity")
+    vorticity_magnitude = np.linalg.norm(vorticity(velocity), axis=0)
+    middle = velocity.shape[1] // 2
+    if traced:
+        spectra = record.eulerian = read_table(file, "spectra")
+        record.filter_width = reference["length"]
+    else:
+        wavenumber, energy = energy_spectrum(velocity)
+        spectra = {"wavenumber": wavenumber, "energy": energy[None]}
+    record.cost.append(Metric("dns_seconds_per_step", "DNS, seconds per step (median)",
+                              float(np.median(statistics["seconds_per_step"]))))
+    planes = {"velocity": velocity[0, middle], "vorticity": vorticity_magnitude[middle]}
+    return figures_flow.section(figures_flow.GroundTruth(statistics, spectra, reference, planes, name))
+
+
+def _read_kernel(file, record: Run) -> Section:
+    tables = {name: read_table(file, name) for name in ("kernels", "slices", "errors", "history")}
+    return figures_kernel.section(json.loads(file.attrs["description"])["support"], **tables)
+
+
+def _read_model(file, record: Run) -> Section:
+    density_rate = read_table(file, "density_rate_sample") if "density_rate_sample" in file else None
+    return figures_model.section(
+        json.loads(file.attrs["description"]), read_table(file, "a_priori"),
+        read_table(file, "acceleration_sample"), density_rate, read_table(file, "history"))
+
+
+def _read_rollout(file, record: Run) -> Section:
+    attributes = _attributes(file, "rollout")
+    record.cost += [Metric(key, label, attributes[key]) for key, label in ROLLOUT_COST.items()]
+    model, truth = Trajectory(file, "model"), Trajectory(file, "truth")
+    fields = {name: FieldSeries(file, name) for name in find_group(file, "fields")}
+    return figures_comparison.section(figures_comparison.Rollout(
+        attributes, model, truth, fields, model.length, record.filter_width, record.eulerian))
+
+
+def _cost_section(record: Run) -> Section:
+    seconds = {STAGES[kind]: value for kind, value in record.seconds.items() if value is not None}
+    untimed = ", ".join(f"{kind}.h5" for kind, value in record.seconds.items() if value is None)
+    metrics = [*record.cost, Metric("stage_seconds", "wall seconds by stage", seconds or None,
+                                    f"no wall time stored in {untimed}")]
+    present = {metric.key for metric in metrics}
+    metrics += [Metric(key, label, None, "there is no rollout.h5") for key, label in ROLLOUT_COST.items()
+                if key not in present]
+    return Section("cost", "Cost", "Wall seconds of stages and of steps.", metrics=metrics,
+                   main=("seconds_per_step",))
+
+
+def _stage_seconds(file) -> float | None:
+    """Wall seconds: an attribute of products that are written on the way, in the provenance of weights."""
+    seconds = file.attrs.get("seconds", read_provenance(file).get("seconds"))
+    return None if seconds is None else float(seconds)
+
+
+def _attributes(file, group: str) -> dict[str, Any]:
+    """Attributes of a group as Python numbers and strings."""
+    values = find_group(file, group).attrs.items()
+    return {name: value.item() if isinstance(value, np.generic) else value for name, value in values}
+
+
+def _run_record(directory: Path, record: Run) -> RunRecord:
+    rows = [("stage", "ranks", "wall time (s)", "date", "eddies", "commit", "libraries")]
+    for kind, origin in record.provenance.items():
+        seconds = "not stored" if record.seconds[kind] is None else shown(record.seconds[kind])
+        commit = (origin["commit"] or "not a checkout")[:12]
+        libraries = ", ".join(f"{name} {version}" for name, version in origin["libraries"].items())
+        ranks = str(origin["ranks"])
+        rows.append((STAGES[kind], ranks, seconds, origin["date"], origin["eddies"], commit, libraries))
+    newest = list(record.provenance.values())[-1]
+    stages = ", ".join(STAGES[kind] for kind in record.provenance)
+    summary = f"Lagrangian large-eddy simulation; stages: {stages}; {newest['date']}"
+    return RunRecord(directory.resolve().name, summary, newest["scene"], rows)
+
+
+def _write_files(output: Path, record: RunRecord, sections: Sequence[Section]) -> None:
+    (output / "figures").mkdir(parents=True, exist_ok=True)
+    for stale in (output / "figures").glob("*.png"):
+        stale.unlink()
+    for section in sections:
+        for illustration in section.illustrations:
+            (output / "figures" / f"{illustration.name}.png").write_bytes(illustration.image)
+    (output / "metrics.json").write_text(metrics_json(sections), encoding="utf-8")
+    (output / "index.html").write_text(render_page(record, sections), encoding="utf-8")
+    log.info("report: %s", output / "index.html")
+
+
+def _log_main_numbers(sections: Sequence[Section]) -> None:
+    for section in sections:
+        for metric in section.metrics:
+            if metric.key in section.main:
+                log.info("  %-48s %s", metric.label, "-" if metric.value is None else shown(metric.value))

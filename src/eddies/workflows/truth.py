@@ -1,0 +1,65 @@
+"""The ground truth as training and simulation read it: frames of particles on their slabs, fields, scales."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from eddies.io.fields import FieldSeries
+from eddies.io.hdf5 import read_attributes
+from eddies.io.trajectories import Trajectory
+from eddies.parallel.migration import id_block, migrate
+from eddies.parallel.slab import SlabDecomposition
+from eddies.particles.reference_scales import ReferenceScales
+
+
+class GroundTruth:
+    """An open ground_truth.h5, read by all ranks; particles arrive on the slabs of `decomposition`."""
+
+    def __init__(self, file, decomposition: SlabDecomposition) -> None:
+        self.decomposition = decomposition
+        self.trajectory, self.fields = Trajectory(file, "tracers"), FieldSeries(file, "filtered")
+        self.times, self.total = self.trajectory.times, self.trajectory.total
+        self.reference = read_attributes(file, "reference")
+
+    @property
+    def scales(self) -> ReferenceScales:
+        """Reference scales of the pair-force model."""
+        r = self.reference
+        return ReferenceScales(
+            length=r["length"], spacing=r["spacing"], velocity=r["velocity_rms"], density_mean=r["density_mean"],
+            density=r["density_rms"], acceleration=r["acceleration_rms"], density_rate=r["density_rate_rms"],
+            sound_speed=r["sound_speed"])
+
+    def particles(self, frame: int) -> dict[str, np.ndarray]:
+        """id, position, velocity and density of this rank's particles at a frame."""
+        return migrate(self.decomposition, self._block(frame))
+
+    def particles_with_rates(self, frame: int) -> dict[str, np.ndarray]:
+        """The same with `acceleration` (n, 3) and `density_rate` (n,): centred differences along the trajectories.
+
+        Not for the first and the last frame.
+        """
+        columns = self._block(frame)
+        before, after = self._block(frame - 1), self._block(frame + 1)
+        span = self.times[frame + 1] - self.times[frame - 1]
+        columns["acceleration"] = (after["velocity"] - before["velocity"]) / span
+        columns["density_rate"] = (after["density"] - before["density"]) / span
+        return migrate(self.decomposition, columns)
+
+    def field(self, index: int, variable: str) -> np.ndarray:
+        """This rank's planes of a filtered field, (components, z_local, y, x), in double precision."""
+        planes = (self.decomposition.start, self.decomposition.stop)
+        return self.fields.read(index, variable, *planes).astype(np.float64)
+
+    def frame_of_field(self, index: int) -> int:
+        """The frame taken at the time of a field."""
+        return int(np.argmin(np.abs(self.times - self.fields.times[index])))
+
+    def last_frame_seen(self, window: float) -> int:
+        """The last frame of the training window, a fraction of the ground truth."""
+        return max(int(window * (len(self.times) - 1)), 1)
+
+    def _block(self, frame: int) -> dict[str, np.ndarray]:
+        start, stop = id_block(self.decomposition.comm, self.total)
+        columns = {name: self.trajectory.read(frame, name, start, stop) for name in ("position", "velocity", "density")}
+        return {"id": np.arange(start, stop, dtype=np.int64), **columns}

@@ -1,0 +1,56 @@
+import numpy as np
+import pytest
+
+from eddies.analysis.spectra import energy_spectrum, spectrum_error, vorticity
+
+
+def grid(cells):
+    x = 2 * np.pi * np.arange(cells) / cells
+    return np.meshgrid(x, x, x, indexing="ij")[::-1]
+
+
+@pytest.mark.parametrize("mode, shell", [
+    ((3, 0, 0), 3), ((0, 2, 0), 2), ((0, 0, 4), 4), ((1, 2, 2), 3), ((1, 1, 0), 1),
+])
+def test_single_mode_lies_in_its_shell(mode, shell):
+    x, y, z = grid(12)
+    velocity = np.zeros((3, 12, 12, 12))
+    velocity[1] = 0.7 * np.cos(mode[0] * x + mode[1] * y + mode[2] * z)
+    wavenumber, energy = energy_spectrum(velocity)
+    assert energy[shell] == pytest.approx(0.7**2 / 4)
+    assert np.allclose(np.delete(energy, shell), 0)
+    assert wavenumber[shell] == shell
+
+
+@pytest.mark.parametrize("cells", [7, 8, 9, 16])
+def test_parseval(cells):
+    velocity = np.random.default_rng(2).normal(size=(3, cells, cells, cells))
+    _, energy = energy_spectrum(velocity)
+    assert energy.sum() == pytest.approx(0.5 * np.mean(np.sum(velocity**2, axis=0)), rel=1e-13)
+
+
+def test_spectrum_error_looks_only_at_the_range():
+    wavenumber = np.arange(6.0)
+    reference = np.array([9.0, 3.0, 4.0, 1.0, 1.0, 1.0])
+    energy = np.array([0.0, 3.0, 4.5, 7.0, 7.0, 7.0])
+    assert spectrum_error(wavenumber, energy, reference, 2) == pytest.approx(0.5 / 5)
+    assert spectrum_error(wavenumber, reference, reference, 5) == 0
+    with pytest.raises(ValueError, match="shells"):
+        spectrum_error(wavenumber, energy, reference, 0.5)
+
+
+@pytest.mark.parametrize("cells", [9, 12])
+def test_vorticity_of_an_abc_flow_is_its_velocity(cells):
+    x, y, z = grid(cells)
+    a, b, c = 1.0, 0.8, 0.6
+    flow = np.stack([
+        a * np.sin(z) + c * np.cos(y),
+        b * np.sin(x) + a * np.cos(z),
+        c * np.sin(y) + b * np.cos(x),
+    ])
+    assert np.allclose(vorticity(flow), flow, atol=1e-13)
+
+
+def test_a_field_of_wrong_shape_is_refused():
+    with pytest.raises(ValueError, match="shape"):
+        energy_spectrum(np.zeros((3, 8, 8, 4)))

@@ -1,0 +1,109 @@
+import numpy as np
+import pytest
+
+from eddies.analysis.velocity_gradients import (
+    ConditionalVelocity, InvariantBins, anisotropic_part, enstrophy_scale, invariants, vieillefosse_line,
+)
+
+
+def random_gradients(count, seed=6):
+    return np.random.default_rng(seed).normal(size=(count, 3, 3))
+
+
+def solenoidal_gradients(cells=16, seed=7):
+    """Gradients (n, 3, 3) of a random solenoidal field, |k| < cells / 3: cubes integrate exactly."""
+    rng = np.random.default_rng(seed)
+    full = np.fft.fftfreq(cells, 1 / cells)
+    k = np.stack(np.meshgrid(full, full, np.arange(cells // 2 + 1), indexing="ij")[::-1])
+    modes = np.stack([np.fft.rfftn(rng.normal(size=(cells,) * 3)) for _ in range(3)])
+    squared = np.sum(k**2, axis=0)
+    modes *= (squared > 0) & (squared < (cells / 3) ** 2)
+    modes -= k * np.sum(k * modes, axis=0) / np.where(squared == 0, 1, squared)
+    gradient = [[np.fft.irfftn(1j * k[j] * modes[i], s=(cells,) * 3, axes=(0, 1, 2)) for j in range(3)]
+                for i in range(3)]
+    return np.moveaxis(np.array(gradient), (0, 1), (-2, -1)).reshape(-1, 3, 3)
+
+
+def test_simple_flows():
+    spin, strain = np.zeros((3, 3)), np.diag([1.0, 1.0, -2.0])
+    spin[0, 1], spin[1, 0] = -1.5, 1.5
+    assert invariants(spin) == pytest.approx((1.5**2, 0))
+    second, third = invariants(strain)
+    assert (second, third) == pytest.approx((-3, 2))
+    assert enstrophy_scale(spin[None]) == pytest.approx(1.5**2)
+    assert enstrophy_scale(strain[None]) == 0
+
+
+def test_axisymmetric_strain_lies_on_the_vieillefosse_line():
+    for amplitude in (-1.3, 0.4, 2.0):
+        second, third = invariants(amplitude * np.diag([1.0, 1.0, -2.0]))
+        assert vieillefosse_line(third) == pytest.approx(second)
+        assert 27 / 4 * third**2 + second**3 == pytest.approx(0, abs=1e-12)
+
+
+def test_invariants_ignore_dilatation_and_rotation():
+    gradient = random_gradients(20)
+    rotation, _ = np.linalg.qr(np.random.default_rng(8).normal(size=(3, 3)))
+    expected = np.array(invariants(gradient))
+    assert np.allclose(invariants(gradient + 3 * np.eye(3)), expected)
+    assert np.allclose(invariants(rotation @ gradient @ rotation.T), expected)
+    assert np.allclose(np.trace(anisotropic_part(gradient), axis1=-2, axis2=-1), 0)
+
+
+def test_means_vanish_for_an_incompressible_homogeneous_field():
+    """<Q> = <R> = 0, and <W:W> = <S:S>."""
+    gradient = solenoidal_gradients()
+    second, third = invariants(gradient)
+    scale = enstrophy_scale(gradient)
+    assert abs(second.mean()) < 1e-12 * scale
+    assert abs(third.mean()) < 1e-12 * scale**1.5
+    strain = (gradient + np.swapaxes(gradient, 1, 2)) / 2
+    assert np.mean(np.sum(strain**2, axis=(1, 2))) / 2 == pytest.approx(scale)
+
+
+def test_bins_keep_all_particles():
+    second, third = invariants(random_gradients(5000))
+    bins = InvariantBins.covering(second, third, quantile=0.9)
+    cells = bins.probabilities(second, third)
+    assert cells.sum() == pytest.approx(1)
+    area = np.outer(np.diff(bins.second), np.diff(bins.third))
+    assert np.sum(bins.density(cells) * area) == pytest.approx(1)
+
+
+def restricted_euler(gradient):
+    squared = gradient @ gradient
+    return -squared + np.trace(squared, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)
+
+
+def midpoint_step(gradient, step):
+    return gradient + step * restricted_euler(gradient + step / 2 * restricted_euler(gradient))
+
+
+def test_conditional_velocity_of_restricted_euler():
+    """dA/dt = -A^2 + Tr(A^2)/3 I gives exactly dQ/dt = -3 R and dR/dt = 2/3 Q^2."""
+    gradient = anisotropic_part(random_gradients(60_000))
+    scale, step = enstrophy_scale(gradient), 1e-3
+    second, third = invariants(gradient)
+    bins = InvariantBins.covering(second / scale, third / scale**1.5, quantile=0.9)
+    flow = ConditionalVelocity(bins)
+    for _ in range(2):
+        after = midpoint_step(gradient, step)
+        flow.add(gradient, after, step, scale)
+        gradient = after
+    second_rate, third_rate = flow.mean(at_least=30)
+    q = ((bins.second[1:] + bins.second[:-1]) / 2)[:, None]
+    r = ((bins.third[1:] + bins.third[:-1]) / 2)[None, :]
+    known = np.isfinite(second_rate)
+    assert known.sum() > 100
+    exact = np.broadcast_to(-3 * r, known.shape)[known], np.broadcast_to(2 / 3 * q**2, known.shape)[known]
+    bin_width = np.diff(bins.third)[0], np.diff(bins.second)[0]
+    assert np.abs(second_rate[known] - exact[0]).max() < 3 * bin_width[0] / 2 * 1.01
+    assert np.abs(third_rate[known] - exact[1]).max() < 2 / 3 * bin_width[1] * np.abs(q).max() * 1.1
+
+
+def test_cells_with_few_particles_are_unknown():
+    flow = ConditionalVelocity(InvariantBins(np.linspace(-1, 1, 5), np.linspace(-1, 1, 5)))
+    still = np.zeros((3, 3, 3))
+    flow.add(still, still, 0.1, 1.0)
+    assert np.isfinite(flow.mean(at_least=3)[0]).sum() == 1
+    assert np.isfinite(flow.mean(at_least=4)[0]).sum() == 0

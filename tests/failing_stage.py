@@ -1,0 +1,24 @@
+"""Run by test_cli.py under mpirun: `eddies dns`, with a stage that fails while its product is open."""
+
+import sys
+
+import eddies.cli
+import eddies.workflows.dns
+from eddies.io.hdf5 import create_product
+from eddies.scene import SceneError
+
+FAILURES = {"one rank crashes": lambda rank: RuntimeError("reactor leak") if rank == 1 else None,
+            "one rank refuses": lambda rank: SceneError("no such reactor") if rank == 1 else None,
+            "all ranks refuse": lambda rank: SceneError("no such reactor")}
+
+
+def failing_run(scene, comm, directory):
+    with create_product(comm, directory / "ground_truth.h5", "ground_truth", {}):
+        error = FAILURES[sys.argv[1]](comm.rank)
+        if error:
+            raise error
+        comm.Barrier()
+
+
+eddies.workflows.dns.run = failing_run
+sys.exit(eddies.cli.main(["dns", "abc", "--output", sys.argv[2]]))

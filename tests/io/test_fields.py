@@ -1,0 +1,40 @@
+"""Fields: slabs of any thickness make the whole."""
+
+import numpy as np
+import pytest
+
+from eddies.io.fields import FieldSeries, FieldWriter
+from eddies.io.hdf5 import ProductError, create_product, open_product
+
+CELLS = 6
+VARIABLES = {"velocity": 3, "density": 1}
+PLANES = {"even": lambda comm: np.linspace(0, CELLS, comm.size + 1).astype(int),
+          "uneven": lambda comm: np.array([0, *[CELLS - 1] * (comm.size - 1), CELLS]),
+          "all on the last rank": lambda comm: np.array([0] * comm.size + [CELLS])}
+
+
+def field(index, variable):
+    shape = (VARIABLES[variable], CELLS, CELLS, CELLS)
+    return np.random.default_rng([index, VARIABLES[variable]]).random(shape)
+
+
+@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.parametrize("planes", PLANES)
+def test_fields_survive(comm, tmp_path, planes):
+    starts = PLANES[planes](comm)
+    start, stop = starts[comm.rank], starts[comm.rank + 1]
+    with create_product(comm, tmp_path / "f.h5", "ground_truth", {}) as file:
+        writer = FieldWriter(file, "filtered", CELLS, VARIABLES)
+        for index in range(2):
+            writer.append(0.1 * index, start, {name: field(index, name)[:, start:stop] for name in VARIABLES})
+    with open_product(comm, tmp_path / "f.h5", "ground_truth") as file:
+        series = FieldSeries(file, "filtered")
+        assert np.array_equal(series.times, [0, 0.1])
+        assert series.cells == CELLS and set(series.variables) == VARIABLES.keys()
+        for index in range(2):
+            for name in VARIABLES:
+                assert np.array_equal(series.read(index, name), field(index, name).astype(np.float32))
+        planes = series.read(1, "velocity", 2, 4)
+        assert np.array_equal(planes, field(1, "velocity")[:, 2:4].astype(np.float32))
+        with pytest.raises(ProductError, match="holds no fields/truth"):
+            FieldSeries(file, "truth")

@@ -1,0 +1,74 @@
+"""Trajectories: what is read is what was written, on any number of ranks, in the H5MD layout."""
+
+import numpy as np
+import pytest
+
+from eddies.io.hdf5 import ProductError, create_product, open_product
+from eddies.io.trajectories import Trajectory, TrajectoryWriter
+
+COLUMNS = {"position": (3,), "density": (), "velocity_gradient": (3, 3)}
+TOTAL, FRAMES = 11, 3
+BLOCKS = {"even": lambda comm: np.linspace(0, TOTAL, comm.size + 1).astype(int),
+          "all on the first rank": lambda comm: np.array([0] + [TOTAL] * comm.size),
+          "all on the last rank": lambda comm: np.array([0] * comm.size + [TOTAL])}
+
+
+def values(frame, column):
+    return np.random.default_rng([frame, len(column)]).random((TOTAL, *COLUMNS[column]))
+
+
+def write(comm, path, dtype, starts):
+    start, stop = starts[comm.rank], starts[comm.rank + 1]
+    with create_product(comm, path, "ground_truth", {}) as file:
+        for name in ("model", "truth"):
+            writer = TrajectoryWriter(file, name, TOTAL, 2 * np.pi, COLUMNS, dtype)
+            for frame in range(FRAMES):
+                writer.append(10 * frame, 0.5 * frame, start,
+                              {column: values(frame, column)[start:stop] for column in COLUMNS})
+
+
+@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.parametrize("blocks", BLOCKS)
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_frames_survive(comm, tmp_path, blocks, dtype):
+    write(comm, tmp_path / "t.h5", dtype, BLOCKS[blocks](comm))
+    with open_product(comm, tmp_path / "t.h5", "ground_truth") as file:
+        trajectory = Trajectory(file, "model")
+        assert np.array_equal(trajectory.times, [0, 0.5, 1]) and np.array_equal(trajectory.steps, [0, 10, 20])
+        assert (trajectory.total, trajectory.length) == (TOTAL, 2 * np.pi)
+        assert set(trajectory.columns) == COLUMNS.keys()
+        for frame in range(FRAMES):
+            for column in COLUMNS:
+                read = trajectory.read(frame, column)
+                assert read.dtype == dtype
+                assert np.array_equal(read, values(frame, column).astype(dtype))
+        assert np.array_equal(trajectory.read(1, "position", 4, 7), values(1, "position")[4:7].astype(dtype))
+        assert trajectory.read(-1, "density", 5, 5).shape == (0,)
+
+
+@pytest.mark.mpi(1, 2)
+def test_layout_is_h5md(comm, tmp_path):
+    write(comm, tmp_path / "t.h5", np.float32, BLOCKS["even"](comm))
+    with open_product(comm, tmp_path / "t.h5", "ground_truth") as file:
+        assert list(file["h5md"].attrs["version"]) == [1, 1]
+        assert {"name", "version"} <= file["h5md/creator"].attrs.keys()
+        assert "name" in file["h5md/author"].attrs
+        group = file["particles/model"]
+        assert group["box"].attrs["dimension"] == 3
+        assert list(group["box"].attrs["boundary"]) == [b"periodic"] * 3
+        assert np.allclose(group["box/edges"], 2 * np.pi)
+        assert np.array_equal(group["id"], np.arange(TOTAL))
+        for column, shape in COLUMNS.items():
+            element = group[column]
+            assert element["value"].shape == (FRAMES, TOTAL, *shape)
+            assert element["time"] == group["time"] and element["step"] == group["step"]
+
+
+@pytest.mark.mpi(1)
+def test_unknown_names_list_the_others(comm, tmp_path):
+    write(comm, tmp_path / "t.h5", np.float32, BLOCKS["even"](comm))
+    with open_product(comm, tmp_path / "t.h5", "ground_truth") as file:
+        with pytest.raises(ProductError, match="holds no particles/tracers"):
+            Trajectory(file, "tracers")
+        with pytest.raises(ProductError, match="holds no velocity; .*position"):
+            Trajectory(file, "model").read(0, "velocity")

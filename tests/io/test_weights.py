@@ -1,0 +1,73 @@
+"""Weights: read back as written, and refused when they are not."""
+
+import h5py
+import numpy as np
+import pytest
+
+from eddies.io.hdf5 import ProductError
+from eddies.io.weights import load_tables, load_weights, save_weights
+
+DESCRIPTION = {"basis": "corrected", "hidden": [16, 16], "scales": {"length": 0.39}}
+
+
+def tensors():
+    random = np.random.default_rng(1)
+    return {"layers.0.weight": random.random((3, 5)).astype(np.float32), "layers.0.bias": random.random(3),
+            "scale": np.array(2.5), "none": np.zeros((0, 4))}
+
+
+def save(comm, path):
+    save_weights(comm, path, "model", DESCRIPTION, tensors(), {"fingerprint": "abc"},
+                 {"history": {"step": np.arange(4), "loss": np.ones(4)}})
+
+
+@pytest.mark.mpi(1, 2, 3)
+def test_weights_survive(comm, tmp_path):
+    save(comm, tmp_path / "m.h5")
+    description, loaded = load_weights(comm, tmp_path / "m.h5", "model")
+    assert description == DESCRIPTION
+    assert loaded.keys() == tensors().keys()
+    for name, tensor in tensors().items():
+        assert loaded[name].dtype == tensor.dtype and np.array_equal(loaded[name], tensor)
+    tables = load_tables(tmp_path / "m.h5")
+    assert tables.keys() == {"history"} and np.array_equal(tables["history"]["step"], np.arange(4))
+
+
+def replace(file, name, tensor):
+    del file["weights"][name]
+    file["weights"][name] = tensor
+
+
+DAMAGES = {
+    "another value": lambda file: file["weights/scale"].write_direct(np.array(2.6)),
+    "another shape": lambda file: replace(file, "layers.0.bias", np.zeros(4)),
+    "another type": lambda file: replace(file, "layers.0.bias", np.float32(tensors()["layers.0.bias"])),
+    "missing": lambda file: file["weights"].pop("layers.0.bias"),
+    "unknown": lambda file: file["weights"].create_dataset("layers.1.bias", data=np.zeros(3)),
+}
+
+
+@pytest.mark.mpi(1, 2)
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_damage_is_named(comm, tmp_path, damage):
+    save(comm, tmp_path / "m.h5")
+    if comm.rank == 0:
+        with h5py.File(tmp_path / "m.h5", "a") as file:
+            DAMAGES[damage](file)
+    comm.Barrier()
+    with pytest.raises(ProductError, match="m.h5: tensor (scale|layers.*bias) is not what was written"):
+        load_weights(comm, tmp_path / "m.h5", "model")
+
+
+@pytest.mark.mpi(1)
+def test_values_that_are_not_finite_are_refused(comm, tmp_path):
+    save_weights(comm, tmp_path / "m.h5", "model", {}, {"scale": np.array([1.0, np.nan])}, {})
+    with pytest.raises(ProductError, match="tensor scale holds values that are not finite"):
+        load_weights(comm, tmp_path / "m.h5", "model")
+
+
+@pytest.mark.mpi(1, 2)
+def test_wrong_kind(comm, tmp_path):
+    save(comm, tmp_path / "m.h5")
+    with pytest.raises(ProductError, match="expected kernel: run `eddies train-kernel SCENE` first"):
+        load_weights(comm, tmp_path / "m.h5", "kernel")

@@ -1,0 +1,84 @@
+"""The job scripts, run in a made-up checkout where `mpirun` and `eddies` only say what they were asked."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from mpi_tools.launch import local_cores
+
+CHECKOUT = Path(__file__).parents[2]
+SCRIPTS = sorted([*CHECKOUT.glob("jobs/*.sh"), *CHECKOUT.glob("mpi_tools/*.sh"), CHECKOUT / ".ci/run"])
+SCHEDULERS = {"slurm": "#SBATCH --signal=USR1@", "pbs": "--signal=USR1", "lsf": "#BSUB -wa USR1", "flux": "--signal=USR1@"}
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.name)
+def test_syntax(script):
+    subprocess.run(["bash", "-n", script], check=True)
+
+
+def test_schedulers_differ_in_header_and_launcher_only():
+    def body(name):
+        lines = (CHECKOUT / f"jobs/{name}.sh").read_text().splitlines()
+        return [line for line in lines if line and not re.match(r"#|launcher=|resubmit=", line)]
+    assert len(body("slurm")) == 3
+    for name, warning in SCHEDULERS.items():
+        assert body(name) == body("slurm"), name
+        assert warning in (CHECKOUT / f"jobs/{name}.sh").read_text()
+
+
+@pytest.fixture
+def checkout(tmp_path):
+    """A copy of jobs/ and of the launcher beside stand-ins for the set-up, mpirun and eddies."""
+    shutil.copytree(CHECKOUT / "jobs", tmp_path / "jobs")
+    (tmp_path / "mpi_tools").mkdir()
+    shutil.copy(CHECKOUT / "mpi_tools/launch.py", tmp_path / "mpi_tools")
+    for name, text in {"mpi_tools/bootstrap.sh": "true", "bin/mpirun": 'echo "mpirun $*"; shift 2; "$@"',
+                       "bin/srun": '"$@"', "bin/scontrol": 'echo "scontrol $*"',
+                       ".venv/bin/eddies": 'echo "eddies $*"; echo "threads $OMP_NUM_THREADS"; exit ${ENDS_WITH:-0}',
+                       ".venv/bin/python": f'exec {sys.executable} "$@"'}.items():
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(f"#!/bin/sh\n{text}\n")
+        path.chmod(0o755)
+    return tmp_path
+
+
+def run(checkout, script, *arguments, **variables):
+    ours = {name: value for name, value in os.environ.items() if not re.match("EDDIES_|OMP_|PBS_", name)}
+    path = f"{checkout / 'bin'}:{os.environ['PATH']}"
+    return subprocess.run(["bash", checkout / "jobs" / script, *arguments], cwd=checkout, text=True,
+                          capture_output=True, timeout=60, env=ours | {"PATH": path} | variables)
+
+
+@pytest.mark.parametrize("asked, ranks", [("1", 1), ("1000", local_cores()), (None, min(8, local_cores()))])
+def test_local_runs_on_the_cores_or_fewer(checkout, asked, ranks):
+    result = run(checkout, "local.sh", **({"EDDIES_RANKS": asked} if asked else {}))
+    assert result.returncode == 0, result.stderr
+    assert f"mpirun -n {ranks} " in result.stdout
+    assert "eddies run hit-small --resume\nthreads 1\n" in result.stdout
+
+
+def test_local_passes_scene_and_options_on(checkout):
+    assert "eddies run abc.toml --resume --set seed=2\n" in run(checkout, "local.sh", "abc.toml", "--set", "seed=2").stdout
+    assert "eddies run hit-small --resume --set seed=2\n" in run(checkout, "local.sh", "--set", "seed=2").stdout
+
+
+@pytest.mark.parametrize("asked", ["0", "-2", "two"])
+def test_local_refuses_a_wrong_number_of_ranks(checkout, asked):
+    result = run(checkout, "local.sh", EDDIES_RANKS=asked)
+    assert result.returncode == 2
+    assert f"EDDIES_RANKS = '{asked}'" in result.stderr
+
+
+@pytest.mark.parametrize("status, requeued", [("0", False), ("2", False), ("75", True)])
+def test_batch_job_is_requeued_after_a_checkpoint(checkout, status, requeued):
+    result = run(checkout, "slurm.sh", SLURM_JOB_ID="17", ENDS_WITH=status, EDDIES_SCENE="hit", EDDIES_OUTPUT="there",
+                 OMP_NUM_THREADS="3")
+    assert result.returncode == int(status)
+    assert "eddies run hit --resume --output there\nthreads 3\n" in result.stdout
+    assert ("scontrol requeue 17" in result.stdout) == requeued

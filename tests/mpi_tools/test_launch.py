@@ -1,0 +1,65 @@
+"""Environment and ranks that the launcher chooses, and the doctor under it."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from mpi_tools import launch
+
+CHECKOUT = Path(__file__).parents[2]
+
+
+def test_ranks_are_the_cores_or_fewer(monkeypatch):
+    monkeypatch.setattr(launch, "local_cores", lambda: 4)
+    for asked, ranks in {"": 4, "3": 3, "9": 4}.items():
+        monkeypatch.setenv("EDDIES_RANKS", asked)
+        assert launch.default_ranks() == ranks
+    monkeypatch.setenv("EDDIES_RANKS", "many")
+    with pytest.raises(ValueError, match="EDDIES_RANKS = 'many'"):
+        launch.default_ranks()
+
+
+def test_container_quota_limits_the_cores(monkeypatch, tmp_path):
+    monkeypatch.setattr(launch, "CPU_QUOTA", tmp_path / "cpu.max")
+    monkeypatch.setattr(launch.os, "sched_getaffinity", lambda process: range(1000, 1008))
+    for quota, cores in {"max 100000": 8, "250000 100000": 3, "50000 100000": 1}.items():
+        launch.CPU_QUOTA.write_text(quota)
+        assert launch.local_cores() == cores
+
+
+def test_environment_of_the_user_wins(monkeypatch):
+    monkeypatch.setattr(launch, "local_cores", lambda: 4)
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    monkeypatch.delenv("OMPI_MCA_rmaps_base_oversubscribe", raising=False)
+    assert launch.mpi_environment(4)["OMP_NUM_THREADS"] == "1"
+    assert "OMPI_MCA_rmaps_base_oversubscribe" not in launch.mpi_environment(4)
+    assert launch.mpi_environment(5)["OMPI_MCA_rmaps_base_oversubscribe"] == "1"
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
+    assert launch.mpi_environment(4)["OMP_NUM_THREADS"] == "2"
+
+
+def test_exit_code_is_that_of_the_ranks():
+    line = [sys.executable, CHECKOUT / "mpi_tools/launch.py", "-n", "2", "--", sys.executable, "-c", "raise SystemExit(75)"]
+    assert subprocess.run(line, capture_output=True, timeout=60).returncode == 75
+
+
+def test_doctor_finds_nothing(tmp_path):
+    line = [sys.executable, CHECKOUT / "mpi_tools/launch.py", "-n", "3", "--", sys.executable,
+            CHECKOUT / "mpi_tools/doctor.py"]
+    result = subprocess.run(line, capture_output=True, text=True, timeout=120, cwd=tmp_path)
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert all(f"rank {rank} of 3 on" in result.stdout for rank in range(3))
+    assert "mpio" in result.stdout and "all is well" in result.stdout
+    assert not list(tmp_path.iterdir())
+
+
+def test_doctor_names_what_is_missing(tmp_path):
+    (tmp_path / "pyfftw.py").write_text("raise ImportError('made up')")
+    code = (f"import sys, runpy; sys.path.insert(0, {str(tmp_path)!r}); "
+            f"runpy.run_path({str(CHECKOUT / 'mpi_tools/doctor.py')!r}, run_name='__main__')")
+    line = [sys.executable, CHECKOUT / "mpi_tools/launch.py", "-n", "2", "--", sys.executable, "-c", code]
+    result = subprocess.run(line, capture_output=True, text=True, timeout=120, cwd=tmp_path)
+    assert result.returncode == 2
+    assert "rank 1: pyfftw cannot be imported (made up)" in result.stdout

@@ -1,0 +1,148 @@
+"""The MPI plugin, on small made-up test files in a pytest of their own."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+CHECKOUT = Path(__file__).parents[2]
+HEAD = "import os, time\nimport numpy as np\nimport pytest\n\n\n"
+
+
+def run(folder, body, *options):
+    """Output and pytest's closing line for a test file with this body."""
+    (folder / "test_made_up.py").write_text(HEAD + body)
+    (folder / "pytest.ini").touch()  # a root folder of its own
+    result = subprocess.run(
+        [sys.executable, "-m", "pytest", "-p", "mpi_tools.pytest_mpi", "-v", "--color=no", *options], cwd=folder,
+        capture_output=True, text=True, timeout=120, env=os.environ | {"PYTHONPATH": str(CHECKOUT)})
+    return result.stdout, result.stdout.splitlines()[-1]
+
+
+def test_runs_on_each_number_of_ranks_and_leaves_mpi_alone(tmp_path):
+    output, closing = run(tmp_path, """
+@pytest.mark.mpi(1, 2, 3)
+def test_sum(comm, mpi_ranks, tmp_path):
+    total = np.zeros(1)
+    comm.Allreduce(np.ones(1), total)
+    assert total[0] == comm.size == mpi_ranks
+    (tmp_path / str(comm.rank)).touch()
+    comm.Barrier()
+    assert len(list(tmp_path.iterdir())) == comm.size
+
+
+def test_unmarked():
+    from mpi4py import MPI
+    assert not MPI.Is_initialized()
+""")
+    assert " 4 passed" in closing, output
+    assert all(f"test_sum[mpi-{ranks}] PASSED" in output for ranks in (1, 2, 3))
+
+
+def test_failure_on_one_rank_is_reported_and_the_rest_runs(tmp_path):
+    output, closing = run(tmp_path, """
+@pytest.mark.mpi(2)
+def test_uneven(comm):
+    print("value", 40 + comm.rank)
+    assert comm.rank == 0
+
+
+@pytest.mark.mpi(2)
+def test_others_wait(comm):
+    if comm.rank == 1:
+        raise ValueError("raised while rank 0 is in a barrier")
+    comm.Barrier()
+
+
+@pytest.mark.mpi(2)
+def test_after(comm):
+    comm.Barrier()
+""")
+    assert " 2 failed, 1 passed" in closing, output
+    assert "rank 1 of 2 failed in call" in output
+    assert "Captured stdout of rank 1 call" in output and "value 41" in output
+    assert "ValueError: raised while rank 0 is in a barrier" in output
+
+
+def test_hanging_and_dying_ranks_are_reported(tmp_path):
+    output, closing = run(tmp_path, """
+@pytest.mark.mpi(2, timeout=2)
+def test_hangs(comm):
+    if comm.rank == 1:
+        time.sleep(1000)  # here
+    comm.Barrier()
+
+
+@pytest.mark.mpi(2)
+def test_dies(comm):
+    if comm.rank == 1:
+        os._exit(3)
+    comm.Barrier()
+
+
+@pytest.mark.mpi(2)
+def test_after(comm):
+    comm.Barrier()
+""")
+    assert " 2 failed, 1 passed" in closing, output
+    assert "rank 1 of 2 did not finish\nnot at its end after the time limit of 2 s" in output
+    assert "test_made_up.py\", line 9 in test_hangs" in output
+    assert "died; output of the run" in output
+
+
+def test_outcomes_other_than_passed_and_failed(tmp_path):
+    output, closing = run(tmp_path, """
+@pytest.mark.mpi(2)
+def test_leaves(comm):
+    pytest.skip("no reason")
+
+
+@pytest.mark.mpi(2)
+@pytest.mark.xfail(reason="known")
+def test_expected(comm):
+    assert comm.size == 1
+
+
+@pytest.fixture
+def broken(comm):
+    raise RuntimeError("in the fixture")
+
+
+@pytest.mark.mpi(2)
+def test_setup(broken):
+    pass
+
+
+def test_without_marker(comm):
+    pass
+""")
+    assert " 1 failed, 1 skipped, 1 xfailed, 1 error" in closing, output
+    assert "failed in setup" in output and "in the fixture" in output
+    assert "needs @pytest.mark.mpi" in output
+
+
+@pytest.mark.parametrize("options, passed", [
+    (["-k", "mpi-2"], 3),
+    (["test_made_up.py::test_one"], 2),
+    (["test_made_up.py::test_two[mpi-2-b]"], 1),
+    (["-m", "not mpi"], 1)])
+def test_selection(tmp_path, options, passed):
+    output, closing = run(tmp_path, """
+@pytest.mark.mpi(1, 2)
+def test_one(comm):
+    pass
+
+
+@pytest.mark.mpi(2)
+@pytest.mark.parametrize("letter", ["a", "b"])
+def test_two(comm, letter):
+    pass
+
+
+def test_three():
+    pass
+""", *options)
+    assert f" {passed} passed" in closing, output
+    assert "failed" not in closing

@@ -1,0 +1,205 @@
+"""The command line: exit codes, one clear message, no hang when a rank fails, resuming."""
+
+import json
+import logging
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from bad_scenes import BAD_OVERRIDES, BAD_TEXTS
+
+from mpi_tools.launch import mpi_environment, mpirun_command
+
+ABC = ["abc", "--set", "time.duration=0.1"]
+FAILING = Path(__file__).with_name("failing_stage.py")
+
+
+def run_cli(*arguments):
+    from eddies.cli import main
+    return main([str(argument) for argument in arguments])
+
+
+def start(ranks, *command):
+    """Run a Python program on some ranks; its exit code, output, error output and seconds."""
+    begin = time.monotonic()
+    line = mpirun_command(ranks, [sys.executable, *map(str, command)])
+    # There is no checkpoint to wait for.
+    environment = mpi_environment(ranks) | {"OMPI_MCA_odls_base_sigkill_timeout": "1"}
+    ended = subprocess.run(line, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True,
+                           timeout=60)
+    return ended.returncode, ended.stdout, ended.stderr, time.monotonic() - begin
+
+
+@pytest.mark.mpi(1, 2)
+@pytest.mark.parametrize("override, message", BAD_OVERRIDES, ids=[override for override, _ in BAD_OVERRIDES])
+def test_bad_override_ends_with_2_and_writes_nothing(comm, tmp_path, capfd, override, message):
+    assert run_cli("run", "tiny", "--set", override, "--output", tmp_path / "run") == 2
+    output, errors = capfd.readouterr()
+    assert not (tmp_path / "run").exists()
+    if comm.rank > 0:
+        assert output == errors == ""
+    else:
+        assert errors.startswith("eddies: error: ") and message in errors and errors.count("\n") == 1
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("text, message", BAD_TEXTS, ids=range(len(BAD_TEXTS)))
+def test_bad_scene_file_ends_with_2(comm, tmp_path, capfd, text, message):
+    (tmp_path / "bad.toml").write_text(text)
+    assert run_cli("check", tmp_path / "bad.toml") == 2
+    errors = capfd.readouterr().err
+    assert errors.startswith(f"eddies: error: {tmp_path / 'bad.toml'}: ") and message in errors
+
+
+@pytest.mark.mpi(1, 2)
+@pytest.mark.parametrize("stage", ["train-kernel", "train", "simulate"])
+def test_stage_without_its_input_writes_nothing(comm, tmp_path, capfd, stage):
+    assert run_cli(stage, "tiny", "--output", tmp_path / "run") == 2
+    assert not (tmp_path / "run").exists()
+    if comm.rank == 0:
+        assert "ground_truth.h5: no such file; run `eddies dns SCENE` first" in capfd.readouterr().err
+
+
+@pytest.mark.mpi(1, 2)
+def test_stage_that_the_scene_lacks(comm, tmp_path, capfd):
+    assert run_cli("train", "abc", "--output", tmp_path) == 2
+    assert comm.rank > 0 or "has no [model], which `eddies train` is about" in capfd.readouterr().err
+
+
+@pytest.mark.mpi(1, 2)
+def test_directory_that_cannot_be_made(comm, tmp_path, capfd):
+    if comm.rank == 0:
+        (tmp_path / "file").write_text("")
+    comm.Barrier()
+    assert run_cli("dns", *ABC, "--output", tmp_path / "file" / "run") == 2
+    assert comm.rank > 0 or "choose another --output" in capfd.readouterr().err
+
+
+@pytest.mark.mpi(1, 2)
+@pytest.mark.parametrize("arguments", [[], ["fly"], ["run"], ["run", "tiny", "--colour"]])
+def test_wrong_usage_is_said_once(comm, capfd, arguments):
+    with pytest.raises(SystemExit) as ended:
+        run_cli(*arguments)
+    assert ended.value.code == 2
+    assert ("usage: eddies" in capfd.readouterr().err) == (comm.rank == 0)
+
+
+@pytest.mark.mpi(1, 2)
+def test_list_of_scenes(comm, capfd):
+    assert run_cli("scenes") == 0
+    lines = capfd.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == ([] if comm.rank else [
+        "abc", "hit-small", "shear-wave", "sound-wave", "taylor-green", "tiny", "tracers-only"])
+    assert run_cli("scenes", "abc") == 0
+    assert ("viscosity = 0.1  # " in capfd.readouterr().out) == (comm.rank == 0)
+
+
+@pytest.mark.mpi(1, 2)
+def test_resume_skips_what_is_done_with_the_same_settings(comm, tmp_path, capfd):
+    product = tmp_path / "ground_truth.h5"
+
+    def run(*options):
+        before = product.stat().st_mtime_ns if product.exists() else 0
+        comm.Barrier()
+        assert run_cli("dns", *ABC, "--output", tmp_path, *options) == 0
+        return product.stat().st_mtime_ns > before, capfd.readouterr().out
+
+    assert run("--resume")[0]
+    ran, output = run("--resume")
+    assert not ran
+    skipped = "dns: skipped, ground_truth.h5 is complete and made with the same settings" in output
+    assert skipped == (comm.rank == 0)
+    assert run("--resume", "--set", "flow.viscosity=0.2")[0]
+    assert run("--set", "flow.viscosity=0.2")[0]
+    assert json.loads((tmp_path / "stage_seconds.json").read_text()).keys() == {"dns"}
+    assert "viscosity = 0.2" in (tmp_path / "scene.toml").read_text()
+
+
+@pytest.mark.mpi(2)
+def test_run_ends_with_a_report(comm, tmp_path, capfd):
+    assert run_cli("run", *ABC, "--output", tmp_path) == 0
+    page = tmp_path / "report" / "index.html"
+    assert page.exists() and (tmp_path / "report" / "metrics.json").exists()
+    assert (str(page) in capfd.readouterr().out) == (comm.rank == 0)
+    assert json.loads((tmp_path / "stage_seconds.json").read_text()).keys() == {"dns", "report"}
+    assert run_cli("report", tmp_path) == 0
+
+
+@pytest.mark.mpi(1, 2)
+def test_report_of_no_directory(comm, tmp_path, capfd):
+    assert run_cli("report", tmp_path / "none") == 2
+    assert comm.rank > 0 or "none: no such directory" in capfd.readouterr().err
+
+
+@pytest.mark.mpi(1, 2)
+def test_input_of_another_scene_is_told(comm, tmp_path, capfd):
+    from eddies.io.hdf5 import create_product
+    from eddies.logs import configure_logging
+    from eddies.scene import load_scene
+    from eddies.stages import check_inputs
+    with create_product(comm, tmp_path / "ground_truth.h5", "ground_truth", {"fingerprint": "of another"}):
+        pass
+    configure_logging(comm.rank)
+    check_inputs(["train-kernel"], load_scene("tiny"), comm, tmp_path)
+    told = "was made with other settings than this scene's" in capfd.readouterr().out
+    assert told == (comm.rank == 0)
+
+
+@pytest.mark.mpi(1, 2)
+def test_levels_of_the_log(comm, capfd, monkeypatch):
+    from eddies.logs import configure_logging
+    log = logging.getLogger("eddies")
+    configure_logging(comm.rank)
+    log.info("so far")
+    log.warning("look")
+    output = capfd.readouterr().out
+    assert output == ("so far\nwarning: look\n" if comm.rank == 0 else f"rank {comm.rank}: warning: look\n")
+    monkeypatch.setenv("EDDIES_LOG", "warning")
+    configure_logging(comm.rank)
+    log.info("so far")
+    assert capfd.readouterr().out == ""
+
+
+@pytest.mark.mpi(1)
+def test_unknown_log_level_is_bad_input(comm, capfd, monkeypatch):
+    monkeypatch.setenv("EDDIES_LOG", "loud")
+    assert run_cli("scenes") == 2
+    assert "EDDIES_LOG = loud: must be one of debug, info, warning" in capfd.readouterr().err
+
+
+def test_exit_code_of_the_program():
+    code, _, errors, _ = start(2, "-m", "eddies", "check", "tiny", "--set", "flow.cels=3")
+    assert code == 2
+    assert errors.count("did you mean cells?") == 1 and "Traceback" not in errors
+
+
+@pytest.mark.parametrize("given, used", [(None, "1"), ("3", "3")])
+def test_threads_per_rank(given, used):
+    program = "import os, eddies.cli; eddies.cli.main(['scenes']); print(os.environ['OMP_NUM_THREADS'])"
+    environment = {name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"}
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True,
+                           env=environment | ({"OMP_NUM_THREADS": given} if given else {}))
+    assert ended.stdout.splitlines()[-1] == used
+
+
+def test_crash_of_one_rank_ends_the_job(tmp_path):
+    code, _, errors, seconds = start(2, FAILING, "one rank crashes", tmp_path)
+    assert code == 1 and seconds < 10
+    assert "rank 1: Traceback" in errors and "rank 1: RuntimeError: reactor leak" in errors
+    assert not (tmp_path / "ground_truth.h5").exists()
+
+
+def test_mistake_met_by_one_rank_ends_the_job(tmp_path):
+    code, _, errors, seconds = start(2, FAILING, "one rank refuses", tmp_path)
+    assert code == 2 and seconds < 15
+    assert "rank 1: eddies: error: no such reactor" in errors and "Traceback" not in errors
+
+
+def test_mistake_met_by_all_ranks_while_writing(tmp_path):
+    code, _, errors, seconds = start(2, FAILING, "all ranks refuse", tmp_path)
+    assert code == 2 and seconds < 10
+    assert errors.count("eddies: error: no such reactor") == 1 and "Traceback" not in errors
+    assert not (tmp_path / "ground_truth.h5").exists()

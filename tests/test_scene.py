@@ -1,0 +1,119 @@
+"""Scenes: what is read, what is refused and in which words."""
+
+import dataclasses
+
+import pytest
+from bad_scenes import BAD_OVERRIDES, BAD_TEXTS
+
+from eddies.scene import STAGES, Flow, Scene, SceneError, Time, builtin_scenes, load_scene
+
+SMALLEST = '[flow]\nfluid = "incompressible"\ncells = 16\nviscosity = 0.1\n[time]\nduration = 1\n'
+NAMES = [name for name, _ in builtin_scenes()]
+
+
+def scene_file(tmp_path, text, name="case"):
+    path = tmp_path / f"{name}.toml"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_written_scene_reads_back_equal(name, tmp_path):
+    scene = load_scene(name)
+    assert load_scene(scene_file(tmp_path, scene.to_toml(), "other-name")) == scene
+
+
+def test_all_values_survive_writing(tmp_path):
+    scene = load_scene("tiny", ['title="a \\"quoted\\" # title"', "tracers.filter_width=0.1234567890123456",
+                                "simulation.injection=1e-7", "model.hidden=[1, 2, 3]", "simulation.start=0"])
+    assert load_scene(scene_file(tmp_path, scene.to_toml())) == scene
+    assert scene.simulation.start == 0.0
+    assert scene.model.hidden == (1, 2, 3)
+
+
+def test_absent_sections_and_defaults(tmp_path):
+    scene = load_scene(scene_file(tmp_path, SMALLEST))
+    assert scene.name == "case"
+    assert scene.forcing is scene.tracers is scene.kernel is scene.model is scene.simulation is None
+    assert (scene.flow.precision, scene.time.stepper, scene.seed) == ("float64", "etdrk4", 1)
+    assert scene.stages == ("dns", "report")
+
+
+@pytest.mark.parametrize("override, read", [
+    ("seed=7", lambda scene: scene.seed == 7),
+    ("flow.viscosity=1", lambda scene: scene.flow.viscosity == 1.0),
+    ("flow.precision=float32", lambda scene: scene.flow.precision == "float32"),
+    ('flow.precision="float32"', lambda scene: scene.flow.precision == "float32"),
+    (" flow.cells = 32 ", lambda scene: scene.flow.cells == 32),
+    ("forcing.injection_rate=0.5", lambda scene: scene.forcing.injection_rate == 0.5),
+    ("title=a=b", lambda scene: scene.title == "a=b"),
+])
+def test_override(override, read, tmp_path):
+    assert read(load_scene(scene_file(tmp_path, SMALLEST), [override]))
+
+
+def test_all_stages_of_a_whole_scene():
+    assert load_scene("tiny").stages == STAGES
+
+
+def test_derived_lengths():
+    tracers, kernel = load_scene("hit-small").tracers, load_scene("hit-small").kernel
+    assert tracers.width == 2 * tracers.spacing == pytest.approx(0.3926990817)
+    assert (tracers.particles, tracers.cells) == (32768, 48)
+    assert load_scene("tiny").tracers.cells == 18
+    assert kernel.support(tracers.particles) / tracers.spacing == pytest.approx(2.4287, rel=1e-4)
+
+
+FINGERPRINTS = {"flow.viscosity=0.061": "dns", "seed=2": "dns", "kernel.steps=99": "train-kernel",
+                "model.hidden=[4]": "train", "training.steps=59": "train", "simulation.skin=0.2": "simulate"}
+
+
+@pytest.mark.parametrize("override, first_changed", FINGERPRINTS.items())
+def test_fingerprint_changes_from_the_stage_that_reads_the_key(override, first_changed):
+    scene, changed = load_scene("tiny"), load_scene("tiny", [override])
+    affected = [stage for stage in STAGES if scene.fingerprint(stage) != changed.fingerprint(stage)]
+    assert affected == list(STAGES[STAGES.index(first_changed):])
+
+
+def test_fingerprint_ignores_names_and_the_device():
+    scene, renamed = load_scene("tiny"), load_scene("tiny", ["name=x", "title=y", "device=cuda"])
+    assert scene.fingerprint("report") == renamed.fingerprint("report")
+
+
+@pytest.mark.parametrize("text, message", BAD_TEXTS, ids=range(len(BAD_TEXTS)))
+def test_bad_text(text, message, tmp_path):
+    path = scene_file(tmp_path, text)
+    with pytest.raises(SceneError) as error:
+        load_scene(path)
+    assert str(error.value).startswith(f"{path}: ")
+    assert message in str(error.value)
+
+
+@pytest.mark.parametrize("override, message", BAD_OVERRIDES, ids=[override for override, _ in BAD_OVERRIDES])
+def test_bad_override(override, message):
+    with pytest.raises(SceneError) as error:
+        load_scene("tiny", [override])
+    assert message in str(error.value)
+
+
+def test_override_is_named_as_the_origin():
+    with pytest.raises(SceneError, match=r"tiny.toml, --set: \[flow\] cells = 3: "):
+        load_scene("tiny", ["flow.cells=3"])
+
+
+def test_unknown_scene_lists_those_there_are():
+    with pytest.raises(SceneError, match="hit-smal: no such scene; did you mean hit-small.*tiny"):
+        load_scene("hit-smal")
+
+
+def test_sections_are_checked_against_each_other_without_a_file():
+    with pytest.raises(SceneError, match="a compressible fluid needs"):
+        Scene(flow=Flow(fluid="compressible", cells=16, viscosity=0.1), time=Time(duration=1.0))
+
+
+def test_every_key_is_explained():
+    scene = load_scene("tiny")
+    for section in (scene, scene.flow, scene.initial, scene.forcing, scene.time, scene.spin_up, scene.tracers,
+                    scene.kernel, scene.model, scene.training, scene.simulation):
+        for field in dataclasses.fields(section):
+            assert "section" in field.metadata or field.metadata["rule"].about

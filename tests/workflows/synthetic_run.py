@@ -1,0 +1,182 @@
+"""Products of a made-up run: random smooth fields and particles in the layout that the stages write."""
+
+import numpy as np
+
+from eddies.io.fields import FieldWriter
+from eddies.io.hdf5 import create_product, write_attributes, write_table
+from eddies.io.trajectories import TrajectoryWriter
+from eddies.io.weights import save_weights
+
+LENGTH = 2 * np.pi
+TURNOVER = 1.2
+WIDTH = np.pi / 4
+SCALES = {
+    "energy": 1.5, "dissipation_rate": 0.5, "injection_rate": 0.5, "total_energy": 1.6, "taylor_scale": 0.6,
+    "reynolds_lambda": 45.0, "integral_scale": 1.1, "eddy_turnover_time": TURNOVER, "kmax_eta": 1.1,
+    "mach_turbulent": 0.08, "density_rms": 0.004, "compressible_fraction": 1e-4, "skewness": -0.5,
+    "flatness": 4.5, "time_step": 0.05, "seconds_per_step": 0.04, "turnovers": 2.0,
+}
+
+
+class RandomFlow:
+    """A random solenoidal velocity with |k| <= 4, its gradient and its decay, known at every point."""
+
+    def __init__(self, seed: int, modes: int = 90) -> None:
+        rng = np.random.default_rng(seed)
+        self.k = rng.integers(-4, 5, size=(modes, 3)).astype(float)
+        self.k = self.k[np.sum(self.k**2, axis=1) > 0]
+        size = np.linalg.norm(self.k, axis=1)[:, None]
+        amplitude = rng.normal(size=self.k.shape) * size ** (-11 / 6)
+        self.amplitude = amplitude - self.k * np.sum(amplitude * self.k, axis=1, keepdims=True) / size**2
+        self.phase = rng.uniform(0, LENGTH, len(self.k))
+        self.amplitude *= 1 / np.sqrt(np.sum(self.amplitude**2) / 6)
+
+    def _angle(self, position, time):
+        return position @ self.k.T + self.phase + 0.8 * time * np.linalg.norm(self.k, axis=1)
+
+    def velocity(self, position, time):
+        return np.exp(-0.2 * time) * np.cos(self._angle(position, time)) @ self.amplitude
+
+    def gradient(self, position, time):
+        rates = -np.sin(self._angle(position, time)) * np.exp(-0.2 * time)
+        return np.einsum("pm,mi,mj->pij", rates, self.amplitude, self.k)
+
+    def acceleration(self, position, time):
+        interval = 1e-3
+        return (self.velocity(position, time + interval) - self.velocity(position, time)) / interval
+
+    def field(self, cells, time):
+        x = LENGTH * np.arange(cells) / cells
+        z, y, x = np.meshgrid(x, x, x, indexing="ij")
+        position = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+        return self.velocity(position, time).T.reshape(3, cells, cells, cells)
+
+
+def provenance(fingerprint="0" * 64, **more):
+    return {"scene": 'title = "synthetic"\nseed = 1\n', "fingerprint": fingerprint, **more}
+
+
+def write_ground_truth(comm, directory, tracers=True, cells=16):
+    flow = RandomFlow(1)
+    with create_product(comm, directory / "ground_truth.h5", "ground_truth", provenance()) as file:
+        time = np.linspace(0, 4, 81)
+        wiggle = 1 + 0.1 * np.sin(3 * time)
+        columns = {name: value * wiggle for name, value in SCALES.items()}
+        write_table(file, "statistics", {"time": time, **columns})
+        reference = {**SCALES, "energy_budget_error": 2e-4, "viscosity": 0.014, "kolmogorov_length": 0.05,
+                     "kolmogorov_time": 0.17, "velocity_rms": 1.0}
+        series = FieldWriter(file, "filtered" if tracers else "final", cells, {"velocity": 3})
+        series.append(0.0, 0, {"velocity": flow.field(cells, 0.0)})
+        if tracers:
+            reference |= {"released_at": 2.0, "length": WIDTH, "spacing": WIDTH / 2, "acceleration_rms": 1.4}
+            write_table(file, "spectra", decaying_spectra())
+        write_attributes(file.create_group("reference"), reference)
+        write_attributes(file, {"seconds": 12.5})
+
+
+def decaying_spectra():
+    k, time = np.arange(28), np.linspace(0, 1.2, 5)
+    shape = np.exp(-0.05 * k**1.5) * np.maximum(k, 1.0) ** (-5 / 3) * (k > 0)
+    energy = np.exp(-0.4 * time)[:, None] * shape
+    filtered = energy * np.exp(-k**2 * WIDTH**2 / 12)
+    return {"time": time, "wavenumber": k, "energy": energy, "filtered": filtered}
+
+
+def write_kernel(comm, directory, cells=32):
+    r = np.linspace(0, 1, 101)
+    shapes = {"learned": np.exp(-5 * r**2) * (1 - r) ** 2,
+              "learned_no_gradient": np.exp(-9 * (r - 0.4) ** 2) * (1 - r),
+              "cubic_spline": (1 - r) ** 3, "wendland": (1 - r) ** 4 * (1 + 4 * r)}
+    kernels, slices, errors = {"r_over_h": r}, {}, {}
+    plane = RandomFlow(2).field(cells, 0.0)[0, cells // 2]
+    truth = {"velocity": plane, "gradient": np.gradient(plane, LENGTH / cells, axis=1)}
+    slices |= {f"truth_{quantity}": values for quantity, values in truth.items()}
+    for index, (name, shape) in enumerate(shapes.items()):
+        kernels |= {f"value_{name}": 2 * shape, f"derivative_{name}": 2 * np.gradient(shape, r)}
+        errors[f"integral_{name}"] = 1.0
+        for quantity, values in truth.items():
+            error = errors[f"{quantity}_error_{name}"] = 0.1 + 0.1 * index
+            noise = np.random.default_rng(index).normal(size=values.shape)
+            slices[f"{quantity}_{name}"] = values + error * values.std() * noise
+    step = np.arange(0, 200, 10)
+    history = {"step": step, "loss_learned": np.exp(-step / 60),
+               "loss_learned_no_gradient": np.exp(-step / 40)}
+    tables = {"kernels": kernels, "slices": slices, "errors": errors, "history": history}
+    save_weights(comm, directory / "kernel.h5", "kernel", {"support": 0.9}, {"weight": np.ones(3)},
+                 provenance(seconds=3.0), tables)
+
+
+def write_model(comm, directory):
+    rng = np.random.default_rng(3)
+    step, delay = np.arange(0, 300, 10), np.linspace(-0.6, 0.6, 13)
+    decay = np.exp(-step / 80)
+    history = {name: scale * decay for name, scale in (
+        ("loss", 1.0), ("trajectory_loss", 0.8), ("field_loss", 0.1), ("velocity_kl_loss", 0.01),
+        ("acceleration_kl_loss", 0.02), ("learning_rate", 5e-3), ("gradient_norm", 2.0))}
+    history |= {"step": step, "seconds": step * 0.02,
+                "validation_error": np.where(step % 50 == 0, 0.25 + 0.7 * decay, np.nan)}
+    a_priori = {"delay": delay, "acceleration_error": 0.24 + 0.03 * np.maximum(delay, 0),
+                "density_rate_error": 0.6 + 0.05 * delay, "pressure_gradient_error": 0.24 + 0 * delay,
+                "closure_acceleration_error": np.full(delay.size, np.nan)}
+    truth = rng.standard_t(5, size=(800, 3))
+    predicted = 0.95 * truth + 0.2 * rng.normal(size=truth.shape)
+    tables = {"history": history, "a_priori": a_priori,
+              "acceleration_sample": {"truth": truth, "predicted": predicted},
+              "density_rate_sample": {"truth": truth[:, 0], "predicted": 0.8 * truth[:, 0]}}
+    save_weights(comm, directory / "model.h5", "model", {"basis": "corrected", "closure": "poisson"},
+                 {"weight": np.ones(3)}, provenance(seconds=7.0), tables)
+
+
+class PerturbedFlow:
+    """The truth plus an error that grows linearly in time."""
+
+    def __init__(self, growth):
+        self.truth, self.error, self.growth = RandomFlow(1), RandomFlow(4), growth
+
+    def __getattr__(self, quantity):
+        truth, error = getattr(self.truth, quantity), getattr(self.error, quantity)
+        return lambda where, time: truth(where, time) + self.growth * time * error(where, time)
+
+    def particles(self, start, time):
+        """All columns of particles that moved from `start` with their present velocity."""
+        velocity = self.velocity(start, time)
+        return {"position": (start + time * velocity) % LENGTH, "velocity": velocity,
+                "density": 1 + 0.01 * velocity[:, 0], "acceleration": self.acceleration(start, time),
+                "velocity_gradient": self.gradient(start, time)}
+
+
+def write_rollout(comm, directory, status="complete", total=600, cells=16, frames=9, broken=None):
+    """The truth ends three frames before the model. Velocities of the model's frame `broken` are NaN."""
+    start = np.random.default_rng(5).uniform(0, LENGTH, (total, 3))
+    shapes = {"position": (3,), "velocity": (3,), "density": (), "acceleration": (3,),
+              "velocity_gradient": (3, 3)}
+    times = 0.1 * np.arange(frames)
+    attributes = {"status": status, "start_time": 0.6, "time_step": 0.02, "integrator": "verlet",
+                  "closure": "poisson", "turnovers": times[-1] / TURNOVER, "seconds_per_step": 0.031,
+                  "particles": total, "ranks": 1, "eddy_turnover_time": TURNOVER}
+    with create_product(comm, directory / "rollout.h5", "rollout", provenance()) as file:
+        write_attributes(file.create_group("rollout"), attributes)
+        runs = (("truth", times[:-3], PerturbedFlow(0.0)), ("model", times, PerturbedFlow(0.4)))
+        for name, own, flow in runs:
+            writer = TrajectoryWriter(file, name, total, LENGTH, shapes, np.float64)
+            fields = FieldWriter(file, name, cells, {"velocity": 3})
+            for step, time in enumerate(own):
+                columns = flow.particles(start, time)
+                if step == broken and name == "model":
+                    columns["velocity"] = np.full((total, 3), np.nan)
+                writer.append(step, time, 0, columns)
+                if step % 2 == 0:
+                    fields.append(time, 0, {"velocity": flow.field(cells, time)})
+        filtered = FieldWriter(file, "filtered", cells, {"velocity": 3})
+        for time in times[:-3:2]:
+            filtered.append(time, 0, {"velocity": 1.02 * RandomFlow(1).field(cells, time)})
+        write_attributes(file, {"seconds": 4.0})
+
+
+def write_run(comm, directory, **rollout):
+    """All four products."""
+    directory.mkdir(parents=True, exist_ok=True)
+    write_ground_truth(comm, directory)
+    write_kernel(comm, directory)
+    write_model(comm, directory)
+    write_rollout(comm, directory, **rollout)

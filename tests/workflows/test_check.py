@@ -1,0 +1,109 @@
+"""Numbers told before a run: against closed forms, against what a run does, and nothing is written."""
+
+import logging
+import math
+from dataclasses import replace
+
+import pytest
+
+from eddies.scene import Time, load_scene
+
+
+def lines_of(scene, comm, caplog):
+    from eddies.workflows import check
+    with caplog.at_level(logging.INFO, logger="eddies"):
+        check.run(scene, comm)
+    return "\n".join(record.getMessage() for record in caplog.records)
+
+
+@pytest.fixture
+def recorded(monkeypatch):
+    monkeypatch.setattr(logging.getLogger("eddies"), "propagate", True)
+
+
+@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.parametrize("name", ["hit-small", "tiny", "taylor-green", "sound-wave", "tracers-only"])
+def test_check_of_any_scene_writes_nothing(comm, tmp_path, monkeypatch, caplog, recorded, name):
+    monkeypatch.chdir(tmp_path)
+    text = lines_of(load_scene(name), comm, caplog)
+    for subject in ("grid", "turbulence", "time step", "ranks", "memory", "time"):
+        assert subject in text
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.mpi(1)
+def test_numbers_of_the_small_case(comm, caplog, recorded):
+    text = lines_of(load_scene("hit-small"), comm, caplog)
+    for part in ("spacing 0.09817, k_max 21", "32^3 = 32768, mean spacing 0.1963 = 2 cells", "Re_lambda 53.8",
+                 "filter width 0.3927", "kernel support 0.4769, 60 neighbours", "at most 9"):
+        assert part in text
+
+
+def test_expected_turbulence_is_consistent():
+    from eddies.workflows.estimates import expected_turbulence
+    turbulence = expected_turbulence(load_scene("hit-small"))
+    eta, t_eta, nu = turbulence.kolmogorov_length, turbulence.kolmogorov_time, turbulence.viscosity
+    assert eta**2 / t_eta == pytest.approx(nu)
+    assert nu * (1 / t_eta) ** 2 == pytest.approx(turbulence.dissipation_rate)
+    # Pope (2000), Eq. 6.64 with k = 3 u'^2 / 2: Re_lambda^2 = 15 u'^4 / (nu eps)
+    assert turbulence.reynolds_lambda**2 == pytest.approx(15 * turbulence.velocity_rms**4 / (nu * 0.5))
+
+
+def test_random_start_decays_from_its_own_scales():
+    from eddies.workflows.estimates import expected_turbulence
+    turbulence = expected_turbulence(load_scene("tracers-only"))
+    assert turbulence.velocity_rms == 1.0
+    assert turbulence.turnover_time == pytest.approx(math.sqrt(2 * math.pi) / 3)
+
+
+@pytest.mark.parametrize("overrides, step, limit", [
+    (["time.max_step=0.001"], 0.001, "max_step"),
+    ([], 0.00625, "advection"),
+    (["time.stepper=rk4"], 0.05 / 32, "sound"),
+    (["time.step=0.004"], 0.004, "fixed"),
+])
+def test_what_limits_the_step(overrides, step, limit):
+    from eddies.workflows.estimates import expected_step
+    found, reason = expected_step(load_scene("hit-small", overrides))
+    assert found == pytest.approx(step) and limit in reason
+
+
+@pytest.mark.mpi(1)
+def test_expected_step_is_the_one_taken_at_the_start(comm):
+    from eddies.clock import Clock
+    from eddies.workflows.dns import build_fluid, build_step_limit, initial_state
+    from eddies.workflows.estimates import expected_step
+    for name in ("taylor-green", "abc"):
+        scene = replace(load_scene(name), time=Time(duration=1e9, max_step=1e3))
+        fluid = build_fluid(scene, comm)
+        taken = build_step_limit(scene, fluid.grid)(initial_state(scene, fluid), Clock())
+        assert expected_step(scene)[0] == pytest.approx(taken)
+
+
+@pytest.mark.mpi(1, 2, 3, 4)
+def test_most_ranks_is_what_the_parts_accept(comm):
+    from eddies.parallel.halo import HaloError, require_thick_slabs
+    from eddies.parallel.slab import SlabDecomposition
+    from eddies.scene import BOX_LENGTH
+    from eddies.workflows.estimates import most_ranks, particle_reach
+    scene = load_scene("tiny", ["kernel.neighbors=70"])
+    slabs = SlabDecomposition(comm, BOX_LENGTH, scene.tracers.cells)
+    if comm.size <= min(most_ranks(scene).values()):
+        require_thick_slabs(slabs, particle_reach(scene))
+    else:
+        with pytest.raises(HaloError):
+            require_thick_slabs(slabs, particle_reach(scene))
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("override, warning", [("flow.viscosity=0.001", "k_max eta is below 0.9"),
+                                               ("tracers.filter_width=0.1", "narrower than a cell")])
+def test_warnings(comm, override, warning, caplog, recorded):
+    assert warning in lines_of(load_scene("tiny", [override]), comm, caplog)
+
+
+@pytest.mark.mpi(1)
+def test_job_with_too_many_ranks_is_told(comm):
+    from eddies.workflows.check import warnings
+    assert any("this job has 100 ranks" in line for line in warnings(load_scene("tiny"), 100))
+    assert list(warnings(load_scene("hit-small"), 2)) == []

@@ -1,0 +1,136 @@
+import json
+import math
+import re
+
+import pytest
+
+from eddies.io.hdf5 import ProductError
+from eddies.workflows import report
+
+from tests.workflows.synthetic_run import write_ground_truth, write_kernel, write_rollout, write_run
+
+FIGURES = {
+    "statistics", "spectra", "fields", "figure-1-kernels", "figure-2-reconstruction", "kernel-training",
+    "figure-3-a-priori", "model-training", "figure-4-velocity", "figure-5-vorticity-energy", "figure-6-pdfs",
+    "figure-7-invariants", "figure-8-spectra", "figure-9-errors", "lagrangian",
+}
+METRICS = {
+    "ground_truth": {"reynolds_lambda", "kmax_eta", "mach_turbulent", "energy_budget_error", "skewness"},
+    "kernel": {"integral", "velocity_error", "gradient_error", "cubic_spline_velocity_error",
+               "cubic_spline_gradient_error"},
+    "model": {"acceleration_error", "density_rate_error", "filtered_pressure_gradient_error",
+              "closure_acceleration_error", "delay"},
+    "rollout": {"turnovers", "stable", "energy_ratio", "velocity_error", "spectrum_error", "velocity_kl",
+                "acceleration_kl", "qr_kl"},
+    "cost": {"seconds_per_step", "particles", "ranks", "stage_seconds"},
+}
+
+
+def written(directory):
+    """Metrics and page; the former must be strict JSON."""
+    def refuse(constant):
+        raise AssertionError(f"{constant} is not JSON")
+
+    text = (directory / "report" / "metrics.json").read_text(encoding="utf-8")
+    page = (directory / "report" / "index.html").read_text(encoding="utf-8")
+    return json.loads(text, parse_constant=refuse), page
+
+
+def figures(directory):
+    return {path.stem for path in (directory / "report" / "figures").glob("*.png")}
+
+
+def numbers(values):
+    return [value for value in values if isinstance(value, float)]
+
+
+@pytest.mark.mpi(1)
+def test_a_complete_run_shows_everything(comm, tmp_path):
+    write_run(comm, tmp_path)
+    report.run(tmp_path, comm)
+    metrics, page = written(tmp_path)
+    assert figures(tmp_path) == FIGURES
+    assert page.count("data:image/png;base64,") == len(FIGURES)
+    assert not re.search(r'(src|href)="(?!#|data:)', page), "the page needs no other file"
+    for section, keys in METRICS.items():
+        assert keys <= metrics[section].keys()
+        assert all(math.isfinite(value) for value in numbers(metrics[section].values()))
+    missing = [(section, key) for section, keys in METRICS.items() for key in keys if metrics[section][key] is None]
+    assert missing == [("model", "closure_acceleration_error")]
+    assert "the closure poisson does not have it" in page
+
+
+@pytest.mark.mpi(1)
+def test_numbers_of_a_known_rollout(comm, tmp_path):
+    """The model is the truth plus an error of 0.4 t times an independent flow of the same energy."""
+    write_run(comm, tmp_path, total=3000)
+    report.run(tmp_path, comm)
+    rollout = written(tmp_path)[0]["rollout"]
+    assert rollout["stable"] is True
+    assert rollout["last_common_time"] == pytest.approx(0.5 / 1.2)
+    assert rollout["velocity_error"] == pytest.approx(0.2, rel=0.15)
+    assert rollout["energy_ratio"] == pytest.approx(1.04, abs=0.05)
+    assert rollout["filter_wavenumber"] == pytest.approx(4)
+    assert 0 < rollout["velocity_kl"] < 0.1 and 0 < rollout["qr_kl"] < 0.5
+
+
+@pytest.mark.mpi(1)
+def test_a_stopped_rollout_is_said_to_be_stopped(comm, tmp_path):
+    write_run(comm, tmp_path, status="stopped: particle 17 is not finite at t=0.62", broken=4)
+    report.run(tmp_path, comm)
+    metrics, page = written(tmp_path)
+    assert "stopped: particle 17 is not finite at t=0.62" in page
+    assert "not finite from 0.333 T on" in page
+    assert metrics["rollout"]["stable"] is False
+    assert metrics["rollout"]["last_common_time"] == pytest.approx(0.3 / 1.2)
+    assert all(math.isfinite(value) for value in numbers(metrics["rollout"].values()))
+
+
+@pytest.mark.mpi(1)
+def test_a_dns_alone(comm, tmp_path):
+    write_ground_truth(comm, tmp_path, tracers=False)
+    report.run(tmp_path, comm)
+    metrics, page = written(tmp_path)
+    assert figures(tmp_path) == {"statistics", "spectra", "fields"}
+    assert metrics.keys() == {"ground_truth", "cost"}
+    assert metrics["cost"]["seconds_per_step"] is None and "there is no rollout.h5" in page
+    assert metrics["cost"]["stage_seconds"] == {"dns": 12.5}
+
+
+@pytest.mark.mpi(1)
+def test_a_rollout_without_its_ground_truth(comm, tmp_path):
+    write_rollout(comm, tmp_path)
+    report.run(tmp_path, comm)
+    metrics, page = written(tmp_path)
+    assert metrics["rollout"]["spectrum_error"] is None
+    assert "the filter width is in ground_truth.h5" in page
+    assert "figure-8-spectra" in figures(tmp_path)
+
+
+@pytest.mark.mpi(1)
+def test_figures_of_an_earlier_report_do_not_stay(comm, tmp_path):
+    write_kernel(comm, tmp_path)
+    report.run(tmp_path, comm)
+    (tmp_path / "kernel.h5").unlink()
+    write_ground_truth(comm, tmp_path)
+    report.run(tmp_path, comm)
+    assert figures(tmp_path) == {"statistics", "spectra", "fields"}
+
+
+@pytest.mark.mpi(1)
+def test_an_empty_directory_is_refused(comm, tmp_path):
+    with pytest.raises(ProductError, match="eddies dns"):
+        report.run(tmp_path, comm)
+
+
+@pytest.mark.mpi(2)
+def test_other_ranks_wait(comm, tmp_path):
+    if comm.rank == 0:
+        alone = comm.Split(0)
+        write_kernel(alone, tmp_path)
+    else:
+        alone = comm.Split(1)
+    comm.Barrier()
+    report.run(tmp_path, comm)
+    assert (tmp_path / "report" / "index.html").exists()
+    alone.Free()
