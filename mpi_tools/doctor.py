@@ -9,7 +9,7 @@ code is the number of complaints, at most 100.
 import importlib
 import os
 import platform
-import tempfile
+import traceback
 from pathlib import Path
 
 from mpi4py import MPI
@@ -66,13 +66,9 @@ def ring_bandwidth(comm: MPI.Comm) -> tuple[float, list[str]]:
 def parallel_file(comm: MPI.Comm) -> list[str]:
     """Complaints about a file in the current folder that all ranks write together."""
     import h5py
-    name = np.zeros(64, np.uint8)
-    if comm.rank == 0:
-        handle, path = tempfile.mkstemp(prefix="doctor-", suffix=".h5", dir=".")
-        os.close(handle)
-        name[:len(path)] = np.frombuffer(path.encode(), np.uint8)
-    comm.Bcast(name)
-    path = Path(name[name > 0].tobytes().decode())
+    number = np.array([os.getpid()])  # a name of its own for each run, the same on all ranks
+    comm.Bcast(number)
+    path = Path(f"doctor-{number[0]}.h5")
     with h5py.File(path, "w", driver="mpio", comm=comm) as file:
         rows = file.create_dataset("rank", (comm.size,), int)
         with rows.collective:
@@ -121,4 +117,9 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    try:
+        code = main()
+    except Exception:  # on one rank: the others would wait for it for ever
+        traceback.print_exc()
+        MPI.COMM_WORLD.Abort(1)
+    raise SystemExit(code)

@@ -22,8 +22,7 @@ PATIENCE = 5.0  # seconds that a rank waits for the others to come to the same e
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run one command; returns the exit code: 0 done, 2 bad input. Any other error ends the whole job with
-    1."""
+    """Run one command; returns the exit code: 0 done, 2 bad input, 1 any other error."""
     # Before numpy and torch are imported: they would start a thread for every core, in every rank.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
@@ -41,12 +40,12 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def end_with_error(error: Exception, comm) -> int:
-    """Report an error once and end on all ranks, even if the others know nothing of it; returns the exit
-    code.
+    """Report an error once and end on all ranks, even those that do not know of it; returns the exit code.
 
     A mistake in the input is met by all ranks: rank 0 says so in a line. An error that stays on some ranks,
     or is none of the user's, ends the job by MPI_Abort, because the other ranks may wait for this one for
-    ever. """
+    ever.
+    """
     mistake = is_users_mistake(error)
     text = f"eddies: error: {error}\n" if mistake else "".join(traceback.format_exception(error))
     together = (mistake or comm.size == 1) and all_arrive(comm)

@@ -26,8 +26,7 @@ def configure_logging(rank: int) -> None:
 
 
 class _RankFormatter(logging.Formatter):
-    """Messages as they are on rank 0; "rank 3: " before those of others; the level before warnings and
-    errors."""
+    """Rank 0's messages as they are, "rank 3: " before those of others; warnings and errors are so named."""
 
     def __init__(self, rank: int) -> None:
         super().__init__()

@@ -62,8 +62,7 @@ class Scene:
         return "\n".join(lines) + "\n"
 
     def fingerprint(self, stage: str) -> str:
-        """SHA-256 over the settings that a stage's product depends on: its own sections and those before
-        it."""
+        """SHA-256 over the settings that a stage's product depends on: its own and all earlier stages'."""
         reads = {"dns": ("seed", "flow", "initial", "forcing", "time", "spin_up", "tracers"),
                  "train-kernel": ("kernel",), "train": ("model", "training"), "simulate": ("simulation",)}
         settings = asdict(self)

@@ -1,8 +1,8 @@
-"""Whether the sections of a scene fit together: settings that are each allowed but make no sense side by
-side.
+"""Whether the sections of a scene fit together: values that are allowed, but not side by side.
 
 Each function yields the problems of one subject in words: what was given, why it cannot be, and what to do.
-They run when a scene is made, before any work. """
+They run when a scene is made, before any work.
+"""
 
 from __future__ import annotations
 
@@ -94,8 +94,7 @@ def section_problems(scene: Scene) -> Iterator[str]:
 
 
 def support_problems(scene: Scene) -> Iterator[str]:
-    """A particle must not see another one and its periodic image: support and skin stay below half the
-    cube."""
+    """A particle must not see another one and its image: support and skin stay below half the cube."""
     if scene.kernel and scene.tracers:
         skin = scene.simulation.skin if scene.simulation else 0.0
         reach = scene.kernel.support(scene.tracers.particles) * (1 + skin)

@@ -3,7 +3,8 @@
 Every key of a scene is declared once, beside the dataclass field that holds it, by one of the functions
 `number`, `integer`, `integers`, `choice` and `text`. The declaration carries a line on what the key means,
 which values it accepts, and its default; the reader, the error messages and the written scene all use that
-one declaration. """
+one declaration.
+"""
 
 import dataclasses
 import json
@@ -25,8 +26,7 @@ class SceneError(ValueError):
 
 @dataclass(frozen=True)
 class Bounds:
-    """The interval a number must lie in; a bound is open (`above`, `below`) or closed (`at_least`,
-    `at_most`)."""
+    """The interval a number must lie in, open (`above`, `below`) or closed (`at_least`, `at_most`)."""
 
     above: float = -math.inf
     at_least: float = -math.inf
@@ -162,8 +162,7 @@ def section(kind: type, default: Any = MISSING) -> Any:
 
 
 def quoted(value: Any) -> str:
-    """The value as TOML writes it: strings and keys in double quotes, tuples as lists, floats to full
-    precision."""
+    """The value as TOML writes it: strings in double quotes, tuples as lists, floats to full precision."""
     if isinstance(value, dict):
         return "{" + ", ".join(f"{key} = {quoted(entry)}" for key, entry in value.items()) + "}"
     if isinstance(value, (list, tuple)):

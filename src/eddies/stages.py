@@ -1,5 +1,4 @@
-"""Runs the stages of a scene in a run directory: what is needed first, what is done already, how long each
-took."""
+"""Runs the stages of a scene in a run directory, skips what is done, and keeps how long each took."""
 
 import json
 import logging
@@ -50,8 +49,7 @@ def run_stages(stages: Sequence[str], scene: Scene, comm, directory: Path, resum
 
 
 def check_inputs(stages: Sequence[str], scene: Scene, comm, directory: Path) -> None:
-    """Refuse stages that the scene does not have, or whose inputs are missing; warn of inputs of another
-    scene."""
+    """Refuse stages that the scene lacks or whose inputs are missing; warn of inputs of another scene."""
     for stage in stages:
         if stage not in scene.stages:
             section = {"train-kernel": "kernel", "train": "model", "simulate": "simulation"}[stage]

@@ -13,7 +13,8 @@ from mpi_tools.launch import local_cores
 
 CHECKOUT = Path(__file__).parents[2]
 SCRIPTS = sorted([*CHECKOUT.glob("jobs/*.sh"), *CHECKOUT.glob("mpi_tools/*.sh"), CHECKOUT / ".ci/run"])
-SCHEDULERS = {"slurm": "#SBATCH --signal=USR1@", "pbs": "--signal=USR1", "lsf": "#BSUB -wa USR1", "flux": "--signal=USR1@"}
+SCHEDULERS = {"slurm": "#SBATCH --signal=USR1@", "pbs": "--signal=USR1 ", "lsf": "#BSUB -wa USR1",
+              "flux": "--signal=USR1@"}
 
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.name)
@@ -39,7 +40,7 @@ def checkout(tmp_path):
     shutil.copy(CHECKOUT / "mpi_tools/launch.py", tmp_path / "mpi_tools")
     for name, text in {"mpi_tools/bootstrap.sh": "true", "bin/mpirun": 'echo "mpirun $*"; shift 2; "$@"',
                        "bin/srun": '"$@"', "bin/scontrol": 'echo "scontrol $*"',
-                       ".venv/bin/eddies": 'echo "eddies $*"; echo "threads $OMP_NUM_THREADS"; exit ${ENDS_WITH:-0}',
+                       ".venv/bin/eddies": 'echo "eddies $*; threads $OMP_NUM_THREADS"; exit ${ENDS_WITH:-0}',
                        ".venv/bin/python": f'exec {sys.executable} "$@"'}.items():
         path = tmp_path / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -60,12 +61,13 @@ def test_local_runs_on_the_cores_or_fewer(checkout, asked, ranks):
     result = run(checkout, "local.sh", **({"EDDIES_RANKS": asked} if asked else {}))
     assert result.returncode == 0, result.stderr
     assert f"mpirun -n {ranks} " in result.stdout
-    assert "eddies run hit-small --resume\nthreads 1\n" in result.stdout
+    assert "eddies run hit-small --resume; threads 1\n" in result.stdout
 
 
 def test_local_passes_scene_and_options_on(checkout):
-    assert "eddies run abc.toml --resume --set seed=2\n" in run(checkout, "local.sh", "abc.toml", "--set", "seed=2").stdout
-    assert "eddies run hit-small --resume --set seed=2\n" in run(checkout, "local.sh", "--set", "seed=2").stdout
+    for given, scene in ((["abc.toml"], "abc.toml"), ([], "hit-small")):
+        result = run(checkout, "local.sh", *given, "--set", "seed=2")
+        assert f"eddies run {scene} --resume --set seed=2; " in result.stdout
 
 
 @pytest.mark.parametrize("asked", ["0", "-2", "two"])
@@ -77,8 +79,8 @@ def test_local_refuses_a_wrong_number_of_ranks(checkout, asked):
 
 @pytest.mark.parametrize("status, requeued", [("0", False), ("2", False), ("75", True)])
 def test_batch_job_is_requeued_after_a_checkpoint(checkout, status, requeued):
-    result = run(checkout, "slurm.sh", SLURM_JOB_ID="17", ENDS_WITH=status, EDDIES_SCENE="hit", EDDIES_OUTPUT="there",
-                 OMP_NUM_THREADS="3")
+    result = run(checkout, "slurm.sh", SLURM_JOB_ID="17", ENDS_WITH=status, EDDIES_SCENE="hit",
+                 EDDIES_OUTPUT="there", OMP_NUM_THREADS="3")
     assert result.returncode == int(status)
-    assert "eddies run hit --resume --output there\nthreads 3\n" in result.stdout
+    assert "eddies run hit --resume --output there; threads 3\n" in result.stdout
     assert ("scontrol requeue 17" in result.stdout) == requeued

@@ -11,6 +11,13 @@ from mpi_tools import launch
 CHECKOUT = Path(__file__).parents[2]
 
 
+def launched(ranks, *python_arguments, cwd=None):
+    """A finished Python on so many ranks."""
+    launch_line = [sys.executable, CHECKOUT / "mpi_tools/launch.py", "-n", str(ranks), "--"]
+    return subprocess.run([*launch_line, sys.executable, *python_arguments], cwd=cwd, timeout=120,
+                          capture_output=True, text=True)
+
+
 def test_ranks_are_the_cores_or_fewer(monkeypatch):
     monkeypatch.setattr(launch, "local_cores", lambda: 4)
     for asked, ranks in {"": 4, "3": 3, "9": 4}.items():
@@ -41,14 +48,11 @@ def test_environment_of_the_user_wins(monkeypatch):
 
 
 def test_exit_code_is_that_of_the_ranks():
-    line = [sys.executable, CHECKOUT / "mpi_tools/launch.py", "-n", "2", "--", sys.executable, "-c", "raise SystemExit(75)"]
-    assert subprocess.run(line, capture_output=True, timeout=60).returncode == 75
+    assert launched(2, "-c", "raise SystemExit(75)").returncode == 75
 
 
 def test_doctor_finds_nothing(tmp_path):
-    line = [sys.executable, CHECKOUT / "mpi_tools/launch.py", "-n", "3", "--", sys.executable,
-            CHECKOUT / "mpi_tools/doctor.py"]
-    result = subprocess.run(line, capture_output=True, text=True, timeout=120, cwd=tmp_path)
+    result = launched(3, CHECKOUT / "mpi_tools/doctor.py", cwd=tmp_path)
     assert result.returncode == 0, result.stdout + result.stderr
     assert all(f"rank {rank} of 3 on" in result.stdout for rank in range(3))
     assert "mpio" in result.stdout and "all is well" in result.stdout
@@ -59,7 +63,6 @@ def test_doctor_names_what_is_missing(tmp_path):
     (tmp_path / "pyfftw.py").write_text("raise ImportError('made up')")
     code = (f"import sys, runpy; sys.path.insert(0, {str(tmp_path)!r}); "
             f"runpy.run_path({str(CHECKOUT / 'mpi_tools/doctor.py')!r}, run_name='__main__')")
-    line = [sys.executable, CHECKOUT / "mpi_tools/launch.py", "-n", "2", "--", sys.executable, "-c", code]
-    result = subprocess.run(line, capture_output=True, text=True, timeout=120, cwd=tmp_path)
+    result = launched(2, "-c", code, cwd=tmp_path)
     assert result.returncode == 2
     assert "rank 1: pyfftw cannot be imported (made up)" in result.stdout

@@ -16,8 +16,9 @@ def run(folder, body, *options):
     (folder / "test_made_up.py").write_text(HEAD + body)
     (folder / "pytest.ini").touch()  # a root folder of its own
     result = subprocess.run(
-        [sys.executable, "-m", "pytest", "-p", "mpi_tools.pytest_mpi", "-v", "--color=no", *options], cwd=folder,
-        capture_output=True, text=True, timeout=120, env=os.environ | {"PYTHONPATH": str(CHECKOUT)})
+        [sys.executable, "-m", "pytest", "-p", "mpi_tools.pytest_mpi", "-v", "--color=no", *options],
+        cwd=folder, env=os.environ | {"PYTHONPATH": str(CHECKOUT)}, timeout=120,
+        capture_output=True, text=True)
     return result.stdout, result.stdout.splitlines()[-1]
 
 
@@ -88,7 +89,7 @@ def test_after(comm):
 """)
     assert " 2 failed, 1 passed" in closing, output
     assert "rank 1 of 2 did not finish\nnot at its end after the time limit of 2 s" in output
-    assert "test_made_up.py\", line 9 in test_hangs" in output
+    assert "test_made_up.py\", line 10 in test_hangs" in output
     assert "died; output of the run" in output
 
 

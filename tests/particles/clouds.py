@@ -6,6 +6,7 @@ import numpy as np
 import torch
 
 from eddies.parallel.migration import migrate
+from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.pair_forces import PairModel
@@ -15,7 +16,13 @@ from eddies.particles.reference_scales import ReferenceScales
 
 LENGTH = 2 * math.pi
 SCALES = ReferenceScales(
-    length=1.2, spacing=0.6, velocity=0.9, density_mean=1.0, density=0.02, acceleration=1.7, density_rate=0.05,
+    length=1.2,
+    spacing=0.6,
+    velocity=0.9,
+    density_mean=1.0,
+    density=0.02,
+    acceleration=1.7,
+    density_rate=0.05,
     sound_speed=11.0,
 )
 CUTOFF = 1.5
@@ -24,7 +31,7 @@ CLOUDS = {
     "cluster across a corner": lambda random, n: random.normal(0, 0.4, (n, 3)) % LENGTH,
     "void": lambda random, n: random.uniform(0, LENGTH, (n, 3)) * [1, 1, 0.3],
     "uneven": lambda random, n: LENGTH * random.uniform(0, 1, (n, 3)) ** 4,
-    "lattice": lambda random, n: np.stack(np.unravel_index(np.arange(n), (8, 8, -(-n // 64))), 1) * (LENGTH / 8),
+    "lattice": lambda random, n: np.argwhere(np.ones((8, 8, n // 64))) * (LENGTH / 8),
     "coincident": lambda random, n: np.full((n, 3), 6.28),
 }
 
@@ -47,11 +54,11 @@ def model(**choices):
     return PairModel(SCALES, CUTOFF, neighbors=12.0, **{"hidden": (6, 5), **choices})
 
 
-def rates(model, position, velocity, density, cutoff=None):
+def rates(model, position, velocity, density, cutoff=None, dtype=None):
     """The model's rates for all particles of a periodic box."""
     listed = NeighborList(PeriodicBox(LENGTH), cutoff or model.cutoff, 0.3)
     listed.build(position, position, exclude_self=True)
-    return model(listed.pairs(position, position), {"velocity": velocity, "density": density})
+    return model(listed.pairs(position, position, dtype=dtype), {"velocity": velocity, "density": density})
 
 
 def distributed(comm, position, velocity, density, planes=24):
@@ -62,3 +69,10 @@ def distributed(comm, position, velocity, density, planes=24):
     columns["density"] = density.numpy()
     columns = {name: column[own] for name, column in columns.items()}
     return slab, ParticleSet.from_numpy(migrate(slab, columns))
+
+
+def by_id(comm, particles, column, total):
+    """A column of all particles, in order of id, on every rank."""
+    whole = np.zeros((total, *column.shape[1:]))
+    whole[particles.id.numpy()] = column.detach().numpy()
+    return torch.from_numpy(global_sum(comm, whole))

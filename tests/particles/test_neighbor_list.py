@@ -125,7 +125,7 @@ def test_displacements_are_differentiable_and_nearest():
 def test_single_precision_displacements_lose_nothing_to_the_box():
     position = cloud(count=100)
     neighbors = listed(position, position, 1.0)
-    single, double = (neighbors.pairs(position, position, dtype=dtype) for dtype in (torch.float32, torch.float64))
+    single, double = (neighbors.pairs(position, position, dtype=t) for t in (torch.float32, torch.float64))
     assert single.displacement.dtype == single.distance.dtype == torch.float32
     assert torch.equal(single.displacement, double.displacement.to(torch.float32))
 

@@ -21,7 +21,8 @@ def test_wrapped_positions_lie_in_the_half_open_box():
 
 
 def test_wrapping_leaves_an_axis_that_is_not_periodic():
-    assert PeriodicBox(1.0, periodic_z=False).wrap(torch.tensor([[1.5, 1.5, 1.5]])).tolist() == [[0.5, 0.5, 1.5]]
+    wrapped = PeriodicBox(1.0, periodic_z=False).wrap(torch.tensor([[1.5, 1.5, 1.5]]))
+    assert wrapped.tolist() == [[0.5, 0.5, 1.5]]
 
 
 def test_norm_has_zero_gradient_at_zero():

@@ -22,13 +22,14 @@ KERNELS = {
     "learned, sigmoid": lambda: network("sigmoid").table(),
 }
 kernels = pytest.mark.parametrize("kernel", [make() for make in KERNELS.values()], ids=list(KERNELS))
-smooth = pytest.mark.parametrize("kernel", [KERNELS[name]() for name in list(KERNELS)[:4]], ids=list(KERNELS)[:4])
+SMOOTH = [name for name in KERNELS if "sigmoid" not in name]
+smooth = pytest.mark.parametrize("kernel", [KERNELS[name]() for name in SMOOTH], ids=SMOOTH)
 
 
 @kernels
 def test_unit_integral(kernel):
     r = torch.linspace(0, SUPPORT, 40001, dtype=torch.float64)[:-1]
-    by_hand = float(torch.trapezoid(4 * torch.pi * r**2 * kernel.value(r), r))
+    by_hand = float(torch.trapezoid(4 * torch.pi * r**2 * kernel.value(r), r).detach())
     # The sigmoid ends with a jump, of which the last interval is missed.
     assert by_hand == pytest.approx(1, abs=1e-3 if kernel.value(r[-1]) > 0.01 else 1e-7)
     assert float(integral(kernel)) == pytest.approx(1, abs=1e-13)
@@ -50,7 +51,7 @@ def test_derivative_is_that_of_the_value(kernel):
 @smooth
 def test_no_slope_at_the_centre_and_at_the_edge(kernel):
     ends = torch.tensor([0.0, SUPPORT * (1 - 1e-9)], dtype=torch.float64)
-    assert torch.allclose(kernel.derivative(ends) * SUPPORT**4, torch.zeros(2, dtype=torch.float64), atol=1e-6)
+    assert (kernel.derivative(ends) * SUPPORT**4).abs().max() < 1e-6
 
 
 @kernels

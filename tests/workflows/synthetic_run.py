@@ -100,13 +100,14 @@ def write_kernel(comm, directory, cells=32):
             slices[f"{quantity}_{name}"] = values + error * values.std() * noise
     step = np.arange(0, 200, 10)
     history = {"step": step, "loss_learned": np.exp(-step / 60),
+               "velocity_learned": 0.4 * np.exp(-step / 60), "gradient_learned": 0.6 * np.exp(-step / 60),
                "loss_learned_no_gradient": np.exp(-step / 40)}
     tables = {"kernels": kernels, "slices": slices, "errors": errors, "history": history}
     save_weights(comm, directory / "kernel.h5", "kernel", {"support": 0.9}, {"weight": np.ones(3)},
                  provenance(seconds=3.0), tables)
 
 
-def write_model(comm, directory):
+def write_model(comm, directory, closure="poisson"):
     rng = np.random.default_rng(3)
     step, delay = np.arange(0, 300, 10), np.linspace(-0.6, 0.6, 13)
     decay = np.exp(-step / 80)
@@ -116,14 +117,16 @@ def write_model(comm, directory):
     history |= {"step": step, "seconds": step * 0.02,
                 "validation_error": np.where(step % 50 == 0, 0.25 + 0.7 * decay, np.nan)}
     a_priori = {"delay": delay, "acceleration_error": 0.24 + 0.03 * np.maximum(delay, 0),
-                "density_rate_error": 0.6 + 0.05 * delay, "pressure_gradient_error": 0.24 + 0 * delay,
-                "closure_acceleration_error": np.full(delay.size, np.nan)}
+                "true_density_acceleration_error": 0.22 + 0.02 * np.maximum(delay, 0),
+                "pressure_gradient_error": 0.24 + 0 * delay}
     truth = rng.standard_t(5, size=(800, 3))
     predicted = 0.95 * truth + 0.2 * rng.normal(size=truth.shape)
     tables = {"history": history, "a_priori": a_priori,
-              "acceleration_sample": {"truth": truth, "predicted": predicted},
-              "density_rate_sample": {"truth": truth[:, 0], "predicted": 0.8 * truth[:, 0]}}
-    save_weights(comm, directory / "model.h5", "model", {"basis": "corrected", "closure": "poisson"},
+              "acceleration_sample": {"truth": truth, "predicted": predicted}}
+    if closure != "poisson":
+        tables["a_priori"]["density_rate_error"] = 0.6 + 0.05 * delay
+        tables["density_rate_sample"] = {"truth": truth[:, 0], "predicted": 0.8 * truth[:, 0]}
+    save_weights(comm, directory / "model.h5", "model", {"basis": "corrected", "closure": closure},
                  {"weight": np.ones(3)}, provenance(seconds=7.0), tables)
 
 

@@ -65,6 +65,7 @@ def section(run: Rollout) -> Section:
     _add_particles(shown, run, common)
     _add_invariants(shown, run, common)
     _add_spectra(shown, run, last)
+    shown.illustrations.sort(key=lambda illustration: illustration.name)
     return shown
 
 
@@ -87,7 +88,7 @@ def _add_planes(shown: Section, run: Rollout, last: float) -> None:
     common = CommonFrames.of(model, truth, _just_after(last))
     planes = [_plane_of_first_component(model, truth, common, index) for index in common.spread(4)]
     shown.add_figure(
-        "figure-4-velocity", "Velocity over time",
+        "figure-4-velocity", "Velocity over time (the paper's Fig. 4)",
         png(figures_rollout.velocity_planes(planes, run.turnover, TRUTH_NAMES[name])),
         f"u_x in the plane z = π: {TRUTH_NAMES[name]} above, the model through the learned kernel below. "
         f"Relative difference in the last plane: {normalized_l2(planes[-1].model, planes[-1].truth):.3f}.")
@@ -96,7 +97,7 @@ def _add_planes(shown: Section, run: Rollout, last: float) -> None:
     energy = Pair(fields.time, _magnitude(fields.model) ** 2 / 2, _magnitude(fields.truth) ** 2 / 2)
     ratios = [pair.model.mean() / pair.truth.mean() for pair in (rotation, energy)]
     shown.add_figure(
-        "figure-5-vorticity-energy", "Vorticity and kinetic energy",
+        "figure-5-vorticity-energy", "Vorticity and kinetic energy (the paper's Fig. 5)",
         png(figures_rollout.vorticity_and_energy(rotation, energy, TRUTH_NAMES[name])),
         f"Plane z = π at t = {fields.time / run.turnover:.2f} T. Mean over the plane, model / truth: "
         f"vorticity {ratios[0]:.2f}, energy {ratios[1]:.2f}.")
@@ -117,7 +118,7 @@ def _add_particles(shown: Section, run: Rollout, common: CommonFrames) -> None:
     pairs = {column: [comparison.particle_pair(run.model, run.truth, common, index, column)
                       for index in common.spread(3)] for column in comparison.EDGES}
     shown.add_figure(
-        "figure-6-pdfs", "PDFs of velocity and acceleration",
+        "figure-6-pdfs", "PDFs of velocity and acceleration (the paper's Fig. 6)",
         png(figures_statistics.particle_pdfs(pairs, run.turnover)),
         "All components, centred and divided by the truth's standard deviation at the time; values beyond "
         f"the axis count in its last bins. Last time: KL {final['velocity_kl']:.2g} (velocity), "
@@ -139,7 +140,7 @@ def _add_invariants(shown: Section, run: Rollout, common: CommonFrames) -> None:
     statistics = comparison.invariant_statistics(run.model, run.truth, common)
     shown.metrics.append(Metric("qr_kl", "KL divergence of the Q–R joint PDF", statistics.divergence))
     shown.add_figure(
-        "figure-7-invariants", "Invariants Q and R of the velocity gradient",
+        "figure-7-invariants", "Invariants Q and R of the velocity gradient (the paper's Fig. 7)",
         png(figures_statistics.invariant_plane(statistics)),
         f"Joint PDF at t = {common.times[-1] / run.turnover:.2f} T (isolines half a decade apart, smoothed "
         f"over one bin for drawing; KL {statistics.divergence:.2g} from raw bins) and mean motion over all "
@@ -167,7 +168,8 @@ def _add_spectra(shown: Section, run: Rollout, last: float) -> None:
     ]
     start = float(run.attributes["start_time"])
     figure = figures_rollout.energy_spectra(series, run.eulerian, start, run.turnover, cutoff)
-    shown.add_figure("figure-8-spectra", "Energy spectra over time", png(figure), caption)
+    title = "Energy spectra over time (the paper's Fig. 8)"
+    shown.add_figure("figure-8-spectra", title, png(figure), caption)
 
 
 def _plane_of_first_component(model: Frames, truth: Frames, common: CommonFrames, index: int) -> Pair:

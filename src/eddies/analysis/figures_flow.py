@@ -83,8 +83,8 @@ def spectra(
     filter.
 
     Arrays (shells,); `filtered` None for a run without tracers. `scales`: dissipation_rate,
-    kolmogorov_length, and length, the filter width, where there is a filter. Without viscosity nothing is
-    compensated.
+    kolmogorov_length, and length, the filter width, where there is a filter. Without viscosity, or with three
+    shells or fewer, nothing is compensated.
     """
     inside = (wavenumber >= 1) & (energy > 1e-12 * energy.max())
     k, spectrum = wavenumber[inside], energy[inside]

@@ -6,8 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from eddies.analysis.figures import (
-    DNS, MODEL, SECOND, SIGNED, THIRD, colour_bar, largest, legend_below, letter, panels, png, show_plane,
-    styled,
+    DNS, FOURTH, MODEL, SECOND, SIGNED, THIRD, TRUTH, colour_bar, largest, letter, panels, png, show_plane, styled,
 )
 from eddies.analysis.page import Metric, Section
 
@@ -17,6 +16,8 @@ KERNELS = {  # name in the files: label, colour, line style
     "cubic_spline": ("cubic spline", DNS, "-."),
     "wendland": ("Wendland C$^2$", SECOND, ":"),
 }
+
+LOSSES = {"loss": DNS, "velocity": TRUTH, "gradient": FOURTH, "normalization": SECOND}
 
 
 @styled
@@ -60,13 +61,17 @@ def reconstructed_planes(slices: Mapping[str, np.ndarray], errors: Mapping[str, 
 
 @styled
 def training_history(history: Mapping[str, np.ndarray]) -> Figure:
-    """Every positive column of the kernels' training over the step, on a logarithmic axis."""
+    """Losses of both trained kernels over the step, on a logarithmic axis; columns LOSS_KERNEL."""
     figure, axes = panels(1, 1, (7.5, 3.2))
-    for column, values in history.items():
-        if column != "step" and np.any(np.asarray(values) > 0):
-            axes[0, 0].semilogy(history["step"], values, label=column.replace("_", " "), linewidth=1.3)
+    for name in ("learned", "learned_no_gradient"):
+        kernel, _, style = KERNELS[name]
+        for loss, colour in LOSSES.items():
+            values = history.get(f"{loss}_{name}")
+            if values is not None and np.any(values > 0):
+                axes[0, 0].semilogy(history["step"], values, color=colour, linestyle=style, linewidth=1.2,
+                                    label=f"{'total' if loss == 'loss' else loss}, {kernel}")
     axes[0, 0].set(xlabel="training step", ylabel="loss")
-    legend_below(axes[0, 0], 3)
+    axes[0, 0].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return figure
 
 
@@ -93,10 +98,11 @@ def section(support: float, kernels: Mapping[str, np.ndarray], slices: Mapping[s
     shown = Section("kernel", "Smoothing kernel", "Errors: normalised L2 over a whole unseen field.",
                     metrics=metrics, main=("velocity_error", "gradient_error"))
     value = shown.value
-    shown.add_figure("figure-1-kernels", "Kernels and their derivatives", png(shapes(kernels)),
-                     f"Support h = {support:.3g}; the learned kernel integrates to {value('integral'):.6f}.")
     shown.add_figure(
-        "figure-2-reconstruction", "Fields reconstructed from particles",
+        "figure-1-kernels", "Kernels and their derivatives (the paper's Fig. 1)", png(shapes(kernels)),
+        f"Support h = {support:.3g}; the learned kernel integrates to {value('integral'):.6f}.")
+    shown.add_figure(
+        "figure-2-reconstruction", "Fields reconstructed from particles (the paper's Fig. 2)",
         png(reconstructed_planes(slices, errors)),
         "Plane z = π of an unseen frame. Numbers in titles: normalised error over the whole field; "
         f"velocity {value('velocity_error'):.3f}, gradient {value('gradient_error'):.3f} when learned.")

@@ -13,9 +13,9 @@ from eddies.analysis.page import Metric, Section
 from eddies.analysis.pdfs import bin_edges, bin_probabilities, gaussian, kl_divergence, pdf, standardized
 
 ERRORS = (  # column of the table, label, colour, line style, marker
-    ("acceleration_error", "model, acceleration", MODEL, "-", "o"),
-    ("closure_acceleration_error", "model, density from closure", FOURTH, "-", "s"),
-    ("density_rate_error", "model, density rate", SECOND, "-", "^"),
+    ("acceleration_error", "model", MODEL, "-", "o"),
+    ("true_density_acceleration_error", "model given the true density", FOURTH, "-", "s"),
+    ("density_rate_error", "density rate of the model", SECOND, "-", "^"),
     ("pressure_gradient_error", "exact filtered pressure gradient", DNS, "--", None),
 )
 LOSSES = (
@@ -26,10 +26,11 @@ LOSSES = (
 EDGES = bin_edges(8, 65)  # of the PDFs, in standard deviations of the truth
 METRICS = {  # key in the report: column of the table, label
     "acceleration_error": ("acceleration_error", "a-priori acceleration error"),
+    "true_density_acceleration_error": (
+        "true_density_acceleration_error", "acceleration error given the true density"),
     "density_rate_error": ("density_rate_error", "a-priori density rate error"),
     "filtered_pressure_gradient_error": (
         "pressure_gradient_error", "error of the exact filtered pressure gradient"),
-    "closure_acceleration_error": ("closure_acceleration_error", "acceleration error, closure's density"),
 }
 
 
@@ -82,10 +83,10 @@ def _errors_panel(axis: Axes, table: Mapping[str, np.ndarray]) -> None:
         axis.annotate("training", (delay.min(), 0.01), xycoords=("data", "axes fraction"), fontsize=9,
                       color="#5a5a5a", va="bottom")
     for column, label, colour, style, marker in ERRORS:
-        if np.isfinite(table[column]).any():
+        if column in table:
             axis.plot(delay, table[column], color=colour, linestyle=style, marker=marker, markersize=4,
                       label=label)
-    top = max(1.1, 1.05 * max(np.nanmax(table[c]) for c, *_ in ERRORS if np.isfinite(table[c]).any()))
+    top = max(1.1, *(1.05 * table[column].max() for column, *_ in ERRORS if column in table))
     axis.set(title="A-priori error", xlabel="delay after the training window", ylabel="normalised L2 error",
              ylim=(0, top))
     legend_below(axis, 1)
@@ -111,8 +112,8 @@ def section(description: Mapping[str, object], table: Mapping[str, np.ndarray],
     """The pair-force model: a-priori figures and the errors at the last frame, from the tables."""
     last = int(np.argmax(table["delay"]))
     at = {name: float(values[last]) for name, values in table.items()}
-    missing = f"the closure {description['closure']} does not have it"
-    metrics = [Metric(key, label, at[column], missing) for key, (column, label) in METRICS.items()]
+    missing = f"closure {description['closure']} has none"
+    metrics = [Metric(key, label, at.get(column), missing) for key, (column, label) in METRICS.items()]
     metrics.append(Metric("delay", "delay of these errors after the training window", at["delay"]))
     text = (f"Basis {description['basis']}, closure {description['closure']}. A-priori: the model sees the "
             "true particles of a frame. Numbers are of the last frame, "
@@ -123,7 +124,8 @@ def section(description: Mapping[str, object], table: Mapping[str, np.ndarray],
     divergence = kl_divergence(bin_probabilities(standardized(truth), EDGES),
                                bin_probabilities(standardized(predicted, truth), EDGES))
     shown.add_figure(
-        "figure-3-a-priori", "A-priori errors and PDFs", png(a_priori(table, acceleration, density_rate)),
+        "figure-3-a-priori", "A-priori errors and PDFs (the paper's Fig. 3)",
+        png(a_priori(table, acceleration, density_rate)),
         f"At the last frame the acceleration error is {at['acceleration_error']:.3f}; that of the exact "
         f"filtered pressure gradient alone is {at['pressure_gradient_error']:.3f}, that of no model 1. KL "
         f"divergence of the acceleration PDF {divergence:.2g}. Grey: frames of the training window.")

@@ -84,7 +84,7 @@ def _joint_panel(axis: Axes, bins: InvariantBins, density: np.ndarray, levels: n
     """Filled isolines of the inner cells: the outer ones also hold what lies beyond."""
     inner = np.s_[1:-1]
     third, second = _centres(bins.third)[inner], _centres(bins.second)[inner]
-    shown = np.ma.masked_less_equal(density[inner, inner], 0)
+    shown = np.maximum(density[inner, inner], 1e-3 * levels[0])  # an empty cell has no logarithm
     filled = axis.contourf(third, second, shown, levels, cmap="YlGnBu", norm=LogNorm(levels[0], levels[-1]),
                            extend="max")
     axis.contour(third, second, shown, levels, colors="#303030", linewidths=0.7)
@@ -94,20 +94,23 @@ def _joint_panel(axis: Axes, bins: InvariantBins, density: np.ndarray, levels: n
 def _flow_row(figure: Figure, row: Sequence[Axes], statistics: InvariantStatistics) -> None:
     flows = (statistics.truth_flow, statistics.model_flow)
     speeds = [np.hypot(*flow.mean(FEWEST)) for flow in flows]
-    known = np.concatenate([speed[np.isfinite(speed)] for speed in speeds])
+    known = np.concatenate([speed[speed > 0] for speed in speeds])
     norm = LogNorm(*np.quantile(known, (0.02, 0.98))) if known.size else None
     for axis, flow, name in zip(row, flows, ("true tracers", "model")):
-        arrows = _arrows(axis, flow, norm)
+        arrows = _arrows(axis, flow, norm, _limits(statistics.bins))
         axis.set_title(f"mean motion, {name}")
     colour_bar(figure, arrows, row, r"$|(dR/dt,\ dQ/dt)|$, normalised")
 
 
-def _arrows(axis: Axes, flow: ConditionalVelocity, norm: LogNorm | None):
-    second_rate, third_rate = flow.mean(FEWEST)
+def _arrows(axis: Axes, flow: ConditionalVelocity, norm: LogNorm | None, limits: tuple[float, float]):
+    """Arrows of one length in the cells that lie well inside the limits, so that the frame cuts none."""
+    third, second = _centres(flow.bins.third), _centres(flow.bins.second)
+    inside = np.ix_(np.abs(second) < 0.97 * limits[1], np.abs(third) < 0.97 * limits[0])
+    second_rate, third_rate = (rate[inside] for rate in flow.mean(FEWEST))
     across, up = third_rate / np.ptp(flow.bins.third), second_rate / np.ptp(flow.bins.second)
     length = np.hypot(across, up)
     length[length == 0] = np.nan
-    return axis.quiver(_centres(flow.bins.third), _centres(flow.bins.second), across / length, up / length,
+    return axis.quiver(third[inside[1][0]], second[inside[0][:, 0]], across / length, up / length,
                        np.hypot(second_rate, third_rate), norm=norm, cmap="cividis", pivot="middle", scale=20,
                        width=0.006, headwidth=4)
 
@@ -117,7 +120,13 @@ def _plane_axes(axis: Axes, bins: InvariantBins) -> None:
     axis.plot(third, vieillefosse_line(third), color=MODEL, linewidth=1.3)
     axis.axhline(0, color=GUIDE, linewidth=0.6, zorder=0)
     axis.axvline(0, color=GUIDE, linewidth=0.6, zorder=0)
-    axis.set(xlim=_centres(bins.third)[[1, -2]], ylim=_centres(bins.second)[[1, -2]])
+    across, up = _limits(bins)
+    axis.set(xlim=(-across, across), ylim=(-up, up))
+
+
+def _limits(bins: InvariantBins) -> tuple[float, float]:
+    """Largest |R| and |Q| shown: the centres of the last cells but one."""
+    return float(_centres(bins.third)[-2]), float(_centres(bins.second)[-2])
 
 
 def _centres(edges: np.ndarray) -> np.ndarray:

@@ -19,11 +19,11 @@ h2{font-size:1.25rem;margin:0 0 .6rem}h3{font-size:1rem;margin:1.2rem 0 .4rem}
 .soft{color:var(--soft)}
 nav{display:flex;flex-wrap:wrap;gap:.3rem 1.1rem;margin-top:.6rem}a{color:var(--accent);text-decoration:none}
 section{background:#fff;border:1px solid var(--line);border-radius:8px;padding:1.1rem;margin:0 0 1.1rem}
-.tiles{display:grid;grid-template-columns:repeat(auto-fit,minmax(145px,1fr));gap:.6rem}
-.tile{border:1px solid var(--line);border-radius:6px;padding:.55rem .7rem}
+.tiles{display:flex;flex-wrap:wrap;gap:.6rem}
+.tile{flex:1 1 150px;border:1px solid var(--line);border-radius:6px;padding:.55rem .7rem}
 .tile b{display:block;font-size:1.3rem;font-variant-numeric:tabular-nums}
 .tile span{font-size:.82rem;color:var(--soft)}
-figure{margin:1.3rem 0}img{display:block;max-width:100%;height:auto;margin:0 auto}
+figure{margin:1.3rem 0}img{display:block;max-width:100%;min-width:560px;height:auto;margin:0 auto}
 figcaption{font-size:.9rem;color:var(--soft);margin-top:.4rem}figcaption b{color:var(--ink)}
 .wide{overflow-x:auto}
 table{border-collapse:collapse;font-size:.92rem;width:100%}
@@ -145,8 +145,11 @@ def _section(section: Section) -> str:
 
 
 def _illustration(illustration: Illustration) -> str:
+    # Bytes 16 to 19 of a PNG are its width. At 96 of 150 dots an inch all figures have letters of one size.
+    width = int.from_bytes(illustration.image[16:20], "big") * 96 // 150
     data = base64.b64encode(illustration.image).decode()
-    return (f'<figure><img alt="{_text(illustration.title)}" src="data:image/png;base64,{data}">'
+    return (f'<figure><div class="wide"><img alt="{_text(illustration.title)}" width="{width}" '
+            f'src="data:image/png;base64,{data}"></div>'
             f"<figcaption><b>{_text(illustration.title)}.</b> {_text(illustration.caption)}</figcaption>"
             "</figure>")
 

@@ -18,6 +18,7 @@ class PressureSolver:
     """
 
     def __init__(self, decomposition: SlabDecomposition, interpolation: str = "cubic") -> None:
+        self.decomposition = decomposition
         self.grid = SpectralGrid(decomposition)
         self._spline = SplineInterpolation(self.grid, interpolation)
         x, y, z = np.broadcast_arrays(*self.grid.coordinates())

@@ -10,8 +10,7 @@ from eddies.io.hdf5 import append_frame, find_group, growing_dataset, write_attr
 
 
 class FieldWriter:
-    """Adds fields on cells^3 points to /fields/NAME, in float32. Making one and every `append` are
-    collective.
+    """Adds fields on cells^3 points to /fields/NAME in float32. Making one and `append` are collective.
 
     Args:
         file: an open product.
@@ -28,8 +27,7 @@ class FieldWriter:
                            for variable, components in variables.items()}
 
     def append(self, time: float, start_plane: int, variables: Mapping[str, np.ndarray]) -> None:
-        """Add a field: this rank holds planes start_plane, ... of every variable, (components, z, y, x); z
-        may be 0."""
+        """Add a field: this rank holds planes start_plane, ... as (components, z, y, x); z may be 0."""
         append_frame(self._time, np.array(time), ())
         for variable, dataset in self._variables.items():
             append_frame(dataset, variables[variable], (0, start_plane, 0, 0))

@@ -2,7 +2,8 @@
 
 A product is written under a temporary name, marked complete, closed, and only then renamed, so a file under
 its final name is never half written. Writing uses parallel HDF5 when there is more than one rank; reading
-opens the file on every rank by itself. """
+opens the file on every rank by itself.
+"""
 
 import json
 import math
@@ -17,6 +18,7 @@ import numpy as np
 from mpi4py import MPI
 
 from eddies.io.provenance import environment
+from eddies.parallel.broadcast import share_text
 
 CHUNK_BYTES = 2**20
 REMEDIES = {"ground_truth": "dns", "kernel": "train-kernel", "model": "train", "rollout": "simulate"}
@@ -27,15 +29,13 @@ _abandoned: list[h5py.File] = []
 
 
 class ProductError(RuntimeError):
-    """A product is missing, unfinished, damaged or of the wrong kind: the text names the file and what to
-    do."""
+    """A product is missing, unfinished, damaged or of the wrong kind: the text says which and what to do."""
 
 
 @contextmanager
 def create_product(comm: MPI.Comm, path: str | Path, kind: str,
                    provenance: Mapping[str, Any]) -> Iterator[h5py.File]:
-    """Write a product of some kind, all ranks together; the file appears under `path` once the block ends
-    well.
+    """Write a product, all ranks together; the file appears under `path` once the block ends well.
 
     `provenance` (JSON-able: the scene's text, its fingerprint, ...) is stored with the versions of all
     libraries, the number of ranks and the date. An exception inside the block leaves whatever stood under
@@ -48,7 +48,7 @@ def create_product(comm: MPI.Comm, path: str | Path, kind: str,
     partial = path.with_name(path.name + ".partial")
     file = _create(comm, partial)
     origin = json.dumps({**environment(comm.size), **provenance})
-    write_attributes(file, {"kind": kind, "complete": False, "provenance": _from_first_rank(comm, origin)})
+    write_attributes(file, {"kind": kind, "complete": False, "provenance": share_text(comm, origin)})
     try:
         yield file
     except BaseException:
@@ -66,8 +66,7 @@ def create_product(comm: MPI.Comm, path: str | Path, kind: str,
 
 @contextmanager
 def open_product(comm: MPI.Comm, path: str | Path, kind: str | None) -> Iterator[h5py.File]:
-    """Read a complete product of the expected kind (None: any). All ranks call it; if one cannot open it,
-    all raise.
+    """Read a complete product of a kind (None: any); all ranks call it, and if one cannot open it, all raise.
 
     Raises:
         ProductError: no such file, truncated or not HDF5, unfinished, or of another kind.
@@ -89,8 +88,7 @@ def open_product(comm: MPI.Comm, path: str | Path, kind: str | None) -> Iterator
 
 
 def product_fingerprint(path: str | Path) -> str | None:
-    """The scene's fingerprint stored in a complete product; None if there is no such product or it has
-    none."""
+    """The scene's fingerprint stored in a complete product; None if there is none."""
     try:
         with h5py.File(path, "r") as file:
             return read_provenance(file).get("fingerprint") if file.attrs.get("complete", False) else None
@@ -109,6 +107,12 @@ def write_attributes(group: h5py.Group, values: Mapping[str, Any]) -> None:
         group.attrs[name] = value
 
 
+def read_attributes(file: h5py.Group, name: str) -> dict[str, Any]:
+    """The attributes of a group as Python values; ProductError if there is no such group."""
+    values = find_group(file, name).attrs.items()
+    return {key: value.item() if isinstance(value, np.generic) else value for key, value in values}
+
+
 def write_table(file: h5py.Group, name: str, columns: Mapping[str, Any]) -> None:
     """Write small arrays, equal on all ranks, as the datasets of a group; all ranks call it."""
     group = file.create_group(name)
@@ -117,8 +121,7 @@ def write_table(file: h5py.Group, name: str, columns: Mapping[str, Any]) -> None
 
 
 def read_table(file: h5py.Group, name: str) -> dict[str, np.ndarray]:
-    """Read what `write_table` wrote; ProductError names the tables there are if this one is not among
-    them."""
+    """Read what `write_table` wrote; ProductError lists the tables there are if this is none of them."""
     group = find_group(file, name)
     return {column: dataset[()] for column, dataset in group.items() if isinstance(dataset, h5py.Dataset)}
 
@@ -198,15 +201,3 @@ def _open_checked(path: Path, kind: str | None) -> h5py.File:
     if kind not in (None, found):
         raise ProductError(f"{path}: is of kind {found}, expected {kind}: {remedy}")
     raise ProductError(f"{path}: unfinished, its writer was stopped: {remedy}")
-
-
-def _from_first_rank(comm: MPI.Comm, text: str) -> str:
-    """Rank 0's text on every rank: attributes must be equal everywhere, and clocks are not."""
-    if comm.size == 1:
-        return text
-    encoded = np.frombuffer(text.encode(), np.uint8)
-    length = np.array([len(encoded)], np.int64)
-    comm.Bcast(length)
-    content = encoded.copy() if comm.rank == 0 else np.empty(length[0], np.uint8)
-    comm.Bcast(content)
-    return content.tobytes().decode()

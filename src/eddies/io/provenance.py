@@ -14,8 +14,7 @@ LIBRARIES = ("numpy", "mpi4py", "h5py", "pyfftw", "torch")
 
 
 def environment(ranks: int) -> dict[str, object]:
-    """Versions of this package and of the libraries, the commit if the package runs from a checkout, ranks,
-    date."""
+    """Versions of this package and its libraries, the commit in a checkout, number of ranks, date."""
     versions = {"python": platform.python_version(), "hdf5": h5py.version.hdf5_version,
                 "mpi": MPI.Get_library_version().strip("\0 \n").split("\n")[0]}
     for library in LIBRARIES:
@@ -28,8 +27,7 @@ def environment(ranks: int) -> dict[str, object]:
 
 
 def commit() -> str | None:
-    """The git commit of the checkout that this package runs from, or None. Starts no process, which MPI
-    dislikes."""
+    """The git commit of the checkout this package runs from, or None; starts no process (MPI dislikes it)."""
     git = Path(eddies.__file__).parents[2] / ".git"
     try:
         head = (git / "HEAD").read_text().strip()

@@ -1,7 +1,8 @@
 """Particle trajectories in the H5MD 1.1 layout (de Buyl, Colberg & Höfling, Comput. Phys. Commun. 185, 1546).
 
 Row k of every frame belongs to the particle with id k, so a frame needs no sorting to be compared with
-another. """
+another.
+"""
 
 from collections.abc import Mapping
 from functools import cached_property
@@ -39,8 +40,7 @@ class TrajectoryWriter:
                          for column, shape in columns.items()}
 
     def append(self, step: int, time: float, start: int, columns: Mapping[str, np.ndarray]) -> None:
-        """Add a frame: this rank holds rows start, start + 1, ... of every column, (n, ...) in order of id;
-        n may be 0."""
+        """Add a frame: this rank holds rows start, start + 1, ... of every column, by id; maybe none."""
         append_frame(self._step, np.array(step), ())
         append_frame(self._time, np.array(time), ())
         for column, dataset in self._columns.items():

@@ -45,8 +45,7 @@ def load_weights(comm: MPI.Comm, path: str | Path, kind: str) -> tuple[dict[str,
 
 
 def load_tables(path: str | Path) -> dict[str, dict[str, np.ndarray]]:
-    """The tables saved with the weights, by name; sends nothing. ProductError if the file is not a complete
-    product."""
+    """The tables saved with the weights, by name; sends nothing. ProductError as `open_product`."""
     with open_product(MPI.COMM_SELF, path, None) as file:
         return {name: read_table(file, name) for name in file if name != "weights"}
 

@@ -57,9 +57,9 @@ class TrainingFrame:
         """Predicted minus true rates at all owned particles or some of their rows; collective."""
         kept = slice(None) if rows is None else rows
         rates = self.dynamics.rates(self.particles, rows)
-        errors = {"velocity": rates["velocity"] - self.acceleration[kept]}
+        errors = {"velocity": rates["velocity"].to(self.acceleration) - self.acceleration[kept]}
         if "density" in rates:
-            errors["density"] = rates["density"] - self.density_rate[kept]
+            errors["density"] = rates["density"].to(self.density_rate) - self.density_rate[kept]
         return errors
 
 
@@ -147,11 +147,7 @@ class ForceTrainer:
         return frame.volumes
 
     def _divergence_shares(self, frame: TrainingFrame, rows: Tensor, error: Tensor) -> dict[str, Tensor]:
-        """Eq. 14 for acceleration and for the velocity one step ahead, of all components together.
-
-        Each rank holds the whole divergence, so its share is one part in as many as there are ranks; gradients need
-        that factor back, because the share's gradient covers this rank's particles only.
-        """
+        """Eq. 14 for the acceleration and for the velocity a time a_rms/v_rms ahead, components together."""
         shares = {}
         scales, truth = self.model.scales, frame.acceleration[rows]
         if self.weights.acceleration_kl > 0:
@@ -165,7 +161,8 @@ class ForceTrainer:
         with torch.no_grad():
             expected = soft_histogram(self.comm, truth, HISTOGRAM_BINS, HISTOGRAM_REACH)
         found = soft_histogram(self.comm, truth + error, HISTOGRAM_BINS, HISTOGRAM_REACH)
-        return kullback_leibler(expected, found)
+        # Every rank has the whole divergence, so its share is an equal part.
+        return kullback_leibler(expected, found) / self.comm.size
 
     def _rows_within(self, frame: TrainingFrame, corner: np.ndarray, side: float, margin: float) -> Tensor:
         """Rows of the owned particles in the periodic cube of some side at `corner`, widened by a margin all around."""

@@ -19,16 +19,16 @@ def mean_square_share(error: Tensor, scale: float, total: int) -> Tensor:
 
 
 class _GlobalSum(torch.autograd.Function):
-    """Sum over ranks. Every rank holds the whole result and the same loss of it, so the gradient of a rank's
-    contribution is that of the sum."""
+    """Sum over ranks, on every rank. Its adjoint is the same sum: each rank's loss depends on each contribution."""
 
     @staticmethod
     def forward(ctx, values: Tensor, comm) -> Tensor:
+        ctx.comm = comm
         return torch.from_numpy(global_sum(comm, as_numpy(values))).to(values.device)
 
     @staticmethod
     def backward(ctx, gradient: Tensor) -> tuple[Tensor, None]:
-        return gradient, None
+        return torch.from_numpy(global_sum(ctx.comm, as_numpy(gradient))).to(gradient.device), None
 
 
 def soft_histogram(comm, values: Tensor, bins: int, reach: float) -> Tensor:

@@ -61,6 +61,14 @@ class ParticleDynamics:
         if halo_cutoff > 0:
             self.surroundings = Surroundings(decomposition, box_length, list_cutoff, halo_cutoff, skin)
 
+    def forget(self) -> None:
+        """Build halo and list anew at the next occasion.
+
+        A run that does so wherever it writes a checkpoint goes on bit for bit as one that starts from it.
+        """
+        if self.surroundings is not None:
+            self.surroundings.forget()
+
     def settle(
         self, particles: ParticleSet, companions: dict[str, Tensor] | None = None
     ) -> tuple[ParticleSet, dict[str, Tensor]]:
@@ -75,7 +83,7 @@ class ParticleDynamics:
             return replace(particles, position=self.box.wrap(particles.position)), companions
         columns = vars(particles).values()
         recorded = torch.is_grad_enabled() and any(column.requires_grad for column in columns)
-        if not recorded and self.surroundings.outdated(particles):
+        if not recorded and self.surroundings.due(particles):
             prefix = "companion "
             named = {prefix + name: column for name, column in companions.items()}
             columns = self.surroundings.settle({**vars(particles), **named})

@@ -31,7 +31,8 @@ def find_fault(
     speed = torch.linalg.vector_norm(velocity, dim=1)
     deviation = (density - limits.density_mean).abs()
     # Comparisons with NaN are false, so what is asked is whether a particle is sound.
-    sound = (speed <= limits.speed) & (deviation <= limits.density_deviation) & torch.isfinite(position).all(1)
+    sound = (speed <= limits.speed) & (deviation <= limits.density_deviation)
+    sound &= torch.isfinite(position).all(1)
     if bool(sound.all()):
         return None
     row = int(torch.nonzero(~sound)[0])

@@ -62,7 +62,7 @@ def gather_rows(column: Tensor, index: Tensor) -> Tensor:
     """column[index] for a column (n, ...): (m, ...), stored component by component."""
     if column.dim() == 1:
         return column.index_select(0, index)
-    components = column.reshape(len(column), -1).unbind(1)
+    components = column.flatten(1).unbind(1)
     gathered = torch.stack([component.index_select(0, index) for component in components])
     return gathered.T.reshape(len(index), *column.shape[1:])
 

@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.ghosts import exchange_ghosts
 from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.pairs import Pairs
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.smoothing_kernels import SmoothingKernel
-from eddies.particles.surroundings import LocalParticles
+from eddies.particles.surroundings import LocalParticles, Surroundings
 
 
 class GridSolver(Protocol):
     """What the closure needs of a grid: its points, and fields carried between them and the particles."""
 
     points: np.ndarray
+    decomposition: SlabDecomposition
 
     def modes(self, values: np.ndarray) -> np.ndarray: ...
 
@@ -58,6 +61,15 @@ class PoissonClosure:
         self._built = -1
 
     @torch.no_grad()
+    def apply(self, particles: ParticleSet) -> ParticleSet:
+        """The particles with the density of the closure; collective."""
+        decomposition = self.solver.decomposition
+        surroundings = Surroundings(decomposition, decomposition.length, 0.0, self.cutoff, self.skin)
+        surroundings.update(particles)
+        self._built = -1
+        return replace(particles, density=self.density(particles, surroundings.local(particles, set(self.reads))))
+
+    @torch.no_grad()
     def density(self, particles: ParticleSet, local: LocalParticles) -> Tensor:
         """Density (n,) of the owned particles; collective."""
         modes = self._resolved_velocity(particles, local)
@@ -82,6 +94,7 @@ class PoissonClosure:
 
     def _pairs_around_points(self, local: LocalParticles) -> Pairs:
         if local.builds != self._built:
+            self._points = self._points.to(local.position.device)
             self._list = NeighborList(local.box, self.cutoff, self.skin)
             self._list.build(self._points, local.position, exclude_self=False)
             self._built = local.builds

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -69,14 +70,29 @@ class Surroundings:
     def forget(self) -> None:
         """Build anew at the next occasion."""
         self._ids: Tensor | None = None
+        self._moved_before, self._strayed_at_build = 0.0, False
 
     def outdated(self, particles: ParticleSet) -> bool:
         """Whether, on any rank, these are other particles or one has moved by more than half the skin."""
-        changed = particles.id is not self._ids
-        if not changed and len(particles):
-            moved = self.box.displacement(particles.position.detach(), self._built_at)
-            changed = float((moved * moved).sum(-1).max()) > (self.skin / 2) ** 2
-        return any_rank(self.decomposition.comm, changed)
+        return any_rank(self.decomposition.comm, self._moved(particles) > self.skin / 2)
+
+    def due(self, particles: ParticleSet) -> bool:
+        """Whether to build anew before a step: in the middle of one, particles cannot change rank.
+
+        So it is if the list will be outdated once the particles move as far again as since the last call, or
+        if a particle had left its slab when the list was built.
+        """
+        moved = self._moved(particles)
+        ahead = moved + max(moved - self._moved_before, 0.0)
+        self._moved_before = moved
+        return any_rank(self.decomposition.comm, ahead > self.skin / 2 or self._strayed_at_build)
+
+    def _moved(self, particles: ParticleSet) -> float:
+        """Largest distance that a particle of this rank has moved since the build; infinite for others."""
+        if particles.id is not self._ids:
+            return math.inf
+        moved = self.box.displacement(particles.position.detach(), self._built_at)
+        return math.sqrt(float((moved * moved).sum(-1).max())) if len(moved) else 0.0
 
     def settle(self, columns: dict[str, Tensor]) -> dict[str, Tensor]:
         """All columns after each particle moved to the rank of its slab, ordered by place, then by id.
@@ -93,7 +109,7 @@ class Surroundings:
     def update(self, particles: ParticleSet) -> None:
         """Make halo and list fit the particles.
 
-        No particle changes rank: where one has left its slab, the halo becomes wider by the farthest it strayed.
+        No particle changes rank: where one has left its slab, the halo is wider by the farthest it strayed.
         """
         if not self.outdated(particles):
             return
@@ -101,6 +117,7 @@ class Surroundings:
         width = self.halo_cutoff + self.skin + strayed
         self.halo = HaloExchange(self.decomposition, as_numpy(particles.position), width)
         self._ids, self._built_at = particles.id, particles.position.detach().clone()
+        self._moved_before, self._strayed_at_build = 0.0, strayed > 0
         self.builds += 1
         if self.neighbors is not None:
             with torch.no_grad():

@@ -1,5 +1,4 @@
-"""What a scene amounts to, before hours are spent on it: resolution, steps, ranks, memory, time. Writes
-nothing."""
+"""What a scene amounts to: resolution, steps, ranks, memory, time. Told before a run; writes nothing."""
 
 import logging
 import math

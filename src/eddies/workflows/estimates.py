@@ -1,5 +1,4 @@
-"""What a scene is expected to become: its turbulence, time steps, ranks, memory and wall time, before it is
-run."""
+"""What to expect of a scene before it is run: turbulence, time steps, ranks, memory and wall time."""
 
 import math
 import time
@@ -54,11 +53,11 @@ def largest_wavenumber(scene: Scene) -> int:
 
 
 def expected_turbulence(scene: Scene) -> ExpectedTurbulence | None:
-    """Turbulence kept up by the forcing, or that decays from a random start; None where it cannot be
-    foreseen.
+    """Turbulence kept up by the forcing, or decaying from a random start; None if not to be foreseen.
 
     The integral scale is taken as sqrt(2 pi) / k with k of the forcing or of the initial peak, which is
-    exact for the initial spectrum and holds within some 10 % for forced turbulence. """
+    exact for the initial spectrum and holds within some 10 % for forced turbulence.
+    """
     if scene.flow.viscosity == 0:
         return None
     if scene.forcing and scene.forcing.injection_rate > 0:
@@ -137,8 +136,7 @@ def flow_bytes(scene: Scene) -> float:
 
 
 def pair_bytes(scene: Scene) -> float:
-    """Memory of the pair force over all ranks: list, displacement, distance, and three copies of every
-    activation."""
+    """Memory of the pair force over all ranks: list, displacements, three copies of every activation."""
     pairs = scene.tracers.particles * scene.kernel.neighbors * (1 + scene.simulation.skin) ** 3
     item = 4 if scene.simulation.precision == "float32" else 8
     return pairs * (16 + 4 * item + 3 * item * (5 + sum(scene.model.hidden) + 3))

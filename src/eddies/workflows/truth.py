@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 
 from eddies.io.fields import FieldSeries
 from eddies.io.hdf5 import read_attributes
 from eddies.io.trajectories import Trajectory
+from eddies.learning.force_training import TrainingFrame
 from eddies.parallel.migration import id_block, migrate
 from eddies.parallel.slab import SlabDecomposition
+from eddies.particles.pair_forces import PairModel
+from eddies.particles.particle_set import ParticleSet
+from eddies.particles.poisson_closure import PoissonClosure
 from eddies.particles.reference_scales import ReferenceScales
 
 
@@ -63,3 +68,14 @@ class GroundTruth:
         start, stop = id_block(self.decomposition.comm, self.total)
         columns = {name: self.trajectory.read(frame, name, start, stop) for name in ("position", "velocity", "density")}
         return {"id": np.arange(start, stop, dtype=np.int64), **columns}
+
+
+def load_frame(truth: GroundTruth, index: int, model: PairModel, closure: PoissonClosure | None, dtype: torch.dtype,
+               device: torch.device) -> TrainingFrame:
+    """A frame with its true rates; the particles carry the density of the closure, or the true one without it."""
+    columns = truth.particles_with_rates(int(index))
+    particles = ParticleSet.from_numpy(columns, device)
+    if closure is not None:
+        particles = closure.apply(particles)
+    rates = [torch.from_numpy(columns[name]).to(device, dtype) for name in ("acceleration", "density_rate")]
+    return TrainingFrame(truth.decomposition, model, particles, *rates)

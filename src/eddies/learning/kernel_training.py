@@ -1,0 +1,90 @@
+"""Training of the smoothing kernel on filtered fields and the particles in them (Eqs. 8 to 11)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from eddies.learning.losses import mean_square_share
+from eddies.learning.optimization import Descent, shared_value
+from eddies.parallel.reduction import global_sum
+from eddies.particles.cloud import ParticleCloud
+from eddies.particles.smoothing_kernels import KernelNetwork
+
+
+@dataclass(frozen=True)
+class KernelLossWeights:
+    """Weights of Eq. 8 besides that of the velocity, which is 1."""
+
+    gradient: float = 1.0
+    normalization: float = 0.0
+
+
+class KernelSample:
+    """A filtered field on the grid points of a slab and the particles in it, at one moment.
+
+    Parameters
+    ----------
+    cloud : the particles.
+    field : (m, 3) and gradient (m, 3, 3) [component, direction], the filtered velocity at the m grid points, z slowest.
+    """
+
+    def __init__(self, cloud: ParticleCloud, field: Tensor, gradient: Tensor) -> None:
+        self.cloud, self.decomposition = cloud, cloud.decomposition
+        self.field, self.gradient = field.to(cloud.dtype), gradient.to(cloud.dtype)
+        self.mean_square = self._mean_squares()
+
+    def own_rows(self, points: np.ndarray) -> Tensor:
+        """Rows of those of the given points (numbers in the whole grid, z slowest) that lie in this slab."""
+        n = self.decomposition.planes
+        own = points[(points // n**2 >= self.decomposition.start) & (points // n**2 < self.decomposition.stop)]
+        return torch.from_numpy(own - self.decomposition.start * n**2)
+
+    def errors_of(self, velocity: Tensor, gradient: Tensor) -> tuple[float, float]:
+        """Normalised L2 errors over the whole grid of a reconstruction of all grid points; collective."""
+        squares = [(velocity - self.field).double().square().sum(), (gradient - self.gradient).double().square().sum()]
+        totals = global_sum(self.decomposition.comm, np.array([float(square) for square in squares]))
+        points = self.decomposition.planes**3
+        return tuple(np.sqrt(total / (points * components * mean)) for total, components, mean
+                     in zip(totals, (3, 9), self.mean_square))
+
+    def _mean_squares(self) -> tuple[float, float]:
+        """Mean square of one component of the velocity and of one of its gradient, over the whole grid."""
+        sums = np.array([float(part.double().square().sum()) for part in (self.field, self.gradient)])
+        return tuple(global_sum(self.decomposition.comm, sums) / (self.decomposition.planes**3 * np.array([3, 9])))
+
+
+class KernelTrainer:
+    """Fits a kernel network to samples: at each step the loss of Eq. 8 on random grid points of one of them.
+
+    Points are drawn from (seed, step) alone, so the loss is the same on any number of ranks.
+    """
+
+    def __init__(self, network: KernelNetwork, samples: list[KernelSample], weights: KernelLossWeights, points: int,
+                 seed: int) -> None:
+        self.network, self.samples, self.weights = network, samples, weights
+        self.comm, self.total = samples[0].decomposition.comm, samples[0].decomposition.planes**3
+        self.points, self.seed = min(points, self.total), seed
+
+    def step(self, descent: Descent, step: int) -> dict[str, float]:
+        """One step; returns the global losses."""
+        random = np.random.default_rng([self.seed, step])
+        sample = self.samples[random.integers(len(self.samples))]
+        rows = sample.own_rows(np.sort(random.choice(self.total, self.points, replace=False)))
+        kernel = self.network.table()
+        velocity, gradient = sample.cloud.on_grid(kernel, sample.cloud.volumes(kernel), rows)
+        # Each term in units of the mean square of what it reconstructs.
+        shares = {"velocity": mean_square_share(velocity - sample.field[rows], sample.mean_square[0] ** 0.5, self.points)}
+        total = shares["velocity"]
+        if self.weights.gradient > 0:
+            error = (gradient - sample.gradient[rows]).flatten(1)
+            shares["gradient"] = mean_square_share(error, sample.mean_square[1] ** 0.5, self.points)
+            total = total + self.weights.gradient * shares["gradient"]
+        if self.weights.normalization > 0:
+            shares["normalization"] = (self.network.integral() - 1) ** 2 / self.comm.size
+            total = total + self.weights.normalization * shares["normalization"]
+        descent.step(total)
+        return {name: shared_value(self.comm, share) for name, share in {"loss": total, **shares}.items()}

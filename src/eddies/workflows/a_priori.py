@@ -1,0 +1,94 @@
+"""A-priori tests of a trained model: its rates against the truth's at times it was not trained on (Fig. 3)."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from eddies.flow.interpolation import SplineInterpolation
+from eddies.flow.operators import gradient
+from eddies.flow.spectral_grid import SpectralGrid
+from eddies.learning.force_training import TrainingFrame
+from eddies.parallel.migration import IdOrder, migrate
+from eddies.parallel.reduction import global_sum
+from eddies.parallel.slab import SlabDecomposition
+from eddies.particles.pair_forces import PairModel
+from eddies.particles.particle_set import ParticleSet, as_numpy
+from eddies.particles.poisson_closure import PoissonClosure
+from eddies.workflows.truth import GroundTruth, load_frame
+
+EVALUATIONS, SAMPLE = 9, 20000
+
+
+def evaluation_frames(truth: GroundTruth) -> np.ndarray:
+    """Frames at times of filtered fields, evenly spread over the ground truth, with rates on both sides."""
+    at_fields = np.array([truth.frame_of_field(index) for index in range(len(truth.fields.times))])
+    usable = at_fields[(at_fields > 0) & (at_fields < len(truth.times) - 1)]
+    return usable[np.unique(np.linspace(0, len(usable) - 1, EVALUATIONS).astype(int))]
+
+
+@torch.no_grad()
+def evaluate(truth: GroundTruth, model: PairModel, closure: PoissonClosure | None, frames: np.ndarray, last_seen: int,
+             dtype: torch.dtype, device: torch.device) -> dict[str, dict[str, np.ndarray]]:
+    """Normalised L2 errors over time delay, and samples of true and predicted rates at the last frame; collective.
+
+    `acceleration_error` is that of the model as it runs: with the density of its closure if it has one.
+    `true_density_acceleration_error` is that with the true density, `pressure_gradient_error` that of
+    -c^2 grad ln(rho) of the filtered field, without any model.
+    """
+    rows = []
+    for index in frames:
+        frame = load_frame(truth, index, model, closure, dtype, device)
+        errors = frame.errors()
+        exact = _pressure_force(truth, int(index), frame.particles)
+        row = {"delay": truth.times[index] - truth.times[last_seen],
+               "acceleration_error": _relative(truth, errors["velocity"], frame.acceleration),
+               "pressure_gradient_error": _relative(truth, exact.to(frame.acceleration) - frame.acceleration, frame.acceleration)}
+        if closure is not None:
+            given = load_frame(truth, index, model, None, dtype, device).errors()["velocity"]
+            row["true_density_acceleration_error"] = _relative(truth, given, frame.acceleration)
+        if "density" in errors:
+            row["density_rate_error"] = _relative(truth, errors["density"], frame.density_rate)
+        rows.append(row)
+    tables = {"a_priori": {name: np.array([row[name] for row in rows]) for name in rows[0]},
+              "acceleration_sample": _sample(truth, frame, frame.acceleration, errors["velocity"])}
+    if "density" in errors:
+        tables["density_rate_sample"] = _sample(truth, frame, frame.density_rate, errors["density"])
+    return tables
+
+
+def _relative(truth: GroundTruth, error: torch.Tensor, exact: torch.Tensor) -> float:
+    """|error| / |exact|, L2 norms over all particles."""
+    squares = [float(part.double().square().sum()) for part in (error, exact)]
+    wrong, whole = global_sum(truth.decomposition.comm, np.array(squares))
+    return float(np.sqrt(wrong / whole))
+
+
+def _pressure_force(truth: GroundTruth, index: int, particles: ParticleSet) -> torch.Tensor:
+    """-c^2 grad ln(rho) of the filtered field at the particles (n, 3)."""
+    at = int(np.argmin(np.abs(truth.fields.times - truth.times[index])))
+    slab = SlabDecomposition(truth.decomposition.comm, truth.decomposition.length, truth.fields.cells)
+    grid = SpectralGrid(slab, cutoff=(slab.planes - 1) // 2)
+    planes = truth.fields.read(at, "density", slab.start, slab.stop).astype(np.float64)
+    force = -truth.scales.sound_speed**2 * gradient(grid, grid.forward(np.log(planes))[0])
+    spline = SplineInterpolation(grid, "quintic")
+    columns = migrate(slab, {name: as_numpy(getattr(particles, name)) for name in ("id", "position")})
+    values = spline.at(spline.coefficients(force), columns["position"])
+    # The fields' slabs may differ from the particles': values go back to the particles' owners by id.
+    order = IdOrder(slab.comm, columns["id"], truth.total)
+    back = migrate(truth.decomposition, {"id": np.arange(order.start, order.stop), "value": order.apply(values),
+                                         "position": order.apply(columns["position"])})
+    row = np.empty(len(particles), np.int64)
+    row[np.argsort(as_numpy(particles.id))] = np.argsort(back["id"])
+    return torch.from_numpy(back["value"][row])
+
+
+def _sample(truth: GroundTruth, frame: TrainingFrame, exact: torch.Tensor, error: torch.Tensor) -> dict[str, np.ndarray]:
+    """True and predicted rates of the particles with the lowest ids, on every rank."""
+    columns = {"truth": as_numpy(exact), "predicted": as_numpy(exact + error)}
+    ids, sampled = as_numpy(frame.particles.id), min(SAMPLE, truth.total)
+    chosen = ids < sampled
+    whole = {name: np.zeros((sampled, *values.shape[1:])) for name, values in columns.items()}
+    for name, values in columns.items():
+        whole[name][ids[chosen]] = values[chosen]
+    return {name: global_sum(truth.decomposition.comm, values) for name, values in whole.items()}

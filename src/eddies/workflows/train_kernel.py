@@ -1,0 +1,127 @@
+"""Smoothing kernel: trained on the filtered fields, with and without their gradients, and compared with SPH's."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from eddies.clock import ProgressLine
+from eddies.flow.operators import gradient
+from eddies.flow.spectral_grid import SpectralGrid
+from eddies.io.hdf5 import open_product
+from eddies.io.weights import save_weights
+from eddies.learning.kernel_training import KernelLossWeights, KernelSample, KernelTrainer
+from eddies.learning.optimization import Descent
+from eddies.parallel.reduction import global_sum
+from eddies.parallel.slab import SlabDecomposition
+from eddies.particles.cloud import ParticleCloud
+from eddies.particles.smoothing_kernels import CubicSpline, KernelNetwork, SmoothingKernel, WendlandC2, integral
+from eddies.scene import BOX_LENGTH, Scene
+from eddies.workflows.devices import prepare_torch
+from eddies.workflows.truth import GroundTruth
+
+log = logging.getLogger("eddies")
+
+TRAINING_SAMPLES = 4
+FINAL_RATE_FRACTION = 0.05
+
+
+def run(scene: Scene, comm, directory: str | Path) -> None:
+    """Train the kernel of a scene on fields of the training window and write kernel.h5.
+
+    The kernel without the gradient loss (the paper's Fig. 1) is trained as well. Errors are those at the last field.
+    """
+    prepare_torch("cpu", comm)
+    settings, directory = scene.kernel, Path(directory)
+    slab = SlabDecomposition(comm, BOX_LENGTH, scene.tracers.cells)
+    support = settings.support(scene.tracers.particles)
+    with open_product(comm, directory / "ground_truth.h5", "ground_truth") as file:
+        truth = GroundTruth(file, slab)
+        window = scene.training.window if scene.training is not None else 0.5
+        seen = np.flatnonzero(truth.fields.times <= window * truth.times[-1])
+        chosen = np.unique(np.linspace(0, len(seen) - 1, TRAINING_SAMPLES).astype(int))
+        samples = [load_sample(truth, index, support) for index in chosen]
+        unseen = load_sample(truth, len(truth.fields.times) - 1, support)
+    networks, history = {}, {}
+    for name, weight in (("learned", settings.gradient_weight), ("learned_no_gradient", 0.0)):
+        networks[name], losses = train(scene, samples, name, weight)
+        history |= {"step": losses.pop("step")} | {f"{loss}_{name}": values for loss, values in losses.items()}
+    with torch.no_grad():
+        kernels = {name: network.table() for name, network in networks.items()}
+        kernels |= {"cubic_spline": CubicSpline(support), "wendland": WendlandC2(support)}
+        tables = {"kernels": shapes(kernels, support), "history": history, **compare(kernels, unseen)}
+    description = {"support": support, "neighbors": settings.neighbors, "hidden": list(settings.hidden),
+                   "cutoff": settings.cutoff}
+    weights = {name: tensor.numpy() for name, tensor in networks["learned"].state_dict().items()}
+    provenance = {"scene": scene.to_toml(), "fingerprint": scene.fingerprint("train-kernel")}
+    save_weights(comm, directory / "kernel.h5", "kernel", description, weights, provenance, tables)
+    errors = tables["errors"]
+    log.info("kernel: velocity error %.3f (cubic spline %.3f), gradient error %.3f (cubic spline %.3f)",
+             *(errors[f"{kind}_error_{name}"] for kind in ("velocity", "gradient") for name in ("learned", "cubic_spline")))
+
+
+def load_sample(truth: GroundTruth, index: int, support: float) -> KernelSample:
+    """A filtered field with its exact gradient, and the particles at that time."""
+    slab = truth.decomposition
+    velocity = truth.field(index, "velocity")
+    grid = SpectralGrid(slab, cutoff=(slab.planes - 1) // 2)
+    derivatives = np.stack([grid.backward(gradient(grid, component)) for component in grid.forward(velocity)])
+    columns = truth.particles(truth.frame_of_field(index))
+    by_point = [torch.from_numpy(np.ascontiguousarray(np.moveaxis(values.reshape(*values.shape[:-3], -1), -1, 0)))
+                for values in (velocity, derivatives)]
+    position, own_velocity = (torch.from_numpy(columns[name]) for name in ("position", "velocity"))
+    return KernelSample(ParticleCloud(slab, support, position, own_velocity), *by_point)
+
+
+def train(scene: Scene, samples: list[KernelSample], name: str, gradient_weight: float) -> tuple[KernelNetwork, dict]:
+    """A trained kernel network and the history of its losses."""
+    settings = scene.kernel
+    support = settings.support(scene.tracers.particles)
+    network = KernelNetwork(support, settings.hidden, settings.cutoff, scene.seed).to(samples[0].cloud.dtype)
+    weights = KernelLossWeights(gradient_weight, settings.normalization_weight)
+    trainer = KernelTrainer(network, samples, weights, settings.points, scene.seed)
+    descent = Descent(trainer.comm, network.parameters(), settings.steps, settings.learning_rate,
+                      FINAL_RATE_FRACTION * settings.learning_rate)
+    history: list[dict[str, float]] = []
+    progress = ProgressLine(f"kernel {name}", lambda: f"loss {history[-1]['loss']:.5f}")
+    for step in range(settings.steps):
+        history.append({"step": step, **trainer.step(descent, step)})
+        progress((step + 1) / settings.steps, step + 1)
+    return network, {key: np.array([row[key] for row in history]) for key in history[0]}
+
+
+def shapes(kernels: dict[str, SmoothingKernel], support: float) -> dict[str, np.ndarray]:
+    """W and dW/dr over r/h, made dimensionless with h."""
+    r = torch.linspace(0, support, 201)
+    table = {"r_over_h": (r / support).numpy()}
+    for name, kernel in kernels.items():
+        table[f"value_{name}"] = kernel.value(r).numpy() * support**3
+        table[f"derivative_{name}"] = kernel.derivative(r).numpy() * support**4
+    return table
+
+
+def compare(kernels: dict[str, SmoothingKernel], sample: KernelSample) -> dict[str, dict[str, np.ndarray]]:
+    """Errors of every kernel on a field, and the plane z = pi of u_x and du_x/dx; collective."""
+    errors, slices = {}, {}
+    slab = sample.decomposition
+    slices["truth_velocity"] = _middle_plane(slab, sample.field[:, 0])
+    slices["truth_gradient"] = _middle_plane(slab, sample.gradient[:, 0, 0])
+    for name, kernel in kernels.items():
+        velocity, derivative = sample.cloud.on_whole_grid(kernel)
+        errors[f"velocity_error_{name}"], errors[f"gradient_error_{name}"] = sample.errors_of(velocity, derivative)
+        errors[f"integral_{name}"] = float(integral(kernel))
+        slices[f"velocity_{name}"] = _middle_plane(slab, velocity[:, 0])
+        slices[f"gradient_{name}"] = _middle_plane(slab, derivative[:, 0, 0])
+    return {"errors": errors, "slices": slices}
+
+
+def _middle_plane(slab: SlabDecomposition, values: torch.Tensor) -> np.ndarray:
+    """The plane z = pi of a scalar (m,) at all grid points, [y, x], on every rank."""
+    n, middle = slab.planes, slab.planes // 2
+    plane = np.zeros((n, n))
+    if slab.start <= middle < slab.stop:
+        plane[:] = values.reshape(slab.count, n, n)[middle - slab.start]
+    return global_sum(slab.comm, plane)

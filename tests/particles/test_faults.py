@@ -1,0 +1,54 @@
+import dataclasses
+
+import pytest
+import torch
+from clouds import LENGTH, state
+
+from eddies.particles.faults import Limits, find_fault
+from eddies.particles.particle_set import ParticleSet
+from eddies.particles.periodic_box import PeriodicBox
+
+LIMITS = Limits(speed=20.0, density_mean=1.0, density_deviation=0.5)
+
+
+def sound(count=6):
+    position, velocity, density = state(count)
+    return ParticleSet(torch.arange(count) + 100, position, velocity, density)
+
+
+def fault(particles):
+    return find_fault(particles, LIMITS, PeriodicBox(LENGTH), step=12, rank=3)
+
+
+@pytest.mark.parametrize("count", [0, 1, 6])
+def test_a_sound_state_has_no_fault(count):
+    assert fault(sound(count)) is None
+
+
+@pytest.mark.parametrize(
+    "name, value, complaint",
+    [
+        ("position", torch.nan, "not finite"),
+        ("velocity", torch.inf, "not finite"),
+        ("density", torch.nan, "not finite"),
+        ("velocity", 50.0, "faster than 20"),
+        ("density", 2.0, "farther than 0.5"),
+    ],
+)
+def test_a_faulty_particle_is_described(name, value, complaint):
+    particles = sound()
+    column = getattr(particles, name).clone()
+    column[4] = value
+    description = fault(dataclasses.replace(particles, **{name: column}))
+    for part in (complaint, "step 12", "rank 3", "particle 104", "position", "velocity", "density"):
+        assert part in description
+    assert "nearest particle" in description or name == "position"
+
+
+def test_the_nearest_particle_is_found_across_the_faces():
+    particles = sound(3)
+    position = torch.tensor([[0.1, 1, 1], [3, 3, 3], [LENGTH - 0.2, 1, 1]], dtype=torch.float64)
+    velocity = particles.velocity.clone()
+    velocity[0] = torch.nan
+    description = fault(dataclasses.replace(particles, position=position, velocity=velocity))
+    assert "nearest particle 102 at a distance of 0.3" in description
