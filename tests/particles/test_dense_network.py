@@ -25,7 +25,7 @@ def test_tangent_is_the_directional_derivative():
     network = DenseNetwork(4, (6, 6), 2, seed=2)
     features, tangent = torch.randn(2, 4, 9, dtype=torch.float64)
     outputs, slopes = network.with_tangent(features, tangent)
-    expected = torch.func.jvp(lambda x: by_hand(network, x), (features,), (tangent,))
+    expected = torch.autograd.functional.jvp(lambda x: by_hand(network, x), features, tangent)
     assert torch.allclose(outputs, expected[0]) and torch.allclose(slopes, expected[1])
 
 

@@ -112,6 +112,21 @@ def test_particles_that_cross_slabs_go_on_as_on_one_rank(comm):
     assert_close(*ends, 1e-10)
 
 
+@pytest.mark.mpi(1, 2)
+def test_particles_outside_their_slab_see_all_their_neighbours(comm):
+    """As where a gradient is recorded, and nothing changes rank."""
+    position, velocity, density = state(400)
+    slab, particles = distributed(comm, position, velocity, density)
+    moved = position + 0.8 * torch.sin(7 * position)
+    strayed = replace(particles, position=moved[particles.id])
+    whole, everything = alone(moved, velocity, density)
+    rates, expected = (
+        ParticleDynamics(slabs, LENGTH, [model()], SKIN).rates(which)["velocity"].detach()
+        for slabs, which in ((slab, strayed), (whole, everything))
+    )
+    assert_close(by_id(comm, strayed, rates, 400), expected[torch.argsort(everything.id)])
+
+
 class Recorder:
     """Notes what a halo sends."""
 

@@ -15,7 +15,7 @@ from eddies.particles.poisson_closure import PoissonClosure
 from eddies.particles.smoothing_kernels import WendlandC2
 
 LENGTH, PER_SIDE, SOUND_SPEED = 2 * np.pi, 16, 10.0
-SUPPORT = 2.4 * LENGTH / PER_SIDE
+SUPPORT = 1.8 * LENGTH / PER_SIDE
 
 
 def particles_in_turbulence(comm):
@@ -31,7 +31,7 @@ def particles_in_turbulence(comm):
 
 
 def closure_on(comm, passes):
-    return PoissonClosure(PressureSolver(SlabDecomposition(comm, LENGTH, PER_SIDE)), WendlandC2(SUPPORT), SOUND_SPEED,
+    return PoissonClosure(PressureSolver(SlabDecomposition(comm, LENGTH, PER_SIDE), 6), WendlandC2(SUPPORT), SOUND_SPEED,
                           passes=passes)
 
 

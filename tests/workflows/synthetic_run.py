@@ -71,7 +71,6 @@ def write_ground_truth(comm, directory, tracers=True, cells=16):
             reference |= {"released_at": 2.0, "length": WIDTH, "spacing": WIDTH / 2, "acceleration_rms": 1.4}
             write_table(file, "spectra", decaying_spectra())
         write_attributes(file.create_group("reference"), reference)
-        write_attributes(file, {"seconds": 12.5})
 
 
 def decaying_spectra():
@@ -104,7 +103,7 @@ def write_kernel(comm, directory, cells=32):
                "loss_learned_no_gradient": np.exp(-step / 40)}
     tables = {"kernels": kernels, "slices": slices, "errors": errors, "history": history}
     save_weights(comm, directory / "kernel.h5", "kernel", {"support": 0.9}, {"weight": np.ones(3)},
-                 provenance(seconds=3.0), tables)
+                 provenance(), tables)
 
 
 def write_model(comm, directory, closure="poisson"):
@@ -127,7 +126,7 @@ def write_model(comm, directory, closure="poisson"):
         tables["a_priori"]["density_rate_error"] = 0.6 + 0.05 * delay
         tables["density_rate_sample"] = {"truth": truth[:, 0], "predicted": 0.8 * truth[:, 0]}
     save_weights(comm, directory / "model.h5", "model", {"basis": "corrected", "closure": closure},
-                 {"weight": np.ones(3)}, provenance(seconds=7.0), tables)
+                 {"weight": np.ones(3)}, provenance(), tables)
 
 
 class PerturbedFlow:
@@ -173,7 +172,6 @@ def write_rollout(comm, directory, status="complete", total=600, cells=16, frame
         filtered = FieldWriter(file, "filtered", cells, {"velocity": 3})
         for time in times[:-3:2]:
             filtered.append(time, 0, {"velocity": 1.02 * RandomFlow(1).field(cells, time)})
-        write_attributes(file, {"seconds": 4.0})
 
 
 def write_run(comm, directory, **rollout):

@@ -7,7 +7,9 @@ import pytest
 from eddies.io.hdf5 import ProductError
 from eddies.workflows import report
 
-from tests.workflows.synthetic_run import write_ground_truth, write_kernel, write_model, write_rollout, write_run
+from tests.workflows.synthetic_run import (
+    write_ground_truth, write_kernel, write_model, write_rollout, write_run,
+)
 
 FIGURES = {
     "statistics", "spectra", "fields", "figure-1-kernels", "figure-2-reconstruction", "kernel-training",
@@ -87,6 +89,15 @@ def test_a_stopped_rollout_is_said_to_be_stopped(comm, tmp_path):
 
 
 @pytest.mark.mpi(1)
+def test_a_rollout_that_breaks_at_once_is_not_compared(comm, tmp_path):
+    write_rollout(comm, tmp_path, status="stopped: particle 3 is too fast", broken=0)
+    report.run(tmp_path, comm)
+    metrics, page = written(tmp_path)
+    assert metrics["rollout"]["velocity_error"] is None and metrics["rollout"]["stable"] is False
+    assert "stopped: particle 3 is too fast" in page and "no finite frame at a common time" in page
+
+
+@pytest.mark.mpi(1)
 def test_a_model_that_integrates_density(comm, tmp_path):
     write_model(comm, tmp_path, closure="learned-density")
     report.run(tmp_path, comm)
@@ -103,7 +114,10 @@ def test_a_dns_alone(comm, tmp_path):
     assert figures(tmp_path) == {"statistics", "spectra", "fields"}
     assert metrics.keys() == {"ground_truth", "cost"}
     assert metrics["cost"]["seconds_per_step"] is None and "there is no rollout.h5" in page
-    assert metrics["cost"]["stage_seconds"] == {"dns": 12.5}
+    assert metrics["cost"]["stage_seconds"] is None
+    (tmp_path / "stage_seconds.json").write_text('{"dns": 12.5}')
+    report.run(tmp_path, comm)
+    assert written(tmp_path)[0]["cost"]["stage_seconds"] == {"dns": 12.5}
 
 
 @pytest.mark.mpi(1)

@@ -48,19 +48,23 @@ class Rollout:
 def section(run: Rollout) -> Section:
     """The rollout: figures 4 to 9 and Lagrangian statistics; `run` is read frame by frame."""
     broken = comparison.first_broken_time(run.model)
-    common = CommonFrames.of(run.model, run.truth, broken)
-    last = float(common.times[-1])
     text = (f"Closure {run.attributes['closure']}, integrator {run.attributes['integrator']}, time step "
-            f"{float(run.attributes['time_step']):.3g}. T = {run.turnover:.3g} is the eddy turnover time. "
-            f"Numbers are at the last common time of model and true tracers, {last / run.turnover:.3g} T.")
-    notices = _notices(run, last, broken)
-    shown = Section("rollout", "Rollout against the truth", text, notices=notices, main=MAIN)
-    shown.metrics += [
+            f"{float(run.attributes['time_step']):.3g}. T = {run.turnover:.3g} is the eddy turnover time. ")
+    shown = Section("rollout", "Rollout against the truth", text, main=MAIN, metrics=[
         Metric("status", "status", run.status),
         Metric("stable", "stable to the end", run.status == "complete" and not np.isfinite(broken)),
         Metric("turnovers", "eddy turnovers run", float(run.attributes["turnovers"])),
-        Metric("last_common_time", "last common time / T", last / run.turnover),
-    ]
+    ])
+    try:
+        common = CommonFrames.of(run.model, run.truth, broken)
+    except ValueError as error:
+        shown.notices.append(f"The rollout: {run.status}. It is not compared: {error}.")
+        shown.metrics += [Metric(key, key.replace("_", " "), None, str(error)) for key in MAIN[1:]]
+        return shown
+    last = float(common.times[-1])
+    shown.text += f"Numbers: at the last common time of model and true tracers, {last / run.turnover:.3g} T."
+    shown.notices += _notices(run, last, broken)
+    shown.metrics.append(Metric("last_common_time", "last common time / T", last / run.turnover))
     _add_planes(shown, run, last)
     _add_particles(shown, run, common)
     _add_invariants(shown, run, common)
@@ -83,7 +87,7 @@ def _notices(run: Rollout, last: float, broken: float) -> list[str]:
 
 
 def _add_planes(shown: Section, run: Rollout, last: float) -> None:
-    name = "filtered" if "filtered" in run.fields else "truth"
+    name = "filtered" if run.fields["filtered"].times.size else "truth"
     model, truth = run.fields["model"], run.fields[name]
     common = CommonFrames.of(model, truth, _just_after(last))
     planes = [_plane_of_first_component(model, truth, common, index) for index in common.spread(4)]

@@ -6,7 +6,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from eddies.analysis.figures import (
-    DNS, FOURTH, MODEL, SECOND, SIGNED, THIRD, TRUTH, colour_bar, largest, letter, panels, png, show_plane, styled,
+    DNS, FOURTH, MODEL, SECOND, SIGNED, THIRD, TRUTH, colour_bar, largest, letter, panels, png, show_plane,
+    styled,
 )
 from eddies.analysis.page import Metric, Section
 

@@ -75,7 +75,7 @@ def energy_spectra(series: Sequence[SpectraAt], eulerian: Mapping[str, np.ndarra
         number_wavenumbers(axis)
     peak = max(at.truth[1:].max() for at in series)
     top = series[0].wavenumber.size / np.sqrt(3)
-    guide_power_law(axes[0, 0], (2, 10), 2.2 * peak, -5 / 3, r"$k^{-5/3}$")
+    guide_power_law(axes[0, 0], (2, min(10, 0.7 * top)), 2.2 * peak, -5 / 3, r"$k^{-5/3}$")
     axes[0, 0].set(ylabel="$E(k)$", ylim=(1e-6 * peak, 6 * peak), xlim=(0.9, top))
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncol=4)
     letter(axes.flat)

@@ -11,22 +11,26 @@ from eddies.parallel.slab import SlabDecomposition
 
 
 class PressureSolver:
-    """Poisson's equation  laplacian p = -d_i d_j (u_i u_j)  for the resolved modes of a grid (2/3 rule).
+    """Poisson's equation  laplacian p = -d_i d_j (u_i u_j)  for the modes |k| <= `resolved` of a grid.
+
+    Products of modes above a third of the number of cells alias; with three quarters of the Nyquist wavenumber kept,
+    as for fields known from particles, that is far below the error of the highest modes themselves.
 
     `points` (m, 3) are this rank's grid points, z slowest. Positions given to the other methods must lie in this
     rank's slab, or at most one grid plane outside.
     """
 
-    def __init__(self, decomposition: SlabDecomposition, interpolation: str = "cubic") -> None:
+    def __init__(self, decomposition: SlabDecomposition, resolved: int, interpolation: str = "cubic") -> None:
         self.decomposition = decomposition
-        self.grid = SpectralGrid(decomposition)
+        self.grid = SpectralGrid(decomposition, cutoff=resolved)
+        self._kept = self.grid.index_squared <= resolved**2
         self._spline = SplineInterpolation(self.grid, interpolation)
         x, y, z = np.broadcast_arrays(*self.grid.coordinates())
         self.points = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
 
     def modes(self, values: np.ndarray) -> np.ndarray:
         """Resolved Fourier modes (3, kz, ky, kx) of a vector field given at `points`, (m, 3)."""
-        return self.grid.forward(values.T.reshape(3, *self.grid.physical_shape))
+        return self._kept * self.grid.forward(values.T.reshape(3, *self.grid.physical_shape))
 
     def velocity_at(self, modes: np.ndarray, positions: np.ndarray) -> np.ndarray:
         """The field of the modes at positions (n, 3): (n, 3)."""

@@ -47,6 +47,10 @@ class TrainingFrame:
         self.dynamics = ParticleDynamics(decomposition, decomposition.length, [model], skin=0.0,
                                          dtype=acceleration.dtype)
         self.particles, self.acceleration, self.density_rate = particles, acceleration, density_rate
+        squares = [float(rate.double().square().sum()) for rate in (acceleration, density_rate)]
+        *squares, count = global_sum(decomposition.comm, np.array([*squares, len(particles)]))
+        #: rms of one component of the acceleration, and of the density rate, over all ranks
+        self.acceleration_rms, self.density_rate_rms = np.sqrt(squares[0] / (3 * count)), np.sqrt(squares[1] / count)
         self._row_of_id = dict(zip(particles.id.tolist(), range(len(particles))))
 
     def rows(self, ids: np.ndarray) -> Tensor:
@@ -88,7 +92,7 @@ class ForceTrainer:
         random = np.random.default_rng([self.seed, step])
         frame = self.frames[random.integers(len(self.frames))]
         rows = frame.rows(random.choice(self.total, self.batch, replace=False))
-        share = self.weights.trajectory * self._trajectory_share(frame.errors(rows), self.batch)
+        share = self.weights.trajectory * self._trajectory_share(frame, frame.errors(rows), self.batch)
         norm = descent.step(share)
         loss = shared_value(self.comm, share)
         return {"loss": loss, "trajectory_loss": loss / self.weights.trajectory, "gradient_norm": norm}
@@ -102,7 +106,7 @@ class ForceTrainer:
         rows = self._rows_within(frame, corner, side, self.kernel.support)
         count = int(global_sum(self.comm, len(rows)))
         errors = frame.errors(rows)
-        shares = {"trajectory": self._trajectory_share(errors, count)}
+        shares = {"trajectory": self._trajectory_share(frame, errors, count)}
         if self.weights.field > 0:
             shares["field"] = self._field_share(frame, rows, errors["velocity"], corner, side)
         shares |= self._divergence_shares(frame, rows, errors["velocity"])
@@ -111,12 +115,12 @@ class ForceTrainer:
         values = {name + "_loss": shared_value(self.comm, share) for name, share in shares.items()}
         return {"loss": shared_value(self.comm, total), **values, "gradient_norm": norm}
 
-    def _trajectory_share(self, errors: dict[str, Tensor], count: int) -> Tensor:
-        """Eq. 12 with centred differences, each rate in units of its own rms."""
-        scales = self.model.scales
-        share = mean_square_share(errors["velocity"], scales.acceleration, count)
+    def _trajectory_share(self, frame: TrainingFrame, errors: dict[str, Tensor], count: int) -> Tensor:
+        """Eq. 12 with centred differences, each rate in units of its rms at that moment, so that all moments of a
+        decaying flow count alike."""
+        share = mean_square_share(errors["velocity"], frame.acceleration_rms, count)
         if "density" in errors:
-            share = share + mean_square_share(errors["density"], scales.density_rate, count)
+            share = share + mean_square_share(errors["density"], frame.density_rate_rms, count)
         return share
 
     def _field_share(self, frame: TrainingFrame, rows: Tensor, error: Tensor, corner: np.ndarray, side: float) -> Tensor:
@@ -134,7 +138,7 @@ class ForceTrainer:
         position = surroundings.local(frame.particles, set()).position
         around.build(points, position, exclude_self=False)
         field = reconstruct(self.kernel, around.pairs(points, position, dtype=error.dtype), self._volumes(frame), local)
-        return mean_square_share(field, self.model.scales.acceleration, max(count, 1))
+        return mean_square_share(field, frame.acceleration_rms, max(count, 1))
 
     def _volumes(self, frame: TrainingFrame) -> Tensor:
         """Volumes (s,) of the particles of a frame, ghosts included; computed once."""
@@ -151,10 +155,10 @@ class ForceTrainer:
         shares = {}
         scales, truth = self.model.scales, frame.acceleration[rows]
         if self.weights.acceleration_kl > 0:
-            shares["acceleration_kl"] = self._divergence(truth / scales.acceleration, error / scales.acceleration)
+            shares["acceleration_kl"] = self._divergence(truth / frame.acceleration_rms, error / frame.acceleration_rms)
         if self.weights.velocity_kl > 0:
             velocity = frame.particles.velocity[rows].to(truth) / scales.velocity
-            shares["velocity_kl"] = self._divergence(velocity, error / scales.velocity)
+            shares["velocity_kl"] = self._divergence(velocity, error / frame.acceleration_rms)
         return shares
 
     def _divergence(self, truth: Tensor, error: Tensor) -> Tensor:

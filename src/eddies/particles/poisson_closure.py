@@ -37,7 +37,7 @@ class PoissonClosure:
     The velocity on the grid is a kernel average of the particles', which attenuates the smaller scales. So the
     average of what the grid field still misses at the particles is added to it, `passes` times in all: iterated
     (van Cittert) deconvolution. With four passes -grad p comes as close to the true acceleration as the exact
-    filtered pressure gradient does; one pass misses a third of its amplitude.
+    filtered pressure gradient does; after one pass it is a third too small.
 
     Parameters
     ----------

@@ -16,7 +16,7 @@ from eddies.analysis import figures_comparison, figures_flow, figures_kernel, fi
 from eddies.analysis.page import Metric, RunRecord, Section, metrics_json, render_page, shown
 from eddies.analysis.spectra import energy_spectrum, vorticity
 from eddies.io.fields import FieldSeries
-from eddies.io.hdf5 import ProductError, find_group, open_product, read_provenance, read_table
+from eddies.io.hdf5 import ProductError, open_product, read_attributes, read_provenance, read_table
 from eddies.io.trajectories import Trajectory
 
 log = logging.getLogger("eddies")
@@ -28,10 +28,10 @@ ROLLOUT_COST = {"seconds_per_step": "rollout, seconds per step", "particles": "p
 
 @dataclass
 class Run:
-    """What has been read so far: provenance and wall seconds by product, and what later sections need."""
+    """What has been read so far: wall seconds by stage, provenance by product, and what later sections need."""
 
+    seconds: dict[str, float]
     provenance: dict[str, dict[str, Any]] = field(default_factory=dict)
-    seconds: dict[str, float | None] = field(default_factory=dict)
     cost: list[Metric] = field(default_factory=list)
     filter_width: float | None = None
     eulerian: dict[str, np.ndarray] | None = None
@@ -51,7 +51,7 @@ def run(directory: str | Path, comm) -> None:
 
 
 def _write_report(directory: Path, alone) -> None:
-    record, sections = Run(), []
+    record, sections = Run(seconds=_stage_seconds(directory)), []
     readers = {"ground_truth": _read_flow, "kernel": _read_kernel, "model": _read_model,
                "rollout": _read_rollout}
     for kind, read in readers.items():
@@ -59,7 +59,6 @@ def _write_report(directory: Path, alone) -> None:
         if path.exists():
             with open_product(alone, path, kind) as file:
                 record.provenance[kind] = read_provenance(file)
-                record.seconds[kind] = _stage_seconds(file)
                 sections.append(read(file, record))
             log.info("report: %s, %d figures", sections[-1].title, len(sections[-1].illustrations))
     if not sections:
@@ -71,7 +70,7 @@ def _write_report(directory: Path, alone) -> None:
 
 
 def _read_flow(file, record: Run) -> Section:
-    reference, statistics = _attributes(file, "reference"), read_table(file, "statistics")
+    reference, statistics = read_attributes(file, "reference"), read_table(file, "statistics")
     traced = "released_at" in reference
     name = "filtered" if traced else "final"
     velocity = FieldSeries(file, name).read(-1, "velocity")
@@ -102,19 +101,17 @@ def _read_model(file, record: Run) -> Section:
 
 
 def _read_rollout(file, record: Run) -> Section:
-    attributes = _attributes(file, "rollout")
+    attributes = read_attributes(file, "rollout")
     record.cost += [Metric(key, label, attributes[key]) for key, label in ROLLOUT_COST.items()]
     model, truth = Trajectory(file, "model"), Trajectory(file, "truth")
-    fields = {name: FieldSeries(file, name) for name in find_group(file, "fields")}
+    fields = {name: FieldSeries(file, name) for name in ("model", "truth", "filtered")}
     return figures_comparison.section(figures_comparison.Rollout(
         attributes, model, truth, fields, model.length, record.filter_width, record.eulerian))
 
 
 def _cost_section(record: Run) -> Section:
-    seconds = {STAGES[kind]: value for kind, value in record.seconds.items() if value is not None}
-    untimed = ", ".join(f"{kind}.h5" for kind, value in record.seconds.items() if value is None)
-    metrics = [*record.cost, Metric("stage_seconds", "wall seconds by stage", seconds or None,
-                                    f"no wall time stored in {untimed}")]
+    metrics = [*record.cost, Metric("stage_seconds", "wall seconds by stage", record.seconds or None,
+                                    "no stage_seconds.json: the stages were not run by `eddies`")]
     present = {metric.key for metric in metrics}
     metrics += [Metric(key, label, None, "there is no rollout.h5") for key, label in ROLLOUT_COST.items()
                 if key not in present]
@@ -122,22 +119,15 @@ def _cost_section(record: Run) -> Section:
                    main=("seconds_per_step",))
 
 
-def _stage_seconds(file) -> float | None:
-    """Wall seconds: an attribute of products that are written on the way, in the provenance of weights."""
-    seconds = file.attrs.get("seconds", read_provenance(file).get("seconds"))
-    return None if seconds is None else float(seconds)
-
-
-def _attributes(file, group: str) -> dict[str, Any]:
-    """Attributes of a group as Python numbers and strings."""
-    values = find_group(file, group).attrs.items()
-    return {name: value.item() if isinstance(value, np.generic) else value for name, value in values}
-
+def _stage_seconds(directory: Path) -> dict[str, float]:
+    """Wall seconds of the stages that have run, as the command line notes them beside the products."""
+    path = directory / "stage_seconds.json"
+    return json.loads(path.read_text()) if path.exists() else {}
 
 def _run_record(directory: Path, record: Run) -> RunRecord:
     rows = [("stage", "ranks", "wall time (s)", "date", "eddies", "commit", "libraries")]
     for kind, origin in record.provenance.items():
-        seconds = "not stored" if record.seconds[kind] is None else shown(record.seconds[kind])
+        seconds = shown(record.seconds[STAGES[kind]]) if STAGES[kind] in record.seconds else "not stored"
         commit = (origin["commit"] or "not a checkout")[:12]
         libraries = ", ".join(f"{name} {version}" for name, version in origin["libraries"].items())
         ranks = str(origin["ranks"])

@@ -44,8 +44,7 @@ def run(scene: Scene, comm, directory: str | Path) -> None:
     with (open_product(comm, directory / "ground_truth.h5", "ground_truth") as truth_file,
           create_product(comm, directory / "rollout.h5", "rollout", provenance) as file):
         truth = GroundTruth(truth_file, slab)
-        kernel = load_kernel(comm, directory / "kernel.h5", device)
-        dynamics = build_dynamics(scene, truth, load_model(comm, directory / "model.h5", device), kernel)
+        dynamics = build_dynamics(scene, truth, load_model(comm, directory / "model.h5", device))
         start = start_frame(scene, truth)
         particles = ParticleSet.from_numpy(truth.particles(start), device)
         frames = RolloutFrames(file, truth, load_kernel(comm, directory / "kernel.h5"), truth.times[start])
@@ -111,7 +110,7 @@ def start_frame(scene: Scene, truth: GroundTruth) -> int:
     return next((frame for frame in at_fields if frame >= max(wanted, 1)), at_fields[-1])
 
 
-def build_dynamics(scene: Scene, truth: GroundTruth, model: PairModel, kernel) -> ParticleDynamics:
+def build_dynamics(scene: Scene, truth: GroundTruth, model: PairModel) -> ParticleDynamics:
     """The model, the forcing if there is one, and the closure if the density has no rate of its own."""
     settings, slab = scene.simulation, truth.decomposition
     skin = settings.skin * model.cutoff
@@ -120,7 +119,7 @@ def build_dynamics(scene: Scene, truth: GroundTruth, model: PairModel, kernel) -
     if settings.injection != "none":
         rate = truth.reference["dissipation_rate"] if settings.injection == "dissipation" else settings.injection
         terms.append(LinearForcing(rate, scene.forcing.wavenumber if scene.forcing else 2.0, slab.comm, slab.length))
-    closure = poisson_closure(slab, kernel, truth.scales.sound_speed, skin) if model.closure == "poisson" else None
+    closure = poisson_closure(slab, truth.scales.sound_speed, skin) if model.closure == "poisson" else None
     return ParticleDynamics(slab, slab.length, terms, skin, closure, dtype)
 
 

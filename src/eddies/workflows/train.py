@@ -43,7 +43,7 @@ def run(scene: Scene, comm, directory: str | Path) -> None:
         seen = np.unique(np.linspace(1, last - 1, settings.frames).astype(int))
         log.info("train: %d frames of the times up to %.3g of %.3g; %d weights", len(seen), truth.times[last],
                  truth.times[-1], sum(p.numel() for p in model.parameters()))
-        closure = poisson_closure(slab, kernel, truth.scales.sound_speed) if model.closure == "poisson" else None
+        closure = poisson_closure(slab, truth.scales.sound_speed) if model.closure == "poisson" else None
         frames = [load_frame(truth, index, model, closure, dtype, device) for index in seen]
         validation = load_frame(truth, evaluation_frames(truth)[-1], model, closure, dtype, device)
         trainer = ForceTrainer(slab, model, frames, kernel, scene.tracers.cells,
