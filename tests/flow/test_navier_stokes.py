@@ -53,7 +53,8 @@ def test_nonlinear_terms_against_derivatives_in_physical_space(comm):
     u, A, G = grid.backward(state[:3]), np.array(derivative[:3]), np.array(derivative[3])
     S = (A + A.transpose(1, 0, 2, 3, 4)) / 2
     dilatation = np.einsum("iizyx->zyx", A)
-    rate_u = -np.einsum("jzyx,ijzyx->izyx", u, A) + 2 * nu * np.einsum("ijzyx,jzyx->izyx", S, G) - 2 / 3 * nu * dilatation * G
+    strain_term = np.einsum("ijzyx,jzyx->izyx", S, G) - dilatation * G / 3
+    rate_u = -np.einsum("jzyx,ijzyx->izyx", u, A) + 2 * nu * strain_term
     rate_s = -np.einsum("jzyx,jzyx->zyx", u, G)
     expected = grid.forward(np.concatenate([rate_u, rate_s[None]]))
     assert np.abs(fluid.nonlinear(state) - expected).max(initial=0) < 1e-14

@@ -38,7 +38,8 @@ def test_forward_and_backward_against_numpy(comm, cells, precision):
 @pytest.mark.mpi(1, 2, 3)
 def test_parseval(comm):
     grid = make_grid(comm, 9)
-    band_limited = grid.backward(grid.forward(np.random.default_rng(comm.rank).standard_normal((1, *grid.physical_shape))))
+    noise = np.random.default_rng(comm.rank).standard_normal((1, *grid.physical_shape))
+    band_limited = grid.backward(grid.forward(noise))
     modes = grid.forward(band_limited)
     assert grid.sum_modes(np.abs(modes[0]) ** 2) == pytest.approx(grid.mean(band_limited**2)[0], rel=1e-13)
 

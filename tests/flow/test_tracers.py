@@ -49,7 +49,8 @@ def test_interpolation_is_exact_at_grid_points_also_just_outside_the_slab(comm, 
     velocity = initial_fields.random_velocity(grid, 7, 1.0, 2.0)
     spline = SplineInterpolation(grid, kind)
     planes = grid.backward(velocity)
-    found = spline.at(spline.coefficients(velocity), np.array([[3 * dx, -2 * dx, slab.lower], [0, 40 * dx, slab.lower]]))
+    points = np.array([[3 * dx, -2 * dx, slab.lower], [0, 40 * dx, slab.lower]])
+    found = spline.at(spline.coefficients(velocity), points)
     assert np.allclose(found, [planes[:, 0, 16, 3], planes[:, 0, 4, 0]], atol=1e-12)
     # The plane above the slab belongs to the neighbour, and a predicted position may lie there.
     outside = spline.at(spline.coefficients(velocity), np.array([[0.0, 0.0, slab.upper]]))

@@ -31,8 +31,8 @@ def particles_in_turbulence(comm):
 
 
 def closure_on(comm, passes):
-    return PoissonClosure(PressureSolver(SlabDecomposition(comm, LENGTH, PER_SIDE), 6), WendlandC2(SUPPORT), SOUND_SPEED,
-                          passes=passes)
+    solver = PressureSolver(SlabDecomposition(comm, LENGTH, PER_SIDE), resolved=6)
+    return PoissonClosure(solver, WendlandC2(SUPPORT), SOUND_SPEED, passes=passes)
 
 
 @pytest.mark.mpi(1)

@@ -21,7 +21,8 @@ class CourantLimit:
     every `every` steps.
     """
 
-    def __init__(self, grid: SpectralGrid, courant: float, largest: float, sound_speed: float = 0.0, every: int = 8) -> None:
+    def __init__(self, grid: SpectralGrid, courant: float, largest: float, sound_speed: float = 0.0,
+                 every: int = 8) -> None:
         self.grid, self.courant, self.largest, self.sound_speed, self.every = grid, courant, largest, sound_speed, every
         self._bound = 0.0
 

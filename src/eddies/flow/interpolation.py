@@ -62,7 +62,8 @@ class SplineInterpolation:
         lowest = slab.start - self._halo.below
         rows = (first - lowest) % n
         if len(rows) and rows.max() + self.degree + 1 > planes:
-            raise ValueError("a point lies farther outside its slab than the ghost planes reach: the time step is too long")
+            raise ValueError("a point lies farther outside its slab than the ghost planes reach: "
+                             "the time step is too long")
         return rows
 
 

@@ -82,7 +82,8 @@ class CompressibleFluid:
         longitudinal = dot_wavevector(grid, velocity)
         result = np.empty_like(state)
         for i, k in enumerate(grid.wavevector):
-            result[i] = -1j * self.sound_speed**2 * k * s - nu * (grid.wavenumber_squared * velocity[i] + k * longitudinal / 3)
+            viscous = grid.wavenumber_squared * velocity[i] + k * longitudinal / 3
+            result[i] = -1j * self.sound_speed**2 * k * s - nu * viscous
         result[3] = -divergence(grid, velocity)
         return result
 

@@ -1,4 +1,4 @@
-"""Derivatives and projections in Fourier space. Arrays are as in SpectralGrid: vectors (3, kz, ky, kx), order x, y, z."""
+"""Derivatives and projections in Fourier space. Arrays as in SpectralGrid: vectors (3, kz, ky, kx), order x, y, z."""
 
 from __future__ import annotations
 

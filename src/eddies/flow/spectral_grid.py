@@ -139,7 +139,8 @@ class SpectralGrid:
         half = pyfftw.zeros_aligned((components, nz, n, n // 2 + 1), self.complex)
         if name == "forward x":
             return pyfftw.FFTW(real, half, axes=(3,), flags=("FFTW_ESTIMATE",))
-        return pyfftw.FFTW(half, real, axes=(3,), direction="FFTW_BACKWARD", flags=("FFTW_ESTIMATE", "FFTW_DESTROY_INPUT"))
+        flags = ("FFTW_ESTIMATE", "FFTW_DESTROY_INPUT")
+        return pyfftw.FFTW(half, real, axes=(3,), direction="FFTW_BACKWARD", flags=flags)
 
     def _plan_y(self, name: str, components: int) -> pyfftw.FFTW:
         direction = name.split()[0]
@@ -150,7 +151,8 @@ class SpectralGrid:
 
     def _plan_z(self, name: str, components: int) -> pyfftw.FFTW:
         column = pyfftw.empty_aligned((components, self.cells, *self.spectral_shape[1:]), self.complex)
-        return pyfftw.FFTW(column, column, axes=(1,), direction=f"FFTW_{name.split()[0].upper()}", flags=("FFTW_ESTIMATE",))
+        direction = f"FFTW_{name.split()[0].upper()}"
+        return pyfftw.FFTW(column, column, axes=(1,), direction=direction, flags=("FFTW_ESTIMATE",))
 
 
 def restrict(fine: SpectralGrid, coarse: SpectralGrid, spectral: np.ndarray) -> np.ndarray:

@@ -61,8 +61,9 @@ def incompressible_budget(grid: SpectralGrid, velocity: np.ndarray, viscosity: f
             "dissipation_rate": viscosity * grid.sum_modes(grid.wavenumber_squared * squared)}
 
 
-def compressible_budget(grid: SpectralGrid, state: np.ndarray, viscosity: float, sound_speed: float) -> dict[str, float]:
-    """Total energy <rho |u|^2/2 + c^2 (rho ln rho - rho + 1)> and dissipation nu <rho (2 S:S - 2/3 (div u)^2)>.
+def compressible_budget(grid: SpectralGrid, state: np.ndarray, viscosity: float,
+                        sound_speed: float) -> dict[str, float]:
+    """Total energy <rho |u|^2/2 + c^2 (rho ln rho - rho + 1)>, dissipation nu <rho (2 S:S - 2/3 (div u)^2)>.
 
     Without forcing the first decays at exactly the second. Also the rms of the density and the share of the kinetic
     energy in the longitudinal velocity.

@@ -54,7 +54,7 @@ class FilteredField:
         return self.spline.coefficients(self.transfer * state[:3])
 
     def density_modes(self, state: np.ndarray) -> np.ndarray:
-        """Fourier coefficients (1, kz, ky, kx) of the filtered density exp(s); of density 1 in an incompressible flow."""
+        """Modes (1, kz, ky, kx) of the filtered density exp(s); of density 1 in an incompressible flow."""
         if len(state) == 4:
             return self.transfer * self.grid.forward(np.exp(self.grid.backward(state[3:])))
         modes = np.zeros((1, *self.grid.spectral_shape), self.grid.complex)

@@ -123,7 +123,8 @@ class ForceTrainer:
             share = share + mean_square_share(errors["density"], frame.density_rate_rms, count)
         return share
 
-    def _field_share(self, frame: TrainingFrame, rows: Tensor, error: Tensor, corner: np.ndarray, side: float) -> Tensor:
+    def _field_share(self, frame: TrainingFrame, rows: Tensor, error: Tensor, corner: np.ndarray,
+                     side: float) -> Tensor:
         """Eq. 13 per time step: the kernel average of the acceleration error on the grid points of a cube.
 
         The velocity predicted one step ahead is compared with that of the true particles, both through the kernel:
@@ -146,7 +147,8 @@ class ForceTrainer:
             surroundings = frame.dynamics.surroundings
             position = surroundings.local(frame.particles, set()).position
             with torch.no_grad():
-                pairs = surroundings.neighbors.pairs(position[: len(frame.particles)], position, dtype=frame.acceleration.dtype)
+                pairs = surroundings.neighbors.pairs(position[: len(frame.particles)], position,
+                                                     dtype=frame.acceleration.dtype)
                 frame.volumes = surroundings.column(volumes(self.kernel, pairs))
         return frame.volumes
 

@@ -77,7 +77,8 @@ class KernelTrainer:
         kernel = self.network.table()
         velocity, gradient = sample.cloud.on_grid(kernel, sample.cloud.volumes(kernel), rows)
         # Each term in units of the mean square of what it reconstructs.
-        shares = {"velocity": mean_square_share(velocity - sample.field[rows], sample.mean_square[0] ** 0.5, self.points)}
+        error = velocity - sample.field[rows]
+        shares = {"velocity": mean_square_share(error, sample.mean_square[0] ** 0.5, self.points)}
         total = shares["velocity"]
         if self.weights.gradient > 0:
             error = (gradient - sample.gradient[rows]).flatten(1)

@@ -17,7 +17,8 @@ class Descent:
     summed over ranks in one message, so all ranks, also those without particles, take the same step.
     """
 
-    def __init__(self, comm, parameters: Iterable[nn.Parameter], steps: int, first_rate: float, last_rate: float) -> None:
+    def __init__(self, comm, parameters: Iterable[nn.Parameter], steps: int, first_rate: float,
+                 last_rate: float) -> None:
         self.comm, self.parameters = comm, list(parameters)
         self._adam = torch.optim.Adam(self.parameters, lr=first_rate)
         decay = (last_rate / first_rate) ** (1 / max(steps - 1, 1))

@@ -37,8 +37,9 @@ class HaloExchange:
         z = np.asarray(positions)[:, 2]
         self._down = np.flatnonzero(z < decomposition.lower + width)
         self._up = np.flatnonzero(z >= decomposition.upper - width)
-        self._from_above = int(self._exchange(np.array([len(self._down)]), decomposition.below, decomposition.above, (1,))[0])
-        self._from_below = int(self._exchange(np.array([len(self._up)]), decomposition.above, decomposition.below, (1,))[0])
+        below, above = decomposition.below, decomposition.above
+        self._from_above = int(self._exchange(np.array([len(self._down)]), below, above, (1,))[0])
+        self._from_below = int(self._exchange(np.array([len(self._up)]), above, below, (1,))[0])
         self.count = self._from_above + self._from_below
 
     def forward(self, owned: np.ndarray) -> np.ndarray:

@@ -20,8 +20,9 @@ class PlaneHalo:
         needed = max(below, above)
         if decomposition.thinnest() < needed:
             raise HaloError(
-                f"{decomposition.size} ranks make slabs of {decomposition.thinnest()} grid planes, fewer than the "
-                f"{needed} ghost planes of the interpolation; use at most {max(decomposition.planes // needed, 1)} ranks"
+                f"{decomposition.size} ranks make slabs of {decomposition.thinnest()} grid planes, fewer than "
+                f"the {needed} ghost planes of the interpolation; use at most "
+                f"{max(decomposition.planes // needed, 1)} ranks"
             )
 
     def forward(self, planes: np.ndarray) -> np.ndarray:

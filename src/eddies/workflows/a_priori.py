@@ -40,10 +40,10 @@ def evaluate(truth: GroundTruth, model: PairModel, closure: PoissonClosure | Non
     for index in frames:
         frame = load_frame(truth, index, model, closure, dtype, device)
         errors = frame.errors()
-        exact = _pressure_force(truth, int(index), frame.particles)
+        exact = _pressure_force(truth, int(index), frame.particles).to(frame.acceleration)
         row = {"delay": truth.times[index] - truth.times[last_seen],
                "acceleration_error": _relative(truth, errors["velocity"], frame.acceleration),
-               "pressure_gradient_error": _relative(truth, exact.to(frame.acceleration) - frame.acceleration, frame.acceleration)}
+               "pressure_gradient_error": _relative(truth, exact - frame.acceleration, frame.acceleration)}
         if closure is not None:
             given = load_frame(truth, index, model, None, dtype, device).errors()["velocity"]
             row["true_density_acceleration_error"] = _relative(truth, given, frame.acceleration)
@@ -83,7 +83,8 @@ def _pressure_force(truth: GroundTruth, index: int, particles: ParticleSet) -> t
     return torch.from_numpy(back["value"][row])
 
 
-def _sample(truth: GroundTruth, frame: TrainingFrame, exact: torch.Tensor, error: torch.Tensor) -> dict[str, np.ndarray]:
+def _sample(truth: GroundTruth, frame: TrainingFrame, exact: torch.Tensor,
+            error: torch.Tensor) -> dict[str, np.ndarray]:
     """True and predicted rates of the particles with the lowest ids, on every rank."""
     columns = {"truth": as_numpy(exact), "predicted": as_numpy(exact + error)}
     ids, sampled = as_numpy(frame.particles.id), min(SAMPLE, truth.total)

@@ -55,7 +55,8 @@ def run(scene: Scene, comm, directory: str | Path) -> None:
         write_table(file, "statistics", history.columns())
 
 
-def advance(state: np.ndarray, stepper: Callable, step_limit: Callable, clock: Clock, observers: Sequence[Callable]) -> np.ndarray:
+def advance(state: np.ndarray, stepper: Callable, step_limit: Callable, clock: Clock,
+            observers: Sequence[Callable]) -> np.ndarray:
     """The state when the clock ends; every observer sees every step."""
     while clock.running:
         step = step_limit(state, clock)

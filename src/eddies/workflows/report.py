@@ -124,6 +124,7 @@ def _stage_seconds(directory: Path) -> dict[str, float]:
     path = directory / "stage_seconds.json"
     return json.loads(path.read_text()) if path.exists() else {}
 
+
 def _run_record(directory: Path, record: Run) -> RunRecord:
     rows = [("stage", "ranks", "wall time (s)", "date", "eddies", "commit", "libraries")]
     for kind, origin in record.provenance.items():

@@ -31,7 +31,8 @@ class RolloutFrames:
         self._slab = SlabDecomposition(comm, length, cells)
         self._trajectories = {name: TrajectoryWriter(file, name, truth.total, length, COLUMNS, np.float32)
                               for name in ("model", "truth")}
-        self._fields = {name: FieldWriter(file, name, cells, {"velocity": 3}) for name in ("model", "truth", "filtered")}
+        self._fields = {name: FieldWriter(file, name, cells, {"velocity": 3})
+                        for name in ("model", "truth", "filtered")}
 
     def store(self, step: int, time: float, particles: ParticleSet, acceleration: torch.Tensor) -> None:
         """Store the model's particles and what is true at that time; `time` counts from the start of the rollout."""
@@ -53,7 +54,8 @@ class RolloutFrames:
         cloud = ParticleCloud(self._slab, self.kernel.support, position, velocity)
         columns["velocity_gradient"] = as_numpy(cloud.at_particles(self.kernel)[1])
         order = IdOrder(self._slab.comm, columns["id"], self.truth.total)
-        self._trajectories[name].append(step, time, order.start, {column: order.apply(columns[column]) for column in COLUMNS})
+        by_id = {column: order.apply(columns[column]) for column in COLUMNS}
+        self._trajectories[name].append(step, time, order.start, by_id)
         field = as_numpy(cloud.on_whole_grid(self.kernel)[0]).T
         n = self._slab.planes
         self._fields[name].append(time, self._slab.start, {"velocity": field.reshape(3, self._slab.count, n, n)})

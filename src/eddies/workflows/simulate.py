@@ -105,7 +105,8 @@ def mean_energy(comm, particles: ParticleSet, total: int) -> float:
 def start_frame(scene: Scene, truth: GroundTruth) -> int:
     """The first frame with a filtered field at or after the moment that the scene asks for."""
     fraction = scene.simulation.start
-    wanted = truth.last_frame_seen(scene.training.window) if fraction is None else int(fraction * (len(truth.times) - 1))
+    last_seen = truth.last_frame_seen(scene.training.window)
+    wanted = last_seen if fraction is None else int(fraction * (len(truth.times) - 1))
     at_fields = [truth.frame_of_field(index) for index in range(len(truth.fields.times))]
     return next((frame for frame in at_fields if frame >= max(wanted, 1)), at_fields[-1])
 

@@ -54,7 +54,8 @@ class TracerFrames:
         """Reference scales: root mean squares over particles and frames, of one component where there are three."""
         total = self.settings.particles
         frames, pairs = total * self._frames, total * max(self._frames - 1, 1)
-        squares = {name: float(global_sum(self.coarse.decomposition.comm, value)) for name, value in self._squares.items()}
+        comm = self.coarse.decomposition.comm
+        squares = {name: float(global_sum(comm, value)) for name, value in self._squares.items()}
         return {"velocity_rms": np.sqrt(squares["velocity"] / (3 * frames)),
                 "density_mean": 1.0,
                 "density_rms": np.sqrt(squares["density"] / frames),
@@ -64,7 +65,8 @@ class TracerFrames:
     def write_spectra(self) -> None:
         """Write the table of DNS and filtered energy spectra."""
         wavenumber = np.arange(len(self._spectra["energy"][0]))
-        write_table(self.file, "spectra", {"wavenumber": wavenumber} | {k: np.array(v) for k, v in self._spectra.items()})
+        columns = {name: np.array(rows) for name, rows in self._spectra.items()}
+        write_table(self.file, "spectra", {"wavenumber": wavenumber, **columns})
 
     def _accumulate(self, frame: dict[str, np.ndarray]) -> None:
         self._squares["velocity"] += np.sum(frame["velocity"] ** 2)

@@ -60,7 +60,8 @@ def run(scene: Scene, comm, directory: str | Path) -> None:
     save_weights(comm, directory / "kernel.h5", "kernel", description, weights, provenance, tables)
     errors = tables["errors"]
     log.info("kernel: velocity error %.3f (cubic spline %.3f), gradient error %.3f (cubic spline %.3f)",
-             *(errors[f"{kind}_error_{name}"] for kind in ("velocity", "gradient") for name in ("learned", "cubic_spline")))
+             errors["velocity_error_learned"], errors["velocity_error_cubic_spline"],
+             errors["gradient_error_learned"], errors["gradient_error_cubic_spline"])
 
 
 def load_sample(truth: GroundTruth, index: int, support: float) -> KernelSample:

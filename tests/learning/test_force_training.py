@@ -1,0 +1,103 @@
+import numpy as np
+import pytest
+import torch
+
+from eddies.flow.tracers import release
+from eddies.learning.force_training import ForceTrainer, LossWeights, TrainingFrame
+from eddies.learning.optimization import Descent
+from eddies.parallel.slab import SlabDecomposition
+from eddies.particles.pair_forces import PairModel
+from eddies.particles.particle_set import ParticleSet
+from eddies.particles.reference_scales import ReferenceScales
+from eddies.particles.smoothing_kernels import WendlandC2
+
+LENGTH, PER_SIDE = 2 * np.pi, 12
+SPACING = LENGTH / PER_SIDE
+SUPPORT = 2.2 * SPACING
+SCALES = ReferenceScales(length=2 * SPACING, spacing=SPACING, velocity=1.0, density_mean=1.0, density=0.01,
+                         acceleration=1.0, density_rate=0.02, sound_speed=10.0)
+
+
+def frame_of(comm, model, squeeze=1.0):
+    """Particles in a smooth flow whose acceleration is a pressure gradient and a drag."""
+    slab = SlabDecomposition(comm, LENGTH, PER_SIDE)
+    columns = release(slab, 3, PER_SIDE, "random")
+    x, y, z = columns["position"].T
+    velocity = np.stack([np.sin(y), np.sin(z), np.sin(x)], axis=1)
+    density = 1 + 0.01 * np.cos(x) * np.cos(y)
+    acceleration = np.stack([np.sin(x) * np.cos(y), np.cos(x) * np.sin(y), 0 * z], axis=1) - 0.3 * velocity
+    particles = ParticleSet.from_numpy({**columns, "velocity": velocity, "density": density})
+    return TrainingFrame(slab, model, particles, torch.from_numpy(acceleration), torch.from_numpy(0.02 * np.sin(y)))
+
+
+def trainer_of(comm, closure="learned-density", weights=LossWeights(1.0, 1.0, 0.1, 0.1), batch=300):
+    model = PairModel(SCALES, SUPPORT, 45, (8, 8), closure=closure, seed=2)
+    frame = frame_of(comm, model)
+    return ForceTrainer(frame.dynamics.surroundings.decomposition, model, [frame], WendlandC2(SUPPORT), PER_SIDE,
+                        weights, PER_SIDE**3, batch, seed=5)
+
+
+@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.parametrize("kind", ["trajectory_step", "combined_step"])
+def test_training_is_the_same_on_any_number_of_ranks(comm, kind):
+    from mpi4py import MPI
+
+    def losses_and_weights(communicator):
+        trainer = trainer_of(communicator)
+        descent = Descent(communicator, trainer.model.parameters(), 5, 1e-2, 1e-3)
+        rows = [getattr(trainer, kind)(descent, step) for step in range(5)]
+        return rows, torch.cat([p.detach().flatten() for p in trainer.model.parameters()])
+
+    (rows, weights), (alone, weights_alone) = losses_and_weights(comm), losses_and_weights(MPI.COMM_SELF)
+    for row, other in zip(rows, alone):
+        assert row == pytest.approx(other, rel=1e-9)
+    assert torch.allclose(weights, weights_alone, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("kind", ["trajectory_step", "combined_step"])
+def test_gradient_against_finite_differences(comm, kind):
+    trainer = trainer_of(comm)
+
+    class Recorder:
+        """Takes no step but keeps the share."""
+
+        def step(self, share):
+            self.share = share
+            return 0.0
+
+    def loss():
+        recorder = Recorder()
+        getattr(trainer, kind)(recorder, 0)
+        return recorder.share
+
+    loss().backward()
+    weight = trainer.model.network.weights[0]
+    gradient, epsilon = float(weight.grad[1, 2]), 1e-5
+    values = []
+    for sign in (1, -1):
+        with torch.no_grad():
+            weight[1, 2] += sign * epsilon
+            values.append(float(loss()))
+            weight[1, 2] -= sign * epsilon
+    # The error of a central difference is epsilon^2; the histogram's kinks between bins add a little.
+    assert (values[0] - values[1]) / (2 * epsilon) == pytest.approx(gradient, rel=1e-3)
+
+
+@pytest.mark.mpi(1)
+def test_training_lowers_the_error_of_a_learnable_force(comm):
+    trainer = trainer_of(comm, closure="poisson", weights=LossWeights())
+    descent = Descent(comm, trainer.model.parameters(), 150, 1e-2, 1e-3)
+    losses = [trainer.trajectory_step(descent, step)["loss"] for step in range(150)]
+    # The pressure gradient and drag are in the span of the model; what is left is the
+    # scatter of differences between randomly placed particles.
+    assert np.mean(losses[-20:]) < 0.15 * losses[0]
+
+
+@pytest.mark.mpi(1)
+def test_losses_without_weight_are_not_computed(comm, monkeypatch):
+    trainer = trainer_of(comm, weights=LossWeights())
+    for name in ("_field_share", "_divergence", "_volumes"):
+        monkeypatch.setattr(ForceTrainer, name, lambda *args: pytest.fail("an unused loss was computed"))
+    row = trainer.combined_step(Descent(comm, trainer.model.parameters(), 1, 1e-2, 1e-2), 0)
+    assert set(row) == {"loss", "trajectory_loss", "gradient_norm"}

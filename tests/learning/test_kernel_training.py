@@ -1,0 +1,58 @@
+import numpy as np
+import pytest
+import torch
+
+from eddies.flow.tracers import release
+from eddies.learning.kernel_training import KernelLossWeights, KernelSample, KernelTrainer
+from eddies.learning.optimization import Descent
+from eddies.parallel.slab import SlabDecomposition
+from eddies.particles.cloud import ParticleCloud, grid_points
+from eddies.particles.smoothing_kernels import CubicSpline, KernelNetwork, integral
+
+LENGTH, CELLS, PER_SIDE = 2 * np.pi, 12, 10
+SUPPORT = 2.4 * LENGTH / PER_SIDE
+
+
+def flow(x):
+    """Velocity (n, 3) and gradient (n, 3, 3) of a smooth flow at points (n, 3)."""
+    velocity = torch.stack([torch.sin(2 * x[:, 1]), torch.sin(x[:, 2]), torch.sin(x[:, 0])], dim=1)
+    gradient = torch.zeros(len(x), 3, 3, dtype=x.dtype)
+    gradient[:, 0, 1] = 2 * torch.cos(2 * x[:, 1])
+    gradient[:, 1, 2], gradient[:, 2, 0] = torch.cos(x[:, 2]), torch.cos(x[:, 0])
+    return velocity, gradient
+
+
+def sample_of(comm):
+    slab = SlabDecomposition(comm, LENGTH, CELLS)
+    position = torch.from_numpy(release(slab, 3, PER_SIDE, "random")["position"])
+    cloud = ParticleCloud(slab, SUPPORT, position, flow(position)[0], torch.float64)
+    return KernelSample(cloud, *flow(grid_points(slab)))
+
+
+def fit(comm, steps=4, rate=1e-3):
+    sample, network = sample_of(comm), KernelNetwork(SUPPORT, (8, 8), seed=1)
+    trainer = KernelTrainer(network, [sample], KernelLossWeights(1.0, 0.5), 200, seed=2)
+    descent = Descent(comm, network.parameters(), steps, rate, rate)
+    return sample, network, [trainer.step(descent, step) for step in range(steps)]
+
+
+@pytest.mark.mpi(1, 2, 3)
+def test_training_is_the_same_on_any_number_of_ranks(comm):
+    from mpi4py import MPI
+
+    _, network, losses = fit(comm)
+    _, alone, losses_alone = fit(MPI.COMM_SELF)
+    for row, other in zip(losses, losses_alone):
+        assert row == pytest.approx(other, rel=1e-10)
+    for parameter, other in zip(network.parameters(), alone.parameters()):
+        assert torch.allclose(parameter, other, rtol=1e-8, atol=1e-12)
+
+
+@pytest.mark.mpi(1)
+def test_the_learned_kernel_beats_the_cubic_spline_on_the_field_it_was_fitted_to(comm):
+    sample, network, losses = fit(comm, steps=400, rate=1e-2)
+    with torch.no_grad():
+        learned = network.table()
+        errors = [sample.errors_of(*sample.cloud.on_whole_grid(kernel)) for kernel in (learned, CubicSpline(SUPPORT))]
+    assert float(integral(learned)) == pytest.approx(1, rel=1e-12)
+    assert errors[0][1] < errors[1][1] and losses[-1]["loss"] < losses[0]["loss"]

@@ -1,0 +1,83 @@
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from eddies.io.hdf5 import open_product, read_attributes, read_table
+from eddies.io.trajectories import Trajectory
+from eddies.scene import load_scene
+from eddies.workflows import dns
+
+SMALL = ["flow.cells=16", "tracers.particles_per_side=6", "tracers.turnovers=0.05", "tracers.field_cells=8"]
+
+LEFT_OUT = """
+import sys
+from mpi4py import MPI
+from eddies.parallel import halo
+from eddies.scene import load_scene
+from eddies.workflows import dns
+calls = []
+halo.HaloExchange.__init__ = lambda *a: calls.append("halo")
+dns.run(load_scene("{scene}", {overrides}), MPI.COMM_SELF, sys.argv[1])
+print("torch" in sys.modules, "matplotlib" in sys.modules, calls.count("halo"))
+"""
+
+
+def test_tracers_only_builds_no_particle_halo_and_imports_no_torch(tmp_path):
+    code = LEFT_OUT.format(scene="tracers-only", overrides=SMALL)
+    result = subprocess.run([sys.executable, "-c", code, tmp_path], capture_output=True, text=True, timeout=120)
+    assert result.stdout.split() == ["False", "False", "0"], result.stderr
+
+
+@pytest.mark.mpi(1, 2, 3)
+def test_tracers_are_stored_by_id_and_do_not_depend_on_ranks(comm, tmp_path):
+    from mpi4py import MPI
+
+    scene = load_scene("tracers-only", SMALL)
+    dns.run(scene, comm, tmp_path)
+    if comm.rank == 0:
+        alone = tmp_path / "alone"
+        alone.mkdir()
+        dns.run(scene, MPI.COMM_SELF, alone)
+        paths = [tmp_path / "ground_truth.h5", alone / "ground_truth.h5"]
+        positions = []
+        for path in paths:
+            with open_product(MPI.COMM_SELF, path, "ground_truth") as file:
+                trajectory = Trajectory(file, "tracers")
+                assert trajectory.total == 216 and len(trajectory.times) == 2
+                positions.append(trajectory.read(-1, "position"))
+                assert "density_rms" in read_attributes(file, "reference")
+        assert np.abs(positions[0] - positions[1]).max() < 1e-12
+    comm.Barrier()
+
+
+@pytest.mark.mpi(1)
+def test_a_final_state_is_a_start(comm, tmp_path):
+    first, second = tmp_path / "first", tmp_path / "second"
+    for directory in (first, second):
+        directory.mkdir()
+    overrides = ["flow.cells=16", "time.duration=0.1", "time.step=0.01"]
+    dns.run(load_scene("taylor-green", overrides), comm, first)
+    from_file = ["initial.kind=file", f"initial.path={first / 'ground_truth.h5'}"]
+    dns.run(load_scene("taylor-green", overrides + from_file), comm, second)
+    tables = []
+    for directory in (first, second):
+        with open_product(comm, directory / "ground_truth.h5", "ground_truth") as file:
+            tables.append(read_table(file, "statistics"))
+    # Fields are stored in single precision.
+    assert tables[1]["energy"][0] == pytest.approx(tables[0]["energy"][-1], rel=1e-6)
+    assert tables[1]["time"][-1] == pytest.approx(0.1)
+
+
+@pytest.mark.mpi(1)
+def test_zero_forcing_amplitude_equals_no_forcing(comm, tmp_path):
+    ends = []
+    for name, overrides in (("without", []), ("zero", ["forcing.injection_rate=0.0"])):
+        (tmp_path / name).mkdir()
+        scene = load_scene("taylor-green", ["flow.cells=16", "time.duration=0.05", *overrides])
+        assert (scene.forcing is None) == (name == "without")
+        dns.run(scene, comm, tmp_path / name)
+        with open_product(comm, tmp_path / name / "ground_truth.h5", "ground_truth") as file:
+            ends.append(read_table(file, "statistics")["energy"])
+    assert np.array_equal(*ends)

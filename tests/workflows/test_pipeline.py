@@ -1,0 +1,72 @@
+"""The tiny scene from DNS to report through the command line, as a user runs it."""
+
+import json
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+CHECKOUT = Path(__file__).parents[2]
+
+
+def eddies(ranks, *arguments):
+    command = [sys.executable, CHECKOUT / "mpi_tools" / "launch.py", "-n", str(ranks), "--",
+               sys.executable, "-m", "eddies", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=240, env=dict(os.environ))
+
+
+def numbers(metrics):
+    for value in metrics.values():
+        if isinstance(value, dict):
+            yield from numbers(value)
+        elif isinstance(value, (int, float)) and not isinstance(value, bool):
+            yield value
+
+
+@pytest.fixture(scope="module")
+def run_directory(tmp_path_factory):
+    directory = tmp_path_factory.mktemp("runs") / "tiny"
+    result = eddies(2, "run", "tiny", "--output", str(directory))
+    assert result.returncode == 0, result.stdout + result.stderr
+    return directory
+
+
+def test_metrics_are_finite_and_within_bounds(run_directory):
+    metrics = json.loads((run_directory / "report" / "metrics.json").read_text())
+    assert all(math.isfinite(value) for value in numbers(metrics))
+    truth, kernel, model, rollout = (metrics[key] for key in ("ground_truth", "kernel", "model", "rollout"))
+    assert truth["energy_budget_error"] < 2e-3 and truth["kmax_eta"] > 0.9 and 0.05 < truth["mach_turbulent"] < 0.12
+    assert kernel["integral"] == pytest.approx(1, abs=1e-5)
+    # Sixty steps teach little, but more than nothing: without a model the error is 1.
+    assert model["acceleration_error"] < 0.9
+    assert rollout["stable"] and 0.7 < rollout["energy_ratio"] < 1.3 and rollout["velocity_error"] < 0.5
+
+
+def test_every_product_and_the_page_are_there(run_directory):
+    for name in ("scene.toml", "ground_truth.h5", "kernel.h5", "model.h5", "rollout.h5", "report/index.html"):
+        assert (run_directory / name).stat().st_size > 0
+    assert not list(run_directory.glob("*.partial"))
+
+
+def test_resume_skips_what_is_done_and_redoes_what_changed(run_directory):
+    result = eddies(1, "run", "tiny", "--output", str(run_directory), "--resume")
+    assert result.returncode == 0 and result.stderr.count("skipped") + result.stdout.count("skipped") == 4
+    result = eddies(1, "run", "tiny", "--output", str(run_directory), "--resume", "--set", "simulation.turnovers=0.2")
+    log = result.stdout + result.stderr
+    assert result.returncode == 0 and log.count("skipped") == 3 and "rollout: complete" in log
+
+
+@pytest.mark.parametrize("closure", ["learned-density", "paper-density"])
+def test_the_other_closures_run(run_directory, tmp_path, closure):
+    for name in ("ground_truth.h5", "kernel.h5"):
+        (tmp_path / name).symlink_to(run_directory / name)
+    change = ("--output", str(tmp_path), "--set", f"model.closure={closure}")
+    for stage in ("train", "simulate"):
+        result = eddies(2, stage, "tiny", *change)
+        assert result.returncode == 0, result.stdout + result.stderr
+    assert eddies(1, "report", str(tmp_path)).returncode == 0
+    metrics = json.loads((tmp_path / "report" / "metrics.json").read_text())
+    assert metrics["model"]["density_rate_error"] is not None
