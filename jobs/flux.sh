@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# EDDIES_SCENE=hit flux batch jobs/flux.sh
+# EDDIES_SCENE=hit-small flux batch jobs/flux.sh
 # Submit from the checkout, or set EDDIES_CHECKOUT to it. Load your cluster's modules first, as for set-up.
 #flux: --job-name=eddies
 #flux: --nodes=1

@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
-# EDDIES_SCENE=hit bsub < jobs/lsf.sh
+# EDDIES_SCENE=hit-small bsub < jobs/lsf.sh
 # Submit from the checkout, or set EDDIES_CHECKOUT to it. Load your cluster's modules first, as for set-up.
 #BSUB -J eddies
 #BSUB -n 16
 #BSUB -W 4:00
 #BSUB -o eddies.%J.log
-# SIGUSR1 five minutes before the limit: the ranks write a checkpoint and exit with 75, which queues the job again.
+# SIGUSR1 five minutes before the limit: the ranks end with 75, which queues the job again.
 #BSUB -wa USR1
 #BSUB -wt 5
 #BSUB -Q 75

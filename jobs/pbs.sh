@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# qsub -v EDDIES_SCENE=hit jobs/pbs.sh
+# qsub -v EDDIES_SCENE=hit-small jobs/pbs.sh
 # Submit from the checkout, or set EDDIES_CHECKOUT to it. Load your cluster's modules first, as for set-up.
 #PBS -N eddies
 #PBS -l select=1:ncpus=16:mpiprocs=16:ompthreads=1

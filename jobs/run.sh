@@ -1,23 +1,23 @@
-# The body of every job: runs a scene and resumes what an earlier job left at a checkpoint. Sourced by the others,
-# which set the arrays
+# The body of every job: runs a scene and goes on after the stages that an earlier job finished. Sourced by the
+# others, which set the arrays
 #   launcher  the command that starts the ranks
 #   resubmit  the command that queues this job again on exit code 75, or true
 # Read from the environment of the job:
-#   EDDIES_SCENE     built-in name or path (default: hit)
+#   EDDIES_SCENE     built-in name or path (default: hit-small)
 #   EDDIES_OUTPUT    run directory (default: runs/NAME)
 #   OMP_NUM_THREADS  threads a rank (default: 1)
 # Arguments go to `eddies run`: --set section.key=value and the like.
 
 checkout=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 export OMP_NUM_THREADS=${OMP_NUM_THREADS:-1}
-arguments=(run "${EDDIES_SCENE:-hit}" --resume)
+arguments=(run "${EDDIES_SCENE:-hit-small}" --resume)
 if [ -n "${EDDIES_OUTPUT:-}" ]; then arguments+=(--output "$EDDIES_OUTPUT"); fi
 
-trap : USR1  # some schedulers signal this shell too; the ranks write a checkpoint, it waits for them
+trap : USR1  # some schedulers signal this shell too; the ranks end with 75, it waits for them
 status=0
 "${launcher[@]}" "$checkout/.venv/bin/eddies" "${arguments[@]}" "$@" || status=$?
 if [ "$status" -eq 75 ]; then
-    echo "stopped at a checkpoint: the same command goes on from there"
+    echo "stopped before the time limit: the same command goes on after the last finished stage"
     "${resubmit[@]}" || echo "not queued again, do it by hand: ${resubmit[*]}" >&2
 fi
 exit "$status"

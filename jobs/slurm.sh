@@ -1,12 +1,12 @@
 #!/usr/bin/env bash
-# EDDIES_SCENE=hit sbatch jobs/slurm.sh [options of `eddies run`]
+# EDDIES_SCENE=hit-small sbatch jobs/slurm.sh [options of `eddies run`]
 # Submit from the checkout, or set EDDIES_CHECKOUT to it. Load your cluster's modules first, as for set-up.
 #SBATCH --job-name=eddies
 #SBATCH --nodes=1
 #SBATCH --ntasks-per-node=16
 #SBATCH --cpus-per-task=1
 #SBATCH --time=04:00:00
-# SIGUSR1 to the ranks five minutes before the limit: they write a checkpoint and exit with 75.
+# SIGUSR1 to the ranks five minutes before the limit: they end with 75, and the job is queued again.
 #SBATCH --signal=USR1@300
 #SBATCH --requeue
 #SBATCH --open-mode=append

@@ -41,7 +41,7 @@ def mpi_environment(ranks: int) -> dict[str, str]:
         "OMP_NUM_THREADS": "1",
         # Two jobs on one machine would both be bound to its first cores.
         "OMPI_MCA_hwloc_base_binding_policy": "none",
-        # Seconds from SIGTERM to SIGKILL, for a last checkpoint; mpirun waits twice this when a rank fails.
+        # Seconds from SIGTERM to SIGKILL; mpirun waits twice this when a rank fails.
         "OMPI_MCA_odls_base_sigkill_timeout": "3",
     }
     if os.geteuid() == 0:

@@ -3,6 +3,7 @@
 import json
 import logging
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -203,3 +204,28 @@ def test_mistake_met_by_all_ranks_while_writing(tmp_path):
     assert code == 2 and seconds < 10
     assert errors.count("eddies: error: no such reactor") == 1 and "Traceback" not in errors
     assert not (tmp_path / "ground_truth.h5").exists()
+
+
+@pytest.mark.parametrize("number", [signal.SIGUSR1, signal.SIGTERM])
+def test_a_signal_ends_the_job_to_be_resumed(tmp_path, number):
+    line = mpirun_command(2, [sys.executable, "-m", "eddies", "dns", "hit-small", "--output", str(tmp_path)])
+    job = subprocess.Popen(line, env=mpi_environment(2), stdin=subprocess.DEVNULL, stderr=subprocess.STDOUT,
+                           stdout=subprocess.PIPE, text=True)
+    output = ""
+    while "dns: starts" not in output:
+        output += job.stdout.readline()
+    time.sleep(1)
+    begin = time.monotonic()
+    job.send_signal(number)
+    output += job.communicate(timeout=30)[0]
+    assert time.monotonic() - begin < 10 and "eddies: stopped by" in output
+    # mpirun answers SIGTERM with an exit code of its own.
+    assert job.returncode == 75 or number == signal.SIGTERM and job.returncode != 0
+    assert not (tmp_path / "ground_truth.h5").exists()
+
+
+def test_a_flow_that_diverges_is_told_in_a_sentence(tmp_path):
+    line = ["-m", "eddies", "dns", "taylor-green", "--output", tmp_path, "--set", "time.step=1.0", "--set",
+            "time.duration=100", "--set", "flow.viscosity=0"]
+    code, _, errors, _ = start(2, *line)
+    assert code == 2 and "no longer finite at step" in errors and "Traceback" not in errors

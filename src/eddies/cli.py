@@ -18,16 +18,17 @@ from eddies.logs import configure_logging
 from eddies.scene import SceneError, builtin_scenes, load_scene
 
 BAD_INPUT = 2
+STOPPED = 75  # EX_TEMPFAIL: the same command with --resume goes on
 PATIENCE = 5.0  # seconds that a rank waits for the others to come to the same error
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run one command; returns the exit code: 0 done, 2 bad input, 1 any other error."""
+    """Run one command; returns the exit code: 0 done, 2 bad input, 75 stopped by a signal, 1 any other error."""
     # Before numpy and torch are imported: they would start a thread for every core, in every rank.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     from mpi4py import MPI
     comm, exit_comm = MPI.COMM_WORLD, MPI.COMM_WORLD.Dup()
+    stop_on_signals(comm)
     try:
         configure_logging(comm.rank)
         options = parse_arguments(arguments, comm.rank)
@@ -37,6 +38,22 @@ def main(arguments: list[str] | None = None) -> int:
         return 128 + signal.SIGINT
     except Exception as error:
         return end_with_error(error, exit_comm)
+
+
+def stop_on_signals(comm) -> None:
+    """End the job with exit code 75 on SIGUSR1 and SIGTERM, as schedulers send before the time limit.
+
+    Finished stages are kept, the one that runs leaves nothing under its final name and starts anew with --resume.
+    """
+    def stop(number: int, frame: object) -> None:
+        if comm.rank == 0:
+            sys.stderr.write(f"eddies: stopped by {signal.Signals(number).name}; `--resume` goes on after the last "
+                             "finished stage\n")
+            sys.stderr.flush()
+        comm.Abort(STOPPED)
+
+    for number in (signal.SIGUSR1, signal.SIGTERM):
+        signal.signal(number, stop)
 
 
 def end_with_error(error: Exception, comm) -> int:
@@ -62,9 +79,10 @@ def end_with_error(error: Exception, comm) -> int:
 
 def is_users_mistake(error: Exception) -> bool:
     """Whether the text of an error tells the user what to do, so that no traceback is wanted."""
+    from eddies.flow.courant import FlowDiverged
     from eddies.io.hdf5 import ProductError
     from eddies.parallel.halo import HaloError
-    return isinstance(error, (SceneError, ProductError, HaloError))
+    return isinstance(error, (SceneError, ProductError, HaloError, FlowDiverged))
 
 
 def all_arrive(comm) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from eddies.flow.spectral_grid import SpectralGrid
+from eddies.parallel.halo import HaloError
 from eddies.parallel.plane_halo import PlaneHalo
 
 ORDERS = {"cubic": 3, "quintic": 5}
@@ -62,8 +63,8 @@ class SplineInterpolation:
         lowest = slab.start - self._halo.below
         rows = (first - lowest) % n
         if len(rows) and rows.max() + self.degree + 1 > planes:
-            raise ValueError("a point lies farther outside its slab than the ghost planes reach: "
-                             "the time step is too long")
+            raise HaloError("a particle moves farther out of its slab in one step than the ghost planes reach: "
+                            "lower [time] step, courant or max_step")
         return rows
 
 
