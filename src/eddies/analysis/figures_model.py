@@ -63,7 +63,8 @@ def training_history(history: Mapping[str, np.ndarray]) -> Figure:
     measured = np.isfinite(history["validation_error"])
     axes[0, 1].plot(history["step"][measured], history["validation_error"][measured], color=MODEL, marker="o",
                     markersize=3)
-    axes[0, 1].set(title="Error on unseen frames", xlabel="training step", ylim=(0, None),
+    highest = np.nanmax(history["validation_error"], initial=0.0)
+    axes[0, 1].set(title="Error on an unseen frame", xlabel="training step", ylim=(0, 1.1 * highest or None),
                    ylabel="normalised L2, acceleration")
     letter(axes.flat)
     return figure

@@ -10,6 +10,7 @@ from eddies.time_stepping import STEPPERS
 from eddies.workflows.dns import build_fluid, build_step_limit, initial_state
 
 DISSIPATION_CONSTANT = 0.5   # C_eps = eps L / u'^3 of developed turbulence
+PEAK_VELOCITY = 4.0          # largest component of the velocity of a particle over u'
 PEAK_SPEED = 7.0             # max(|u| + |v| + |w|) over u' in turbulence: four rms in each component at worst
 EXACT_PEAK_SPEED = {"taylor-green": 1.0, "abc": 3 * math.sqrt(2), "shear-wave": 1.0}  # over the amplitude
 GHOST_PLANES = {"cubic": 3, "quintic": 4}
@@ -117,16 +118,21 @@ def most_ranks(scene: Scene) -> dict[str, int]:
         limits[f"{ghosts} ghost planes of the {splines} splines"] = scene.flow.cells // ghosts
     if scene.tracers and scene.kernel:
         reach = particle_reach(scene)
-        cells = scene.tracers.cells
-        planes = math.ceil(reach / (BOX_LENGTH / cells) - 1e-9)
-        limits[f"slabs no thinner than the particles' reach {reach:.3g}"] = max(cells // planes, 1)
+        # Fields are reconstructed on one set of slabs, the pair force is evaluated on another.
+        by_slabs = [cells // math.ceil(reach / (BOX_LENGTH / cells) - 1e-9)
+                    for cells in (scene.tracers.cells, scene.tracers.particles_per_side)]
+        limits[f"slabs no thinner than the particles' reach {reach:.3g}"] = max(min(by_slabs), 1)
     return limits
 
 
 def particle_reach(scene: Scene) -> float:
-    """How far a particle sees: the kernel's support and the skin of the neighbour list."""
-    skin = scene.simulation.skin if scene.simulation else 0.0
-    return scene.kernel.support(scene.tracers.particles) * (1 + skin)
+    """How far a particle sees: the kernel's support, the skin of the neighbour list, and a step's way out of its slab."""
+    support, simulation = scene.kernel.support(scene.tracers.particles), scene.simulation
+    if simulation is None:
+        return support
+    turbulence = expected_turbulence(scene)
+    drift = PEAK_VELOCITY * turbulence.velocity_rms * simulation.step if turbulence else 0.0
+    return support * (1 + simulation.skin) + drift
 
 
 def flow_bytes(scene: Scene) -> float:

@@ -1,0 +1,191 @@
+"""README.md says what is true: its commands, scenes, keys, links and code are those of this checkout."""
+
+import dataclasses
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from eddies.cli import build_parser
+from eddies.scene import BOX_LENGTH, Scene, builtin_scenes, load_scene
+from eddies.scene_values import Bounds, Choice, Integer, Integers, Number, quoted
+
+CHECKOUT = Path(__file__).parents[1]
+README = (CHECKOUT / "README.md").read_text(encoding="utf-8")
+# Programs of the system that README mentions; what follows them is not looked at, but for paths.
+OF_THE_SYSTEM = ("module", "export", "source", "python3", ".venv/bin/pip")
+BATCH = ("sbatch", "qsub", "bsub", "flux")
+
+
+def blocks(language):
+    """The code blocks of a language."""
+    return re.findall(rf"^```{language}\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
+
+
+def marked(name):
+    """The text between the comments NAME and end of NAME."""
+    return README.split(f"<!-- {name} -->")[1].split(f"<!-- end of {name} -->")[0].strip()
+
+
+COMMANDS = [line.strip() for block in blocks("bash") for line in block.replace("\\\n", " ").splitlines()
+            if line.strip() and not line.strip().startswith("#")]
+EXAMPLE_NAME, EXAMPLE = re.fullmatch(r"# (\S+\.toml).*?\n(.*)", blocks("toml")[0], re.DOTALL).groups()
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder with the example scene, to work in."""
+    (tmp_path / EXAMPLE_NAME).write_text(EXAMPLE, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def words_of(command):
+    """Words of a command without variables set before it and without what starts the ranks."""
+    words = shlex.split(command, comments=True)
+    while re.fullmatch(r"[A-Z_0-9]+=.*", words[0]):
+        words = words[1:]
+    if words[:2] == ["python", "mpi_tools/launch.py"] or words[:2] == [".venv/bin/python", "mpi_tools/launch.py"]:
+        return words[words.index("--") + 1:]
+    if words[0] in ("mpirun", "srun"):
+        return words[3:] if words[1] == "-n" else words[1:]
+    return words
+
+
+def check_eddies(arguments):
+    """The command line is accepted, and its scene passes its checks."""
+    options = build_parser().parse_args(arguments)
+    if getattr(options, "scene", None):
+        load_scene(options.scene, getattr(options, "overrides", []))
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_command_exists(command, folder):
+    words = words_of(command)
+    program = words[0].removeprefix(".venv/bin/")
+    if program == "eddies":
+        check_eddies(words[1:])
+    elif words[:2] == ["bash", "jobs/local.sh"]:
+        given = words[2:]
+        scene = [] if given and not given[0].startswith("-") else ["hit-small"]
+        check_eddies(["run", *scene, *given])
+    else:
+        assert program in ("bash", "python", *BATCH) or words[0] in OF_THE_SYSTEM
+    for path in re.findall(r"(?:mpi_tools|jobs|tests|src|docs)/[\w./-]+", command):
+        assert (CHECKOUT / path).exists(), path
+
+
+@pytest.mark.parametrize("command", [line for line in COMMANDS if re.match(r"eddies (scenes|check)", line)])
+def test_cheap_command_runs(command, folder):
+    words = shlex.split(command, comments=True)
+    ended = subprocess.run([sys.executable, "-m", *words], cwd=folder, capture_output=True, text=True, timeout=60)
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stdout and "warning" not in ended.stdout
+
+
+def test_commands_in_the_text_exist():
+    choices = build_parser()._subparsers._group_actions[0].choices
+    named = set(re.findall(r"`eddies ([a-z-]+)", README))
+    assert named == set(choices)
+
+
+def test_options_in_the_text_exist():
+    listed = {option for command in build_parser()._subparsers._group_actions[0].choices.values()
+              for action in command._actions for option in action.option_strings}
+    for option in re.findall(r"`(--(?:set|output|resume)\b)", README):
+        assert option in listed
+    assert all(f"`{option}" in README for option in listed if option.startswith("--") and option != "--help")
+
+
+def test_variables_in_the_text_are_read_somewhere():
+    code = "".join(path.read_text() for pattern in ("src/**/*.py", "mpi_tools/*", "jobs/*")
+                   for path in CHECKOUT.glob(pattern) if path.is_file())
+    named = set(re.findall(r"EDDIES_\w+", README))
+    assert named and all(name in code for name in named)
+    assert set(re.findall(r"EDDIES_[A-Z]+", code)) <= named
+
+
+def test_example_scene_has_all_stages(folder):
+    scene = load_scene(EXAMPLE_NAME)
+    assert scene.name == Path(EXAMPLE_NAME).stem
+    assert scene.stages == ("dns", "train-kernel", "train", "simulate", "report")
+
+
+def test_table_of_scenes():
+    rows = [f"| `{name}` | {title} |" for name, title in builtin_scenes()]
+    assert marked("scenes").splitlines()[2:] == rows
+
+
+def allowed(rule):
+    """The values that a key may have, in few words."""
+    words = [f"`{quoted(word)}`" for word in getattr(rule, "words", ())]
+    if isinstance(rule, Choice):
+        return ", ".join(words)
+    noun = {Number: "number", Integer: "integer", Integers: "list of integers"}.get(type(rule), "text")
+    symbols = {"above": ">", "at_least": "≥", "below": "<", "at_most": "≤"}
+    bounds = getattr(rule, "bounds", Bounds())
+    limits = [f"{symbols[field.name]} {'2π' if value == BOX_LENGTH else format(value, 'g')}"
+              for field in dataclasses.fields(bounds)
+              if (value := getattr(bounds, field.name)) != field.default]
+    return " or ".join([" ".join([noun, " and ".join(limits)]).strip(), *words])
+
+
+def key_row(field):
+    """The row of a key."""
+    rule = field.metadata["rule"]
+    if field.default is dataclasses.MISSING:
+        default = "required"
+    else:
+        default = "none" if field.default is None else f"`{quoted(field.default)}`"
+    return f"| `{field.name}` | {default} | {allowed(rule)} | {rule.about} |".replace("|k|", r"\|k\|")
+
+
+def scene_reference():
+    """The scene reference of README, from the declarations of the keys."""
+    lines = ["| key | default | values | meaning |", "|---|---|---|---|"]
+    fields = dataclasses.fields(Scene)
+    lines += [key_row(field) for field in fields if "rule" in field.metadata]
+    for field in fields:
+        if "section" in field.metadata:
+            kind, absent = field.metadata["section"], field.default
+            need = {dataclasses.MISSING: ", required", None: ", optional"}.get(
+                absent if absent in (dataclasses.MISSING, None) else "", "")
+            lines.append(f"| **`[{field.name}]`**{need} | | | *{kind.__doc__.splitlines()[0].replace('|', '&#124;')}* |")
+            lines += [key_row(key) for key in dataclasses.fields(kind)]
+    return "\n".join(lines)
+
+
+def test_scene_reference():
+    assert marked("scene reference") == scene_reference()
+
+
+def slug(heading):
+    """The anchor that GitHub gives a heading."""
+    return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
+
+
+def test_links_lead_somewhere():
+    anchors = {slug(heading) for heading in re.findall(r"^#+ (.+)$", README, re.MULTILINE)}
+    for link in re.findall(r"\]\(([^)\s]+)\)", README):
+        if link.startswith("#"):
+            assert link[1:] in anchors, link
+        elif not link.startswith("https://"):
+            assert (CHECKOUT / link).exists(), link
+
+
+def test_files_in_the_text_exist():
+    for path in re.findall(r"`((?:mpi_tools|jobs|tests|src|docs)/[\w./-]*)`", README):
+        assert (CHECKOUT / path).exists(), path
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("program", blocks("python"))
+def test_python_runs_on_the_files_of_a_run(comm, tmp_path, monkeypatch, capsys, program):
+    from tests.workflows.synthetic_run import write_run
+    write_run(comm, tmp_path / "runs/hit-small")
+    monkeypatch.chdir(tmp_path)
+    exec(compile(program, "README.md", "exec"), {})
+    assert "nan" not in capsys.readouterr().out
