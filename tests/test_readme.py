@@ -48,7 +48,7 @@ def words_of(command):
     words = shlex.split(command, comments=True)
     while re.fullmatch(r"[A-Z_0-9]+=.*", words[0]):
         words = words[1:]
-    if words[:2] == ["python", "mpi_tools/launch.py"] or words[:2] == [".venv/bin/python", "mpi_tools/launch.py"]:
+    if words[:2] == ["python", "mpi_tools/launch.py"]:
         return words[words.index("--") + 1:]
     if words[0] in ("mpirun", "srun"):
         return words[3:] if words[1] == "-n" else words[1:]
@@ -150,10 +150,9 @@ def scene_reference():
     lines += [key_row(field) for field in fields if "rule" in field.metadata]
     for field in fields:
         if "section" in field.metadata:
-            kind, absent = field.metadata["section"], field.default
-            need = {dataclasses.MISSING: ", required", None: ", optional"}.get(
-                absent if absent in (dataclasses.MISSING, None) else "", "")
-            lines.append(f"| **`[{field.name}]`**{need} | | | *{kind.__doc__.splitlines()[0].replace('|', '&#124;')}* |")
+            kind, default = field.metadata["section"], field.default
+            need = ", required" if default is dataclasses.MISSING else ", optional" if default is None else ""
+            lines.append(f"| **`[{field.name}]`**{need} | | | *{kind.__doc__.splitlines()[0]}* |")
             lines += [key_row(key) for key in dataclasses.fields(kind)]
     return "\n".join(lines)
 
@@ -182,7 +181,7 @@ def test_files_in_the_text_exist():
 
 
 @pytest.mark.mpi(1)
-@pytest.mark.parametrize("program", blocks("python"))
+@pytest.mark.parametrize("program", blocks("python"), ids=lambda _: "program")
 def test_python_runs_on_the_files_of_a_run(comm, tmp_path, monkeypatch, capsys, program):
     from tests.workflows.synthetic_run import write_run
     write_run(comm, tmp_path / "runs/hit-small")
