@@ -3,10 +3,10 @@
 # Submit from the checkout, or set EDDIES_CHECKOUT to it. Load your cluster's modules first, as for set-up.
 #flux: --job-name=eddies
 #flux: --nodes=1
-#flux: --nslots=16
+#flux: --nslots=8
 #flux: --time-limit=4h
 # The ranks are a job of their own inside: SIGUSR1 reaches them five minutes before its limit.
-launcher=(flux run --ntasks=16 --time-limit=238m --signal=USR1@5m)
+launcher=(flux run --ntasks=8 --time-limit=238m --signal=USR1@5m)
 resubmit=(flux --parent batch jobs/flux.sh)
 
 # ---- the same for every scheduler

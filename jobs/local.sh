@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # Sets up what is missing and runs a scene on the cores of this machine:
 #   bash jobs/local.sh [SCENE] [options of `eddies run`]        default scene: hit-small
-# EDDIES_RANKS limits the number of ranks (default: 8, or the cores where there are fewer; a slab of a small scene
-# must not be thinner than its halo).
+# EDDIES_RANKS limits the number of ranks (default: 8, or what the scene can be cut into, or the cores, where that is
+# less).
 set -euo pipefail
 jobs=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 bash "$jobs/../mpi_tools/bootstrap.sh"
@@ -11,7 +11,11 @@ if [ $# -gt 0 ] && [ "${1#-}" = "$1" ]; then
     EDDIES_SCENE=$1
     shift
 fi
-export EDDIES_RANKS=${EDDIES_RANKS:-8}
+if [ -z "${EDDIES_RANKS:-}" ]; then
+    most=$("$jobs/../.venv/bin/eddies" check "$EDDIES_SCENE" | sed -n 's/^ranks *at most //p')
+    EDDIES_RANKS=$((${most:-8} < 8 ? ${most:-8} : 8))
+fi
+export EDDIES_RANKS
 launcher=("$jobs/../.venv/bin/python" "$jobs/../mpi_tools/launch.py" --)
 resubmit=(true)
 source "$jobs/run.sh"

@@ -2,7 +2,7 @@
 # EDDIES_SCENE=hit-small bsub < jobs/lsf.sh
 # Submit from the checkout, or set EDDIES_CHECKOUT to it. Load your cluster's modules first, as for set-up.
 #BSUB -J eddies
-#BSUB -n 16
+#BSUB -n 8
 #BSUB -W 4:00
 #BSUB -o eddies.%J.log
 # SIGUSR1 five minutes before the limit: the ranks end with 75, which queues the job again.

@@ -2,7 +2,7 @@
 # qsub -v EDDIES_SCENE=hit-small jobs/pbs.sh
 # Submit from the checkout, or set EDDIES_CHECKOUT to it. Load your cluster's modules first, as for set-up.
 #PBS -N eddies
-#PBS -l select=1:ncpus=16:mpiprocs=16:ompthreads=1
+#PBS -l select=1:ncpus=8:mpiprocs=8:ompthreads=1
 #PBS -l walltime=04:00:00
 #PBS -j oe
 # PBS cannot warn a job: timeout sends SIGUSR1 to mpirun, and so to the ranks, five minutes before the walltime.

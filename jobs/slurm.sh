@@ -3,7 +3,7 @@
 # Submit from the checkout, or set EDDIES_CHECKOUT to it. Load your cluster's modules first, as for set-up.
 #SBATCH --job-name=eddies
 #SBATCH --nodes=1
-#SBATCH --ntasks-per-node=16
+#SBATCH --ntasks-per-node=8
 #SBATCH --cpus-per-task=1
 #SBATCH --time=04:00:00
 # SIGUSR1 to the ranks five minutes before the limit: they end with 75, and the job is queued again.

@@ -122,6 +122,7 @@ def test_resume_skips_what_is_done_with_the_same_settings(comm, tmp_path, capfd)
 @pytest.mark.mpi(2)
 def test_run_ends_with_a_report(comm, tmp_path, capfd):
     assert run_cli("run", *ABC, "--output", tmp_path) == 0
+    comm.Barrier()
     page = tmp_path / "report" / "index.html"
     assert page.exists() and (tmp_path / "report" / "metrics.json").exists()
     assert (str(page) in capfd.readouterr().out) == (comm.rank == 0)
@@ -136,17 +137,49 @@ def test_report_of_no_directory(comm, tmp_path, capfd):
 
 
 @pytest.mark.mpi(1, 2)
-def test_input_of_another_scene_is_told(comm, tmp_path, capfd):
+def test_input_of_other_settings_is_refused(comm, tmp_path, capfd):
     from eddies.io.hdf5 import create_product
-    from eddies.logs import configure_logging
     from eddies.scene import load_scene
     from eddies.stages import check_inputs
-    with create_product(comm, tmp_path / "ground_truth.h5", "ground_truth", {"fingerprint": "of another"}):
+    scene = load_scene("tiny")
+    with create_product(comm, tmp_path / "ground_truth.h5", "ground_truth", {"fingerprint": scene.fingerprint("dns")}):
         pass
-    configure_logging(comm.rank)
-    check_inputs(["train-kernel"], load_scene("tiny"), comm, tmp_path)
-    told = "was made with other settings than this scene's" in capfd.readouterr().out
-    assert told == (comm.rank == 0)
+    check_inputs(["train-kernel"], scene, comm, tmp_path)
+    assert run_cli("train-kernel", "tiny", "--set", "seed=2", "--output", tmp_path) == 2
+    errors = capfd.readouterr().err
+    assert comm.rank > 0 or "ground_truth.h5: was made with other settings" in errors and "`eddies dns`" in errors
+    assert not (tmp_path / "kernel.h5").exists() and not (tmp_path / "scene.toml").exists()
+
+
+@pytest.mark.mpi(2)
+def test_more_ranks_than_slabs_are_refused_before_any_work(comm, tmp_path, capfd):
+    coarse = ["--set", "tracers.field_cells=6", "--output", tmp_path / "run"]
+    assert run_cli("run", "tiny", *coarse) == 2
+    told = "tiny: 2 ranks are more than the 1 that it can use (ghost planes of the filtered fields)"
+    assert comm.rank > 0 or told in capfd.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.mpi(1)
+def test_limit_of_ranks_is_that_of_the_stages(comm):
+    from types import SimpleNamespace
+
+    from eddies.scene import SceneError, load_scene
+    from eddies.stages import check_ranks
+    check_ranks(["dns"], load_scene("tiny"), SimpleNamespace(size=8))
+    check_ranks(load_scene("hit-small").stages, load_scene("hit-small"), SimpleNamespace(size=8))
+    with pytest.raises(SceneError, match="start at most 4"):
+        check_ranks(load_scene("tiny").stages, load_scene("tiny"), SimpleNamespace(size=5))
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("before, kept", [('{"dns": 1.5}', {"dns", "train"}), ('{"dns": 1', {"train"})])
+def test_seconds_of_stages_are_kept(comm, tmp_path, before, kept):
+    from eddies.stages import record_seconds
+    (tmp_path / "stage_seconds.json").write_text(before)
+    record_seconds("train", 2.0, comm, tmp_path)
+    assert json.loads((tmp_path / "stage_seconds.json").read_text()).keys() == kept
+    assert len(list(tmp_path.iterdir())) == 1
 
 
 @pytest.mark.mpi(1, 2)
@@ -229,3 +262,10 @@ def test_a_flow_that_diverges_is_told_in_a_sentence(tmp_path):
             "time.duration=100", "--set", "flow.viscosity=0"]
     code, _, errors, _ = start(2, *line)
     assert code == 2 and "no longer finite at step" in errors and "Traceback" not in errors
+
+
+def test_a_flow_that_cannot_be_forced_is_told_in_a_sentence(tmp_path):
+    line = ["-m", "eddies", "dns", "taylor-green", "--output", tmp_path, "--set", "forcing.injection_rate=0.5",
+            "--set", "forcing.wavenumber=1.5"]
+    code, _, errors, _ = start(2, *line)
+    assert code == 2 and "no energy at 0 < |k| < wavenumber = 1.5" in errors and "Traceback" not in errors

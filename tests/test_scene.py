@@ -65,6 +65,7 @@ def test_derived_lengths():
 
 
 FINGERPRINTS = {"flow.viscosity=0.061": "dns", "seed=2": "dns", "kernel.steps=99": "train-kernel",
+                "training.window=0.4": "train-kernel", "device=cuda": "train",
                 "model.hidden=[4]": "train", "training.steps=59": "train", "simulation.skin=0.2": "simulate"}
 
 
@@ -75,9 +76,27 @@ def test_fingerprint_changes_from_the_stage_that_reads_the_key(override, first_c
     assert affected == list(STAGES[STAGES.index(first_changed):])
 
 
-def test_fingerprint_ignores_names_and_the_device():
-    scene, renamed = load_scene("tiny"), load_scene("tiny", ["name=x", "title=y", "device=cuda"])
+def test_fingerprint_ignores_names():
+    scene, renamed = load_scene("tiny"), load_scene("tiny", ["name=x", "title=y"])
     assert scene.fingerprint("report") == renamed.fingerprint("report")
+
+
+def test_fingerprint_changes_with_the_file_that_the_flow_starts_from(tmp_path):
+    start = tmp_path / "start.h5"
+    prints = set()
+    for content in ("one state", "another state", "one state"):
+        start.write_text(content)
+        scene = load_scene("taylor-green", ["initial.kind=file", f"initial.path={start}"])
+        prints.add(scene.fingerprint("dns"))
+    assert len(prints) == 2
+
+
+def test_window_without_training_is_the_default_of_training():
+    scene = load_scene("tiny")
+    alone = dataclasses.replace(scene, model=None, training=None, simulation=None)
+    assert alone.window == scene.window == 0.5
+    assert load_scene("tiny", ["training.window=0.4"]).window == 0.4
+    assert alone.fingerprint("train-kernel") == scene.fingerprint("train-kernel")
 
 
 @pytest.mark.parametrize("text, message", BAD_TEXTS, ids=range(len(BAD_TEXTS)))

@@ -47,8 +47,8 @@ def ladder_step(largest: float, bound: float) -> float:
 class ProgressLine:
     """Logs one line every few seconds of wall time: how far, and how long it will still take.
 
-    `describe` returns what is worth reading of the state at that moment; it is called by the rank that reports only,
-    so it must not communicate.
+    `describe` returns what is worth reading of the state at that moment; it is called where that is logged only, so it
+    must not communicate.
     """
 
     def __init__(self, stage: str, describe: Callable[[], str], interval: float = 5.0) -> None:
@@ -57,6 +57,8 @@ class ProgressLine:
 
     def __call__(self, done: float, step: int) -> None:
         """Report if it is time; `done` is the finished fraction of the stage in [0, 1], `step` the steps so far."""
+        if not log.isEnabledFor(logging.INFO):
+            return
         now = time.perf_counter()
         if now - self._last < self.interval or done <= 0:
             return

@@ -7,12 +7,13 @@ import difflib
 import hashlib
 import json
 from dataclasses import asdict, dataclass, fields
+from functools import lru_cache
 from pathlib import Path
 
 from eddies.scene_checks import first_inconsistency
 from eddies.scene_reader import apply_overrides, parse_document, read_section, read_text, write_section
-from eddies.scene_sections import (BOX_LENGTH, Flow, Forcing, Initial, Kernel, Model, Simulation, SpinUp,
-                                   Time, Tracers, Training)
+from eddies.scene_sections import (BOX_LENGTH, DEFAULT_WINDOW, Flow, Forcing, Initial, Kernel, Model, Simulation,
+                                   SpinUp, Time, Tracers, Training)
 from eddies.scene_values import SceneError, choice, integer, section, text
 
 __all__ = ["BOX_LENGTH", "STAGES", "Scene", "SceneError", "builtin_scenes", "load_scene", "Flow", "Forcing",
@@ -52,6 +53,11 @@ class Scene:
         needs = {"train-kernel": self.kernel, "train": self.model, "simulate": self.simulation}
         return tuple(stage for stage in STAGES if needs.get(stage, self) is not None)
 
+    @property
+    def window(self) -> float:
+        """Fraction of the ground truth that kernel and model may see; with a kernel alone the default of [training]."""
+        return self.training.window if self.training else DEFAULT_WINDOW
+
     def to_toml(self) -> str:
         """The scene as a TOML text with a comment on every key; reading it back gives an equal scene."""
         lines = write_section(self)
@@ -62,10 +68,12 @@ class Scene:
         return "\n".join(lines) + "\n"
 
     def fingerprint(self, stage: str) -> str:
-        """SHA-256 over the settings that a stage's product depends on: its own and all earlier stages'."""
-        reads = {"dns": ("seed", "flow", "initial", "forcing", "time", "spin_up", "tracers"),
-                 "train-kernel": ("kernel",), "train": ("model", "training"), "simulate": ("simulation",)}
-        settings = asdict(self)
+        """SHA-256 over what a stage's product depends on: its own settings and all earlier stages', and the content
+        of the file that the flow starts from."""
+        reads = {"dns": ("seed", "flow", "initial", "start", "forcing", "time", "spin_up", "tracers"),
+                 "train-kernel": ("kernel", "window"), "train": ("device", "model", "training"),
+                 "simulate": ("simulation",)}
+        settings = asdict(self) | {"window": self.window, "start": _digest(self.initial.path)}
         keys = [key for earlier in STAGES[:STAGES.index(stage) + 1] for key in reads.get(earlier, ())]
         return hashlib.sha256(json.dumps([[key, settings[key]] for key in keys]).encode()).hexdigest()
 
@@ -90,6 +98,21 @@ def load_scene(name_or_path: str | Path, overrides: list[str] | tuple[str, ...] 
 def builtin_scenes() -> list[tuple[str, str]]:
     """Name and title of every scene that comes with the package, by name."""
     return [(path.stem, parse_document(read_text(path))["title"]) for path in sorted(BUILT_IN.glob("*.toml"))]
+
+
+def _digest(path: str | None) -> str | None:
+    """SHA-256 of a file's content; None if there is no such file."""
+    if path is None or not Path(path).is_file():
+        return None
+    state = Path(path).stat()
+    return _digest_of_version(path, state.st_size, state.st_mtime_ns)
+
+
+@lru_cache(maxsize=4)
+def _digest_of_version(path: str, size: int, modified: int) -> str:
+    # The file may be large, and its digest is asked for several times in a run.
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _find(name_or_path: str) -> Path:

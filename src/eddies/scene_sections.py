@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from eddies.scene_values import choice, integer, integers, number, text
 
 BOX_LENGTH = 2 * math.pi
+DEFAULT_WINDOW = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,7 +108,8 @@ class Kernel:
                                        at_least=1)
     cutoff: str = choice("factor that ends the kernel at its support", "smooth", "sigmoid", default="smooth")
     gradient_weight: float = number("weight of the velocity gradient in the loss", default=1.0, at_least=0)
-    normalization_weight: float = number("weight of the sum over particles being 1", default=0.0, at_least=0)
+    normalization_weight: float = number("weight of (integral - 1)^2 of the kernel before it is normalised",
+                                         default=0.0, at_least=0)
     steps: int = integer("optimiser steps", at_least=1)
     points: int = integer("grid points drawn per step", default=2048, at_least=1)
     learning_rate: float = number("of the optimiser", default=2e-3, above=0)
@@ -134,8 +136,8 @@ class Model:
 class Training:
     """How the pair force is fitted to the tracers: first to trajectories, then to all losses together."""
 
-    window: float = number("fraction of the ground truth that is used, the rest stays unseen", default=0.5,
-                           above=0, at_most=1)
+    window: float = number("fraction of the ground truth that is used, the rest stays unseen",
+                           default=DEFAULT_WINDOW, above=0, at_most=1)
     frames: int = integer("frames of the window to draw from", at_least=2)
     batch: int = integer("particles per step", at_least=1)
     steps: int = integer("optimiser steps", at_least=1)

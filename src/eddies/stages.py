@@ -2,8 +2,10 @@
 
 import json
 import logging
+import os
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
@@ -27,9 +29,11 @@ def run_stages(stages: Sequence[str], scene: Scene, comm, directory: Path, resum
     the first one that has to run.
 
     Raises:
-        SceneError: the scene lacks a section that a stage is about, or the directory cannot be written.
+        SceneError: the scene lacks a section that a stage is about, cannot be cut into as many slabs as there are
+            ranks, differs from that of a product the stages start from, or the directory cannot be written.
         ProductError: a stage that is not among `stages` has not left the product that they start from.
     """
+    check_ranks(stages, scene, comm)
     check_inputs(stages, scene, comm, directory)
     prepare_directory(scene, comm, directory)
     for stage in stages:
@@ -48,8 +52,20 @@ def run_stages(stages: Sequence[str], scene: Scene, comm, directory: Path, resum
         record_seconds(stage, time.perf_counter() - start, comm, directory)
 
 
+def check_ranks(stages: Sequence[str], scene: Scene, comm) -> None:
+    """Refuse more ranks than the slabs of a scene allow; its ground truth alone may use more than what learns of it."""
+    from eddies.workflows.estimates import most_ranks  # imports the flow solver, which `eddies --help` can do without
+    if set(stages) == {"dns"}:
+        scene = replace(scene, kernel=None, model=None, training=None, simulation=None)
+    limits = most_ranks(scene)
+    reason = min(limits, key=limits.get)
+    if comm.size > limits[reason]:
+        raise SceneError(f"{scene.name}: {comm.size} ranks are more than the {limits[reason]} that it can use "
+                         f"({reason}); start at most {limits[reason]}, `eddies check` gives all limits")
+
+
 def check_inputs(stages: Sequence[str], scene: Scene, comm, directory: Path) -> None:
-    """Refuse stages that the scene lacks or whose inputs are missing; warn of inputs of another scene."""
+    """Refuse stages that the scene lacks, and inputs that are missing or of other settings than the scene's."""
     for stage in stages:
         if stage not in scene.stages:
             section = {"train-kernel": "kernel", "train": "model", "simulate": "simulation"}[stage]
@@ -59,9 +75,9 @@ def check_inputs(stages: Sequence[str], scene: Scene, comm, directory: Path) -> 
         kind, name = PRODUCTS[needed]
         with open_product(comm, directory / name, kind):
             pass
-        if product_fingerprint(directory / name) != scene.fingerprint(needed) and comm.rank == 0:
-            log.warning("%s was made with other settings than this scene's; `eddies %s` would make it anew",
-                        directory / name, needed)
+        if not is_done(needed, scene, comm, directory):
+            raise SceneError(f"{directory / name}: was made with other settings than this scene's; run "
+                             f"`eddies {needed}` again with these, or give `eddies {stages[0]}` the --set of then")
 
 
 def prepare_directory(scene: Scene, comm, directory: Path) -> None:
@@ -97,5 +113,15 @@ def record_seconds(stage: str, seconds: float, comm, directory: Path) -> None:
     log.info("%s: took %s", stage, duration(seconds))
     if comm.rank == 0:
         path = directory / "stage_seconds.json"
-        known = json.loads(path.read_text()) if path.exists() else {}
-        path.write_text(json.dumps({**known, stage: round(seconds, 3)}, indent=2) + "\n")
+        partial = path.with_name(path.name + ".partial")
+        partial.write_text(json.dumps({**_known_seconds(path), stage: round(seconds, 3)}, indent=2) + "\n")
+        os.replace(partial, path)
+
+
+def _known_seconds(path: Path) -> dict[str, float]:
+    """What an earlier run noted; a file that is missing or damaged holds nothing worth an error."""
+    try:
+        known = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return {}
+    return known if isinstance(known, dict) else {}

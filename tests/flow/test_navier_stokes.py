@@ -2,11 +2,12 @@ import numpy as np
 import pytest
 
 from eddies.flow import initial_fields
-from eddies.flow.forcing import LinearForcing
+from eddies.flow.forcing import ForcingError, LinearForcing
 from eddies.flow.history import FlowHistory
 from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid
-from eddies.flow.operators import divergence
+from eddies.flow.operators import divergence, gradient
 from eddies.flow.spectral_grid import SpectralGrid
+from eddies.flow.statistics import compressible_budget, longitudinal_gradient
 from eddies.clock import Clock
 from eddies.parallel.migration import Redistribution
 from eddies.parallel.slab import SlabDecomposition
@@ -120,3 +121,27 @@ def test_long_forcing_leaves_no_part_that_a_real_field_has_not(comm):
     state = march(fluid, initial_fields.random_velocity(grid, 3, 0.5, 1.5), 0.1, 1500)
     again = grid.forward(grid.backward(state))
     assert np.abs(again - state).max() < 1e-12
+
+
+@pytest.mark.mpi(1, 2)
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+def test_a_flow_without_energy_at_the_forced_modes_is_refused(comm, precision):
+    grid = SpectralGrid(SlabDecomposition(comm, 2 * np.pi, 16), precision)
+    velocity = initial_fields.taylor_green(grid, 1.0)
+    with pytest.raises(ForcingError, match="no energy at 0 < |k| < wavenumber = 1.5"):
+        LinearForcing(grid, 0.5, 1.5).add(velocity, np.zeros_like(velocity))
+    LinearForcing(grid, 0.5, 2.0).add(velocity, np.zeros_like(velocity))
+    LinearForcing(grid, 0.0, 1.5).add(velocity, np.zeros_like(velocity))
+
+
+@pytest.mark.mpi(1, 2)
+def test_dissipation_against_all_nine_gradients(comm):
+    fluid, state = forced_fluid(comm)
+    grid = fluid.grid
+    A = np.array([grid.backward(gradient(grid, component)) for component in state[:3]])
+    rho, S = np.exp(grid.backward(state[3:])[0]), (A + A.transpose(1, 0, 2, 3, 4)) / 2
+    friction = rho * (2 * (S**2).sum(axis=(0, 1)) - 2 / 3 * np.einsum("iizyx->zyx", A) ** 2)
+    longitudinal = longitudinal_gradient(grid, state[:3])
+    assert np.allclose(longitudinal, [A[i, i] for i in range(3)], atol=1e-13)
+    budget = compressible_budget(grid, state, longitudinal, 0.05, 8.0)
+    assert budget["dissipation_rate"] == pytest.approx(0.05 * float(grid.mean(friction[None])[0]), rel=1e-12)

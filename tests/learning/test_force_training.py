@@ -33,8 +33,7 @@ def frame_of(comm, model, squeeze=1.0):
 def trainer_of(comm, closure="learned-density", weights=LossWeights(1.0, 1.0, 0.1, 0.1), batch=300):
     model = PairModel(SCALES, SUPPORT, 45, (8, 8), closure=closure, seed=2)
     frame = frame_of(comm, model)
-    return ForceTrainer(frame.dynamics.surroundings.decomposition, model, [frame], WendlandC2(SUPPORT), PER_SIDE,
-                        weights, PER_SIDE**3, batch, seed=5)
+    return ForceTrainer(model, [frame], WendlandC2(SUPPORT), weights, batch, seed=5)
 
 
 @pytest.mark.mpi(1, 2, 3)
@@ -97,7 +96,7 @@ def test_training_lowers_the_error_of_a_learnable_force(comm):
 @pytest.mark.mpi(1)
 def test_losses_without_weight_are_not_computed(comm, monkeypatch):
     trainer = trainer_of(comm, weights=LossWeights())
-    for name in ("_field_share", "_divergence", "_volumes"):
+    for name in ("_field_share", "_divergence"):
         monkeypatch.setattr(ForceTrainer, name, lambda *args: pytest.fail("an unused loss was computed"))
     row = trainer.combined_step(Descent(comm, trainer.model.parameters(), 1, 1e-2, 1e-2), 0)
     assert set(row) == {"loss", "trajectory_loss", "gradient_norm"}

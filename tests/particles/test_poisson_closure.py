@@ -8,7 +8,8 @@ from eddies.flow.operators import pressure
 from eddies.flow.pressure import PressureSolver
 from eddies.flow.spectral_grid import SpectralGrid
 from eddies.flow.tracers import release
-from eddies.parallel.migration import IdOrder
+from eddies.parallel.halo import HaloError
+from eddies.parallel.migration import IdOrder, migrate
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.poisson_closure import PoissonClosure
@@ -32,7 +33,7 @@ def particles_in_turbulence(comm):
 
 def closure_on(comm, passes):
     solver = PressureSolver(SlabDecomposition(comm, LENGTH, PER_SIDE), resolved=6)
-    return PoissonClosure(solver, WendlandC2(SUPPORT), SOUND_SPEED, passes=passes)
+    return PoissonClosure(solver, WendlandC2(SUPPORT), SOUND_SPEED, passes=passes, dtype=torch.float64)
 
 
 @pytest.mark.mpi(1)
@@ -53,8 +54,6 @@ def test_density_is_the_same_on_any_number_of_ranks(comm):
         particles = particles_in_turbulence(communicator)[0]
         # The closure's slabs are those of a coarser grid.
         slab = SlabDecomposition(communicator, LENGTH, PER_SIDE)
-        from eddies.parallel.migration import migrate
-
         moved = ParticleSet.from_numpy(migrate(slab, particles.to_numpy()))
         closed = closure_on(communicator, 2).apply(moved)
         order = IdOrder(communicator, as_numpy(closed.id), PER_SIDE**3)
@@ -62,8 +61,7 @@ def test_density_is_the_same_on_any_number_of_ranks(comm):
 
     order, found = density(comm)
     alone = density(MPI.COMM_SELF)[1]
-    # Pair sums are in single precision.
-    assert np.allclose(found - 1, alone[order.start : order.stop] - 1, atol=1e-7)
+    assert np.allclose(found - 1, alone[order.start : order.stop] - 1, rtol=1e-11, atol=1e-14)
 
 
 @pytest.mark.mpi(1)
@@ -71,3 +69,14 @@ def test_uniform_motion_has_no_pressure(comm):
     particles, _ = particles_in_turbulence(comm)
     moving = ParticleSet(particles.id, particles.position, torch.full_like(particles.velocity, 3.0), particles.density)
     assert np.abs(as_numpy(closure_on(comm, 4).apply(moving).density) - 1).max() < 1e-7
+
+
+@pytest.mark.mpi(2)
+def test_a_particle_beyond_the_ghost_planes_is_refused_on_all_ranks(comm):
+    slab = SlabDecomposition(comm, LENGTH, PER_SIDE)
+    particles = ParticleSet.from_numpy(migrate(slab, particles_in_turbulence(comm)[0].to_numpy()))
+    far = particles.position.clone()
+    if comm.rank == 1:
+        far[0, 2] = slab.upper + 1.5 * slab.spacing
+    with pytest.raises(HaloError, match="shorten the time step"):
+        closure_on(comm, 1).apply(ParticleSet(particles.id, far, particles.velocity, particles.density))

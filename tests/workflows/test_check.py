@@ -35,7 +35,7 @@ def test_check_of_any_scene_writes_nothing(comm, tmp_path, monkeypatch, caplog, 
 def test_numbers_of_the_small_case(comm, caplog, recorded):
     text = lines_of(load_scene("hit-small"), comm, caplog)
     for part in ("spacing 0.09817, k_max 21", "32^3 = 32768, mean spacing 0.1963 = 2 cells", "Re_lambda 50.3",
-                 "filter width 0.3927", "kernel support 0.4769, 60 neighbours", "at most 9"):
+                 "filter width 0.3927", "kernel support 0.4769, 60 neighbours", "at most 10"):
         assert part in text
 
 
@@ -81,18 +81,37 @@ def test_expected_step_is_the_one_taken_at_the_start(comm):
 
 
 @pytest.mark.mpi(1, 2, 3, 4)
-def test_most_ranks_is_what_the_parts_accept(comm):
+@pytest.mark.parametrize("neighbors, most", [(56, 4), (100, 3)])
+def test_most_ranks_is_what_the_parts_accept(comm, neighbors, most):
+    from eddies.flow.interpolation import SplineInterpolation
+    from eddies.flow.spectral_grid import SpectralGrid
     from eddies.parallel.halo import HaloError, require_thick_slabs
     from eddies.parallel.slab import SlabDecomposition
     from eddies.scene import BOX_LENGTH
     from eddies.workflows.estimates import most_ranks, particle_reach
-    scene = load_scene("tiny", ["kernel.neighbors=70"])
-    slabs = SlabDecomposition(comm, BOX_LENGTH, scene.tracers.cells)
-    if comm.size <= min(most_ranks(scene).values()):
-        require_thick_slabs(slabs, particle_reach(scene))
+    scene = load_scene("tiny", [f"kernel.neighbors={neighbors}"])
+    fields, particles = (SlabDecomposition(comm, BOX_LENGTH, planes)
+                         for planes in (scene.tracers.cells, scene.tracers.particles_per_side))
+    assert min(most_ranks(scene).values()) == most
+    SplineInterpolation(SpectralGrid(fields), "quintic")
+    SplineInterpolation(SpectralGrid(particles), "cubic")
+    if comm.size <= most:
+        require_thick_slabs(fields, scene.kernel.support(scene.tracers.particles))
+        require_thick_slabs(particles, particle_reach(scene))
     else:
         with pytest.raises(HaloError):
-            require_thick_slabs(slabs, particle_reach(scene))
+            require_thick_slabs(fields, scene.kernel.support(scene.tracers.particles))
+            require_thick_slabs(particles, particle_reach(scene))
+
+
+def test_ghost_planes_limit_the_ranks():
+    from eddies.workflows.estimates import most_ranks
+    fields = {planes: most_ranks(load_scene("tiny", [f"tracers.field_cells={planes}"])) for planes in (11, 12)}
+    assert [limits["ghost planes of the filtered fields"] for limits in fields.values()] == [2, 3]
+    assert fields[12]["ghost planes of the Poisson closure"] == 4
+    fast = most_ranks(load_scene("tiny", ["simulation.step=0.2", "simulation.frame_interval=0.2"]))
+    assert fast["ghost planes of the Poisson closure"] == 3
+    assert "ghost planes of the Poisson closure" not in most_ranks(load_scene("tiny", ["model.closure=paper-density"]))
 
 
 @pytest.mark.mpi(1)
@@ -107,3 +126,11 @@ def test_job_with_too_many_ranks_is_told(comm):
     from eddies.workflows.check import warnings
     assert any("this job has 100 ranks" in line for line in warnings(load_scene("tiny"), 100))
     assert list(warnings(load_scene("hit-small"), 2)) == []
+
+
+@pytest.mark.mpi(1, 2)
+@pytest.mark.parametrize("overrides", [["forcing.wavenumber=1.5"], ["flow.cells=72", "forcing.wavenumber=23"]])
+@pytest.mark.filterwarnings("error")
+def test_probe_forces_any_wavenumber(comm, overrides):
+    from eddies.workflows.estimates import probe_seconds_per_step
+    assert 0 < probe_seconds_per_step(load_scene("hit-small", overrides), comm, steps=1) < math.inf

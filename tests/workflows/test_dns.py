@@ -4,6 +4,7 @@ import sys
 import numpy as np
 import pytest
 
+from eddies.io.fields import FieldSeries
 from eddies.io.hdf5 import open_product, read_attributes, read_table
 from eddies.io.trajectories import Trajectory
 from eddies.scene import load_scene
@@ -47,7 +48,10 @@ def test_tracers_are_stored_by_id_and_do_not_depend_on_ranks(comm, tmp_path):
                 trajectory = Trajectory(file, "tracers")
                 assert trajectory.total == 216 and len(trajectory.times) == 2
                 positions.append(trajectory.read(-1, "position"))
-                assert "density_rms" in read_attributes(file, "reference")
+                # An incompressible fluid has no density to store.
+                assert set(trajectory.columns) == {"position", "velocity"}
+                assert FieldSeries(file, "filtered").variables == ("velocity",)
+                assert "density_rms" not in read_attributes(file, "reference")
         assert np.abs(positions[0] - positions[1]).max() < 1e-12
     comm.Barrier()
 
@@ -81,3 +85,46 @@ def test_zero_forcing_amplitude_equals_no_forcing(comm, tmp_path):
         with open_product(comm, tmp_path / name / "ground_truth.h5", "ground_truth") as file:
             ends.append(read_table(file, "statistics")["energy"])
     assert np.array_equal(*ends)
+
+
+@pytest.mark.mpi(1, 2)
+def test_statistics_are_sampled_every_few_steps_at_the_release_and_at_the_end(comm, tmp_path):
+    overrides = ["flow.cells=16", "tracers.particles_per_side=6", "tracers.field_cells=8", "spin_up.turnovers=0.1",
+                 "tracers.turnovers=0.3", "time.step=0.01", "kernel.neighbors=20", "training.batch=9"]
+    dns.run(load_scene("tiny", overrides), comm, tmp_path)
+    with open_product(comm, tmp_path / "ground_truth.h5", "ground_truth") as file:
+        statistics, reference = read_table(file, "statistics"), read_attributes(file, "reference")
+        end, last_frame = statistics["time"][-1], Trajectory(file, "tracers").times[-1]
+    assert np.all(np.diff(statistics["time"]) > 0)
+    row = int(np.argmin(np.abs(statistics["time"] - reference["released_at"])))
+    assert statistics["time"][row] == reference["released_at"]
+    assert reference["dissipation_rate"] == statistics["dissipation_rate"][row]
+    assert end == pytest.approx(reference["released_at"] + last_frame)
+    steps = round(end / 0.01)
+    assert len(statistics["time"]) <= steps // 4 + 3
+    assert "density_rate_rms" in reference
+
+
+@pytest.mark.mpi(1, 2)
+def test_an_incompressible_start_from_a_compressible_flow_is_solenoidal(comm, tmp_path):
+    from eddies.flow.operators import divergence
+
+    small = ["flow.cells=16", "time.duration=0.1", "time.step=0.05"]
+    sound = ["initial.kind=sound-wave", "initial.amplitude=0.01", "flow.fluid=compressible", "flow.sound_speed=10"]
+    dns.run(load_scene("taylor-green", small + sound), comm, tmp_path)
+    from_file = ["initial.kind=file", f"initial.path={tmp_path / 'ground_truth.h5'}"]
+    scene = load_scene("taylor-green", small + from_file)
+    fluid = dns.build_fluid(scene, comm)
+    state = dns.initial_state(scene, fluid)
+    assert np.abs(divergence(fluid.grid, state)).max(initial=0) < 1e-16
+
+
+@pytest.mark.mpi(1, 2)
+def test_kernel_of_an_incompressible_flow(comm, tmp_path):
+    from eddies.workflows import train_kernel
+
+    scene = load_scene("tracers-only", [*SMALL, "tracers.turnovers=0.3", "kernel.neighbors=20", "kernel.steps=2",
+                                        "kernel.points=32", "kernel.hidden=[4]"])
+    dns.run(scene, comm, tmp_path)
+    train_kernel.run(scene, comm, tmp_path)
+    assert (tmp_path / "kernel.h5").exists()

@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import h5py
+import numpy as np
 import pytest
 
 CHECKOUT = Path(__file__).parents[2]
@@ -42,7 +44,15 @@ def test_metrics_are_finite_and_within_bounds(run_directory):
     assert kernel["integral"] == pytest.approx(1, abs=1e-5)
     # Sixty steps teach little, but more than nothing: without a model the error is 1.
     assert model["acceleration_error"] < 0.9
-    assert rollout["stable"] and 0.7 < rollout["energy_ratio"] < 1.3 and rollout["velocity_error"] < 0.5
+    assert rollout["stable"] and 0.5 < rollout["energy_ratio"] < 1.5
+    assert rollout["velocity_error"] < 0.95 * error_of_frozen_velocities(run_directory)
+
+
+def error_of_frozen_velocities(directory):
+    """Velocity error at the last common frame of particles that keep their first velocity: what no model gives."""
+    with h5py.File(directory / "rollout.h5") as file:
+        velocity = file["particles/truth/velocity/value"]
+        return np.linalg.norm(velocity[0] - velocity[-1]) / np.linalg.norm(velocity[-1])
 
 
 def test_every_product_and_the_page_are_there(run_directory):
@@ -57,6 +67,43 @@ def test_resume_skips_what_is_done_and_redoes_what_changed(run_directory):
     result = eddies(1, "run", "tiny", "--output", str(run_directory), "--resume", "--set", "simulation.turnovers=0.2")
     log = result.stdout + result.stderr
     assert result.returncode == 0 and log.count("skipped") == 3 and "rollout: complete" in log
+
+
+def test_the_rollout_is_the_same_on_any_number_of_ranks(run_directory, tmp_path):
+    positions = []
+    for ranks in (1, 3):
+        directory = tmp_path / str(ranks)
+        directory.mkdir()
+        for name in ("ground_truth.h5", "kernel.h5", "model.h5"):
+            (directory / name).symlink_to(run_directory / name)
+        result = eddies(ranks, "simulate", "tiny", "--output", str(directory), "--set", "simulation.precision=float64")
+        assert result.returncode == 0, result.stdout + result.stderr
+        with h5py.File(directory / "rollout.h5") as file:
+            positions.append(file["particles/model/position/value"][-1])
+    # Stored in single precision.
+    assert max(np.abs(positions[0] - other).max() for other in positions[1:]) < 2e-6
+
+
+def test_a_rollout_that_goes_wrong_ends_there_and_keeps_its_frames(run_directory, tmp_path):
+    for name in ("ground_truth.h5", "kernel.h5", "model.h5"):
+        (tmp_path / name).symlink_to(run_directory / name)
+    result = eddies(1, "simulate", "tiny", "--output", str(tmp_path), "--set", "simulation.injection=1e5")
+    assert result.returncode == 0, result.stdout + result.stderr
+    with h5py.File(tmp_path / "rollout.h5") as file:
+        status = file["rollout"].attrs["status"]
+        assert status.startswith("stopped: step") and "faster than" in status and "nearest particle" in status
+        assert len(file["particles/model/velocity/value"]) >= 1
+    assert eddies(1, "report", str(tmp_path)).returncode == 0
+    assert "stopped: step" in (tmp_path / "report" / "index.html").read_text()
+
+
+def test_a_step_that_outruns_the_slabs_is_refused(run_directory, tmp_path):
+    for name in ("ground_truth.h5", "kernel.h5", "model.h5"):
+        (tmp_path / name).symlink_to(run_directory / name)
+    longer = ("--set", "simulation.step=0.5", "--set", "simulation.frame_interval=0.5")
+    result = eddies(2, "simulate", "tiny", "--output", str(tmp_path), *longer)
+    assert result.returncode == 2 and "slabs no thinner than the particles' reach" in result.stderr
+    assert not (tmp_path / "rollout.h5").exists()
 
 
 @pytest.mark.parametrize("closure", ["learned-density", "paper-density"])

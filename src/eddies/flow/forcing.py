@@ -8,6 +8,14 @@ from eddies.flow.spectral_grid import SpectralGrid
 from eddies.parallel.reduction import global_sum
 
 
+# Share of the kinetic energy at the forced modes that round-off alone may leave there.
+SILENT = {"float64": 1e-20, "float32": 1e-10}
+
+
+class ForcingError(ValueError):
+    """The flow cannot be forced."""
+
+
 class LinearForcing:
     """f(k) = A u_s(k) for 0 < |k| < k_f with A = rate / sum |u_s|^2, so that the mean of u.f is `injection_rate`.
 
@@ -16,10 +24,12 @@ class LinearForcing:
 
     The few forced modes are collected on all ranks in one message. Their mirror images in the plane kx = 0 are made
     exact conjugates there: otherwise round-off in the part that no real field has would be amplified by the forcing.
+    Raises ForcingError at the first evaluation if the velocity has no energy, but round-off, at the forced modes.
     """
 
     def __init__(self, grid: SpectralGrid, injection_rate: float, wavenumber: float) -> None:
-        self.grid, self.injection_rate = grid, injection_rate
+        self.grid, self.injection_rate, self.wavenumber = grid, injection_rate, wavenumber
+        self._checked = False
         self.reach = reach = min(int(np.ceil(wavenumber)) - 1, grid.cutoff)
         signed = np.arange(-reach, reach + 1)
         kx, ky, kz = np.arange(reach + 1)[None, None, :], signed[None, :, None], signed[:, None, None]
@@ -36,13 +46,24 @@ class LinearForcing:
 
     def add(self, velocity: np.ndarray, tendency: np.ndarray) -> None:
         """Add the force to the velocity components of `tendency` in place; both (3, kz, ky, kx), Fourier space."""
+        if self.injection_rate == 0:
+            return
         block = self._forced_modes(velocity)
         energy = float(np.sum(self._multiplicity * np.abs(block) ** 2))
-        if energy == 0.0 and self.injection_rate > 0:
-            raise ValueError("the velocity has no energy at the forced wavenumbers: linear forcing cannot inject any")
-        force = (self.injection_rate / energy if energy > 0 else 0.0) * block
+        if not self._checked:
+            self._require_energy(energy, velocity)
+        force = self.injection_rate / energy * block
         where = np.ix_(range(3), self._planes, self._own_rows, range(self.reach + 1))
         tendency[where] += force[:, :, self._block_rows, :].astype(tendency.dtype)
+
+    def _require_energy(self, forced: float, velocity: np.ndarray) -> None:
+        # Once is enough: modes that are forced do not run out of energy, and the sum costs a message.
+        total = self.grid.sum_modes((np.abs(velocity) ** 2).sum(axis=0))
+        if forced <= SILENT[self.grid.precision] * total:
+            raise ForcingError("[forcing]: the flow has no energy at 0 < |k| < wavenumber = "
+                               f"{self.wavenumber:g}, which linear forcing could amplify; start from a flow with "
+                               "energy there, raise wavenumber, or remove [forcing]")
+        self._checked = True
 
     def _forced_modes(self, velocity: np.ndarray) -> np.ndarray:
         """Solenoidal velocity of the forced modes on every rank: (3, 2 reach + 1, 2 reach + 1, reach + 1)."""

@@ -10,13 +10,15 @@ from eddies.clock import Clock
 from eddies.flow.courant import FlowDiverged
 from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid
 from eddies.flow.statistics import (
-    compressible_budget, energy_spectrum, gradient_moments, incompressible_budget, turbulence_scales,
+    compressible_budget, energy_spectrum, gradient_moments, incompressible_budget, longitudinal_gradient,
+    turbulence_scales,
 )
 
 
 class FlowHistory:
     """An observer that measures a flow every few steps; one row a sample in `rows`.
 
+    Whoever needs the flow of a certain time, such as the last of a run, takes a `sample` then.
     Also integrates the energy budget: `budget_error` is |E(t) - E(0) - integral of (injection - dissipation)| over
     the dissipated energy (over E(0) where nothing is dissipated).
     """
@@ -28,12 +30,17 @@ class FlowHistory:
         self._wall, self._steps = time.perf_counter(), 0
 
     def __call__(self, state: np.ndarray, clock: Clock) -> None:
-        """Take a sample if one is due, and at the end."""
-        if clock.steps % self.every == 0 or not clock.running:
+        """Take a sample if one is due."""
+        if clock.steps % self.every == 0:
             self.sample(state, clock)
 
     def sample(self, state: np.ndarray, clock: Clock) -> dict[str, float]:
-        """Measure now, add the row and return it. Raises FlowDiverged if the flow is no longer finite."""
+        """The row of now, measured and added unless the last one is of this very step.
+
+        Raises FlowDiverged if the flow is no longer finite.
+        """
+        if self.rows and clock.steps == self._steps:
+            return self.rows[-1]
         row = self._measure(state)
         if not np.isfinite(row["total_energy"]):
             raise FlowDiverged(f"the energy is no longer finite at step {clock.steps}, time {clock.time:.6g}: "
@@ -74,14 +81,15 @@ class FlowHistory:
     def _measure(self, state: np.ndarray) -> dict[str, float]:
         fluid, grid = self.fluid, self.fluid.grid
         velocity = state[:3]
+        longitudinal = longitudinal_gradient(grid, velocity)
         if isinstance(fluid, CompressibleFluid):
-            row = compressible_budget(grid, state, fluid.viscosity, fluid.sound_speed)
+            row = compressible_budget(grid, state, longitudinal, fluid.viscosity, fluid.sound_speed)
         else:
             row = incompressible_budget(grid, velocity, fluid.viscosity)
         _, spectrum = energy_spectrum(grid, velocity)
         row["energy"] = float(spectrum.sum())
         row |= turbulence_scales(spectrum, row["dissipation_rate"], fluid.viscosity, grid.cutoff)
-        row["skewness"], row["flatness"] = gradient_moments(grid, velocity)
+        row["skewness"], row["flatness"] = gradient_moments(grid, longitudinal)
         row["injection_rate"] = fluid.forcing.injection_rate if fluid.forcing is not None else 0.0
         if isinstance(fluid, CompressibleFluid):
             row["mach_turbulent"] = float(np.sqrt(2 * row["energy"]) / fluid.sound_speed)

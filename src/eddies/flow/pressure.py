@@ -17,14 +17,15 @@ class PressureSolver:
     as for fields known from particles, that is far below the error of the highest modes themselves.
 
     `points` (m, 3) are this rank's grid points, z slowest. Positions given to the other methods must lie in this
-    rank's slab, or at most one grid plane outside.
+    rank's slab, or at most `reach` outside, which is `margin` grid planes.
     """
 
-    def __init__(self, decomposition: SlabDecomposition, resolved: int, interpolation: str = "cubic") -> None:
+    def __init__(self, decomposition: SlabDecomposition, resolved: int, margin: int = 1) -> None:
         self.decomposition = decomposition
         self.grid = SpectralGrid(decomposition, cutoff=resolved)
         self._kept = self.grid.index_squared <= resolved**2
-        self._spline = SplineInterpolation(self.grid, interpolation)
+        self.reach = margin * decomposition.spacing
+        self._spline = SplineInterpolation(self.grid, "cubic", margin)
         x, y, z = np.broadcast_arrays(*self.grid.coordinates())
         self.points = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from eddies.flow.operators import dot_wavevector, gradient, inverse_wavenumber_squared
+from eddies.flow.operators import dot_wavevector, inverse_wavenumber_squared
 from eddies.flow.spectral_grid import SpectralGrid
 from eddies.parallel.reduction import global_sum
 
@@ -44,11 +44,15 @@ def turbulence_scales(spectrum: np.ndarray, dissipation_rate: float, viscosity: 
     }
 
 
-def gradient_moments(grid: SpectralGrid, velocity: np.ndarray) -> tuple[float, float]:
+def longitudinal_gradient(grid: SpectralGrid, velocity: np.ndarray) -> np.ndarray:
+    """du/dx, dv/dy, dw/dz at the grid points, (3, z_local, y, x), of the modes (3, kz, ky, kx) of a velocity."""
+    modes = np.stack([1j * k * component for k, component in zip(grid.wavevector, velocity)])
+    return grid.backward(modes.astype(grid.complex, copy=False))
+
+
+def gradient_moments(grid: SpectralGrid, longitudinal: np.ndarray) -> tuple[float, float]:
     """Skewness and flatness of the longitudinal velocity gradient, averaged over the three directions."""
-    longitudinal = np.stack([1j * k * component for k, component in zip(grid.wavevector, velocity)])
-    physical = grid.backward(longitudinal.astype(grid.complex, copy=False))
-    second, third, fourth = (grid.mean(physical**power) for power in (2, 3, 4))
+    second, third, fourth = (grid.mean(longitudinal**power) for power in (2, 3, 4))
     if not np.all(second > 0):
         return 0.0, 0.0
     return float(np.mean(third / second**1.5)), float(np.mean(fourth / second**2))
@@ -61,24 +65,30 @@ def incompressible_budget(grid: SpectralGrid, velocity: np.ndarray, viscosity: f
             "dissipation_rate": viscosity * grid.sum_modes(grid.wavenumber_squared * squared)}
 
 
-def compressible_budget(grid: SpectralGrid, state: np.ndarray, viscosity: float,
+def compressible_budget(grid: SpectralGrid, state: np.ndarray, longitudinal: np.ndarray, viscosity: float,
                         sound_speed: float) -> dict[str, float]:
     """Total energy <rho |u|^2/2 + c^2 (rho ln rho - rho + 1)>, dissipation nu <rho (2 S:S - 2/3 (div u)^2)>.
 
-    Without forcing the first decays at exactly the second. Also the rms of the density and the share of the kinetic
-    energy in the longitudinal velocity.
+    Without forcing the first decays at exactly the second. `longitudinal` is the velocity's `longitudinal_gradient`.
+    Also the rms of the density and the share of the kinetic energy in the longitudinal velocity.
     """
-    fields = grid.backward(np.concatenate([state, *(gradient(grid, component) for component in state[:3])]))
-    u, s, A = fields[:3], fields[3], fields[4:].reshape(3, 3, *fields.shape[1:])
+    # Three components at a time: all nine gradients at once would need more memory than the time stepper.
+    s = grid.backward(state[3:])[0]
     rho = np.exp(s)
-    strain = sum(((A[i, j] + A[j, i]) / 2) ** 2 for i in range(3) for j in range(3))
-    dilatation = A[0, 0] + A[1, 1] + A[2, 2]
-    kinetic = 0.5 * rho * (u**2).sum(axis=0)
-    internal = sound_speed**2 * (rho * s - rho + 1)
-    means = grid.mean(np.stack([kinetic + internal, rho * (2 * strain - 2 / 3 * dilatation**2), rho, rho**2]))
-    longitudinal = np.abs(dot_wavevector(grid, state[:3])) ** 2 * inverse_wavenumber_squared(grid)
+    energy = 0.5 * rho * (grid.backward(state[:3]) ** 2).sum(axis=0) + sound_speed**2 * (rho * s - rho + 1)
+    strain = (longitudinal**2).sum(axis=0) + 2 * (_shear(grid, state[:3]) ** 2).sum(axis=0)
+    friction = rho * (2 * strain - 2 / 3 * longitudinal.sum(axis=0) ** 2)
+    means = grid.mean(np.stack([energy, friction, rho, rho**2]))
+    along = np.abs(dot_wavevector(grid, state[:3])) ** 2 * inverse_wavenumber_squared(grid)
     kinetic_spectral = grid.sum_modes((np.abs(state[:3]) ** 2).sum(axis=0))
     return {"total_energy": float(means[0]),
             "dissipation_rate": viscosity * float(means[1]),
             "density_rms": float(np.sqrt(max(means[3] - means[2] ** 2, 0.0))),
-            "compressible_fraction": grid.sum_modes(longitudinal) / kinetic_spectral if kinetic_spectral > 0 else 0.0}
+            "compressible_fraction": grid.sum_modes(along) / kinetic_spectral if kinetic_spectral > 0 else 0.0}
+
+
+def _shear(grid: SpectralGrid, velocity: np.ndarray) -> np.ndarray:
+    """The off-diagonal rates of strain S_xy, S_xz, S_yz at the grid points, (3, z_local, y, x)."""
+    k, u = grid.wavevector, velocity
+    modes = np.stack([0.5j * (k[j] * u[i] + k[i] * u[j]) for i, j in ((0, 1), (0, 2), (1, 2))])
+    return grid.backward(modes.astype(grid.complex, copy=False))

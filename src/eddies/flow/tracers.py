@@ -42,7 +42,7 @@ def release(decomposition: SlabDecomposition, seed: int, per_side: int, placemen
 
 
 class FilteredField:
-    """The Gaussian-filtered velocity and density of a state, at any point."""
+    """The Gaussian-filtered velocity of a state, and density of a compressible one, at any point."""
 
     def __init__(self, grid: SpectralGrid, filter_width: float, interpolation: str) -> None:
         self.grid = grid
@@ -54,12 +54,8 @@ class FilteredField:
         return self.spline.coefficients(self.transfer * state[:3])
 
     def density_modes(self, state: np.ndarray) -> np.ndarray:
-        """Modes (1, kz, ky, kx) of the filtered density exp(s); of density 1 in an incompressible flow."""
-        if len(state) == 4:
-            return self.transfer * self.grid.forward(np.exp(self.grid.backward(state[3:])))
-        modes = np.zeros((1, *self.grid.spectral_shape), self.grid.complex)
-        modes[:, self.grid.index_squared == 0] = 1
-        return modes
+        """Modes (1, kz, ky, kx) of the filtered density exp(s) of a compressible flow."""
+        return self.transfer * self.grid.forward(np.exp(self.grid.backward(state[3:])))
 
 
 class TracerParticles:
@@ -84,6 +80,6 @@ class TracerParticles:
         self.columns = migrate(self.decomposition, {**self.columns, "position": position, "velocity": velocity})
 
     def density(self, state: np.ndarray) -> np.ndarray:
-        """Filtered density (n,) at the particles."""
+        """Filtered density (n,) at the particles, in a compressible flow."""
         coefficients = self.field.spline.coefficients(self.field.density_modes(state))
         return self.field.spline.at(coefficients, self.columns["position"])[:, 0]

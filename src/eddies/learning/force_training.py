@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -13,8 +14,8 @@ from eddies.learning.losses import kullback_leibler, mean_square_share, soft_his
 from eddies.learning.optimization import Descent, shared_value
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
+from eddies.particles.cloud import grid_points
 from eddies.particles.dynamics import ParticleDynamics
-from eddies.particles.ghosts import exchange_ghosts
 from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.pair_forces import PairModel
 from eddies.particles.particle_set import ParticleSet
@@ -36,26 +37,45 @@ class LossWeights:
 
 
 class TrainingFrame:
-    """The particles of one moment with their true rates, and the dynamics around them.
+    """The particles of one moment with their true rates, and the dynamics around them; making one is collective.
 
     `particles` carry the density that the model will see in a simulation; `acceleration` (n, 3) and `density_rate`
-    (n,) are what it should answer.
+    (n,) are what it should answer, and `acceleration_rms` and `density_rate_rms` their rms over all ranks, of one
+    component. `total` is the number of particles of all ranks.
     """
 
     def __init__(self, decomposition: SlabDecomposition, model: PairModel, particles: ParticleSet,
                  acceleration: Tensor, density_rate: Tensor) -> None:
-        self.dynamics = ParticleDynamics(decomposition, decomposition.length, [model], skin=0.0,
-                                         dtype=acceleration.dtype)
+        self.decomposition, self.dtype = decomposition, acceleration.dtype
+        self.dynamics = ParticleDynamics(decomposition, decomposition.length, [model], skin=0.0, dtype=self.dtype)
+        self.surroundings = self.dynamics.surroundings
+        self.surroundings.update(particles)
         self.particles, self.acceleration, self.density_rate = particles, acceleration, density_rate
         squares = [float(rate.double().square().sum()) for rate in (acceleration, density_rate)]
         *squares, count = global_sum(decomposition.comm, np.array([*squares, len(particles)]))
-        #: rms of one component of the acceleration, and of the density rate, over all ranks
+        self.total = int(count)
         self.acceleration_rms, self.density_rate_rms = np.sqrt(squares[0] / (3 * count)), np.sqrt(squares[1] / count)
-        self._row_of_id = dict(zip(particles.id.tolist(), range(len(particles))))
+        self._sorted_ids, self._row_of_sorted = torch.sort(particles.id)
 
     def rows(self, ids: np.ndarray) -> Tensor:
         """Rows of those of the given particles that this rank owns."""
-        return torch.tensor([self._row_of_id[i] for i in ids.tolist() if i in self._row_of_id], dtype=torch.int64)
+        wanted = torch.from_numpy(ids).to(self._sorted_ids.device)
+        place = torch.searchsorted(self._sorted_ids, wanted)
+        inside = place < len(self._sorted_ids)
+        place, wanted = place[inside], wanted[inside]
+        return self._row_of_sorted[place[self._sorted_ids[place] == wanted]]
+
+    @cached_property
+    def position(self) -> Tensor:
+        """Positions (s, 3) of the particles, then of the ghosts; its first use is collective."""
+        return self.surroundings.local(self.particles, set()).position
+
+    @torch.no_grad()
+    def volumes(self, kernel: SmoothingKernel) -> Tensor:
+        """Volumes (s,) of the particles, ghosts included; collective."""
+        own = self.position[: len(self.particles)]
+        pairs = self.surroundings.neighbors.pairs(own, self.position, dtype=self.dtype)
+        return self.surroundings.column(volumes(kernel, pairs))
 
     def errors(self, rows: Tensor | None = None) -> dict[str, Tensor]:
         """Predicted minus true rates at all owned particles or some of their rows; collective."""
@@ -75,40 +95,43 @@ class ForceTrainer:
 
     Parameters
     ----------
-    decomposition, model, frames : the last all on the same slabs.
-    kernel : of the field loss. points_per_side : of the grid on which fields are compared.
-    weights : of the losses. total : number of particles over all ranks.
+    model, frames : the frames all on the same slabs.
+    kernel : of the field loss, which compares on a grid of one cell for each plane of the slabs.
+    weights : of the losses. batch : particles of a trajectory step.
     """
 
-    def __init__(self, decomposition: SlabDecomposition, model: PairModel, frames: Sequence[TrainingFrame],
-                 kernel: SmoothingKernel, points_per_side: int, weights: LossWeights, total: int, batch: int,
-                 seed: int) -> None:
-        self.decomposition, self.comm, self.model, self.frames = decomposition, decomposition.comm, model, frames
-        self.kernel, self.points_per_side, self.weights = kernel, points_per_side, weights
-        self.total, self.batch, self.seed = total, min(batch, total), seed
+    def __init__(self, model: PairModel, frames: Sequence[TrainingFrame], kernel: SmoothingKernel,
+                 weights: LossWeights, batch: int, seed: int) -> None:
+        self.decomposition, self.total = frames[0].decomposition, frames[0].total
+        self.comm, self.model, self.frames = self.decomposition.comm, model, frames
+        self.kernel, self.weights, self.batch, self.seed = kernel, weights, min(batch, self.total), seed
+        self._points = grid_points(self.decomposition).to(frames[0].particles.position.device)
+        self._volumes: dict[int, Tensor] = {}
 
     def trajectory_step(self, descent: Descent, step: int) -> dict[str, float]:
         """One step on the trajectory loss of a random batch of particles (Eq. 12); returns the losses."""
         random = np.random.default_rng([self.seed, step])
         frame = self.frames[random.integers(len(self.frames))]
         rows = frame.rows(random.choice(self.total, self.batch, replace=False))
-        share = self.weights.trajectory * self._trajectory_share(frame, frame.errors(rows), self.batch)
-        norm = descent.step(share)
+        share = self._trajectory_share(frame, frame.errors(rows), self.batch)
+        norm = descent.step(self.weights.trajectory * share)
         loss = shared_value(self.comm, share)
-        return {"loss": loss, "trajectory_loss": loss / self.weights.trajectory, "gradient_norm": norm}
+        return {"loss": self.weights.trajectory * loss, "trajectory_loss": loss, "gradient_norm": norm}
 
     def combined_step(self, descent: Descent, step: int) -> dict[str, float]:
         """One step on all losses of the particles in and around a random cube; returns the losses."""
         random = np.random.default_rng([self.seed, step])
-        frame = self.frames[random.integers(len(self.frames))]
-        corner = random.uniform(0, self.decomposition.length, 3)
-        side = self.decomposition.length / 4
-        rows = self._rows_within(frame, corner, side, self.kernel.support)
+        number = random.integers(len(self.frames))
+        frame = self.frames[number]
+        corner, side = random.uniform(0, self.decomposition.length, 3), self.decomposition.length / 4
+        reach = self.kernel.support
+        rows = self._within(frame.particles.position, corner - reach, side + 2 * reach)
         count = int(global_sum(self.comm, len(rows)))
         errors = frame.errors(rows)
         shares = {"trajectory": self._trajectory_share(frame, errors, count)}
         if self.weights.field > 0:
-            shares["field"] = self._field_share(frame, rows, errors["velocity"], corner, side)
+            points = self._points[self._within(self._points, corner, side)]
+            shares["field"] = self._field_share(number, rows, errors["velocity"], points)
         shares |= self._divergence_shares(frame, rows, errors["velocity"])
         total = sum(getattr(self.weights, name) * share for name, share in shares.items())
         norm = descent.step(total)
@@ -123,37 +146,27 @@ class ForceTrainer:
             share = share + mean_square_share(errors["density"], frame.density_rate_rms, count)
         return share
 
-    def _field_share(self, frame: TrainingFrame, rows: Tensor, error: Tensor, corner: np.ndarray,
-                     side: float) -> Tensor:
-        """Eq. 13 per time step: the kernel average of the acceleration error on the grid points of a cube.
+    def _field_share(self, number: int, rows: Tensor, error: Tensor, points: Tensor) -> Tensor:
+        """Eq. 13 per time step: the kernel average of the acceleration error at grid points (m, 3) of all ranks.
 
         The velocity predicted one step ahead is compared with that of the true particles, both through the kernel:
-        its own error is hundreds of times what a step changes, and the force could not make up for it.
+        its own error is many times what a step changes, and the force could not make up for it.
         """
-        points = self._grid_points(corner, side)
-        count = int(global_sum(self.comm, len(points)))
-        surroundings = frame.dynamics.surroundings
+        frame = self.frames[number]
+        if number not in self._volumes:
+            self._volumes[number] = frame.volumes(self.kernel)
         spread = torch.zeros_like(frame.acceleration).index_add(0, rows, error)
-        local = torch.cat([spread, exchange_ghosts(surroundings.halo, spread)])
-        around = NeighborList(surroundings.box, self.kernel.support, 0.0)
-        position = surroundings.local(frame.particles, set()).position
-        around.build(points, position, exclude_self=False)
-        field = reconstruct(self.kernel, around.pairs(points, position, dtype=error.dtype), self._volumes(frame), local)
+        local = frame.surroundings.column(spread)
+        around = NeighborList(frame.surroundings.box, self.kernel.support, 0.0)
+        around.build(points, frame.position, exclude_self=False)
+        pairs = around.pairs(points, frame.position, dtype=error.dtype)
+        field = reconstruct(self.kernel, pairs, self._volumes[number], local)
+        count = int(global_sum(self.comm, len(points)))
         return mean_square_share(field, frame.acceleration_rms, max(count, 1))
 
-    def _volumes(self, frame: TrainingFrame) -> Tensor:
-        """Volumes (s,) of the particles of a frame, ghosts included; computed once."""
-        if not hasattr(frame, "volumes"):
-            surroundings = frame.dynamics.surroundings
-            position = surroundings.local(frame.particles, set()).position
-            with torch.no_grad():
-                pairs = surroundings.neighbors.pairs(position[: len(frame.particles)], position,
-                                                     dtype=frame.acceleration.dtype)
-                frame.volumes = surroundings.column(volumes(self.kernel, pairs))
-        return frame.volumes
-
     def _divergence_shares(self, frame: TrainingFrame, rows: Tensor, error: Tensor) -> dict[str, Tensor]:
-        """Eq. 14 for the acceleration and for the velocity a time a_rms/v_rms ahead, components together."""
+        """Eq. 14, components together, for the acceleration, and for the velocity that the error of the acceleration
+        leads to after a time v_rms / a_rms."""
         shares = {}
         scales, truth = self.model.scales, frame.acceleration[rows]
         if self.weights.acceleration_kl > 0:
@@ -170,17 +183,7 @@ class ForceTrainer:
         # Every rank has the whole divergence, so its share is an equal part.
         return kullback_leibler(expected, found) / self.comm.size
 
-    def _rows_within(self, frame: TrainingFrame, corner: np.ndarray, side: float, margin: float) -> Tensor:
-        """Rows of the owned particles in the periodic cube of some side at `corner`, widened by a margin all around."""
-        offset = (frame.particles.position - torch.from_numpy(corner - margin)) % self.decomposition.length
-        return torch.nonzero((offset < side + 2 * margin).all(1)).squeeze(1)
-
-    def _grid_points(self, corner: np.ndarray, side: float) -> Tensor:
-        """This rank's points (m, 3) of the comparison grid within a periodic cube."""
-        slab = self.decomposition
-        spacing = slab.length / self.points_per_side
-        first = np.ceil(corner / spacing)
-        axes = [((f + np.arange(int(side / spacing))) % self.points_per_side) * spacing for f in first]
-        axes[2] = axes[2][slab.owner_of(axes[2]) == slab.rank]
-        z, y, x = np.meshgrid(axes[2], axes[1], axes[0], indexing="ij")
-        return torch.from_numpy(np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1))
+    def _within(self, points: Tensor, corner: np.ndarray, side: float) -> Tensor:
+        """Rows of the points (m, 3) that lie in a periodic cube."""
+        offset = (points - torch.from_numpy(corner).to(points.device)) % self.decomposition.length
+        return torch.nonzero((offset < side).all(1)).squeeze(1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,6 +17,13 @@ def mean_square_share(error: Tensor, scale: float, total: int) -> Tensor:
     """
     components = error.shape[1] if error.dim() > 1 else 1
     return (error / scale).square().sum() / (components * total)
+
+
+def relative_error(comm, error: Tensor, exact: Tensor) -> float:
+    """Normalised L2 error |error| / |exact| over the rows of all ranks; collective."""
+    squares = [float(part.detach().double().square().sum()) for part in (error, exact)]
+    wrong, whole = global_sum(comm, np.array(squares))
+    return float(np.sqrt(wrong / whole))
 
 
 class _GlobalSum(torch.autograd.Function):

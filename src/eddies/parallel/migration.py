@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from mpi4py import MPI
 
@@ -38,13 +40,12 @@ class Redistribution:
         column = np.asarray(column)
         if self.comm.size == 1:
             return column.copy()
-        row_bytes = column.dtype.itemsize * int(np.prod(column.shape[1:], dtype=np.int64))
         sent = np.ascontiguousarray(column[self._order])
         received = np.empty((int(self._received.sum()), *column.shape[1:]), column.dtype)
-        self.comm.Alltoallv(
-            [sent.view(np.uint8).reshape(-1) if sent.size else np.empty(0, np.uint8), self._sent * row_bytes, MPI.BYTE],
-            [received.reshape(-1).view(np.uint8), self._received * row_bytes, MPI.BYTE],
-        )
+        # Counts are in rows: in bytes they would leave the range of MPI's integers above 2 GiB.
+        row = MPI.BYTE.Create_contiguous(column.dtype.itemsize * math.prod(column.shape[1:])).Commit()
+        self.comm.Alltoallv([sent, self._sent, row], [received, self._received, row])
+        row.Free()
         return received
 
 

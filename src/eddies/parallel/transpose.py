@@ -45,7 +45,10 @@ class Transpose:
         sizes_out = np.array([int(np.prod(shape)) for shape in shapes])
         sent = np.concatenate([block.ravel() for block in blocks])
         received = np.empty(int(sizes_out.sum()), dtype)
-        width = dtype.itemsize
-        self.comm.Alltoallv([sent, sizes_in * width, MPI.BYTE], [received, sizes_out * width, MPI.BYTE])
+        # Counts are in lines along x of all components: in bytes they would leave the range of MPI's integers.
+        length = shapes[0][0] * shapes[0][3]
+        line = MPI.BYTE.Create_contiguous(length * dtype.itemsize).Commit()
+        self.comm.Alltoallv([sent, sizes_in // length, line], [received, sizes_out // length, line])
+        line.Free()
         bounds = np.concatenate([[0], np.cumsum(sizes_out)])
         return [received[a:b].reshape(shape) for a, b, shape in zip(bounds[:-1], bounds[1:], shapes)]

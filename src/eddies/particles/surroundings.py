@@ -27,16 +27,14 @@ class LocalParticles:
     ----------
     position : (s, 3); on several ranks z is not periodic here, and ghosts stand where they are seen from.
     columns : the columns that were asked for, (s, ...).
-    halo : for further columns, with `ghosts.exchange_ghosts`.
+    halo : for further columns, with `ghosts.exchange_ghosts`; another one whenever rows of ghosts change.
     box : the box in which differences of these positions are taken.
-    builds : changes whenever rows of ghosts do.
     """
 
     position: Tensor
     columns: dict[str, Tensor]
     halo: HaloExchange
     box: PeriodicBox
-    builds: int
 
 
 class Surroundings:
@@ -129,7 +127,7 @@ class Surroundings:
         # Stored component by component, as the gathering of pairs wants it.
         position = self._with_ghosts(particles.position, exchange_ghost_positions).T.contiguous().T
         columns = {name: self.column(getattr(particles, name)) for name in sorted(names)}
-        return LocalParticles(position, columns, self.halo, self.box, self.builds)
+        return LocalParticles(position, columns, self.halo, self.box)
 
     def column(self, owned: Tensor) -> Tensor:
         """A column (n, ...) of owned particles followed by its ghost rows."""

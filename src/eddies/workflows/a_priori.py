@@ -9,21 +9,29 @@ from eddies.flow.interpolation import SplineInterpolation
 from eddies.flow.operators import gradient
 from eddies.flow.spectral_grid import SpectralGrid
 from eddies.learning.force_training import TrainingFrame
+from eddies.learning.losses import relative_error
 from eddies.parallel.migration import IdOrder, migrate
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.pair_forces import PairModel
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.poisson_closure import PoissonClosure
+from eddies.scene import SceneError
 from eddies.workflows.truth import GroundTruth, load_frame
 
 EVALUATIONS, SAMPLE = 9, 20000
 
 
 def evaluation_frames(truth: GroundTruth) -> np.ndarray:
-    """Frames at times of filtered fields, evenly spread over the ground truth, with rates on both sides."""
+    """Frames at times of filtered fields, evenly spread over the ground truth, with frames on both sides.
+
+    Raises SceneError if there is none.
+    """
     at_fields = np.array([truth.frame_of_field(index) for index in range(len(truth.fields.times))])
     usable = at_fields[(at_fields > 0) & (at_fields < len(truth.times) - 1)]
+    if not len(usable):
+        raise SceneError("[tracers] field_every: no filtered field is stored between the first and the last frame; "
+                         "lower it, or raise [tracers] turnovers")
     return usable[np.unique(np.linspace(0, len(usable) - 1, EVALUATIONS).astype(int))]
 
 
@@ -36,32 +44,25 @@ def evaluate(truth: GroundTruth, model: PairModel, closure: PoissonClosure | Non
     `true_density_acceleration_error` is that with the true density, `pressure_gradient_error` that of
     -c^2 grad ln(rho) of the filtered field, without any model.
     """
-    rows = []
+    rows, comm = [], truth.decomposition.comm
     for index in frames:
         frame = load_frame(truth, index, model, closure, dtype, device)
         errors = frame.errors()
         exact = _pressure_force(truth, int(index), frame.particles).to(frame.acceleration)
         row = {"delay": truth.times[index] - truth.times[last_seen],
-               "acceleration_error": _relative(truth, errors["velocity"], frame.acceleration),
-               "pressure_gradient_error": _relative(truth, exact - frame.acceleration, frame.acceleration)}
+               "acceleration_error": relative_error(comm, errors["velocity"], frame.acceleration),
+               "pressure_gradient_error": relative_error(comm, exact - frame.acceleration, frame.acceleration)}
         if closure is not None:
             given = load_frame(truth, index, model, None, dtype, device).errors()["velocity"]
-            row["true_density_acceleration_error"] = _relative(truth, given, frame.acceleration)
+            row["true_density_acceleration_error"] = relative_error(comm, given, frame.acceleration)
         if "density" in errors:
-            row["density_rate_error"] = _relative(truth, errors["density"], frame.density_rate)
+            row["density_rate_error"] = relative_error(comm, errors["density"], frame.density_rate)
         rows.append(row)
     tables = {"a_priori": {name: np.array([row[name] for row in rows]) for name in rows[0]},
               "acceleration_sample": _sample(truth, frame, frame.acceleration, errors["velocity"])}
     if "density" in errors:
         tables["density_rate_sample"] = _sample(truth, frame, frame.density_rate, errors["density"])
     return tables
-
-
-def _relative(truth: GroundTruth, error: torch.Tensor, exact: torch.Tensor) -> float:
-    """|error| / |exact|, L2 norms over all particles."""
-    squares = [float(part.double().square().sum()) for part in (error, exact)]
-    wrong, whole = global_sum(truth.decomposition.comm, np.array(squares))
-    return float(np.sqrt(wrong / whole))
 
 
 def _pressure_force(truth: GroundTruth, index: int, particles: ParticleSet) -> torch.Tensor:

@@ -6,6 +6,7 @@ import os
 
 import torch
 
+from eddies.parallel.node import node_rank
 from eddies.scene import SceneError
 
 
@@ -19,4 +20,4 @@ def prepare_torch(device: str, comm) -> torch.device:
         return torch.device("cpu")
     if not torch.cuda.is_available():
         raise SceneError('device = "cuda": torch finds no GPU here; set device = "cpu"')
-    return torch.device("cuda", comm.rank % torch.cuda.device_count())
+    return torch.device("cuda", node_rank(comm) % torch.cuda.device_count())

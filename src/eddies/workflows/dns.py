@@ -14,6 +14,7 @@ from eddies.flow.courant import CourantLimit, FixedStep
 from eddies.flow.forcing import LinearForcing
 from eddies.flow.history import FlowHistory
 from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid
+from eddies.flow.operators import project
 from eddies.flow.spectral_grid import SpectralGrid
 from eddies.flow.tracers import FilteredField, TracerParticles, release
 from eddies.io.fields import FieldSeries, FieldWriter
@@ -51,7 +52,9 @@ def run(scene: Scene, comm, directory: str | Path) -> None:
             state = advance(state, stepper, step_limit, clock,
                             [history, lambda _, clock: progress((clock.time - start) / span, clock.steps)])
             write_final_fields(file, fluid.grid, state)
-            write_attributes(file.create_group("reference"), {**scales_at(history), "viscosity": fluid.viscosity})
+            write_attributes(file.create_group("reference"), {
+                **scales_of(history.sample(state, clock)), "energy_budget_error": history.budget_error,
+                "viscosity": fluid.viscosity})
         write_table(file, "statistics", history.columns())
 
 
@@ -88,12 +91,12 @@ def follow_tracers(scene: Scene, file, state: np.ndarray, stepper: Callable, ste
                    history: FlowHistory) -> None:
     """Release tracers into the flow, forcing off, and store their frames, the filtered fields and the scales."""
     fluid, settings = history.fluid, scene.tracers
+    released = history.sample(state, clock)
     fluid.forcing = None
     field = FilteredField(fluid.grid, settings.width, settings.interpolation)
     columns = release(fluid.grid.decomposition, scene.seed, settings.particles_per_side, settings.placement)
     tracers = TracerParticles(field, columns, state)
-    frames = TracerFrames(file, tracers, settings, released_at=clock.time)
-    released = history.rows[-1]
+    frames = TracerFrames(file, tracers, settings, clock.time, isinstance(fluid, CompressibleFluid))
     intervals = int(np.ceil(settings.turnovers * released["eddy_turnover_time"] / settings.frame_interval - 1e-9))
     progress = ProgressLine("tracers", history.describe)
     frames.store(state, clock)
@@ -107,11 +110,11 @@ def follow_tracers(scene: Scene, file, state: np.ndarray, stepper: Callable, ste
                         [history, lambda state, _: tracers.advance(state, step)])
         frames.store(state, clock)
         progress(interval / intervals, clock.steps - first_step)
+    history.sample(state, clock)
     write_attributes(file.create_group("reference"), {
-        **{name: value for name, value in released.items() if name not in ("time", "turnovers", "seconds_per_step")},
-        "energy_budget_error": history.budget_error, "viscosity": fluid.viscosity, "released_at": frames.released_at,
-        "sound_speed": scene.flow.sound_speed or np.inf, "length": settings.width, "spacing": settings.spacing,
-        **frames.scales()})
+        **scales_of(released), "energy_budget_error": history.budget_error, "viscosity": fluid.viscosity,
+        "released_at": frames.released_at, "sound_speed": scene.flow.sound_speed or np.inf, "length": settings.width,
+        "spacing": settings.spacing, **frames.scales()})
     frames.write_spectra()
 
 
@@ -172,8 +175,9 @@ def _state_from_file(path: str, fluid: IncompressibleFluid | CompressibleFluid) 
                 s = grid.forward(np.log(fields.read(-1, "density", *planes)))
             else:
                 s = initial_fields.balanced_density(grid, state, fluid.sound_speed)[None]
-            state = np.concatenate([state, s])
-    return state
+            return np.concatenate([state, s])
+    # A velocity of a compressible flow, or in single precision, is not solenoidal.
+    return project(grid, state)
 
 
 def write_final_fields(file, grid: SpectralGrid, state: np.ndarray) -> None:
@@ -186,8 +190,7 @@ def write_final_fields(file, grid: SpectralGrid, state: np.ndarray) -> None:
     writer.append(0.0, grid.decomposition.start, variables)
 
 
-def scales_at(history: FlowHistory) -> dict[str, float]:
-    """The scales of the last sample and the error of the energy budget."""
-    row = history.rows[-1]
-    return {name: value for name, value in row.items() if name not in ("time", "turnovers", "seconds_per_step")} | {
-        "energy_budget_error": history.budget_error}
+def scales_of(sample: dict[str, float]) -> dict[str, float]:
+    """The part of a sample that tells of the flow, not of the run."""
+    of_the_run = ("time", "turnovers", "time_step", "seconds_per_step")
+    return {name: value for name, value in sample.items() if name not in of_the_run}

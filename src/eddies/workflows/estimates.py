@@ -117,22 +117,43 @@ def most_ranks(scene: Scene) -> dict[str, int]:
         ghosts = GHOST_PLANES[splines]
         limits[f"{ghosts} ghost planes of the {splines} splines"] = scene.flow.cells // ghosts
     if scene.tracers and scene.kernel:
+        support = scene.kernel.support(scene.tracers.particles)
+        limits[f"slabs of the fields no thinner than the kernel's support {support:.3g}"] = thick_slabs(
+            scene.tracers.cells, support)
+    if scene.model:
+        # The a-priori test interpolates filtered fields to the particles, the closure the pressure.
         reach = particle_reach(scene)
-        # Fields are reconstructed on one set of slabs, the pair force is evaluated on another.
-        by_slabs = [cells // math.ceil(reach / (BOX_LENGTH / cells) - 1e-9)
-                    for cells in (scene.tracers.cells, scene.tracers.particles_per_side)]
-        limits[f"slabs no thinner than the particles' reach {reach:.3g}"] = max(min(by_slabs), 1)
+        limits[f"slabs no thinner than the particles' reach {reach:.3g}"] = thick_slabs(
+            scene.tracers.particles_per_side, reach)
+        limits["ghost planes of the filtered fields"] = max(scene.tracers.cells // GHOST_PLANES["quintic"], 1)
+        if scene.model.closure == "poisson":
+            planes = scene.tracers.particles_per_side
+            limits["ghost planes of the Poisson closure"] = max(planes // closure_ghost_planes(scene), 1)
     return limits
 
 
+def thick_slabs(planes: int, width: float) -> int:
+    """The largest number of slabs of that many planes in all that are no thinner than `width`."""
+    return max(planes // math.ceil(width / (BOX_LENGTH / planes) - 1e-9), 1)
+
+
 def particle_reach(scene: Scene) -> float:
-    """How far a particle sees: the kernel's support, the skin of the neighbour list, and a step's way out of its slab."""
-    support, simulation = scene.kernel.support(scene.tracers.particles), scene.simulation
-    if simulation is None:
-        return support
+    """How far a particle sees: kernel support, skin of the neighbour list, and a step's way out of its slab."""
+    skin = scene.simulation.skin if scene.simulation else 0.0
+    return scene.kernel.support(scene.tracers.particles) * (1 + skin) + particle_drift(scene)
+
+
+def particle_drift(scene: Scene) -> float:
+    """How far a particle of the model is expected to move in a step; 0 without [simulation]."""
     turbulence = expected_turbulence(scene)
-    drift = PEAK_VELOCITY * turbulence.velocity_rms * simulation.step if turbulence else 0.0
-    return support * (1 + simulation.skin) + drift
+    return PEAK_VELOCITY * turbulence.velocity_rms * scene.simulation.step if turbulence and scene.simulation else 0.0
+
+
+def closure_ghost_planes(scene: Scene) -> int:
+    """Ghost planes of the pressure's cubic splines: one more for each plane that a particle may be outside its slab."""
+    support, skin = scene.kernel.support(scene.tracers.particles), scene.simulation.skin if scene.simulation else 0.0
+    outside = (skin * support / 2 + particle_drift(scene)) / scene.tracers.spacing
+    return GHOST_PLANES["cubic"] - 1 + max(math.ceil(outside), 1)
 
 
 def flow_bytes(scene: Scene) -> float:
@@ -154,7 +175,12 @@ def probe_seconds_per_step(scene: Scene, comm, steps: int = 3) -> float:
     A grid beyond PROBE_CELLS is not set up; the time of the smaller one is scaled by n^3 log n.
     """
     cells = min(scene.flow.cells, PROBE_CELLS)
-    probe = replace(scene, flow=replace(scene.flow, cells=cells), initial=Initial(kind="taylor-green"),
+    turbulence, forcing = expected_turbulence(scene), scene.forcing
+    # Random turbulence, with energy wherever the scene may force it.
+    initial = Initial(amplitude=turbulence.velocity_rms if turbulence else 1.0, peak_wavenumber=min(3.0, cells / 3))
+    if forcing:
+        forcing = replace(forcing, wavenumber=min(forcing.wavenumber, cells / 3))
+    probe = replace(scene, flow=replace(scene.flow, cells=cells), initial=initial, forcing=forcing,
                     time=replace(scene.time, duration=1.0), spin_up=None, tracers=None, kernel=None,
                     model=None, training=None, simulation=None)
     fluid = build_fluid(probe, comm)

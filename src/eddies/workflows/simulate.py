@@ -13,6 +13,7 @@ from eddies.clock import Clock, ProgressLine
 from eddies.io.hdf5 import create_product, open_product, write_attributes
 from eddies.io.weights import load_weights
 from eddies.parallel.broadcast import first_complaint
+from eddies.parallel.halo import HaloError
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.body_forces import LinearForcing
@@ -21,7 +22,7 @@ from eddies.particles.faults import Limits, find_fault
 from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.pair_forces import PairModel
 from eddies.particles.particle_set import ParticleSet
-from eddies.scene import BOX_LENGTH, Scene
+from eddies.scene import BOX_LENGTH, Scene, SceneError
 from eddies.workflows.closures import load_kernel, poisson_closure
 from eddies.workflows.devices import prepare_torch
 from eddies.workflows.rollout_frames import RolloutFrames
@@ -32,6 +33,8 @@ log = logging.getLogger("eddies")
 # A state is runaway, not turbulence, when a particle is this many times faster, or its density this many times
 # farther from the mean, than the rms of the truth.
 RUNAWAY_SPEED, RUNAWAY_DENSITY = 30.0, 300.0
+# Largest velocity component to be expected of a particle, over the rms: how far it may go within a step.
+PEAK_SPEED = 6.0
 
 
 def run(scene: Scene, comm, directory: str | Path) -> None:
@@ -44,7 +47,8 @@ def run(scene: Scene, comm, directory: str | Path) -> None:
     with (open_product(comm, directory / "ground_truth.h5", "ground_truth") as truth_file,
           create_product(comm, directory / "rollout.h5", "rollout", provenance) as file):
         truth = GroundTruth(truth_file, slab)
-        dynamics = build_dynamics(scene, truth, load_model(comm, directory / "model.h5", device))
+        model = load_model(comm, directory / "model.h5", device)
+        dynamics = build_dynamics(scene, truth, model)
         start = start_frame(scene, truth)
         particles = ParticleSet.from_numpy(truth.particles(start), device)
         frames = RolloutFrames(file, truth, load_kernel(comm, directory / "kernel.h5"), truth.times[start])
@@ -54,7 +58,7 @@ def run(scene: Scene, comm, directory: str | Path) -> None:
             outcome = roll_out(scene, dynamics, particles, frames, count, truth)
         write_attributes(file.create_group("rollout"), {
             **outcome, "turnovers": outcome["time"] / turnover, "eddy_turnover_time": turnover,
-            "start_time": float(truth.times[start]), "integrator": settings.integrator, "closure": scene.model.closure,
+            "start_time": float(truth.times[start]), "integrator": settings.integrator, "closure": model.closure,
             "particles": truth.total, "ranks": comm.size})
     log.info("rollout: %s after %.2f turnovers, %.3f s/step", outcome["status"], outcome["time"] / turnover,
              outcome["seconds_per_step"])
@@ -75,7 +79,11 @@ def roll_out(scene: Scene, dynamics: ParticleDynamics, particles: ParticleSet, f
     while clock.running and complaint is None:
         for _ in range(substeps):
             began = time.perf_counter()
-            particles = integrator.step(particles, step)
+            try:
+                particles = integrator.step(particles, step)
+            except HaloError as error:  # on all ranks alike: particles outrun the halo
+                complaint = f"step {clock.steps + 1}: {error}"
+                break
             clock.tick(step)
             complaint = first_complaint(comm, find_fault(particles, limits, dynamics.box, clock.steps, comm.rank))
             seconds.append(time.perf_counter() - began)
@@ -88,7 +96,7 @@ def roll_out(scene: Scene, dynamics: ParticleDynamics, particles: ParticleSet, f
     if complaint is not None and comm.rank == 0:
         log.warning("rollout stopped at time %.4g: %s", clock.time, complaint)
     return {"status": "complete" if complaint is None else f"stopped: {complaint}", "time": clock.time,
-            "time_step": step, "seconds_per_step": float(np.median(seconds))}
+            "time_step": step, "seconds_per_step": float(np.median(seconds or [np.nan]))}
 
 
 def store(frames: RolloutFrames, dynamics: ParticleDynamics, particles: ParticleSet, clock: Clock) -> None:
@@ -103,12 +111,21 @@ def mean_energy(comm, particles: ParticleSet, total: int) -> float:
 
 
 def start_frame(scene: Scene, truth: GroundTruth) -> int:
-    """The first frame with a filtered field at or after the moment that the scene asks for."""
+    """The first frame with a filtered field at or after the moment that the scene asks for.
+
+    Raises SceneError if none follows that leaves a frame of the ground truth to compare with.
+    """
     fraction = scene.simulation.start
     last_seen = truth.last_frame_seen(scene.training.window)
     wanted = last_seen if fraction is None else int(fraction * (len(truth.times) - 1))
     at_fields = [truth.frame_of_field(index) for index in range(len(truth.fields.times))]
-    return next((frame for frame in at_fields if frame >= max(wanted, 1)), at_fields[-1])
+    last = len(truth.times) - 2 - round(scene.simulation.frame_interval / scene.tracers.frame_interval)
+    usable = [frame for frame in at_fields if max(wanted, 1) <= frame <= last]
+    if not usable:
+        raise SceneError(f"[simulation] start: after frame {wanted} of {len(truth.times)} no filtered field is "
+                         "followed by ground truth to compare with; lower start or [training] window, or raise "
+                         "[tracers] turnovers")
+    return usable[0]
 
 
 def build_dynamics(scene: Scene, truth: GroundTruth, model: PairModel) -> ParticleDynamics:
@@ -120,7 +137,10 @@ def build_dynamics(scene: Scene, truth: GroundTruth, model: PairModel) -> Partic
     if settings.injection != "none":
         rate = truth.reference["dissipation_rate"] if settings.injection == "dissipation" else settings.injection
         terms.append(LinearForcing(rate, scene.forcing.wavenumber if scene.forcing else 2.0, slab.comm, slab.length))
-    closure = poisson_closure(slab, truth.scales.sound_speed, skin) if model.closure == "poisson" else None
+    closure = None
+    if model.closure == "poisson":
+        drift = PEAK_SPEED * truth.scales.velocity * settings.step
+        closure = poisson_closure(slab, truth.scales.sound_speed, dtype, skin, drift)
     return ParticleDynamics(slab, slab.length, terms, skin, closure, dtype)
 
 

@@ -20,21 +20,26 @@ from eddies.scene import Tracers
 class TracerFrames:
     """Stores frames of tracers and accumulates the reference scales over all particles and frames.
 
-    Times are counted from the release. The acceleration and density rate scales are those of differences between
-    successive frames, along the trajectories.
+    Times are counted from the release. Of a `compressible` flow the density is stored as well. The acceleration and
+    density rate scales are those of differences between successive frames, along the trajectories.
     """
 
-    def __init__(self, file, tracers: TracerParticles, settings: Tracers, released_at: float) -> None:
+    def __init__(self, file, tracers: TracerParticles, settings: Tracers, released_at: float,
+                 compressible: bool) -> None:
         self.file, self.tracers, self.settings, self.released_at = file, tracers, settings, released_at
         fine = tracers.field.grid
         slab = SlabDecomposition(fine.decomposition.comm, fine.decomposition.length, settings.cells)
         self.coarse = SpectralGrid(slab, fine.precision, min(fine.cutoff, (settings.cells - 1) // 2))
+        self._compressible = compressible
+        scalar = {"density": ()} if compressible else {}
         self._trajectory = TrajectoryWriter(file, "tracers", settings.particles, slab.length,
-                                            {"position": (3,), "velocity": (3,), "density": ()}, np.float64)
-        self._fields = FieldWriter(file, "filtered", settings.cells, {"velocity": 3, "density": 1})
+                                            {"position": (3,), "velocity": (3,), **scalar}, np.float64)
+        self._fields = FieldWriter(file, "filtered", settings.cells, {"velocity": 3, **dict.fromkeys(scalar, 1)})
         self._frames = 0
         self._last: dict[str, np.ndarray] = {}
-        self._squares = {"velocity": 0.0, "density": 0.0, "acceleration": 0.0, "density_rate": 0.0}
+        self._squares = dict.fromkeys(["velocity", "acceleration"], 0.0)
+        if compressible:
+            self._squares |= dict.fromkeys(["density", "density_rate"], 0.0)
         self._spectra: dict[str, list] = {"time": [], "energy": [], "filtered": []}
 
     def store(self, state: np.ndarray, clock: Clock) -> None:
@@ -42,8 +47,9 @@ class TracerFrames:
         time = clock.time - self.released_at
         order = IdOrder(self.coarse.decomposition.comm, self.tracers.columns["id"], self.settings.particles)
         frame = {"position": order.apply(self.tracers.columns["position"]),
-                 "velocity": order.apply(self.tracers.columns["velocity"]),
-                 "density": order.apply(self.tracers.density(state))}
+                 "velocity": order.apply(self.tracers.columns["velocity"])}
+        if self._compressible:
+            frame["density"] = order.apply(self.tracers.density(state))
         self._trajectory.append(clock.steps, time, order.start, frame)
         self._accumulate(frame)
         if self._frames % self.settings.field_every == 0:
@@ -56,11 +62,13 @@ class TracerFrames:
         frames, pairs = total * self._frames, total * max(self._frames - 1, 1)
         comm = self.coarse.decomposition.comm
         squares = {name: float(global_sum(comm, value)) for name, value in self._squares.items()}
-        return {"velocity_rms": np.sqrt(squares["velocity"] / (3 * frames)),
-                "density_mean": 1.0,
-                "density_rms": np.sqrt(squares["density"] / frames),
-                "acceleration_rms": np.sqrt(squares["acceleration"] / (3 * pairs)),
-                "density_rate_rms": np.sqrt(squares["density_rate"] / pairs)}
+        scales = {"velocity_rms": np.sqrt(squares["velocity"] / (3 * frames)),
+                  "acceleration_rms": np.sqrt(squares["acceleration"] / (3 * pairs))}
+        if self._compressible:
+            scales |= {"density_mean": 1.0,
+                       "density_rms": np.sqrt(squares["density"] / frames),
+                       "density_rate_rms": np.sqrt(squares["density_rate"] / pairs)}
+        return scales
 
     def write_spectra(self) -> None:
         """Write the table of DNS and filtered energy spectra."""
@@ -69,20 +77,23 @@ class TracerFrames:
         write_table(self.file, "spectra", {"wavenumber": wavenumber, **columns})
 
     def _accumulate(self, frame: dict[str, np.ndarray]) -> None:
-        self._squares["velocity"] += np.sum(frame["velocity"] ** 2)
-        self._squares["density"] += np.sum((frame["density"] - 1) ** 2)
-        if self._last:
-            interval = self.settings.frame_interval
-            self._squares["acceleration"] += np.sum((frame["velocity"] - self._last["velocity"]) ** 2) / interval**2
-            self._squares["density_rate"] += np.sum((frame["density"] - self._last["density"]) ** 2) / interval**2
+        rates = {"velocity": "acceleration", "density": "density_rate"}
+        mean = {"velocity": 0.0, "density": 1.0}
+        for name in frame.keys() & rates.keys():
+            self._squares[name] += np.sum((frame[name] - mean[name]) ** 2)
+            if self._last:
+                rate = (frame[name] - self._last[name]) / self.settings.frame_interval
+                self._squares[rates[name]] += np.sum(rate**2)
         self._last = frame
 
     def _store_fields(self, state: np.ndarray, time: float) -> None:
         field = self.tracers.field
         velocity = field.transfer * state[:3]
-        modes = np.concatenate([velocity, field.density_modes(state)])
-        physical = self.coarse.backward(restrict(field.grid, self.coarse, modes))
-        self._fields.append(time, self.coarse.decomposition.start, {"velocity": physical[:3], "density": physical[3:]})
+        modes = {"velocity": velocity}
+        if self._compressible:
+            modes["density"] = field.density_modes(state)
+        planes = {name: self.coarse.backward(restrict(field.grid, self.coarse, part)) for name, part in modes.items()}
+        self._fields.append(time, self.coarse.decomposition.start, planes)
         self._spectra["time"].append(time)
         self._spectra["energy"].append(energy_spectrum(field.grid, state[:3])[1])
         self._spectra["filtered"].append(energy_spectrum(field.grid, velocity)[1])

@@ -13,11 +13,11 @@ from eddies.clock import ProgressLine
 from eddies.io.hdf5 import open_product
 from eddies.io.weights import save_weights
 from eddies.learning.force_training import ForceTrainer, LossWeights, TrainingFrame
+from eddies.learning.losses import relative_error
 from eddies.learning.optimization import Descent
-from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.pair_forces import PairModel
-from eddies.scene import BOX_LENGTH, Scene
+from eddies.scene import BOX_LENGTH, Scene, SceneError
 from eddies.workflows.a_priori import evaluate, evaluation_frames
 from eddies.workflows.closures import load_kernel, poisson_closure
 from eddies.workflows.devices import prepare_torch
@@ -37,28 +37,31 @@ def run(scene: Scene, comm, directory: str | Path) -> None:
     slab = SlabDecomposition(comm, BOX_LENGTH, scene.tracers.particles_per_side)
     with open_product(comm, directory / "ground_truth.h5", "ground_truth") as file:
         truth = GroundTruth(file, slab)
-        kernel = load_kernel(comm, directory / "kernel.h5")
+        kernel = load_kernel(comm, directory / "kernel.h5", device)
         model = build_model(scene, truth, kernel.support).to(dtype=dtype, device=device)
-        last = truth.last_frame_seen(settings.window)
+        last, tests = truth.last_frame_seen(settings.window), evaluation_frames(truth)
+        if last < 2:
+            raise SceneError(f"[training] window = {settings.window:g}: holds fewer than three frames of the ground "
+                             "truth; raise it or [tracers] turnovers, or lower [tracers] frame_interval")
         seen = np.unique(np.linspace(1, last - 1, settings.frames).astype(int))
         log.info("train: %d frames of the times up to %.3g of %.3g; %d weights", len(seen), truth.times[last],
                  truth.times[-1], sum(p.numel() for p in model.parameters()))
-        closure = poisson_closure(slab, truth.scales.sound_speed) if model.closure == "poisson" else None
+        closure = poisson_closure(slab, truth.scales.sound_speed, dtype) if model.closure == "poisson" else None
         frames = [load_frame(truth, index, model, closure, dtype, device) for index in seen]
-        validation = load_frame(truth, evaluation_frames(truth)[-1], model, closure, dtype, device)
-        trainer = ForceTrainer(slab, model, frames, kernel, scene.tracers.cells,
-                               LossWeights(settings.trajectory_weight, settings.field_weight,
-                                           settings.velocity_kl_weight, settings.acceleration_kl_weight),
-                               truth.total, settings.batch, scene.seed)
+        validation = load_frame(truth, tests[-1], model, closure, dtype, device)
+        weights = LossWeights(settings.trajectory_weight, settings.field_weight, settings.velocity_kl_weight,
+                              settings.acceleration_kl_weight)
+        trainer = ForceTrainer(model, frames, kernel, weights, settings.batch, scene.seed)
         history = train(scene, trainer, validation)
-        tables = evaluate(truth, model, closure, evaluation_frames(truth), last, dtype, device)
+        tables = evaluate(truth, model, closure, tests, last, dtype, device)
     weights = {name: tensor.cpu().numpy() for name, tensor in model.state_dict().items()}
     provenance = {"scene": scene.to_toml(), "fingerprint": scene.fingerprint("train")}
     save_weights(comm, directory / "model.h5", "model", model.state_description(), weights, provenance,
                  {"history": history, **tables})
     errors = tables["a_priori"]
-    log.info("model: acceleration error %.3f at an unseen time (exact filtered pressure gradient %.3f)",
-             errors["acceleration_error"][-1], errors["pressure_gradient_error"][-1])
+    log.info("model: acceleration error %.3f at a time %.3g after the training window (exact filtered pressure "
+             "gradient %.3f)", errors["acceleration_error"][-1], errors["delay"][-1],
+             errors["pressure_gradient_error"][-1])
 
 
 def build_model(scene: Scene, truth: GroundTruth, support: float) -> PairModel:
@@ -101,7 +104,4 @@ def validation_error(trainer: ForceTrainer, frame: TrainingFrame) -> float:
     total = trainer.total
     ids = np.random.default_rng(trainer.seed).choice(total, min(VALIDATION_PARTICLES, total), replace=False)
     rows = frame.rows(ids)
-    error = frame.errors(rows)["velocity"].double()
-    squares = [float(error.square().sum()), float(frame.acceleration[rows].double().square().sum())]
-    wrong, all_ = global_sum(trainer.comm, np.array(squares))
-    return float(np.sqrt(wrong / all_))
+    return relative_error(trainer.comm, frame.errors(rows)["velocity"], frame.acceleration[rows])

@@ -15,6 +15,7 @@ from eddies.io.hdf5 import open_product
 from eddies.io.weights import save_weights
 from eddies.learning.kernel_training import KernelLossWeights, KernelSample, KernelTrainer
 from eddies.learning.optimization import Descent
+from eddies.parallel.migration import id_block, migrate
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.cloud import ParticleCloud
@@ -40,8 +41,7 @@ def run(scene: Scene, comm, directory: str | Path) -> None:
     support = settings.support(scene.tracers.particles)
     with open_product(comm, directory / "ground_truth.h5", "ground_truth") as file:
         truth = GroundTruth(file, slab)
-        window = scene.training.window if scene.training is not None else 0.5
-        seen = np.flatnonzero(truth.fields.times <= window * truth.times[-1])
+        seen = np.flatnonzero(truth.fields.times <= scene.window * truth.times[-1])
         chosen = np.unique(np.linspace(0, len(seen) - 1, TRAINING_SAMPLES).astype(int))
         samples = [load_sample(truth, index, support) for index in chosen]
         unseen = load_sample(truth, len(truth.fields.times) - 1, support)
@@ -70,7 +70,10 @@ def load_sample(truth: GroundTruth, index: int, support: float) -> KernelSample:
     velocity = truth.field(index, "velocity")
     grid = SpectralGrid(slab, cutoff=(slab.planes - 1) // 2)
     derivatives = np.stack([grid.backward(gradient(grid, component)) for component in grid.forward(velocity)])
-    columns = truth.particles(truth.frame_of_field(index))
+    frame, block = truth.frame_of_field(index), id_block(slab.comm, truth.total)
+    # Without the density, which an incompressible ground truth has not.
+    columns = {name: truth.trajectory.read(frame, name, *block) for name in ("position", "velocity")}
+    columns = migrate(slab, {"id": np.arange(*block, dtype=np.int64), **columns})
     by_point = [torch.from_numpy(np.ascontiguousarray(np.moveaxis(values.reshape(*values.shape[:-3], -1), -1, 0)))
                 for values in (velocity, derivatives)]
     position, own_velocity = (torch.from_numpy(columns[name]) for name in ("position", "velocity"))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 
@@ -44,8 +46,10 @@ class GroundTruth:
 
         Not for the first and the last frame.
         """
+        if not 0 < frame < len(self.times) - 1:
+            raise ValueError(f"frame {frame} of {len(self.times)} has no frames on both sides")
         columns = self._block(frame)
-        before, after = self._block(frame - 1), self._block(frame + 1)
+        before, after = (self._block(other, ("velocity", "density")) for other in (frame - 1, frame + 1))
         span = self.times[frame + 1] - self.times[frame - 1]
         columns["acceleration"] = (after["velocity"] - before["velocity"]) / span
         columns["density_rate"] = (after["density"] - before["density"]) / span
@@ -64,9 +68,9 @@ class GroundTruth:
         """The last frame of the training window, a fraction of the ground truth."""
         return max(int(window * (len(self.times) - 1)), 1)
 
-    def _block(self, frame: int) -> dict[str, np.ndarray]:
+    def _block(self, frame: int, names: Sequence[str] = ("position", "velocity", "density")) -> dict[str, np.ndarray]:
         start, stop = id_block(self.decomposition.comm, self.total)
-        columns = {name: self.trajectory.read(frame, name, start, stop) for name in ("position", "velocity", "density")}
+        columns = {name: self.trajectory.read(frame, name, start, stop) for name in names}
         return {"id": np.arange(start, stop, dtype=np.int64), **columns}
 
 
