@@ -40,7 +40,8 @@ def checkout(tmp_path):
     shutil.copy(CHECKOUT / "mpi_tools/launch.py", tmp_path / "mpi_tools")
     for name, text in {"mpi_tools/bootstrap.sh": "true", "bin/mpirun": 'echo "mpirun $*"; shift 2; "$@"',
                        "bin/srun": '"$@"', "bin/scontrol": 'echo "scontrol $*"',
-                       ".venv/bin/eddies": 'echo "eddies $*; threads $OMP_NUM_THREADS"; exit ${ENDS_WITH:-0}',
+                       ".venv/bin/eddies": 'echo "$SAYS"; echo "eddies $*; threads $OMP_NUM_THREADS"\n'
+                                           'exit ${ENDS_WITH:-0}',
                        ".venv/bin/python": f'exec {sys.executable} "$@"'}.items():
         path = tmp_path / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -62,6 +63,11 @@ def test_local_runs_on_the_cores_or_fewer(checkout, asked, ranks):
     assert result.returncode == 0, result.stderr
     assert f"mpirun -n {ranks} " in result.stdout
     assert "eddies run hit-small --resume; threads 1\n" in result.stdout
+
+
+def test_local_starts_no_more_ranks_than_the_scene_can_use(checkout):
+    result = run(checkout, "local.sh", "tiny", SAYS="ranks       at most 1")
+    assert "mpirun -n 1 " in result.stdout and "eddies check" not in result.stdout
 
 
 def test_local_passes_scene_and_options_on(checkout):
