@@ -128,3 +128,20 @@ def test_kernel_of_an_incompressible_flow(comm, tmp_path):
     dns.run(scene, comm, tmp_path)
     train_kernel.run(scene, comm, tmp_path)
     assert (tmp_path / "kernel.h5").exists()
+
+
+class SilentComm:
+    """One rank without any means to send."""
+
+    rank, size = 0, 1
+
+    def Barrier(self):
+        """Nobody to wait for."""
+
+
+def test_one_rank_sends_nothing(tmp_path):
+    scene = load_scene("tiny", ["flow.cells=16", "spin_up.turnovers=0.05", "tracers.turnovers=0.05",
+                                "tracers.field_cells=8"])
+    # Any reduction, exchange or transpose would be an AttributeError.
+    dns.run(scene, SilentComm(), tmp_path)
+    assert (tmp_path / "ground_truth.h5").exists()
