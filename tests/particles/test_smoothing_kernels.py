@@ -32,7 +32,7 @@ def test_unit_integral(kernel):
     by_hand = float(torch.trapezoid(4 * torch.pi * r**2 * kernel.value(r), r).detach())
     # The sigmoid ends with a jump, of which the last interval is missed.
     assert by_hand == pytest.approx(1, abs=1e-3 if kernel.value(r[-1]) > 0.01 else 1e-7)
-    assert float(integral(kernel)) == pytest.approx(1, abs=1e-13)
+    assert integral(kernel).item() == pytest.approx(1, abs=1e-13)
 
 
 @kernels

@@ -41,6 +41,7 @@ def evaluate(truth: GroundTruth, model: PairModel, closure: PoissonClosure | Non
     """Normalised L2 errors over time delay, and samples of true and predicted rates at the last frame; collective.
 
     `acceleration_error` is that of the model as it runs: with the density of its closure if it has one.
+    `density_rate_error` is that of the learned rate, or of the rate at which the closure's density changes.
     `true_density_acceleration_error` is that with the true density, `pressure_gradient_error` that of
     -c^2 grad ln(rho) of the filtered field, without any model.
     """
@@ -55,6 +56,7 @@ def evaluate(truth: GroundTruth, model: PairModel, closure: PoissonClosure | Non
         if closure is not None:
             given = load_frame(truth, index, model, None, dtype, device).errors()["velocity"]
             row["true_density_acceleration_error"] = relative_error(comm, given, frame.acceleration)
+            row["density_rate_error"] = _closure_rate_error(truth, closure, int(index), device)
         if "density" in errors:
             row["density_rate_error"] = relative_error(comm, errors["density"], frame.density_rate)
         rows.append(row)
@@ -63,6 +65,24 @@ def evaluate(truth: GroundTruth, model: PairModel, closure: PoissonClosure | Non
     if "density" in errors:
         tables["density_rate_sample"] = _sample(truth, frame, frame.density_rate, errors["density"])
     return tables
+
+
+def _closure_rate_error(truth: GroundTruth, closure: PoissonClosure, index: int, device: torch.device) -> float:
+    """Error of the rate of the closure's density along the true trajectories, by centred differences."""
+    comm, total = truth.decomposition.comm, truth.total
+
+    def density(frame: int) -> np.ndarray:
+        particles = ParticleSet.from_numpy(truth.particles(frame), device)
+        return _by_id(comm, total, closure.apply(particles).to_numpy(), "density")
+
+    rate = (density(index + 1) - density(index - 1)) / (truth.times[index + 1] - truth.times[index - 1])
+    exact = _by_id(comm, total, truth.particles_with_rates(index), "density_rate")
+    return relative_error(comm, torch.from_numpy(rate - exact), torch.from_numpy(exact))
+
+
+def _by_id(comm, total: int, columns: dict[str, np.ndarray], name: str) -> np.ndarray:
+    """This rank's block of a column in the order of particle ids."""
+    return IdOrder(comm, columns["id"], total).apply(columns[name])
 
 
 def _pressure_force(truth: GroundTruth, index: int, particles: ParticleSet) -> torch.Tensor:
