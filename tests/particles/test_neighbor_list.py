@@ -89,7 +89,6 @@ def test_list_holds_while_nothing_moves_by_more_than_half_the_skin():
     neighbors = listed(position, position, 0.9, skin=0.2)
     direction = torch.nn.functional.normalize(cloud(count=200, seed=8) - LENGTH / 2)
     moved = position + 0.0999 * direction
-    assert neighbors.displaced(moved) == pytest.approx(0.0999)
     assert as_set(neighbors.pairs(moved, moved)) == oracle(moved % LENGTH, moved % LENGTH, 0.9, True)
 
 

@@ -59,15 +59,7 @@ class NeighborList:
         self._receivers, self.senders = (torch.cat(column) for column in zip(*found))
         neighbors = torch.bincount(self._receivers, minlength=len(receivers))
         self.offsets = torch.cat([neighbors.new_zeros(1), neighbors.cumsum(0)])
-        self._built_at = senders.clone()
         self.builds += 1
-
-    def displaced(self, senders: Tensor) -> float:
-        """Largest distance moved since the build by the first rows (k, 3) of the senders; zero for no row."""
-        if not len(senders):
-            return 0.0
-        moved = self.box.displacement(senders.detach(), self._built_at[: len(senders)])
-        return float(torch.sqrt((moved * moved).sum(-1).max()))
 
     def blocks(self, together: int) -> Iterator[slice]:
         """Consecutive receivers with about `together` listed pairs; one empty block without receivers."""

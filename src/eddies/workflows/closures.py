@@ -31,7 +31,7 @@ def poisson_closure(decomposition: SlabDecomposition, sound_speed: float, dtype:
 
     24 neighbours, four passes and modes up to three quarters of the Nyquist wavenumber are the best of a trial on
     filtered turbulence (64^3 cells, 32^3 particles): error of -grad p at the particles 0.30, against 0.32 of the exact
-    filtered pressure gradient and 0.43 of a single pass; more neighbours smooth more and cost more, higher modes carry
+    filtered pressure gradient and 0.42 of a single pass; more neighbours smooth more and cost more, higher modes carry
     more noise than flow. `drift` is how far particles may move beyond the skin before they change rank.
     """
     neighbors, nyquist = 24, decomposition.planes / 2
