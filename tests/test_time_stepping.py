@@ -33,8 +33,10 @@ class Oscillator:
         return self.rates * state
 
     def linear_function(self, function, step):
-        factor = function(step * self.rates)
-        return lambda state: factor * state
+        return function(step * self.rates)
+
+    def combine(self, *terms):
+        return sum(factor * state for factor, state in terms)
 
     def exact(self, state, time):
         # Bernoulli's equation: 1/u is linear in exp(-L t).

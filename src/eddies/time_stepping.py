@@ -1,13 +1,14 @@
 """Time steppers for du/dt = L u + N(u): exponential time differencing and explicit Runge-Kutta.
 
 A stepper knows an equation only through four things: `nonlinear(state)` is N, `linear(state)` is L u,
-`linear_function(f, step)` is the operator f(step L), and both results and states add like arrays.
+`linear_function(f, step)` is the operator f(step L), and `combine((operator, state), ...)` the sum of such operators
+applied to states. Results and states add like arrays.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -21,7 +22,9 @@ class Equation(Protocol):
 
     def linear(self, state: np.ndarray) -> np.ndarray: ...
 
-    def linear_function(self, function: ScalarFunction, step: float) -> Callable[[np.ndarray], np.ndarray]: ...
+    def linear_function(self, function: ScalarFunction, step: float) -> Any: ...
+
+    def combine(self, *terms: tuple[Any, np.ndarray]) -> np.ndarray: ...
 
 
 # Below this modulus the closed forms of the phi functions lose digits to cancellation.
@@ -76,28 +79,21 @@ class ETDRK4:
 
     def __init__(self, equation: Equation) -> None:
         self.equation = equation
-        self._operators: dict[float, list[Callable[[np.ndarray], np.ndarray]]] = {}
+        self._operators: dict[float, list[Any]] = {}
 
     def __call__(self, state: np.ndarray, step: float) -> np.ndarray:
         """The state one `step` later."""
         full, half, q, f1, f2, f3 = self._operators.setdefault(step, None) or self._prepare(step)
-        N = self.equation.nonlinear
+        N, combine = self.equation.nonlinear, self.equation.combine
         n0 = N(state)
-        half_state = half(state)
-        a = half_state + q(n0)
+        a = combine((half, state), (q, n0))
         na = N(a)
-        nb = N(half_state + q(na))
-        half_state = half(a)
-        half_state += q(2 * nb - n0)
-        nc = N(half_state)
-        result = full(state)
-        result += f1(n0)
+        nb = N(combine((half, state), (q, na)))
+        nc = N(combine((half, a), (q, 2 * nb - n0)))
         na += nb
-        result += f2(na)
-        result += f3(nc)
-        return result
+        return combine((full, state), (f1, n0), (f2, na), (f3, nc))
 
-    def _prepare(self, step: float) -> list[Callable[[np.ndarray], np.ndarray]]:
+    def _prepare(self, step: float) -> list[Any]:
         functions: list[ScalarFunction] = [
             np.exp,
             lambda z: np.exp(z / 2),

@@ -70,7 +70,7 @@ def test_linear_function_is_the_exponential_of_the_linear_operator(comm):
     for n in range(1, 40):
         term = step / n * fluid.linear(term)
         series = series + term
-    assert np.abs(fluid.linear_function(np.exp, step)(state) - series).max() < 1e-13
+    assert np.abs(fluid.combine((fluid.linear_function(np.exp, step), state)) - series).max() < 1e-13
 
 
 @pytest.mark.mpi(1)

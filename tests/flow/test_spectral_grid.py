@@ -3,6 +3,7 @@ import pytest
 
 from eddies.flow.spectral_grid import SpectralGrid, restrict
 from eddies.parallel.slab import SlabDecomposition
+from eddies.parallel.transpose import TransposeBuffers
 
 # Round-off of a transform of this size; float32 has 2^29 times coarser numbers.
 TOLERANCE = {"float64": 1e-14, "float32": 2e-6}
@@ -83,8 +84,7 @@ def test_restriction_keeps_the_common_modes(comm, cells):
 def test_one_rank_sends_nothing(comm, monkeypatch):
     grid = make_grid(comm, 8)
     sent = []
-    monkeypatch.setattr(grid._transpose, "_exchange",
-                        lambda *a, exchange=grid._transpose._exchange: sent.append(1) or exchange(*a))
+    monkeypatch.setattr(TransposeBuffers, "_send", lambda *a, send=TransposeBuffers._send: sent.append(1) or send(*a))
     grid.backward(grid.forward(np.zeros((3, *grid.physical_shape))))
     # On more ranks a batch of three components travels in one message each way.
     assert len(sent) == (0 if comm.size == 1 else 2)

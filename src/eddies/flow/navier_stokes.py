@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from eddies.flow.forcing import LinearForcing
-from eddies.flow.operators import curl, divergence, dot_wavevector, gradient, project
+from eddies.flow.linear_operators import AcousticBlock, Decay, sum_of_acoustic_blocks, sum_of_decays
+from eddies.flow.operators import divergence, dot_wavevector, project
 from eddies.flow.spectral_grid import SpectralGrid
 from eddies.time_stepping import ScalarFunction, divided_difference
-
-Operator = Callable[[np.ndarray], np.ndarray]
 
 
 class IncompressibleFluid:
     """u_t = P[u x omega + f] + nu laplacian u,  P the projection on solenoidal fields (it absorbs p + |u|^2 / 2).
 
-    The state is the velocity, (3, kz, ky, kx). Nine transforms an evaluation.
+    The state is the velocity, (3, kz, ky, kx). Nine transforms an evaluation, of which eight are sent.
     """
 
     def __init__(self, grid: SpectralGrid, viscosity: float, forcing: LinearForcing | None = None) -> None:
@@ -25,20 +22,30 @@ class IncompressibleFluid:
 
     def nonlinear(self, state: np.ndarray) -> np.ndarray:
         """P[u x omega + f]."""
-        u, v, w, p, q, r = self.grid.backward(np.concatenate([state, curl(self.grid, state)]))
-        tendency = project(self.grid, self.grid.forward(np.stack([v * r - w * q, w * p - u * r, u * q - v * p])))
+        products = self.grid.multiply(state, _cross_vorticity, 3, fields=6, expand=self._with_vorticity,
+                                      z_derivatives=2)
+        tendency = project(self.grid, products)
         if self.forcing is not None:
             self.forcing.add(state, tendency)
         return tendency
+
+    def _with_vorticity(self, modes: np.ndarray) -> list[np.ndarray]:
+        """u and curl u from u and the z derivatives of its first two components."""
+        d_dx, d_dy = self.grid.d_dx, self.grid.d_dy
+        u, v, w, du_dz, dv_dz = modes
+        return [modes[:3], np.stack([d_dy[0] * w - dv_dz, du_dz - d_dx[0] * w, d_dx[0] * v - d_dy[0] * u])]
 
     def linear(self, state: np.ndarray) -> np.ndarray:
         """-nu k^2 u."""
         return -self.viscosity * self.grid.wavenumber_squared * state
 
-    def linear_function(self, function: ScalarFunction, step: float) -> Operator:
+    def linear_function(self, function: ScalarFunction, step: float) -> Decay:
         """f(step L), which multiplies each mode by f(-nu k^2 step)."""
-        factor = by_wavenumber(self.grid, lambda k2: function(-self.viscosity * k2 * step).real)
-        return lambda state: factor * state
+        return Decay(self.grid, lambda k2: function(-self.viscosity * k2 * step).real)
+
+    def combine(self, *terms: tuple[Decay, np.ndarray]) -> np.ndarray:
+        """The sum of linear functions applied to states."""
+        return sum_of_decays(self.grid, terms)
 
 
 class CompressibleFluid:
@@ -48,7 +55,8 @@ class CompressibleFluid:
         u_t = -c^2 grad s + nu (laplacian u + 1/3 grad div u) - u.grad u + 2 nu (S - 1/3 div u).grad s + f
 
     S is the rate of strain. Everything nonlinear is quadratic, so the 2/3 rule dealiases it exactly. The state is
-    (u, v, w, s), (4, kz, ky, kx). Fifteen transforms back (u and the gradients of u and s), four forth.
+    (u, v, w, s), (4, kz, ky, kx). Fifteen transforms back (u and the gradients of u and s), four forth; of the first
+    eight are sent, because derivatives along x and y are taken after the transform along z.
     """
 
     def __init__(self, grid: SpectralGrid, viscosity: float, sound_speed: float,
@@ -57,23 +65,35 @@ class CompressibleFluid:
 
     def nonlinear(self, state: np.ndarray) -> np.ndarray:
         """-u.grad u + 2 nu (S - 1/3 div u).grad s + f, and -u.grad s."""
-        spectral = np.concatenate([state[:3], *(gradient(self.grid, component) for component in state)])
-        physical = self.grid.backward(spectral)
-        u, A, G = physical[:3], physical[3:12].reshape(3, 3, *physical.shape[1:]), physical[12:]
-        nu = self.viscosity
-        # u.grad u - 2 nu S.grad s = A (u - nu G) - nu A^T G  with A_ij = d_j u_i
-        w = u - nu * G if nu > 0 else u
-        product = np.empty((4, *physical.shape[1:]), physical.dtype)
-        for i in range(3):
-            product[i] = -(A[i, 0] * w[0] + A[i, 1] * w[1] + A[i, 2] * w[2])
-            if nu > 0:
-                product[i] += nu * (A[0, i] * G[0] + A[1, i] * G[1] + A[2, i] * G[2])
-                product[i] -= (2 / 3 * nu) * ((A[0, 0] + A[1, 1] + A[2, 2]) * G[i])
-        product[3] = -(u[0] * G[0] + u[1] * G[1] + u[2] * G[2])
-        tendency = self.grid.forward(product)
+        tendency = self.grid.multiply(state, self._products, 4, fields=15, expand=self._with_gradients,
+                                      z_derivatives=4)
         if self.forcing is not None:
             self.forcing.add(state[:3], tendency[:3])
         return tendency
+
+    def _with_gradients(self, modes: np.ndarray) -> list[np.ndarray]:
+        """u, and the derivatives of (u, v, w, s) along x, along y and along z."""
+        return [modes[:3], self.grid.d_dx * modes[:4], self.grid.d_dy * modes[:4], modes[4:]]
+
+    def _products(self, fields: np.ndarray, out: np.ndarray) -> None:
+        u, gradients = fields[:3], fields[3:].reshape(3, 4, *fields.shape[1:])
+        # u.grad u - 2 nu S.grad s = (u - H).grad u - grad u.H  with H = nu grad s, grad u.H = H_j d_i u_j
+        if self.viscosity > 0:
+            H = self.viscosity * gradients[:, 3]
+            carrier = u - H
+        else:
+            carrier = u
+        _along(carrier, gradients[:, :3], out[:3])
+        _along(u, gradients[:, 3:], out[3:])
+        np.negative(out, out=out)
+        if self.viscosity > 0:
+            divergence = (gradients[0, 0] + gradients[1, 1] + gradients[2, 2]) * self.grid.real(2 / 3)
+            for i in range(3):
+                turned = gradients[i, :3] * H
+                turned[0] += turned[1]
+                turned[0] += turned[2]
+                out[i] += turned[0]
+                out[i] -= np.multiply(divergence, H[i], out=turned[1])
 
     def linear(self, state: np.ndarray) -> np.ndarray:
         """-c^2 grad s - nu (k^2 u + 1/3 k (k.u)), and -div u."""
@@ -87,7 +107,7 @@ class CompressibleFluid:
         result[3] = -divergence(grid, velocity)
         return result
 
-    def linear_function(self, function: ScalarFunction, step: float) -> Operator:
+    def linear_function(self, function: ScalarFunction, step: float) -> AcousticBlock:
         """f(step L): on transverse velocity f(-nu k^2 step); on (s, longitudinal u) the function of a 2 x 2 block.
 
         The block [[0, -ik], [-i c^2 k, -2 gamma]], gamma = 2/3 nu k^2, has the eigenvalues
@@ -102,40 +122,37 @@ class CompressibleFluid:
             slope = divided_difference(function, z1, z2)
             return slope, (function(z1) - z1 * slope)
 
-        transverse = by_wavenumber(grid, lambda k2: function(-nu * k2 * step).real)
-        identity = by_wavenumber(grid, lambda k2: block(k2)[1].real)
-        coupling = by_wavenumber(grid, lambda k2: step * block(k2)[0].real)
+        def transverse(k2: np.ndarray) -> np.ndarray:
+            return function(-nu * k2 * step).real
 
-        def longitudinal_excess(k2: np.ndarray) -> np.ndarray:
+        def excess(k2: np.ndarray) -> np.ndarray:
             slope, constant = block(k2)
-            excess = constant - 4 / 3 * nu * k2 * step * slope - function(-nu * k2 * step)
-            return np.divide(excess.real, k2, out=np.zeros_like(k2), where=k2 > 0)
+            difference = (constant - 4 / 3 * nu * k2 * step * slope).real - transverse(k2)
+            return np.divide(difference, k2, out=np.zeros_like(k2), where=k2 > 0)
 
-        excess = by_wavenumber(grid, longitudinal_excess)
-        elastic = (c**2 * coupling).astype(grid.real)
+        return AcousticBlock(grid, transverse=transverse, excess=excess, identity=lambda k2: block(k2)[1].real,
+                             coupling=lambda k2: step * block(k2)[0].real,
+                             elastic=lambda k2: c**2 * step * block(k2)[0].real)
 
-        def apply(state: np.ndarray) -> np.ndarray:
-            velocity, s = state[:3], state[3]
-            dotted = dot_wavevector(grid, velocity)
-            along = excess * dotted - 1j * (elastic * s)
-            result = np.empty_like(state)
-            for i, k in enumerate(grid.wavevector):
-                np.multiply(transverse, velocity[i], out=result[i])
-                result[i] += k * along
-            result[3] = identity * s - 1j * (coupling * dotted)
-            return result
-
-        return apply
+    def combine(self, *terms: tuple[AcousticBlock, np.ndarray]) -> np.ndarray:
+        """The sum of linear functions applied to states."""
+        return sum_of_acoustic_blocks(self.grid, terms)
 
 
-def by_wavenumber(grid: SpectralGrid, function: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """A real function of k^2 on all modes of this rank, evaluated once for each integer |k|^2: (kz, ky, kx)."""
-    unit = 2 * np.pi / grid.decomposition.length
-    distinct = np.unique(grid.index_squared)
-    table = np.zeros(3 * grid.cutoff**2 + 1)
-    if len(distinct):
-        table[distinct] = function(unit**2 * distinct)
-    return table[grid.index_squared].astype(grid.real)
+def _along(u: np.ndarray, gradients: np.ndarray, out: np.ndarray) -> None:
+    """u.grad of fields from their gradients (3, c, ...): out (c, ...)."""
+    np.multiply(u[0], gradients[0], out=out)
+    term = u[1] * gradients[1]
+    out += term
+    out += np.multiply(u[2], gradients[2], out=term)
+
+
+def _cross_vorticity(fields: np.ndarray, out: np.ndarray) -> None:
+    """u x omega of (u, omega): (6, ...) -> (3, ...)."""
+    u, omega = fields[:3], fields[3:]
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        np.multiply(u[j], omega[k], out=out[i])
+        out[i] -= u[k] * omega[j]
 
 
 def advective_speed(grid: SpectralGrid, velocity: np.ndarray) -> float:

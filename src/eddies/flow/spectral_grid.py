@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-import numpy as np
-import pyfftw
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
+import numpy as np
+
+from eddies.flow.fourier_passes import ColumnPass, PlanePass
 from eddies.parallel.migration import Redistribution
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
-from eddies.parallel.transpose import Transpose
+from eddies.parallel.transpose import Transpose, TransposeBuffers
 
 REAL = {"float64": np.float64, "float32": np.float32}
 COMPLEX = {"float64": np.complex128, "float32": np.complex64}
+
+Expansion = Callable[[np.ndarray], Sequence[np.ndarray]]
 
 
 class SpectralGrid:
@@ -29,7 +34,7 @@ class SpectralGrid:
     cutoff : largest wavenumber K kept in each direction, in units of 2 pi / length. The default, the largest integer
         below cells / 3, makes quadratic products free of aliasing (Orszag 1971). At most (cells - 1) // 2.
 
-    Dropped modes are neither transformed further nor sent. Plans are made once per number of components.
+    Dropped modes are neither transformed further nor sent.
     """
 
     def __init__(self, decomposition: SlabDecomposition, precision: str = "float64", cutoff: int | None = None) -> None:
@@ -38,7 +43,9 @@ class SpectralGrid:
         self.precision, self.real, self.complex = precision, REAL[precision], COMPLEX[precision]
         self.modes = 2 * self.cutoff + 1
         self._transpose = Transpose(decomposition.comm, self.cells, self.modes)
-        self._plans: dict[tuple[str, int], pyfftw.FFTW] = {}
+        self._buffers: dict[tuple[str, int], TransposeBuffers] = {}
+        self.column_pass = ColumnPass(self.cells, self.cutoff + 1, self.complex)
+        self.plane_pass = PlanePass(self.cells, self.cutoff, self.complex)
         self._wavenumbers()
 
     def _wavenumbers(self) -> None:
@@ -51,6 +58,9 @@ class SpectralGrid:
         self.wavevector = tuple((unit * axis).astype(self.real) for axis in self.index)
         self.index_squared = sum(axis.astype(np.int64) ** 2 for axis in self.index)
         self.wavenumber_squared = (unit**2 * self.index_squared).astype(self.real)
+        #: i kx and i ky for the modes in (ky, kx) that an `expand` of `blocks` gets, all of them in storage order
+        self.d_dx = (1j * unit * signed).astype(self.complex)[None, None, None, :]
+        self.d_dy = (1j * unit * signed).astype(self.complex)[None, None, :, None]
         #: how often a stored mode stands in the full sum: twice, but for kx = 0, whose mirror image is stored itself
         self.multiplicity = np.where(self.index[0] == 0, 1, 2).astype(self.real)
 
@@ -77,43 +87,85 @@ class SpectralGrid:
 
     def forward(self, physical: np.ndarray) -> np.ndarray:
         """Fourier coefficients (c, kz, ky_local, kx) of a real field (c, z_local, y, x); `backward` is its inverse."""
-        components, K = len(physical), self.cutoff
-        along_x = self._plan("forward x", components)
-        along_x.input_array[...] = physical
-        along_x.execute()
-        plane_plan = self._plan("forward y", components)
-        plane_plan.execute()
-        plane = plane_plan.output_array
-        kept = np.empty((components, self.decomposition.count, self.modes, K + 1), self.complex)
-        kept[:, :, : K + 1], kept[:, :, K + 1 :] = plane[:, :, : K + 1], plane[:, :, self.cells - K :]
-        along_z = self._plan("forward z", components)
-        along_z.input_array[...] = self._transpose.forward(kept)
-        along_z.execute()
-        column = along_z.output_array
-        spectral = np.empty((components, *self.spectral_shape), self.complex)
-        scale = self.real(1.0 / self.cells**3)
-        np.multiply(column[:, : K + 1], scale, out=spectral[:, : K + 1])
-        np.multiply(column[:, self.cells - K :], scale, out=spectral[:, K + 1 :])
-        return spectral
+        collected = Collector(self, len(physical))
+        for planes in self.plane_pass.blocks(self.decomposition.count):
+            collected.add(planes, physical[:, planes])
+        return collected.modes()
 
     def backward(self, spectral: np.ndarray) -> np.ndarray:
         """Real field (c, z_local, y, x) of Fourier coefficients (c, kz, ky_local, kx); the inverse of `forward`."""
-        components, K = len(spectral), self.cutoff
-        along_z = self._plan("backward z", components)
-        column = along_z.input_array
-        column[:, : K + 1], column[:, self.cells - K :] = spectral[:, : K + 1], spectral[:, K + 1 :]
-        column[:, K + 1 : self.cells - K] = 0
-        along_z.execute()
-        kept = self._transpose.backward(along_z.output_array)
-        plane_plan = self._plan("backward y", components)
-        plane = plane_plan.input_array
-        plane[:, :, : K + 1], plane[:, :, self.cells - K :] = kept[:, :, : K + 1], kept[:, :, K + 1 :]
-        plane[:, :, K + 1 : self.cells - K] = 0
-        plane_plan.execute()
-        along_x = self._plan("backward x", components)
-        along_x.input_array[..., K + 1 :] = 0
-        along_x.execute()
-        return along_x.output_array.copy()
+        physical = np.empty((len(spectral), *self.physical_shape), self.real)
+        for planes, values in self.blocks(spectral, len(spectral)):
+            physical[:, planes] = values
+        return physical
+
+    def multiply(self, spectral: np.ndarray, product: Callable[[np.ndarray, np.ndarray], None], results: int,
+                 **fields: Any) -> np.ndarray:
+        """Fourier coefficients (results, kz, ky_local, kx) of products of fields, formed at the grid points.
+
+        `product(values, out)` gets what `blocks` yields for the same arguments and fills (results, planes, y, x).
+        """
+        collected, out = Collector(self, results), None
+        for planes, values in self.blocks(spectral, **fields):
+            if out is None or out.shape[1:] != values.shape[1:]:
+                out = np.empty((results, *values.shape[1:]), self.real)
+            product(values, out)
+            collected.add(planes, out)
+        return collected.modes()
+
+    def blocks(self, spectral: np.ndarray, fields: int, expand: Expansion | None = None,
+               z_derivatives: int = 0) -> Iterator[tuple[slice, np.ndarray]]:
+        """Real fields at the grid points, some planes at a time: pairs of planes and values (fields, planes, y, x).
+
+        A block of planes stays in cache while it is worked on; its memory is used again for the next one.
+
+        Parameters
+        ----------
+        spectral : modes (c, kz, ky_local, kx).
+        fields : number of fields yielded.
+        expand : makes the fields, in parts (c_i, planes, ky, kx), from modes in (ky, kx) of planes: those of
+            `spectral`, followed by the derivatives along z of its first `z_derivatives` components. It may combine
+            them and multiply by `d_dx` and `d_dy`. By default the fields are what it would be given.
+        """
+        transform, count = self.plane_pass, self.decomposition.count
+        buffers = self._columns_to_planes(spectral, z_derivatives)
+        values: dict[int, np.ndarray] = {}
+        for planes in transform.blocks(count):
+            size = planes.stop - planes.start
+            if size not in values:
+                values[size] = np.empty((fields, size, self.cells, self.cells), self.real)
+            packed = transform.pack(_joined(buffers.plane_blocks, planes))
+            transform.to_physical([packed] if expand is None else expand(packed), size, values[size])
+            yield planes, values[size]
+
+    def _columns_to_planes(self, spectral: np.ndarray, z_derivatives: int) -> TransposeBuffers:
+        """Transform along z, components and the z derivatives of the first of them, and make them planes."""
+        components, K, n = len(spectral), self.cutoff, self.cells
+        buffers = self.buffers("backward", components + z_derivatives)
+        d_dz = (1j * self.wavevector[2][:, 0]).astype(self.complex)[:, None]
+        parts = [(spectral, slice(0, components), None),
+                 (spectral[:z_derivatives], slice(components, components + z_derivatives), d_dz)]
+        for modes, where, factor in parts:
+            for rows in self.column_pass.rows(self.spectral_shape[1], len(modes)) if len(modes) else ():
+                plan = self.column_pass.plan("BACKWARD", len(modes), rows.stop - rows.start)
+                column = plan.input_array
+                for kept, place in ((slice(0, K + 1), slice(0, K + 1)), (slice(K + 1, None), slice(n - K, None))):
+                    if factor is None:
+                        column[:, place] = modes[:, kept, rows]
+                    else:
+                        np.multiply(modes[:, kept, rows], factor[kept], out=column[:, place])
+                plan.execute()
+                for block, start in zip(buffers.column_blocks, self._transpose.z_starts):
+                    block[where, :, rows] = plan.output_array[:, start : start + block.shape[1]]
+        buffers.to_planes()
+        return buffers
+
+    def buffers(self, direction: str, components: int) -> TransposeBuffers:
+        """What a batch of components is sent in; used again, so a direction is for one transform at a time."""
+        key = (direction, components)
+        if key not in self._buffers:
+            self._buffers[key] = self._transpose.buffers(components, self.cutoff + 1, self.complex)
+        return self._buffers[key]
 
     def sum_modes(self, density: np.ndarray) -> float:
         """Sum of a real spectral quantity (..., kz, ky_local, kx) over all modes of the full spectrum, all ranks."""
@@ -124,35 +176,42 @@ class SpectralGrid:
         total = global_sum(self.decomposition.comm, physical.sum(axis=(1, 2, 3), dtype=np.float64))
         return total / self.cells**3
 
-    def _plan(self, name: str, components: int) -> pyfftw.FFTW:
-        """The FFTW plan of one pass, with its own aligned arrays; the y passes work in place inside the x arrays."""
-        key = (name, components)
-        if key not in self._plans:
-            self._plans[key] = getattr(self, "_plan_" + name.split()[1])(name, components)
-        return self._plans[key]
 
-    # FFTW_ESTIMATE: measured plans may differ from run to run, and with them the last bits of the results.
+class Collector:
+    """Takes real fields (components, planes, y, x) a block of planes at a time and gives their Fourier coefficients."""
 
-    def _plan_x(self, name: str, components: int) -> pyfftw.FFTW:
-        nz, n = self.decomposition.count, self.cells
-        real = pyfftw.empty_aligned((components, nz, n, n), self.real)
-        half = pyfftw.zeros_aligned((components, nz, n, n // 2 + 1), self.complex)
-        if name == "forward x":
-            return pyfftw.FFTW(real, half, axes=(3,), flags=("FFTW_ESTIMATE",))
-        flags = ("FFTW_ESTIMATE", "FFTW_DESTROY_INPUT")
-        return pyfftw.FFTW(half, real, axes=(3,), direction="FFTW_BACKWARD", flags=flags)
+    def __init__(self, grid: SpectralGrid, components: int) -> None:
+        self.grid, self.components = grid, components
+        self._buffers = grid.buffers("forward", components)
 
-    def _plan_y(self, name: str, components: int) -> pyfftw.FFTW:
-        direction = name.split()[0]
-        x_plan = self._plan(f"{direction} x", components)
-        half = x_plan.output_array if direction == "forward" else x_plan.input_array
-        kept = half[..., : self.cutoff + 1]
-        return pyfftw.FFTW(kept, kept, axes=(2,), direction=f"FFTW_{direction.upper()}", flags=("FFTW_ESTIMATE",))
+    def add(self, planes: slice, values: np.ndarray) -> None:
+        """Transform a block of planes along x and y."""
+        transform = self.grid.plane_pass
+        modes = transform.unpack(transform.to_modes(values), planes.stop - planes.start)
+        start = 0
+        for block in self._buffers.plane_blocks:
+            block[:, planes] = modes[:, :, start : start + block.shape[2]]
+            start += block.shape[2]
 
-    def _plan_z(self, name: str, components: int) -> pyfftw.FFTW:
-        column = pyfftw.empty_aligned((components, self.cells, *self.spectral_shape[1:]), self.complex)
-        direction = f"FFTW_{name.split()[0].upper()}"
-        return pyfftw.FFTW(column, column, axes=(1,), direction=direction, flags=("FFTW_ESTIMATE",))
+    def modes(self) -> np.ndarray:
+        """The Fourier coefficients (components, kz, ky_local, kx), once all planes are there; all ranks call it."""
+        grid, K = self.grid, self.grid.cutoff
+        self._buffers.to_columns()
+        spectral = np.empty((self.components, *grid.spectral_shape), grid.complex)
+        scale = grid.real(0.5 / grid.cells**3)
+        for rows in grid.column_pass.rows(grid.spectral_shape[1], self.components):
+            plan = grid.column_pass.plan("FORWARD", self.components, rows.stop - rows.start)
+            np.concatenate([block[:, :, rows] for block in self._buffers.column_blocks], axis=1, out=plan.input_array)
+            plan.execute()
+            column = plan.output_array
+            np.multiply(column[:, : K + 1], scale, out=spectral[:, : K + 1, rows])
+            np.multiply(column[:, grid.cells - K :], scale, out=spectral[:, K + 1 :, rows])
+        return spectral
+
+
+def _joined(blocks: Sequence[np.ndarray], planes: slice) -> np.ndarray:
+    """Some planes of blocks (c, planes, y, x) that follow each other in y."""
+    return blocks[0][:, planes] if len(blocks) == 1 else np.concatenate([block[:, planes] for block in blocks], axis=2)
 
 
 def restrict(fine: SpectralGrid, coarse: SpectralGrid, spectral: np.ndarray) -> np.ndarray:

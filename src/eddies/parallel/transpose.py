@@ -1,4 +1,4 @@
-"""The global transpose of the slab transform: planes cut along z become planes cut along y."""
+"""The global transpose of the slab transform: planes cut along z become columns cut along y."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ from eddies.parallel.slab import block_starts
 class Transpose:
     """Exchange of arrays (components, z, y, x) between cuts along z and along y, all components in one message.
 
-    `rows` is the length of the full z axis, `columns` of the full y axis. This rank holds z planes `z_starts[rank]`
-    to `z_starts[rank + 1]` before `forward` and the same block rule along y after it; `backward` is its inverse and,
-    the map being a permutation, its adjoint. One rank sends nothing and copies nothing.
+    `rows` is the length of the full z axis, `columns` of the full y axis. As planes, this rank holds `z_starts[rank]`
+    to `z_starts[rank + 1]` of z and all of y; as columns all of z and the block of y by the same rule.
     """
 
     def __init__(self, comm: MPI.Comm, rows: int, columns: int) -> None:
@@ -22,33 +21,55 @@ class Transpose:
         self.z_count = int(self.z_starts[comm.rank + 1] - self.z_starts[comm.rank])
         self.y_count = int(self.y_starts[comm.rank + 1] - self.y_starts[comm.rank])
 
-    def forward(self, planes: np.ndarray) -> np.ndarray:
-        """(c, z_count, columns, x) -> (c, rows, y_count, x)."""
-        if self.comm.size == 1:
-            return planes
-        components, _, _, width = planes.shape
-        blocks = [planes[:, :, a:b] for a, b in zip(self.y_starts[:-1], self.y_starts[1:])]
-        shapes = [(components, b - a, self.y_count, width) for a, b in zip(self.z_starts[:-1], self.z_starts[1:])]
-        return np.concatenate(self._exchange(blocks, shapes, planes.dtype), axis=1)
+    def buffers(self, components: int, width: int, dtype: np.dtype) -> TransposeBuffers:
+        """Memory for a batch of components with lines of `width` along x, to be filled on one side and sent."""
+        return TransposeBuffers(self, components, width, np.dtype(dtype))
 
-    def backward(self, columns: np.ndarray) -> np.ndarray:
-        """(c, rows, y_count, x) -> (c, z_count, columns, x)."""
-        if self.comm.size == 1:
-            return columns
-        components, _, _, width = columns.shape
-        blocks = [columns[:, a:b] for a, b in zip(self.z_starts[:-1], self.z_starts[1:])]
-        shapes = [(components, self.z_count, b - a, width) for a, b in zip(self.y_starts[:-1], self.y_starts[1:])]
-        return np.concatenate(self._exchange(blocks, shapes, columns.dtype), axis=2)
 
-    def _exchange(self, blocks: list[np.ndarray], shapes: list[tuple], dtype: np.dtype) -> list[np.ndarray]:
-        sizes_in = np.array([block.size for block in blocks])
-        sizes_out = np.array([int(np.prod(shape)) for shape in shapes])
-        sent = np.concatenate([block.ravel() for block in blocks])
-        received = np.empty(int(sizes_out.sum()), dtype)
+class TransposeBuffers:
+    """The blocks that ranks exchange, for whoever fills and reads them in place: nothing is packed or unpacked.
+
+    `column_blocks[r]` (components, planes of r, own columns, x) and `plane_blocks[r]` (components, own planes, columns
+    of r, x) hold what rank r has on the other side. The own block is the same memory on both sides and is not sent.
+    """
+
+    def __init__(self, transpose: Transpose, components: int, width: int, dtype: np.dtype) -> None:
+        self._comm, rank = transpose.comm, transpose.comm.rank
+        z_counts, y_counts = np.diff(transpose.z_starts), np.diff(transpose.y_starts)
         # Counts are in lines along x of all components: in bytes they would leave the range of MPI's integers.
-        length = shapes[0][0] * shapes[0][3]
+        self._line = (components * width, dtype)
+        self._column_lines, self._plane_lines = z_counts * transpose.y_count, y_counts * transpose.z_count
+        shapes = [(components, int(z), transpose.y_count, width) for z in z_counts]
+        own = np.empty(shapes[rank], dtype)
+        self._columns, self.column_blocks = _blocks(shapes, dtype, rank, own)
+        shapes = [(components, transpose.z_count, int(y), width) for y in y_counts]
+        self._planes, self.plane_blocks = _blocks(shapes, dtype, rank, own)
+        self._column_lines[rank] = self._plane_lines[rank] = 0
+
+    def to_planes(self) -> None:
+        """Send the column blocks to where they are plane blocks; all ranks call it."""
+        self._exchange(self._columns, self._column_lines, self._planes, self._plane_lines)
+
+    def to_columns(self) -> None:
+        """Send the plane blocks to where they are column blocks, the inverse and adjoint of `to_planes`."""
+        self._exchange(self._planes, self._plane_lines, self._columns, self._column_lines)
+
+    def _exchange(self, *arguments: np.ndarray) -> None:
+        if self._comm.size > 1:
+            self._send(*arguments)
+
+    def _send(self, sent: np.ndarray, sent_lines: np.ndarray, received: np.ndarray, received_lines: np.ndarray) -> None:
+        length, dtype = self._line
         line = MPI.BYTE.Create_contiguous(length * dtype.itemsize).Commit()
-        self.comm.Alltoallv([sent, sizes_in // length, line], [received, sizes_out // length, line])
+        self._comm.Alltoallv([sent, sent_lines, line], [received, received_lines, line])
         line.Free()
-        bounds = np.concatenate([[0], np.cumsum(sizes_out)])
-        return [received[a:b].reshape(shape) for a, b, shape in zip(bounds[:-1], bounds[1:], shapes)]
+
+
+def _blocks(shapes: list[tuple[int, ...]], dtype: np.dtype, rank: int,
+            own: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+    """The memory that is sent or received, and blocks of the given shapes in it, but for the own one."""
+    sizes = [0 if index == rank else int(np.prod(shape)) for index, shape in enumerate(shapes)]
+    flat = np.empty(sum(sizes), dtype)
+    ends = np.cumsum(sizes)
+    return flat, [own if index == rank else flat[ends[index] - sizes[index] : ends[index]].reshape(shape)
+                  for index, shape in enumerate(shapes)]
