@@ -69,8 +69,8 @@ class PlanePass:
         np.add(f[:, :whole], ig, out=packed[:, :whole, :, : K + 1])
         np.subtract(f[:, :whole], ig, out=ig)
         _mirror(ig, packed[:, :whole, :, K + 1 :])
-        # The plane kx = 0 holds both a mode and its mirror image: where they are not conjugate, by round-off, their mean
-        # counts, or f would leak into g.
+        # The plane kx = 0 holds both a mode and its mirror image: where they are not conjugate, by round-off, their
+        # mean counts, or f would leak into g.
         real = _hermitian(modes[..., 0])
         packed[..., 0] = real[:, :pairs]
         packed[:, :whole, :, 0] += self.dtype.type(1j) * real[:, pairs:]
@@ -118,7 +118,7 @@ class PlanePass:
         return packed
 
     def _pass(self, direction: str, pairs: int) -> tuple[np.ndarray, list[pyfftw.FFTW], np.ndarray]:
-        """Input, plans and output for one component; gaps of dropped modes stay zero, as no plan writes to its input."""
+        """Input, plans and output for one component. Gaps of dropped modes stay zero: no plan writes to its input."""
         key = (direction, pairs)
         if key not in self._passes:
             n, K = self.cells, self.cutoff

@@ -10,8 +10,7 @@ from eddies.clock import Clock
 from eddies.flow.courant import FlowDiverged
 from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid
 from eddies.flow.statistics import (
-    compressible_budget, energy_spectrum, gradient_moments, incompressible_budget, longitudinal_gradient,
-    turbulence_scales,
+    compressible_budget, energy_spectrum, gradient_moments, incompressible_budget, turbulence_scales,
 )
 
 
@@ -71,6 +70,16 @@ class FlowHistory:
         """All rows as columns."""
         return {name: np.array([row[name] for row in self.rows]) for name in self.rows[0]}
 
+    def memory(self) -> dict[str, float]:
+        """What `rows` do not tell, for a checkpoint."""
+        return {"injected": self._injected, "dissipated": self._dissipated, "steps": self._steps}
+
+    def restore(self, columns: dict[str, np.ndarray], memory: dict[str, float]) -> None:
+        """Go on from `columns` and `memory`."""
+        self.rows = [dict(zip(columns, map(float, row))) for row in zip(*columns.values())]
+        self._injected, self._dissipated, self._steps = memory["injected"], memory["dissipated"], int(memory["steps"])
+        self._wall = time.perf_counter()
+
     def describe(self) -> str:
         """The last sample in a few words."""
         row = self.rows[-1]
@@ -81,15 +90,14 @@ class FlowHistory:
     def _measure(self, state: np.ndarray) -> dict[str, float]:
         fluid, grid = self.fluid, self.fluid.grid
         velocity = state[:3]
-        longitudinal = longitudinal_gradient(grid, velocity)
         if isinstance(fluid, CompressibleFluid):
-            row = compressible_budget(grid, state, longitudinal, fluid.viscosity, fluid.sound_speed)
+            row = compressible_budget(grid, state, fluid.viscosity, fluid.sound_speed)
         else:
             row = incompressible_budget(grid, velocity, fluid.viscosity)
+            row["skewness"], row["flatness"] = gradient_moments(grid, velocity)
         _, spectrum = energy_spectrum(grid, velocity)
         row["energy"] = float(spectrum.sum())
         row |= turbulence_scales(spectrum, row["dissipation_rate"], fluid.viscosity, grid.cutoff)
-        row["skewness"], row["flatness"] = gradient_moments(grid, longitudinal)
         row["injection_rate"] = fluid.forcing.injection_rate if fluid.forcing is not None else 0.0
         if isinstance(fluid, CompressibleFluid):
             row["mach_turbulent"] = float(np.sqrt(2 * row["energy"]) / fluid.sound_speed)

@@ -44,15 +44,27 @@ def turbulence_scales(spectrum: np.ndarray, dissipation_rate: float, viscosity: 
     }
 
 
-def longitudinal_gradient(grid: SpectralGrid, velocity: np.ndarray) -> np.ndarray:
-    """du/dx, dv/dy, dw/dz at the grid points, (3, z_local, y, x), of the modes (3, kz, ky, kx) of a velocity."""
-    modes = np.stack([1j * k * component for k, component in zip(grid.wavevector, velocity)])
-    return grid.backward(modes.astype(grid.complex, copy=False))
+def gradient_moments(grid: SpectralGrid, velocity: np.ndarray) -> tuple[float, float]:
+    """Skewness and flatness of du/dx, dv/dy and dw/dz of the modes (3, kz, ky, kx) of a velocity, averaged."""
+    def longitudinal(modes: np.ndarray) -> list[np.ndarray]:
+        return [grid.d_dx * modes[1:2], grid.d_dy * modes[2:3], modes[3:]]
+
+    sums = np.zeros((3, 3))
+    for _, gradient in grid.blocks(velocity[[2, 0, 1]], fields=3, expand=longitudinal, z_derivatives=1):
+        sums += _powers(gradient)
+    return _skewness_and_flatness(global_sum(grid.decomposition.comm, sums) / grid.cells**3)
 
 
-def gradient_moments(grid: SpectralGrid, longitudinal: np.ndarray) -> tuple[float, float]:
-    """Skewness and flatness of the longitudinal velocity gradient, averaged over the three directions."""
-    second, third, fourth = (grid.mean(longitudinal**power) for power in (2, 3, 4))
+def _powers(values: np.ndarray) -> np.ndarray:
+    """Sums of squares, cubes and fourth powers of fields (c, planes, y, x): (3, c)."""
+    flat = values.reshape(len(values), -1).astype(float, copy=False)
+    squares = flat**2
+    return np.stack([squares.sum(axis=1), (squares * flat).sum(axis=1), (squares * squares).sum(axis=1)])
+
+
+def _skewness_and_flatness(moments: np.ndarray) -> tuple[float, float]:
+    """Averages over the components of the second, third and fourth moments (3, c)."""
+    second, third, fourth = moments
     if not np.all(second > 0):
         return 0.0, 0.0
     return float(np.mean(third / second**1.5)), float(np.mean(fourth / second**2))
@@ -65,30 +77,32 @@ def incompressible_budget(grid: SpectralGrid, velocity: np.ndarray, viscosity: f
             "dissipation_rate": viscosity * grid.sum_modes(grid.wavenumber_squared * squared)}
 
 
-def compressible_budget(grid: SpectralGrid, state: np.ndarray, longitudinal: np.ndarray, viscosity: float,
+def compressible_budget(grid: SpectralGrid, state: np.ndarray, viscosity: float,
                         sound_speed: float) -> dict[str, float]:
     """Total energy <rho |u|^2/2 + c^2 (rho ln rho - rho + 1)>, dissipation nu <rho (2 S:S - 2/3 (div u)^2)>.
 
-    Without forcing the first decays at exactly the second. `longitudinal` is the velocity's `longitudinal_gradient`.
-    Also the rms of the density and the share of the kinetic energy in the longitudinal velocity.
+    Without forcing the first decays at exactly the second. Also the rms of the density, the share of the kinetic energy
+    in the longitudinal velocity, and the `gradient_moments`, for which the same gradients serve.
     """
-    # Three components at a time: all nine gradients at once would need more memory than the time stepper.
-    s = grid.backward(state[3:])[0]
-    rho = np.exp(s)
-    energy = 0.5 * rho * (grid.backward(state[:3]) ** 2).sum(axis=0) + sound_speed**2 * (rho * s - rho + 1)
-    strain = (longitudinal**2).sum(axis=0) + 2 * (_shear(grid, state[:3]) ** 2).sum(axis=0)
-    friction = rho * (2 * strain - 2 / 3 * longitudinal.sum(axis=0) ** 2)
-    means = grid.mean(np.stack([energy, friction, rho, rho**2]))
+    def with_gradients(modes: np.ndarray) -> list[np.ndarray]:
+        return [modes[:4], grid.d_dx * modes[:3], grid.d_dy * modes[:3], modes[4:]]
+
+    sums, powers = np.zeros(4), np.zeros((3, 3))
+    for _, fields in grid.blocks(state, fields=13, expand=with_gradients, z_derivatives=3):
+        u, s, A = fields[:3], fields[3], fields[4:].reshape(3, 3, *fields.shape[1:])
+        diagonal = np.stack([A[0, 0], A[1, 1], A[2, 2]])
+        rho = np.exp(s)
+        energy = 0.5 * rho * (u**2).sum(axis=0) + sound_speed**2 * (rho * s - rho + 1)
+        shear = sum((A[i, j] + A[j, i]) ** 2 for i, j in ((0, 1), (0, 2), (1, 2)))
+        friction = rho * (2 * (diagonal**2).sum(axis=0) + shear - 2 / 3 * diagonal.sum(axis=0) ** 2)
+        sums += [part.sum(dtype=float) for part in (energy, friction, rho, rho**2)]
+        powers += _powers(diagonal)
+    total = global_sum(grid.decomposition.comm, np.concatenate([sums, powers.ravel()])) / grid.cells**3
     along = np.abs(dot_wavevector(grid, state[:3])) ** 2 * inverse_wavenumber_squared(grid)
-    kinetic_spectral = grid.sum_modes((np.abs(state[:3]) ** 2).sum(axis=0))
-    return {"total_energy": float(means[0]),
-            "dissipation_rate": viscosity * float(means[1]),
-            "density_rms": float(np.sqrt(max(means[3] - means[2] ** 2, 0.0))),
-            "compressible_fraction": grid.sum_modes(along) / kinetic_spectral if kinetic_spectral > 0 else 0.0}
-
-
-def _shear(grid: SpectralGrid, velocity: np.ndarray) -> np.ndarray:
-    """The off-diagonal rates of strain S_xy, S_xz, S_yz at the grid points, (3, z_local, y, x)."""
-    k, u = grid.wavevector, velocity
-    modes = np.stack([0.5j * (k[j] * u[i] + k[i] * u[j]) for i, j in ((0, 1), (0, 2), (1, 2))])
-    return grid.backward(modes.astype(grid.complex, copy=False))
+    kinetic = grid.sum_modes((np.abs(state[:3]) ** 2).sum(axis=0))
+    skewness, flatness = _skewness_and_flatness(total[4:].reshape(3, 3))
+    return {"total_energy": float(total[0]),
+            "dissipation_rate": viscosity * float(total[1]),
+            "density_rms": float(np.sqrt(max(total[3] - total[2] ** 2, 0.0))),
+            "compressible_fraction": grid.sum_modes(along) / kinetic if kinetic > 0 else 0.0,
+            "skewness": skewness, "flatness": flatness}

@@ -61,14 +61,17 @@ class FilteredField:
 class TracerParticles:
     """Advection dx/dt = v(x, t) by the filtered velocity with Heun's method, second order in time.
 
-    `columns` holds this rank's `id`, `position` and `velocity` (the filtered velocity at the particle, now).
+    `columns` holds this rank's `id`, `position` and `velocity` (the filtered velocity at the particle, now, taken from
+    `state` if it is not among the given columns).
     """
 
     def __init__(self, field: FilteredField, columns: dict[str, np.ndarray], state: np.ndarray) -> None:
         self.field = field
         self.decomposition = field.grid.decomposition
-        velocity = field.spline.at(field.velocity_coefficients(state), columns["position"])
-        self.columns = {**columns, "velocity": velocity}
+        self.columns = columns
+        if "velocity" not in columns:
+            velocity = field.spline.at(field.velocity_coefficients(state), columns["position"])
+            self.columns = {**columns, "velocity": velocity}
 
     def advance(self, state: np.ndarray, step: float) -> None:
         """Move on by one step, to the time of `state`, the flow one step later."""
