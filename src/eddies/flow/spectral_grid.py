@@ -95,8 +95,8 @@ class SpectralGrid:
     def backward(self, spectral: np.ndarray) -> np.ndarray:
         """Real field (c, z_local, y, x) of Fourier coefficients (c, kz, ky_local, kx); the inverse of `forward`."""
         physical = np.empty((len(spectral), *self.physical_shape), self.real)
-        for planes, values in self.blocks(spectral, len(spectral)):
-            physical[:, planes] = values
+        for planes, packed in self._packed_blocks(spectral):
+            self.plane_pass.to_physical([packed], planes.stop - planes.start, physical[:, planes])
         return physical
 
     def multiply(self, spectral: np.ndarray, product: Callable[[np.ndarray, np.ndarray], None], results: int,
@@ -127,16 +127,18 @@ class SpectralGrid:
             `spectral`, followed by the derivatives along z of its first `z_derivatives` components. It may combine
             them and multiply by `d_dx` and `d_dy`. By default the fields are what it would be given.
         """
-        transform, count = self.plane_pass, self.decomposition.count
-        buffers = self._columns_to_planes(spectral, z_derivatives)
         values: dict[int, np.ndarray] = {}
-        for planes in transform.blocks(count):
+        for planes, packed in self._packed_blocks(spectral, z_derivatives):
             size = planes.stop - planes.start
             if size not in values:
                 values[size] = np.empty((fields, size, self.cells, self.cells), self.real)
-            packed = transform.pack(_joined(buffers.plane_blocks, planes))
-            transform.to_physical([packed] if expand is None else expand(packed), size, values[size])
+            self.plane_pass.to_physical([packed] if expand is None else expand(packed), size, values[size])
             yield planes, values[size]
+
+    def _packed_blocks(self, spectral: np.ndarray, z_derivatives: int = 0) -> Iterator[tuple[slice, np.ndarray]]:
+        buffers = self._columns_to_planes(spectral, z_derivatives)
+        for planes in self.plane_pass.blocks(self.decomposition.count):
+            yield planes, self.plane_pass.pack(_joined(buffers.plane_blocks, planes))
 
     def _columns_to_planes(self, spectral: np.ndarray, z_derivatives: int) -> TransposeBuffers:
         """Transform along z, components and the z derivatives of the first of them, and make them planes."""

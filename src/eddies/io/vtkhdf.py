@@ -1,0 +1,183 @@
+"""VTKHDF files: a series of fields or of particles in one file that ParaView opens.
+
+Layout: "VTKHDF file format" in the documentation of VTK, version 2.0 of the format, which VTK 9.3 (ParaView 5.12) and
+all later ones read. A file is a copy and needs no other; it appears under its name once it is whole.
+
+The reader takes a file of one step for one without time, and fails on an axis of time in it. A single frame is
+therefore written without steps; its time is the field data `time`.
+"""
+
+import io
+import json
+import math
+import os
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from eddies.io.fields import FieldSeries
+from eddies.io.hdf5 import ProductError, write_attributes
+from eddies.io.trajectories import Trajectory
+
+VERSION = (2, 0)
+BLOCK_BYTES = 2**26  # of a field at once in memory
+OVERHEAD_BYTES, OVERHEAD_BYTES_PER_STEP = 2**20, 2**10  # of a file, above its datasets: far more than is needed
+
+Layout = dict[str, tuple[tuple[int, ...], Any]]  # shape and type of each large dataset
+
+
+def write_images(path: Path, series: FieldSeries, length: float, provenance: Mapping[str, Any]) -> None:
+    """Write a series of fields as ImageData, a step for each frame; called by one rank.
+
+    The values are point data. The plane at L, by periodicity equal to that at 0, is added along each axis, so that
+    the (cells + 1)^3 points span the whole cube and every particle lies between them.
+
+    Args:
+        path: of the file; its directory is made if there is none.
+        series: the fields, at least one frame.
+        length: edge L of the periodic cube.
+        provenance: JSON-able, stored as in a product.
+
+    Raises:
+        ProductError: the file cannot be written.
+    """
+    cells, frames, layout = series.cells, len(series.times), {}
+    for variable in series.variables:
+        sample = series.read(0, variable, 0, 0)
+        components = sample.shape[:1] if len(sample) > 1 else ()
+        shape = (*[cells + 1] * 3, *components)
+        layout[f"PointData/{variable}"] = shape if frames == 1 else (frames, *shape), sample.dtype
+    with _create(path, "ImageData", frames, layout, provenance) as root:
+        write_attributes(root, {"WholeExtent": np.array([0, cells] * 3), "Origin": np.zeros(3),
+                                "Spacing": np.full(3, length / cells), "Direction": np.eye(3).ravel()})
+        _write_steps(root, series.times, {_offsets_of(name): np.arange(frames) for name in layout})
+        for variable in series.variables:
+            for frame in range(frames):
+                _copy_field(series, frame, variable, root[f"PointData/{variable}"])
+
+
+def write_points(path: Path, trajectory: Trajectory, provenance: Mapping[str, Any]) -> None:
+    """Write trajectories as PolyData, a step for each frame, a vertex for each particle; called by one rank.
+
+    Point data are the particle's `id` and all columns but the position; of a 3 x 3 column the 9 components, row by row.
+
+    Args:
+        path: of the file; its directory is made if there is none.
+        trajectory: the particles, at least one frame.
+        provenance: JSON-able, stored as in a product.
+
+    Raises:
+        ProductError: the file cannot be written.
+    """
+    frames, total, layout = len(trajectory.times), trajectory.total, {}
+    names = {column: "Points" if column == "position" else f"PointData/{column}" for column in trajectory.columns}
+    for column, name in names.items():
+        sample = trajectory.read(0, column, 0, 0)
+        components = (math.prod(sample.shape[1:]),) if sample.ndim > 1 else ()
+        layout[name] = (frames * total, *components), sample.dtype
+    counted = {"PointData/id": total, "Vertices/Connectivity": total, "Vertices/Offsets": total + 1}
+    layout |= {name: ((count,), np.int64) for name, count in counted.items()}
+    with _create(path, "PolyData", frames, layout, provenance) as root:
+        for name, count in counted.items():
+            root[name][:] = np.arange(count)
+        _write_cells(root, total)
+        _write_steps(root, trajectory.times, _point_offsets(frames, total, names.values()))
+        for column, name in names.items():
+            for frame in range(frames):
+                values = trajectory.read(frame, column).reshape(total, *root[name].shape[1:])
+                root[name][frame * total:(frame + 1) * total] = values
+
+
+@contextmanager
+def _create(path: Path, kind: str, frames: int, layout: Layout,
+            provenance: Mapping[str, Any]) -> Iterator[h5py.Group]:
+    """The group VTKHDF of a new file, with empty datasets; the file appears under `path` once the block ends well."""
+    partial = path.with_name(path.name + ".partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        bulk = sum(math.prod(shape) * np.dtype(dtype).itemsize for shape, dtype in layout.values())
+        _reserve(partial, bulk + OVERHEAD_BYTES + OVERHEAD_BYTES_PER_STEP * frames)
+        with h5py.File(partial, "r+") as file:
+            write_attributes(file, {"provenance": json.dumps(dict(provenance))})
+            root = file.create_group("VTKHDF")
+            # The reader wants the type as a string of fixed length.
+            write_attributes(root, {"Version": np.array(VERSION), "Type": np.bytes_(kind)})
+            for name, (shape, dtype) in layout.items():
+                root.create_dataset(name, shape, dtype)
+            yield root
+        os.replace(partial, path)
+    except OSError as error:
+        raise ProductError(f"{path}: cannot be written: {error}; check its directory, the space on the disk, and "
+                           "whether the product it is made from is whole") from None
+    finally:
+        if partial.is_file():
+            partial.unlink()
+
+
+def _reserve(path: Path, size: int) -> None:
+    """Make an empty HDF5 file that has `size` bytes of the disk; HDF5 cuts off the rest when it closes the file.
+
+    A full disk thus shows here, as OSError. Met by HDF5 later it would end the process: some versions crash when they
+    close a dataset that they cannot flush.
+    """
+    empty = io.BytesIO()
+    h5py.File(empty, "w").close()
+    with open(path, "wb") as file:
+        file.write(empty.getvalue())
+        file.flush()
+        os.posix_fallocate(file.fileno(), 0, size)
+
+
+def _write_steps(root: h5py.Group, times: np.ndarray, offsets: Mapping[str, np.ndarray]) -> None:
+    """The time of each step, and where it begins in each dataset."""
+    if len(times) == 1:
+        root["FieldData/time"] = times
+        return
+    steps = root.create_group("Steps")
+    write_attributes(steps, {"NSteps": len(times)})
+    for name, values in {"Values": times, **offsets}.items():
+        steps[name] = values
+
+
+def _copy_field(series: FieldSeries, frame: int, variable: str, dataset: h5py.Dataset) -> None:
+    """Copy (components, z, y, x) to (z, y, x, components), closing the periodic cube."""
+    cells, frames = series.cells, len(series.times)
+    step = () if frames == 1 else (frame,)
+    blocks = math.ceil(dataset.nbytes / frames / BLOCK_BYTES)
+    for planes in np.array_split(np.arange(cells), min(blocks, cells)):
+        start, stop = planes[0], planes[-1] + 1
+        block = np.moveaxis(series.read(frame, variable, start, stop), 0, -1)
+        block = np.pad(block, ((0, 0), (0, 1), (0, 1), (0, 0)), mode="wrap")
+        block = block.reshape(stop - start, *dataset.shape[len(step) + 1:])
+        dataset[*step, start:stop] = block
+        if start == 0:
+            dataset[*step, cells] = block[0]
+
+
+def _write_cells(root: h5py.Group, total: int) -> None:
+    """Number of points, and of cells: a vertex at each point; of the other kinds, which the reader asks for, none."""
+    root["NumberOfPoints"] = np.array([total])
+    for cells, count in (("Vertices", total), ("Lines", 0), ("Polygons", 0), ("Strips", 0)):
+        root[f"{cells}/NumberOfCells"] = root[f"{cells}/NumberOfConnectivityIds"] = np.array([count])
+        if not count:
+            root[f"{cells}/Connectivity"], root[f"{cells}/Offsets"] = np.zeros(0, np.int64), np.zeros(1, np.int64)
+
+
+def _point_offsets(frames: int, total: int, names: Iterable[str]) -> dict[str, np.ndarray]:
+    """Where each step begins in each dataset. All steps share the ids and the cells, which are stored once."""
+    shared = np.zeros(frames, np.int64)
+    offsets = {"NumberOfParts": shared + 1, "PartOffsets": shared, "PointDataOffsets/id": shared}
+    for name in ("CellOffsets", "ConnectivityIdOffsets"):
+        offsets[name] = np.zeros((frames, 4), np.int64)  # of the four kinds of cells
+    for name in names:
+        offsets[_offsets_of(name)] = total * np.arange(frames)
+    return offsets
+
+
+def _offsets_of(name: str) -> str:
+    """Where the offsets of a dataset stand among the steps."""
+    return "PointOffsets" if name == "Points" else name.replace("PointData/", "PointDataOffsets/")

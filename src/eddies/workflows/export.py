@@ -1,0 +1,65 @@
+"""The fields and particles of a run as VTKHDF files, one for each series. Rank 0 does the work, the others wait."""
+
+import logging
+from pathlib import Path
+
+from eddies.io.fields import FieldSeries
+from eddies.io.hdf5 import ProductError, open_product, read_provenance
+from eddies.io.trajectories import Trajectory
+from eddies.io.vtkhdf import write_images, write_points
+from eddies.parallel.broadcast import first_complaint
+from eddies.scene_sections import BOX_LENGTH
+
+log = logging.getLogger("eddies")
+
+PRODUCTS = ("ground_truth", "rollout")
+
+
+def run(run_directory: Path, output: Path, comm) -> None:
+    """Write OUTPUT/PRODUCT-fields-NAME.vtkhdf and OUTPUT/PRODUCT-particles-NAME.vtkhdf for every series of a run
+    directory; all ranks call it.
+
+    Raises:
+        ProductError: on all ranks, if there is no such series, a product is damaged, or a file cannot be written.
+    """
+    alone = comm.Split(comm.rank)
+    complaint = None
+    if comm.rank == 0:
+        try:
+            _export(run_directory, output, alone)
+        except ProductError as error:
+            complaint = str(error)
+    alone.Free()
+    complaint = first_complaint(comm, complaint)
+    if complaint is not None:
+        raise ProductError(complaint)
+
+
+def _export(run_directory: Path, output: Path, alone) -> None:
+    written = 0
+    for kind in PRODUCTS:
+        path = run_directory / f"{kind}.h5"
+        if path.exists():
+            with open_product(alone, path, kind) as file:
+                written += _export_product(file, kind, output)
+    if not written:
+        raise ProductError(f"{run_directory}: holds no fields or particles, which would be in "
+                           f"{' and '.join(f'{kind}.h5' for kind in PRODUCTS)}; run `eddies dns SCENE` first")
+
+
+def _export_product(file, kind: str, output: Path) -> int:
+    """Write the series of a product; returns how many have been written."""
+    provenance, written = read_provenance(file), 0
+    for group, reader in (("fields", FieldSeries), ("particles", Trajectory)):
+        for name in file.get(group, ()):
+            series, path = reader(file, name), output / f"{kind}-{group}-{name}.vtkhdf"
+            if not len(series.times):
+                log.info("export: %s/%s of %s.h5 has no frames", group, name, kind)
+                continue
+            if group == "fields":
+                write_images(path, series, BOX_LENGTH, provenance)
+            else:
+                write_points(path, series, provenance)
+            log.info("export: %s, %d steps", path, len(series.times))
+            written += 1
+    return written

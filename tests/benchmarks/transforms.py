@@ -1,0 +1,72 @@
+"""Forward and backward transforms of three components against mpi4py-fft, on the same arrays and in one run.
+
+    mpirun -n 2 .venv/bin/python tests/benchmarks/transforms.py [CELLS ...]
+
+mpi4py-fft (pip install mpi4py-fft; it needs FFTW's headers) transforms all modes and has those beyond the 2/3 rule set
+to zero between the two transforms; its plans are measured ones, as is its default. Ours drop them on the way.
+"""
+
+import sys
+import time
+from collections.abc import Callable
+from statistics import median
+
+import numpy as np
+from mpi4py import MPI
+from mpi4py_fft import PFFT, newDistArray
+
+from eddies.flow.spectral_grid import SpectralGrid
+from eddies.parallel.slab import SlabDecomposition
+
+REPEATS = 15
+
+
+def peer_transform(comm: MPI.Comm, grid: SpectralGrid, field: np.ndarray) -> Callable[[], np.ndarray]:
+    """The same round trip by mpi4py-fft, slabs along z as well."""
+    plan = PFFT(comm, [grid.cells] * 3, axes=(0, 1, 2), dtype=grid.real, grid=(-1,))
+    given, modes, result = (newDistArray(plan, forward, rank=1) for forward in (False, True, False))
+    given[:] = field
+    signed = np.abs(np.fft.fftfreq(grid.cells, 1 / grid.cells))
+    z, y, x = (axis[part] for axis, part in zip((signed, signed, np.arange(grid.cells // 2 + 1)),
+                                                plan.local_slice(True)))
+    kept = np.maximum(np.maximum(z[:, None, None], y[None, :, None]), x[None, None, :]) <= grid.cutoff
+
+    def round_trip() -> np.ndarray:
+        for component, spectral in zip(given, modes):
+            plan.forward(component, spectral)
+        np.multiply(modes, kept, out=modes)
+        for spectral, component in zip(modes, result):
+            plan.backward(spectral, component)
+        return result
+
+    return round_trip
+
+
+def main() -> None:
+    comm = MPI.COMM_WORLD
+    for cells in [int(argument) for argument in sys.argv[1:]] or [64, 128]:
+        for precision in ("float64", "float32"):
+            grid = SpectralGrid(SlabDecomposition(comm, 2 * np.pi, cells), precision)
+            field = np.random.default_rng(comm.rank).standard_normal((3, *grid.physical_shape)).astype(grid.real)
+            round_trips = {"eddies": lambda: grid.backward(grid.forward(field)),
+                           "mpi4py-fft": peer_transform(comm, grid, field)}
+            ours, theirs = (round_trip() for round_trip in round_trips.values())
+            difference = comm.allreduce(float(np.abs(ours - theirs).max()), MPI.MAX)
+            seconds = {name: [] for name in round_trips}
+            for _ in range(REPEATS):  # in turn, so that both meet the same disturbances
+                for name, round_trip in round_trips.items():
+                    comm.Barrier()
+                    start = time.perf_counter()
+                    round_trip()
+                    comm.Barrier()
+                    seconds[name].append(time.perf_counter() - start)
+            if comm.rank == 0:
+                middle = {name: 1e3 * median(times) for name, times in seconds.items()}
+                print(f"{cells:4}^3  {precision}  {comm.size} ranks  "
+                      + "  ".join(f"{name} {value:.1f} ms" for name, value in middle.items())
+                      + f"  ratio {middle['mpi4py-fft'] / middle['eddies']:.2f}  difference {difference:.0e}",
+                      flush=True)
+
+
+if __name__ == "__main__":
+    main()
