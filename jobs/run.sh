@@ -17,7 +17,7 @@ trap : USR1  # some schedulers signal this shell too; the ranks end with 75, it 
 status=0
 "${launcher[@]}" "$checkout/.venv/bin/eddies" "${arguments[@]}" "$@" || status=$?
 if [ "$status" -eq 75 ]; then
-    echo "stopped before the time limit: the same command goes on after the last finished stage"
+    echo "stopped before the time limit: the same command goes on from the last checkpoint"
     "${resubmit[@]}" || echo "not queued again, do it by hand: ${resubmit[*]}" >&2
 fi
 exit "$status"

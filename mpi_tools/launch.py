@@ -1,5 +1,7 @@
 """Start a command on this machine's cores under `mpirun`, with the environment that it needs there.
 
+SIGTERM and SIGUSR1 reach the ranks as SIGUSR1, so that they can end in order; a second SIGTERM ends the job at once.
+
     python mpi_tools/launch.py [-n RANKS] -- COMMAND...
 
 RANKS is the number of cores, or EDDIES_RANKS where that is smaller. Variables that are set already stay as
@@ -10,6 +12,8 @@ import argparse
 import math
 import os
 import shutil
+import signal
+import subprocess
 import sys
 from pathlib import Path
 
@@ -41,7 +45,8 @@ def mpi_environment(ranks: int) -> dict[str, str]:
         "OMP_NUM_THREADS": "1",
         # Two jobs on one machine would both be bound to its first cores.
         "OMPI_MCA_hwloc_base_binding_policy": "none",
-        # Seconds from SIGTERM to SIGKILL; mpirun waits twice this when a rank fails.
+        # Seconds from SIGTERM to SIGKILL. Not more: mpirun waits twice this whenever a rank ends with another exit code
+        # than 0, even if all ranks are gone. `run_job` therefore spares the ranks a SIGTERM.
         "OMPI_MCA_odls_base_sigkill_timeout": "3",
     }
     if os.geteuid() == 0:
@@ -63,8 +68,33 @@ def mpirun_command(ranks: int, command: list[str]) -> list[str]:
     return [mpirun, "-n", str(ranks), *command]
 
 
+def run_job(line: list[str], environment: dict[str, str]) -> int:
+    """Run mpirun to its end; its exit code, or 128 and the number of the signal that ended it.
+
+    mpirun kills its ranks soon after a SIGTERM and returns a code of its own; SIGUSR1 it hands on, and no more.
+    """
+    terminations = []
+
+    def hand_on(number: int, frame: object) -> None:
+        terminations.extend([number] if number == signal.SIGTERM else [])
+        job.send_signal(signal.SIGTERM if len(terminations) > 1 else signal.SIGUSR1)
+
+    signals = {signal.SIGTERM, signal.SIGUSR1}
+    # Held back until there is a job to hand them on to.
+    signal.pthread_sigmask(signal.SIG_BLOCK, signals)
+    job = subprocess.Popen(line, env=environment,
+                           preexec_fn=lambda: signal.pthread_sigmask(signal.SIG_UNBLOCK, signals))
+    for number in signals:
+        signal.signal(number, hand_on)
+    # The keyboard interrupts mpirun as well, and the launcher waits for it.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, signals)
+    code = job.wait()
+    return code if code >= 0 else 128 - code
+
+
 def main() -> None:
-    """Become mpirun, so that its signals and its exit code are the caller's."""
+    """Run the command and end with its exit code."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-n", dest="ranks", type=int, help="number of ranks (default: one for each core)")
     parser.add_argument("command", nargs="+")
@@ -74,8 +104,7 @@ def main() -> None:
         line = mpirun_command(ranks, given.command)
     except (ValueError, FileNotFoundError) as error:
         parser.error(str(error))
-    sys.stdout.flush()
-    os.execve(line[0], line, mpi_environment(ranks))
+    sys.exit(run_job(line, mpi_environment(ranks)))
 
 
 if __name__ == "__main__":

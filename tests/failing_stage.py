@@ -12,7 +12,7 @@ FAILURES = {"one rank crashes": lambda rank: RuntimeError("reactor leak") if ran
             "all ranks refuse": lambda rank: SceneError("no such reactor")}
 
 
-def failing_run(scene, comm, directory):
+def failing_run(scene, comm, directory, stop):
     with create_product(comm, directory / "ground_truth.h5", "ground_truth", {}):
         error = FAILURES[sys.argv[1]](comm.rank)
         if error:

@@ -16,6 +16,7 @@ from mpi_tools.launch import mpi_environment, mpirun_command
 
 ABC = ["abc", "--set", "time.duration=0.1"]
 FAILING = Path(__file__).with_name("failing_stage.py")
+LAUNCHER = Path(__file__).parents[1] / "mpi_tools/launch.py"
 
 
 def run_cli(*arguments):
@@ -239,22 +240,56 @@ def test_mistake_met_by_all_ranks_while_writing(tmp_path):
     assert not (tmp_path / "ground_truth.h5").exists()
 
 
-@pytest.mark.parametrize("number", [signal.SIGUSR1, signal.SIGTERM])
-def test_a_signal_ends_the_job_to_be_resumed(tmp_path, number):
-    line = mpirun_command(2, [sys.executable, "-m", "eddies", "dns", "hit-small", "--output", str(tmp_path)])
-    job = subprocess.Popen(line, env=mpi_environment(2), stdin=subprocess.DEVNULL, stderr=subprocess.STDOUT,
-                           stdout=subprocess.PIPE, text=True)
-    output = ""
+def launch(ranks, *command):
+    """A running Python program on some ranks, as the job scripts start it."""
+    line = [sys.executable, LAUNCHER, "-n", str(ranks), "--", sys.executable, *command]
+    environment = os.environ | {"OMPI_MCA_odls_base_sigkill_timeout": "1"}
+    return subprocess.Popen(list(map(str, line)), env=environment, stdin=subprocess.DEVNULL, text=True,
+                            stderr=subprocess.STDOUT, stdout=subprocess.PIPE)
+
+
+# In set-up, and some steps later.
+@pytest.mark.parametrize("number, after", [(signal.SIGUSR1, 0), (signal.SIGTERM, 0), (signal.SIGUSR1, 1)])
+def test_a_signal_ends_the_job_to_be_resumed(tmp_path, number, after):
+    job, output = launch(2, "-m", "eddies", "dns", "hit-small", "--output", tmp_path), ""
     while "dns: starts" not in output:
         output += job.stdout.readline()
-    time.sleep(1)
+    time.sleep(after)
     begin = time.monotonic()
     job.send_signal(number)
-    output += job.communicate(timeout=30)[0]
-    assert time.monotonic() - begin < 10 and "eddies: stopped by" in output
-    # mpirun answers SIGTERM with an exit code of its own.
-    assert job.returncode == 75 or number == signal.SIGTERM and job.returncode != 0
-    assert not (tmp_path / "ground_truth.h5").exists()
+    output += job.communicate(timeout=60)[0]
+    assert job.returncode == 75 and time.monotonic() - begin < 10
+    assert output.count("eddies: stopped by SIGUSR1; the same command with --resume goes on") == 1
+    assert "Traceback" not in output and not list(tmp_path.glob("ground_truth.h5*"))
+
+
+@pytest.mark.mpi(1, 2)
+def test_a_limit_of_wall_time_or_a_file_stops_the_job(comm, tmp_path, capfd):
+    assert run_cli("dns", *ABC, "--output", tmp_path, "--max-minutes", "1e-9") == 75
+    errors = capfd.readouterr().err
+    told = "eddies: stopped by its limit of wall time; the same command with --resume goes on "
+    assert errors.startswith(told) if comm.rank == 0 else errors == ""
+    if comm.rank == 0:
+        (tmp_path / "STOP").write_text("")
+    comm.Barrier()
+    assert run_cli("dns", *ABC, "--output", tmp_path) == 2
+    assert comm.rank > 0 or "STOP: asks the job to stop before it begins; remove" in capfd.readouterr().err
+
+
+@pytest.mark.mpi(1)
+def test_a_second_sigterm_ends_the_process(comm, tmp_path):
+    code = ("import signal, eddies.cli; received = eddies.cli.catch_signals(); signal.raise_signal(15);"
+            "print(received, flush=True); signal.raise_signal(15)")
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert ended.returncode == -signal.SIGTERM and ended.stdout == "[15]\n"
+
+
+@pytest.mark.mpi(1)
+def test_commands_that_nobody_resumes_end_at_the_first_signal(comm):
+    code = ("import signal, eddies.cli; received = eddies.cli.catch_signals(); signal.raise_signal(10);"
+            "print(received, flush=True); eddies.cli.release_signals(received)")
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert ended.returncode == -signal.SIGUSR1 and ended.stdout == "[10]\n"
 
 
 def test_a_flow_that_diverges_is_told_in_a_sentence(tmp_path):

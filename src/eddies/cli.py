@@ -5,6 +5,7 @@ This is where the communicator of the job enters; everything below gets it as an
 
 import argparse
 import contextlib
+import math
 import os
 import signal
 import sys
@@ -19,41 +20,62 @@ from eddies.scene import SceneError, builtin_scenes, load_scene
 
 BAD_INPUT = 2
 STOPPED = 75  # EX_TEMPFAIL: the same command with --resume goes on
+STOP_SIGNALS = (signal.SIGUSR1, signal.SIGTERM)
 PATIENCE = 5.0  # seconds that a rank waits for the others to come to the same error
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run one command; returns the exit code: 0 done, 2 bad input, 75 stopped by a signal, 1 any other error."""
+    """Run one command; returns the exit code: 0 done, 2 bad input, 75 asked to stop, 1 any other error."""
     # Before numpy and torch are imported: they would start a thread for every core, in every rank.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    signals = catch_signals()  # first of all: MPI takes a second to start
     from mpi4py import MPI
     comm, exit_comm = MPI.COMM_WORLD, MPI.COMM_WORLD.Dup()
-    stop_on_signals(comm)
+    from eddies.parallel.stop import Stopped
     try:
         configure_logging(comm.rank)
         options = parse_arguments(arguments, comm.rank)
-        options.command(options, comm)
+        if options.command is run_command:
+            run_command(options, comm, signals)
+        else:
+            release_signals(signals)
+            options.command(options, comm)
         return 0
     except KeyboardInterrupt:
         return 128 + signal.SIGINT
+    except Stopped as stopped:
+        if comm.rank == 0:
+            sys.stdout.flush()
+            sys.stderr.write(f"eddies: {stopped}\n")
+            sys.stderr.flush()
+        return STOPPED
     except Exception as error:
         return end_with_error(error, exit_comm)
 
 
-def stop_on_signals(comm) -> None:
-    """End the job with exit code 75 on SIGUSR1 and SIGTERM, as schedulers send before the time limit.
+def catch_signals() -> list[int]:
+    """The list to which SIGUSR1 and SIGTERM, as schedulers send before the time limit, add their numbers from now on.
 
-    Finished stages are kept, the one that runs leaves nothing under its final name and starts anew with --resume.
+    The stages look at it at every step. A second SIGTERM ends the process at once.
     """
-    def stop(number: int, frame: object) -> None:
-        if comm.rank == 0:
-            sys.stderr.write(f"eddies: stopped by {signal.Signals(number).name}; `--resume` goes on after the last "
-                             "finished stage\n")
-            sys.stderr.flush()
-        comm.Abort(STOPPED)
+    received: list[int] = []
 
-    for number in (signal.SIGUSR1, signal.SIGTERM):
-        signal.signal(number, stop)
+    def note(number: int, frame: object) -> None:
+        received.append(number)
+        if number == signal.SIGTERM:
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+    for number in STOP_SIGNALS:
+        signal.signal(number, note)
+    return received
+
+
+def release_signals(received: list[int]) -> None:
+    """Let signals end the process, for commands that nobody resumes; also those that came so far."""
+    for number in STOP_SIGNALS:
+        signal.signal(number, signal.SIG_DFL)
+    for number in received:
+        signal.raise_signal(number)
 
 
 def end_with_error(error: Exception, comm) -> int:
@@ -122,11 +144,21 @@ def build_parser() -> argparse.ArgumentParser:
         add_scene_options(command)
         command.add_argument("--output", type=Path, metavar="DIR", help="run directory (default: runs/NAME)")
         command.add_argument("--resume", action="store_true",
-                             help="skip stages whose product is complete and was made with the same settings")
+                             help="skip stages whose product is complete and was made with the same settings, and go "
+                                  "on from the newest checkpoint of the direct simulation")
+        command.add_argument("--max-minutes", type=positive, default=math.inf, metavar="M",
+                             help="stop after M minutes of wall time, with exit code 75, to be resumed")
+        command.add_argument("--checkpoint-minutes", type=positive, default=10.0, metavar="M",
+                             help="wall time between two checkpoints of the direct simulation (default: 10)")
         command.set_defaults(command=run_command, stage=name)
     report = commands.add_parser("report", help="figures, one page and metrics.json of a run directory")
     report.add_argument("run", type=Path, metavar="RUN", help="a run directory, such as runs/tiny")
     report.set_defaults(command=report_command)
+    export = commands.add_parser("export", help="fields and particles of a run directory, for ParaView")
+    export.add_argument("run", type=Path, metavar="RUN", help="a run directory, such as runs/tiny")
+    export.add_argument("--format", choices=["vtkhdf"], default="vtkhdf", help="format of the files (default: vtkhdf)")
+    export.add_argument("--output", type=Path, metavar="DIR", help="where the files go (default: RUN/vtkhdf)")
+    export.set_defaults(command=export_command)
     check = commands.add_parser("check", help="derived numbers, memory, ranks and time; writes nothing")
     add_scene_options(check)
     check.set_defaults(command=check_command)
@@ -136,6 +168,14 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
+def positive(text: str) -> float:
+    """A number of the command line that is larger than zero."""
+    value = float(text)
+    if not value > 0:
+        raise argparse.ArgumentTypeError(f"{text}: a number larger than 0 is expected")
+    return value
+
+
 def add_scene_options(parser: argparse.ArgumentParser) -> None:
     """The scene and changes to it."""
     parser.add_argument("scene", metavar="SCENE", help="name of a built-in scene, or path of a TOML file")
@@ -143,13 +183,16 @@ def add_scene_options(parser: argparse.ArgumentParser) -> None:
                         help="change a key of the scene; repeatable")
 
 
-def run_command(options: argparse.Namespace, comm) -> None:
-    """One stage of a scene, or all that it has."""
+def run_command(options: argparse.Namespace, comm, signals: list[int]) -> None:
+    """One stage of a scene, or all that it has, until a signal, a file STOP or the limit of wall time ends it."""
+    from eddies.parallel.stop import StopRequest
     from eddies.stages import run_stages
     scene = load_scene(options.scene, options.overrides)
     directory = options.output or Path("runs") / scene.name
+    stop = StopRequest(comm, signals, directory / "STOP", 60 * options.max_minutes,
+                       60 * options.checkpoint_minutes)
     stages = scene.stages if options.stage == "run" else (options.stage,)
-    run_stages(stages, scene, comm, directory, options.resume)
+    run_stages(stages, scene, comm, directory, options.resume, stop)
 
 
 def report_command(options: argparse.Namespace, comm) -> None:
@@ -157,6 +200,12 @@ def report_command(options: argparse.Namespace, comm) -> None:
     if not options.run.is_dir():
         raise SceneError(f"{options.run}: no such directory; give a run directory, such as runs/tiny")
     import_module("eddies.workflows.report").run(options.run, comm)
+
+
+def export_command(options: argparse.Namespace, comm) -> None:
+    """The fields and particles of a run directory in another format."""
+    output = options.output or options.run / options.format
+    import_module("eddies.workflows.export").run(options.run, output, comm)
 
 
 def check_command(options: argparse.Namespace, comm) -> None:

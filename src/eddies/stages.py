@@ -12,7 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from eddies.clock import duration
+from eddies.io.checkpoint import CheckpointDirectory
 from eddies.io.hdf5 import open_product, product_fingerprint
+from eddies.parallel.stop import StopRequest
 from eddies.scene import Scene, SceneError
 
 log = logging.getLogger("eddies")
@@ -22,32 +24,40 @@ PRODUCTS = {"dns": ("ground_truth", "ground_truth.h5"), "train-kernel": ("kernel
             "train": ("model", "model.h5"), "simulate": ("rollout", "rollout.h5")}
 
 
-def run_stages(stages: Sequence[str], scene: Scene, comm, directory: Path, resume: bool) -> None:
+def run_stages(stages: Sequence[str], scene: Scene, comm, directory: Path, resume: bool,
+               stop: StopRequest) -> None:
     """Run stages of a scene, all ranks together, and record the wall time of each in stage_seconds.json.
 
     With `resume`, stages whose product is complete and was made with the same settings are skipped, up to
-    the first one that has to run.
+    the first one that has to run; that one goes on from its newest checkpoint, if it makes any.
 
     Raises:
-        SceneError: the scene lacks a section that a stage is about, cannot be cut into as many slabs as there are
-            ranks, differs from that of a product the stages start from, or the directory cannot be written.
+        Stopped: `stop` found a reason to; the running stage has kept what --resume needs.
+        SceneError: a file STOP asks the job to end before it begins, the scene lacks a section that a stage is about,
+            cannot be cut into as many slabs as there are ranks, differs from that of a product the stages start from,
+            or the directory cannot be written.
         ProductError: a stage that is not among `stages` has not left the product that they start from.
     """
     check_ranks(stages, scene, comm)
     check_inputs(stages, scene, comm, directory)
+    check_stop_file(comm, directory)
     prepare_directory(scene, comm, directory)
+    begin_anew = not resume
     for stage in stages:
         resume = resume and is_done(stage, scene, comm, directory)
+        if stage == "dns" and (begin_anew or resume):  # left by another run, or by one killed in its last moment
+            CheckpointDirectory(comm, directory / "checkpoints", "").remove()
         if resume:
             log.info("%s: skipped, %s is complete and made with the same settings", stage, PRODUCTS[stage][1])
             continue
         log.info("%s: starts on %d %s", stage, comm.size, "rank" if comm.size == 1 else "ranks")
         start = time.perf_counter()
         workflow = import_module(f"eddies.workflows.{stage.replace('-', '_')}")
+        stop.check()
         if stage == "report":
             workflow.run(directory, comm)
         else:
-            workflow.run(scene, comm, directory)
+            workflow.run(scene, comm, directory, stop)
         comm.Barrier()
         record_seconds(stage, time.perf_counter() - start, comm, directory)
 
@@ -78,6 +88,12 @@ def check_inputs(stages: Sequence[str], scene: Scene, comm, directory: Path) -> 
         if not is_done(needed, scene, comm, directory):
             raise SceneError(f"{directory / name}: was made with other settings than this scene's; run "
                              f"`eddies {needed}` again with these, or give `eddies {stages[0]}` the --set of then")
+
+
+def check_stop_file(comm, directory: Path) -> None:
+    """Refuse to start where a file STOP lies: put there between two jobs, it ends a chain that queues itself again."""
+    if verdict_of_first_rank((directory / "STOP").exists(), comm):
+        raise SceneError(f"{directory / 'STOP'}: asks the job to stop before it begins; remove the file to go on")
 
 
 def prepare_directory(scene: Scene, comm, directory: Path) -> None:

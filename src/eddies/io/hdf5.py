@@ -19,6 +19,7 @@ from mpi4py import MPI
 
 from eddies.io.provenance import environment
 from eddies.parallel.broadcast import share_text
+from eddies.parallel.stop import Stopped
 
 CHUNK_BYTES = 2**20
 REMEDIES = {"ground_truth": "dns", "kernel": "train-kernel", "model": "train", "rollout": "simulate"}
@@ -51,6 +52,11 @@ def create_product(comm: MPI.Comm, path: str | Path, kind: str,
     write_attributes(file, {"kind": kind, "complete": False, "provenance": share_text(comm, origin)})
     try:
         yield file
+    except Stopped:  # on all ranks alike, so that they can close the file together
+        file.close()
+        if comm.rank == 0:
+            partial.unlink()
+        raise
     except BaseException:
         if comm.size == 1:
             file.close()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,64 +15,75 @@ from eddies.flow.history import FlowHistory
 from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid
 from eddies.flow.operators import project
 from eddies.flow.spectral_grid import SpectralGrid
-from eddies.flow.tracers import FilteredField, TracerParticles, release
+from eddies.io.checkpoint import Checkpoint
 from eddies.io.fields import FieldSeries, FieldWriter
 from eddies.io.hdf5 import create_product, open_product, write_attributes, write_table
 from eddies.parallel.slab import SlabDecomposition
+from eddies.parallel.stop import StopRequest
 from eddies.scene import BOX_LENGTH, Scene, SceneError
 from eddies.time_stepping import STEPPERS
-from eddies.workflows.tracer_frames import TracerFrames
+from eddies.workflows.flow_run import FlowRun, Guard
+from eddies.workflows.frame_segments import FrameSegments
+from eddies.workflows.tracer_run import TracerRun
 
 log = logging.getLogger("eddies")
 
 
-def run(scene: Scene, comm, directory: str | Path) -> None:
+def run(scene: Scene, comm, directory: str | Path, stop: StopRequest | None = None) -> None:
     """Simulate the flow of a scene and write ground_truth.h5: statistics, and with tracers their frames and fields.
 
     Forced turbulence is first brought to a stationary state ([spin_up]). Tracers are released with the forcing off.
+    Goes on from the newest checkpoint in the directory, if there is one of the same settings.
+
+    Raises Stopped, after a checkpoint, when `stop` asks for it.
     """
-    fluid = build_fluid(scene, comm)
-    state = initial_state(scene, fluid)
-    step_limit = build_step_limit(scene, fluid.grid)
-    history = FlowHistory(fluid)
-    clock = Clock()
-    provenance = {"scene": scene.to_toml(), "fingerprint": scene.fingerprint("dns")}
-    with create_product(comm, Path(directory) / "ground_truth.h5", "ground_truth", provenance) as file:
-        history.sample(state, clock)
-        stepper = STEPPERS[scene.time.stepper](fluid)
-        if scene.spin_up is not None:
-            state = spin_up(scene.spin_up.turnovers, state, stepper, step_limit, clock, history)
+    directory, fingerprint = Path(directory), scene.fingerprint("dns")
+    guard = Guard(comm, directory / "checkpoints", fingerprint, stop or StopRequest(comm))
+    saved = guard.checkpoints.newest()
+    flow = build_run(scene, comm, guard, saved)
+    provenance = {"scene": scene.to_toml(), "fingerprint": fingerprint}
+    with create_product(comm, directory / "ground_truth.h5", "ground_truth", provenance) as file:
+        if saved is None:
+            flow.history.sample(flow.state, flow.clock)
+        in_tracers = saved is not None and "tracers" in saved.description
+        if scene.spin_up is not None and flow.clock.end == np.inf:
+            spin_up(scene.spin_up.turnovers, flow)
         if scene.tracers is not None:
-            follow_tracers(scene, file, state, stepper, step_limit, clock, history)
+            follow_tracers(scene, file, flow, saved if in_tracers else None)
         else:
-            clock.end = clock.time + scene.time.duration
-            start, span = clock.time, scene.time.duration
-            progress = ProgressLine("dns", history.describe)
-            state = advance(state, stepper, step_limit, clock,
-                            [history, lambda _, clock: progress((clock.time - start) / span, clock.steps)])
-            write_final_fields(file, fluid.grid, state)
+            run_for(scene.time.duration, flow)
+            write_final_fields(file, flow.fluid.grid, flow.state)
             write_attributes(file.create_group("reference"), {
-                **scales_of(history.sample(state, clock)), "energy_budget_error": history.budget_error,
-                "viscosity": fluid.viscosity})
-        write_table(file, "statistics", history.columns())
+                **scales_of(flow.history.sample(flow.state, flow.clock)), "viscosity": flow.fluid.viscosity,
+                "energy_budget_error": flow.history.budget_error})
+        write_table(file, "statistics", flow.history.columns())
+    guard.checkpoints.remove()
 
 
-def advance(state: np.ndarray, stepper: Callable, step_limit: Callable, clock: Clock,
-            observers: Sequence[Callable]) -> np.ndarray:
-    """The state when the clock ends; every observer sees every step."""
-    while clock.running:
-        step = step_limit(state, clock)
-        state = stepper(state, step)
-        clock.tick(step)
-        for observer in observers:
-            observer(state, clock)
-    return state
+def build_run(scene: Scene, comm, guard: Guard, saved: Checkpoint | None) -> FlowRun:
+    """The flow of a scene at time 0, or as a checkpoint holds it."""
+    fluid = build_fluid(scene, comm)
+    state = initial_state(scene, fluid) if saved is None else None
+    flow = FlowRun(fluid, state, STEPPERS[scene.time.stepper](fluid), build_step_limit(scene, fluid.grid),
+                   FlowHistory(fluid), guard)
+    if saved is not None:
+        flow.restore(saved)
+        log.info("dns: goes on from step %d, time %.4g", flow.clock.steps, flow.clock.time)
+    return flow
 
 
-def spin_up(turnovers: float, state: np.ndarray, stepper: Callable, step_limit: Callable, clock: Clock,
-            history: FlowHistory) -> np.ndarray:
+def run_for(duration: float, flow: FlowRun) -> None:
+    """Run the flow for a time after its start or spin-up."""
+    clock, progress = flow.clock, ProgressLine("dns", flow.history.describe)
+    if clock.end == np.inf:
+        clock.end = clock.time + duration
+    start = clock.end - duration
+    flow.advance([flow.history, lambda _, clock: progress((clock.time - start) / duration, clock.steps)])
+
+
+def spin_up(turnovers: float, flow: FlowRun) -> None:
     """Run until the flow has turned over the given number of times."""
-    progress = ProgressLine("spin-up", history.describe)
+    history, progress = flow.history, ProgressLine("spin-up", flow.history.describe)
 
     def until_turned_over(_: np.ndarray, clock: Clock) -> None:
         done = history.rows[-1]["turnovers"] / turnovers
@@ -81,41 +91,24 @@ def spin_up(turnovers: float, state: np.ndarray, stepper: Callable, step_limit: 
         if done >= 1:
             clock.stop()
 
-    state = advance(state, stepper, step_limit, clock, [history, until_turned_over])
-    history.sample(state, clock)
+    flow.advance([history, until_turned_over])
+    flow.clock.end = np.inf  # known in the phases that follow only
+    history.sample(flow.state, flow.clock)
     log.info("spin-up  done  %s", history.describe())
-    return state
 
 
-def follow_tracers(scene: Scene, file, state: np.ndarray, stepper: Callable, step_limit: Callable, clock: Clock,
-                   history: FlowHistory) -> None:
+def follow_tracers(scene: Scene, file, flow: FlowRun, saved: Checkpoint | None) -> None:
     """Release tracers into the flow, forcing off, and store their frames, the filtered fields and the scales."""
-    fluid, settings = history.fluid, scene.tracers
-    released = history.sample(state, clock)
-    fluid.forcing = None
-    field = FilteredField(fluid.grid, settings.width, settings.interpolation)
-    columns = release(fluid.grid.decomposition, scene.seed, settings.particles_per_side, settings.placement)
-    tracers = TracerParticles(field, columns, state)
-    frames = TracerFrames(file, tracers, settings, clock.time, isinstance(fluid, CompressibleFluid))
-    intervals = int(np.ceil(settings.turnovers * released["eddy_turnover_time"] / settings.frame_interval - 1e-9))
-    progress = ProgressLine("tracers", history.describe)
-    frames.store(state, clock)
-    first_step = clock.steps
-    for interval in range(1, intervals + 1):
-        # The longest allowed step that divides the frame interval, so that frames are equally spaced.
-        steps = int(np.ceil(settings.frame_interval / step_limit.bound(state, clock) - 1e-9))
-        step = settings.frame_interval / max(steps, int(np.ceil(settings.frame_interval / scene.time.max_step - 1e-9)))
-        clock.end = clock.time + settings.frame_interval
-        state = advance(state, stepper, FixedStep(step), clock,
-                        [history, lambda state, _: tracers.advance(state, step)])
-        frames.store(state, clock)
-        progress(interval / intervals, clock.steps - first_step)
-    history.sample(state, clock)
+    compressible = isinstance(flow.fluid, CompressibleFluid)
+    comm, names = flow.fluid.grid.decomposition.comm, saved.files if saved is not None else ()
+    with FrameSegments(comm, flow.guard.checkpoints.path, scene.tracers, compressible, names) as segments:
+        run = flow.guard.tracers = TracerRun(scene, flow, segments, saved)
+        run.follow()
+        segments.assemble(file)
     write_attributes(file.create_group("reference"), {
-        **scales_of(released), "energy_budget_error": history.budget_error, "viscosity": fluid.viscosity,
-        "released_at": frames.released_at, "sound_speed": scene.flow.sound_speed or np.inf, "length": settings.width,
-        "spacing": settings.spacing, **frames.scales()})
-    frames.write_spectra()
+        **scales_of(run.released), "energy_budget_error": flow.history.budget_error, "viscosity": flow.fluid.viscosity,
+        **run.scales()})
+    run.frames.write_spectra(file)
 
 
 def build_fluid(scene: Scene, comm) -> IncompressibleFluid | CompressibleFluid:

@@ -16,6 +16,7 @@ from eddies.parallel.broadcast import first_complaint
 from eddies.parallel.halo import HaloError
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
+from eddies.parallel.stop import StopRequest
 from eddies.particles.body_forces import LinearForcing
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.faults import Limits, find_fault
@@ -37,7 +38,7 @@ RUNAWAY_SPEED, RUNAWAY_DENSITY = 30.0, 300.0
 PEAK_SPEED = 6.0
 
 
-def run(scene: Scene, comm, directory: str | Path) -> None:
+def run(scene: Scene, comm, directory: str | Path, stop: StopRequest | None = None) -> None:
     """Simulate with the trained model and write rollout.h5. A run that goes wrong ends there, keeps its frames, and
     says so in its status."""
     device = prepare_torch(scene.device, comm)
@@ -55,7 +56,7 @@ def run(scene: Scene, comm, directory: str | Path) -> None:
         turnover = truth.reference["eddy_turnover_time"]
         count = int(np.ceil(settings.turnovers * turnover / settings.frame_interval - 1e-9))
         with torch.no_grad():
-            outcome = roll_out(scene, dynamics, particles, frames, count, truth)
+            outcome = roll_out(scene, dynamics, particles, frames, count, truth, stop or StopRequest(comm))
         write_attributes(file.create_group("rollout"), {
             **outcome, "turnovers": outcome["time"] / turnover, "eddy_turnover_time": turnover,
             "start_time": float(truth.times[start]), "integrator": settings.integrator, "closure": model.closure,
@@ -65,7 +66,7 @@ def run(scene: Scene, comm, directory: str | Path) -> None:
 
 
 def roll_out(scene: Scene, dynamics: ParticleDynamics, particles: ParticleSet, frames: RolloutFrames, count: int,
-             truth: GroundTruth) -> dict[str, float | str]:
+             truth: GroundTruth, stop: StopRequest) -> dict[str, float | str]:
     """Advance `count` frame intervals, or until the state is at fault; returns status, time and seconds a step."""
     settings, scales, comm = scene.simulation, truth.scales, truth.decomposition.comm
     substeps = max(int(np.ceil(settings.frame_interval / settings.step - 1e-9)), 1)
@@ -78,6 +79,7 @@ def roll_out(scene: Scene, dynamics: ParticleDynamics, particles: ParticleSet, f
     store(frames, dynamics, particles, clock)
     while clock.running and complaint is None:
         for _ in range(substeps):
+            stop.check()
             began = time.perf_counter()
             try:
                 particles = integrator.step(particles, step)

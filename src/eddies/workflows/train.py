@@ -16,6 +16,7 @@ from eddies.learning.force_training import ForceTrainer, LossWeights, TrainingFr
 from eddies.learning.losses import relative_error
 from eddies.learning.optimization import Descent
 from eddies.parallel.slab import SlabDecomposition
+from eddies.parallel.stop import StopRequest
 from eddies.particles.pair_forces import PairModel
 from eddies.scene import BOX_LENGTH, Scene, SceneError
 from eddies.workflows.a_priori import evaluate, evaluation_frames
@@ -29,7 +30,7 @@ log = logging.getLogger("eddies")
 VALIDATIONS, VALIDATION_PARTICLES = 25, 8192
 
 
-def run(scene: Scene, comm, directory: str | Path) -> None:
+def run(scene: Scene, comm, directory: str | Path, stop: StopRequest | None = None) -> None:
     """Train the model of a scene and write model.h5: weights, learning history and a-priori tests."""
     device = prepare_torch(scene.device, comm)
     directory, settings = Path(directory), scene.training
@@ -52,7 +53,7 @@ def run(scene: Scene, comm, directory: str | Path) -> None:
         weights = LossWeights(settings.trajectory_weight, settings.field_weight, settings.velocity_kl_weight,
                               settings.acceleration_kl_weight)
         trainer = ForceTrainer(model, frames, kernel, weights, settings.batch, scene.seed)
-        history = train(scene, trainer, validation)
+        history = train(scene, trainer, validation, stop or StopRequest(comm))
         tables = evaluate(truth, model, closure, tests, last, dtype, device)
     weights = {name: tensor.cpu().numpy() for name, tensor in model.state_dict().items()}
     provenance = {"scene": scene.to_toml(), "fingerprint": scene.fingerprint("train")}
@@ -71,7 +72,8 @@ def build_model(scene: Scene, truth: GroundTruth, support: float) -> PairModel:
                      form.eddy_viscosity, scene.seed)
 
 
-def train(scene: Scene, trainer: ForceTrainer, validation: TrainingFrame) -> dict[str, np.ndarray]:
+def train(scene: Scene, trainer: ForceTrainer, validation: TrainingFrame,
+          stop: StopRequest) -> dict[str, np.ndarray]:
     """Take all steps of a scene's training and return its history by column; NaN where a loss was not in use."""
     settings, started = scene.training, time.perf_counter()
     descent = Descent(trainer.comm, trainer.model.parameters(), settings.steps, settings.learning_rate,
@@ -86,6 +88,7 @@ def train(scene: Scene, trainer: ForceTrainer, validation: TrainingFrame) -> dic
 
     progress = ProgressLine("train", describe)
     for step in range(settings.steps):
+        stop.check()
         combined = step >= settings.steps - settings.combined_steps
         rate = descent.learning_rate
         losses = (trainer.combined_step if combined else trainer.trajectory_step)(descent, step)

@@ -18,6 +18,7 @@ from eddies.learning.optimization import Descent
 from eddies.parallel.migration import id_block, migrate
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
+from eddies.parallel.stop import StopRequest
 from eddies.particles.cloud import ParticleCloud
 from eddies.particles.smoothing_kernels import CubicSpline, KernelNetwork, SmoothingKernel, WendlandC2, integral
 from eddies.scene import BOX_LENGTH, Scene
@@ -30,7 +31,7 @@ TRAINING_SAMPLES = 4
 FINAL_RATE_FRACTION = 0.05
 
 
-def run(scene: Scene, comm, directory: str | Path) -> None:
+def run(scene: Scene, comm, directory: str | Path, stop: StopRequest | None = None) -> None:
     """Train the kernel of a scene on fields of the training window and write kernel.h5.
 
     The kernel without the gradient loss (the paper's Fig. 1) is trained as well. Errors are those at the last field.
@@ -47,7 +48,7 @@ def run(scene: Scene, comm, directory: str | Path) -> None:
         unseen = load_sample(truth, len(truth.fields.times) - 1, support)
     networks, history = {}, {}
     for name, weight in (("learned", settings.gradient_weight), ("learned_no_gradient", 0.0)):
-        networks[name], losses = train(scene, samples, name, weight)
+        networks[name], losses = train(scene, samples, name, weight, stop or StopRequest(comm))
         history |= {"step": losses.pop("step")} | {f"{loss}_{name}": values for loss, values in losses.items()}
     with torch.no_grad():
         kernels = {name: network.table() for name, network in networks.items()}
@@ -80,7 +81,8 @@ def load_sample(truth: GroundTruth, index: int, support: float) -> KernelSample:
     return KernelSample(ParticleCloud(slab, support, position, own_velocity), *by_point)
 
 
-def train(scene: Scene, samples: list[KernelSample], name: str, gradient_weight: float) -> tuple[KernelNetwork, dict]:
+def train(scene: Scene, samples: list[KernelSample], name: str, gradient_weight: float,
+          stop: StopRequest) -> tuple[KernelNetwork, dict]:
     """A trained kernel network and the history of its losses."""
     settings = scene.kernel
     support = settings.support(scene.tracers.particles)
@@ -92,6 +94,7 @@ def train(scene: Scene, samples: list[KernelSample], name: str, gradient_weight:
     history: list[dict[str, float]] = []
     progress = ProgressLine(f"kernel {name}", lambda: f"loss {history[-1]['loss']:.5f}")
     for step in range(settings.steps):
+        stop.check()
         history.append({"step": step, **trainer.step(descent, step)})
         progress((step + 1) / settings.steps, step + 1)
     return network, {key: np.array([row[key] for row in history]) for key in history[0]}

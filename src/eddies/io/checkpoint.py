@@ -1,0 +1,214 @@
+"""Checkpoints: directories step-NNNNNNNN of a file state.h5 and a manifest, complete and undamaged or not used.
+
+state.h5 holds global arrays that do not depend on the number of ranks. The manifest is written last, then the directory
+gets its name.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from mpi4py import MPI
+
+from eddies.io.contiguous import Block, lay_out, write_arrays
+from eddies.io.hdf5 import ProductError
+from eddies.io.manifest import find_damage, hash_file, manifest_text, parse_manifest
+from eddies.parallel.broadcast import first_complaint, share_text
+
+log = logging.getLogger("eddies")
+
+KEPT = 3
+STATE, MANIFEST = "state.h5", "manifest.json"
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A checkpoint whose bytes have been found to be as written."""
+
+    path: Path
+    content: Mapping[str, Any]
+
+    @property
+    def files(self) -> list[str]:
+        """The files beside the checkpoint that belong to it."""
+        return list(self.content["files"])
+
+    @cached_property
+    def description(self) -> dict[str, Any]:
+        """What was given to `write`."""
+        return json.loads(self.read("description").tobytes())
+
+    def read(self, name: str, start: int = 0, stop: int | None = None, axis: int = 0) -> np.ndarray:
+        """Rows start to stop of an array along an axis; every rank reads what it needs."""
+        with h5py.File(self.path / STATE, "r") as file:
+            return file[name][(slice(None),) * axis + (slice(start, stop),)]
+
+
+class CheckpointDirectory:
+    """The checkpoints of a run, made with settings of a `fingerprint`. All methods are collective."""
+
+    def __init__(self, comm: MPI.Comm, path: Path, fingerprint: str) -> None:
+        self.comm, self.path, self.fingerprint = comm, path, fingerprint
+
+    def write(self, step: int, description: Mapping[str, Any], arrays: Mapping[str, np.ndarray | Block],
+              files: Sequence[str] = ()) -> None:
+        """Add a checkpoint, and keep the newest few.
+
+        `description` (JSON-able) and plain arrays are equal on all ranks. `files` are names of closed files in this
+        directory that belong to the checkpoint.
+
+        Raises ProductError if it cannot be written, as on a full disk; those before it are intact.
+        """
+        final, partial = self.path / _name(step), self.path / f"{_name(step)}.partial"
+        if self._exists(final):
+            return
+        arrays = {"description": np.frombuffer(json.dumps(description).encode(), np.uint8), **arrays}
+        try:
+            self._by_first_rank(lambda: _make_empty(partial))
+            regions = json.loads(self._by_first_rank(lambda: json.dumps(lay_out(partial / STATE, arrays))))
+            self._by_all(lambda: write_arrays(self.comm.rank, partial / STATE, regions, arrays))
+            content = {"step": step, "fingerprint": self.fingerprint,
+                       "state": hash_file(self.comm, partial / STATE, regions, (partial / STATE).stat().st_size),
+                       "files": {name: self._hash_whole(name) for name in files}}
+            self._by_first_rank(lambda: _finish(partial, final, manifest_text(content)))
+        except OSError as error:
+            if self.comm.rank == 0:
+                shutil.rmtree(partial, ignore_errors=True)
+            raise ProductError(f"{final}: cannot be written ({error}); the checkpoints before it are intact: once "
+                               "there is room, go on with --resume") from None
+        for name in self._names()[KEPT:]:
+            self._remove(name)
+
+    def newest(self) -> Checkpoint | None:
+        """The newest sound checkpoint made with these settings; all else in the directory is removed, with a warning
+        where it was no leftover of a broken writing."""
+        names, found = self._names(), None
+        while names and found is None:
+            content, complaint = self._examine(self.path / names[0])
+            if complaint is None:
+                found = Checkpoint(self.path / names[0], content)
+                break
+            if self.comm.rank == 0:
+                log.warning("%s; this checkpoint is not used", complaint)
+            names.pop(0)
+        self._clean({*names, *(found.files if found else ())} if found else set())
+        return found
+
+    def remove(self) -> None:
+        """Remove the directory."""
+        if self.comm.rank == 0 and self.path.exists():
+            shutil.rmtree(self.path)
+        self.comm.Barrier()
+
+    def _examine(self, path: Path) -> tuple[dict[str, Any] | None, str | None]:
+        manifest = path / MANIFEST
+        content = parse_manifest(manifest.read_bytes()) if manifest.is_file() else None
+        # All ranks must read the same before they compare hashes together.
+        complaint = f"{manifest}: missing, or not what was written" if content is None else None
+        complaint = first_complaint(self.comm, complaint)
+        if complaint is None and content["fingerprint"] != self.fingerprint:
+            complaint = f"{path}: was made with other settings"
+        if complaint is None:
+            complaint = find_damage(self.comm, path / STATE, content["state"])
+        for name, entry in content["files"].items() if complaint is None else ():
+            complaint = complaint or find_damage(self.comm, self.path / name, entry)
+        return content, complaint
+
+    def _names(self) -> list[str]:
+        """Checkpoints, the newest first, as rank 0 sees them."""
+        def look() -> str:
+            found = sorted(path.name for path in self.path.glob("step-*") if path.suffix != ".partial")
+            return " ".join(reversed(found))
+        return self._by_first_rank(look).split()
+
+    def _exists(self, path: Path) -> bool:
+        return bool(self._by_first_rank(lambda: "yes" if path.exists() else ""))
+
+    def _hash_whole(self, name: str) -> dict[str, Any]:
+        size = int(self._by_first_rank(lambda: str((self.path / name).stat().st_size)))
+        self._by_first_rank(lambda: _sync(self.path / name) or "")
+        return hash_file(self.comm, self.path / name, {"frames": (0, size)}, size)
+
+    def _clean(self, kept: set[str]) -> None:
+        if self.comm.rank == 0 and self.path.exists():
+            for path in self.path.iterdir():
+                if path.name not in kept:
+                    self._delete(path)
+        self.comm.Barrier()
+
+    def _remove(self, name: str) -> None:
+        if self.comm.rank == 0:
+            self._delete(self.path / name)
+
+    @staticmethod
+    def _delete(path: Path) -> None:
+        if path.is_dir():
+            # Renamed first: what is half deleted no longer looks like a checkpoint.
+            dying = path.with_name(path.name.removesuffix(".partial") + ".partial")
+            shutil.rmtree(path.rename(dying))
+        else:
+            path.unlink()
+
+    def _by_first_rank(self, action: Callable[[], str]) -> str:
+        """What `action` returns on rank 0; if it raises OSError there, all ranks do."""
+        answer, complaint = "", None
+        if self.comm.rank == 0:
+            try:
+                answer = action()
+            except OSError as error:
+                complaint = error.strerror or str(error)
+        return self._agree(complaint) or share_text(self.comm, answer)
+
+    def _by_all(self, action: Callable[[], None]) -> None:
+        complaint = None
+        try:
+            action()
+        except OSError as error:
+            complaint = error.strerror or str(error)
+        self._agree(complaint)
+
+    def _agree(self, complaint: str | None) -> None:
+        complaint = first_complaint(self.comm, complaint)
+        if complaint is not None:
+            raise OSError(complaint)
+
+
+def _name(step: int) -> str:
+    return f"step-{step:08d}"
+
+
+def _make_empty(directory: Path) -> str:
+    """Make a directory, in place of any that has its name."""
+    shutil.rmtree(directory, ignore_errors=True)
+    directory.mkdir(parents=True)
+    return directory.name
+
+
+def _finish(partial: Path, final: Path, manifest: str) -> str:
+    """Write the manifest, wait for the disk, and give the checkpoint its name."""
+    with open(partial / MANIFEST, "w", encoding="utf-8") as file:
+        file.write(manifest)
+        file.flush()
+        os.fsync(file.fileno())
+    _sync(partial)
+    partial.rename(final)
+    _sync(final.parent)
+    return final.name
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

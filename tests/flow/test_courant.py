@@ -1,0 +1,20 @@
+import pytest
+
+from eddies.clock import Clock
+from eddies.flow.courant import CourantLimit
+from eddies.flow.initial_fields import taylor_green
+from eddies.flow.spectral_grid import SpectralGrid
+from eddies.parallel.slab import SlabDecomposition
+
+
+@pytest.mark.mpi(1, 2)
+def test_memory_of_the_step_goes_on_between_two_measurements(comm):
+    grid = SpectralGrid(SlabDecomposition(comm, 6.283185307179586, 8))
+    slow, fast, clock = taylor_green(grid, 1.0), taylor_green(grid, 4.0), Clock()
+    limit, resumed, fresh = (CourantLimit(grid, 0.5, 1.0, every=8) for _ in range(3))
+    step = limit(slow, clock)
+    clock.steps = 3  # measured again at step 8 only, though the flow is faster by now
+    resumed.restore(limit.memory())
+    assert resumed(fast, clock) == limit(fast, clock) == step > fresh(fast, clock)
+    clock.steps = 8
+    assert resumed(fast, clock) == fresh(fast, clock)
