@@ -58,8 +58,11 @@ def kills(count, directory, chooser):
             seen["kills"] += 1
             seen["in the writing of a checkpoint"] += bool(list(run.glob("checkpoints/step-*.partial")))
             before = last_step(run)
-            saved = CheckpointDirectory(MPI.COMM_SELF, run / "checkpoints", fingerprint).newest()
-            seen["newest checkpoint complete"] += saved is not None and saved.content["step"] == before
+            if (run / "ground_truth.h5").exists():
+                seen["after the end, ground truth complete"] += 1
+            else:
+                saved = CheckpointDirectory(MPI.COMM_SELF, run / "checkpoints", fingerprint).newest()
+                seen["newest checkpoint complete"] += saved is not None and saved.content["step"] == before
         if (run / "ground_truth.h5").exists():
             again = product(MPI.COMM_SELF, run)
             seen["runs ended"] += 1
@@ -88,8 +91,9 @@ def harms(kind, count, directory, chooser):
         told.text = ""
         saved = trial.newest()
         seen["harms"] += 1
+        seen["of state.h5"] += name == "state.h5"
         seen["found, file named"] += f"step-00000002/{name}: " in told.text
-        seen["dataset named (of state.h5)"] += "dataset" in told.text
+        seen["dataset named (state.h5)"] += name == "state.h5" and "dataset" in told.text
         seen["checkpoint before it used"] += saved is not None and saved.content["step"] == 1
     return seen
 
