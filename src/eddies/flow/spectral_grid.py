@@ -145,10 +145,11 @@ class SpectralGrid:
         components, K, n = len(spectral), self.cutoff, self.cells
         buffers = self.buffers("backward", components + z_derivatives)
         d_dz = (1j * self.wavevector[2][:, 0]).astype(self.complex)[:, None]
-        parts = [(spectral, slice(0, components), None),
-                 (spectral[:z_derivatives], slice(components, components + z_derivatives), d_dz)]
+        parts = [(spectral, slice(0, components), None)]
+        if z_derivatives:
+            parts.append((spectral[:z_derivatives], slice(components, components + z_derivatives), d_dz))
         for modes, where, factor in parts:
-            for rows in self.column_pass.rows(self.spectral_shape[1], len(modes)) if len(modes) else ():
+            for rows in self.column_pass.rows(self.spectral_shape[1], len(modes)):
                 plan = self.column_pass.plan("BACKWARD", len(modes), rows.stop - rows.start)
                 column = plan.input_array
                 for kept, place in ((slice(0, K + 1), slice(0, K + 1)), (slice(K + 1, None), slice(n - K, None))):

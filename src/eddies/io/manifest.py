@@ -15,13 +15,12 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
+from eddies.io.contiguous import Regions
 from eddies.parallel.broadcast import first_complaint
 from eddies.parallel.reduction import global_sum
 
 PIECE_BYTES = 4 * 2**20
 DIGEST_BYTES = 32
-
-Regions = Mapping[str, tuple[int, int]]  # name: offset and number of bytes
 
 
 def hash_file(comm: MPI.Comm, path: Path, regions: Regions, size: int) -> dict[str, Any]:
@@ -60,9 +59,8 @@ def find_damage(comm: MPI.Comm, path: Path, entry: Mapping[str, Any]) -> str | N
     complaint = first_complaint(comm, complaint)  # before the ranks read it together
     if complaint is not None:
         return complaint
-    regions = {name: tuple(place) for name, place in entry["regions"].items()}
     try:
-        found = hash_file(comm, path, regions, entry["bytes"])
+        found = hash_file(comm, path, entry["regions"], entry["bytes"])
     except OSError as error:
         return f"{path}: cannot be read ({error})"
     for name, hashes in entry["blake2b"].items():
