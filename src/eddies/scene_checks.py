@@ -66,6 +66,9 @@ def time_problems(scene: Scene) -> Iterator[str]:
     if scene.tracers is not None and duration is not None:
         yield (f"[time] duration = {duration:g}: with [tracers] the run time is [tracers] turnovers; "
                "remove one of the two")
+    if scene.spin_up and scene.spin_up.stationary and scene.spin_up.stationary >= scene.spin_up.turnovers:
+        yield (f"[spin_up] stationary = {scene.spin_up.stationary:g}: must be less than turnovers = "
+               f"{scene.spin_up.turnovers:g}, of which they are the last")
     if scene.forcing and scene.tracers and scene.spin_up is None:
         yield ("[forcing]: acts only before the tracers start, and there is no [spin_up]; add [spin_up] "
                "turnovers or remove [forcing]")

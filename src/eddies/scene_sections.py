@@ -61,6 +61,8 @@ class SpinUp:
     """The time before tracers are released, in which forced turbulence becomes stationary."""
 
     turnovers: float = number("large-eddy turnovers", above=0)
+    stationary: float | None = number("of them, the last: averages of the stationary state are taken over these",
+                                      default=None, above=0)
 
 
 @dataclass(frozen=True, kw_only=True)

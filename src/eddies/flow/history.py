@@ -15,7 +15,7 @@ from eddies.flow.statistics import (
 
 
 class FlowHistory:
-    """An observer that measures a flow every few steps; one row a sample in `rows`.
+    """An observer that measures a flow every few steps: for each sample a row in `rows` and E(k) in `spectra`.
 
     Whoever needs the flow of a certain time, such as the last of a run, takes a `sample` then.
     Also integrates the energy budget: `budget_error` is |E(t) - E(0) - integral of (injection - dissipation)| over
@@ -25,6 +25,7 @@ class FlowHistory:
     def __init__(self, fluid: IncompressibleFluid | CompressibleFluid, every: int = 4) -> None:
         self.fluid, self.every = fluid, every
         self.rows: list[dict[str, float]] = []
+        self.spectra: list[np.ndarray] = []
         self._injected = self._dissipated = 0.0
         self._wall, self._steps = time.perf_counter(), 0
 
@@ -40,7 +41,7 @@ class FlowHistory:
         """
         if self.rows and clock.steps == self._steps:
             return self.rows[-1]
-        row = self._measure(state)
+        row, spectrum = self._measure(state)
         if not np.isfinite(row["total_energy"]):
             raise FlowDiverged(f"the energy is no longer finite at step {clock.steps}, time {clock.time:.6g}: "
                                "lower [time] courant or max_step, or raise [flow] viscosity or cells")
@@ -56,6 +57,7 @@ class FlowHistory:
                 "seconds_per_step": (now - self._wall) / steps}
         self._wall, self._steps = now, clock.steps
         self.rows.append(row)
+        self.spectra.append(spectrum)
         return row
 
     @property
@@ -74,8 +76,9 @@ class FlowHistory:
         """What `rows` do not tell, for a checkpoint."""
         return {"injected": self._injected, "dissipated": self._dissipated, "steps": self._steps}
 
-    def restore(self, columns: dict[str, np.ndarray], memory: dict[str, float]) -> None:
-        """Go on from `columns` and `memory`."""
+    def restore(self, columns: dict[str, np.ndarray], spectra: np.ndarray, memory: dict[str, float]) -> None:
+        """Go on from `columns`, `spectra` and `memory`."""
+        self.spectra = list(spectra)
         self.rows = [dict(zip(columns, map(float, row))) for row in zip(*columns.values())]
         self._injected, self._dissipated, self._steps = memory["injected"], memory["dissipated"], int(memory["steps"])
         self._wall = time.perf_counter()
@@ -87,7 +90,7 @@ class FlowHistory:
                 f"energy {row['energy']:.4f}  dissipation {row['dissipation_rate']:.4f}  "
                 f"Re_lambda {row['reynolds_lambda']:.1f}")
 
-    def _measure(self, state: np.ndarray) -> dict[str, float]:
+    def _measure(self, state: np.ndarray) -> tuple[dict[str, float], np.ndarray]:
         fluid, grid = self.fluid, self.fluid.grid
         velocity = state[:3]
         if isinstance(fluid, CompressibleFluid):
@@ -97,8 +100,10 @@ class FlowHistory:
             row["skewness"], row["flatness"] = gradient_moments(grid, velocity)
         _, spectrum = energy_spectrum(grid, velocity)
         row["energy"] = float(spectrum.sum())
+        row |= {f"energy_{axis}": 0.5 * grid.sum_modes(np.abs(component) ** 2)
+                for axis, component in zip("xyz", velocity)}
         row |= turbulence_scales(spectrum, row["dissipation_rate"], fluid.viscosity, grid.cutoff)
         row["injection_rate"] = fluid.forcing.injection_rate if fluid.forcing is not None else 0.0
         if isinstance(fluid, CompressibleFluid):
             row["mach_turbulent"] = float(np.sqrt(2 * row["energy"]) / fluid.sound_speed)
-        return row
+        return row, spectrum

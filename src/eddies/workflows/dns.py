@@ -21,6 +21,7 @@ from eddies.io.hdf5 import create_product, open_product, write_attributes, write
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import StopRequest
 from eddies.scene import BOX_LENGTH, Scene, SceneError
+from eddies.scene_sections import SpinUp
 from eddies.time_stepping import STEPPERS
 from eddies.workflows.flow_run import FlowRun, Guard
 from eddies.workflows.frame_segments import FrameSegments
@@ -57,6 +58,9 @@ def run(scene: Scene, comm, directory: str | Path, stop: StopRequest | None = No
                 **scales_of(flow.history.sample(flow.state, flow.clock)), "viscosity": flow.fluid.viscosity,
                 "energy_budget_error": flow.history.budget_error})
         write_table(file, "statistics", flow.history.columns())
+        write_table(file, "spectra_of_statistics", {"energy": np.array(flow.history.spectra)})
+        if scene.spin_up is not None and scene.spin_up.stationary is not None:
+            write_attributes(file.create_group("stationary"), stationary_span(scene.spin_up, flow.history))
     guard.checkpoints.remove()
 
 
@@ -95,6 +99,14 @@ def spin_up(turnovers: float, flow: FlowRun) -> None:
     flow.clock.end = np.inf  # known in the phases that follow only
     history.sample(flow.state, flow.clock)
     log.info("spin-up  done  %s", history.describe())
+
+
+def stationary_span(settings: SpinUp, history: FlowHistory) -> dict[str, float]:
+    """First and last time of the turnovers at the end of the spin-up that count as stationary."""
+    turned, times = (np.array([row[name] for row in history.rows]) for name in ("turnovers", "time"))
+    last = int(np.argmax(turned >= settings.turnovers))
+    first = int(np.argmax(turned >= turned[last] - settings.stationary))
+    return {"start": times[first], "end": times[last]}
 
 
 def follow_tracers(scene: Scene, file, flow: FlowRun, saved: Checkpoint | None) -> None:

@@ -48,13 +48,14 @@ class FlowRun:
         self.clock.restore(known["clock"])
         self.step_limit.restore(known["step_limit"])
         columns = {name: saved.read(f"history_{name}") for name in known["history_columns"]}
-        self.history.restore(columns, known["history"])
+        self.history.restore(columns, saved.read("spectra_of_history"), known["history"])
 
     def memory(self) -> tuple[dict[str, Any], dict[str, np.ndarray | Block]]:
         """What `restore` needs: a description and arrays."""
         grid = self.fluid.grid
         columns = self.history.columns()
         arrays = {"modes": Block(self.state, int(grid.column_starts[grid.decomposition.rank]), grid.modes, axis=2),
+                  "spectra_of_history": np.array(self.history.spectra),
                   **{f"history_{name}": values for name, values in columns.items()}}
         return {"clock": self.clock.state(), "step_limit": self.step_limit.memory(), "history": self.history.memory(),
                 "history_columns": list(columns)}, arrays
