@@ -93,10 +93,11 @@ class PlanePass:
 
     def to_physical(self, packed: Sequence[np.ndarray], planes: int, out: np.ndarray) -> None:
         """Real planes of packed modes, given in parts (c_i, pairs, ky, kx): out (sum of c_i, planes, y, x)."""
-        K, pairs = self.cutoff, (planes + 1) // 2
+        pairs = (planes + 1) // 2
         rows, plans, complex_planes = self._pass("BACKWARD", pairs)
         for modes, real in zip(itertools.chain.from_iterable(packed), out):
-            rows[:, : K + 1], rows[:, self.cells - K :] = modes[:, : K + 1], modes[:, K + 1 :]
+            for given, place in zip(self._kept(modes), self._kept(rows)):
+                place[...] = given
             for plan in plans:
                 plan.execute()
             real[:pairs] = complex_planes.real
@@ -104,27 +105,40 @@ class PlanePass:
 
     def to_modes(self, real: np.ndarray) -> np.ndarray:
         """Packed modes (c, pairs, ky, kx), not normalised, of real planes (c, planes, y, x)."""
-        K, (components, planes) = self.cutoff, real.shape[:2]
+        modes, (components, planes) = 2 * self.cutoff + 1, real.shape[:2]
         pairs = (planes + 1) // 2
         complex_planes, plans, rows = self._pass("FORWARD", pairs)
-        packed = np.empty((components, pairs, 2 * K + 1, 2 * K + 1), self.dtype)
+        packed = np.empty((components, pairs, modes, modes), self.dtype)
         for values, modes in zip(real, packed):
             complex_planes.real = values[:pairs]
             complex_planes[: planes - pairs].imag = values[pairs:]
             complex_planes[planes - pairs :].imag = 0
             for plan in plans:
                 plan.execute()
-            modes[:, : K + 1], modes[:, K + 1 :] = rows[:, : K + 1], rows[:, self.cells - K :]
+            for place, result in zip(self._kept(modes), self._kept(rows)):
+                place[...] = result
         return packed
+
+    def _kept(self, modes: np.ndarray) -> list[np.ndarray]:
+        """The kept modes in the corners of an array (pairs, ky, kx), in which dropped ones may lie between them."""
+        K, (_, rows, width) = self.cutoff, modes.shape
+        return [modes[:, y, x] for y in (slice(0, K + 1), slice(rows - K, rows))
+                for x in (slice(0, K + 1), slice(width - K, width))]
 
     def _pass(self, direction: str, pairs: int) -> tuple[np.ndarray, list[pyfftw.FFTW], np.ndarray]:
         """Input, plans and output for one component. Gaps of dropped modes stay zero: no plan writes to its input."""
         key = (direction, pairs)
         if key not in self._passes:
             n, K = self.cells, self.cutoff
-            rows = pyfftw.zeros_aligned((pairs, n, 2 * K + 1), self.dtype)
+            # Along y go the columns 0 ... K and -K ... -1, from one whole vector up to another where there is room: the
+            # rest of a vector costs as much as several whole ones.
+            vector = 32 // self.dtype.itemsize
+            stop, start = K + 1 + -(K + 1) % vector, n - K - (n - K) % vector
+            if stop > start:
+                stop, start = K + 1, n - K
+            rows = pyfftw.zeros_aligned((pairs, n, stop + n - start), self.dtype)
             lines, planes = (pyfftw.zeros_aligned((pairs, n, n), self.dtype) for _ in range(2))
-            kept = [(rows[..., : K + 1], lines[..., : K + 1]), (rows[..., K + 1 :], lines[..., n - K :])]
+            kept = [(rows[..., :stop], lines[..., :stop]), (rows[..., stop:], lines[..., start:])]
             settings = {"direction": f"FFTW_{direction}", "flags": ("FFTW_ESTIMATE",)}
             if direction == "BACKWARD":
                 plans = [pyfftw.FFTW(a, b, axes=(1,), **settings) for a, b in kept if a.size]
