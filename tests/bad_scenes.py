@@ -39,6 +39,7 @@ BAD_OVERRIDES = [
     ("initial.peak_wavenumber=9", "24 cells resolve wavenumbers up to 8; lower it or raise [flow] cells"),
     ("forcing.wavenumber=1", "[forcing] wavenumber = 1: must be a number above 1"),
     ("forcing.wavenumber=20", "24 cells resolve wavenumbers up to 8"),
+    ("spin_up.stationary=1", "[spin_up] stationary = 1: must be less than turnovers = 1"),
     ("time.duration=3", "with [tracers] the run time is [tracers] turnovers"),
     ("time.max_step=0", "[time] max_step = 0: must be a number above 0"),
     ("tracers.particles_per_side=1", "must be a whole number at least 2"),

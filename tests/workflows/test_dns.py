@@ -69,6 +69,7 @@ def test_a_final_state_is_a_start(comm, tmp_path):
     for directory in (first, second):
         with open_product(comm, directory / "ground_truth.h5", "ground_truth") as file:
             tables.append(read_table(file, "statistics"))
+            assert FieldSeries(file, "final").times[-1] == pytest.approx(0.1)
     # Fields are stored in single precision.
     assert tables[1]["energy"][0] == pytest.approx(tables[0]["energy"][-1], rel=1e-6)
     assert tables[1]["time"][-1] == pytest.approx(0.1)
@@ -90,14 +91,22 @@ def test_zero_forcing_amplitude_equals_no_forcing(comm, tmp_path):
 @pytest.mark.mpi(1, 2)
 def test_statistics_are_sampled_every_few_steps_at_the_release_and_at_the_end(comm, tmp_path):
     overrides = ["flow.cells=16", "tracers.particles_per_side=6", "tracers.field_cells=8", "spin_up.turnovers=0.1",
-                 "tracers.turnovers=0.3", "time.step=0.01", "kernel.neighbors=20", "training.batch=9"]
+                 "spin_up.stationary=0.04", "tracers.turnovers=0.3", "time.step=0.01", "kernel.neighbors=20",
+                 "training.batch=9"]
     dns.run(load_scene("tiny", overrides), comm, tmp_path)
     with open_product(comm, tmp_path / "ground_truth.h5", "ground_truth") as file:
         statistics, reference = read_table(file, "statistics"), read_attributes(file, "reference")
+        spectra, stationary = read_table(file, "spectra_of_statistics"), read_attributes(file, "stationary")
         end, last_frame = statistics["time"][-1], Trajectory(file, "tracers").times[-1]
     assert np.all(np.diff(statistics["time"]) > 0)
     row = int(np.argmin(np.abs(statistics["time"] - reference["released_at"])))
     assert statistics["time"][row] == reference["released_at"]
+    # Each sample has its spectrum, and the stationary state is the last part of the spin-up.
+    assert spectra["energy"].sum(axis=1) == pytest.approx(statistics["energy"], rel=1e-12)
+    assert sum(statistics[f"energy_{axis}"] for axis in "xyz") == pytest.approx(statistics["energy"], rel=1e-12)
+    turned = np.interp([stationary["start"], stationary["end"]], statistics["time"], statistics["turnovers"])
+    assert stationary["end"] == reference["released_at"]
+    assert turned[1] - turned[0] == pytest.approx(0.04, abs=np.diff(statistics["turnovers"]).max())
     assert reference["dissipation_rate"] == statistics["dissipation_rate"][row]
     assert end == pytest.approx(reference["released_at"] + last_frame)
     steps = round(end / 0.01)

@@ -53,7 +53,7 @@ def run(scene: Scene, comm, directory: str | Path, stop: StopRequest | None = No
             follow_tracers(scene, file, flow, saved if in_tracers else None)
         else:
             run_for(scene.time.duration, flow)
-            write_final_fields(file, flow.fluid.grid, flow.state)
+            write_final_fields(file, flow)
             write_attributes(file.create_group("reference"), {
                 **scales_of(flow.history.sample(flow.state, flow.clock)), "viscosity": flow.fluid.viscosity,
                 "energy_budget_error": flow.history.budget_error})
@@ -185,14 +185,15 @@ def _state_from_file(path: str, fluid: IncompressibleFluid | CompressibleFluid) 
     return project(grid, state)
 
 
-def write_final_fields(file, grid: SpectralGrid, state: np.ndarray) -> None:
+def write_final_fields(file, flow: FlowRun) -> None:
     """Store the last velocity, and density of a compressible fluid, on the full grid."""
-    physical = grid.backward(state)
+    grid = flow.fluid.grid
+    physical = grid.backward(flow.state)
     variables = {"velocity": physical[:3]}
-    if len(state) == 4:
+    if len(physical) == 4:
         variables["density"] = np.exp(physical[3:])
     writer = FieldWriter(file, "final", grid.cells, {name: len(values) for name, values in variables.items()})
-    writer.append(0.0, grid.decomposition.start, variables)
+    writer.append(flow.clock.time, grid.decomposition.start, variables)
 
 
 def scales_of(sample: dict[str, float]) -> dict[str, float]:
