@@ -174,10 +174,8 @@ class RankRun:
                  "--color=no", "-p", "mpi_tools.pytest_mpi", "-p", "no:cacheprovider",
                  f"--rootdir={config.rootpath}", f"--tb={config.option.tbstyle}",
                  *(["-c", str(config.inipath)] if config.inipath else []), *(["-s"] if shown else [])]
-        # A failed run has no checkpoint to write: its ranks are killed sooner than those of a job.
         path = [str(Path(__file__).parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
-        environment = mpi_environment(ranks) | {"OMPI_MCA_odls_base_sigkill_timeout": "1",
-                                                "PYTHONPATH": os.pathsep.join(path)}
+        environment = mpi_environment(ranks) | {"PYTHONPATH": os.pathsep.join(path)}
         self.process = subprocess.Popen(
             mpirun_command(ranks, inner), cwd=config.invocation_params.dir, env=environment,
             stdin=subprocess.DEVNULL, stdout=None if shown else self.output, stderr=subprocess.STDOUT,

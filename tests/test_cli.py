@@ -25,14 +25,11 @@ def run_cli(*arguments):
 
 
 def start(ranks, *command):
-    """Run a Python program on some ranks; its exit code, output, error output and seconds."""
-    begin = time.monotonic()
+    """Run a Python program on some ranks; its exit code, output and error output."""
     line = mpirun_command(ranks, [sys.executable, *map(str, command)])
-    # There is no checkpoint to wait for.
-    environment = mpi_environment(ranks) | {"OMPI_MCA_odls_base_sigkill_timeout": "1"}
-    ended = subprocess.run(line, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True,
+    ended = subprocess.run(line, env=mpi_environment(ranks), stdin=subprocess.DEVNULL, capture_output=True, text=True,
                            timeout=60)
-    return ended.returncode, ended.stdout, ended.stderr, time.monotonic() - begin
+    return ended.returncode, ended.stdout, ended.stderr
 
 
 @pytest.mark.mpi(1, 2)
@@ -93,8 +90,9 @@ def test_wrong_usage_is_said_once(comm, capfd, arguments):
 def test_list_of_scenes(comm, capfd):
     assert run_cli("scenes") == 0
     lines = capfd.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines] == ([] if comm.rank else [
-        "abc", "hit-small", "shear-wave", "sound-wave", "taylor-green", "tiny", "tracers-only"])
+    assert sorted(line.split()[0] for line in lines) == ([] if comm.rank else [
+        "abc", "hit", "hit-mt004", "hit-mt008", "hit-mt016", "hit-paper", "hit-small", "shear-wave", "sound-wave",
+        "taylor-green", "tiny", "tracers-only"])
     assert run_cli("scenes", "abc") == 0
     assert ("viscosity = 0.1  # " in capfd.readouterr().out) == (comm.rank == 0)
 
@@ -206,7 +204,7 @@ def test_unknown_log_level_is_bad_input(comm, capfd, monkeypatch):
 
 
 def test_exit_code_of_the_program():
-    code, _, errors, _ = start(2, "-m", "eddies", "check", "tiny", "--set", "flow.cels=3")
+    code, _, errors = start(2, "-m", "eddies", "check", "tiny", "--set", "flow.cels=3")
     assert code == 2
     assert errors.count("did you mean cells?") == 1 and "Traceback" not in errors
 
@@ -220,22 +218,15 @@ def test_threads_per_rank(given, used):
     assert ended.stdout.splitlines()[-1] == used
 
 
-def test_crash_of_one_rank_ends_the_job(tmp_path):
-    code, _, errors, seconds = start(2, FAILING, "one rank crashes", tmp_path)
-    assert code == 1 and seconds < 10
-    assert "rank 1: Traceback" in errors and "rank 1: RuntimeError: reactor leak" in errors
-    assert not (tmp_path / "ground_truth.h5").exists()
-
-
 def test_mistake_met_by_one_rank_ends_the_job(tmp_path):
-    code, _, errors, seconds = start(2, FAILING, "one rank refuses", tmp_path)
-    assert code == 2 and seconds < 15
+    code, _, errors = start(2, FAILING, "one rank refuses", tmp_path)
+    assert code == 2 and time.time() - float((tmp_path / "refused").read_text()) < 10
     assert "rank 1: eddies: error: no such reactor" in errors and "Traceback" not in errors
 
 
 def test_mistake_met_by_all_ranks_while_writing(tmp_path):
-    code, _, errors, seconds = start(2, FAILING, "all ranks refuse", tmp_path)
-    assert code == 2 and seconds < 10
+    code, _, errors = start(2, FAILING, "all ranks refuse", tmp_path)
+    assert code == 2 and time.time() - float((tmp_path / "refused").read_text()) < 10
     assert errors.count("eddies: error: no such reactor") == 1 and "Traceback" not in errors
     assert not (tmp_path / "ground_truth.h5").exists()
 
@@ -243,8 +234,7 @@ def test_mistake_met_by_all_ranks_while_writing(tmp_path):
 def launch(ranks, *command):
     """A running Python program on some ranks, as the job scripts start it."""
     line = [sys.executable, LAUNCHER, "-n", str(ranks), "--", sys.executable, *command]
-    environment = os.environ | {"OMPI_MCA_odls_base_sigkill_timeout": "1"}
-    return subprocess.Popen(list(map(str, line)), env=environment, stdin=subprocess.DEVNULL, text=True,
+    return subprocess.Popen(list(map(str, line)), stdin=subprocess.DEVNULL, text=True,
                             stderr=subprocess.STDOUT, stdout=subprocess.PIPE)
 
 
@@ -295,12 +285,12 @@ def test_commands_that_nobody_resumes_end_at_the_first_signal(comm):
 def test_a_flow_that_diverges_is_told_in_a_sentence(tmp_path):
     line = ["-m", "eddies", "dns", "taylor-green", "--output", tmp_path, "--set", "time.step=1.0", "--set",
             "time.duration=100", "--set", "flow.viscosity=0"]
-    code, _, errors, _ = start(2, *line)
-    assert code == 2 and "no longer finite at step" in errors and "Traceback" not in errors
+    code, _, errors = start(2, *line)
+    assert code == 2 and "unstable at step" in errors and "Traceback" not in errors
 
 
 def test_a_flow_that_cannot_be_forced_is_told_in_a_sentence(tmp_path):
     line = ["-m", "eddies", "dns", "taylor-green", "--output", tmp_path, "--set", "forcing.injection_rate=0.5",
             "--set", "forcing.wavenumber=1.5"]
-    code, _, errors, _ = start(2, *line)
+    code, _, errors = start(2, *line)
     assert code == 2 and "no energy at 0 < |k| < wavenumber = 1.5" in errors and "Traceback" not in errors

@@ -1,0 +1,69 @@
+"""Run by test_faults.py under mpirun: a small `eddies dns` whose rank 1 breaks in the middle of its work.
+
+    broken_rank.py PLACE KIND DIRECTORY
+
+Every rank leaves its process id in DIRECTORY; rank 1 leaves the time, right before it breaks.
+"""
+
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+from mpi4py import MPI
+
+import eddies.cli
+import eddies.flow.fourier_passes
+import eddies.io.contiguous
+import eddies.io.hdf5
+import eddies.parallel.plane_halo
+import eddies.parallel.reduction
+
+# What of eddies breaks, and in which call of it. In each of these the other ranks wait for this one, or soon will.
+PLACES = {
+    "transform": (eddies.flow.fourier_passes.PlanePass, "to_physical", 50),  # between the two transposes of a product
+    "halo": (eddies.parallel.plane_halo.PlaneHalo, "_exchange", 4),
+    "reduction": (eddies.parallel.reduction, "_reduce", 60),
+    "product": (eddies.io.hdf5, "_collective", 15),  # the last preparation of a collective write: the second frame
+    "checkpoint": (eddies.io.contiguous, "_write_block", 50),  # the third checkpoint, half written
+}
+
+SCENE = ["flow.cells=12", "tracers.particles_per_side=5", "tracers.field_cells=8", "spin_up.turnovers=0.01",
+         "tracers.turnovers=0.15", "tracers.frame_interval=0.06", "simulation.frame_interval=0.06",
+         "tracers.field_every=2", "time.max_step=0.025", "kernel.neighbors=20", "training.batch=9"]
+
+
+def fail(kind, directory):
+    """Break in the way of the name of an exception or of a signal."""
+    (directory / "broke").write_text(f"{time.time():.6f}")
+    if kind.startswith("SIG"):
+        os.kill(os.getpid(), getattr(signal, kind))
+    raise {"RuntimeError": RuntimeError, "MemoryError": MemoryError}[kind]("reactor leak")
+
+
+def break_at(owner, name, call, kind, directory):
+    """Let a function of a module or class fail in its `call`-th call."""
+    sound, calls = getattr(owner, name), []
+
+    def broken(*arguments):
+        calls.append(name)
+        if len(calls) == call:
+            fail(kind, directory)
+        return sound(*arguments)
+
+    setattr(owner, name, broken)
+
+
+def main():
+    place, kind, directory = sys.argv[1], sys.argv[2], Path(sys.argv[3])
+    (directory / f"process-{MPI.COMM_WORLD.rank}").write_text(str(os.getpid()))
+    if MPI.COMM_WORLD.rank == 1:
+        break_at(*PLACES[place], kind, directory)
+    overrides = [word for override in SCENE for word in ("--set", override)]
+    # A checkpoint before every step, so that steps and their writing alternate.
+    often = ["--checkpoint-minutes", "1e-9"] if place == "checkpoint" else []
+    return eddies.cli.main(["dns", "tiny", "--output", str(directory / "run"), *overrides, *often])
+
+
+sys.exit(main())

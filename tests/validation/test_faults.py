@@ -1,0 +1,72 @@
+"""A rank that breaks, wherever it is, ends the job: soon, with an exit code, a word of which rank, and nothing left."""
+
+import os
+import re
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from mpi_tools.launch import mpi_environment, mpirun_command
+
+PROGRAM = Path(__file__).with_name("broken_rank.py")
+LAUNCHER = Path(__file__).parents[2] / "mpi_tools/launch.py"
+SECONDS = 10  # from the fault to the end of the job
+
+# Where, how, on how many ranks, and whether through the launcher. Every place once raises and once is killed.
+CASES = [("transform", "SIGKILL", 3, True), ("halo", "RuntimeError", 3, True),
+         ("transform", "RuntimeError", 2, False), ("halo", "SIGSEGV", 2, False),
+         ("reduction", "MemoryError", 3, False), ("reduction", "SIGKILL", 2, False),
+         ("product", "RuntimeError", 2, False), ("product", "SIGKILL", 3, False),
+         ("checkpoint", "MemoryError", 2, False), ("checkpoint", "SIGSEGV", 2, False)]
+
+
+@pytest.fixture(scope="module")
+def jobs(tmp_path_factory):
+    """The ended job of each case. Some run at once: most of their time is waiting for ranks to go."""
+    with ThreadPoolExecutor(4) as pool:
+        yield {case: pool.submit(break_job, *case, tmp_path_factory.mktemp("broken")) for case in CASES}
+
+
+def break_job(place, kind, ranks, launched, directory):
+    """Run the program; its exit code, error output, seconds from the fault to the end, and its directory."""
+    command = [sys.executable, str(PROGRAM), place, kind, str(directory)]
+    environment = os.environ | {"OMPI_MCA_mpi_yield_when_idle": "1"}  # several jobs share the cores
+    if launched:
+        line = [sys.executable, str(LAUNCHER), "-n", str(ranks), "--", *command]
+    else:
+        line, environment = mpirun_command(ranks, command), mpi_environment(ranks) | environment
+    ended = subprocess.run(line, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=120)
+    return ended.returncode, ended.stderr, time.time() - float((directory / "broke").read_text()), directory
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: "-".join(map(str, case[:3])))
+def test_a_broken_rank_ends_the_job(jobs, case):
+    place, kind, ranks, _ = case
+    code, errors, seconds, directory = jobs[case].result()
+    print(f"{place}, {kind}, {ranks} ranks: gone after {seconds:.1f} s, exit code {code}")
+    assert code != 0 and seconds < SECONDS
+    if kind.startswith("SIG"):
+        assert re.search(r"process rank 1 .* exited on signal", errors)
+    else:
+        assert f"rank 1: {kind}: reactor leak" in errors and re.search(r"rank 1: +File .*, in broken", errors)
+        assert "rank 0: Traceback" not in errors
+    assert not (directory / "run/ground_truth.h5").exists() and not list(directory.glob("run/checkpoints/frames-*.h5"))
+    left = [file.read_text() for file in directory.glob("process-*")]
+    assert len(left) == ranks and not any(map(is_alive, left))
+
+
+def test_a_broken_rank_spares_the_checkpoints_before(jobs):
+    for case in CASES:
+        if case[0] == "checkpoint":
+            names = {path.name for path in jobs[case].result()[-1].glob("run/checkpoints/step-*")}
+            assert names == {"step-00000000", "step-00000001.partial"}
+
+
+def is_alive(process):
+    """Whether a process is there that is not merely waiting to be buried by its parent."""
+    status = Path("/proc", process, "status")
+    return status.exists() and not re.search(r"^State:\s+Z", status.read_text(), re.M)
