@@ -101,7 +101,7 @@ def end_with_error(error: Exception, comm) -> int:
 
 def is_users_mistake(error: Exception) -> bool:
     """Whether the text of an error tells the user what to do, so that no traceback is wanted."""
-    from eddies.flow.courant import FlowDiverged
+    from eddies.flow.stability import FlowDiverged
     from eddies.flow.forcing import ForcingError
     from eddies.io.hdf5 import ProductError
     from eddies.parallel.halo import HaloError

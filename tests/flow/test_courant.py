@@ -4,6 +4,7 @@ from eddies.clock import Clock
 from eddies.flow.courant import CourantLimit
 from eddies.flow.initial_fields import taylor_green
 from eddies.flow.spectral_grid import SpectralGrid
+from eddies.flow.stability import FlowDiverged
 from eddies.parallel.slab import SlabDecomposition
 
 
@@ -18,3 +19,13 @@ def test_memory_of_the_step_goes_on_between_two_measurements(comm):
     assert resumed(fast, clock) == limit(fast, clock) == step > fresh(fast, clock)
     clock.steps = 8
     assert resumed(fast, clock) == fresh(fast, clock)
+
+
+@pytest.mark.mpi(1, 2)
+def test_a_velocity_that_is_not_finite_is_told_by_all_ranks(comm):
+    grid = SpectralGrid(SlabDecomposition(comm, 6.283185307179586, 8))
+    velocity = taylor_green(grid, 1.0)
+    if comm.rank == 0:
+        velocity[0, 0, 0, 1] = float("nan")
+    with pytest.raises(FlowDiverged, match="step 0, time 0: the flow is not finite"):
+        CourantLimit(grid, 0.5, 1.0).bound(velocity, Clock())

@@ -7,11 +7,8 @@ import numpy as np
 from eddies.clock import Clock, ladder_step
 from eddies.flow.navier_stokes import advective_speed
 from eddies.flow.spectral_grid import SpectralGrid
+from eddies.flow.stability import FlowDiverged
 from eddies.parallel.reduction import global_max
-
-
-class FlowDiverged(RuntimeError):
-    """The flow is no longer finite."""
 
 
 class CourantLimit:
@@ -41,11 +38,9 @@ class CourantLimit:
         self._bound = memory["bound"]
 
     def bound(self, state: np.ndarray, clock: Clock) -> float:
-        """The longest step that the Courant number allows now; FlowDiverged if the flow is no longer finite."""
+        """The longest step that the Courant number allows now; FlowDiverged if the flow is not finite."""
         speed = float(global_max(self.grid.decomposition.comm, advective_speed(self.grid, state[:3])))
-        if not np.isfinite(speed):
-            raise FlowDiverged(f"the velocity is no longer finite at step {clock.steps}, time {clock.time:.6g}: "
-                               "lower [time] courant or max_step, or raise [flow] viscosity or cells")
+        FlowDiverged.unless_finite(speed, clock)
         speed += self.sound_speed
         return self.courant * self.grid.decomposition.spacing / speed if speed > 0 else np.inf
 

@@ -7,8 +7,8 @@ import time
 import numpy as np
 
 from eddies.clock import Clock
-from eddies.flow.courant import FlowDiverged
 from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid
+from eddies.flow.stability import FlowDiverged
 from eddies.flow.statistics import (
     compressible_budget, energy_spectrum, gradient_moments, incompressible_budget, turbulence_scales,
 )
@@ -37,14 +37,12 @@ class FlowHistory:
     def sample(self, state: np.ndarray, clock: Clock) -> dict[str, float]:
         """The row of now, measured and added unless the last one is of this very step.
 
-        Raises FlowDiverged if the flow is no longer finite.
+        Raises FlowDiverged if the flow is not finite.
         """
         if self.rows and clock.steps == self._steps:
             return self.rows[-1]
         row, spectrum = self._measure(state)
-        if not np.isfinite(row["total_energy"]):
-            raise FlowDiverged(f"the energy is no longer finite at step {clock.steps}, time {clock.time:.6g}: "
-                               "lower [time] courant or max_step, or raise [flow] viscosity or cells")
+        FlowDiverged.unless_finite(row["total_energy"], clock)
         if self.rows:
             last, elapsed = self.rows[-1], clock.time - self.rows[-1]["time"]
             self._injected += elapsed * row["injection_rate"]

@@ -13,6 +13,7 @@ from eddies.clock import Clock
 from eddies.flow.courant import CourantLimit, FixedStep
 from eddies.flow.history import FlowHistory
 from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid
+from eddies.flow.stability import StabilityWatch
 from eddies.io.checkpoint import Checkpoint, CheckpointDirectory
 from eddies.io.contiguous import Block
 from eddies.parallel.stop import Stopped, StopRequest
@@ -20,7 +21,10 @@ from eddies.parallel.stop import Stopped, StopRequest
 
 @dataclass
 class FlowRun:
-    """A fluid with its state, the steps that it takes, its clock and its history; `guard` looks on before each step."""
+    """A fluid with its state, the steps that it takes, its clock and its history.
+
+    `guard` looks on before each step; after it `watch` ends a run that became unstable.
+    """
 
     fluid: IncompressibleFluid | CompressibleFluid
     state: np.ndarray
@@ -29,14 +33,24 @@ class FlowRun:
     history: FlowHistory
     guard: Callable[[FlowRun], None]
     clock: Clock = field(default_factory=Clock)
+    watch: StabilityWatch = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.watch = StabilityWatch(self.fluid, self.stepper, self.history)
 
     def advance(self, observers: Sequence[Callable], step_limit: Callable | None = None) -> None:
-        """Take steps, of another limit if one is given, until the clock ends; every observer sees every step."""
+        """Take steps, of another limit if one is given, until the clock ends; every observer sees every step.
+
+        Raises FlowDiverged at the step that was unstable.
+        """
         while self.clock.running:
             self.guard(self)
             step = (step_limit or self.step_limit)(self.state, self.clock)
-            self.state = self.stepper(self.state, step)
+            with np.errstate(over="ignore", invalid="ignore"):  # the watch says it better
+                state = self.stepper(self.state, step)
             self.clock.tick(step)
+            self.watch(self.state, state, step, self.clock)
+            self.state = state
             for observer in observers:
                 observer(self.state, self.clock)
 
