@@ -5,7 +5,6 @@ import logging
 import os
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from eddies.io.checkpoint import CheckpointDirectory
 from eddies.io.hdf5 import open_product, product_fingerprint
 from eddies.parallel.stop import StopRequest
 from eddies.scene import Scene, SceneError
+from eddies.workflows.estimates import ground_truth_alone, most_ranks
 
 log = logging.getLogger("eddies")
 
@@ -64,10 +64,7 @@ def run_stages(stages: Sequence[str], scene: Scene, comm, directory: Path, resum
 
 def check_ranks(stages: Sequence[str], scene: Scene, comm) -> None:
     """Refuse more ranks than the slabs of a scene allow; its ground truth alone may use more than what learns of it."""
-    from eddies.workflows.estimates import most_ranks  # imports the flow solver, which `eddies --help` can do without
-    if set(stages) == {"dns"}:
-        scene = replace(scene, kernel=None, model=None, training=None, simulation=None)
-    limits = most_ranks(scene)
+    limits = most_ranks(ground_truth_alone(scene) if set(stages) == {"dns"} else scene)
     reason = min(limits, key=limits.get)
     if comm.size > limits[reason]:
         raise SceneError(f"{scene.name}: {comm.size} ranks are more than the {limits[reason]} that it can use "

@@ -30,6 +30,7 @@ def test_schedulers_differ_in_header_and_launcher_only():
     for name, warning in SCHEDULERS.items():
         assert body(name) == body("slurm"), name
         assert warning in (CHECKOUT / f"jobs/{name}.sh").read_text()
+    assert body("hit-paper.slurm")[-3:] == body("slurm")
 
 
 @pytest.fixture
@@ -89,4 +90,35 @@ def test_batch_job_is_requeued_after_a_checkpoint(checkout, status, requeued):
                  EDDIES_OUTPUT="there", OMP_NUM_THREADS="3")
     assert result.returncode == int(status)
     assert "eddies run hit --resume --output there; threads 3\n" in result.stdout
+    assert ("scontrol requeue 17" in result.stdout) == requeued
+
+
+def asked_of_slurm(script):
+    """What the header of a job script asks for."""
+    return dict(re.findall(r"^#SBATCH --([a-z-]+)=(\S+)", (CHECKOUT / "jobs" / script).read_text(), re.MULTILINE))
+
+
+def test_large_job_fits_the_scene():
+    # Ranks that all work on planes of their own, ghost planes included, in the memory of a node; those of the stages
+    # that follow, of which the comment speaks, are no more than they can use.
+    from eddies.scene import load_scene
+    from eddies.workflows.cost_model import flow_bytes
+    from eddies.workflows.estimates import ground_truth_alone, most_ranks
+    scene, asked = load_scene("hit-paper"), asked_of_slurm("hit-paper.slurm.sh")
+    on_node = int(asked["ntasks-per-node"])
+    ranks = int(asked["nodes"]) * on_node
+    assert scene.flow.cells % ranks == 0
+    assert ranks <= min(most_ranks(ground_truth_alone(scene)).values())
+    assert 1.1 * on_node * flow_bytes(scene, ranks) < 1e9 * int(asked["mem"].removesuffix("G"))
+    text = (CHECKOUT / "jobs/hit-paper.slurm.sh").read_text()
+    most = min(most_ranks(scene).values())
+    assert f"at most {most} ranks" in text
+    assert int(re.search(r"--ntasks-per-node=(\d+) jobs/slurm.sh", text)[1]) <= most
+
+
+@pytest.mark.parametrize("status, requeued", [("0", False), ("75", True)])
+def test_large_job_makes_the_ground_truth_alone(checkout, status, requeued):
+    result = run(checkout, "hit-paper.slurm.sh", "--set", "seed=2", SLURM_JOB_ID="17", ENDS_WITH=status)
+    assert result.returncode == int(status), result.stderr
+    assert "eddies dns hit-paper --resume --set seed=2; threads 1\n" in result.stdout
     assert ("scontrol requeue 17" in result.stdout) == requeued

@@ -14,7 +14,8 @@ SCALES = {
     "energy": 1.5, "dissipation_rate": 0.5, "injection_rate": 0.5, "total_energy": 1.6, "taylor_scale": 0.6,
     "reynolds_lambda": 45.0, "integral_scale": 1.1, "eddy_turnover_time": TURNOVER, "kmax_eta": 1.1,
     "mach_turbulent": 0.08, "density_rms": 0.004, "compressible_fraction": 1e-4, "skewness": -0.5,
-    "flatness": 4.5, "time_step": 0.05, "seconds_per_step": 0.04, "turnovers": 2.0,
+    "flatness": 4.5, "velocity_rms": 1.0, "energy_x": 0.6, "energy_y": 0.5, "energy_z": 0.4,
+    "kolmogorov_length": 0.05, "time_step": 0.05, "seconds_per_step": 0.04, "turnovers": 2.0,
 }
 
 
@@ -52,25 +53,40 @@ class RandomFlow:
         return self.velocity(position, time).T.reshape(3, cells, cells, cells)
 
 
-def provenance(fingerprint="0" * 64, **more):
-    return {"scene": 'title = "synthetic"\nseed = 1\n', "fingerprint": fingerprint, **more}
+def provenance(forcing="", fingerprint="0" * 64):
+    return {"scene": f'title = "synthetic"\nseed = 1\n{forcing}', "fingerprint": fingerprint}
 
 
-def write_ground_truth(comm, directory, tracers=True, cells=16):
-    flow = RandomFlow(1)
-    with create_product(comm, directory / "ground_truth.h5", "ground_truth", provenance()) as file:
+def write_ground_truth(comm, directory, tracers=True, cells=16, frames=0, stationary=False):
+    """With `frames` of the tracers, and with a span over which the stationary state is averaged."""
+    flow, forced = RandomFlow(1), '[forcing]\nwavenumber = 2.0\n' if stationary else ""
+    with create_product(comm, directory / "ground_truth.h5", "ground_truth", provenance(forcing=forced)) as file:
         time = np.linspace(0, 4, 81)
         wiggle = 1 + 0.1 * np.sin(3 * time)
-        columns = {name: value * wiggle for name, value in SCALES.items()}
+        columns = {name: value * wiggle for name, value in SCALES.items()} | {"turnovers": time / TURNOVER}
         write_table(file, "statistics", {"time": time, **columns})
-        reference = {**SCALES, "energy_budget_error": 2e-4, "viscosity": 0.014, "kolmogorov_length": 0.05,
-                     "kolmogorov_time": 0.17, "velocity_rms": 1.0}
+        reference = {**SCALES, "energy_budget_error": 2e-4, "viscosity": 0.014, "kolmogorov_time": 0.17}
         series = FieldWriter(file, "filtered" if tracers else "final", cells, {"velocity": 3})
         series.append(0.0, 0, {"velocity": flow.field(cells, 0.0)})
         if tracers:
             reference |= {"released_at": 2.0, "length": WIDTH, "spacing": WIDTH / 2, "acceleration_rms": 1.4}
             write_table(file, "spectra", decaying_spectra())
+        if frames:
+            write_tracers(file, frames)
+        if stationary:
+            spectra = np.outer(wiggle, decaying_spectra()["energy"][0])
+            write_table(file, "spectra_of_statistics", {"energy": spectra})
+            write_attributes(file.create_group("stationary"), {"start": 1.0, "end": 3.0})
         write_attributes(file.create_group("reference"), reference)
+
+
+def write_tracers(file, frames, total=600):
+    """Frames of tracers until the last of the spectra."""
+    flow, start = PerturbedFlow(0.0), np.random.default_rng(6).uniform(0, LENGTH, (total, 3))
+    writer = TrajectoryWriter(file, "tracers", total, LENGTH, {"position": (3,), "velocity": (3,)}, np.float64)
+    for step, time in enumerate(np.linspace(0, 1.2, frames)):
+        columns = flow.particles(start, time)
+        writer.append(step, time, 0, {name: columns[name] for name in ("position", "velocity")})
 
 
 def decaying_spectra():
@@ -174,10 +190,10 @@ def write_rollout(comm, directory, status="complete", total=600, cells=16, frame
             filtered.append(time, 0, {"velocity": 1.02 * RandomFlow(1).field(cells, time)})
 
 
-def write_run(comm, directory, **rollout):
-    """All four products."""
+def write_run(comm, directory, truth=None, **rollout):
+    """All four products; `truth` holds arguments of the first, the others are those of the rollout."""
     directory.mkdir(parents=True, exist_ok=True)
-    write_ground_truth(comm, directory)
+    write_ground_truth(comm, directory, **(truth or {}))
     write_kernel(comm, directory)
     write_model(comm, directory)
     write_rollout(comm, directory, **rollout)

@@ -132,5 +132,93 @@ def test_job_with_too_many_ranks_is_told(comm):
 @pytest.mark.parametrize("overrides", [["forcing.wavenumber=1.5"], ["flow.cells=72", "forcing.wavenumber=23"]])
 @pytest.mark.filterwarnings("error")
 def test_probe_forces_any_wavenumber(comm, overrides):
-    from eddies.workflows.estimates import probe_seconds_per_step
-    assert 0 < probe_seconds_per_step(load_scene("hit-small", overrides), comm, steps=1) < math.inf
+    from eddies.workflows.cost_model import probe
+    speed = probe(load_scene("hit-small", overrides), comm, steps=1)
+    assert 0 < speed.work < math.inf and 0 < speed.bandwidth < math.inf
+
+
+def rows_of(scene):
+    """The table of `eddies check` for ranks of a speed that is made up, as words."""
+    from eddies.workflows.check import cost_lines
+    from eddies.workflows.cost_model import Speed
+    return [line.split("  ") for line in list(cost_lines(scene, Speed(1e-6, 1e9)))[2:]]
+
+
+def test_table_goes_to_the_most_slabs():
+    from eddies.workflows.cost_model import NODE_RANKS
+    rows = [[word.strip() for word in row if word.strip()] for row in rows_of(load_scene("hit-paper"))]
+    assert [int(row[0]) for row in rows] == [2**m for m in range(9)]  # at most 341
+    assert [int(row[1]) for row in rows] == [max(1, 2**m // NODE_RANKS) for m in range(9)]
+    assert [int(row[2]) for row in rows] == [1024 // 2**m for m in range(9)]
+    assert [len(row) for row in rows] == [8] * 5 + [7] * 4  # the pair force is for 21 ranks and fewer
+    # without tracers: a plane each, twelve rows and no more
+    scene = load_scene("taylor-green", ["flow.cells=4096"])
+    assert [int(row[0]) for row in map(lambda row: [word for word in row if word], rows_of(scene))] == [
+        2**m for m in range(1, 13)]
+
+
+def test_memory_and_time_fall_with_the_ranks():
+    from eddies.workflows.cost_model import Speed, costs
+    rows = costs(load_scene("hit-paper"), 512, Speed(1e-6, 1e9))
+    for few, many in zip(rows, rows[1:]):
+        assert many.memory < few.memory and many.seconds < few.seconds
+        assert many.ranks * many.seconds >= few.ranks * few.seconds * (1 - 1e-12)  # no speed-up beyond the ideal
+    # An odd plane costs as much as a pair.
+    from eddies.workflows.cost_model import cost
+    assert cost(load_scene("hit-paper"), 1024, Speed(1e-6, 1e9)).work == rows[-1].work
+
+
+@pytest.mark.mpi(2)
+@pytest.mark.parametrize("fluid", ["compressible", "incompressible"])
+def test_bytes_sent_are_those_of_the_transposes(comm, fluid, monkeypatch):
+    from eddies.parallel.reduction import global_sum
+    from eddies.parallel.transpose import TransposeBuffers
+    from eddies.workflows.cost_model import sent_bytes
+    from eddies.workflows.dns import build_fluid, initial_state
+    changes = ["flow.cells=20", f"flow.fluid={fluid}", "initial.kind=taylor-green"]
+    scene = load_scene("taylor-green", changes + (["flow.sound_speed=10"] if fluid == "compressible" else []))
+    equation = build_fluid(scene, comm)
+    state, sent = initial_state(scene, equation), []
+    send = TransposeBuffers._send
+
+    def counted(self, outgoing, *others):
+        sent.append(outgoing.nbytes)
+        send(self, outgoing, *others)
+
+    monkeypatch.setattr(TransposeBuffers, "_send", counted)
+    equation.nonlinear(state)
+    # Of what changes sides, each of two ranks keeps half, but for the uneven cut of 13 columns.
+    assert float(global_sum(comm, sum(sent))) == pytest.approx(sent_bytes(scene) / 2, rel=0.01)
+
+
+def test_messages_cost_time_beyond_a_node():
+    from eddies.workflows.cost_model import LATENCY, NODE_BANDWIDTH, NODE_RANKS, Speed, exchange_seconds, sent_bytes
+    scene, speed = load_scene("hit-paper"), Speed(1e-6, 1e9)
+    assert exchange_seconds(scene, 1, speed) == 0
+    # Two nodes: each holds half of all bytes and keeps half of that, in messages from each rank to all others.
+    ranks = 2 * NODE_RANKS
+    crossing = sent_bytes(scene) / 4 / NODE_BANDWIDTH
+    within = sent_bytes(scene) / ranks * (NODE_RANKS - 1) / ranks / speed.bandwidth
+    assert exchange_seconds(scene, ranks, speed) == pytest.approx(
+        4 * (crossing + within + 2 * (ranks - 1) * LATENCY))
+
+
+@pytest.mark.mpi(1, 2)
+@pytest.mark.parametrize("fluid", ["compressible", "incompressible"])
+def test_memory_of_a_step_is_as_expected(comm, fluid):
+    # Arrays that a state, its operators and buffers hold, counted by the allocator, at a size where they are most.
+    import tracemalloc
+    from eddies.clock import Clock
+    from eddies.time_stepping import ETDRK4
+    from eddies.workflows.cost_model import PROCESS_BYTES, flow_bytes
+    from eddies.workflows.dns import build_fluid, build_step_limit, initial_state
+    changes = ["flow.cells=48", f"flow.fluid={fluid}", "initial.kind=taylor-green"]
+    scene = load_scene("taylor-green", changes + (["flow.sound_speed=10"] if fluid == "compressible" else []))
+    tracemalloc.start()
+    equation = build_fluid(scene, comm)
+    stepper, state = ETDRK4(equation), initial_state(scene, equation)
+    stepper(state, build_step_limit(scene, equation.grid)(state, Clock()))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    expected = flow_bytes(scene, comm.size) - PROCESS_BYTES
+    assert 0.4 * expected < peak < 1.1 * expected

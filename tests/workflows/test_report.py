@@ -12,12 +12,15 @@ from tests.workflows.synthetic_run import (
 )
 
 FIGURES = {
-    "statistics", "spectra", "fields", "figure-1-kernels", "figure-2-reconstruction", "kernel-training",
-    "figure-3-a-priori", "model-training", "figure-4-velocity", "figure-5-vorticity-energy", "figure-6-pdfs",
-    "figure-7-invariants", "figure-8-spectra", "figure-9-errors", "lagrangian",
+    "statistics", "spectra", "fields", "stationary", "tracers", "figure-1-kernels", "figure-2-reconstruction",
+    "kernel-training", "figure-3-a-priori", "model-training", "figure-4-velocity", "figure-5-vorticity-energy",
+    "figure-6-pdfs", "figure-7-invariants", "figure-8-spectra", "figure-9-errors", "lagrangian",
 }
 METRICS = {
     "ground_truth": {"reynolds_lambda", "kmax_eta", "mach_turbulent", "energy_budget_error", "skewness"},
+    "stationary": {"turnovers", "skewness", "dissipation_constant", "energy_imbalance", "mach_turbulent"},
+    "tracers": {"tracer_energy_ratio_first", "tracer_energy_ratio_last", "acceleration_kurtosis",
+                "structure_function_exponent", "ballistic_exponent"},
     "kernel": {"integral", "velocity_error", "gradient_error", "cubic_spline_velocity_error",
                "cubic_spline_gradient_error"},
     "model": {"acceleration_error", "density_rate_error", "filtered_pressure_gradient_error",
@@ -48,7 +51,7 @@ def numbers(values):
 
 @pytest.mark.mpi(1)
 def test_a_complete_run_shows_everything(comm, tmp_path):
-    write_run(comm, tmp_path)
+    write_run(comm, tmp_path, {"frames": 17, "stationary": True})
     report.run(tmp_path, comm)
     metrics, page = written(tmp_path)
     assert figures(tmp_path) == FIGURES
@@ -60,6 +63,16 @@ def test_a_complete_run_shows_everything(comm, tmp_path):
         missing = {key for key in keys if metrics[section][key] is None}
         assert missing == ({"density_rate_error"} if section == "model" else set())
     assert "closure poisson has none" in page
+    check_stationary(metrics["stationary"], page)
+
+
+def check_stationary(shown, page):
+    """The statistics are constants times 1 + 0.1 sin 3t, averaged from t = 1 to 3."""
+    mean = 1 + 0.1 * (math.cos(3) - math.cos(9)) / 6
+    assert shown["skewness"]["this run"] == pytest.approx(-0.5 * mean, rel=1e-3)
+    assert shown["skewness"]["literature"] == pytest.approx(-0.32 * (45 * mean) ** 0.11, rel=1e-3)
+    assert shown["turnovers"]["this run"] == pytest.approx(2 / 1.2)
+    assert "Ishihara et al. 2007" in page
 
 
 @pytest.mark.mpi(1)

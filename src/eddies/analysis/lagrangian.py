@@ -1,5 +1,7 @@
 """Statistics along trajectories: how long velocities are remembered, how particles spread."""
 
+from collections.abc import Iterable, Iterator, Sequence
+
 import numpy as np
 
 
@@ -8,18 +10,14 @@ def velocity_correlation(initial: np.ndarray, later: np.ndarray) -> float:
     return float(np.sum(initial * later) / np.sqrt(np.sum(initial**2) * np.sum(later**2)))
 
 
-def velocity_autocorrelation(velocity: np.ndarray) -> np.ndarray:
-    """Correlation of every frame with the first one: (frames, n, 3) -> (frames,), from 1."""
-    return np.array([velocity_correlation(velocity[0], frame) for frame in velocity])
-
-
-def structure_function(velocity: np.ndarray, lags: np.ndarray) -> np.ndarray:
+def structure_function(velocity: Sequence[np.ndarray], lags: np.ndarray) -> np.ndarray:
     """Second-order Lagrangian structure function <|v(t + lag) - v(t)|^2> / 3 per component.
 
     velocity (frames, n, 3) at equal intervals, lags (m,) in frames; mean over particles and all start frames.
     (m,).
     """
-    return np.array([np.mean((velocity[lag:] - velocity[: len(velocity) - lag]) ** 2) for lag in lags])
+    return np.array([np.mean([np.mean((velocity[start + lag] - velocity[start]) ** 2)
+                              for start in range(len(velocity) - lag)]) for lag in lags])
 
 
 def minimum_image(displacement: np.ndarray, length: float) -> np.ndarray:
@@ -27,21 +25,43 @@ def minimum_image(displacement: np.ndarray, length: float) -> np.ndarray:
     return displacement - length * np.rint(displacement / length)
 
 
-def unwrapped(position: np.ndarray, length: float) -> np.ndarray:
-    """Continuous trajectories from wrapped ones (frames, n, 3); no step may be longer than length / 2."""
-    steps = minimum_image(np.diff(position, axis=0), length)
-    return position[0] + np.concatenate([np.zeros_like(position[:1]), np.cumsum(steps, axis=0)])
+def separations(position: Iterable[np.ndarray], first: np.ndarray, second: np.ndarray,
+                length: float) -> Iterator[np.ndarray]:
+    """Separation x_first - x_second of pairs over time: frames (n, 3) -> as many (m, 3), frame by frame.
 
-
-def pair_dispersion(position: np.ndarray, first: np.ndarray, second: np.ndarray, length: float) -> np.ndarray:
-    """Mean-square change of separation <|r(t) - r(0)|^2> of the pairs (first, second): (frames, n, 3) ->
-    (frames,).
-
-    Positions may be wrapped into the box; `first` and `second` (m,) are rows.
+    Positions may be wrapped into the box; separations start as the nearest image and are continuous, as long as none
+    changes by more than length / 2 between two frames. `first` and `second` (m,) are rows.
     """
-    path = unwrapped(position, length)
-    separation = path[:, first] - path[:, second]
-    return np.mean(np.sum((separation - separation[0]) ** 2, axis=-1), axis=-1)
+    separation = None
+    for frame in position:
+        wrapped = frame[first] - frame[second]
+        previous = 0.0 if separation is None else separation
+        separation = previous + minimum_image(wrapped - previous, length)
+        yield separation
+
+
+def pair_dispersion(position: Iterable[np.ndarray], first: np.ndarray, second: np.ndarray,
+                    length: float) -> np.ndarray:
+    """Mean-square change of separation <|r(t) - r(0)|^2> of the pairs (first, second): (frames, n, 3) ->
+    (frames,)."""
+    paths = separations(position, first, second, length)
+    start = next(paths)
+    return np.array([0.0, *(np.mean(np.sum((separation - start) ** 2, axis=1)) for separation in paths)])
+
+
+def pairs_at(position: np.ndarray, length: float, distances: Sequence[float], tolerance: float,
+             followed: int) -> list[np.ndarray]:
+    """Rows (2, m) of the pairs at each distance, within a fraction `tolerance` of it, among particles (n, 3).
+
+    The first of a pair is one of the first `followed` rows, which are compared with all.
+    """
+    pairs = [[np.empty((2, 0), int)] for _ in distances]
+    for row, start in enumerate(position[:followed]):
+        apart = np.sqrt(np.sum(minimum_image(position - start, length) ** 2, axis=1))
+        for distance, found in zip(distances, pairs):
+            others = np.flatnonzero(np.abs(apart - distance) <= tolerance * distance)
+            found.append(np.stack([np.full(others.size, row), others]))
+    return [np.concatenate(found, axis=1) for found in pairs]
 
 
 def nearest_neighbors(position: np.ndarray, length: float) -> np.ndarray:

@@ -155,12 +155,25 @@ def _illustration(illustration: Illustration) -> str:
 
 
 def _metric_table(metrics: Sequence[Metric]) -> str:
+    if metrics and all(isinstance(metric.value, dict) for metric in metrics):
+        return _table_of_columns(metrics)
     rows = "".join(
         f'<tr><td>{_text(metric.label)}</td>'
         + (f'<td class="soft">not available: {_text(metric.reason)}</td>' if metric.value is None
            else f'<td class="number">{_text(shown(metric.value))}</td>') + "</tr>"
         for metric in metrics)
     return f'<h3>Numbers</h3><div class="wide"><table>{rows}</table></div>' if rows else ""
+
+
+def _table_of_columns(metrics: Sequence[Metric]) -> str:
+    """Metrics that all have several values, by name: a column for each name."""
+    columns = list(dict.fromkeys(name for metric in metrics for name in metric.value))
+    head = "".join(f"<th>{_text(name)}</th>" for name in ("", *columns))
+    rows = "".join(
+        f"<tr><td>{_text(metric.label)}</td>"
+        + "".join(f"<td>{_text(shown(metric.value.get(name, '')))}</td>" for name in columns) + "</tr>"
+        for metric in metrics)
+    return f'<h3>Numbers</h3><div class="wide"><table><tr>{head}</tr>{rows}</table></div>'
 
 
 def _run(run: RunRecord) -> str:

@@ -15,6 +15,7 @@ import numpy as np
 import pyfftw
 
 BLOCK_BYTES = 2**18  # of one component in a pass: a few of them fit the second-level cache of a core
+PADDING = 8           # complex numbers between the lines along x of a plane that is transformed along y
 
 
 class ColumnPass:
@@ -137,7 +138,9 @@ class PlanePass:
             if stop > start:
                 stop, start = K + 1, n - K
             rows = pyfftw.zeros_aligned((pairs, n, stop + n - start), self.dtype)
-            lines, planes = (pyfftw.zeros_aligned((pairs, n, n), self.dtype) for _ in range(2))
+            planes = pyfftw.zeros_aligned((pairs, n, n), self.dtype)
+            # Lines a power of two apart would all fall into the same few sets of a cache, and push each other out.
+            lines = pyfftw.zeros_aligned((pairs, n, n + PADDING), self.dtype)[..., :n]
             kept = [(rows[..., :stop], lines[..., :stop]), (rows[..., stop:], lines[..., start:])]
             settings = {"direction": f"FFTW_{direction}", "flags": ("FFTW_ESTIMATE",)}
             if direction == "BACKWARD":

@@ -6,18 +6,20 @@ from collections.abc import Iterator
 
 from eddies.clock import duration
 from eddies.scene import BOX_LENGTH, Scene
-from eddies.workflows.estimates import (PROCESS_BYTES, expected_step, expected_turbulence, flow_bytes,
-                                        largest_wavenumber, most_ranks, pair_bytes, particle_reach,
-                                        probe_seconds_per_step, run_time)
+from eddies.workflows.cost_model import LATENCY, NODE_BANDWIDTH, NODE_RANKS, Speed, cost, costs, pair_bytes, probe
+from eddies.workflows.estimates import (expected_step, expected_turbulence, ground_truth_alone, largest_wavenumber,
+                                        most_ranks, particle_reach, run_time)
 
 log = logging.getLogger("eddies")
 
 
 def run(scene: Scene, comm) -> None:
     """Log every derived number of a scene, estimates of steps and time, and warnings; all ranks call it."""
+    speed = probe(scene, comm)
     subjects = {"grid": grid_lines(scene), "turbulence": turbulence_lines(scene),
                 "particles": particle_lines(scene), "time step": step_lines(scene),
-                "ranks": rank_lines(scene), "memory": memory_lines(scene), "time": time_lines(scene, comm)}
+                "ranks": rank_lines(scene), "time": time_lines(scene, comm.size, speed),
+                "more ranks": cost_lines(scene, speed)}
     log.info("%s: %s", scene.name, scene.title)
     log.info("stages: %s", ", ".join(scene.stages))
     for title, lines in subjects.items():
@@ -75,7 +77,7 @@ def step_lines(scene: Scene) -> Iterator[str]:
         yield "not foreseen: the flow comes from a file"
         return
     step, limit = expected
-    steps = f", about {math.ceil(span / step)} steps for a time of {span:.3g}" if span else ""
+    steps = f", about {expected_steps(scene)} steps for a time of {span:.3g}" if span else ""
     yield f"{step:.4g}, {limit}{steps}"
     if scene.tracers:
         interval = scene.tracers.frame_interval
@@ -84,31 +86,45 @@ def step_lines(scene: Scene) -> Iterator[str]:
 
 def rank_lines(scene: Scene) -> Iterator[str]:
     """How many ranks can be used, and why no more."""
-    limits = most_ranks(scene)
+    limits, alone = most_ranks(scene), most_ranks(ground_truth_alone(scene))
     yield f"at most {min(limits.values())}"
     for reason, ranks in limits.items():
         yield f"    {ranks}: {reason}"
+    if min(alone.values()) > min(limits.values()):
+        yield f"the direct simulation alone (`eddies dns`) at most {min(alone.values())}: {min(alone, key=alone.get)}"
 
 
-def memory_lines(scene: Scene) -> Iterator[str]:
-    """Memory of a job: number of ranks times that of each."""
-    most = min(most_ranks(scene).values())
-    for ranks in (2**m for m in range(most.bit_length())):
-        line = f"{ranks} x {megabytes(PROCESS_BYTES + flow_bytes(scene) / ranks)} for the direct simulation"
-        if scene.simulation:
-            line += f", {ranks} x {megabytes(PROCESS_BYTES + pair_bytes(scene) / ranks)} for the pair force"
+def time_lines(scene: Scene, ranks: int, speed: Speed) -> Iterator[str]:
+    """Wall time of the direct simulation on the ranks at hand."""
+    seconds, steps = cost(scene, ranks, speed).seconds, expected_steps(scene)
+    at_hand = "this rank" if ranks == 1 else f"these {ranks} ranks"
+    yield f"{number(seconds)} s for a step of the direct simulation on {at_hand}"
+    if steps:
+        yield f"direct simulation about {duration(seconds * steps)}, statistics, tracers and files not counted"
+
+
+def cost_lines(scene: Scene, speed: Speed) -> Iterator[str]:
+    """Memory and wall time of the direct simulation on any number of ranks, and memory of the pair force."""
+    yield (f"estimates, from the work of the ranks at hand, for nodes of {NODE_RANKS} ranks that share "
+           f"{NODE_BANDWIDTH / 1e9:g} GB/s, {1e6 * LATENCY:g} us a message")
+    yield ("ranks  nodes  planes  memory a rank  s a step     wall time  core hours"
+           + ("  pair force a rank" if scene.simulation else ""))
+    most, most_alone = (min(most_ranks(case).values()) for case in (scene, ground_truth_alone(scene)))
+    steps = expected_steps(scene)
+    for row in costs(scene, most_alone, speed):
+        line = f"{row.ranks:5}  {row.nodes:5}  {row.planes:6}  {megabytes(row.memory):>13}  {number(row.seconds):>8}"
+        if steps:
+            seconds = row.seconds * steps
+            line += f"  {duration(seconds):>12}  {row.ranks * seconds / 3600:10,.1f}"
+        if scene.simulation and row.ranks <= most:
+            line += f"  {megabytes(pair_bytes(scene, row.ranks)):>17}"
         yield line
 
 
-def time_lines(scene: Scene, comm) -> Iterator[str]:
-    """Wall time of the direct simulation on the ranks at hand; every rank must draw the lines."""
-    seconds = probe_seconds_per_step(scene, comm)
-    ranks = "this rank" if comm.size == 1 else f"these {comm.size} ranks"
-    yield f"{seconds:.3g} s for a step of the direct simulation on {ranks}"
+def expected_steps(scene: Scene) -> int | None:
+    """Steps of the direct simulation; None if they cannot be foreseen."""
     expected, span = expected_step(scene), run_time(scene)
-    if expected and span:
-        total = duration(seconds * math.ceil(span / expected[0]))
-        yield f"direct simulation about {total}, tracers and files not counted"
+    return math.ceil(span / expected[0]) if expected and span else None
 
 
 def warnings(scene: Scene, ranks: int) -> Iterator[str]:
@@ -122,6 +138,11 @@ def warnings(scene: Scene, ranks: int) -> Iterator[str]:
         yield "the filter is narrower than a cell of the grid: it filters nothing"
     if ranks > most:
         yield f"this job has {ranks} ranks, and the scene can use at most {most}"
+
+
+def number(value: float) -> str:
+    """Three digits, or all of an integer part that has more."""
+    return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
 
 
 def megabytes(size: float) -> str:

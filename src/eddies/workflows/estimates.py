@@ -1,22 +1,16 @@
-"""What to expect of a scene before it is run: turbulence, time steps, ranks, memory and wall time."""
+"""What to expect of a scene before it is run: turbulence, time steps, and the ranks that it can use."""
 
 import math
-import time
 from dataclasses import dataclass, replace
 
-from eddies.clock import Clock, ladder_step
-from eddies.scene import BOX_LENGTH, Initial, Scene
-from eddies.time_stepping import STEPPERS
-from eddies.workflows.dns import build_fluid, build_step_limit, initial_state
+from eddies.clock import ladder_step
+from eddies.scene import BOX_LENGTH, Scene
 
 DISSIPATION_CONSTANT = 0.5   # C_eps = eps L / u'^3 of developed turbulence
 PEAK_VELOCITY = 4.0          # largest component of the velocity of a particle over u'
 PEAK_SPEED = 7.0             # max(|u| + |v| + |w|) over u' in turbulence: four rms in each component at worst
 EXACT_PEAK_SPEED = {"taylor-green": 1.0, "abc": 3 * math.sqrt(2), "shear-wave": 1.0}  # over the amplitude
 GHOST_PLANES = {"cubic": 3, "quintic": 4}
-FLOW_BYTES = {"compressible": 920, "incompressible": 410}  # per cell in float64, measured from 48^3 to 128^3
-PROCESS_BYTES = 90e6         # of a rank before it holds any field
-PROBE_CELLS = 64
 
 
 @dataclass(frozen=True)
@@ -132,6 +126,11 @@ def most_ranks(scene: Scene) -> dict[str, int]:
     return limits
 
 
+def ground_truth_alone(scene: Scene) -> Scene:
+    """The scene without what learns of its ground truth, which may use more ranks."""
+    return replace(scene, kernel=None, model=None, training=None, simulation=None)
+
+
 def thick_slabs(planes: int, width: float) -> int:
     """The largest number of slabs of that many planes in all that are no thinner than `width`."""
     return max(planes // math.ceil(width / (BOX_LENGTH / planes) - 1e-9), 1)
@@ -154,43 +153,3 @@ def closure_ghost_planes(scene: Scene) -> int:
     support, skin = scene.kernel.support(scene.tracers.particles), scene.simulation.skin if scene.simulation else 0.0
     outside = (skin * support / 2 + particle_drift(scene)) / scene.tracers.spacing
     return GHOST_PLANES["cubic"] - 1 + max(math.ceil(outside), 1)
-
-
-def flow_bytes(scene: Scene) -> float:
-    """Memory of the direct simulation over all ranks."""
-    single = 0.5 if scene.flow.precision == "float32" else 1.0
-    return FLOW_BYTES[scene.flow.fluid] * single * scene.flow.cells**3
-
-
-def pair_bytes(scene: Scene) -> float:
-    """Memory of the pair force over all ranks: list, displacements, three copies of every activation."""
-    pairs = scene.tracers.particles * scene.kernel.neighbors * (1 + scene.simulation.skin) ** 3
-    item = 4 if scene.simulation.precision == "float32" else 8
-    return pairs * (16 + 4 * item + 3 * item * (5 + sum(scene.model.hidden) + 3))
-
-
-def probe_seconds_per_step(scene: Scene, comm, steps: int = 3) -> float:
-    """Wall seconds of one step of the direct simulation on these ranks, from a few steps.
-
-    A grid beyond PROBE_CELLS is not set up; the time of the smaller one is scaled by n^3 log n.
-    """
-    cells = min(scene.flow.cells, PROBE_CELLS)
-    turbulence, forcing = expected_turbulence(scene), scene.forcing
-    # Random turbulence, with energy wherever the scene may force it.
-    initial = Initial(amplitude=turbulence.velocity_rms if turbulence else 1.0, peak_wavenumber=min(3.0, cells / 3))
-    if forcing:
-        forcing = replace(forcing, wavenumber=min(forcing.wavenumber, cells / 3))
-    probe = replace(scene, flow=replace(scene.flow, cells=cells), initial=initial, forcing=forcing,
-                    time=replace(scene.time, duration=1.0), spin_up=None, tracers=None, kernel=None,
-                    model=None, training=None, simulation=None)
-    fluid = build_fluid(probe, comm)
-    stepper, state = STEPPERS[scene.time.stepper](fluid), initial_state(probe, fluid)
-    step = build_step_limit(probe, fluid.grid)(state, Clock(end=probe.time.duration))
-    state = stepper(state, step)  # the first step also plans transforms and makes tables
-    comm.Barrier()
-    start = time.perf_counter()
-    for _ in range(steps):
-        state = stepper(state, step)
-    comm.Barrier()
-    work = scene.flow.cells**3 * math.log(scene.flow.cells) / (cells**3 * math.log(cells))
-    return work * (time.perf_counter() - start) / steps

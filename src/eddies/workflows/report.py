@@ -5,6 +5,7 @@ Every product is optional; a section appears for what there is. Rank 0 does the 
 
 import json
 import logging
+import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,9 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from eddies.analysis import figures_comparison, figures_flow, figures_kernel, figures_model
+from eddies.analysis import (
+    figures_comparison, figures_flow, figures_kernel, figures_model, figures_tracers, figures_turbulence,
+)
+from eddies.analysis.isotropic_turbulence import StationarySpan
 from eddies.analysis.page import Metric, RunRecord, Section, metrics_json, render_page, shown
 from eddies.analysis.spectra import energy_spectrum, vorticity
+from eddies.analysis.tracer_statistics import tracer_statistics
 from eddies.io.fields import FieldSeries
 from eddies.io.hdf5 import ProductError, open_product, read_attributes, read_provenance, read_table
 from eddies.io.trajectories import Trajectory
@@ -52,15 +57,17 @@ def run(directory: str | Path, comm) -> None:
 
 def _write_report(directory: Path, alone) -> None:
     record, sections = Run(seconds=_stage_seconds(directory)), []
-    readers = {"ground_truth": _read_flow, "kernel": _read_kernel, "model": _read_model,
+    readers = {"ground_truth": _read_ground_truth, "kernel": _read_kernel, "model": _read_model,
                "rollout": _read_rollout}
     for kind, read in readers.items():
         path = directory / f"{kind}.h5"
         if path.exists():
             with open_product(alone, path, kind) as file:
                 record.provenance[kind] = read_provenance(file)
-                sections.append(read(file, record))
-            log.info("report: %s, %d figures", sections[-1].title, len(sections[-1].illustrations))
+                found = read(file, record)
+            sections += found
+            for section in found:
+                log.info("report: %s, %d figures", section.title, len(section.illustrations))
     if not sections:
         raise ProductError(f"{directory}: holds none of {', '.join(f'{kind}.h5' for kind in readers)}; "
                            "run `eddies dns SCENE` first")
@@ -69,8 +76,32 @@ def _write_report(directory: Path, alone) -> None:
     _log_main_numbers(sections)
 
 
-def _read_flow(file, record: Run) -> Section:
+def read_stationary_span(file) -> StationarySpan:
+    """The span of an open ground_truth.h5 over which its stationary state is averaged.
+
+    ProductError where the scene has none ([spin_up] stationary), or one of hardly a step.
+    """
+    span, scene = read_attributes(file, "stationary"), tomllib.loads(read_provenance(file)["scene"])
+    forced_below = scene["forcing"]["wavenumber"] if "forcing" in scene else 0.0
+    try:
+        return StationarySpan(read_table(file, "statistics"), read_table(file, "spectra_of_statistics")["energy"],
+                              read_attributes(file, "reference")["viscosity"], span["start"], span["end"], forced_below)
+    except ValueError as error:
+        raise ProductError(f"{file.filename}: {error}; raise [spin_up] stationary and run `eddies dns` again") from None
+
+
+def _read_ground_truth(file, record: Run) -> list[Section]:
     reference, statistics = read_attributes(file, "reference"), read_table(file, "statistics")
+    sections = [_read_flow(file, record, reference, statistics)]
+    if "stationary" in file and reference["viscosity"] > 0:  # without friction forced flow is never stationary
+        sections.append(figures_turbulence.section(statistics, read_stationary_span(file)))
+    if "particles/tracers" in file:
+        found = tracer_statistics(Trajectory(file, "tracers"), record.eulerian, reference["spacing"])
+        sections.append(figures_tracers.section(found, reference))
+    return sections
+
+
+def _read_flow(file, record: Run, reference: dict[str, Any], statistics: dict[str, np.ndarray]) -> Section:
     traced = "released_at" in reference
     name = "filtered" if traced else "final"
     velocity = FieldSeries(file, name).read(-1, "velocity")
@@ -88,25 +119,25 @@ def _read_flow(file, record: Run) -> Section:
     return figures_flow.section(figures_flow.GroundTruth(statistics, spectra, reference, planes, name))
 
 
-def _read_kernel(file, record: Run) -> Section:
+def _read_kernel(file, record: Run) -> list[Section]:
     tables = {name: read_table(file, name) for name in ("kernels", "slices", "errors", "history")}
-    return figures_kernel.section(json.loads(file.attrs["description"])["support"], **tables)
+    return [figures_kernel.section(json.loads(file.attrs["description"])["support"], **tables)]
 
 
-def _read_model(file, record: Run) -> Section:
+def _read_model(file, record: Run) -> list[Section]:
     density_rate = read_table(file, "density_rate_sample") if "density_rate_sample" in file else None
-    return figures_model.section(
+    return [figures_model.section(
         json.loads(file.attrs["description"]), read_table(file, "a_priori"),
-        read_table(file, "acceleration_sample"), density_rate, read_table(file, "history"))
+        read_table(file, "acceleration_sample"), density_rate, read_table(file, "history"))]
 
 
-def _read_rollout(file, record: Run) -> Section:
+def _read_rollout(file, record: Run) -> list[Section]:
     attributes = read_attributes(file, "rollout")
     record.cost += [Metric(key, label, attributes[key]) for key, label in ROLLOUT_COST.items()]
     model, truth = Trajectory(file, "model"), Trajectory(file, "truth")
     fields = {name: FieldSeries(file, name) for name in ("model", "truth", "filtered")}
-    return figures_comparison.section(figures_comparison.Rollout(
-        attributes, model, truth, fields, model.length, record.filter_width, record.eulerian))
+    return [figures_comparison.section(figures_comparison.Rollout(
+        attributes, model, truth, fields, model.length, record.filter_width, record.eulerian))]
 
 
 def _cost_section(record: Run) -> Section:

@@ -1,0 +1,26 @@
+#!/usr/bin/env bash
+# sbatch jobs/hit-paper.slurm.sh [options of `eddies dns`]
+# The ground truth of the scene hit-paper: 1024^3 cells on 256 ranks, 64 on each of four nodes, about 90 GB of memory a
+# node. `eddies check hit-paper` on ranks of your cluster says how many hours; a job that meets its limit is queued again
+# and goes on. What learns from the ground truth uses at most 21 ranks. Submit it afterwards:
+#   EDDIES_SCENE=hit-paper sbatch --ntasks-per-node=16 jobs/slurm.sh
+# Submit from the checkout, or set EDDIES_CHECKOUT to it. Load your cluster's modules first, as for set-up.
+#SBATCH --job-name=hit-paper
+#SBATCH --nodes=4
+#SBATCH --ntasks-per-node=64
+#SBATCH --cpus-per-task=1
+#SBATCH --mem=120G
+#SBATCH --time=24:00:00
+# SIGUSR1 to the ranks five minutes before the limit: they end with 75, and the job is queued again.
+#SBATCH --signal=USR1@300
+#SBATCH --requeue
+#SBATCH --open-mode=append
+EDDIES_SCENE=hit-paper
+ground_truth() { srun "$1" dns "${@:3}"; }  # this stage instead of `run`, which is all of them
+launcher=(ground_truth)
+resubmit=(scontrol requeue "${SLURM_JOB_ID:-}")
+
+# ---- the same for every scheduler
+set -euo pipefail
+cd "${PBS_O_WORKDIR:-$PWD}"
+source "${EDDIES_CHECKOUT:-$PWD}/jobs/run.sh"

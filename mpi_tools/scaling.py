@@ -1,0 +1,93 @@
+"""Measure the step of the direct simulation on several numbers of ranks, and say what larger runs would take.
+
+    .venv/bin/python mpi_tools/scaling.py [--cells 64 128] [--ranks 1 2] [--scene hit-paper] [--larger 256 512 1024]
+
+The times are those of tests/benchmarks/step.py, which shows each part against its bound; speed-up and efficiency are
+against the first of RANKS. What follows is `eddies check` of the scene on other grids, on the last of RANKS: the same
+flow at the same k_max eta and Courant number. It measures anew and knows the model of larger runs.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+CHECKOUT = Path(__file__).parents[1]
+# Columns of the table: what the parts of the step's benchmark are summed up to.
+GROUPS = {"transforms": ("plane transforms", "column transforms"),
+          "transposes": ("transposes",),
+          "pointwise": ("pairs of planes", "derivatives", "products", "linear operators", "the rest")}
+
+
+def output_of(arguments: list[str], ranks: int = 0) -> str:
+    """What a Python program prints, on so many ranks or without MPI; CalledProcessError if it fails."""
+    launcher = [sys.executable, CHECKOUT / "mpi_tools/launch.py", "-n", str(ranks), "--"] if ranks else []
+    return subprocess.run([*launcher, sys.executable, *arguments], check=True, text=True,
+                          stdout=subprocess.PIPE).stdout
+
+
+def measured(cells: int, ranks: int, precision: str, steps: int) -> dict:
+    """The result of the step's benchmark."""
+    return json.loads(output_of([str(CHECKOUT / "tests/benchmarks/step.py"), str(cells), "--precision", precision,
+                                 "--steps", str(steps), "--json"], ranks))
+
+
+def row(result: dict, first: dict) -> str:
+    """A line of the table, against the result on the first number of ranks."""
+    speed_up = first["seconds"] / result["seconds"]
+    shares = [sum(result["parts"][part] for part in parts) / result["seconds"] for parts in GROUPS.values()]
+    return (f"{result['cells']:5} {result['precision']:>9} {result['ranks']:6} {result['seconds']:9.4f} "
+            f"{speed_up:8.2f} {speed_up * first['ranks'] / result['ranks']:10.0%} "
+            + " ".join(f"{share:10.0%}" for share in shares)
+            + f" {result['memory_bytes'] / 1e6:9.0f} MB")
+
+
+def other_grid(scene: str, cells: int) -> list[str]:
+    """Options of `eddies check` for a built-in scene on another grid: nu ~ n^(-4/3) keeps k_max eta."""
+    settings = tomllib.loads(output_of(["-m", "eddies", "scenes", scene]))
+    ratio = settings["flow"]["cells"] / cells
+    changes = {"flow.cells": cells, "flow.viscosity": settings["flow"]["viscosity"] * ratio ** (4 / 3),
+               "time.max_step": settings["time"]["max_step"] * ratio}
+    return [word for key, value in changes.items() for word in ("--set", f"{key}={value:g}")]
+
+
+def larger_run(scene: str, cells: int, ranks: int) -> str:
+    """What `eddies check` says of more ranks."""
+    report = output_of(["-m", "eddies", "check", scene, *other_grid(scene, cells)], ranks).splitlines()
+    start = next(number for number, line in enumerate(report) if line.startswith("more ranks"))
+    return "\n".join([f"{cells}^3, {scene}", *(line for line in report[start:] if line[:1] == " ")])
+
+
+def positive(text: str) -> int:
+    """An integer of the command line that is larger than zero."""
+    if not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r}: a positive integer is expected")
+    return int(text)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--cells", nargs="+", type=positive, default=[64, 128], help="cells along a side, measured")
+    parser.add_argument("--ranks", nargs="+", type=positive, default=[1, 2], help="numbers of ranks, measured")
+    parser.add_argument("--precision", nargs="+", choices=["float64", "float32"], default=["float64", "float32"])
+    parser.add_argument("--steps", type=positive, default=7, help="steps of which the median is taken")
+    parser.add_argument("--scene", default="hit-paper", help="built-in scene of the larger runs (default: hit-paper)")
+    parser.add_argument("--larger", nargs="*", type=positive, default=[256, 512, 1024, 2048, 4096],
+                        help="cells along a side of the larger runs")
+    options = parser.parse_args(arguments)
+    names = " ".join(f"{name:>10}" for name in GROUPS)
+    print(f"cells precision  ranks  s a step speed-up efficiency {names}    memory", flush=True)
+    for cells in options.cells:
+        for precision in options.precision:
+            results = []
+            for ranks in options.ranks:
+                results.append(measured(cells, ranks, precision, options.steps))
+                print(row(results[-1], results[0]), flush=True)
+    for cells in options.larger:
+        print(f"\n{larger_run(options.scene, cells, options.ranks[-1])}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

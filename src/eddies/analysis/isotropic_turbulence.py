@@ -1,0 +1,240 @@
+"""Averages of stationary isotropic turbulence, beside the values of the literature at the same Reynolds number.
+
+u' is the rms of a velocity component, L the integral scale, eps the dissipation rate, eta Kolmogorov's length.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+# Sreenivasan, Phys. Fluids 7, 2778 (1995); Yeung & Zhou, Phys. Rev. E 56, 1746 (1997).
+KOLMOGOROV_CONSTANT = (1.5, 1.64)
+INERTIAL = (0.03, 0.2)  # of k eta, where spectra are compared with Kolmogorov's constant
+BOTTLENECK = 0.5  # largest k eta at which the maximum of a compensated spectrum is looked for
+COMPONENTS = ("energy_x", "energy_y", "energy_z")
+
+
+def gradient_skewness(reynolds_lambda: float) -> float:
+    """Skewness of the longitudinal gradient, -0.32 Re_lambda^0.11 (Ishihara et al., J. Fluid Mech. 592, 335, 2007).
+
+    A fit at Re_lambda > 200; at 30 to 100 simulations find -0.45 to -0.55.
+    """
+    return -0.32 * reynolds_lambda**0.11
+
+
+def gradient_flatness(reynolds_lambda: float) -> float:
+    """Flatness of the longitudinal gradient, 1.14 Re_lambda^0.34 (Ishihara et al. 2007, a fit at Re_lambda > 200)."""
+    return 1.14 * reynolds_lambda**0.34
+
+
+def dissipation_constant(reynolds_lambda: float) -> float:
+    """C_eps = eps L / u'^3 = A (1 + sqrt(1 + (B / Re_lambda)^2)), A = 0.2, B = 92.
+
+    Donzis, Sreenivasan & Yeung, J. Fluid Mech. 532, 199 (2005), a fit to forced turbulence; 0.4 at high Re_lambda.
+    """
+    return float(0.2 * (1 + np.sqrt(1 + (92 / reynolds_lambda) ** 2)))
+
+
+def acceleration_constant(reynolds_lambda: float) -> float:
+    """a_0 = <a^2> nu^(1/2) / eps^(3/2) of a component of the acceleration, 5 / (1 + 110 / Re_lambda).
+
+    Sawford et al., Phys. Fluids 15, 3478 (2003), of an unfiltered flow.
+    """
+    return 5 / (1 + 110 / reynolds_lambda)
+
+
+def modes_per_shell(largest: int) -> np.ndarray:
+    """Number of wavevectors with integer components whose length rounds to 0, 1, ... largest: (largest + 1,)."""
+    k = np.arange(largest + 1)
+    twins = np.where(k == 0, 1, 2)  # k and -k
+    squared, weights = np.add.outer(k**2, k**2), np.multiply.outer(twins, twins).ravel()
+    modes = np.zeros(largest + 1)
+    for kz, twin in zip(k, twins):
+        shell = np.rint(np.sqrt(squared + kz**2)).astype(int).ravel()
+        modes += twin * np.bincount(shell, weights)[:largest + 1]
+    return modes
+
+
+@dataclass(frozen=True)
+class Row:
+    """A quantity of this flow, its standard deviation in time (None: it is no average), the literature's value."""
+
+    key: str
+    label: str
+    value: float
+    deviation: float | None = None
+    literature: float | str | None = None
+    source: str = ""
+
+
+class StationarySpan:
+    """The samples of a flow between two times, over which its stationary state is averaged.
+
+    Args:
+        statistics: columns (samples,) of a ground truth's table.
+        spectra: E(k) at every sample, (samples, shells), k = 0, 1, ...
+        viscosity: kinematic viscosity.
+        start, end: first and last time.
+        forced_below: modes with 0 < |k| < this are forced; 0 if none is.
+
+    Raises ValueError if the span holds fewer than three samples.
+    """
+
+    def __init__(self, statistics: Mapping[str, np.ndarray], spectra: np.ndarray, viscosity: float, start: float,
+                 end: float, forced_below: float) -> None:
+        time, tolerance = statistics["time"], 1e-9 * max(1.0, abs(end))
+        inside = (time >= start - tolerance) & (time <= end + tolerance)
+        if inside.sum() < 3:
+            raise ValueError(f"only {inside.sum()} samples from t = {start:g} to {end:g}: nothing to average")
+        self.columns = {name: values[inside] for name, values in statistics.items()}
+        self.viscosity, self.forced_below = viscosity, forced_below
+        interval = np.diff(self.columns["time"])
+        # Trapezoidal rule: samples are a number of steps apart, not a time.
+        self._weights = (np.append(interval, 0) + np.append(0, interval)) / (2 * interval.sum())
+        self.spectra = spectra[inside]
+        self.spectrum = self._weights @ self.spectra
+
+    @property
+    def duration(self) -> float:
+        """Time from the first to the last sample."""
+        return float(self.columns["time"][-1] - self.columns["time"][0])
+
+    @property
+    def turnovers(self) -> float:
+        """Number of large-eddy turnovers."""
+        return float(self.columns["turnovers"][-1] - self.columns["turnovers"][0])
+
+    @property
+    def steps_per_turnover(self) -> float:
+        """Time steps to a turnover."""
+        return float(np.sum(np.diff(self.columns["time"]) / self.columns["time_step"][1:]) / self.turnovers)
+
+    def mean(self, name: str) -> float:
+        """Time average of a column."""
+        return self.average(self.columns[name])[0]
+
+    def average(self, values: np.ndarray) -> tuple[float, float]:
+        """Time average and standard deviation of values (samples,)."""
+        mean = float(self._weights @ values)
+        return mean, float(np.sqrt(self._weights @ (values - mean) ** 2))
+
+    @property
+    def energy_trend(self) -> float:
+        """Slope of a straight line through the energy, relative to its mean, per turnover."""
+        time = self.columns["time"] - self.columns["time"].mean()
+        slope = np.sum(time * self.columns["energy"]) / np.sum(time**2)
+        return float(slope * self.duration / self.turnovers / self.mean("energy"))
+
+    @property
+    def energy_imbalance(self) -> float:
+        """(mean injection - mean dissipation - growth of the energy per time) / mean dissipation."""
+        energy, dissipation = self.columns["total_energy"], self.mean("dissipation_rate")
+        growth = (energy[-1] - energy[0]) / self.duration
+        return float((self.mean("injection_rate") - dissipation - growth) / dissipation)
+
+    @property
+    def kolmogorov_length(self) -> float:
+        """eta of the mean dissipation rate."""
+        return float((self.viscosity**3 / self.mean("dissipation_rate")) ** 0.25)
+
+    def compensated_spectrum(self) -> tuple[np.ndarray, np.ndarray]:
+        """k eta and eps^(-2/3) k^(5/3) E(k) of the mean spectrum, for k = 1 to the last complete shell.
+
+        The lattice of modes fills its shells unevenly (k = 1: 18 modes on 4 pi k^2 = 12.6): E(k) is the mean energy of
+        a shell's modes times 4 pi k^2.
+        """
+        cutoff = int(np.rint(self.columns["kmax_eta"][-1] / self.columns["kolmogorov_length"][-1]))
+        k = np.arange(1, cutoff + 1)
+        energy = self.spectrum[k] * 4 * np.pi * k**2 / modes_per_shell(cutoff)[k]
+        return k * self.kolmogorov_length, self.mean("dissipation_rate") ** (-2 / 3) * k ** (5 / 3) * energy
+
+    def unforced(self) -> tuple[np.ndarray, np.ndarray]:
+        """The `compensated_spectrum` of the shells without a forced mode."""
+        k_eta, compensated = self.compensated_spectrum()
+        free = np.arange(1, len(k_eta) + 1) >= self.forced_below + 0.5
+        return k_eta[free], compensated[free]
+
+    def enstrophy_skewness(self) -> np.ndarray:
+        """Skewness of the longitudinal gradient that isotropy asks for at each sample, (samples,).
+
+        -S (35/2) (W/15)^(3/2) = nu <|grad w|^2> + 1/2 dW/dt, where W = <w.w> = eps/nu is the enstrophy and
+        <|grad w|^2> = 2 sum k^4 E(k) (Batchelor & Townsend, Proc. R. Soc. A 190, 534, 1947). The enstrophy that the
+        forcing brings is neglected: 1 % at Re_lambda = 85, 8 % at 25.
+        """
+        enstrophy = self.columns["dissipation_rate"] / self.viscosity
+        destroyed = 2 * self.viscosity * self.spectra @ np.arange(self.spectra.shape[1]) ** 4.0
+        growth = np.gradient(enstrophy, self.columns["time"]) / 2
+        return -(destroyed + growth) / (17.5 * (enstrophy / 15) ** 1.5)
+
+    def component_shares(self) -> np.ndarray:
+        """Energy of the three components over their mean, (3, samples)."""
+        energies = np.array([self.columns[name] for name in COMPONENTS])
+        return energies / energies.mean(axis=0)
+
+
+def comparison(span: StationarySpan) -> list[Row]:
+    """What is known of isotropic turbulence, as it is in this flow and as it should be at its Re_lambda."""
+    def averaged(key: str, label: str, values: np.ndarray, *literature) -> Row:
+        return Row(key, label, *span.average(values), *literature)
+
+    c = span.columns
+    reynolds = span.mean("reynolds_lambda")
+    dissipation = c["dissipation_rate"] * c["integral_scale"] / c["velocity_rms"] ** 3
+    gradients = "Ishihara et al. 2007, fit at Re_λ > 200"
+    rows = [
+        Row("turnovers", "large-eddy turnovers averaged over", span.turnovers),
+        averaged("reynolds_lambda", "Re_λ", c["reynolds_lambda"]),
+        averaged("kmax_eta", "k_max η", c["kmax_eta"], "1 or more", "Eswaran & Pope 1988"),
+        averaged("skewness", "skewness of the longitudinal gradient", c["skewness"],
+                 gradient_skewness(reynolds), gradients),
+        averaged("enstrophy_skewness", "the same from the production of enstrophy, were the flow isotropic",
+                 span.enstrophy_skewness(), gradient_skewness(reynolds), gradients),
+        averaged("flatness", "flatness of the longitudinal gradient", c["flatness"],
+                 gradient_flatness(reynolds), gradients),
+        averaged("dissipation_constant", "C_ε = ε L / u′³", dissipation, dissipation_constant(reynolds),
+                 "Donzis et al. 2005, fit to forced flows"),
+        *_spectrum_rows(span),
+        *(averaged(f"share_{name[-1]}", f"energy of u_{name[-1]} over the mean of the components", values, 1.0,
+                   "isotropy") for name, values in zip(COMPONENTS, span.component_shares())),
+        Row("energy_trend", "trend of the energy, per turnover", span.energy_trend, None, 0.0, "stationarity"),
+        Row("energy_imbalance", "(injection − dissipation − dE/dt) / dissipation", span.energy_imbalance, None, 0.0,
+            "energy budget"),
+        Row("time_step", "time step", span.mean("time_step")),
+        Row("steps_per_turnover", "time steps per turnover", span.steps_per_turnover),
+    ]
+    return rows + (_compressibility_rows(span) if "mach_turbulent" in c else [])
+
+
+def _spectrum_rows(span: StationarySpan) -> list[Row]:
+    """Mean and maximum of the compensated spectrum, where the flow has shells for them."""
+    k_eta, compensated = span.unforced()
+    inertial = compensated[(k_eta >= INERTIAL[0]) & (k_eta <= INERTIAL[1])]
+    constant = "{}–{}, a bottleneck above".format(*KOLMOGOROV_CONSTANT)
+    sources = "Sreenivasan 1995, Yeung & Zhou 1997"
+    rows = []
+    if inertial.size:
+        label = "compensated spectrum, unforced shells: mean at {} ≤ kη ≤ {}".format(*INERTIAL)
+        rows.append(Row("compensated_spectrum", label, float(inertial.mean()), None, constant, sources))
+    searched = k_eta <= BOTTLENECK
+    if searched.any():
+        top = int(np.argmax(compensated[searched]))
+        rows += [Row("bottleneck", "compensated spectrum, unforced shells: maximum", float(compensated[top]), None,
+                     f"above {KOLMOGOROV_CONSTANT[1]}", sources),
+                 Row("bottleneck_k_eta", "kη of the maximum", float(k_eta[top]), None, "0.1–0.2", "Yeung & Zhou 1997")]
+    return rows
+
+
+def _compressibility_rows(span: StationarySpan) -> list[Row]:
+    """M_t and what follows from it as long as it is small.
+
+    Density follows the pressure of the incompressible flow: rho' = p / c^2, so rho_rms ~ M_t^2, and the velocity that
+    brings this density about is ~ M_t^2 u' (pseudo-sound: Ristorcelli, J. Fluid Mech. 347, 37, 1997).
+    """
+    c, squared = span.columns, span.columns["mach_turbulent"] ** 2
+    longitudinal = np.sqrt(c["compressible_fraction"])
+    return [Row(key, label, *span.average(values)) for key, label, values in (
+        ("mach_turbulent", "M_t = √⟨u·u⟩ / c", c["mach_turbulent"]),
+        ("compressible_fraction", "compressible fraction χ of the kinetic energy", c["compressible_fraction"]),
+        ("compressible_velocity_over_mach_squared", "√χ / M_t²", longitudinal / squared),
+        ("density_rms_over_mach_squared", "ρ_rms / (ρ₀ M_t²)", c["density_rms"] / squared))]

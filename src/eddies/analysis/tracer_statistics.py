@@ -1,0 +1,132 @@
+"""Statistics of the tracers of a ground truth: energy, acceleration, memory and spreading.
+
+Tracers follow the filtered flow: their accelerations and small-scale separations are those of its eddies.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from eddies.analysis.lagrangian import pair_dispersion, pairs_at, structure_function
+from eddies.analysis.pdfs import bin_edges, pdf
+
+FOLLOWED = 2**14  # tracers of which all velocities are held at once
+CENTRES = 1000  # tracers around which pairs are looked for
+PAIRS, FEWEST = 10_000, 30  # pairs of a distance: at most, at least
+SEPARATIONS, TOLERANCE = (0.5, 1.0, 2.0, 4.0), 0.1  # initial distances of pairs in mean spacings, and how exactly
+EDGES = bin_edges(12, 120)  # of the PDF of accelerations, in their standard deviations
+
+
+class Tracers(Protocol):
+    """A trajectory as stored, its frames at equal intervals."""
+
+    times: np.ndarray
+    total: int
+    length: float
+
+    def read(self, frame: int, column: str, start: int = 0, stop: int | None = None) -> np.ndarray:
+        """Rows start to stop of one column of one frame."""
+
+
+@dataclass(frozen=True)
+class Dispersion:
+    """Pairs that start `distance` apart: <|r(t) - r(0)|^2> (frames,), and <|v_1 - v_2|^2> when they start."""
+
+    distance: float
+    pairs: int
+    spread: np.ndarray
+    structure: float
+
+
+@dataclass(frozen=True)
+class TracerStatistics:
+    """What the tracers of a run do.
+
+    energy_ratio: <v.v> of the tracers over that of the filtered field at `field_times`; energy_error: its standard
+    deviation for as many points put at random; both (fields,). probability: PDF (bins,) of a component of the
+    acceleration between EDGES, in units of its rms at the time, from differences of successive frames; kurtosis: of the
+    same, Gaussian 3; acceleration_rms: of the first interval. structure: Lagrangian structure function at `lags`
+    (times).
+    """
+
+    times: np.ndarray
+    field_times: np.ndarray
+    energy_ratio: np.ndarray
+    energy_error: np.ndarray
+    probability: np.ndarray
+    kurtosis: float
+    acceleration_rms: float
+    lags: np.ndarray
+    structure: np.ndarray
+    dispersion: list[Dispersion]
+
+    @property
+    def structure_exponent(self) -> float:
+        """Power of the lag with which the structure function starts: 2 where accelerations are resolved."""
+        return first_exponent(self.lags, self.structure)
+
+    @property
+    def ballistic_exponent(self) -> float:
+        """Power of time with which pairs start to part, mean over the distances: 2 while velocities are kept."""
+        exponents = [first_exponent(self.times[1:], pairs.spread[1:]) for pairs in self.dispersion]
+        return float(np.mean(exponents)) if exponents else np.nan
+
+    @property
+    def ballistic_prefactor(self) -> float:
+        """<|r - r0|^2> / (<|v_1 - v_2|^2> t^2) at the first frame after the start, mean over the distances: 1."""
+        ratios = [pairs.spread[1] / (pairs.structure * self.times[1] ** 2) for pairs in self.dispersion]
+        return float(np.mean(ratios)) if ratios else np.nan
+
+
+def first_exponent(x: np.ndarray, y: np.ndarray) -> float:
+    """Slope of log y over log x between the first two points; not a number with fewer."""
+    return float(np.log(y[1] / y[0]) / np.log(x[1] / x[0])) if len(x) > 1 else np.nan
+
+
+def tracer_statistics(tracers: Tracers, spectra: Mapping[str, np.ndarray], spacing: float) -> TracerStatistics:
+    """Measure the tracers; `spectra` holds `time` (m,) and `filtered` (m, shells), their mean distance is `spacing`."""
+    times, every = tracers.times, -(-tracers.total // FOLLOWED)
+    velocity = np.stack([tracers.read(frame, "velocity")[::every] for frame in range(times.size)])
+    interval = (times[-1] - times[0]) / (times.size - 1)
+    lags = np.unique(np.rint(np.geomspace(1, max(times.size // 2, 1), 18)).astype(int))
+    probability, kurtosis = _accelerations(velocity)
+    return TracerStatistics(
+        times - times[0], spectra["time"], *_energy_ratio(tracers, spectra), probability, kurtosis,
+        float(np.sqrt(np.mean((velocity[1] - velocity[0]) ** 2)) / interval),
+        lags * interval, structure_function(velocity, lags), _dispersion(tracers, spacing))
+
+
+def _energy_ratio(tracers: Tracers, spectra: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    ratios, errors = [], []
+    for time, filtered in zip(spectra["time"], spectra["filtered"]):
+        frame = int(np.argmin(np.abs(tracers.times - time)))
+        squared = np.sum(tracers.read(frame, "velocity") ** 2, axis=1)
+        ratios.append(squared.mean() / (2 * filtered.sum()))
+        errors.append(squared.std() / squared.mean() / np.sqrt(squared.size))
+    return np.array(ratios), np.array(errors)
+
+
+def _accelerations(velocity: np.ndarray) -> tuple[np.ndarray, float]:
+    """PDF and kurtosis, means over the intervals, so that the decay of the flow does not widen the tails."""
+    probability, kurtosis = [], []
+    for earlier, later in zip(velocity, velocity[1:]):
+        scaled = (later - earlier) / np.sqrt(np.mean((later - earlier) ** 2))
+        probability.append(pdf(scaled, EDGES))
+        kurtosis.append(np.mean(scaled**4))
+    return np.mean(probability, axis=0), float(np.mean(kurtosis))
+
+
+def _dispersion(tracers: Tracers, spacing: float) -> list[Dispersion]:
+    start, velocity = (tracers.read(0, column) for column in ("position", "velocity"))
+    distances = [spacing * factor for factor in SEPARATIONS if spacing * factor < tracers.length / 2]
+    found = []
+    for distance, pairs in zip(distances, pairs_at(start, tracers.length, distances, TOLERANCE, CENTRES)):
+        if pairs.shape[1] >= FEWEST:
+            first, second = pairs[:, ::-(-pairs.shape[1] // PAIRS)]
+            frames = (tracers.read(frame, "position") for frame in range(tracers.times.size))
+            spread = pair_dispersion(frames, first, second, tracers.length)
+            structure = float(np.mean(np.sum((velocity[first] - velocity[second]) ** 2, axis=1)))
+            found.append(Dispersion(distance, first.size, spread, structure))
+    return found

@@ -1,0 +1,241 @@
+"""One ETDRK4 step of the compressible fluid, its parts apart, each against its bound measured in the same run.
+
+    mpirun -n 2 .venv/bin/python tests/benchmarks/step.py [CELLS ...] [--precision float32] [--share-of RANKS] [--json]
+
+Times of parts are means over the ranks, medians over the steps. A part that waits for another rank counts the wait.
+Bounds: the same transforms by FFTW alone, in cache; the bytes that a rank sends over the bandwidth around a ring of the
+ranks; for pointwise work the bytes of the arrays that go in and come out, each moved once, over the bandwidth of a
+triad a = b + c, of arrays that take up as much cache as those blocks, or for whole states of arrays beyond all caches.
+
+`--share-of` runs the share of the first of so many ranks, without the others: what they would send is zero. It tells
+the work and the memory of a rank of a grid that is far too large for this machine.
+"""
+
+import argparse
+import functools
+import json
+import resource
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable
+from statistics import median
+
+import numpy as np
+from mpi4py import MPI
+
+from eddies.flow import spectral_grid
+from eddies.flow.fourier_passes import BLOCK_BYTES, PlanePass
+from eddies.flow.initial_fields import balanced_density, random_velocity
+from eddies.flow.navier_stokes import CompressibleFluid
+from eddies.flow.spectral_grid import Collector, SpectralGrid
+from eddies.parallel.slab import SlabDecomposition
+from eddies.parallel.transpose import TransposeBuffers
+from eddies.time_stepping import ETDRK4
+
+EVALUATIONS = 4              # of the nonlinear term in a step
+BACKWARD, FORWARD = 15, 4    # transforms of an evaluation
+RING_BYTES, RING_ROUNDS = 2**23, 10
+BLOCK_ARRAYS = BACKWARD + FORWARD  # of a block of planes, that the products read and write
+TRIAD_BYTES = 2**25          # of an array that no cache holds
+# What belongs to a part: owner and name. What a call of one part makes of another counts for the other alone.
+PARTS = {
+    "plane transforms": [(PlanePass, "to_physical"), (PlanePass, "to_modes")],
+    "column transforms": [(SpectralGrid, "_columns_to_planes"), (Collector, "modes")],
+    "transposes": [(TransposeBuffers, "to_planes"), (TransposeBuffers, "to_columns")],
+    "pairs of planes": [(PlanePass, "pack"), (PlanePass, "unpack"), (spectral_grid, "_joined"), (Collector, "add")],
+    "derivatives": [(CompressibleFluid, "_with_gradients")],
+    "products": [(CompressibleFluid, "_products")],
+    "linear operators": [(CompressibleFluid, "combine")],
+}
+BLOCKWISE = ("pairs of planes", "derivatives", "products")
+
+
+class Stopwatch:
+    """Seconds, calls and bytes in and out of each part; what is in no part is "the rest"."""
+
+    def __init__(self) -> None:
+        self.open, self.last = ["the rest"], time.perf_counter()
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin anew."""
+        self.seconds, self.bytes = Counter(), Counter()
+
+    def switch(self) -> None:
+        """Book the time since the last switch on the part that is open."""
+        now = time.perf_counter()
+        self.seconds[self.open[-1]] += now - self.last
+        self.last = now
+
+    def wrap(self, owner: object, name: str, part: str) -> None:
+        """Let calls of `owner.name` count for `part`."""
+        function = getattr(owner, name)
+
+        @functools.wraps(function)
+        def measured(*arguments):
+            self.switch()
+            self.open.append(part)
+            result = function(*arguments)
+            self.switch()
+            self.open.pop()
+            self.bytes[part] += sum(array.nbytes for array in arrays_in((arguments, result)))
+            self.last = time.perf_counter()
+            return result
+
+        setattr(owner, name, measured)
+
+
+def arrays_in(items: object) -> Iterable[np.ndarray]:
+    """The arrays among arguments or results, and those that operators hold."""
+    if isinstance(items, np.ndarray):
+        yield items
+    elif isinstance(items, (tuple, list)):
+        for item in items:
+            yield from arrays_in(item)
+    elif type(items).__module__ == "eddies.flow.linear_operators":
+        yield from arrays_in(list(vars(items).values()))
+
+
+class FirstOf:
+    """Stands for the communicator of the first of `size` ranks; the others send zeros and add nothing."""
+
+    rank = 0
+
+    def __init__(self, size: int) -> None:
+        self.size, self._zeroed = size, set()
+
+    def Alltoallv(self, sent: list, received: list) -> None:
+        if id(received[0]) not in self._zeroed:
+            self._zeroed.add(id(received[0]))
+            received[0][:] = 0
+
+    def Allreduce(self, *arguments: object, op: MPI.Op) -> None:
+        pass
+
+
+def best(action: Callable[[], object], repeats: int = 7) -> float:
+    """Shortest of several times."""
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        action()
+        times.append(time.perf_counter() - start)
+    return min(times)
+
+
+def triad_bandwidth(size: int) -> float:
+    """Bytes a second that a rank reads and writes in a = b + c, arrays of `size` bytes."""
+    a, b, c = np.ones((3, size // 8))
+    rounds = max(1, 2**26 // size)
+
+    def triad() -> None:
+        for _ in range(rounds):
+            np.add(b, c, out=a)
+
+    return 3 * size * rounds / best(triad)
+
+
+def ring_bandwidth(comm: MPI.Comm) -> float:
+    """Bytes a second that a rank sends to the next while it receives as many."""
+    outgoing, incoming = np.ones(RING_BYTES, np.uint8), np.zeros(RING_BYTES, np.uint8)
+    above, below = (comm.rank + 1) % comm.size, (comm.rank - 1) % comm.size
+
+    def ring() -> None:
+        for _ in range(RING_ROUNDS):
+            comm.Sendrecv(outgoing, above, 0, incoming, below, 0)
+
+    return RING_ROUNDS * RING_BYTES / best(ring)
+
+
+def transform_bounds(grid: SpectralGrid) -> dict[str, float]:
+    """Seconds of the transforms of a step by FFTW alone."""
+    count, planes = grid.decomposition.count, 0.0
+    for direction, components in (("BACKWARD", BACKWARD), ("FORWARD", FORWARD)):
+        for pairs, blocks in Counter((b.stop - b.start + 1) // 2 for b in grid.plane_pass.blocks(count)).items():
+            _, plans, _ = grid.plane_pass._pass(direction, pairs)
+            planes += components * blocks * best(lambda: [plan.execute() for plan in plans])
+    columns = 0.0
+    for direction, batches in (("BACKWARD", (4, 4)), ("FORWARD", (FORWARD,))):
+        for components in batches:
+            rows = grid.column_pass.rows(grid.spectral_shape[1], components)
+            for size, blocks in Counter(row.stop - row.start for row in rows).items():
+                columns += blocks * best(grid.column_pass.plan(direction, components, size).execute)
+    return {"plane transforms": EVALUATIONS * planes, "column transforms": EVALUATIONS * columns}
+
+
+def sent_bytes(grid: SpectralGrid) -> int:
+    """Bytes that a rank sends in a step."""
+    return EVALUATIONS * sum(lines.nbytes for lines in (grid.buffers("backward", 8)._columns,
+                                                        grid.buffers("forward", FORWARD)._planes))
+
+
+def measure(comm: MPI.Comm, watch: Stopwatch, cells: int, precision: str, steps: int, share_of: int) -> dict:
+    """Seconds of a step and of its parts, with bounds and the largest memory of a rank so far."""
+    over = FirstOf(share_of) if share_of else comm
+    grid = SpectralGrid(SlabDecomposition(over, 2 * np.pi, cells), precision)
+    fluid = CompressibleFluid(grid, 1.2 / cells**(4 / 3), sound_speed=22.7)
+    velocity = random_velocity(grid, 1, 1.0, 3.0)
+    state = np.concatenate([velocity, balanced_density(grid, velocity, fluid.sound_speed)[None]])
+    stepper, step, totals, parts = ETDRK4(fluid), 0.8 / cells, [], []
+    state = stepper(state, step)  # the first step also plans transforms and makes tables
+    for _ in range(steps):
+        comm.Barrier()
+        watch.switch()
+        watch.reset()
+        start = time.perf_counter()
+        state = stepper(state, step)
+        watch.switch()
+        parts.append(dict(watch.seconds))
+        comm.Barrier()
+        totals.append(time.perf_counter() - start)
+    if not np.isfinite(state).all():
+        raise FloatingPointError(f"{cells}^3, {precision}: the benchmark's flow is no longer finite")
+    seconds = {part: comm.allreduce(median(step.get(part, 0.0) for step in parts)) / comm.size
+               for part in [*PARTS, "the rest"]}
+    memory = comm.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, MPI.MAX)
+    bounds = transform_bounds(grid)
+    blockwise, whole = triad_bandwidth(BLOCK_ARRAYS // 3 * BLOCK_BYTES), triad_bandwidth(TRIAD_BYTES)
+    bounds |= {part: watch.bytes[part] / blockwise for part in BLOCKWISE}
+    bounds["linear operators"] = watch.bytes["linear operators"] / whole
+    if comm.size > 1:
+        bounds["transposes"] = sent_bytes(grid) / ring_bandwidth(comm)
+    bounds = {part: comm.allreduce(bound) / comm.size for part, bound in bounds.items()}
+    return {"cells": cells, "precision": precision, "ranks": comm.size, "share_of": share_of,
+            "seconds": median(totals), "parts": seconds, "bounds": bounds, "sent_bytes": sent_bytes(grid),
+            "memory_bytes": 1024 * memory}
+
+
+def table(result: dict) -> str:
+    """A result as text."""
+    alone = f", the share of one of {result['share_of']}" if result["share_of"] else ""
+    lines = [f"{result['cells']}^3 {result['precision']}, {result['ranks']} ranks{alone}: {result['seconds']:.4f} s a "
+             f"step, at most {result['memory_bytes'] / 1e6:.0f} MB a rank so far",
+             f"    {'part':18} {'seconds':>9} {'share':>7} {'bound':>9} {'ratio':>6}"]
+    for part, seconds in result["parts"].items():
+        line = f"    {part:18} {seconds:9.4f} {seconds / result['seconds']:7.1%}"
+        bound = result["bounds"].get(part, 0.0)
+        lines.append(line + (f" {bound:9.4f} {seconds / bound:6.2f}" if bound else ""))
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("cells", nargs="*", type=int, default=[64, 128])
+    parser.add_argument("--precision", nargs="+", choices=["float64", "float32"], default=["float64", "float32"])
+    parser.add_argument("--steps", type=int, default=7)
+    parser.add_argument("--share-of", type=int, default=0, metavar="RANKS", help="run one rank's share alone")
+    parser.add_argument("--json", action="store_true", help="print a JSON object a line instead of a table")
+    options = parser.parse_args()
+    comm, watch = MPI.COMM_WORLD, Stopwatch()
+    for part, functions in PARTS.items():
+        for owner, name in functions:
+            watch.wrap(owner, name, part)
+    for cells in options.cells:
+        for precision in options.precision:
+            result = measure(comm, watch, cells, precision, options.steps, options.share_of)
+            if comm.rank == 0:
+                print(json.dumps(result) if options.json else table(result), flush=True)
+
+
+if __name__ == "__main__":
+    main()
