@@ -1,4 +1,4 @@
-"""README.md says what is true: its commands, scenes, keys, links and code are those of this checkout."""
+"""README.md and docs say what is true: their commands, scenes, keys, links and code are those of this checkout."""
 
 import dataclasses
 import re
@@ -15,14 +15,15 @@ from eddies.scene_values import Bounds, Choice, Integer, Integers, Number, quote
 
 CHECKOUT = Path(__file__).parents[1]
 README = (CHECKOUT / "README.md").read_text(encoding="utf-8")
+VALIDATION = CHECKOUT / "docs/validation.md"
 # Programs of the system that README mentions; what follows them is not looked at, but for paths.
 OF_THE_SYSTEM = ("module", "export", "source", "python3", ".venv/bin/pip")
 BATCH = ("sbatch", "qsub", "bsub", "flux")
 
 
-def blocks(language):
+def blocks(language, text=README):
     """The code blocks of a language."""
-    return re.findall(rf"^```{language}\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
+    return re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
 
 
 def marked(name):
@@ -30,7 +31,8 @@ def marked(name):
     return README.split(f"<!-- {name} -->")[1].split(f"<!-- end of {name} -->")[0].strip()
 
 
-COMMANDS = [line.strip() for block in blocks("bash") for line in block.replace("\\\n", " ").splitlines()
+BASH = blocks("bash") + blocks("bash", VALIDATION.read_text(encoding="utf-8"))
+COMMANDS = [line.strip() for block in BASH for line in block.replace("\\\n", " ").splitlines()
             if line.strip() and not line.strip().startswith("#")]
 EXAMPLE_NAME, EXAMPLE = re.fullmatch(r"# (\S+\.toml).*?\n(.*)", blocks("toml")[0], re.DOTALL).groups()
 
@@ -166,17 +168,16 @@ def slug(heading):
     return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
 
 
-def test_links_lead_somewhere():
-    anchors = {slug(heading) for heading in re.findall(r"^#+ (.+)$", README, re.MULTILINE)}
-    for link in re.findall(r"\]\(([^)\s]+)\)", README):
+@pytest.mark.parametrize("page", [CHECKOUT / "README.md", VALIDATION], ids=lambda page: page.name)
+def test_links_and_files_of_a_page_exist(page):
+    text = page.read_text(encoding="utf-8")
+    anchors = {slug(heading) for heading in re.findall(r"^#+ (.+)$", text, re.MULTILINE)}
+    for link in re.findall(r"\]\(([^)\s]+)\)", text):
         if link.startswith("#"):
             assert link[1:] in anchors, link
         elif not link.startswith("https://"):
-            assert (CHECKOUT / link).exists(), link
-
-
-def test_files_in_the_text_exist():
-    for path in re.findall(r"`((?:mpi_tools|jobs|tests|src|docs)/[\w./-]*)`", README):
+            assert (page.parent / link).exists(), link
+    for path in re.findall(r"`((?:mpi_tools|jobs|tests|src|docs)/[\w./-]*)`", text):
         assert (CHECKOUT / path).exists(), path
 
 
