@@ -1,4 +1,4 @@
-"""Run by test_faults.py under mpirun: a small `eddies dns` whose rank 1 breaks in the middle of its work.
+"""Run by test_broken_ranks.py under mpirun: a small `eddies dns` whose rank 1 breaks in the middle of its work.
 
     broken_rank.py PLACE KIND DIRECTORY
 
