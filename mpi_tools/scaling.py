@@ -1,6 +1,6 @@
 """Measure the step of the direct simulation on several numbers of ranks, and say what larger runs would take.
 
-    .venv/bin/python mpi_tools/scaling.py [--cells 64 128] [--ranks 1 2] [--scene hit-paper] [--larger 256 512 1024]
+    .venv/bin/python mpi_tools/scaling.py [--cells 64 128] [--ranks 1 2] [--scene hit-paper] [--larger 256 512 ...]
 
 The times are those of tests/benchmarks/step.py, which shows each part against its bound; speed-up and efficiency are
 against the first of RANKS. What follows is `eddies check` of the scene on other grids, on the last of RANKS: the same
@@ -48,8 +48,8 @@ def other_grid(scene: str, cells: int) -> list[str]:
     """Options of `eddies check` for a built-in scene on another grid: nu ~ n^(-4/3) keeps k_max eta."""
     settings = tomllib.loads(output_of(["-m", "eddies", "scenes", scene]))
     ratio = settings["flow"]["cells"] / cells
-    changes = {"flow.cells": cells, "flow.viscosity": settings["flow"]["viscosity"] * ratio ** (4 / 3),
-               "time.max_step": settings["time"]["max_step"] * ratio}
+    changes = {"flow.cells": cells, "flow.viscosity": settings["flow"]["viscosity"] * ratio ** (4 / 3)}
+    changes |= {f"time.{key}": settings["time"][key] * ratio for key in ("max_step", "step") if key in settings["time"]}
     return [word for key, value in changes.items() for word in ("--set", f"{key}={value:g}")]
 
 

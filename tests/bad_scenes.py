@@ -13,6 +13,7 @@ BAD_TEXTS = [
     (FLOW, "[time] duration: this key is missing; without [tracers] it is the run time"),
     (FLOW + '[initial]\nkind = "file"\n' + TIME, "[initial] path: this key is missing"),
     (FLOW + "[initial]\nkind = \"sound-wave\"\n" + TIME, "needs sound; set [flow] fluid"),
+    (FLOW + TIME + "[spin_up]\nturnovers = 2\nstationary = 1\n", "only a flow with forcing and viscosity becomes"),
     (FLOW + TIME + "[kernel]\nsteps = 3\n", "[kernel]: needs a section [tracers]"),
     (FLOW + TIME + "[simulation]\nstep = 1\nturnovers = 1\nframe_interval = 1\n",
      "[simulation]: needs a section [model]"),

@@ -66,6 +66,10 @@ def time_problems(scene: Scene) -> Iterator[str]:
     if scene.tracers is not None and duration is not None:
         yield (f"[time] duration = {duration:g}: with [tracers] the run time is [tracers] turnovers; "
                "remove one of the two")
+    if scene.spin_up and scene.spin_up.stationary and not (
+            scene.forcing and scene.forcing.injection_rate > 0 and scene.flow.viscosity > 0):
+        yield (f"[spin_up] stationary = {scene.spin_up.stationary:g}: only a flow with forcing and viscosity becomes "
+               "stationary; add [forcing] with an injection_rate above 0 and a viscosity, or remove the key")
     if scene.spin_up and scene.spin_up.stationary and scene.spin_up.stationary >= scene.spin_up.turnovers:
         yield (f"[spin_up] stationary = {scene.spin_up.stationary:g}: must be less than turnovers = "
                f"{scene.spin_up.turnovers:g}, of which they are the last")

@@ -194,7 +194,8 @@ def measure(comm: MPI.Comm, watch: Stopwatch, cells: int, precision: str, steps:
                for part in [*PARTS, "the rest"]}
     memory = comm.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, MPI.MAX)
     bounds = transform_bounds(grid)
-    blockwise, whole = triad_bandwidth(BLOCK_ARRAYS // 3 * BLOCK_BYTES), triad_bandwidth(TRIAD_BYTES)
+    block = max(BLOCK_BYTES, 2 * cells**2 * np.dtype(grid.real).itemsize)
+    blockwise, whole = triad_bandwidth(BLOCK_ARRAYS // 3 * block), triad_bandwidth(TRIAD_BYTES)
     bounds |= {part: watch.bytes[part] / blockwise for part in BLOCKWISE}
     bounds["linear operators"] = watch.bytes["linear operators"] / whole
     if comm.size > 1:

@@ -65,12 +65,14 @@ def test_each_stepper_has_the_limits_of_what_it_does_not_take_exactly(comm):
 @pytest.mark.mpi(1)
 def test_advice_names_what_was_broken_and_the_grid_if_nothing_was(comm):
     fluid, _ = compressible(comm)
-    text = advice(step_limits(fluid, RungeKutta4(fluid), 0.1, 2.0), 1.0)  # sound at 4.8
+    text = advice(fluid, step_limits(fluid, RungeKutta4(fluid), 0.1, 2.0), 1.0)  # sound at 4.8
     assert "Broken: sound" in text and "= 4.76, stable up to 2.83" in text and "courant" in text
     assert "advection" not in text and "cells" not in text
-    text = advice(step_limits(fluid, ETDRK4(fluid), 0.1, 2.0), 0.31)
+    text = advice(fluid, step_limits(fluid, ETDRK4(fluid), 0.1, 2.0), 0.31)
     assert "broke no limit (advection" in text and "k_max eta was 0.31" in text and "[flow] cells" in text
-    assert "no viscosity" in advice([], 0.0)
+    assert "sound grows that is hardly damped" in text
+    inviscid, _ = compressible(comm, nu=0.0)
+    assert "no viscosity" in advice(inviscid, [], 0.0)
 
 
 @pytest.mark.mpi(1, 2, 3)

@@ -26,7 +26,7 @@ PLACES = {
     "halo": (eddies.parallel.plane_halo.PlaneHalo, "_exchange", 4),
     "reduction": (eddies.parallel.reduction, "_reduce", 60),
     "product": (eddies.io.hdf5, "_collective", 15),  # the last preparation of a collective write: the second frame
-    "checkpoint": (eddies.io.contiguous, "_write_block", 50),  # the third checkpoint, half written
+    "checkpoint": (eddies.io.contiguous, "_write_block", 50),  # the second checkpoint, half written
 }
 
 SCENE = ["flow.cells=12", "tracers.particles_per_side=5", "tracers.field_cells=8", "spin_up.turnovers=0.01",

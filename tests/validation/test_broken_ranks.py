@@ -27,7 +27,7 @@ CASES = [("transform", "SIGKILL", 3, True), ("halo", "RuntimeError", 3, True),
 @pytest.fixture(scope="module")
 def jobs(tmp_path_factory):
     """The ended job of each case. Some run at once: most of their time is waiting for ranks to go."""
-    with ThreadPoolExecutor(4) as pool:
+    with ThreadPoolExecutor(2) as pool:
         yield {case: pool.submit(break_job, *case, tmp_path_factory.mktemp("broken")) for case in CASES}
 
 

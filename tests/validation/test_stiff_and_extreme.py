@@ -11,7 +11,7 @@ from eddies.flow.forcing import LinearForcing
 from eddies.flow.history import FlowHistory
 from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid
 from eddies.flow.spectral_grid import SpectralGrid
-from eddies.flow.stability import FlowDiverged, quadratic_energy
+from eddies.flow.stability import GROWTH, FlowDiverged, quadratic_energy
 from eddies.parallel.reduction import global_max, global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.scene import load_scene
@@ -175,7 +175,7 @@ def test_a_run_that_diverges_says_so_at_the_step_and_names_the_limit(comm, tmp_p
     states = [dns.initial_state(scene, fluid)]
     energies = [quadratic_energy(fluid, states[0])]
     with np.errstate(all="ignore"):
-        while energies[-1] <= 10 * min(energies):
+        while energies[-1] <= GROWTH * min(energies):
             states.append(march(fluid, states[-1], scene.time.step, 1, scene.time.stepper))
             energies.append(quadratic_energy(fluid, states[-1]))
     assert f"unstable at step {len(energies) - 1}, " in str(caught.value)

@@ -1,9 +1,10 @@
 """Stationary turbulence at several turbulent Mach numbers against the literature, and its scaling with M_t. A script.
 
-    python tests/validation/turbulence.py RUN RUN ... [--output runs/validation]
+    python tests/validation/turbulence.py runs/hit=0.08 RUN=M_T ... [--output runs/validation]
 
-Reads the ground_truth.h5 of runs whose scenes have [spin_up] stationary (hit, hit-mt004, hit-mt008, hit-mt016), prints
-a table of their averages beside the literature's values, and writes turbulence.json and turbulence.png.
+Reads the ground_truth.h5 of runs, each with its nominal M_t, whose scenes have [spin_up] stationary (hit, hit-mt004,
+hit-mt008, hit-mt016), prints a table of their averages beside the literature's values, and writes turbulence.json and
+turbulence.png.
 """
 
 import argparse
@@ -33,8 +34,9 @@ SCALED = {"density_rms": (r"$\rho_{rms}/\rho_0$", TRUTH, "o"), "compressible_vel
 class Run:
     """The stationary state of one run, by name."""
 
-    def __init__(self, directory: str) -> None:
-        path = Path(directory)
+    def __init__(self, given: str) -> None:
+        directory, _, mach = given.partition("=")
+        path, self.nominal = Path(directory), float(mach)
         self.name = path.resolve().name
         with open_product(MPI.COMM_SELF, path / "ground_truth.h5", "ground_truth") as file:
             self.span = read_stationary_span(file)
@@ -42,7 +44,6 @@ class Run:
             raise SystemExit(f"{path}: an incompressible fluid has no Mach number; give runs of compressible ones")
         self.rows: dict[str, Row] = {row.key: row for row in comparison(self.span)}
         self.mach = self.span.mean("mach_turbulent")
-        self.nominal = min(NOMINAL, key=lambda nominal: abs(np.log(self.mach / nominal)))
         self.density_rms = self.span.mean("density_rms")
         self.compressible_fraction = self.span.mean("compressible_fraction")
         self.compressible_velocity = np.sqrt(self.compressible_fraction)
@@ -128,7 +129,7 @@ def draw(runs: list[Run]) -> Figure:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("runs", nargs="+", metavar="RUN", help="run directory")
+    parser.add_argument("runs", nargs="+", metavar="RUN=M_T", help="run directory and its nominal M_t")
     parser.add_argument("--output", default="runs/validation", metavar="DIR")
     options = parser.parse_args()
     runs, output = [Run(directory) for directory in options.runs], Path(options.output)

@@ -16,8 +16,9 @@ from eddies.workflows import dns
 
 # Eight steps of spin-up, twelve with tracers in four frame intervals.
 SPLIT = ["flow.cells=12", "tracers.particles_per_side=5", "tracers.field_cells=8", "spin_up.turnovers=0.08",
-         "tracers.turnovers=0.15", "tracers.frame_interval=0.06", "simulation.frame_interval=0.06",
-         "tracers.field_every=2", "time.max_step=0.025", "kernel.neighbors=20", "training.batch=9"]
+         "spin_up.stationary=0.04", "tracers.turnovers=0.15", "tracers.frame_interval=0.06",
+         "simulation.frame_interval=0.06", "tracers.field_every=2", "time.max_step=0.025", "kernel.neighbors=20",
+         "training.batch=9"]
 STEPS = 20
 
 
@@ -67,11 +68,13 @@ def product(comm, path):
     """All numbers of a ground truth that another run must repeat."""
     with open_product(comm, path / "ground_truth.h5", "ground_truth") as file:
         trajectory = Trajectory(file, "tracers")
-        tables = read_table(file, "statistics") | read_table(file, "spectra") | read_attributes(file, "reference")
+        tables = {f"{table}/{name}": values for table in ("statistics", "spectra", "spectra_of_statistics")
+                  for name, values in read_table(file, table).items() if name != "seconds_per_step"}
+        tables |= read_attributes(file, "reference") | read_attributes(file, "stationary")
         tables |= {"frames": trajectory.times, "fields": file["fields/filtered/velocity"][()]}
         tables |= {name: np.stack([trajectory.read(frame, name) for frame in range(len(trajectory.times))])
                    for name in trajectory.columns}
-    return {name: values for name, values in tables.items() if name != "seconds_per_step"}
+    return tables
 
 
 @pytest.mark.mpi(1, 2)
@@ -164,7 +167,7 @@ def test_another_number_of_ranks(comm, tmp_path, last, before, after):
         groups[after].Barrier()
         last.guard.save(last.run)
         saved = [Checkpoint(path / name, {}) for path in (run / "checkpoints", tmp_path)]
-        for name in ("modes", "position", "velocity", "last_velocity", "history_time"):
+        for name in ("modes", "position", "velocity", "last_velocity", "history_time", "spectra_of_history"):
             assert np.array_equal(*(checkpoint.read(name) for checkpoint in saved)), name
         dns.run(scene, groups[after], run)
         assert last.run.clock.steps >= 30

@@ -50,9 +50,9 @@ def tracers(found: TracerStatistics, scales: Mapping[str, float]) -> Figure:
     seen = found.probability > 0
     acceleration.semilogy(centres[seen], found.probability[seen], color=TRUTH, label="tracers")
     acceleration.semilogy(centres, gaussian(centres), color=GUIDE, linestyle="--", label="Gaussian")
-    reach = np.abs(centres[seen]).max() + 1
+    reach = np.abs(centres[seen]).max(initial=5.0) + 1
     acceleration.set(title="Acceleration", xlabel=r"$a_i\,/\,a_{rms}$", ylabel="PDF", xlim=(-reach, reach),
-                     ylim=(found.probability[seen].min() / 2, 2))
+                     ylim=(found.probability[seen].min(initial=1e-3) / 2, 2))
     acceleration.legend()
     lags, squared = found.lags / units.time, found.structure[0] * (found.lags / found.lags[0]) ** 2
     memory.loglog(lags, found.structure, "o-", color=TRUTH, markersize=3.5)

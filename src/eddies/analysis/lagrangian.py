@@ -60,6 +60,7 @@ def pairs_at(position: np.ndarray, length: float, distances: Sequence[float], to
         apart = np.sqrt(np.sum(minimum_image(position - start, length) ** 2, axis=1))
         for distance, found in zip(distances, pairs):
             others = np.flatnonzero(np.abs(apart - distance) <= tolerance * distance)
+            others = others[(others >= followed) | (others > row)]  # each pair once
             found.append(np.stack([np.full(others.size, row), others]))
     return [np.concatenate(found, axis=1) for found in pairs]
 

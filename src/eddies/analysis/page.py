@@ -47,6 +47,9 @@ class Metric:
         if isinstance(self.value, float) and not math.isfinite(self.value):
             object.__setattr__(self, "value", None)
             object.__setattr__(self, "reason", self.reason or "not a finite number")
+        elif isinstance(self.value, dict):
+            object.__setattr__(self, "value", {name: None if isinstance(value, float) and not math.isfinite(value)
+                                               else value for name, value in self.value.items()})
         elif self.value is None and not self.reason:
             object.__setattr__(self, "reason", "not measured in this run")
 

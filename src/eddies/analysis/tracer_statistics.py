@@ -112,7 +112,10 @@ def _accelerations(velocity: np.ndarray) -> tuple[np.ndarray, float]:
     """PDF and kurtosis, means over the intervals, so that the decay of the flow does not widen the tails."""
     probability, kurtosis = [], []
     for earlier, later in zip(velocity, velocity[1:]):
-        scaled = (later - earlier) / np.sqrt(np.mean((later - earlier) ** 2))
+        rms = np.sqrt(np.mean((later - earlier) ** 2))
+        if rms == 0:
+            return np.zeros(EDGES.size - 1), np.nan
+        scaled = (later - earlier) / rms
         probability.append(pdf(scaled, EDGES))
         kurtosis.append(np.mean(scaled**4))
     return np.mean(probability, axis=0), float(np.mean(kurtosis))

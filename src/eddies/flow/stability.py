@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 # Where |1 + z + z^2/2 + z^3/6 + z^4/24| = 1 on the axes: the reach of a four-stage fourth-order Runge-Kutta method.
 IMAGINARY_REACH, REAL_REACH = math.sqrt(8), 2.785293563405282
 
+# From this advective number on ETDRK4 lets undamped sound grow by more than 0.1 % a step: see `step_limits`.
+LEAK = 0.5
+
 # The flow is unstable when it holds this many times the energy that there was or that came in. Generous, because for
 # strong density fluctuations the quadratic energy looked at is several times the true one, or a fraction of it.
 GROWTH = 10
@@ -37,9 +40,10 @@ class FlowDiverged(RuntimeError):
 
     @classmethod
     def unless_finite(cls, number: float, clock: Clock) -> None:
-        """Raise it unless a number measured of a flow is finite; a flow that is watched can only start otherwise."""
+        """Raise it unless a number measured of a flow is finite; a flow that is watched hardly can but at its start."""
         if not math.isfinite(number):
-            raise cls("the flow is not finite", clock, "Correct what it starts from: [initial] amplitude or path")
+            raise cls("the flow is not finite", clock, "Correct what it starts from: [initial] amplitude or path"
+                      if clock.steps == 0 else "Lower [time] courant or step, or raise [flow] cells or viscosity")
 
 
 @dataclass(frozen=True)
@@ -90,14 +94,17 @@ def step_limits(fluid: IncompressibleFluid | CompressibleFluid, stepper: Callabl
     return limits
 
 
-def advice(limits: Sequence[StepLimit], kmax_eta: float) -> str:
+def advice(fluid: IncompressibleFluid | CompressibleFluid, limits: Sequence[StepLimit], kmax_eta: float) -> str:
     """What an unstable run should change: for the limits that its step broke, or for the resolution if none."""
     broken = [limit for limit in limits if limit.exceeded]
     if broken:
         return "Broken: " + "; ".join(f"{limit}: {REMEDIES[limit.name]}" for limit in broken)
-    resolution = f"k_max eta was {kmax_eta:.2g}, about 1 is needed" if kmax_eta > 0 else "there is no viscosity"
-    return ("The step broke no limit (" + "; ".join(map(str, limits)) + f"), so the grid is likely too coarse "
+    resolution = f"k_max eta was {kmax_eta:.2g}, about 1 is needed" if fluid.viscosity > 0 else "there is no viscosity"
+    text = ("The step broke no limit (" + "; ".join(map(str, limits)) + f"), so the grid is likely too coarse "
             f"({resolution}): raise [flow] cells or viscosity")
+    if isinstance(fluid, CompressibleFluid) and len(limits) == 1 and limits[0].number > LEAK:
+        text += ". Or sound grows that is hardly damped: lower [time] courant or step"
+    return text
 
 
 def quadratic_energy(fluid: IncompressibleFluid | CompressibleFluid, state: np.ndarray) -> float:
@@ -144,4 +151,12 @@ class StabilityWatch:
     def _advice(self, before: np.ndarray, step: float) -> str:
         speed = float(global_max(self.fluid.grid.decomposition.comm, advective_speed(self.fluid.grid, before[:3])))
         kmax_eta = self.history.rows[-1]["kmax_eta"] if self.history.rows else 0.0
-        return advice(step_limits(self.fluid, self.stepper, step, speed), kmax_eta)
+        return advice(self.fluid, step_limits(self.fluid, self.stepper, step, speed), kmax_eta)
+
+    def memory(self) -> dict[str, float | None]:
+        """The most energy that there may be, for a checkpoint; None before the first step."""
+        return {"ceiling": self._ceiling if math.isfinite(self._ceiling) else None}
+
+    def restore(self, memory: dict[str, float | None]) -> None:
+        """Go on with a `memory`."""
+        self._ceiling = math.inf if memory["ceiling"] is None else memory["ceiling"]

@@ -131,9 +131,9 @@ def pair_bytes(scene: Scene, ranks: int) -> float:
 def probe(scene: Scene, comm, steps: int = 3) -> Speed:
     """The speed of the ranks at hand, from a few steps of the scene's fluid; all ranks call it.
 
-    A grid beyond PROBE_CELLS is not set up, a smaller one takes its place.
+    The grid has no more cells a rank than PROBE_CELLS^3.
     """
-    small = small_flow(scene)
+    small = small_flow(scene, comm.size)
     fluid = build_fluid(small, comm)
     grid, stepper, state = fluid.grid, STEPPERS[scene.time.stepper](fluid), initial_state(small, fluid)
     step = build_step_limit(small, grid)(state, Clock(end=small.time.duration))
@@ -145,9 +145,11 @@ def probe(scene: Scene, comm, steps: int = 3) -> Speed:
     comm.Barrier()
     seconds, bandwidth = (time.perf_counter() - start) / steps, RANK_BANDWIDTH
     if comm.size > 1:
-        exchange = EVALUATIONS * min(exchange_once(grid, small, comm) for _ in range(EVALUATIONS * steps))
-        bandwidth = EVALUATIONS * sent_bytes(small) * (comm.size - 1) / comm.size**2 / exchange
-        seconds -= exchange
+        exchange = min(exchange_once(grid, small, comm) for _ in range(EVALUATIONS * steps))
+        # Ranks of a node may pass messages faster than LATENCY.
+        moving = max(exchange - 2 * (comm.size - 1) * LATENCY, exchange / 2)
+        bandwidth = sent_bytes(small) * (comm.size - 1) / comm.size**2 / moving
+        seconds -= EVALUATIONS * exchange
     cells = small.flow.cells
     return Speed(seconds / (cells**2 * busiest_planes(cells, comm.size) * work_growth(cells)), bandwidth)
 
@@ -163,9 +165,9 @@ def exchange_once(grid: SpectralGrid, scene: Scene, comm) -> float:
     return time.perf_counter() - start
 
 
-def small_flow(scene: Scene) -> Scene:
-    """The flow of a scene on at most PROBE_CELLS cells along a side: random turbulence, forced where the scene is."""
-    cells = min(scene.flow.cells, PROBE_CELLS)
+def small_flow(scene: Scene, ranks: int) -> Scene:
+    """The flow of a scene with at most PROBE_CELLS^3 cells a rank: random turbulence, forced where the scene is."""
+    cells = min(scene.flow.cells, 16 * int(PROBE_CELLS / 16 * ranks ** (1 / 3) + 1e-9))
     turbulence, forcing = expected_turbulence(scene), scene.forcing
     initial = Initial(amplitude=turbulence.velocity_rms if turbulence else 1.0, peak_wavenumber=min(3.0, cells / 3))
     if forcing:

@@ -48,8 +48,8 @@ class FlowRun:
             step = (step_limit or self.step_limit)(self.state, self.clock)
             with np.errstate(over="ignore", invalid="ignore"):  # the watch says it better
                 state = self.stepper(self.state, step)
-            self.clock.tick(step)
-            self.watch(self.state, state, step, self.clock)
+                self.clock.tick(step)
+                self.watch(self.state, state, step, self.clock)
             self.state = state
             for observer in observers:
                 observer(self.state, self.clock)
@@ -61,6 +61,7 @@ class FlowRun:
         self.state = saved.read("modes", starts[rank], starts[rank + 1], axis=2)
         self.clock.restore(known["clock"])
         self.step_limit.restore(known["step_limit"])
+        self.watch.restore(known["watch"])
         columns = {name: saved.read(f"history_{name}") for name in known["history_columns"]}
         self.history.restore(columns, saved.read("spectra_of_history"), known["history"])
 
@@ -71,8 +72,8 @@ class FlowRun:
         arrays = {"modes": Block(self.state, int(grid.column_starts[grid.decomposition.rank]), grid.modes, axis=2),
                   "spectra_of_history": np.array(self.history.spectra),
                   **{f"history_{name}": values for name, values in columns.items()}}
-        return {"clock": self.clock.state(), "step_limit": self.step_limit.memory(), "history": self.history.memory(),
-                "history_columns": list(columns)}, arrays
+        return {"clock": self.clock.state(), "step_limit": self.step_limit.memory(), "watch": self.watch.memory(),
+                "history": self.history.memory(), "history_columns": list(columns)}, arrays
 
 
 class Guard:

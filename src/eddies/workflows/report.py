@@ -93,12 +93,19 @@ def read_stationary_span(file) -> StationarySpan:
 def _read_ground_truth(file, record: Run) -> list[Section]:
     reference, statistics = read_attributes(file, "reference"), read_table(file, "statistics")
     sections = [_read_flow(file, record, reference, statistics)]
-    if "stationary" in file and reference["viscosity"] > 0:  # without friction forced flow is never stationary
-        sections.append(figures_turbulence.section(statistics, read_stationary_span(file)))
+    if "stationary" in file:
+        sections.append(_read_stationary(file, statistics))
     if "particles/tracers" in file:
         found = tracer_statistics(Trajectory(file, "tracers"), record.eulerian, reference["spacing"])
         sections.append(figures_tracers.section(found, reference))
     return sections
+
+
+def _read_stationary(file, statistics: dict[str, np.ndarray]) -> Section:
+    try:
+        return figures_turbulence.section(statistics, read_stationary_span(file))
+    except ProductError as error:
+        return Section("stationary", "Stationary turbulence", notices=[str(error)])
 
 
 def _read_flow(file, record: Run, reference: dict[str, Any], statistics: dict[str, np.ndarray]) -> Section:
