@@ -1,4 +1,4 @@
-"""The Taylor-Green vortex at Re = 1600 against a published simulation on 512^3 cells. A script, some minutes long.
+"""The Taylor-Green vortex at Re = 1600 against 512^3 points (van Rees et al. 2011). A script, some minutes long.
 
     mpirun -n 2 .venv/bin/python -m mpi4py tests/validation/taylor_green.py [--cells 64 128] [--output runs/validation]
 

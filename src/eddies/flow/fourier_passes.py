@@ -106,10 +106,10 @@ class PlanePass:
 
     def to_modes(self, real: np.ndarray) -> np.ndarray:
         """Packed modes (c, pairs, ky, kx), not normalised, of real planes (c, planes, y, x)."""
-        modes, (components, planes) = 2 * self.cutoff + 1, real.shape[:2]
+        width, (components, planes) = 2 * self.cutoff + 1, real.shape[:2]
         pairs = (planes + 1) // 2
         complex_planes, plans, rows = self._pass("FORWARD", pairs)
-        packed = np.empty((components, pairs, modes, modes), self.dtype)
+        packed = np.empty((components, pairs, width, width), self.dtype)
         for values, modes in zip(real, packed):
             complex_planes.real = values[:pairs]
             complex_planes[: planes - pairs].imag = values[pairs:]

@@ -13,6 +13,7 @@ memory, what leaves it shares the node's network.
 import math
 import time
 from dataclasses import dataclass, replace
+from statistics import median
 
 import numpy as np
 
@@ -29,7 +30,7 @@ EVALUATIONS = 4              # of the nonlinear term in a step, of either steppe
 SENT_COMPONENTS = {"compressible": (8, 4), "incompressible": (5, 3)}  # to planes, and back to columns
 # Work of a cell over that at 64^3. It outgrows the transforms' log n because planes and their blocks outgrow the
 # caches. From tests/benchmarks/step.py, from 256^3 on for the slab of one of many ranks (--share-of).
-WORK_GROWTH = {64: 1.0, 128: 1.05, 256: 1.3, 512: 1.7, 1024: 3.0, 2048: 4.0}
+WORK_GROWTH = {64: 1.0, 128: 1.0, 256: 1.35, 512: 1.7, 1024: 2.75, 2048: 4.8}
 # Memory of a rank, from runs at 64^3 to 128^3 on 1 and 2 ranks, and from thin slabs of 1024^3: of a cell in float64; of
 # the block of planes that is worked on, in real arrays of a pair of planes; and what there is before any field.
 FLOW_BYTES = {"compressible": 320, "incompressible": 220}
@@ -128,7 +129,7 @@ def pair_bytes(scene: Scene, ranks: int) -> float:
     return PROCESS_BYTES + pairs / ranks * (16 + 4 * item + 3 * item * (5 + sum(scene.model.hidden) + 3))
 
 
-def probe(scene: Scene, comm, steps: int = 3) -> Speed:
+def probe(scene: Scene, comm, steps: int = 5) -> Speed:
     """The speed of the ranks at hand, from a few steps of the scene's fluid; all ranks call it.
 
     The grid has no more cells a rank than PROBE_CELLS^3.
@@ -138,12 +139,14 @@ def probe(scene: Scene, comm, steps: int = 3) -> Speed:
     grid, stepper, state = fluid.grid, STEPPERS[scene.time.stepper](fluid), initial_state(small, fluid)
     step = build_step_limit(small, grid)(state, Clock(end=small.time.duration))
     state = stepper(state, step)  # the first step also plans transforms and makes tables
-    comm.Barrier()
-    start = time.perf_counter()
+    times = []
     for _ in range(steps):
+        comm.Barrier()
+        start = time.perf_counter()
         state = stepper(state, step)
-    comm.Barrier()
-    seconds, bandwidth = (time.perf_counter() - start) / steps, RANK_BANDWIDTH
+        comm.Barrier()
+        times.append(time.perf_counter() - start)
+    seconds, bandwidth = median(times), RANK_BANDWIDTH
     if comm.size > 1:
         exchange = min(exchange_once(grid, small, comm) for _ in range(EVALUATIONS * steps))
         # Ranks of a node may pass messages faster than LATENCY.
@@ -167,7 +170,7 @@ def exchange_once(grid: SpectralGrid, scene: Scene, comm) -> float:
 
 def small_flow(scene: Scene, ranks: int) -> Scene:
     """The flow of a scene with at most PROBE_CELLS^3 cells a rank: random turbulence, forced where the scene is."""
-    cells = min(scene.flow.cells, 16 * int(PROBE_CELLS / 16 * ranks ** (1 / 3) + 1e-9))
+    cells = min(scene.flow.cells, PROBE_CELLS * 2 ** int(math.log(ranks, 8) + 1e-9))
     turbulence, forcing = expected_turbulence(scene), scene.forcing
     initial = Initial(amplitude=turbulence.velocity_rms if turbulence else 1.0, peak_wavenumber=min(3.0, cells / 3))
     if forcing:
