@@ -179,6 +179,7 @@ def test_links_and_files_of_a_page_exist(page):
             assert (page.parent / link).exists(), link
     for path in re.findall(r"`((?:mpi_tools|jobs|tests|src|docs)/[\w./-]*)`", text):
         assert (CHECKOUT / path).exists(), path
+    assert not re.search(r"^[A-Z]+(_[A-Z]+)*$|<[A-Z]+>", text, re.MULTILINE)  # nothing left to fill in
 
 
 @pytest.mark.mpi(1)

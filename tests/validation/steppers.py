@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from mpi4py import MPI
 
-from eddies.analysis.figures import MODEL, TRUTH, letter, panels, styled
+from eddies.analysis.figures import MODEL, TRUTH, letter, number_wavenumbers, panels, styled
 from eddies.analysis.spectra import spectrum_error
 from eddies.clock import ProgressLine
 from eddies.flow import initial_fields
@@ -222,7 +222,7 @@ def cost_ratio(flow, quantity, error):
 @styled
 def draw(flows, path):
     """Errors of density and spectrum over cost, a panel for each Mach number; unstable steps along the top."""
-    figure, axes = panels(1, len(flows), (3.25, 3.2), sharey=True)
+    figure, axes = panels(1, len(flows), (3.25, 3.2), sharex=True, sharey=True)
     for flow, axis in zip(flows, axes.flat):
         for name, colour, marker in (("etdrk4", TRUTH, "o"), ("rk4", MODEL, "s")):
             runs = stable_runs(flow, name)
@@ -233,6 +233,7 @@ def draw(flows, path):
             failed = [run["seconds"] for run in flow.runs if run["stepper"] == name and run["failed_at"] is not None]
             axis.plot(failed, [0.3] * len(failed), "x", color=colour, markersize=7)
         axis.set_title(f"$M_t = {flow.mach:g}$")
+        number_wavenumbers(axis)
     axes[0, 0].set(ylabel="relative error  (× unstable)", ylim=(None, 1))
     axes[0, 1].set_xlabel("wall seconds per unit of time")
     letter(axes.flat)
