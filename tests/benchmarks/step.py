@@ -5,7 +5,7 @@
 Times of parts are means over the ranks, medians over the steps. A part that waits for another rank counts the wait.
 Bounds: the same transforms by FFTW alone, in cache; the bytes that a rank sends over the bandwidth around a ring of the
 ranks; for pointwise work the bytes of the arrays that go in and come out, each moved once, over the bandwidth of a
-triad a = b + c, of arrays that take up as much cache as those blocks, or for whole states of arrays beyond all caches.
+triad a = b + c, of arrays that take up as much cache as a call's, or for whole states of arrays beyond all caches.
 
 `--share-of` runs the share of the first of so many ranks, without the others: what they would send is zero. It tells
 the work and the memory of a rank of a grid that is far too large for this machine.
@@ -23,8 +23,7 @@ from statistics import median
 import numpy as np
 from mpi4py import MPI
 
-from eddies.flow import spectral_grid
-from eddies.flow.fourier_passes import BLOCK_BYTES, PlanePass
+from eddies.flow.fourier_passes import PlanePass
 from eddies.flow.initial_fields import balanced_density, random_velocity
 from eddies.flow.navier_stokes import CompressibleFluid
 from eddies.flow.spectral_grid import Collector, SpectralGrid
@@ -35,14 +34,13 @@ from eddies.time_stepping import ETDRK4
 EVALUATIONS = 4              # of the nonlinear term in a step
 BACKWARD, FORWARD = 15, 4    # transforms of an evaluation
 RING_BYTES, RING_ROUNDS = 2**23, 10
-BLOCK_ARRAYS = BACKWARD + FORWARD  # of a block of planes, that the products read and write
 TRIAD_BYTES = 2**25          # of an array that no cache holds
 # What belongs to a part: owner and name. What a call of one part makes of another counts for the other alone.
 PARTS = {
     "plane transforms": [(PlanePass, "to_physical"), (PlanePass, "to_modes")],
     "column transforms": [(SpectralGrid, "_columns_to_planes"), (Collector, "modes")],
     "transposes": [(TransposeBuffers, "to_planes"), (TransposeBuffers, "to_columns")],
-    "pairs of planes": [(PlanePass, "pack"), (PlanePass, "unpack"), (spectral_grid, "_joined"), (Collector, "add")],
+    "pairs of planes": [(PlanePass, "pack"), (PlanePass, "unpack")],
     "derivatives": [(CompressibleFluid, "_with_gradients")],
     "products": [(CompressibleFluid, "_products")],
     "linear operators": [(CompressibleFluid, "combine")],
@@ -59,7 +57,7 @@ class Stopwatch:
 
     def reset(self) -> None:
         """Begin anew."""
-        self.seconds, self.bytes = Counter(), Counter()
+        self.seconds, self.calls, self.bytes = Counter(), Counter(), Counter()
 
     def switch(self) -> None:
         """Book the time since the last switch on the part that is open."""
@@ -78,6 +76,7 @@ class Stopwatch:
             result = function(*arguments)
             self.switch()
             self.open.pop()
+            self.calls[part] += 1
             self.bytes[part] += sum(array.nbytes for array in arrays_in((arguments, result)))
             self.last = time.perf_counter()
             return result
@@ -194,10 +193,9 @@ def measure(comm: MPI.Comm, watch: Stopwatch, cells: int, precision: str, steps:
                for part in [*PARTS, "the rest"]}
     memory = comm.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, MPI.MAX)
     bounds = transform_bounds(grid)
-    block = max(BLOCK_BYTES, 2 * cells**2 * np.dtype(grid.real).itemsize)
-    blockwise, whole = triad_bandwidth(BLOCK_ARRAYS // 3 * block), triad_bandwidth(TRIAD_BYTES)
-    bounds |= {part: watch.bytes[part] / blockwise for part in BLOCKWISE}
-    bounds["linear operators"] = watch.bytes["linear operators"] / whole
+    bounds |= {part: watch.bytes[part] / triad_bandwidth(watch.bytes[part] // (3 * watch.calls[part]))
+               for part in BLOCKWISE}
+    bounds["linear operators"] = watch.bytes["linear operators"] / triad_bandwidth(TRIAD_BYTES)
     if comm.size > 1:
         bounds["transposes"] = sent_bytes(grid) / ring_bandwidth(comm)
     bounds = {part: comm.allreduce(bound) / comm.size for part, bound in bounds.items()}

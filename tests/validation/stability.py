@@ -10,26 +10,23 @@ stable step of turbulence. Writes stability.json and stability.png.
 import argparse
 import json
 import math
-import sys
 from pathlib import Path
 
 import numpy as np
 from mpi4py import MPI
 from PIL import Image
 
-sys.path.insert(0, str(Path(__file__).resolve().parent))
+from flows import make_grid, march, turbulence
 
-from test_stiff_and_extreme import make_grid, march, turbulence  # noqa: E402
-
-from eddies.analysis.figures import GUIDE, MODEL, SECOND, THIRD, TRUTH, letter, panels, styled  # noqa: E402
-from eddies.clock import Clock  # noqa: E402
-from eddies.flow.history import FlowHistory  # noqa: E402
-from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid, advective_speed  # noqa: E402
-from eddies.flow.stability import (  # noqa: E402
+from eddies.analysis.figures import GUIDE, MODEL, SECOND, THIRD, TRUTH, letter, panels, styled
+from eddies.clock import Clock
+from eddies.flow.history import FlowHistory
+from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid, advective_speed
+from eddies.flow.stability import (
     IMAGINARY_REACH, REAL_REACH, FlowDiverged, StabilityWatch, step_limits,
 )
-from eddies.parallel.reduction import global_max, global_sum  # noqa: E402
-from eddies.time_stepping import STEPPERS, phi  # noqa: E402
+from eddies.parallel.reduction import global_max, global_sum
+from eddies.time_stepping import STEPPERS, phi
 
 WAVE = 1e-6  # amplitude of a wave: its square, what it does to itself, stays below what is measured
 STEPS, TURBULENT_STEPS = 20, 60

@@ -7,7 +7,6 @@ Prints a table and writes it as stiff_and_extreme.json.
 
 import argparse
 import json
-import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,16 +14,14 @@ from pathlib import Path
 import numpy as np
 from mpi4py import MPI
 
-sys.path.insert(0, str(Path(__file__).resolve().parent))
-
-from test_stiff_and_extreme import (  # noqa: E402
+from test_stiff_and_extreme import (
     ODD_GRIDS, TIME_STEPS, TOO_LONG, VISCOSITIES, diverging_scene, error_of_ranks, inviscid_energy_error,
     one_wavevector_error, run_at_mach_number, shear_wave_error, single_precision_error,
 )
 
-from eddies.flow.stability import FlowDiverged  # noqa: E402
-from eddies.time_stepping import STEPPERS  # noqa: E402
-from eddies.workflows import dns  # noqa: E402
+from eddies.flow.stability import FlowDiverged
+from eddies.time_stepping import STEPPERS
+from eddies.workflows import dns
 
 
 def cases(comm) -> Iterator[tuple[str, str, str]]:

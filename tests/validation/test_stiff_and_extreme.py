@@ -2,18 +2,16 @@
 
 import numpy as np
 import pytest
+from flows import make_grid, march, turbulence
 
 from eddies.cli import is_users_mistake
 from eddies.clock import Clock
 from eddies.flow import initial_fields
 from eddies.flow.courant import CourantLimit
-from eddies.flow.forcing import LinearForcing
 from eddies.flow.history import FlowHistory
 from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid
-from eddies.flow.spectral_grid import SpectralGrid
 from eddies.flow.stability import GROWTH, FlowDiverged, quadratic_energy
 from eddies.parallel.reduction import global_max, global_sum
-from eddies.parallel.slab import SlabDecomposition
 from eddies.scene import load_scene
 from eddies.time_stepping import ETDRK4, STEPPERS
 from eddies.workflows import dns
@@ -30,26 +28,6 @@ TOO_LONG = {
     "advection": ("taylor-green", [*RANDOM, "time.step=1.3"]),
     "advection, rk4": ("taylor-green", [*RANDOM, "time.stepper=rk4", "time.step=1.3"]),
 }
-
-
-def make_grid(comm, cells, precision="float64", cutoff=None):
-    return SpectralGrid(SlabDecomposition(comm, 2 * np.pi, cells), precision, cutoff)
-
-
-def turbulence(comm, cells, nu, c, precision="float64", rate=None):
-    """A compressible fluid, of density that fits the pressure, whose velocity components have an rms of 1."""
-    grid = make_grid(comm, cells, precision)
-    velocity = initial_fields.random_velocity(grid, 3, 1.0, 2.0)
-    state = np.concatenate([velocity, initial_fields.balanced_density(grid, velocity, c)[None]])
-    forcing = None if rate is None else LinearForcing(grid, rate, 2.0)
-    return CompressibleFluid(grid, nu, c, forcing), state.astype(grid.complex)
-
-
-def march(fluid, state, step, count, stepper="etdrk4"):
-    advance = STEPPERS[stepper](fluid)
-    for _ in range(count):
-        state = advance(state, step)
-    return state
 
 
 def norm(comm, modes):
