@@ -3,9 +3,11 @@ import pytest
 from eddies.clock import Clock
 from eddies.flow.courant import CourantLimit
 from eddies.flow.initial_fields import taylor_green
+from eddies.flow.navier_stokes import CompressibleFluid, advective_speed
 from eddies.flow.spectral_grid import SpectralGrid
-from eddies.flow.stability import FlowDiverged
+from eddies.flow.stability import FlowDiverged, step_limits
 from eddies.parallel.slab import SlabDecomposition
+from eddies.time_stepping import RungeKutta4
 
 
 @pytest.mark.mpi(1, 2)
@@ -19,6 +21,17 @@ def test_memory_of_the_step_goes_on_between_two_measurements(comm):
     assert resumed(fast, clock) == limit(fast, clock) == step > fresh(fast, clock)
     clock.steps = 8
     assert resumed(fast, clock) == fresh(fast, clock)
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("sound_speed", [0.1, 100.0])
+def test_up_to_a_courant_number_of_1_3_no_limit_of_the_explicit_stepper_is_broken(comm, sound_speed):
+    # k_max dx is at most 2 pi / 3, and 1.35 times that is 2.83.
+    grid = SpectralGrid(SlabDecomposition(comm, 6.283185307179586, 32))
+    fluid, velocity = CompressibleFluid(grid, 0.0, sound_speed), taylor_green(grid, 1.0)
+    step = CourantLimit(grid, 1.3, 1.0, sound_speed).bound(velocity, Clock())
+    limits = step_limits(fluid, RungeKutta4(fluid), step, advective_speed(grid, velocity))
+    assert not any(limit.exceeded for limit in limits) and limits[1].number > 2.5
 
 
 @pytest.mark.mpi(1, 2)

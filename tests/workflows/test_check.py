@@ -59,7 +59,7 @@ def test_random_start_decays_from_its_own_scales():
 @pytest.mark.parametrize("overrides, step, limit", [
     (["time.max_step=0.001"], 0.001, "max_step"),
     ([], 0.01, "advection"),
-    (["time.stepper=rk4"], 0.02 / 8, "sound"),
+    (["time.stepper=rk4"], 0.02 / 16, "sound"),
     (["time.step=0.004"], 0.004, "fixed"),
 ])
 def test_what_limits_the_step(overrides, step, limit):

@@ -12,10 +12,10 @@ from eddies.parallel.reduction import global_max
 
 
 class CourantLimit:
-    """Steps from the ladder largest * 2^-m with  step * (max(|u| + |v| + |w|) + c) <= courant * dx.
+    """Steps from the ladder largest * 2^-m with  step * (max(|u| + |v| + |w|) + sqrt(3) c) <= courant * dx.
 
-    `sound_speed` c is counted for a stepper that treats sound explicitly only (0 otherwise). The speed is measured
-    every `every` steps.
+    `sound_speed` c is counted for a stepper that treats sound explicitly only (0 otherwise); sqrt(3) because sound that
+    runs diagonally has the largest wavenumber (`stability.step_limits`). The speed is measured every `every` steps.
     """
 
     def __init__(self, grid: SpectralGrid, courant: float, largest: float, sound_speed: float = 0.0,
@@ -41,7 +41,7 @@ class CourantLimit:
         """The longest step that the Courant number allows now; FlowDiverged if the flow is not finite."""
         speed = float(global_max(self.grid.decomposition.comm, advective_speed(self.grid, state[:3])))
         FlowDiverged.unless_finite(speed, clock)
-        speed += self.sound_speed
+        speed += np.sqrt(3) * self.sound_speed
         return self.courant * self.grid.decomposition.spacing / speed if speed > 0 else np.inf
 
 

@@ -86,7 +86,7 @@ def expected_step(scene: Scene) -> tuple[float, str] | None:
         return settings.step, "fixed by [time] step"
     if speed is None:
         return None
-    sound = scene.flow.sound_speed if settings.stepper == "rk4" and scene.flow.sound_speed else 0.0
+    sound = math.sqrt(3) * scene.flow.sound_speed if settings.stepper == "rk4" and scene.flow.sound_speed else 0.0
     bound = settings.courant * BOX_LENGTH / scene.flow.cells / (speed + sound)
     if bound >= settings.max_step:
         return settings.max_step, "limited by [time] max_step"
