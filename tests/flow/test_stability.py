@@ -115,6 +115,17 @@ def test_energy_from_nowhere_is_seen_and_that_of_the_forcing_is_not(comm):
 
 
 @pytest.mark.mpi(1)
+def test_a_watch_that_goes_on_remembers_the_energy_before(comm):
+    fluid, state = compressible(comm)
+    watch, resumed, fresh = watched(fluid), watched(fluid), watched(fluid)
+    watch(state, 2 * state, 0.01, Clock())  # four times the energy, then four times that
+    resumed.restore(watch.memory())
+    fresh(2 * state, 4 * state, 0.01, Clock())
+    with pytest.raises(FlowDiverged, match="came in"):
+        resumed(2 * state, 4 * state, 0.01, Clock())
+
+
+@pytest.mark.mpi(1)
 def test_a_start_that_is_not_finite_is_told_before_the_first_step(comm):
     fluid, state = compressible(comm)
     state[0, 0, 0, 1] = np.nan
