@@ -56,3 +56,11 @@ def test_two_frames_have_no_exponents():
     found = tracer_statistics(Drifting(frames=2), spectra(1.5), SPACING)
     assert np.isnan(found.structure_exponent) and np.isnan(found.ballistic_exponent)
     assert found.ballistic_prefactor == pytest.approx(1)
+
+
+def test_tracers_whose_velocities_stay_have_no_kurtosis():
+    steady = Drifting(acceleration=lambda random: np.zeros((TOTAL, 3)))
+    found = tracer_statistics(steady, spectra(1.5), SPACING)
+    assert found.acceleration_rms == 0 and not found.probability.any()
+    assert np.isnan(found.kurtosis) and np.isnan(found.structure_exponent)
+    assert found.ballistic_exponent == pytest.approx(2)

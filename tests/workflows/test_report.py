@@ -2,6 +2,7 @@ import json
 import math
 import re
 
+import h5py
 import pytest
 
 from eddies.io.hdf5 import ProductError
@@ -73,6 +74,17 @@ def check_stationary(shown, page):
     assert shown["skewness"]["literature"] == pytest.approx(-0.32 * (45 * mean) ** 0.11, rel=1e-3)
     assert shown["turnovers"]["this run"] == pytest.approx(2 / 1.2)
     assert "Ishihara et al. 2007" in page
+
+
+@pytest.mark.mpi(1)
+def test_a_span_too_short_to_average_is_said_and_the_rest_is_shown(comm, tmp_path):
+    write_ground_truth(comm, tmp_path, stationary=True)
+    with h5py.File(tmp_path / "ground_truth.h5", "r+") as file:
+        file["stationary"].attrs["end"] = file["stationary"].attrs["start"]
+    report.run(tmp_path, comm)
+    metrics, page = written(tmp_path)
+    assert "nothing to average; raise [spin_up] stationary" in page
+    assert "stationary" not in figures(tmp_path) and metrics["ground_truth"]["reynolds_lambda"] > 0
 
 
 @pytest.mark.mpi(1)

@@ -174,9 +174,13 @@ def _table_of_columns(metrics: Sequence[Metric]) -> str:
     head = "".join(f"<th>{_text(name)}</th>" for name in ("", *columns))
     rows = "".join(
         f"<tr><td>{_text(metric.label)}</td>"
-        + "".join(f"<td>{_text(shown(metric.value.get(name, '')))}</td>" for name in columns) + "</tr>"
+        + "".join(f"<td>{_text(_shown_in_cell(metric.value.get(name, '')))}</td>" for name in columns) + "</tr>"
         for metric in metrics)
     return f'<h3>Numbers</h3><div class="wide"><table><tr>{head}</tr>{rows}</table></div>'
+
+
+def _shown_in_cell(value: Number) -> str:
+    return "not available" if value is None else shown(value)
 
 
 def _run(run: RunRecord) -> str:

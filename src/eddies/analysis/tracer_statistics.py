@@ -81,8 +81,8 @@ class TracerStatistics:
 
 
 def first_exponent(x: np.ndarray, y: np.ndarray) -> float:
-    """Slope of log y over log x between the first two points; not a number with fewer."""
-    return float(np.log(y[1] / y[0]) / np.log(x[1] / x[0])) if len(x) > 1 else np.nan
+    """Slope of log y over log x between the first two points; not a number with fewer, or where y is 0."""
+    return float(np.log(y[1] / y[0]) / np.log(x[1] / x[0])) if len(x) > 1 and y[0] > 0 else np.nan
 
 
 def tracer_statistics(tracers: Tracers, spectra: Mapping[str, np.ndarray], spacing: float) -> TracerStatistics:

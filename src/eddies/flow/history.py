@@ -10,7 +10,8 @@ from eddies.clock import Clock
 from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid
 from eddies.flow.stability import FlowDiverged
 from eddies.flow.statistics import (
-    compressible_budget, energy_spectrum, gradient_moments, incompressible_budget, turbulence_scales,
+    component_energies, compressible_budget, energy_spectrum, gradient_moments, incompressible_budget,
+    turbulence_scales,
 )
 
 
@@ -98,8 +99,7 @@ class FlowHistory:
             row["skewness"], row["flatness"] = gradient_moments(grid, velocity)
         _, spectrum = energy_spectrum(grid, velocity)
         row["energy"] = float(spectrum.sum())
-        row |= {f"energy_{axis}": 0.5 * grid.sum_modes(np.abs(component) ** 2)
-                for axis, component in zip("xyz", velocity)}
+        row |= component_energies(grid, velocity)
         row |= turbulence_scales(spectrum, row["dissipation_rate"], fluid.viscosity, grid.cutoff)
         row["injection_rate"] = fluid.forcing.injection_rate if fluid.forcing is not None else 0.0
         if isinstance(fluid, CompressibleFluid):

@@ -18,6 +18,13 @@ def energy_spectrum(grid: SpectralGrid, velocity: np.ndarray) -> tuple[np.ndarra
     return np.arange(shells), global_sum(grid.decomposition.comm, spectrum)
 
 
+def component_energies(grid: SpectralGrid, velocity: np.ndarray) -> dict[str, float]:
+    """Energies <u_i^2>/2 of the components, which add up to <u.u>/2: energy_x, energy_y, energy_z."""
+    halves = np.array([0.5 * np.sum(grid.multiplicity * np.abs(component) ** 2, dtype=float) for component in velocity])
+    total = global_sum(grid.decomposition.comm, halves)
+    return {f"energy_{axis}": float(energy) for axis, energy in zip("xyz", total)}
+
+
 def turbulence_scales(spectrum: np.ndarray, dissipation_rate: float, viscosity: float, cutoff: int) -> dict[str, float]:
     """Scales of isotropic turbulence from E(k), the dissipation rate and the viscosity.
 
