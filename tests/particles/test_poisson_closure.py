@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -10,7 +12,9 @@ from eddies.flow.spectral_grid import SpectralGrid
 from eddies.flow.tracers import release
 from eddies.parallel.halo import HaloError
 from eddies.parallel.migration import IdOrder, migrate
+from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
+from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.poisson_closure import PoissonClosure
 from eddies.particles.smoothing_kernels import WendlandC2
@@ -31,9 +35,9 @@ def particles_in_turbulence(comm):
     return particles, values[:, 3] / SOUND_SPEED**2
 
 
-def closure_on(comm, passes):
+def closure_on(comm, passes, factors=None):
     solver = PressureSolver(SlabDecomposition(comm, LENGTH, PER_SIDE), resolved=6)
-    return PoissonClosure(solver, WendlandC2(SUPPORT), SOUND_SPEED, passes=passes, dtype=torch.float64)
+    return PoissonClosure(solver, WendlandC2(SUPPORT), SOUND_SPEED, passes=passes, dtype=torch.float64, factors=factors)
 
 
 @pytest.mark.mpi(1)
@@ -41,7 +45,7 @@ def test_each_pass_brings_the_density_closer_to_the_exact_pressure(comm):
     particles, exact = particles_in_turbulence(comm)
     errors = []
     for passes in (1, 2, 4):
-        deviation = as_numpy(closure_on(comm, passes).apply(particles).density) - 1
+        deviation = as_numpy(closure_on(comm, passes).apply(particles)[0].density) - 1
         errors.append(np.linalg.norm(deviation - exact) / np.linalg.norm(exact))
     assert errors[0] > 1.5 * errors[1] > 1.5 * errors[2] and errors[2] < 0.15
 
@@ -55,7 +59,7 @@ def test_density_is_the_same_on_any_number_of_ranks(comm):
         # The closure's slabs are those of a coarser grid.
         slab = SlabDecomposition(communicator, LENGTH, PER_SIDE)
         moved = ParticleSet.from_numpy(migrate(slab, particles.to_numpy()))
-        closed = closure_on(communicator, 2).apply(moved)
+        closed, _ = closure_on(communicator, 2).apply(moved)
         order = IdOrder(communicator, as_numpy(closed.id), PER_SIDE**3)
         return order, order.apply(as_numpy(closed.density))
 
@@ -68,7 +72,7 @@ def test_density_is_the_same_on_any_number_of_ranks(comm):
 def test_uniform_motion_has_no_pressure(comm):
     particles, _ = particles_in_turbulence(comm)
     moving = ParticleSet(particles.id, particles.position, torch.full_like(particles.velocity, 3.0), particles.density)
-    assert np.abs(as_numpy(closure_on(comm, 4).apply(moving).density) - 1).max() < 1e-7
+    assert np.abs(as_numpy(closure_on(comm, 4).apply(moving)[0].density) - 1).max() < 1e-7
 
 
 @pytest.mark.mpi(2)
@@ -80,3 +84,52 @@ def test_a_particle_beyond_the_ghost_planes_is_refused_on_all_ranks(comm):
         far[0, 2] = slab.upper + 1.5 * slab.spacing
     with pytest.raises(HaloError, match="shorten the time step"):
         closure_on(comm, 1).apply(ParticleSet(particles.id, far, particles.velocity, particles.density))
+
+
+@pytest.mark.mpi(1, 2, 3)
+def test_gradient_of_density_and_force_against_central_differences(comm):
+    """Through averages, ghosts, transforms and splines, in positions and velocities."""
+    slab = SlabDecomposition(comm, LENGTH, PER_SIDE)
+    particles = ParticleSet.from_numpy(migrate(slab, particles_in_turbulence(comm)[0].to_numpy()))
+    factors = torch.tensor([0.02, 0.03, 0.7], dtype=torch.float64, requires_grad=True)
+    dynamics = ParticleDynamics(slab, LENGTH, [], 0.0, closure_on(comm, 3, lambda: factors), fixed_ranks=True)
+    random = np.random.default_rng(comm.rank)
+    weights = [torch.from_numpy(random.standard_normal(shape)) for shape in ((len(particles),), (len(particles), 3))]
+    changes = torch.from_numpy(random.standard_normal((2, len(particles), 3)))
+
+    def share(position, velocity):
+        rates = dynamics.rates(replace(particles, position=position, velocity=velocity))
+        # Density deviates by a hundredth or so: weighted, both count.
+        return 100 * (weights[0] * rates["closure_density"]).sum() + (weights[1] * rates["velocity"]).sum()
+
+    columns = [column.clone().requires_grad_() for column in (particles.position, particles.velocity)]
+    share(*columns).backward()
+    by_factors = global_sum(comm, factors.grad.numpy())
+    for number, change in enumerate(changes):
+        step = 1e-6
+        with torch.no_grad():
+            ends = [share(*(column + sign * change * (row == number) for row, column in enumerate(columns)))
+                    for sign in (step, -step)]
+        found = global_sum(comm, float(ends[0] - ends[1]) / (2 * step))
+        expected = global_sum(comm, float((columns[number].grad * change).sum()))
+        # Particles that enter or leave a support add kinks of second order in the step.
+        assert found == pytest.approx(expected, rel=1e-5)
+    for number in range(3):
+        with torch.no_grad():
+            values = []
+            for sign in (1, -2, 1):
+                factors[number] += sign * 1e-3
+                values.append(global_sum(comm, float(share(particles.position, particles.velocity))))
+        # The force is linear in its factors.
+        assert (values[0] - values[1]) / 2e-3 == pytest.approx(by_factors[number], rel=1e-8)
+
+
+@pytest.mark.mpi(1, 2)
+def test_force_at_fixed_particles_is_that_of_the_dynamics(comm):
+    slab = SlabDecomposition(comm, LENGTH, PER_SIDE)
+    particles = ParticleSet.from_numpy(migrate(slab, particles_in_turbulence(comm)[0].to_numpy()))
+    closure = closure_on(comm, 2, lambda: torch.tensor([0.02, 0.03, 0.7], dtype=torch.float64))
+    rates = ParticleDynamics(slab, LENGTH, [], 0.0, closure, fixed_ranks=True).rates(particles)
+    closed, force = closure.apply(particles)
+    assert torch.allclose(force.at(slice(None)), rates["velocity"], rtol=0, atol=1e-12)
+    assert torch.allclose(closed.density, rates["closure_density"], rtol=0, atol=1e-14)

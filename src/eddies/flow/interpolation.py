@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from eddies.flow.spectral_grid import SpectralGrid
@@ -39,23 +41,60 @@ class SplineInterpolation:
 
     def at(self, coefficients: np.ndarray, positions: np.ndarray) -> np.ndarray:
         """Values (n, c) at positions (n, 3), x and y anywhere, z within the slab and the margin (periodically)."""
-        n, width, components = self.grid.cells, self.degree + 1, coefficients.shape[-1]
-        slab = self.grid.decomposition
-        scaled = np.asarray(positions) / slab.spacing
+        flat = coefficients.reshape(-1, coefficients.shape[-1])
+        values = np.zeros((len(positions), flat.shape[1]))
+        for rows, weight in self._stencil(positions, len(coefficients)):
+            values += weight[:, None] * flat[rows]
+        return values
+
+    def slope_along(self, coefficients: np.ndarray, positions: np.ndarray, factors: np.ndarray) -> np.ndarray:
+        """Gradient (n, 3) with respect to the positions of sum_c factors_c f_c, the factors (n, c) held fixed."""
+        flat = coefficients.reshape(-1, coefficients.shape[-1])
+        slope = np.zeros((len(positions), 3))
+        for axis in range(3):
+            for rows, weight in self._stencil(positions, len(coefficients), axis):
+                slope[:, axis] += weight * np.einsum("nc,nc->n", factors, flat[rows])
+        return slope
+
+    def spread(self, values: np.ndarray, positions: np.ndarray) -> np.ndarray:
+        """Transpose of `at` with the ghost planes' exchange: values (n, c) added to planes (c, z_local, y, x).
+
+        For all planes f and values g, the sum over ranks of at(ghosts of f).g equals that of f.spread(g).
+        """
+        n, planes = self.grid.cells, self.grid.physical_shape[0] + self._halo.below + self._halo.above
+        flat = np.zeros((values.shape[1], planes * n * n))
+        for rows, weight in self._stencil(positions, planes):
+            for component, column in zip(flat, values.T):
+                component += np.bincount(rows, weight * column, planes * n * n)
+        return np.moveaxis(self._halo.adjoint(np.moveaxis(flat.reshape(-1, planes, n, n), 0, -1)), -1, 0)
+
+    def from_coefficients(self, planes: np.ndarray) -> np.ndarray:
+        """Transpose of `coefficients` without the ghost planes: planes (c, z, y, x) to modes, (c, kz, ky, kx).
+
+        Division by the B-spline's transform is symmetric, so it is the same on the way back.
+        """
+        return self.grid.forward(planes) * self._inverse
+
+    def _stencil(self, positions: np.ndarray, planes: int,
+                 derivative: int | None = None) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """For each of the (degree + 1)^3 splines around the points: rows (n,) in the flattened padded planes, and
+        weights (n,); or the weights' derivative along one axis."""
+        n, width, spacing = self.grid.cells, self.degree + 1, self.grid.decomposition.spacing
+        scaled = np.asarray(positions) / spacing
         base = np.floor(scaled)
-        weights = _spline_weights(self.degree, scaled - base)
+        weights = [_spline_weights(self.degree, fraction) for fraction in (scaled - base).T]
+        if derivative is not None:
+            slope = _spline_slopes(self.degree, (scaled - base)[:, derivative])
+            weights[derivative] = slope / spacing
         first = base.astype(np.int64) - (self.degree - 1) // 2
         columns = [(first[:, axis, None] + np.arange(width)) % n for axis in (0, 1)]
-        rows = self._rows(first[:, 2], len(coefficients))
-        flat = coefficients.reshape(-1, components)
-        values = np.zeros((len(scaled), components))
+        lowest = self._rows(first[:, 2], planes)
         for k in range(width):
             for j in range(width):
-                line = ((rows + k) * n + columns[1][:, j]) * n
+                line = ((lowest + k) * n + columns[1][:, j]) * n
                 weight = weights[2][:, k] * weights[1][:, j]
                 for i in range(width):
-                    values += (weight * weights[0][:, i])[:, None] * flat[line + columns[0][:, i]]
-        return values
+                    yield line + columns[0][:, i], weight * weights[0][:, i]
 
     def _rows(self, first: np.ndarray, planes: int) -> np.ndarray:
         """Index in the padded planes of the first of the planes that each point needs."""
@@ -75,20 +114,23 @@ def _spline_transform(degree: int, angle: np.ndarray) -> np.ndarray:
     return (33 + 26 * np.cos(angle) + np.cos(2 * angle)) / 60
 
 
-def _spline_weights(degree: int, fraction: np.ndarray) -> list[np.ndarray]:
-    """For each of three axes the degree + 1 B-spline weights (n, degree + 1) of points at `fraction` (n, 3) of a cell.
+def _spline_weights(degree: int, fraction: np.ndarray) -> np.ndarray:
+    """The degree + 1 B-spline weights (n, degree + 1) of points at `fraction` (n,) of a cell.
 
     Built up from the constant spline by the recursion of de Boor on uniform knots.
     """
-    weights = []
-    for t in fraction.T:
-        w = np.ones((len(t), 1))
-        for order in range(1, degree + 1):
-            # The distance of the point from the left end of each of the `order` overlapping splines.
-            left = t[:, None] + np.arange(order - 1, -1, -1)
-            next_w = np.zeros((len(t), order + 1))
-            next_w[:, :-1] += w * (order - left)
-            next_w[:, 1:] += w * left
-            w = next_w / order
-        weights.append(w)
+    weights = np.ones((len(fraction), 1))
+    for order in range(1, degree + 1):
+        # The distance of the point from the left end of each of the `order` overlapping splines.
+        left = fraction[:, None] + np.arange(order - 1, -1, -1)
+        following = np.zeros((len(fraction), order + 1))
+        following[:, :-1] += weights * (order - left)
+        following[:, 1:] += weights * left
+        weights = following / order
     return weights
+
+
+def _spline_slopes(degree: int, fraction: np.ndarray) -> np.ndarray:
+    """Derivatives (n, degree + 1) of the weights with respect to `fraction`: differences of the next lower degree."""
+    lower = _spline_weights(degree - 1, fraction)
+    return np.pad(lower, ((0, 0), (1, 0))) - np.pad(lower, ((0, 0), (0, 1)))

@@ -1,11 +1,14 @@
-"""The pressure that keeps a velocity field, known on a grid, solenoidal; at the points of particles."""
+"""What a velocity field known on a grid does to the particles in it: its pressure and its forces, with adjoints."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from eddies.flow.interpolation import SplineInterpolation
-from eddies.flow.operators import pressure
+from eddies.flow.operators import (
+    divergence, gradient, gradient_stress_divergence, gradient_stress_divergence_adjoint, pressure, pressure_adjoint,
+    project,
+)
 from eddies.flow.spectral_grid import SpectralGrid
 from eddies.parallel.slab import SlabDecomposition
 
@@ -13,11 +16,16 @@ from eddies.parallel.slab import SlabDecomposition
 class PressureSolver:
     """Poisson's equation  laplacian p = -d_i d_j (u_i u_j)  for the modes |k| <= `resolved` of a grid.
 
-    Products of modes above a third of the number of cells alias; with three quarters of the Nyquist wavenumber kept,
-    as for fields known from particles, that is far below the error of the highest modes themselves.
+    Fields are given at `points` (m, 3), this rank's grid points, z slowest, and only the solenoidal part of their
+    resolved modes counts: with a divergence, which scattered particles always leave in a field made of them, the
+    pressure would depend on the mean velocity, and oscillate with it faster than particles can be stepped. Products of
+    modes above a third of the number of cells alias; for fields known from particles that is far below the error of
+    the highest modes themselves.
 
-    `points` (m, 3) are this rank's grid points, z slowest. Positions given to the other methods must lie in this
-    rank's slab, or at most `reach` outside, which is `margin` grid planes.
+    Positions (n, 3) must lie in this rank's slab, or at most `reach` outside, which is `margin` grid planes.
+
+    The adjoints take the derivatives of a scalar by what the method of that name returned, and give those by its
+    field (m, 3) and by the positions (n, 3). All methods are collective.
     """
 
     def __init__(self, decomposition: SlabDecomposition, resolved: int, margin: int = 1) -> None:
@@ -29,15 +37,68 @@ class PressureSolver:
         x, y, z = np.broadcast_arrays(*self.grid.coordinates())
         self.points = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
 
-    def modes(self, values: np.ndarray) -> np.ndarray:
-        """Resolved Fourier modes (3, kz, ky, kx) of a vector field given at `points`, (m, 3)."""
-        return self._kept * self.grid.forward(values.T.reshape(3, *self.grid.physical_shape))
+    def velocity_at(self, field: np.ndarray, positions: np.ndarray) -> np.ndarray:
+        """The resolved part of a field at positions: (n, 3)."""
+        return self._spline.at(self._spline.coefficients(self._modes(field)), positions)
 
-    def velocity_at(self, modes: np.ndarray, positions: np.ndarray) -> np.ndarray:
-        """The field of the modes at positions (n, 3): (n, 3)."""
-        return self._spline.at(self._spline.coefficients(modes), positions)
+    def velocity_adjoint(self, field: np.ndarray, positions: np.ndarray,
+                         weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Adjoint of `velocity_at`; weights (n, 3)."""
+        coefficients = self._spline.coefficients(self._modes(field))
+        by_field = self._on_points(self._spline.from_coefficients(self._spline.spread(weights, positions)))
+        return by_field, self._spline.slope_along(coefficients, positions, weights)
 
-    def pressure_at(self, modes: np.ndarray, positions: np.ndarray) -> np.ndarray:
-        """The pressure of the velocity of the modes at positions (n, 3): (n,)."""
+    def pressure_at(self, field: np.ndarray, positions: np.ndarray) -> np.ndarray:
+        """Pressure of the resolved field at positions: (n, 1)."""
+        modes = pressure(self.grid, self._modes(field))
+        return self._spline.at(self._spline.coefficients(modes[None]), positions)
+
+    def pressure_adjoint(self, field: np.ndarray, positions: np.ndarray,
+                         weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Adjoint of `pressure_at`; weights (n, 1)."""
+        modes = self._modes(field)
         coefficients = self._spline.coefficients(pressure(self.grid, modes)[None])
-        return self._spline.at(coefficients, positions)[:, 0]
+        spread = self._spline.from_coefficients(self._spline.spread(weights, positions))
+        by_field = self._on_points(pressure_adjoint(self.grid, modes, spread[0]))
+        return by_field, self._spline.slope_along(coefficients, positions, weights)
+
+    def force_at(self, field: np.ndarray, positions: np.ndarray, factors: np.ndarray) -> np.ndarray:
+        """Pressure and force at positions, (n, 4): p, then -grad p - A div(grad u grad u^T) + B laplacian u.
+
+        `factors` (2,): A, of the gradient model's stress, in length^2; and B, a viscosity. Those that are zero cost
+        nothing.
+        """
+        forces = self._pressure_and_force(self._modes(field), factors)
+        return self._spline.at(self._spline.coefficients(forces), positions)
+
+    def force_adjoint(self, field: np.ndarray, positions: np.ndarray, factors: np.ndarray,
+                      weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Adjoint of `force_at`; weights (n, 4). Third, the derivatives by the factors, this rank's share of them."""
+        grid, modes = self.grid, self._modes(field)
+        coefficients = self._spline.coefficients(self._pressure_and_force(modes, factors))
+        spread = self._spline.from_coefficients(self._spline.spread(weights, positions))
+        # A derivative is antisymmetric: its transpose is itself with the other sign.
+        by_modes = pressure_adjoint(grid, modes, spread[0] + divergence(grid, spread[1:]))
+        by_modes -= factors[0] * gradient_stress_divergence_adjoint(grid, modes, spread[1:])
+        by_modes -= factors[1] * grid.wavenumber_squared * spread[1:]
+        terms = -gradient_stress_divergence(grid, modes), -grid.wavenumber_squared * modes
+        by_factors = np.array([grid.cells**3 * np.sum(grid.multiplicity * (spread[1:].conj() * term).real)
+                               for term in terms])
+        return self._on_points(by_modes), self._spline.slope_along(coefficients, positions, weights), by_factors
+
+    def _modes(self, field: np.ndarray) -> np.ndarray:
+        return project(self.grid, self._kept * self.grid.forward(field.T.reshape(3, *self.grid.physical_shape)))
+
+    def _on_points(self, modes: np.ndarray) -> np.ndarray:
+        """The resolved solenoidal part of a vector at the grid points, (m, 3): transpose of `_modes`, up to what both
+        ways of the transform share."""
+        return self.grid.backward(project(self.grid, self._kept * modes)).reshape(3, -1).T
+
+    def _pressure_and_force(self, modes: np.ndarray, factors: np.ndarray) -> np.ndarray:
+        grid, found = self.grid, pressure(self.grid, modes)
+        force = -gradient(grid, found)
+        if factors[0] != 0:
+            force -= factors[0] * gradient_stress_divergence(grid, modes)
+        if factors[1] != 0:
+            force -= factors[1] * grid.wavenumber_squared * modes
+        return np.concatenate([found[None], force])

@@ -39,6 +39,20 @@ class PlaneHalo:
             self._exchange(highest, slab.above, padded[: self.below], slab.below)
         return padded
 
+    def adjoint(self, padded: np.ndarray) -> np.ndarray:
+        """Transpose of `forward`: ghost planes sent home and added, (below + z_local + above, ...) -> (z_local, ...)."""
+        slab, count = self.decomposition, len(padded) - self.below - self.above
+        planes = padded[self.below : self.below + count].copy()
+        lowest, highest = padded[self.below + count :], padded[: self.below]
+        if slab.size > 1:
+            received = np.empty(lowest.shape, padded.dtype), np.empty(highest.shape, padded.dtype)
+            self._exchange(lowest, slab.above, received[0], slab.below)
+            self._exchange(highest, slab.below, received[1], slab.above)
+            lowest, highest = received
+        planes[: self.above] += lowest
+        planes[count - self.below :] += highest
+        return planes
+
     def _exchange(self, sent: np.ndarray, destination: int, received: np.ndarray, source: int) -> None:
         self.decomposition.comm.Sendrecv(
             [np.ascontiguousarray(sent), MPI.BYTE], destination, recvbuf=[received, MPI.BYTE], source=source

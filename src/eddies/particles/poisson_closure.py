@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -21,17 +22,39 @@ from eddies.particles.surroundings import LocalParticles, Surroundings
 
 
 class GridSolver(Protocol):
-    """What the closure needs of a grid: its points, and fields carried between them and the particles."""
+    """What the closure needs of a grid: its points, and what it makes of a field there at the particles, both with
+    their adjoints (see `flow.pressure.PressureSolver`)."""
 
     points: np.ndarray
     decomposition: SlabDecomposition
     reach: float
 
-    def modes(self, values: np.ndarray) -> np.ndarray: ...
+    def velocity_at(self, field: np.ndarray, positions: np.ndarray) -> np.ndarray: ...
 
-    def velocity_at(self, modes: np.ndarray, positions: np.ndarray) -> np.ndarray: ...
+    def velocity_adjoint(self, field: np.ndarray, positions: np.ndarray, weights: np.ndarray) -> tuple: ...
 
-    def pressure_at(self, modes: np.ndarray, positions: np.ndarray) -> np.ndarray: ...
+    def pressure_at(self, field: np.ndarray, positions: np.ndarray) -> np.ndarray: ...
+
+    def pressure_adjoint(self, field: np.ndarray, positions: np.ndarray, weights: np.ndarray) -> tuple: ...
+
+    def force_at(self, field: np.ndarray, positions: np.ndarray, factors: np.ndarray) -> np.ndarray: ...
+
+    def force_adjoint(self, field: np.ndarray, positions: np.ndarray, factors: np.ndarray,
+                      weights: np.ndarray) -> tuple: ...
+
+
+@dataclass(frozen=True)
+class ResolvedForce:
+    """The force of a closure at fixed particles, as a function of its factors: constant (n, 3), terms (3, n, 3)."""
+
+    constant: Tensor
+    terms: Tensor
+    factors: Callable[[], Tensor]
+
+    def at(self, rows: Tensor | slice) -> Tensor:
+        """The force (k, 3) on some of the particles; differentiable in the factors."""
+        factors = self.factors().to(self.terms)
+        return self.constant[rows] + torch.tensordot(factors, self.terms[:, rows], 1)
 
 
 class PoissonClosure:
@@ -48,59 +71,86 @@ class PoissonClosure:
     sound_speed : c. `density_mean` : rho_0.
     skin : extra radius of the list of particles around grid points.
     dtype : of the pair sums.
+    factors : if given, the closure also gives a force, and this its factors (A, B, C) in the units of the flow:
+        -grad p - A div(grad u grad u^T) + B laplacian u  of the resolved velocity u,  - C (v - u)  of what it misses.
 
-    Has no gradient: it is evaluated outside of recorded operations. All ranks call it together. Raises HaloError, on
-    all ranks, where a particle lies farther outside its slab than the grid reaches.
+    Differentiable in the particles' positions and velocities and in the factors. All ranks call it together. Raises
+    HaloError, on all ranks, where a particle lies farther outside its slab than the grid reaches.
     """
 
     reads = ("velocity",)
 
     def __init__(self, solver: GridSolver, kernel: SmoothingKernel, sound_speed: float, density_mean: float = 1.0,
-                 skin: float = 0.0, passes: int = 4, dtype: torch.dtype = torch.float32) -> None:
+                 skin: float = 0.0, passes: int = 4, dtype: torch.dtype = torch.float32,
+                 factors: Callable[[], Tensor] | None = None) -> None:
         self.solver, self.kernel, self.passes, self.skin = solver, kernel, passes, skin
-        self.sound_speed, self.density_mean = sound_speed, density_mean
+        self.sound_speed, self.density_mean, self.factors = sound_speed, density_mean, factors
         self.cutoff, self.dtype = kernel.support, dtype
         self._points = torch.from_numpy(solver.points)
         self._list: NeighborList | None = None
         self._halo: HaloExchange | None = None
 
     @torch.no_grad()
-    def apply(self, particles: ParticleSet) -> ParticleSet:
-        """The particles with the density of the closure; collective."""
+    def apply(self, particles: ParticleSet) -> tuple[ParticleSet, ResolvedForce | None]:
+        """The particles with the density of the closure, and the force if there is one; collective."""
+        field = self._resolved_velocity(particles, self._local(particles))
+        if self.factors is None:
+            pressure = _PressureAt.apply(field, particles.position, self.solver)[:, 0]
+            return replace(particles, density=self._density(pressure, particles)), None
+        none, units = torch.zeros(3, dtype=torch.float64), torch.eye(3, dtype=torch.float64)
+        pressure, constant = self._pressure_and_force(particles, field, none)
+        terms = [self._pressure_and_force(particles, field, unit)[1] - constant for unit in units]
+        force = ResolvedForce(constant, torch.stack(terms), self.factors)
+        return replace(particles, density=self._density(pressure, particles)), force
+
+    def fields(self, particles: ParticleSet, local: LocalParticles) -> dict[str, Tensor]:
+        """The "density" (n,) of the owned particles, and if there is a force, the rate "velocity" (n, 3); collective."""
+        field = self._resolved_velocity(particles, local)
+        if self.factors is None:
+            pressure = _PressureAt.apply(field, particles.position, self.solver)[:, 0]
+            return {"density": self._density(pressure, particles)}
+        pressure, force = self._pressure_and_force(particles, field, self.factors())
+        return {"density": self._density(pressure, particles), "velocity": force}
+
+    def _density(self, pressure: Tensor, particles: ParticleSet) -> Tensor:
+        return (self.density_mean * (1 + pressure / self.sound_speed**2)).to(particles.density)
+
+    def _pressure_and_force(self, particles: ParticleSet, field: Tensor, factors: Tensor) -> tuple[Tensor, Tensor]:
+        found = _ForceAt.apply(field, particles.position, factors[:2], self.solver)
+        force = found[:, 1:].to(particles.velocity)
+        if factors[2] != 0:
+            resolved = _VelocityAt.apply(field, particles.position, self.solver).to(particles.velocity)
+            force = force - factors[2] * (particles.velocity - resolved)
+        return found[:, 0], force
+
+    def _local(self, particles: ParticleSet) -> LocalParticles:
+        """What this rank sees of the particles."""
         decomposition = self.solver.decomposition
         surroundings = Surroundings(decomposition, decomposition.length, 0.0, self.cutoff, self.skin)
         surroundings.update(particles)
-        return replace(particles, density=self.density(particles, surroundings.local(particles, set(self.reads))))
+        return surroundings.local(particles, set(self.reads))
 
-    @torch.no_grad()
-    def density(self, particles: ParticleSet, local: LocalParticles) -> Tensor:
-        """Density (n,) of the owned particles; collective."""
+    def _resolved_velocity(self, particles: ParticleSet, local: LocalParticles) -> Tensor:
+        """The velocity (m, 3) at the grid points whose resolved part is that of the particles, in double precision."""
         self._require_reach(particles.position)
-        modes = self._resolved_velocity(particles, local)
-        pressure = self.solver.pressure_at(modes, as_numpy(particles.position))
-        density = self.density_mean * (1 + pressure / self.sound_speed**2)
-        return torch.from_numpy(density).to(particles.density)
-
-    def _resolved_velocity(self, particles: ParticleSet, local: LocalParticles) -> np.ndarray:
         pairs = self._pairs_around_points(local)
         weight = self.kernel.value(pairs.distance)
         weight = weight / pairs.sum(weight).clamp_min(torch.finfo(weight.dtype).tiny).index_select(0, pairs.segment)
-        velocity, position = particles.velocity, as_numpy(particles.position)
-        missing, modes = local.columns["velocity"], 0
+        missing, field = local.columns["velocity"], 0
         for remaining in reversed(range(self.passes)):
             average = pairs.sum((weight * pairs.at_senders(missing.to(weight.dtype)).T).T)
-            modes = modes + self.solver.modes(as_numpy(average).astype(np.float64))
+            field = field + average.double()
             if remaining:
-                resolved = torch.from_numpy(self.solver.velocity_at(modes, position)).to(velocity)
-                owned = velocity - resolved
+                resolved = _VelocityAt.apply(field, particles.position, self.solver)
+                owned = particles.velocity - resolved.to(particles.velocity)
                 missing = torch.cat([owned, exchange_ghosts(local.halo, owned)])
-        return modes
+        return field
 
     def _require_reach(self, position: Tensor) -> None:
         slab = self.solver.decomposition
         if slab.size == 1:
             return
-        z, reach = position[:, 2], self.solver.reach
+        z, reach = position[:, 2].detach(), self.solver.reach
         if any_rank(slab.comm, bool(((z < slab.lower - reach) | (z >= slab.upper + reach)).any())):
             raise HaloError(f"a particle moves more than {reach:.3g} out of its slab before it can change rank, and "
                             "the ghost planes reach no farther: shorten the time step or the skin")
@@ -113,3 +163,58 @@ class PoissonClosure:
             self._list.build(self._points, local.position, exclude_self=False)
             self._halo = local.halo
         return self._list.pairs(self._points, local.position, dtype=self.dtype)
+
+
+class _VelocityAt(torch.autograd.Function):
+    """`GridSolver.velocity_at` of a field (m, 3) at positions (n, 3)."""
+
+    @staticmethod
+    def forward(ctx, field: Tensor, position: Tensor, solver: GridSolver) -> Tensor:
+        ctx.save_for_backward(field, position)
+        ctx.solver = solver
+        return torch.from_numpy(solver.velocity_at(as_numpy(field), as_numpy(position))).to(field.device)
+
+    @staticmethod
+    def backward(ctx, weights: Tensor) -> tuple[Tensor, Tensor, None]:
+        return *_adjoint(ctx.solver.velocity_adjoint, *ctx.saved_tensors, weights), None
+
+
+class _PressureAt(torch.autograd.Function):
+    """`GridSolver.pressure_at` of a field (m, 3) at positions (n, 3)."""
+
+    @staticmethod
+    def forward(ctx, field: Tensor, position: Tensor, solver: GridSolver) -> Tensor:
+        ctx.save_for_backward(field, position)
+        ctx.solver = solver
+        return torch.from_numpy(solver.pressure_at(as_numpy(field), as_numpy(position))).to(field.device)
+
+    @staticmethod
+    def backward(ctx, weights: Tensor) -> tuple[Tensor, Tensor, None]:
+        return *_adjoint(ctx.solver.pressure_adjoint, *ctx.saved_tensors, weights), None
+
+
+class _ForceAt(torch.autograd.Function):
+    """`GridSolver.force_at` of a field (m, 3) at positions (n, 3), with factors (2,)."""
+
+    @staticmethod
+    def forward(ctx, field: Tensor, position: Tensor, factors: Tensor, solver: GridSolver) -> Tensor:
+        ctx.save_for_backward(field, position, factors)
+        ctx.solver = solver
+        found = solver.force_at(as_numpy(field), as_numpy(position), as_numpy(factors.double()))
+        return torch.from_numpy(found).to(field.device)
+
+    @staticmethod
+    def backward(ctx, weights: Tensor) -> tuple[Tensor, Tensor, Tensor, None]:
+        field, position, factors = ctx.saved_tensors
+        by_field, by_position, by_factors = ctx.solver.force_adjoint(
+            as_numpy(field), as_numpy(position), as_numpy(factors.double()), as_numpy(weights))
+        return (*_tensors(by_field, field, by_position, position), torch.from_numpy(by_factors).to(factors), None)
+
+
+def _adjoint(apply, field: Tensor, position: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    by_field, by_position = apply(as_numpy(field), as_numpy(position), as_numpy(weights))
+    return _tensors(by_field, field, by_position, position)
+
+
+def _tensors(by_field: np.ndarray, field: Tensor, by_position: np.ndarray, position: Tensor) -> tuple[Tensor, Tensor]:
+    return torch.from_numpy(np.ascontiguousarray(by_field)).to(field), torch.from_numpy(by_position).to(position)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 from torch import Tensor
 
@@ -25,6 +25,24 @@ class PairTerm(Protocol):
         """Rates (count, ...) of "velocity" and perhaps "density"; nothing from pairs beyond the cutoff."""
 
 
+@runtime_checkable
+class MutualPairTerm(PairTerm, Protocol):
+    """A sum over neighbours whose two halves of a pair follow from one evaluation, where `mutual` is true.
+
+    What particle i gets from j is `pair_values` of the pair (i, j); what j gets from i is the same times `parity`,
+    which is 1 or -1 for each component.
+    """
+
+    mutual: bool
+    parity: Tensor
+
+    def pair_values(self, pairs: Pairs, columns: dict[str, Tensor]) -> Tensor:
+        """What is summed over neighbours, (components, m)."""
+
+    def rates(self, sums: Tensor) -> dict[str, Tensor]:
+        """Rates as of a call, from the sums (components, count)."""
+
+
 class BodyTerm(Protocol):
     """An acceleration of each particle by itself or by all together. `cutoff` = 0."""
 
@@ -41,5 +59,5 @@ class DensityClosure(Protocol):
     cutoff: float
     reads: Sequence[str]
 
-    def density(self, particles: ParticleSet, local: LocalParticles) -> Tensor:
-        """Density (n,) at the owned particles; collective."""
+    def fields(self, particles: ParticleSet, local: LocalParticles) -> dict[str, Tensor]:
+        """The "density" (n,) of the owned particles, and perhaps "velocity", a rate (n, 3) with it; collective."""
