@@ -7,10 +7,11 @@ from clouds import CUTOFF, LENGTH, SCALES, by_id, distributed, model, state
 from mpi4py import MPI
 
 from eddies.parallel.halo import HaloExchange
-from eddies.parallel.reduction import sum_flat
+from eddies.parallel.reduction import global_sum, sum_flat
 from eddies.particles import dynamics as dynamics_module
 from eddies.particles import surroundings
 from eddies.particles.body_forces import LinearForcing
+from eddies.particles.dense_network import DenseNetwork
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.particle_set import ParticleSet
@@ -20,6 +21,7 @@ MODELS = {
     "paper": dict(basis="paper", closure="paper-density", eddy_viscosity="two-sided"),
     "corrected": dict(basis="corrected", closure="learned-density", eddy_viscosity="monaghan"),
     "poisson": dict(),
+    "antisymmetric": dict(basis="paper", closure="learned-density", symmetry="antisymmetric"),
 }
 every_model = pytest.mark.parametrize("choices", MODELS.values(), ids=list(MODELS))
 
@@ -110,6 +112,47 @@ def test_particles_that_cross_slabs_go_on_as_on_one_rank(comm):
         assert slab.size == 1 or set(start.id.tolist()) != set(particles.id.tolist())
         ends.append(by_id(slab.comm, particles, particles.velocity, 150))
     assert_close(*ends, 1e-10)
+
+
+@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.parametrize("symmetry, kept", [("antisymmetric", True), ("none", False)])
+def test_opposite_forces_keep_the_total_momentum(comm, symmetry, kept):
+    """To round-off over 100 steps, with pairs across the faces of slabs and particles that change rank."""
+    position, velocity, density = state(150)
+    slab, particles = distributed(comm, position, velocity + torch.tensor([0.0, 0.0, 2.0]), density)
+    force = model(basis="paper", closure="paper-density", eddy_viscosity="monaghan", symmetry=symmetry)
+    stepper = INTEGRATORS["verlet"](ParticleDynamics(slab, LENGTH, [force], SKIN))
+    end = particles
+    with torch.no_grad():
+        for _ in range(100):
+            end = stepper.step(end, 0.005)
+    change = global_sum(comm, (end.velocity.sum(0) - particles.velocity.sum(0)).numpy())
+    speeds = float(global_sum(comm, float(particles.velocity.norm(dim=1).sum())))
+    changed = float(global_sum(comm, float(end.velocity.square().sum() - particles.velocity.square().sum())))
+    assert abs(changed) > 1
+    assert np.abs(change).max() < 1e-13 * speeds if kept else np.abs(change).max() > 1e-6 * speeds
+
+
+@pytest.mark.mpi(1)
+def test_each_pair_is_evaluated_once(comm, monkeypatch):
+    slab, particles = distributed(comm, *state())
+    evaluated = []
+
+    def noting(network, features):
+        evaluated.append(features.shape[1])
+        return plain(network, features)
+
+    plain = DenseNetwork.forward
+    monkeypatch.setattr(DenseNetwork, "forward", noting)
+    monkeypatch.setitem(dynamics_module.PAIR_VALUES_TOGETHER, "cpu", 300)
+    counts = {}
+    for symmetry in ("none", "antisymmetric"):
+        evaluated.clear()
+        with torch.no_grad():
+            ParticleDynamics(slab, LENGTH, [model(basis="paper", symmetry=symmetry)], SKIN).rates(particles)
+        assert len(evaluated) > 3
+        counts[symmetry] = sum(evaluated)
+    assert counts["none"] == 2 * counts["antisymmetric"] > 0
 
 
 @pytest.mark.mpi(1, 2)
@@ -218,9 +261,9 @@ class Closure:
 
     cutoff, reads = 1.6, ("velocity",)
 
-    def density(self, particles, local):
+    def fields(self, particles, local):
         assert set(local.columns) == {"velocity"} and len(local.columns["velocity"]) == len(local.position)
-        return 1 + SCALES.density * torch.sin(particles.position).sum(1)
+        return {"density": 1 + SCALES.density * torch.sin(particles.position).sum(1)}
 
 
 @pytest.mark.mpi(1, 2, 3)

@@ -4,7 +4,7 @@ import pytest
 import torch
 from clouds import LENGTH, state
 
-from eddies.particles.faults import Limits, find_fault
+from eddies.particles.faults import Limits, find_fault, find_unplaced
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.periodic_box import PeriodicBox
 
@@ -52,3 +52,14 @@ def test_the_nearest_particle_is_found_across_the_faces():
     velocity[0] = torch.nan
     description = fault(dataclasses.replace(particles, position=position, velocity=velocity))
     assert "nearest particle 102 at a distance of 0.3" in description
+
+
+@pytest.mark.parametrize("value, complaint", [(torch.nan, "not finite"), (-torch.inf, "not finite"),
+                                              (-7.0 * LENGTH, "farther from the box than its length")])
+def test_a_particle_that_is_nowhere_near_the_box_is_described(value, complaint):
+    particles, box = sound(), PeriodicBox(LENGTH)
+    assert find_unplaced(particles, box, rank=3) is None
+    position = particles.position.clone()
+    position[4, 2] = value
+    description = find_unplaced(dataclasses.replace(particles, position=position), box, rank=3)
+    assert description.startswith(f"rank 3, particle 104: {complaint}; position (")

@@ -103,6 +103,36 @@ def test_pairs_of_some_receivers(rows):
     assert as_set(pairs) == {pair for pair in as_set(everything) if pair[0] in number.tolist()}
 
 
+@pytest.mark.parametrize("rows", [None, slice(20, 60)], ids=["all", "slice"])
+def test_each_pair_of_receivers_once_and_every_other_sender(rows):
+    """Of 150 receivers among 200 senders."""
+    position = cloud(count=200)
+    neighbors = listed(position[:150], position, 1.0)
+    once, both = (as_set(neighbors.pairs(position[:150], position, rows, once=each)) for each in (True, False))
+    assert once == {(i, j) for i, j in both if i < j} and any(j >= 150 for _, j in once)
+
+
+@pytest.mark.parametrize("parity", [1.0, -1.0])
+def test_values_of_pairs_that_stand_once_reach_both_particles_but_no_ghost(parity):
+    position = cloud(count=80)
+    pairs = listed(position[:50], position, 1.5).pairs(position[:50], position, once=True)
+    values = torch.rand(2, len(pairs.sender), dtype=torch.float64, requires_grad=True)
+
+    def sums(values):
+        totals = torch.zeros(2, 50, dtype=torch.float64)
+        pairs.add_to_both(values, torch.tensor([1.0, parity], dtype=torch.float64), totals)
+        return totals
+
+    expected = torch.zeros(2, 50, dtype=torch.float64)
+    for k, (i, j) in enumerate(zip(pairs.receiver.tolist(), pairs.sender.tolist())):
+        expected[:, i] += values[:, k].detach()
+        if j < 50:
+            expected[0, j] += values[0, k].detach()
+            expected[1, j] += parity * values[1, k].detach()
+    assert torch.allclose(sums(values), expected)
+    assert torch.autograd.gradcheck(sums, values)
+
+
 def test_blocks_are_all_rows_once():
     position = cloud("uneven", 300)
     neighbors = listed(position, position, 0.8)

@@ -8,6 +8,7 @@ from eddies.flow.forcing import LinearForcing
 from eddies.flow.linear_operators import AcousticBlock, Decay, sum_of_acoustic_blocks, sum_of_decays
 from eddies.flow.operators import divergence, dot_wavevector, project
 from eddies.flow.spectral_grid import SpectralGrid
+from eddies.flow.subgrid import Smagorinsky
 from eddies.time_stepping import ScalarFunction, divided_difference
 
 
@@ -54,14 +55,16 @@ class CompressibleFluid:
         s_t = -div u - u.grad s
         u_t = -c^2 grad s + nu (laplacian u + 1/3 grad div u) - u.grad u + 2 nu (S - 1/3 div u).grad s + f
 
-    S is the rate of strain. Everything nonlinear is quadratic, so the 2/3 rule dealiases it exactly. The state is
-    (u, v, w, s), (4, kz, ky, kx). Fifteen transforms back (u and the gradients of u and s), four forth; of the first
-    eight are sent, because derivatives along x and y are taken after the transform along z.
+    S is the rate of strain; a large-eddy simulation adds the divergence of the `subgrid` stress. Everything else
+    nonlinear is quadratic, so the 2/3 rule dealiases it exactly. The state is (u, v, w, s), (4, kz, ky, kx). Fifteen
+    transforms back (u and the gradients of u and s), four forth; of the first eight are sent, because derivatives along
+    x and y are taken after the transform along z.
     """
 
     def __init__(self, grid: SpectralGrid, viscosity: float, sound_speed: float,
-                 forcing: LinearForcing | None = None) -> None:
-        self.grid, self.viscosity, self.sound_speed, self.forcing = grid, viscosity, sound_speed, forcing
+                 forcing: LinearForcing | None = None, subgrid: Smagorinsky | None = None) -> None:
+        self.grid, self.viscosity, self.sound_speed = grid, viscosity, sound_speed
+        self.forcing, self.subgrid = forcing, subgrid
 
     def nonlinear(self, state: np.ndarray) -> np.ndarray:
         """-u.grad u + 2 nu (S - 1/3 div u).grad s + f, and -u.grad s."""
@@ -69,6 +72,8 @@ class CompressibleFluid:
                                       z_derivatives=4)
         if self.forcing is not None:
             self.forcing.add(state[:3], tendency[:3])
+        if self.subgrid is not None:
+            self.subgrid.add(state[:3], tendency[:3])
         return tendency
 
     def _with_gradients(self, modes: np.ndarray) -> list[np.ndarray]:

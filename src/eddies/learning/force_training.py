@@ -19,6 +19,7 @@ from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.pair_forces import PairModel
 from eddies.particles.particle_set import ParticleSet
+from eddies.particles.poisson_closure import ResolvedForce
 from eddies.particles.reconstruction import reconstruct, volumes
 from eddies.particles.smoothing_kernels import SmoothingKernel
 
@@ -41,16 +42,17 @@ class TrainingFrame:
 
     `particles` carry the density that the model will see in a simulation; `acceleration` (n, 3) and `density_rate`
     (n,) are what it should answer, and `acceleration_rms` and `density_rate_rms` their rms over all ranks, of one
-    component. `total` is the number of particles of all ranks.
+    component. `force` is an acceleration that the closure gives besides the pair sum. `total`
+    is the number of particles of all ranks.
     """
 
     def __init__(self, decomposition: SlabDecomposition, model: PairModel, particles: ParticleSet,
-                 acceleration: Tensor, density_rate: Tensor) -> None:
+                 acceleration: Tensor, density_rate: Tensor, force: ResolvedForce | None = None) -> None:
         self.decomposition, self.dtype = decomposition, acceleration.dtype
         self.dynamics = ParticleDynamics(decomposition, decomposition.length, [model], skin=0.0, dtype=self.dtype)
         self.surroundings = self.dynamics.surroundings
         self.surroundings.update(particles)
-        self.particles, self.acceleration, self.density_rate = particles, acceleration, density_rate
+        self.particles, self.acceleration, self.density_rate, self.force = particles, acceleration, density_rate, force
         squares = [float(rate.double().square().sum()) for rate in (acceleration, density_rate)]
         *squares, count = global_sum(decomposition.comm, np.array([*squares, len(particles)]))
         self.total = int(count)
@@ -82,6 +84,8 @@ class TrainingFrame:
         kept = slice(None) if rows is None else rows
         rates = self.dynamics.rates(self.particles, rows)
         errors = {"velocity": rates["velocity"].to(self.acceleration) - self.acceleration[kept]}
+        if self.force is not None:
+            errors["velocity"] = errors["velocity"] + self.force.at(kept).to(self.acceleration)
         if "density" in rates:
             errors["density"] = rates["density"].to(self.density_rate) - self.density_rate[kept]
         return errors
@@ -113,10 +117,8 @@ class ForceTrainer:
         random = np.random.default_rng([self.seed, step])
         frame = self.frames[random.integers(len(self.frames))]
         rows = frame.rows(random.choice(self.total, self.batch, replace=False))
-        share = self._trajectory_share(frame, frame.errors(rows), self.batch)
-        norm = descent.step(self.weights.trajectory * share)
-        loss = shared_value(self.comm, share)
-        return {"loss": self.weights.trajectory * loss, "trajectory_loss": loss, "gradient_norm": norm}
+        errors = frame.errors(rows)
+        return self._descend(descent, {"trajectory": self._trajectory_share(frame, errors, self.batch)})
 
     def combined_step(self, descent: Descent, step: int) -> dict[str, float]:
         """One step on all losses of the particles in and around a random cube; returns the losses."""
@@ -133,6 +135,10 @@ class ForceTrainer:
             points = self._points[self._within(self._points, corner, side)]
             shares["field"] = self._field_share(number, rows, errors["velocity"], points)
         shares |= self._divergence_shares(frame, rows, errors["velocity"])
+        return self._descend(descent, shares)
+
+    def _descend(self, descent: Descent, shares: dict[str, Tensor]) -> dict[str, float]:
+        """A step down the weighted sum of the losses; returns them."""
         total = sum(getattr(self.weights, name) * share for name, share in shares.items())
         norm = descent.step(total)
         values = {name + "_loss": shared_value(self.comm, share) for name, share in shares.items()}

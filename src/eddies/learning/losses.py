@@ -39,6 +39,11 @@ class _GlobalSum(torch.autograd.Function):
         return torch.from_numpy(global_sum(ctx.comm, as_numpy(gradient))).to(gradient.device), None
 
 
+def sum_over_ranks(comm, values: Tensor) -> Tensor:
+    """Sum of a tensor over ranks, on every rank; differentiable, collective both ways."""
+    return _GlobalSum.apply(values, comm)
+
+
 def soft_histogram(comm, values: Tensor, bins: int, reach: float) -> Tensor:
     """Global histogram of `values` (any shape) over [-reach, reach], mass 1, differentiable: (bins,).
 
@@ -50,7 +55,7 @@ def soft_histogram(comm, values: Tensor, bins: int, reach: float) -> Tensor:
     fraction = position - lower
     counts = torch.zeros(bins, dtype=values.dtype, device=values.device)
     counts = counts.index_add(0, lower, 1 - fraction).index_add(0, lower + 1, fraction)
-    counts = _GlobalSum.apply(counts, comm)
+    counts = sum_over_ranks(comm, counts)
     return counts / counts.sum()
 
 

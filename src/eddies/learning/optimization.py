@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from eddies.parallel.reduction import global_sum, sum_flat
+
+MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
 class Descent:
@@ -20,14 +23,14 @@ class Descent:
     def __init__(self, comm, parameters: Iterable[nn.Parameter], steps: int, first_rate: float,
                  last_rate: float) -> None:
         self.comm, self.parameters = comm, list(parameters)
+        self.steps, self.first_rate, self.last_rate = steps, first_rate, last_rate
+        self.taken = 0
         self._adam = torch.optim.Adam(self.parameters, lr=first_rate)
-        decay = (last_rate / first_rate) ** (1 / max(steps - 1, 1))
-        self._schedule = torch.optim.lr_scheduler.ExponentialLR(self._adam, decay)
 
     @property
     def learning_rate(self) -> float:
         """Rate of the next step."""
-        return self._adam.param_groups[0]["lr"]
+        return self.first_rate * (self.last_rate / self.first_rate) ** (self.taken / max(self.steps - 1, 1))
 
     def step(self, share: Tensor) -> float:
         """One step down the gradient of the sum of all shares; returns the norm of that gradient."""
@@ -42,9 +45,26 @@ class Descent:
         for gradient, summed in zip(gradients, on_host):
             gradient.copy_(summed)
         norm = float(sum(gradient.double().square().sum() for gradient in on_host) ** 0.5)
+        for group in self._adam.param_groups:
+            group["lr"] = self.learning_rate
         self._adam.step()
-        self._schedule.step()
+        self.taken += 1
         return norm
+
+    def memory(self) -> dict[str, np.ndarray]:
+        """What `restore` needs besides the parameters: Adam's running means, by name; the same on all ranks."""
+        if self.taken == 0:
+            return {}
+        states = [self._adam.state[parameter] for parameter in self.parameters]
+        return {f"{moment}_{number}": state[moment].cpu().numpy() for number, state in enumerate(states)
+                for moment in MOMENTS}
+
+    def restore(self, taken: int, memory: Mapping[str, np.ndarray]) -> None:
+        """Go on after `taken` steps, with the parameters and the memory of then."""
+        self.taken = taken
+        for number, parameter in enumerate(self.parameters) if taken else ():
+            moments = {moment: torch.from_numpy(memory[f"{moment}_{number}"]).to(parameter) for moment in MOMENTS}
+            self._adam.state[parameter] = {"step": torch.tensor(float(taken)), **moments}
 
 
 def shared_value(comm, share: Tensor) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
 import torch
@@ -13,7 +13,7 @@ from eddies.particles.pairs import Pairs
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.periodic_box import PeriodicBox
 from eddies.particles.surroundings import LocalParticles, Surroundings
-from eddies.particles.terms import BodyTerm, DensityClosure, PairTerm
+from eddies.particles.terms import BodyTerm, DensityClosure, MutualPairTerm, PairTerm
 
 # Numbers held at once while pairs are summed without a gradient: about a core's cache, or a part of a
 # device's memory.
@@ -33,6 +33,8 @@ class ParticleDynamics:
     closure : gives the density, where it has no rate of its own; or None.
     dtype : precision of pair arithmetic; that of positions unless given. Positions stay in double precision,
         and pair displacements are converted after the nearest image is taken.
+    fixed_ranks : particles never change rank, nor rows; for a few steps of which gradients are taken. The halo
+        is as much wider as they stray from their slab.
 
     Only columns that some pair term or the closure reads travel to other ranks, no farther than the largest
     cutoff plus the skin.
@@ -46,11 +48,14 @@ class ParticleDynamics:
         skin: float,
         closure: DensityClosure | None = None,
         dtype: torch.dtype | None = None,
+        fixed_ranks: bool = False,
     ) -> None:
+        self.fixed_ranks = fixed_ranks
         self.box = PeriodicBox(box_length)
         self.pair_terms: list[PairTerm] = [term for term in terms if term.cutoff > 0]
         self.body_terms: list[BodyTerm] = [term for term in terms if term.cutoff == 0]
         self.closure, self.dtype = closure, dtype
+        self._mutual = all(isinstance(term, MutualPairTerm) and term.mutual for term in self.pair_terms)
         self._pair_reads = {name for term in self.pair_terms for name in term.reads}
         self._travelling = self._pair_reads
         if closure is not None:
@@ -79,6 +84,8 @@ class ParticleDynamics:
         Collective.
         """
         companions = companions or {}
+        if self.fixed_ranks:
+            return particles, companions
         if self.surroundings is None:
             return replace(particles, position=self.box.wrap(particles.position)), companions
         columns = vars(particles).values()
@@ -100,16 +107,20 @@ class ParticleDynamics:
         """
         kept = slice(None) if rows is None else rows
         rates: dict[str, Tensor] = {}
+        given: dict[str, Tensor] = {}
         if self.surroundings is not None:
             self.surroundings.update(particles)
             local = self.surroundings.local(particles, self._travelling)
             if self.closure is not None:
-                rates["closure_density"] = density = self.closure.density(particles, local)
+                given = self.closure.fields(particles, local)
+                rates["closure_density"] = given["density"]
                 if "density" in self._pair_reads:
-                    local.columns["density"] = self.surroundings.column(density)
+                    local.columns["density"] = self.surroundings.column(given["density"])
             if self.pair_terms:
                 rates |= self._pair_rates(local, len(particles), rows, particles.velocity.dtype)
         acceleration = rates.get("velocity", torch.zeros_like(particles.velocity[kept]))
+        if "velocity" in given:
+            acceleration = acceleration + given["velocity"][kept]
         for term in self.body_terms:
             acceleration = acceleration + term(particles.position, particles.velocity)[kept]
         return {**rates, "velocity": acceleration}
@@ -119,18 +130,26 @@ class ParticleDynamics:
     ) -> dict[str, Tensor]:
         """The sums over neighbours, converted to `dtype`."""
         receivers = local.position[:owned]
+        if rows is None and self._mutual:
+            return {name: rate.to(dtype) for name, rate in self._mutual_rates(local, receivers).items()}
         blocks = []
         for block in self._blocks(rows, receivers.device):
             pairs = self.surroundings.neighbors.pairs(receivers, local.position, block, self.dtype)
             blocks.append(self._sum_of_terms(pairs, local.columns))
         return {name: torch.cat([block[name] for block in blocks]).to(dtype) for name in blocks[0]}
 
+    def _mutual_rates(self, local: LocalParticles, receivers: Tensor) -> dict[str, Tensor]:
+        """The sums over neighbours, each pair of owned particles evaluated once; those with ghosts on both sides."""
+        dtype = self.dtype or receivers.dtype
+        totals = [receivers.new_zeros((len(term.parity), len(receivers)), dtype=dtype) for term in self.pair_terms]
+        for block in self._blocks(None, receivers.device):
+            pairs = self.surroundings.neighbors.pairs(receivers, local.position, block, dtype, once=True)
+            for term, total in zip(self.pair_terms, totals):
+                pairs.add_to_both(term.pair_values(pairs, local.columns), term.parity.to(total), total)
+        return _added(term.rates(total) for term, total in zip(self.pair_terms, totals))
+
     def _sum_of_terms(self, pairs: Pairs, columns: dict[str, Tensor]) -> dict[str, Tensor]:
-        total: dict[str, Tensor] = {}
-        for term in self.pair_terms:
-            for name, rate in term(pairs, columns).items():
-                total[name] = total[name] + rate if name in total else rate
-        return total
+        return _added(term(pairs, columns) for term in self.pair_terms)
 
     def _blocks(self, rows: Tensor | None, device: torch.device) -> Iterator[Tensor | slice | None]:
         """Receivers to take together: few enough for the cache, or all where a gradient is recorded."""
@@ -139,3 +158,11 @@ class ParticleDynamics:
             return
         together = PAIR_VALUES_TOGETHER[device.type] // max(term.width for term in self.pair_terms)
         yield from self.surroundings.neighbors.blocks(max(together, 1))
+
+
+def _added(rates: Iterable[dict[str, Tensor]]) -> dict[str, Tensor]:
+    total: dict[str, Tensor] = {}
+    for each in rates:
+        for name, rate in each.items():
+            total[name] = total[name] + rate if name in total else rate
+    return total

@@ -36,10 +36,26 @@ def find_fault(
     if bool(sound.all()):
         return None
     row = int(torch.nonzero(~sound)[0])
+    return f"step {step}, rank {rank}, {_description(particles, box, row, _complaint(particles, limits, row))}"
+
+
+def find_unplaced(particles: ParticleSet, box: PeriodicBox, rank: int) -> str | None:
+    """The first particle of this rank whose position is not finite, or farther than a period outside the box,
+    described as by `find_fault`; or None."""
+    placed = (particles.position - box.length / 2).abs() <= 1.5 * box.length
+    if bool(placed.all()):
+        return None
+    row = int(torch.nonzero(~placed.all(1))[0])
+    finite = bool(torch.isfinite(particles.position[row]).all())
+    complaint = "farther from the box than its length" if finite else "not finite"
+    return f"rank {rank}, {_description(particles, box, row, complaint)}"
+
+
+def _description(particles: ParticleSet, box: PeriodicBox, row: int, complaint: str) -> str:
     return (
-        f"step {step}, rank {rank}, particle {int(particles.id[row])}: {_complaint(particles, limits, row)}; "
-        f"position {_numbers(position[row])}, velocity {_numbers(velocity[row])}, "
-        f"density {float(density[row]):.6g}, {_nearest(particles, box, row)}"
+        f"particle {int(particles.id[row])}: {complaint}; position {_numbers(particles.position[row])}, "
+        f"velocity {_numbers(particles.velocity[row])}, density {float(particles.density[row]):.6g}, "
+        f"{_nearest(particles, box, row)}"
     )
 
 

@@ -10,7 +10,22 @@ from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.particle_set import ParticleSet
 
 
-class VelocityVerlet:
+class Integrator:
+    """A time stepping scheme; `memory` is what it carries from one step to the next besides the particles."""
+
+    def __init__(self, dynamics: ParticleDynamics) -> None:
+        self.dynamics = dynamics
+        self.memory: dict[str, Tensor] = {}
+
+    def restore(self, particles: ParticleSet, memory: dict[str, Tensor]) -> None:
+        """Go on from a checkpoint: `memory` belongs to these very particles."""
+
+    def step(self, particles: ParticleSet, time_step: float) -> ParticleSet:
+        """The particles one time step later; collective."""
+        raise NotImplementedError
+
+
+class VelocityVerlet(Integrator):
     """Kick-drift-kick velocity Verlet of second order, one evaluation of the rates a step.
 
     Rates may depend on velocity and density: they are evaluated at the velocity and density predicted for the
@@ -23,16 +38,13 @@ class VelocityVerlet:
     """
 
     def __init__(self, dynamics: ParticleDynamics) -> None:
-        self.dynamics = dynamics
-        self.memory: dict[str, Tensor] = {}
+        super().__init__(dynamics)
         self._last: ParticleSet | None = None
 
     def restore(self, particles: ParticleSet, memory: dict[str, Tensor]) -> None:
-        """Go on from a checkpoint: `memory` belongs to these very particles."""
         self._last, self.memory = particles, memory
 
     def step(self, particles: ParticleSet, time_step: float) -> ParticleSet:
-        """The particles one time step later; collective."""
         memory = self.memory if particles is self._last else {}
         particles, memory = self.dynamics.settle(particles, memory)
         start = memory or self.dynamics.rates(particles)
@@ -47,27 +59,19 @@ class VelocityVerlet:
         return result
 
 
-class Midpoint:
+class Midpoint(Integrator):
     """Runge-Kutta of second order, two evaluations of the rates a step."""
 
-    def __init__(self, dynamics: ParticleDynamics) -> None:
-        self.dynamics = dynamics
-
     def step(self, particles: ParticleSet, time_step: float) -> ParticleSet:
-        """The particles one time step later; collective."""
         start, _ = self.dynamics.settle(particles)
         middle = _advanced(start, _all_rates(self.dynamics, start), 0.5 * time_step)
         return _advanced(start, _all_rates(self.dynamics, middle), time_step)
 
 
-class RungeKutta4:
+class RungeKutta4(Integrator):
     """The classical Runge-Kutta scheme of fourth order, four evaluations of the rates a step."""
 
-    def __init__(self, dynamics: ParticleDynamics) -> None:
-        self.dynamics = dynamics
-
     def step(self, particles: ParticleSet, time_step: float) -> ParticleSet:
-        """The particles one time step later; collective."""
         start, _ = self.dynamics.settle(particles)
         rates = [_all_rates(self.dynamics, start)]
         for fraction in (0.5, 0.5, 1.0):

@@ -74,6 +74,7 @@ class NeighborList:
         senders: Tensor,
         rows: Tensor | slice | None = None,
         dtype: torch.dtype | None = None,
+        once: bool = False,
     ) -> Pairs:
         """The pairs that are within the cutoff now, differentiable in the positions.
 
@@ -83,8 +84,13 @@ class NeighborList:
         rows : receivers to keep, as row numbers (k,) or a slice; output row k is then the k-th of them.
         dtype : type of displacement and distance, that of the positions unless given. It is applied after the
             nearest image is taken, so single precision loses nothing to the size of the box.
+        once : leave out the second of the two orders of each pair of receivers; for lists whose senders are the
+            receivers, then others.
         """
         receiver, segment, sender, count = self._listed(rows)
+        if once:
+            first = torch.nonzero(receiver < sender).squeeze(1)
+            receiver, segment, sender = (index.index_select(0, first) for index in (receiver, segment, sender))
         # One component at a time: much faster than (m, 3) rows.
         points, others = receivers.T.contiguous(), senders.T.contiguous()
         with torch.no_grad():

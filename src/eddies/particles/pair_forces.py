@@ -15,8 +15,12 @@ from eddies.particles.periodic_box import safe_norm
 from eddies.particles.reference_scales import ReferenceScales
 
 BASES = ("paper", "corrected")
-CLOSURES = ("poisson", "learned-density", "paper-density")
+CLOSURES = ("poisson", "poisson-force", "poisson-stress", "learned-density", "paper-density")
 EDDY_VISCOSITIES = ("none", *EddyViscosity.FORMS)
+SYMMETRIES = ("none", "antisymmetric")
+# What is summed over neighbours, with the number of components; what changes sign where i and j are exchanged.
+COMPONENTS = {"push": 3, "drag": 3, "weight": 1, "moment": 6, "strain": 6, "contrast": 1, "flux": 1}
+ODD = ("push", "drag", "contrast")
 # Added to moment matrices and sums of weights, as a fraction of their values for evenly spread neighbours:
 # they stay invertible without neighbours or with coplanar ones, at a bias of a tenth of a percent elsewhere.
 REGULARISATION = 1e-3
@@ -34,7 +38,8 @@ class PairModel(nn.Module):
     dv_i/dt = a_rms A_i with
         A_i = 1/n (sum_j w (NN_1 + Pi) x + sum_j w NN_2 v)                          basis "paper"
         A_i = M_i^-1 sum_j w (NN_1 + Pi) x + sum_j w NN_2 v / sum_j w               basis "corrected"
-    where n is the expected number of neighbours and M_i = sum_j w x x^T.
+    where n is the expected number of neighbours and M_i = sum_j w x x^T. With symmetry "antisymmetric" the first two
+    invariants are rho'_i + rho'_j and (rho'_i - rho'_j)^2: i and j get opposite forces, which keep the total momentum.
 
     Parameters
     ----------
@@ -43,14 +48,17 @@ class PairModel(nn.Module):
     neighbors : n, the expected number of particles within the cutoff.
     hidden : widths of the tanh layers.
     basis : "paper" or "corrected".
-    closure : "poisson": no density rate, the density is given; "paper-density": r_rms/n sum_j w NN_rho, r_rms
-        the rms of the density rate; "learned-density": -a rho_0 div v + b (c/h) (mean_j rho_j - rho_i) + the
-        same flux, with the divergence from moment-corrected differences, the mean weighted by w, and a, b
+    closure : "poisson", "poisson-force", "poisson-stress": no density rate, the density is given, and but in the first
+        case a force with it, to which the pair sum is added (`resolved_factors`); "paper-density": r_rms/n sum_j w
+        NN_rho, r_rms the rms of the density rate; "learned-density": -a rho_0 div v + b (c/h) (mean_j rho_j - rho_i)
+        + the same flux, with the divergence from moment-corrected differences, the mean weighted by w, and a, b
         learned.
     eddy_viscosity : "none" (Pi = 0 and no parameters), "two-sided" or "monaghan".
+    symmetry : "none", or "antisymmetric", with basis "paper" only: M_i^-1 differs from particle to particle.
     seed : of the initial weights.
 
-    The module is in double precision until it is converted. Raises ValueError for an unknown choice.
+    The module is in double precision until it is converted. Raises ValueError for an unknown choice, or two that do
+    not go together.
     """
 
     reads = ("velocity", "density")
@@ -64,20 +72,53 @@ class PairModel(nn.Module):
         basis: str = "corrected",
         closure: str = "poisson",
         eddy_viscosity: str = "none",
+        symmetry: str = "none",
         seed: int = 1,
     ) -> None:
         super().__init__()
         _require("basis", basis, BASES)
         _require("closure", closure, CLOSURES)
         _require("eddy_viscosity", eddy_viscosity, EDDY_VISCOSITIES)
+        _require("symmetry", symmetry, SYMMETRIES)
+        if symmetry == "antisymmetric" and basis != "paper":
+            raise ValueError(f'symmetry "antisymmetric" does not go with basis "{basis}", only with "paper"')
         self.scales, self.cutoff, self.neighbors, self.hidden = scales, cutoff, neighbors, tuple(hidden)
-        self.basis, self.closure, self.eddy_viscosity = basis, closure, eddy_viscosity
-        self.network = DenseNetwork(5, hidden, 2 if closure == "poisson" else 3, seed)
+        self.basis, self.closure, self.eddy_viscosity, self.symmetry = basis, closure, eddy_viscosity, symmetry
+        self.network = DenseNetwork(5, hidden, 3 if self.learns_density else 2, seed)
         if eddy_viscosity != "none":
             self.viscosity = EddyViscosity(eddy_viscosity)
+        if closure == "poisson-stress":
+            self.stress_factors = nn.Parameter(torch.ones(3, dtype=torch.float64))
         if closure == "learned-density":
             # The factors a and b of the divergence and of the density's relaxation.
             self.density_factors = nn.Parameter(torch.tensor([1.0, 0.4], dtype=torch.float64))
+
+    def resolved_factors(self) -> Tensor:
+        """What the closure's force is made with, beside -grad p: A, B and C of `PoissonClosure`, (3,).
+
+        With "poisson-stress" each is learned, in units of the value that it has in filtered turbulence, more or less:
+        A = d^2/12 of the gradient model, B = 0.04 v_rms d, C = 2 v_rms/d. Otherwise they are zero.
+        """
+        scales = self.scales
+        if self.closure != "poisson-stress":
+            return torch.zeros(3, dtype=torch.float64)
+        units = (scales.length**2 / 12, 0.04 * scales.velocity * scales.length, 2 * scales.velocity / scales.length)
+        return self.stress_factors * self.stress_factors.new_tensor(units)
+
+    @property
+    def learns_density(self) -> bool:
+        """Whether the density has a learned rate; otherwise the pressure on a grid gives it."""
+        return self.closure.endswith("density")
+
+    @property
+    def mutual(self) -> bool:
+        """Whether the effect of i on j follows from that of j on i, so that one evaluation of a pair gives both."""
+        return self.symmetry == "antisymmetric"
+
+    @property
+    def parity(self) -> Tensor:
+        """Of each component of `pair_values`: -1 if it changes its sign where i and j are exchanged, 1 otherwise."""
+        return torch.tensor([-1.0 if name in ODD else 1.0 for name in self._summed for _ in range(COMPONENTS[name])])
 
     @property
     def width(self) -> int:
@@ -91,24 +132,39 @@ class PairModel(nn.Module):
         the acceleration (count, 3), and "density", its rate (count,), if the closure learns one. The
         receivers' own rows are not their neighbours.
         """
+        return self.rates(pairs.sum(self.pair_values(pairs, columns).T).T)
+
+    def pair_values(self, pairs: Pairs, columns: dict[str, Tensor]) -> Tensor:
+        """What is summed over neighbours: (components, m)."""
         x, v, own_density, other_density = self._dimensionless(pairs, columns)
         distance, approach = pairs.distance / self.scales.length, (x * v).sum(0)
-        features = torch.stack([own_density, other_density, distance, safe_norm(v, dim=0), approach])
-        outputs = self.network(features)
+        densities = self._density_invariants(own_density, other_density)
+        outputs = self.network(torch.stack([*densities, distance, safe_norm(v, dim=0), approach]))
         push, drag = outputs[0], outputs[1]
         if self.eddy_viscosity != "none":
             push = push + self.viscosity(distance, approach)
         w = moments.weight(pairs.distance, self.cutoff)
-        terms = {"push": [(w * push) * x], "drag": [(w * drag) * v]}
+        terms = [(w * push) * x, (w * drag) * v]
         if self._needs_moment:
             weighted_x = w * x
-            terms |= {"weight": [w], "moment": moments.products(weighted_x, x)}
+            terms += [w, *moments.products(weighted_x, x)]
         if self.closure == "learned-density":
-            terms["strain"] = moments.symmetric_products(weighted_x, v)
-            terms["contrast"] = [w * (other_density - own_density)]
-        if self.closure != "poisson":
-            terms["flux"] = [w * outputs[2]]
-        return self._rates(_sum_together(pairs, terms))
+            terms += [*moments.symmetric_products(weighted_x, v), w * (other_density - own_density)]
+        if self.learns_density:
+            terms.append(w * outputs[2])
+        return torch.cat([torch.atleast_2d(term) for term in terms])
+
+    @property
+    def _summed(self) -> list[str]:
+        """Names of what is summed over neighbours, in the order of `pair_values`."""
+        names = ["push", "drag"]
+        names += ["weight", "moment"] if self._needs_moment else []
+        names += ["strain", "contrast"] if self.closure == "learned-density" else []
+        return names + (["flux"] if self.learns_density else [])
+
+    def _density_invariants(self, own: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
+        """The first two invariants (m,), from rho'_i and rho'_j."""
+        return (own + other, (own - other).square()) if self.mutual else (own, other)
 
     def _dimensionless(self, pairs: Pairs, columns: dict[str, Tensor]) -> tuple[Tensor, ...]:
         """x and v (3, m), rho'_i and rho'_j (m,) of the pairs."""
@@ -125,8 +181,9 @@ class PairModel(nn.Module):
     def _needs_moment(self) -> bool:
         return self.basis == "corrected" or self.closure == "learned-density"
 
-    def _rates(self, sums: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Rates from the sums over neighbours, each (components, count)."""
+    def rates(self, sums: Tensor) -> dict[str, Tensor]:
+        """Rates, as of a call, from the sums over neighbours (components, count)."""
+        sums = dict(zip(self._summed, sums.split([COMPONENTS[name] for name in self._summed])))
         if self._needs_moment:
             inverse, total = self._inverse_moment(sums["moment"]), self._total_weight(sums["weight"])
         if self.basis == "corrected":
@@ -134,7 +191,7 @@ class PairModel(nn.Module):
         else:
             acceleration = (sums["push"] + sums["drag"]) / self.neighbors
         rates = {"velocity": self.scales.acceleration * acceleration.T}
-        if self.closure != "poisson":
+        if self.learns_density:
             rates["density"] = self.scales.density_rate / self.neighbors * sums["flux"][0]
         if self.closure == "learned-density":
             divergence = moments.contract_symmetric(inverse, sums["strain"])
@@ -169,6 +226,7 @@ class PairModel(nn.Module):
             "basis": self.basis,
             "closure": self.closure,
             "eddy_viscosity": self.eddy_viscosity,
+            "symmetry": self.symmetry,
         }
 
     @classmethod
@@ -185,10 +243,3 @@ class PairModel(nn.Module):
 def _require(name: str, value: str, choices: Sequence[str]) -> None:
     if value not in choices:
         raise ValueError(f'{name} "{value}": one of {", ".join(choices)}')
-
-
-def _sum_together(pairs: Pairs, terms: dict[str, list[Tensor]]) -> dict[str, Tensor]:
-    """Sums over neighbours of terms, lists of (m,) or (3, m), in one pass: (components, count) by name."""
-    rows = {name: [torch.atleast_2d(row) for row in term] for name, term in terms.items()}
-    sums = pairs.sum(torch.cat([row for term in rows.values() for row in term]).T).T
-    return dict(zip(rows, sums.split([sum(map(len, term)) for term in rows.values()])))

@@ -57,6 +57,16 @@ class Pairs:
         sums = _SegmentSum.apply(by_component, self.offsets, self.segment)
         return sums.T.reshape(self.count, *values.shape[1:])
 
+    def add_to_both(self, values: Tensor, parity: Tensor, totals: Tensor) -> None:
+        """Add values (components, m) of pairs that stand once to totals (components, n) of the owned particles.
+
+        A value is added at the receiver and, times its `parity` (components,), 1 or -1, at the sender, unless that is
+        a ghost, whose owner has the pair as well. In place; the order is fixed, except on a GPU.
+        """
+        totals.index_add_(1, self.receiver, values)
+        home = torch.nonzero(self.sender < totals.shape[1]).squeeze(1)
+        totals.index_add_(1, self.sender.index_select(0, home), parity[:, None] * values.index_select(1, home))
+
 
 def gather_rows(column: Tensor, index: Tensor) -> Tensor:
     """column[index] for a column (n, ...): (m, ...), stored component by component."""

@@ -9,10 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from eddies.parallel.halo import HaloExchange
+from eddies.parallel.broadcast import first_complaint
+from eddies.parallel.halo import HaloError, HaloExchange
 from eddies.parallel.migration import migrate
 from eddies.parallel.reduction import any_rank, global_max
 from eddies.parallel.slab import SlabDecomposition
+from eddies.particles.faults import find_unplaced
 from eddies.particles.ghosts import exchange_ghost_positions, exchange_ghosts
 from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.particle_set import ParticleSet, as_numpy
@@ -27,12 +29,14 @@ class LocalParticles:
     ----------
     position : (s, 3); on several ranks z is not periodic here, and ghosts stand where they are seen from.
     columns : the columns that were asked for, (s, ...).
+    neighbors : the list of pairs, built from these rows; or None.
     halo : for further columns, with `ghosts.exchange_ghosts`; another one whenever rows of ghosts change.
     box : the box in which differences of these positions are taken.
     """
 
     position: Tensor
     columns: dict[str, Tensor]
+    neighbors: NeighborList | None
     halo: HaloExchange
     box: PeriodicBox
 
@@ -48,7 +52,7 @@ class Surroundings:
     halo_cutoff : how far a rank must see beyond its particles, at least `list_cutoff`.
     skin : extra radius of both. They hold until some particle of any rank has moved by half of it.
 
-    All methods are collective. Raises HaloError when slabs are thinner than the halo.
+    All methods are collective. Raises HaloError, on all ranks, when slabs are thinner than the halo.
     """
 
     def __init__(
@@ -71,8 +75,9 @@ class Surroundings:
         self._moved_before, self._strayed_at_build = 0.0, False
 
     def outdated(self, particles: ParticleSet) -> bool:
-        """Whether, on any rank, these are other particles or one has moved by more than half the skin."""
-        return any_rank(self.decomposition.comm, self._moved(particles) > self.skin / 2)
+        """Whether, on any rank, these are other particles or one has moved by more than half the skin, or to a
+        position that is not a number."""
+        return any_rank(self.decomposition.comm, not self._moved(particles) <= self.skin / 2)
 
     def due(self, particles: ParticleSet) -> bool:
         """Whether to build anew before a step: in the middle of one, particles cannot change rank.
@@ -107,11 +112,14 @@ class Surroundings:
     def update(self, particles: ParticleSet) -> None:
         """Make halo and list fit the particles.
 
-        No particle changes rank: where one has left its slab, the halo is wider by the farthest it strayed.
+        No particle changes rank: where one has left its slab, the halo is wider by the farthest it strayed. Raises
+        HaloError, on all ranks, where a position is not finite, or farther outside its slab than the box is long.
         """
         if not self.outdated(particles):
             return
         strayed = float(global_max(self.decomposition.comm, self._strayed(particles.position)))
+        if strayed > self.box.length:
+            self._refuse(particles)
         width = self.halo_cutoff + self.skin + strayed
         self.halo = HaloExchange(self.decomposition, as_numpy(particles.position), width)
         self._ids, self._built_at = particles.id, particles.position.detach().clone()
@@ -127,7 +135,7 @@ class Surroundings:
         # Stored component by component, as the gathering of pairs wants it.
         position = self._with_ghosts(particles.position, exchange_ghost_positions).T.contiguous().T
         columns = {name: self.column(getattr(particles, name)) for name in sorted(names)}
-        return LocalParticles(position, columns, self.halo, self.box)
+        return LocalParticles(position, columns, self.neighbors, self.halo, self.box)
 
     def column(self, owned: Tensor) -> Tensor:
         """A column (n, ...) of owned particles followed by its ghost rows."""
@@ -136,7 +144,16 @@ class Surroundings:
     def _with_ghosts(self, owned: Tensor, exchange) -> Tensor:
         return owned if self.decomposition.size == 1 else torch.cat([owned, exchange(self.halo, owned)])
 
+    def _refuse(self, particles: ParticleSet) -> None:
+        """Raise HaloError with the first particle, over the ranks, that is nowhere near its slab."""
+        comm = self.decomposition.comm
+        found = find_unplaced(particles, PeriodicBox(self.box.length), comm.rank)
+        raise HaloError(f"within the step, {first_complaint(comm, found)}")
+
     def _strayed(self, position: Tensor) -> float:
+        """How far a particle is outside the slab, at most; infinite where a position is not finite."""
+        if not bool(torch.isfinite(position).all()):
+            return math.inf
         slab, z = self.decomposition, position[:, 2].detach()
         if slab.size == 1 or not len(z):
             return 0.0

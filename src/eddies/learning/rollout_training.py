@@ -1,0 +1,147 @@
+"""Training through several steps of the simulation: the trajectory loss of Eq. 12 over a window of frames."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from eddies.learning.losses import mean_square_share, sum_over_ranks
+from eddies.learning.optimization import Descent, shared_value
+from eddies.parallel.reduction import global_sum
+from eddies.particles.integrators import Integrator
+from eddies.particles.particle_set import ParticleSet
+
+
+@dataclass(frozen=True)
+class TrainingWindow:
+    """Particles at one moment and what is true of them later.
+
+    Parameters
+    ----------
+    particles : at the start.
+    velocity : (frames, n, 3), true velocities at the end of frame intervals 1, 2, ...; rows as in `particles`.
+    density : (frames, n), the same for the density.
+    """
+
+    particles: ParticleSet
+    velocity: Tensor
+    density: Tensor
+
+
+class RolloutTrainer:
+    """Trains a model on what its simulation makes of true initial states.
+
+    Every step draws a window from (seed, step), advances all its particles by the integrator of the simulation, and
+    takes for each frame k that is reached the mean of |v - v_true|^2 / |v_true - v_start|^2: the velocity error in
+    units of that of particles without acceleration, so that all frames count alike. A density that has a rate of its
+    own counts in the same way. Added with a weight is the same for the mean kinetic energy, (E - E_true)^2 /
+    (E_true - E_start)^2: fitted forces are attenuated where what they are fitted to is noisy, the power of friction
+    among them, and an energy off by little at every step is hardly seen in the error of the velocity.
+
+    The gradient goes through all steps: force, neighbours, halo, and the closure's grid. Each step is computed anew on
+    the way back, so that memory holds one step and not all.
+
+    Parameters
+    ----------
+    integrator : of dynamics with fixed ranks.
+    windows : on the slabs of the dynamics.
+    frame_interval : time between frames. steps_per_frame : time steps in it.
+    energy_weight : of the energy beside the velocity.
+    noise : standard deviation of what is added to each component of the initial velocities.
+    """
+
+    def __init__(self, comm, integrator: Integrator, windows: Sequence[TrainingWindow], frame_interval: float,
+                 steps_per_frame: int, energy_weight: float, noise: float, seed: int) -> None:
+        self.comm, self.integrator, self.windows = comm, integrator, windows
+        self.steps_per_frame, self.time_step = steps_per_frame, frame_interval / steps_per_frame
+        self.energy_weight, self.noise, self.seed = energy_weight, noise, seed
+        self.total = int(global_sum(comm, len(windows[0].particles)))
+
+    def step(self, descent: Descent, step: int, horizon: int) -> dict[str, float]:
+        """One optimiser step on windows of `horizon` frames; returns the losses."""
+        random = np.random.default_rng([self.seed, step])
+        window = self.windows[random.integers(len(self.windows))]
+        window = replace(window, particles=self._disturbed(window.particles, random))
+        shares = self.loss_shares(window, horizon)
+        total = sum(shares.values())
+        norm = descent.step(total)
+        values = {name: shared_value(self.comm, share) for name, share in shares.items()}
+        return {"loss": sum(values.values()), **values, "gradient_norm": norm}
+
+    def loss_shares(self, window: TrainingWindow, horizon: int) -> dict[str, Tensor]:
+        """This rank's shares of the losses of a window, weighted, by name; collective."""
+        shares: dict[str, list[Tensor]] = {"rollout_loss": []}
+        for reached, particles in self._frames(window.particles, horizon):
+            shares["rollout_loss"] += [mean_square_share(error, self._scale(true, start), self.total)
+                                       for error, true, start in self._errors(window, reached, particles)]
+            if self.energy_weight > 0:
+                shares.setdefault("energy_loss", []).append(
+                    self.energy_weight * self._energy_share(window, reached, particles))
+        return {name: sum(parts) / horizon for name, parts in shares.items()}
+
+    @torch.no_grad()
+    def validation_error(self, window: TrainingWindow, horizon: int) -> float:
+        """Root of the loss of a window, without noise: but for the energy 1 without acceleration."""
+        shares = self.loss_shares(window, horizon)
+        return sum(shared_value(self.comm, share) for share in shares.values()) ** 0.5
+
+    def _energy_share(self, window: TrainingWindow, frame: int, particles: ParticleSet) -> Tensor:
+        """This rank's part of the squared error of the mean kinetic energy; all ranks' parts are equal."""
+        start, true = (0.5 * float(global_sum(self.comm, float(velocity.double().square().sum()))) / self.total
+                       for velocity in (window.particles.velocity, window.velocity[frame]))
+        energy = sum_over_ranks(self.comm, 0.5 * particles.velocity.square().sum()) / self.total
+        return ((energy - true) / (true - start)).square() / self.comm.size
+
+    def _frames(self, particles: ParticleSet, horizon: int) -> Iterator[tuple[int, ParticleSet]]:
+        """Number and particles of each frame reached."""
+        memory: dict[str, Tensor] = {}
+        for reached in range(horizon):
+            for _ in range(self.steps_per_frame):
+                particles, memory = self._advanced(particles, memory)
+            yield reached, particles
+
+    def _advanced(self, particles: ParticleSet, memory: dict[str, Tensor]) -> tuple[ParticleSet, dict[str, Tensor]]:
+        """One time step; where gradients are recorded, without keeping what happens within it."""
+        names = list(memory)
+        after: list[str] = []
+
+        def advance(position: Tensor, velocity: Tensor, density: Tensor, *remembered: Tensor) -> tuple[Tensor, ...]:
+            # Lists built anew, so that the way back does the very same.
+            self.integrator.dynamics.forget()
+            start = ParticleSet(particles.id, position, velocity, density)
+            self.integrator.restore(start, dict(zip(names, remembered)))
+            end = self.integrator.step(start, self.time_step)
+            after[:] = self.integrator.memory
+            return end.position, end.velocity, end.density, *self.integrator.memory.values()
+
+        columns = particles.position, particles.velocity, particles.density, *memory.values()
+        if torch.is_grad_enabled():
+            columns = checkpoint(advance, *columns, use_reentrant=False, preserve_rng_state=False)
+        else:
+            columns = advance(*columns)
+        moved = ParticleSet(particles.id, *columns[:3])
+        return moved, dict(zip(after, columns[3:]))
+
+    def _errors(self, window: TrainingWindow, frame: int,
+                particles: ParticleSet) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+        """Error, truth, and value at the start of each column that has a rate."""
+        yield particles.velocity - window.velocity[frame], window.velocity[frame], window.particles.velocity
+        if self.integrator.dynamics.closure is None:
+            yield particles.density - window.density[frame], window.density[frame], window.particles.density
+
+    def _scale(self, true: Tensor, start: Tensor) -> float:
+        """Root mean square of the change of one component."""
+        squares = global_sum(self.comm, float((true - start).double().square().sum()))
+        return float(np.sqrt(squares / (self.total * (true.numel() // max(len(true), 1) or 1))))
+
+    def _disturbed(self, particles: ParticleSet, random: np.random.Generator) -> ParticleSet:
+        """The particles with noise on their velocities, which depends on their ids alone."""
+        if self.noise == 0:
+            return particles
+        noise = torch.from_numpy(random.normal(0.0, self.noise, (self.total, 3))).to(particles.velocity)
+        return replace(particles, velocity=particles.velocity + noise[particles.id])

@@ -1,0 +1,140 @@
+"""The course of a training: phases of descent, validation, the best state, and what a checkpoint must hold."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from eddies.learning.optimization import Descent
+
+
+@dataclass(frozen=True)
+class Phase:
+    """A stretch of training with one fall of the learning rate and one measure of success.
+
+    Parameters
+    ----------
+    name : for the progress line.
+    work : cost of each optimiser step, in any unit common to the phases, for the time left.
+    rates : learning rate of the first and of the last step.
+    take : one step of the descent, given the number of the step within the phase; returns losses by name.
+    validate : error on what is not trained on; the state where it was least is kept.
+    validate_every : steps between two validations. The last step is always followed by one.
+    """
+
+    name: str
+    work: np.ndarray
+    rates: tuple[float, float]
+    take: Callable[[Descent, int], dict[str, float]]
+    validate: Callable[[], float]
+    validate_every: int
+
+    @property
+    def steps(self) -> int:
+        """Number of optimiser steps."""
+        return len(self.work)
+
+
+class Training:
+    """Takes a model through phases. At the end of each it returns to the state of least validation error.
+
+    Parameters
+    ----------
+    phases : in order, each of at least one step.
+    patience : validations without a new best after which a phase ends early; None: it never does.
+
+    `history` holds a row for each step. All ranks hold the same state.
+    """
+
+    def __init__(self, comm, model: nn.Module, phases: Sequence[Phase], patience: int | None = None) -> None:
+        self.comm, self.model, self.patience = comm, model, patience
+        self.phases = list(phases)
+        self.history: list[dict[str, float]] = []
+        self._started, self._seconds_before = time.perf_counter(), 0.0
+        self._begin(0)
+
+    def _begin(self, number: int) -> None:
+        """Be at the start of a phase."""
+        self.number, self.best_error, self.best, self.unimproved = number, np.inf, self._weights(), 0
+        if self.running:
+            self.descent = Descent(self.comm, self.model.parameters(), self.phase.steps, *self.phase.rates)
+
+    @property
+    def running(self) -> bool:
+        """Whether a phase is left."""
+        return self.number < len(self.phases)
+
+    @property
+    def phase(self) -> Phase:
+        """The present one."""
+        return self.phases[self.number]
+
+    @property
+    def done(self) -> float:
+        """The fraction of all work that is done."""
+        before = [phase.work for phase in self.phases[:self.number]]
+        done = sum(work.sum() for work in (*before, self.phase.work[:self.descent.taken]))
+        return float(done / sum(phase.work.sum() for phase in self.phases))
+
+    def step(self) -> None:
+        """One step of the present phase, and the validation that may be due after it."""
+        phase, rate = self.phase, self.descent.learning_rate
+        row = {"phase": float(self.number), "step": float(len(self.history)), "learning_rate": rate,
+               **phase.take(self.descent, self.descent.taken)}
+        last = self.descent.taken == phase.steps
+        if last or self.descent.taken % phase.validate_every == 0:
+            row["validation_error"] = self._validate()
+        row["seconds"] = self._seconds_before + time.perf_counter() - self._started
+        self.history.append(row)
+        if last or self.patience is not None and self.unimproved >= self.patience:
+            self._load(self.best)
+            self._begin(self.number + 1)
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """The history by column; NaN where a step had no such number."""
+        names = sorted({name for row in self.history for name in row})
+        return {name: np.array([row.get(name, np.nan) for row in self.history]) for name in names}
+
+    def memory(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        """What `restore` needs: a description and arrays."""
+        columns = self.columns()
+        description = {"number": self.number, "taken": self.descent.taken, "best_error": self.best_error,
+                       "unimproved": self.unimproved, "columns": list(columns), "moments": list(self.descent.memory())}
+        return description, {**_named("model", self._weights()), **_named("best", self.best),
+                             **_named("history", columns), **_named("descent", self.descent.memory())}
+
+    def restore(self, known: Mapping[str, Any], read: Callable[[str], np.ndarray]) -> None:
+        """Go on from a memory: its description, and what gives an array of it by name."""
+        names = list(self._weights())
+        self._load({name: read(f"model {name}") for name in names})
+        self._begin(known["number"])
+        self.best = {name: read(f"best {name}") for name in names}
+        self.best_error, self.unimproved = known["best_error"], known["unimproved"]
+        self.descent.restore(known["taken"], {name: read(f"descent {name}") for name in known["moments"]})
+        columns = {name: read(f"history {name}") for name in known["columns"]}
+        rows = zip(*columns.values())
+        self.history = [{name: float(value) for name, value in zip(columns, row) if np.isfinite(value)} for row in rows]
+        self._seconds_before = self.history[-1]["seconds"] if self.history else 0.0
+
+    def _validate(self) -> float:
+        error = self.phase.validate()
+        self.unimproved += 1
+        if error < self.best_error:
+            self.best_error, self.best, self.unimproved = error, self._weights(), 0
+        return error
+
+    def _weights(self) -> dict[str, np.ndarray]:
+        return {name: tensor.detach().cpu().numpy().copy() for name, tensor in self.model.state_dict().items()}
+
+    def _load(self, weights: Mapping[str, np.ndarray]) -> None:
+        self.model.load_state_dict({name: torch.from_numpy(array) for name, array in weights.items()})
+
+
+def _named(prefix: str, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    return {f"{prefix} {name}": array for name, array in arrays.items()}

@@ -1,0 +1,189 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from eddies.flow.pressure import PressureSolver
+from eddies.flow.tracers import release
+from eddies.learning.optimization import Descent
+from eddies.learning.rollout_training import RolloutTrainer, TrainingWindow
+from eddies.parallel.migration import migrate
+from eddies.parallel.reduction import global_max, global_sum
+from eddies.parallel.slab import SlabDecomposition
+from eddies.particles.dynamics import ParticleDynamics
+from eddies.particles.integrators import INTEGRATORS
+from eddies.particles.pair_forces import PairModel
+from eddies.particles.particle_set import ParticleSet
+from eddies.particles.poisson_closure import PoissonClosure
+from eddies.particles.reference_scales import ReferenceScales
+from eddies.particles.smoothing_kernels import WendlandC2
+
+LENGTH, PER_SIDE, FRAMES, INTERVAL = 2 * np.pi, 12, 4, 0.1
+SPACING = LENGTH / PER_SIDE
+SUPPORT = 2.0 * SPACING
+SCALES = ReferenceScales(length=2 * SPACING, spacing=SPACING, velocity=1.0, density_mean=1.0, density=0.01,
+                         acceleration=1.0, density_rate=0.02, sound_speed=10.0)
+every_closure = pytest.mark.parametrize("closure", ["poisson", "poisson-stress", "learned-density"])
+
+
+def window_of(slab):
+    """Particles in a smooth flow, and what it makes of them if it turns slowly."""
+    columns = release(slab, 3, PER_SIDE, "random")
+    x, y, z = columns["position"].T
+
+    def velocity(turned):
+        return np.stack([np.sin(y + turned), np.sin(z + turned), 1.5 + np.sin(x + turned)], axis=1)
+
+    def density(turned):
+        return 1 + 0.01 * np.cos(x + turned) * np.cos(y)
+
+    times = INTERVAL * np.arange(1, FRAMES + 1)
+    later = {"velocity_later": np.stack([velocity(time) for time in times], axis=1),
+             "density_later": np.stack([density(time) for time in times], axis=1)}
+    columns = migrate(slab, {**columns, "velocity": velocity(0.0), "density": density(0.0), **later})
+    columns = {name: torch.from_numpy(column) for name, column in columns.items()}
+    true = [columns.pop(f"{name}_later").movedim(1, 0).contiguous() for name in ("velocity", "density")]
+    return TrainingWindow(ParticleSet(**columns), *true)
+
+
+def trainer_of(comm, closure="poisson-stress", integrator="verlet", steps=1, noise=0.0):
+    slab = SlabDecomposition(comm, LENGTH, PER_SIDE)
+    model = PairModel(SCALES, SUPPORT, 34, (6, 5), closure=closure, seed=2)
+    given = None
+    if not model.learns_density:
+        # Within four intervals particles move farther than a grid plane out of their slab.
+        factors = model.resolved_factors if closure == "poisson-stress" else None
+        given = PoissonClosure(PressureSolver(slab, 5, margin=2), WendlandC2(1.6 * SPACING), 10.0, passes=2,
+                               dtype=torch.float64, factors=factors)
+    dynamics = ParticleDynamics(slab, LENGTH, [model], 0.0, given, torch.float64, fixed_ranks=True)
+    trainer = RolloutTrainer(comm, INTEGRATORS[integrator](dynamics), [window_of(slab)], INTERVAL, steps, 0.5, noise, 5)
+    return trainer, model
+
+
+class Recorder:
+    """Takes no step but keeps the gradient, summed over ranks."""
+
+    def __init__(self, comm, model):
+        self.comm, self.model = comm, model
+
+    def step(self, share):
+        self.model.zero_grad()
+        share.backward()
+        parts = [torch.zeros_like(p) if p.grad is None else p.grad for p in self.model.parameters()]
+        self.gradient = global_sum(self.comm, torch.cat([part.flatten() for part in parts]).numpy())
+        return 0.0
+
+
+def gradient_of(comm, horizon, **choices):
+    trainer, model = trainer_of(comm, **choices)
+    recorder = Recorder(comm, model)
+    loss = trainer.step(recorder, 0, horizon)["loss"]
+    return loss, recorder.gradient
+
+
+@every_closure
+@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.parametrize("horizon", [1, 4])
+def test_gradient_is_the_same_on_any_number_of_ranks(comm, horizon, closure):
+    from mpi4py import MPI
+
+    loss, gradient = gradient_of(comm, horizon, closure=closure)
+    alone, expected = gradient_of(MPI.COMM_SELF, horizon, closure=closure)
+    assert loss == pytest.approx(alone, rel=1e-11)
+    assert np.linalg.norm(gradient - expected) < 1e-10 * np.linalg.norm(expected)
+
+
+@every_closure
+@pytest.mark.mpi(1, 2)
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_gradient_through_several_steps_against_finite_differences(comm, integrator, closure):
+    trainer, model = trainer_of(comm, closure, integrator, steps=2)
+    recorder = Recorder(comm, model)
+    trainer.step(recorder, 0, 2)
+    random = np.random.default_rng(1)
+    direction = [torch.from_numpy(random.standard_normal(p.shape)) for p in model.parameters()]
+    expected = recorder.gradient @ torch.cat([part.flatten() for part in direction]).numpy()
+    epsilon, losses = 1e-5, []
+    for sign in (1, -2, 1):
+        with torch.no_grad():
+            for parameter, part in zip(model.parameters(), direction):
+                parameter += sign * epsilon * part
+        losses.append(trainer.step(Recorder(comm, model), 0, 2)["loss"])
+    # Errors: epsilon^2 of the difference, and kinks of second order where pairs enter or leave the support.
+    assert (losses[0] - losses[1]) / (2 * epsilon) == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.mpi(2, 3)
+def test_particles_leave_their_slabs_within_a_window(comm):
+    """What the test of ranks covers: with the flow along z particles end up beyond the neighbouring planes."""
+    trainer, _ = trainer_of(comm)
+    with torch.no_grad():
+        *_, (_, particles) = trainer._frames(trainer.windows[0].particles, FRAMES)
+    slab = trainer.integrator.dynamics.surroundings.decomposition
+    assert global_max(comm, float(particles.position[:, 2].max()) - slab.upper) > 1.5 * SPACING
+
+
+@pytest.mark.mpi(1, 2, 3)
+def test_twenty_steps_have_the_same_losses_on_any_number_of_ranks(comm):
+    from mpi4py import MPI
+
+    def losses(communicator):
+        trainer, model = trainer_of(communicator, noise=0.05)
+        descent = Descent(communicator, model.parameters(), 20, 1e-2, 1e-3)
+        return [trainer.step(descent, step, 1 + step // 10) for step in range(20)]
+
+    found, alone = losses(comm), losses(MPI.COMM_SELF)
+    for row, other in zip(found, alone):
+        assert row == pytest.approx(other, rel=1e-8)
+    assert found[9]["loss"] < found[0]["loss"]
+
+
+@pytest.mark.mpi(1)
+def test_memory_does_not_grow_with_the_steps(comm):
+    def kept(horizon):
+        """Bytes held for the way back."""
+        trainer, _ = trainer_of(comm)
+        held = {}
+
+        def pack(tensor):
+            held[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
+            return tensor
+
+        with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
+            shares = trainer.loss_shares(trainer.windows[0], horizon)
+        return sum(held.values()), sum(shares.values())
+
+    (one, first), (four, _) = kept(1), kept(4)
+    assert first.requires_grad
+    # A state is a few columns of the particles; the pairs of a single evaluation are a hundred times more.
+    columns = 8 * 12 * PER_SIDE**3
+    assert four - one < 3 * 4 * columns
+
+
+@pytest.mark.mpi(1)
+def test_the_energy_counts_in_units_of_its_true_change(comm):
+    trainer, _ = trainer_of(comm)
+    window = trainer.windows[0]
+    exact = replace(window.particles, velocity=window.velocity[1])
+    assert float(trainer._energy_share(window, 1, exact)) < 1e-20
+    assert float(trainer._energy_share(window, 1, window.particles)) == pytest.approx(1, rel=1e-9)
+
+
+@pytest.mark.mpi(1)
+def test_no_acceleration_has_an_error_of_one(comm):
+    trainer, model = trainer_of(comm, closure="poisson")
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.zero_()
+    # The energy counts with a weight of a half.
+    assert trainer.validation_error(trainer.windows[0], FRAMES) == pytest.approx(1.5**0.5, rel=1e-9)
+
+
+@pytest.mark.mpi(1, 2, 3)
+def test_noise_depends_on_ids_alone(comm):
+    trainer, _ = trainer_of(comm, noise=0.1)
+    particles = trainer.windows[0].particles
+    noise = trainer._disturbed(particles, np.random.default_rng(3)).velocity - particles.velocity
+    expected = np.random.default_rng(3).normal(0, 0.1, (PER_SIDE**3, 3))[particles.id]
+    assert np.allclose(noise, expected, atol=1e-14)

@@ -1,0 +1,89 @@
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from eddies.learning.training import Phase, Training
+
+TARGET = torch.tensor([[1.0, -2.0, 0.5]], dtype=torch.float64)
+
+
+def training_of(comm, validate=None, patience=None, steps=(6, 5)):
+    """A linear map learned from random vectors, drawn for each step, in two phases; ranks share the loss evenly."""
+    torch.manual_seed(3)
+    model = nn.Linear(3, 1, bias=False).double()
+
+    def take(descent, step):
+        given = torch.from_numpy(np.random.default_rng([7, step]).standard_normal((4, 3)))
+        loss = (model(given) - given @ TARGET.T).square().mean()
+        return {"loss": float(loss), "gradient_norm": descent.step(loss / comm.size)}
+
+    def error():
+        return float((model.weight - TARGET).norm())
+
+    phases = [Phase(f"phase {number}", np.ones(count), (0.1, 0.01), take, validate or error, 2)
+              for number, count in enumerate(steps)]
+    return Training(comm, model, phases, patience)
+
+
+def finished(training):
+    while training.running:
+        training.step()
+    return training
+
+
+def numbers(training):
+    """Weights and history, but for the time that was taken."""
+    columns = {name: values for name, values in training.columns().items() if name != "seconds"}
+    return {"weight": training.model.weight.detach().numpy(), **columns}
+
+
+@pytest.mark.mpi(1, 2)
+def test_a_training_restored_at_any_step_is_bitwise_the_one_never_stopped(comm):
+    whole = numbers(finished(training_of(comm)))
+    for split in range(11):
+        first = training_of(comm)
+        for _ in range(split):
+            first.step()
+        description, arrays = first.memory()
+        second = training_of(comm)
+        second.restore(description, lambda name: arrays[name])
+        again = numbers(finished(second))
+        assert whole.keys() == again.keys()
+        for name, values in whole.items():
+            assert np.array_equal(values, again[name], equal_nan=True), (split, name)
+
+
+@pytest.mark.mpi(1)
+def test_the_state_of_least_validation_error_is_kept(comm):
+    seen, errors = [], iter([3.0, 1.0, 2.0, 5.0, 4.0, 6.0])
+
+    def validate():
+        seen.append(training.model.weight.detach().numpy().copy())
+        return next(errors)
+
+    training = training_of(comm, validate)
+    finished(training)
+    # Three validations in each phase: the second is the best of the first phase, and the second of the other.
+    assert np.array_equal(training.model.weight.detach().numpy(), seen[4])
+    starts = np.flatnonzero(training.columns()["phase"] == 1)
+    assert starts[0] == 6
+
+
+@pytest.mark.mpi(1)
+def test_a_phase_ends_after_too_many_validations_without_a_new_best(comm):
+    errors = iter([1.0, 2.0, 2.0, 9.0, 8.0, 7.0, 6.0, 5.0])
+    training = finished(training_of(comm, lambda: next(errors), patience=2, steps=(20, 8)))
+    assert [np.sum(training.columns()["phase"] == number) for number in (0, 1)] == [6, 8]
+
+
+@pytest.mark.mpi(1)
+def test_work_done_counts_steps_by_their_cost(comm):
+    training = training_of(comm, steps=(2, 2))
+    training.phases = [Phase(phase.name, np.array(work), phase.rates, phase.take, phase.validate, 2)
+                       for phase, work in zip(training.phases, ([1.0, 1.0], [2.0, 4.0]))]
+    found = []
+    while training.running:
+        found.append(training.done)
+        training.step()
+    assert found == [0, 1 / 8, 2 / 8, 4 / 8]
