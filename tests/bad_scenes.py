@@ -17,8 +17,13 @@ BAD_TEXTS = [
     (FLOW + TIME + "[kernel]\nsteps = 3\n", "[kernel]: needs a section [tracers]"),
     (FLOW + TIME + "[simulation]\nstep = 1\nturnovers = 1\nframe_interval = 1\n",
      "[simulation]: needs a section [model]"),
+    (FLOW + '[tracers]\nparticles_per_side = 8\nturnovers = 1\nframe_interval = 1\n[kernel]\nsteps = 3\n'
+     '[simulation]\nforce = "none"\nstep = 1\nturnovers = 1\nframe_interval = 1\n',
+     "[simulation]: starts from the density, which an incompressible flow does not have"),
     (FLOW + "[tracers]\nparticles_per_side = 12\nturnovers = 1\nframe_interval = 1\n",
      "[tracers] field_cells = 18 (from particles_per_side): must be at most [flow] cells = 16"),
+    (FLOW + "[tracers]\nparticles_per_side = 8\nturnovers = 1\nframe_interval = 1\n[kernel]\nsteps = 3\n[model]\n",
+     "[model]: needs a section [training], which the scene lacks; add it, give [model] path"),
 ]
 
 BAD_OVERRIDES = [
@@ -49,6 +54,7 @@ BAD_OVERRIDES = [
     ("kernel.hidden=[]", "must be a list such as [16, 16]"),
     ("kernel.hidden=16", "must be a list such as [16, 16]"),
     ("model.hidden=[16, 0]", "each at least 1"),
+    ("model.symmetry=antisymmetric", 'with basis = "corrected" the forces of a pair are not opposite'),
     ("training.window=1.5", "must be a number above 0 and at most 1"),
     ("training.window=1", "[simulation] start: this key is missing"),
     ("training.batch=5000", "must be at most the number of particles, 1728"),
@@ -57,5 +63,9 @@ BAD_OVERRIDES = [
     ("training.final_learning_rate=1", "must be at most learning_rate"),
     ("simulation.step=0.03", "must be a whole multiple of step = 0.03"),
     ("simulation.frame_interval=0.05", "must be a whole multiple of"),
+    ("simulation.force=magnetic", 'must be one of "learned", "none", "wcsph", "eulerian"'),
+    ("simulation.force=wcsph", "[simulation] step = 0.02: force = \"wcsph\" must resolve sound, with a step of"),
+    ("wcsph.alpha=2", '[wcsph]: only read with [simulation] force = "wcsph"; set it, or remove [wcsph]'),
+    ("eulerian.cells=16", '[eulerian]: only read with [simulation] force = "eulerian"'),
     ("simulation.injection=some", 'must be a number above 0 or "none" or "dissipation"'),
 ]

@@ -14,7 +14,7 @@ LONGEST_MODULE = 300
 # Modules below eddies, by layer. Imports go down, or stay within a group.
 LAYERS = (
     (("__init__", "__version__"),),
-    (("scene*",), ("clock*",), ("time_stepping*",)),
+    (("scene*", "comparison*"), ("clock*",), ("time_stepping*",)),
     (("parallel*",),),
     (("io*",),),
     (("flow*",), ("particles*",)),
@@ -30,8 +30,9 @@ ONLY_IN = {
     "pyfftw*": ("flow*",),
     "torch*": ("particles*", "learning*", "workflows*"),
     "matplotlib*": ("analysis.figures*", "workflows.report", "workflows.compare"),
-    "eddies.analysis.figures*": ("analysis.figures*", "workflows.report", "workflows.compare"),
-    "eddies.scene*": ("scene*", "workflows*", "cli", "stages", "logs"),
+    "eddies.analysis.figures*": ("analysis.figures*", "workflows.report", "workflows.compare", "workflows.train"),
+    "eddies.scene*": ("scene*", "comparison", "workflows*", "cli", "stages", "logs"),
+    "eddies.comparison*": ("workflows*", "cli"),
     "pickle*": (),
 }
 COMM_WORLD_IN = ("cli",)

@@ -10,8 +10,9 @@ from pathlib import Path
 import pytest
 
 from eddies.cli import build_parser
+from eddies.comparison import Comparison, Variant, load_comparison
 from eddies.scene import BOX_LENGTH, Scene, builtin_scenes, load_scene
-from eddies.scene_values import Bounds, Choice, Integer, Integers, Number, quoted
+from eddies.scene_values import Bounds, Choice, Integer, Integers, Number, Texts, quoted
 
 CHECKOUT = Path(__file__).parents[1]
 README = (CHECKOUT / "README.md").read_text(encoding="utf-8")
@@ -60,6 +61,8 @@ def words_of(command):
 def check_eddies(arguments):
     """The command line is accepted, and its scene passes its checks."""
     options = build_parser().parse_args(arguments)
+    if getattr(options, "comparison", None):
+        load_comparison(options.comparison)
     if getattr(options, "scene", None):
         load_scene(options.scene, getattr(options, "overrides", []))
 
@@ -126,7 +129,8 @@ def allowed(rule):
     words = [f"`{quoted(word)}`" for word in getattr(rule, "words", ())]
     if isinstance(rule, Choice):
         return ", ".join(words)
-    noun = {Number: "number", Integer: "integer", Integers: "list of integers"}.get(type(rule), "text")
+    nouns = {Number: "number", Integer: "integer", Integers: "list of integers", Texts: "list of texts"}
+    noun = nouns.get(type(rule), "text")
     symbols = {"above": ">", "at_least": "≥", "below": "<", "at_most": "≤"}
     bounds = getattr(rule, "bounds", Bounds())
     limits = [f"{symbols[field.name]} {'2π' if value == BOX_LENGTH else format(value, 'g')}"
@@ -161,6 +165,20 @@ def scene_reference():
 
 def test_scene_reference():
     assert marked("scene reference") == scene_reference()
+
+
+def comparison_reference():
+    """The keys of a comparison, from their declarations."""
+    lines = ["| key | default | values | meaning |", "|---|---|---|---|"]
+    lines += [key_row(field) for field in dataclasses.fields(Comparison) if "rule" in field.metadata]
+    lines.append(f"| **`[[variant]]`**, one or more | | | *{Variant.__doc__.splitlines()[0]}* |")
+    return "\n".join(lines + [key_row(field) for field in dataclasses.fields(Variant)])
+
+
+def test_comparison_reference(tmp_path):
+    assert marked("comparison reference") == comparison_reference()
+    (tmp_path / "example.toml").write_text(blocks("toml")[1], encoding="utf-8")
+    assert list(load_comparison(tmp_path / "example.toml").scenes) == ["learned", "small", "no-force"]
 
 
 def slug(heading):

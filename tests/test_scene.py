@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 from bad_scenes import BAD_OVERRIDES, BAD_TEXTS
 
-from eddies.scene import STAGES, Flow, Scene, SceneError, Time, builtin_scenes, load_scene
+from eddies.scene import STAGES, Eulerian, Flow, Scene, SceneError, Time, builtin_scenes, load_scene
 
 SMALLEST = '[flow]\nfluid = "incompressible"\ncells = 16\nviscosity = 0.1\n[time]\nduration = 1\n'
 NAMES = [name for name, _ in builtin_scenes()]
@@ -56,6 +56,34 @@ def test_all_stages_of_a_whole_scene():
     assert load_scene("tiny").stages == STAGES
 
 
+def test_without_a_learned_force_nothing_is_trained():
+    scene = load_scene("tiny", ["simulation.force=none"])
+    assert scene.stages == ("dns", "train-kernel", "simulate", "report")
+    other = load_scene("tiny", ["simulation.force=none", "model.hidden=[4]", "training.steps=50"])
+    assert other.fingerprint("simulate") == scene.fingerprint("simulate")
+    bare = dataclasses.replace(scene, model=None, training=None)
+    assert bare.stages == scene.stages
+
+
+@pytest.mark.parametrize("first, second", [("wcsph.alpha=1", "wcsph.alpha=2"),
+                                           ("eulerian.smagorinsky=0", "eulerian.smagorinsky=0.1")])
+def test_the_form_of_a_baseline_counts_for_its_rollout_alone(first, second):
+    force = first.partition(".")[0]
+    scene, changed = (load_scene("tiny", [f"simulation.force={force}", "simulation.step=0.0025", override])
+                      for override in (first, second))
+    affected = [stage for stage in STAGES if scene.fingerprint(stage) != changed.fingerprint(stage)]
+    assert affected == ["simulate", "report"]
+
+
+def test_coarse_grid_of_the_filter():
+    widths = {name: load_scene(name).tracers.width for name in ("hit", "tiny")}
+    assert Eulerian().cells_for(widths["hit"]) == 16  # Nyquist wavenumber 8 = pi / d
+    assert Eulerian().cells_for(widths["tiny"]) == 8
+    assert Eulerian(cells=24).cells_for(widths["hit"]) == 24
+    with pytest.raises(SceneError, match=r"\[eulerian\] cells = 20: must be at most the 18 of the filtered fields"):
+        load_scene("tiny", ["simulation.force=eulerian", "eulerian.cells=20"])
+
+
 def test_derived_lengths():
     tracers, kernel = load_scene("hit-small").tracers, load_scene("hit-small").kernel
     assert tracers.width == 2 * tracers.spacing == pytest.approx(0.3926990817)
@@ -89,6 +117,25 @@ def test_fingerprint_changes_with_the_file_that_the_flow_starts_from(tmp_path):
         scene = load_scene("taylor-green", ["initial.kind=file", f"initial.path={start}"])
         prints.add(scene.fingerprint("dns"))
     assert len(prints) == 2
+
+
+def test_fingerprint_of_training_changes_with_the_weights_that_it_starts_from(tmp_path):
+    scene = load_scene("tiny", [f"model.path={tmp_path}"])
+    prints = [scene.fingerprint("train")]
+    for content in ("some weights", "others"):
+        (tmp_path / "model.h5").write_text(content)
+        prints.append(scene.fingerprint("train"))
+    assert len(set(prints)) == 3
+    assert scene.fingerprint("train-kernel") == load_scene("tiny").fingerprint("train-kernel")
+
+
+def test_trained_weights_need_no_training_and_have_seen_nothing():
+    scene = load_scene("tiny", ["model.path=runs/other"])
+    alone = dataclasses.replace(scene, training=None)
+    assert (scene.seen, alone.seen, alone.window) == (0.5, 0.0, 0.5)
+    assert alone.stages == STAGES
+    assert str(alone.model.weights_file) == "runs/other/model.h5"
+    assert str(load_scene("tiny", ["model.path=a/b.h5"]).model.weights_file) == "a/b.h5"
 
 
 def test_window_without_training_is_the_default_of_training():

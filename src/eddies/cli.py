@@ -9,7 +9,6 @@ import math
 import os
 import signal
 import sys
-import time
 import traceback
 from importlib import import_module
 from pathlib import Path
@@ -21,7 +20,6 @@ from eddies.scene import SceneError, builtin_scenes, load_scene
 BAD_INPUT = 2
 STOPPED = 75  # EX_TEMPFAIL: the same command with --resume goes on
 STOP_SIGNALS = (signal.SIGUSR1, signal.SIGTERM)
-PATIENCE = 5.0  # seconds that a rank waits for the others to come to the same error
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -35,8 +33,8 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         configure_logging(comm.rank)
         options = parse_arguments(arguments, comm.rank)
-        if options.command is run_command:
-            run_command(options, comm, signals)
+        if options.command in (run_command, compare_command):
+            options.command(options, comm, signals)
         else:
             release_signals(signals)
             options.command(options, comm)
@@ -85,6 +83,7 @@ def end_with_error(error: Exception, comm) -> int:
     or is none of the user's, ends the job by MPI_Abort, because the other ranks may wait for this one for
     ever.
     """
+    from eddies.parallel.rendezvous import all_arrive
     mistake = is_users_mistake(error)
     text = f"eddies: error: {error}\n" if mistake else "".join(traceback.format_exception(error))
     together = (mistake or comm.size == 1) and all_arrive(comm)
@@ -106,16 +105,6 @@ def is_users_mistake(error: Exception) -> bool:
     from eddies.io.hdf5 import ProductError
     from eddies.parallel.halo import HaloError
     return isinstance(error, (SceneError, ProductError, HaloError, FlowDiverged, ForcingError))
-
-
-def all_arrive(comm) -> bool:
-    """Whether all ranks call this within PATIENCE seconds of each other."""
-    request, deadline = comm.Ibarrier(), time.monotonic() + PATIENCE
-    while not request.Test():
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(0.01)
-    return True
 
 
 def parse_arguments(arguments: list[str] | None, rank: int) -> argparse.Namespace:
@@ -142,18 +131,23 @@ def build_parser() -> argparse.ArgumentParser:
     for name, about in stages.items():
         command = commands.add_parser(name, help=about, description=about)
         add_scene_options(command)
-        command.add_argument("--output", type=Path, metavar="DIR", help="run directory (default: runs/NAME)")
-        command.add_argument("--resume", action="store_true",
-                             help="skip stages whose product is complete and was made with the same settings, and go "
-                                  "on from the newest checkpoint of the direct simulation")
-        command.add_argument("--max-minutes", type=positive, default=math.inf, metavar="M",
-                             help="stop after M minutes of wall time, with exit code 75, to be resumed")
+        add_job_options(command, "run directory (default: runs/NAME)",
+                        "skip stages whose product is complete and was made with the same settings, and go on from the "
+                        "newest checkpoint of the direct simulation")
         command.add_argument("--checkpoint-minutes", type=positive, default=10.0, metavar="M",
                              help="wall time between two checkpoints of the direct simulation (default: 10)")
         command.set_defaults(command=run_command, stage=name)
     report = commands.add_parser("report", help="figures, one page and metrics.json of a run directory")
     report.add_argument("run", type=Path, metavar="RUN", help="a run directory, such as runs/tiny")
     report.set_defaults(command=report_command)
+    compare = commands.add_parser("compare", help="error against run time of variants of a scene")
+    compare.add_argument("comparison", metavar="COMPARISON",
+                         help="name of a built-in comparison, or path of a TOML file")
+    compare.add_argument("--run", type=Path, metavar="DIR",
+                         help="run directory with the ground truth (default: the comparison's, or runs/BASE)")
+    add_job_options(compare, "directory of the comparison (default: runs/NAME)",
+                    "keep the rollouts that are complete and were made with the same settings on as many ranks")
+    compare.set_defaults(command=compare_command)
     export = commands.add_parser("export", help="fields and particles of a run directory, for ParaView")
     export.add_argument("run", type=Path, metavar="RUN", help="a run directory, such as runs/tiny")
     export.add_argument("--format", choices=["vtkhdf"], default="vtkhdf", help="format of the files (default: vtkhdf)")
@@ -183,6 +177,14 @@ def add_scene_options(parser: argparse.ArgumentParser) -> None:
                         help="change a key of the scene; repeatable")
 
 
+def add_job_options(parser: argparse.ArgumentParser, output: str, resume: str) -> None:
+    """Options of commands that run for long: where the products go, what is kept, and when to stop."""
+    parser.add_argument("--output", type=Path, metavar="DIR", help=output)
+    parser.add_argument("--resume", action="store_true", help=resume)
+    parser.add_argument("--max-minutes", type=positive, default=math.inf, metavar="M",
+                        help="stop after M minutes of wall time, with exit code 75, to be resumed")
+
+
 def run_command(options: argparse.Namespace, comm, signals: list[int]) -> None:
     """One stage of a scene, or all that it has, until a signal, a file STOP or the limit of wall time ends it."""
     from eddies.parallel.stop import StopRequest
@@ -200,6 +202,22 @@ def report_command(options: argparse.Namespace, comm) -> None:
     if not options.run.is_dir():
         raise SceneError(f"{options.run}: no such directory; give a run directory, such as runs/tiny")
     import_module("eddies.workflows.report").run(options.run, comm)
+
+
+def compare_command(options: argparse.Namespace, comm, signals: list[int]) -> None:
+    """Variants of a scene, one after the other, until a signal, a file STOP or the limit of wall time ends it."""
+    from eddies.comparison import load_comparison
+    from eddies.parallel.stop import StopRequest
+    from eddies.stages import check_ranks, check_stop_file, run_stages
+    comparison = load_comparison(options.comparison, options.run)
+    for scene in comparison.scenes.values():
+        check_ranks(scene.stages, scene, comm)
+    directory = options.output or Path("runs") / comparison.name
+    check_stop_file(comm, directory)
+    stop = StopRequest(comm, signals, directory / "STOP", 60 * options.max_minutes)
+    import_module("eddies.workflows.compare").run(
+        comparison, comm, directory, options.resume,
+        lambda stages, scene, where: run_stages(stages, scene, comm, where, True, stop))
 
 
 def export_command(options: argparse.Namespace, comm) -> None:

@@ -3,7 +3,6 @@
 A section that is optional and absent is None, and then nothing is built for it.
 """
 
-import difflib
 import hashlib
 import json
 from dataclasses import asdict, dataclass, fields
@@ -11,13 +10,15 @@ from functools import lru_cache
 from pathlib import Path
 
 from eddies.scene_checks import first_inconsistency
-from eddies.scene_reader import apply_overrides, parse_document, read_section, read_text, write_section
-from eddies.scene_sections import (BOX_LENGTH, DEFAULT_WINDOW, Flow, Forcing, Initial, Kernel, Model, Simulation,
-                                   SpinUp, Time, Tracers, Training)
+from eddies.scene_reader import (apply_overrides, find_document, parse_document, read_section, read_text,
+                                 write_section)
+from eddies.scene_sections import (BOX_LENGTH, DEFAULT_WINDOW, Eulerian, Flow, Forcing, Initial, Kernel, Model,
+                                   Simulation, SpinUp, Time, Tracers, Training, Wcsph)
 from eddies.scene_values import SceneError, choice, integer, section, text
 
-__all__ = ["BOX_LENGTH", "STAGES", "Scene", "SceneError", "builtin_scenes", "load_scene", "Flow", "Forcing",
-           "Initial", "Kernel", "Model", "Simulation", "SpinUp", "Time", "Tracers", "Training"]
+__all__ = ["BOX_LENGTH", "STAGES", "Scene", "SceneError", "builtin_scenes", "load_scene", "Eulerian",
+           "Flow", "Forcing", "Initial", "Kernel", "Model", "Simulation", "SpinUp", "Time", "Tracers", "Training",
+           "Wcsph"]
 
 STAGES = ("dns", "train-kernel", "train", "simulate", "report")
 BUILT_IN = Path(__file__).with_name("scenes")
@@ -41,6 +42,8 @@ class Scene:
     model: Model | None = section(Model, default=None)
     training: Training | None = section(Training, default=None)
     simulation: Simulation | None = section(Simulation, default=None)
+    wcsph: Wcsph | None = section(Wcsph, default=None)
+    eulerian: Eulerian | None = section(Eulerian, default=None)
 
     def __post_init__(self) -> None:
         problem = first_inconsistency(self)
@@ -50,13 +53,19 @@ class Scene:
     @property
     def stages(self) -> tuple[str, ...]:
         """The stages that this scene asks for, in the order in which they run."""
-        needs = {"train-kernel": self.kernel, "train": self.model, "simulate": self.simulation}
+        learned = self.simulation is None or self.simulation.force == "learned"
+        needs = {"train-kernel": self.kernel, "train": self.model if learned else None, "simulate": self.simulation}
         return tuple(stage for stage in STAGES if needs.get(stage, self) is not None)
 
     @property
     def window(self) -> float:
         """Fraction of the ground truth that kernel and model may see; with a kernel alone the default of [training]."""
         return self.training.window if self.training else DEFAULT_WINDOW
+
+    @property
+    def seen(self) -> float:
+        """Fraction of the ground truth that the model was trained on; 0 without [training], as with [model] path."""
+        return self.training.window if self.training else 0.0
 
     def to_toml(self) -> str:
         """The scene as a TOML text with a comment on every key; reading it back gives an equal scene."""
@@ -68,13 +77,15 @@ class Scene:
         return "\n".join(lines) + "\n"
 
     def fingerprint(self, stage: str) -> str:
-        """SHA-256 over what a stage's product depends on: its own settings and all earlier stages', and the content
-        of the file that the flow starts from."""
+        """SHA-256 over what a stage's product depends on: its own settings and those of the earlier stages that
+        the scene has, and the content of the files that the flow starts from and that trained weights come from."""
         reads = {"dns": ("seed", "flow", "initial", "start", "forcing", "time", "spin_up", "tracers"),
-                 "train-kernel": ("kernel", "window"), "train": ("device", "model", "training"),
-                 "simulate": ("simulation",)}
-        settings = asdict(self) | {"window": self.window, "start": _digest(self.initial.path)}
-        keys = [key for earlier in STAGES[:STAGES.index(stage) + 1] for key in reads.get(earlier, ())]
+                 "train-kernel": ("kernel", "window"), "train": ("device", "model", "weights", "training"),
+                 "simulate": ("device", "simulation", "wcsph", "eulerian")}
+        settings = asdict(self) | {"window": self.window, "start": _digest(self.initial.path),
+                                   "weights": _digest(self.model and self.model.weights_file)}
+        keys = [key for earlier in STAGES[:STAGES.index(stage) + 1]
+                if earlier in self.stages for key in reads.get(earlier, ())]
         return hashlib.sha256(json.dumps([[key, settings[key]] for key in keys]).encode()).hexdigest()
 
 
@@ -84,7 +95,7 @@ def load_scene(name_or_path: str | Path, overrides: list[str] | tuple[str, ...] 
     Raises:
         SceneError: names the file (or --set), the section and the key, what is allowed and what to do.
     """
-    path = _find(str(name_or_path))
+    path = find_document(str(name_or_path), BUILT_IN, "scene")
     keys: set[str] = set()
     try:
         document = {"name": path.stem, **parse_document(read_text(path))}
@@ -100,7 +111,7 @@ def builtin_scenes() -> list[tuple[str, str]]:
     return [(path.stem, parse_document(read_text(path))["title"]) for path in sorted(BUILT_IN.glob("*.toml"))]
 
 
-def _digest(path: str | None) -> str | None:
+def _digest(path: str | Path | None) -> str | None:
     """SHA-256 of a file's content; None if there is no such file."""
     if path is None or not Path(path).is_file():
         return None
@@ -109,19 +120,7 @@ def _digest(path: str | None) -> str | None:
 
 
 @lru_cache(maxsize=4)
-def _digest_of_version(path: str, size: int, modified: int) -> str:
+def _digest_of_version(path: str | Path, size: int, modified: int) -> str:
     # The file may be large, and its digest is asked for several times in a run.
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _find(name_or_path: str) -> Path:
-    names = sorted(path.stem for path in BUILT_IN.glob("*.toml"))
-    if name_or_path in names:
-        return BUILT_IN / f"{name_or_path}.toml"
-    if Path(name_or_path).is_file():
-        return Path(name_or_path)
-    near = difflib.get_close_matches(name_or_path, names, n=1)
-    advice = f"did you mean {near[0]}? " if near else ""
-    raise SceneError(f"{name_or_path}: no such scene; {advice}give the path of a TOML file, or one of "
-                     f"{', '.join(names)}")

@@ -11,6 +11,8 @@ from collections.abc import Iterator
 from itertools import chain
 from typing import TYPE_CHECKING
 
+from eddies.scene_sections import Eulerian, Wcsph
+
 if TYPE_CHECKING:
     from eddies.scene import Scene
 
@@ -23,7 +25,7 @@ INITIAL_KEYS = {
 def first_inconsistency(scene: Scene) -> str | None:
     """The first problem found, or None."""
     subjects = (flow_problems, initial_problems, time_problems, tracer_problems, section_problems,
-                support_problems, training_problems, simulation_problems)
+                support_problems, training_problems, simulation_problems, baseline_problems)
     return next(chain.from_iterable(subject(scene) for subject in subjects), None)
 
 
@@ -89,15 +91,26 @@ def tracer_problems(scene: Scene) -> Iterator[str]:
 
 def section_problems(scene: Scene) -> Iterator[str]:
     """Which sections need which others."""
-    needs = {"kernel": ("tracers",), "model": ("tracers", "kernel", "training"), "training": ("model",),
-             "simulation": ("model",)}
+    needs = {"kernel": ("tracers",), "model": ("tracers", "kernel"), "training": ("model",),
+             "simulation": ("tracers", "kernel")}
+    if scene.simulation and scene.simulation.force == "learned":
+        needs["simulation"] = ("model",)
     for name, others in needs.items():
         for other in others:
             if getattr(scene, name) is not None and getattr(scene, other) is None:
                 yield f"[{name}]: needs a section [{other}], which the scene lacks; add it or remove [{name}]"
+    if scene.model and scene.model.path is None and scene.training is None:
+        yield ("[model]: needs a section [training], which the scene lacks; add it, give [model] path, a run directory "
+               "with trained weights, or remove [model]")
+    if scene.model and scene.model.symmetry == "antisymmetric" and scene.model.basis != "paper":
+        yield (f'[model] symmetry = "antisymmetric": with basis = "{scene.model.basis}" the forces of a pair are not '
+               'opposite, as each particle has a moment matrix of its own; set basis = "paper", or symmetry = "none"')
     if scene.model and scene.flow.fluid != "compressible":
         yield ('[model]: learns from the density, which an incompressible flow does not have; set [flow] '
                'fluid = "compressible" and sound_speed, or remove [model]')
+    if scene.simulation and scene.flow.fluid != "compressible":
+        yield ('[simulation]: starts from the density, which an incompressible flow does not have; set [flow] '
+               'fluid = "compressible" and sound_speed, or remove [simulation]')
 
 
 def support_problems(scene: Scene) -> Iterator[str]:
@@ -122,6 +135,13 @@ def training_problems(scene: Scene) -> Iterator[str]:
     if training.final_learning_rate > training.learning_rate:
         yield (f"[training] final_learning_rate = {training.final_learning_rate:g}: must be at most "
                f"learning_rate = {training.learning_rate:g}")
+    step, interval = training.horizon_step, scene.tracers.frame_interval if scene.tracers else None
+    if step and interval and not _is_multiple(interval, step):
+        yield (f"[training] horizon_step = {step:g}: [tracers] frame_interval = {interval:g} must be a whole multiple "
+               "of it; change either")
+    if training.horizon_steps and training.final_learning_rate > training.horizon_learning_rate:
+        yield (f"[training] final_learning_rate = {training.final_learning_rate:g}: must be at most "
+               f"horizon_learning_rate = {training.horizon_learning_rate:g}")
     if scene.tracers and training.batch > scene.tracers.particles:
         yield (f"[training] batch = {training.batch}: must be at most the number of particles, "
                f"{scene.tracers.particles}; lower it or raise [tracers] particles_per_side")
@@ -148,6 +168,29 @@ def simulation_problems(scene: Scene) -> Iterator[str]:
     if simulation.start is None and scene.training and scene.training.window == 1:
         yield ("[simulation] start: this key is missing; the training window is the whole ground truth, so "
                "there is nothing after it; give start, or a smaller [training] window")
+
+
+def baseline_problems(scene: Scene) -> Iterator[str]:
+    """Sections of another force; a step that sound outruns; a coarse grid that is finer than what it starts from."""
+    simulation = scene.simulation
+    for name in ("wcsph", "eulerian"):
+        if getattr(scene, name) is not None and (simulation is None or simulation.force != name):
+            yield f'[{name}]: only read with [simulation] force = "{name}"; set it, or remove [{name}]'
+    if simulation and simulation.force == "wcsph" and simulation.step > acoustic_step(scene):
+        yield (f'[simulation] step = {simulation.step:g}: force = "wcsph" must resolve sound, with a step of at most '
+               f"0.4 h / (c (1 + 0.6 alpha)) = {acoustic_step(scene):.3g}, h half the support of [kernel] neighbors "
+               "and c [flow] sound_speed; lower step")
+    if simulation and simulation.force == "eulerian":
+        cells = (scene.eulerian or Eulerian()).cells_for(scene.tracers.width)
+        if cells > scene.tracers.cells:
+            yield (f"[eulerian] cells = {cells}: must be at most the {scene.tracers.cells} of the filtered fields that "
+                   "it starts from; lower cells or raise [tracers] field_cells")
+
+
+def acoustic_step(scene: Scene) -> float:
+    """The longest step of WCSPH, 0.4 h / (c (1 + 0.6 alpha)) (Monaghan 1992), h half the kernel's support."""
+    h, alpha = scene.kernel.support(scene.tracers.particles) / 2, (scene.wcsph or Wcsph()).alpha
+    return 0.4 * h / (scene.flow.sound_speed * (1 + 0.6 * alpha))
 
 
 def _is_multiple(interval: float, unit: float) -> bool:

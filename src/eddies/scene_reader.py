@@ -14,6 +14,19 @@ from typing import Any
 from eddies.scene_values import SceneError, quoted
 
 
+def find_document(name_or_path: str, built_in: Path, what: str) -> Path:
+    """The file of a built-in name (a TOML file in the folder `built_in`), or of a path; SceneError lists the names."""
+    names = sorted(path.stem for path in built_in.glob("*.toml"))
+    if name_or_path in names:
+        return built_in / f"{name_or_path}.toml"
+    if Path(name_or_path).is_file():
+        return Path(name_or_path)
+    near = difflib.get_close_matches(name_or_path, names, n=1)
+    advice = f"did you mean {near[0]}? " if near else ""
+    raise SceneError(f"{name_or_path}: no such {what}; {advice}give the path of a TOML file, or one of "
+                     f"{', '.join(names)}")
+
+
 def parse_document(text: str) -> dict[str, Any]:
     """The tables and keys of a TOML text.
 
@@ -98,6 +111,8 @@ def _override_value(value: str) -> Any:
 def _read_value(field: dataclasses.Field, value: Any, section: str) -> Any:
     if "section" in field.metadata:
         return read_section(field.metadata["section"], value, field.name)
+    if "sections" in field.metadata:
+        return _read_sections(field.metadata["sections"], value, field.name)
     rule = field.metadata["rule"]
     try:
         return rule.accept(value)
@@ -105,6 +120,20 @@ def _read_value(field: dataclasses.Field, value: Any, section: str) -> Any:
         where = _where(field.name, section)
         message = f"{where} = {quoted(value)}: must be {rule.allowed} ({rule.about})"
         raise SceneError(message, _path(field.name, section)) from None
+
+
+def _read_sections(kind: type, tables: Any, name: str) -> tuple:
+    """A dataclass for each [[name]]; an error says which by its number, and by its name if it has one."""
+    if not isinstance(tables, list):
+        raise SceneError(f"{name} = {quoted(tables)}: must be sections; write [[{name}]] before each", name)
+    read = []
+    for number, table in enumerate(tables, 1):
+        try:
+            read.append(read_section(kind, table, name))
+        except SceneError as error:
+            own = f' ("{table["name"]}")' if isinstance(table, dict) and "name" in table else ""
+            raise SceneError(f"[[{name}]] number {number}{own}: {error}", error.key) from None
+    return tuple(read)
 
 
 def _unknown(key: str, value: Any, section: str, fields: dict[str, dataclasses.Field]) -> SceneError:

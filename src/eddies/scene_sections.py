@@ -6,6 +6,7 @@ cube [0, 2 pi)^3, the mean density is 1, and times are in the unit that follows 
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
 from eddies.scene_values import choice, integer, integers, number, text
 
@@ -127,11 +128,23 @@ class Model:
 
     basis: str = choice("of the pair sum; corrected: times the inverse moment matrix", "paper", "corrected",
                         default="corrected")
-    closure: str = choice("where the density comes from", "poisson", "learned-density", "paper-density",
-                          default="poisson")
+    closure: str = choice("where the density comes from; -force: with -grad p as a force, -stress: and resolved stress",
+                          "poisson", "poisson-force", "poisson-stress", "learned-density", "paper-density",
+                          default="poisson-stress")
     hidden: tuple[int, ...] = integers("widths of the pair network's layers", default=(16, 16), at_least=1)
     eddy_viscosity: str = choice("explicit eddy viscosity between pairs", "none", "two-sided", "monaghan",
                                  default="none")
+    symmetry: str = choice("antisymmetric: pairs get opposite forces, which keep the momentum; with basis paper only",
+                           "none", "antisymmetric", default="none")
+    path: str | None = text("run directory or model.h5 whose trained weights are used; absent: they are trained",
+                            default=None)
+
+    @property
+    def weights_file(self) -> Path | None:
+        """The file of the weights: `path` where it ends in .h5, model.h5 within it otherwise; None without it."""
+        if self.path is None:
+            return None
+        return Path(self.path) if self.path.endswith(".h5") else Path(self.path) / "model.h5"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,14 +164,27 @@ class Training:
     velocity_kl_weight: float = number("weight of the divergence of velocity PDFs", default=0.0, at_least=0)
     acceleration_kl_weight: float = number("the same for acceleration PDFs", default=0.0, at_least=0)
     combined_steps: int = integer("steps at the end that use every loss", default=0, at_least=0)
+    horizons: tuple[int, ...] = integers("frames through which the simulation is differentiated, one after the other",
+                                         default=(1, 2, 4, 8), at_least=1)
+    horizon_steps: int = integer("optimiser steps of each horizon, after all others", default=0, at_least=0)
+    horizon_step: float | None = number("time step of the horizons; absent: the interval of frames", default=None,
+                                        above=0)
+    horizon_integrator: str = choice("time stepping of the horizons", "verlet", "rk2", "rk4", default="verlet")
+    horizon_learning_rate: float = number("of the optimiser, at the start of the horizons", default=1e-3, above=0)
+    energy_weight: float = number("weight of the kinetic energy in the loss of the horizons", default=1.0, at_least=0)
+    noise: float = number("added to initial velocities of the horizons, in units of their rms", default=0.0, at_least=0)
+    patience: int | None = integer("validations without a new best that end steps or horizons early; absent: none",
+                                   default=None, at_least=1)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Simulation:
-    """The run of the learned model, without the direct simulation."""
+    """The run of the particles, without the direct simulation."""
 
+    force: str = choice("what moves the particles; see Baselines", "learned", "none", "wcsph", "eulerian",
+                        default="learned")
     integrator: str = choice("time stepping of the particles", "verlet", "rk2", "rk4", default="verlet")
-    step: float = number("time step", above=0)
+    step: float = number("time step; eulerian: the longest", above=0)
     turnovers: float = number("large-eddy turnovers to simulate", above=0)
     start: float | None = number("as a fraction of the ground truth; absent: where the training window ends",
                                  default=None, at_least=0, below=1)
@@ -167,3 +193,31 @@ class Simulation:
     precision: str = choice("of the forces", "float32", "float64", default="float32")
     injection: float | str = number("large-scale forcing power per mass; dissipation: as the flow loses",
                                     default="none", words=("none", "dissipation"), above=0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wcsph:
+    """Weakly compressible smoothed particle hydrodynamics, with force = "wcsph"; absent: the defaults."""
+
+    kernel: str = choice("smoothing kernel, of the support of [kernel]", "cubic-spline", "wendland",
+                         default="cubic-spline")
+    alpha: float = number("linear coefficient of the artificial viscosity", default=1.0, at_least=0)
+    beta: float = number("quadratic coefficient of the artificial viscosity", default=2.0, at_least=0)
+    exponent: float = number("gamma of the pressure c^2 rho_0 / gamma ((rho / rho_0)^gamma - 1)", default=1.0,
+                             at_least=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Eulerian:
+    """Large-eddy simulation on a coarse grid, with force = "eulerian"; absent: the defaults."""
+
+    cells: int | None = integer("of the coarse grid; absent: its Nyquist wavenumber is pi / filter width, at least 8",
+                                default=None, at_least=8)
+    smagorinsky: float = number("C_s of the eddy viscosity (C_s d)^2 (2 S:S)^(1/2), d the filter width; 0: no model",
+                                default=0.17, at_least=0)
+
+    def cells_for(self, filter_width: float) -> int:
+        """Cells along each side: as given, or the fewest whose Nyquist wavenumber reaches pi / d."""
+        if self.cells is not None:
+            return self.cells
+        return max(math.ceil(BOX_LENGTH / filter_width - 1e-9), 8)

@@ -1,7 +1,7 @@
 """What a single value of a scene may be.
 
 Every key of a scene is declared once, beside the dataclass field that holds it, by one of the functions
-`number`, `integer`, `integers`, `choice` and `text`. The declaration carries a line on what the key means,
+`number`, `integer`, `integers`, `choice`, `text` and `texts`. The declaration carries a line on what the key means,
 which values it accepts, and its default; the reader, the error messages and the written scene all use that
 one declaration.
 """
@@ -99,6 +99,22 @@ class Integers:
 
 
 @dataclass(frozen=True)
+class Texts:
+    """A list of non-empty strings; held as a tuple."""
+
+    about: str
+
+    def accept(self, value: Any) -> tuple[str, ...]:
+        if not isinstance(value, list):
+            raise ValueError
+        return tuple(Text(self.about).accept(entry) for entry in value)
+
+    @property
+    def allowed(self) -> str:
+        return 'a list of texts, such as ["one", "two"]'
+
+
+@dataclass(frozen=True)
 class Choice:
     """One of a few words."""
 
@@ -156,9 +172,19 @@ def text(about: str, default: Any = MISSING) -> Any:
     return _declare(Text(about), default)
 
 
+def texts(about: str, default: Any = MISSING) -> Any:
+    """Declare a dataclass field that holds a tuple of strings."""
+    return _declare(Texts(about), default)
+
+
 def section(kind: type, default: Any = MISSING) -> Any:
     """Declare a dataclass field that holds a whole section, itself a dataclass `kind` (None: absent)."""
     return dataclasses.field(default=default, metadata={"section": kind})
+
+
+def sections(kind: type) -> Any:
+    """Declare a dataclass field that holds a tuple of dataclasses `kind`, one for each [[section]] of its name."""
+    return dataclasses.field(default=(), metadata={"sections": kind})
 
 
 def quoted(value: Any) -> str:

@@ -16,6 +16,7 @@ from eddies.io.hdf5 import open_product, product_fingerprint
 from eddies.parallel.stop import StopRequest
 from eddies.scene import Scene, SceneError
 from eddies.workflows.estimates import ground_truth_alone, most_ranks
+from eddies.workflows.model_source import read_source
 
 log = logging.getLogger("eddies")
 
@@ -72,13 +73,20 @@ def check_ranks(stages: Sequence[str], scene: Scene, comm) -> None:
 
 
 def check_inputs(stages: Sequence[str], scene: Scene, comm, directory: Path) -> None:
-    """Refuse stages that the scene lacks, and inputs that are missing or of other settings than the scene's."""
+    """Refuse stages that the scene lacks, and inputs that are missing or of other settings or another form than the
+    scene's."""
     for stage in stages:
         if stage not in scene.stages:
+            if stage == "train" and scene.model is not None:
+                raise SceneError(f'{scene.name}: [simulation] force = "{scene.simulation.force}" needs no trained '
+                                 'model; set force = "learned" to train one')
             section = {"train-kernel": "kernel", "train": "model", "simulate": "simulation"}[stage]
             raise SceneError(f"{scene.name}: has no [{section}], which `eddies {stage}` is about; add it")
+    if "train" in stages and scene.model.path is not None:
+        read_source(scene, comm)
     order = list(PRODUCTS)
-    for needed in order[:order.index(stages[0])] if stages[0] in order else ():
+    earlier = order[:order.index(stages[0])] if stages[0] in order else ()
+    for needed in [stage for stage in earlier if stage in scene.stages]:
         kind, name = PRODUCTS[needed]
         with open_product(comm, directory / name, kind):
             pass

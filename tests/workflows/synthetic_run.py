@@ -122,14 +122,15 @@ def write_kernel(comm, directory, cells=32):
                  provenance(), tables)
 
 
-def write_model(comm, directory, closure="poisson"):
+def write_model(comm, directory, closure="poisson", source=None):
+    """With weights of another run, where `source` says which and at which Mach number."""
     rng = np.random.default_rng(3)
     step, delay = np.arange(0, 300, 10), np.linspace(-0.6, 0.6, 13)
     decay = np.exp(-step / 80)
     history = {name: scale * decay for name, scale in (
         ("loss", 1.0), ("trajectory_loss", 0.8), ("field_loss", 0.1), ("velocity_kl_loss", 0.01),
         ("acceleration_kl_loss", 0.02), ("learning_rate", 5e-3), ("gradient_norm", 2.0))}
-    history |= {"step": step, "seconds": step * 0.02,
+    history |= {"step": step, "seconds": step * 0.02, "phase": 0 * step,
                 "validation_error": np.where(step % 50 == 0, 0.25 + 0.7 * decay, np.nan)}
     a_priori = {"delay": delay, "acceleration_error": 0.24 + 0.03 * np.maximum(delay, 0),
                 "true_density_acceleration_error": 0.22 + 0.02 * np.maximum(delay, 0),
@@ -141,8 +142,12 @@ def write_model(comm, directory, closure="poisson"):
     if closure != "poisson":
         tables["a_priori"]["density_rate_error"] = 0.6 + 0.05 * delay
         tables["density_rate_sample"] = {"truth": truth[:, 0], "predicted": 0.8 * truth[:, 0]}
+    origin = provenance()
+    if source:
+        tables["source_a_priori"] = {name: 0.9 * errors for name, errors in tables["a_priori"].items()}
+        origin |= {"mach_turbulent": 0.16, "source": source}
     save_weights(comm, directory / "model.h5", "model", {"basis": "corrected", "closure": closure},
-                 {"weight": np.ones(3)}, provenance(), tables)
+                 {"weight": np.ones(3)}, origin, tables)
 
 
 class PerturbedFlow:
@@ -170,8 +175,8 @@ def write_rollout(comm, directory, status="complete", total=600, cells=16, frame
               "velocity_gradient": (3, 3)}
     times = 0.1 * np.arange(frames)
     attributes = {"status": status, "start_time": 0.6, "time_step": 0.02, "integrator": "verlet",
-                  "closure": "poisson", "turnovers": times[-1] / TURNOVER, "seconds_per_step": 0.031,
-                  "particles": total, "ranks": 1, "eddy_turnover_time": TURNOVER}
+                  "force": "learned", "closure": "poisson", "turnovers": times[-1] / TURNOVER,
+                  "seconds_per_step": 0.031, "particles": total, "ranks": 1, "eddy_turnover_time": TURNOVER}
     with create_product(comm, directory / "rollout.h5", "rollout", provenance()) as file:
         write_attributes(file.create_group("rollout"), attributes)
         runs = (("truth", times[:-3], PerturbedFlow(0.0)), ("model", times, PerturbedFlow(0.4)))

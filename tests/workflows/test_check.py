@@ -128,6 +128,15 @@ def test_job_with_too_many_ranks_is_told(comm):
     assert list(warnings(load_scene("hit-small"), 2)) == []
 
 
+def test_weights_that_are_not_there_yet_are_told(tmp_path):
+    from eddies.workflows.check import warnings
+    scene = load_scene("tiny", [f"model.path={tmp_path}"])
+    (told,) = warnings(scene, 1)
+    assert f"there is no {tmp_path / 'model.h5'} yet" in told
+    (tmp_path / "model.h5").touch()
+    assert not list(warnings(scene, 1))
+
+
 @pytest.mark.mpi(1, 2)
 @pytest.mark.parametrize("overrides", [["forcing.wavenumber=1.5"], ["flow.cells=72", "forcing.wavenumber=23"]])
 @pytest.mark.filterwarnings("error")

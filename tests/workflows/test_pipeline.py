@@ -1,5 +1,6 @@
 """The tiny scene from DNS to report through the command line, as a user runs it."""
 
+import dataclasses
 import json
 import math
 import os
@@ -10,6 +11,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+
+from eddies.scene import load_scene
 
 CHECKOUT = Path(__file__).parents[2]
 
@@ -104,6 +107,28 @@ def test_a_step_that_outruns_the_slabs_is_refused(run_directory, tmp_path):
     result = eddies(2, "simulate", "tiny", "--output", str(tmp_path), *longer)
     assert result.returncode == 2 and "slabs no thinner than the particles' reach" in result.stderr
     assert not (tmp_path / "rollout.h5").exists()
+
+
+def test_a_trained_model_runs_on_another_flow(run_directory, tmp_path):
+    """At twice the Mach number, with nothing of that flow but its scales; all of it is unseen."""
+    slower = load_scene("tiny", ["flow.sound_speed=11", "seed=2", "tracers.turnovers=0.4", "kernel.steps=20",
+                                 "simulation.turnovers=0.1", f"model.path={run_directory}"])
+    (tmp_path / "slower.toml").write_text(dataclasses.replace(slower, training=None).to_toml())
+    result = eddies(2, "run", str(tmp_path / "slower.toml"), "--output", str(tmp_path / "run"))
+    assert result.returncode == 0, result.stdout + result.stderr
+    with h5py.File(run_directory / "model.h5") as trained, h5py.File(tmp_path / "run" / "model.h5") as adopted:
+        for name, weight in trained["weights"].items():
+            assert np.array_equal(adopted["weights"][name], weight)
+        scales = [json.loads(file.attrs["description"])["scales"] for file in (trained, adopted)]
+        assert scales[0]["sound_speed"] == 22.5 and scales[1]["sound_speed"] == 11
+        assert scales[1]["density"] > 2 * scales[0]["density"]
+        assert adopted["a_priori/delay"][0] > 0
+    with h5py.File(tmp_path / "run" / "rollout.h5") as file:
+        rollout = dict(file["rollout"].attrs)
+        assert rollout["start_time"] == pytest.approx(0.1) and rollout["status"] == "complete"
+    shown = json.loads((tmp_path / "run" / "report" / "metrics.json").read_text())["model"]
+    assert shown["acceleration_error"] < 0.95 and shown["source_acceleration_error"] < 0.9
+    assert shown["mach_turbulent"] == pytest.approx(2 * shown["source_mach_turbulent"], rel=0.2)
 
 
 @pytest.mark.parametrize("closure", ["learned-density", "paper-density"])

@@ -16,6 +16,7 @@ FIGURES = {
     "statistics", "spectra", "fields", "stationary", "tracers", "figure-1-kernels", "figure-2-reconstruction",
     "kernel-training", "figure-3-a-priori", "model-training", "figure-4-velocity", "figure-5-vorticity-energy",
     "figure-6-pdfs", "figure-7-invariants", "figure-8-spectra", "figure-9-errors", "lagrangian",
+    "particle-disorder",
 }
 METRICS = {
     "ground_truth": {"reynolds_lambda", "kmax_eta", "mach_turbulent", "energy_budget_error", "skewness"},
@@ -27,7 +28,8 @@ METRICS = {
     "model": {"acceleration_error", "density_rate_error", "filtered_pressure_gradient_error",
               "true_density_acceleration_error", "delay"},
     "rollout": {"turnovers", "stable", "energy_ratio", "velocity_error", "spectrum_error", "velocity_kl",
-                "acceleration_kl", "qr_kl"},
+                "acceleration_kl", "qr_kl", "nearest_distance_kl", "count_variance_ratio",
+                "high_wavenumber_energy_ratio"},
     "cost": {"seconds_per_step", "particles", "ranks", "stage_seconds"},
 }
 
@@ -99,6 +101,9 @@ def test_numbers_of_a_known_rollout(comm, tmp_path):
     assert rollout["energy_ratio"] == pytest.approx(1.04, abs=0.05)
     assert rollout["filter_wavenumber"] == pytest.approx(4)
     assert 0 < rollout["velocity_kl"] < 0.1 and 0 < rollout["qr_kl"] < 0.5
+    # Both start at the same random points. The field of the model is made without its error, and k <= 4.
+    assert 0 < rollout["nearest_distance_kl"] < 0.1
+    assert rollout["count_variance_ratio"] == pytest.approx(1, abs=0.3)
 
 
 @pytest.mark.mpi(1)
@@ -132,6 +137,26 @@ def test_a_model_that_integrates_density(comm, tmp_path):
 
 
 @pytest.mark.mpi(1)
+def test_a_model_of_another_flow_is_shown_beside_its_source(comm, tmp_path):
+    write_model(comm, tmp_path, source={"path": "runs/other", "mach_turbulent": 0.08})
+    report.run(tmp_path, comm)
+    metrics, page = written(tmp_path)
+    assert "figure-3b-mach" in figures(tmp_path) and "Trained in runs/other at M_t = 0.080" in page
+    # Errors 0.24 + 0.03 t of this flow, at t = 0.1 to 0.6; the source's are 0.9 of them, and so are its times.
+    assert metrics["model"]["unseen_acceleration_error"] == pytest.approx(0.2505)
+    assert metrics["model"]["source_acceleration_error"] == pytest.approx(0.9 * 0.2505)
+    assert (metrics["model"]["source_mach_turbulent"], metrics["model"]["mach_turbulent"]) == (0.08, 0.16)
+
+
+@pytest.mark.mpi(1)
+def test_a_source_of_unknown_mach_number_is_said(comm, tmp_path):
+    write_model(comm, tmp_path, source={"path": "runs/other", "mach_turbulent": None})
+    report.run(tmp_path, comm)
+    assert "runs/other does not say its Mach number" in written(tmp_path)[1]
+    assert "figure-3b-mach" not in figures(tmp_path)
+
+
+@pytest.mark.mpi(1)
 def test_a_dns_alone(comm, tmp_path):
     write_ground_truth(comm, tmp_path, tracers=False)
     report.run(tmp_path, comm)
@@ -151,6 +176,7 @@ def test_a_rollout_without_its_ground_truth(comm, tmp_path):
     report.run(tmp_path, comm)
     metrics, page = written(tmp_path)
     assert metrics["rollout"]["spectrum_error"] is None
+    assert metrics["rollout"]["high_wavenumber_energy_ratio"] is None
     assert "the filter width is in ground_truth.h5" in page
     assert "figure-8-spectra" in figures(tmp_path)
 

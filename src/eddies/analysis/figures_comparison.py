@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from eddies.analysis import figures_rollout, figures_statistics
+from eddies.analysis import figures_disorder, figures_rollout, figures_statistics
 from eddies.analysis import rollout_comparison as comparison
 from eddies.analysis.errors import normalized_l2
 from eddies.analysis.figures import png
@@ -15,6 +15,14 @@ from eddies.analysis.spectra import spectrum_error, vorticity
 
 MAIN = ("turnovers", "energy_ratio", "velocity_error", "spectrum_error", "velocity_kl", "acceleration_kl",
         "qr_kl")
+# What moved the particles, by [simulation] force, from the attributes of the rollout.
+FORCES = {
+    "learned": "learned pair force, closure {closure}",
+    "none": "no force: every particle keeps its velocity",
+    "wcsph": "WCSPH, {kernel} kernel, density by summation, α = {alpha:g}, β = {beta:g}, γ = {exponent:g}",
+    "eulerian": "Eulerian large-eddy simulation on {cells}³ cells, |kᵢ| ≤ {largest_wavenumber}, Smagorinsky constant "
+                "{smagorinsky:g}",
+}
 TRUTH_NAMES = {"filtered": "filtered DNS", "truth": "true tracers"}
 
 
@@ -40,6 +48,17 @@ class Rollout:
         return float(self.attributes["eddy_turnover_time"])
 
     @property
+    def filter_wavenumber(self) -> float | None:
+        """k_d = pi / d, or None where the filter width is not known."""
+        return None if self.filter_width is None else np.pi / self.filter_width
+
+    @property
+    def force(self) -> str:
+        """What moved the particles, in words."""
+        # A file without this attribute was written before there were baselines.
+        return FORCES[str(self.attributes.get("force", "learned"))].format_map(self.attributes)
+
+    @property
     def status(self) -> str:
         """How it ended: "complete", or "stopped: reason"."""
         return str(self.attributes["status"])
@@ -48,9 +67,10 @@ class Rollout:
 def section(run: Rollout) -> Section:
     """The rollout: figures 4 to 9 and Lagrangian statistics; `run` is read frame by frame."""
     broken = comparison.first_broken_time(run.model)
-    text = (f"Closure {run.attributes['closure']}, integrator {run.attributes['integrator']}, time step "
+    text = (f"Moved by: {run.force}; integrator {run.attributes['integrator']}, time step "
             f"{float(run.attributes['time_step']):.3g}. T = {run.turnover:.3g} is the eddy turnover time. ")
     shown = Section("rollout", "Rollout against the truth", text, main=MAIN, metrics=[
+        Metric("force", "what moved the particles", run.force),
         Metric("status", "status", run.status),
         Metric("stable", "stable to the end", run.status == "complete" and not np.isfinite(broken)),
         Metric("turnovers", "eddy turnovers run", float(run.attributes["turnovers"])),
@@ -69,6 +89,9 @@ def section(run: Rollout) -> Section:
     _add_particles(shown, run, common)
     _add_invariants(shown, run, common)
     _add_spectra(shown, run, last)
+    found = figures_disorder.measure({"model": run.model, "truth": run.truth}, run.fields, common, run.length, broken,
+                                     run.filter_wavenumber)
+    figures_disorder.add(shown, found, run.turnover)
     shown.illustrations.sort(key=lambda illustration: illustration.name)
     return shown
 
@@ -157,9 +180,8 @@ def _add_spectra(shown: Section, run: Rollout, last: float) -> None:
     series = [comparison.spectra_pair(model, truth, common, index) for index in common.spread(3)]
     at = series[-1]
     caption = "Model and true tracers through the learned kernel; the DNS at the nearest stored time."
-    cutoff, half, whole = None, None, None
-    if run.filter_width is not None:
-        cutoff = np.pi / run.filter_width
+    cutoff, half, whole = run.filter_wavenumber, None, None
+    if cutoff is not None:
         half, whole = (spectrum_error(at.wavenumber, at.model, at.truth, max(1.0, largest))
                        for largest in (cutoff / 2, cutoff))
         caption += (f" Relative L2 difference at t = {at.time / run.turnover:.2f} T: {half:.3f} up to k_d/2, "

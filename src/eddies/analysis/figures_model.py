@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from eddies.analysis import figures_learning
 from eddies.analysis.figures import (
     DNS, FOURTH, GUIDE, MODEL, SECOND, TRUTH, legend_below, letter, panels, png, styled,
 )
@@ -17,11 +18,6 @@ ERRORS = (  # column of the table, label, colour, line style, marker
     ("true_density_acceleration_error", "model given the true density", FOURTH, "-", "s"),
     ("density_rate_error", "density rate of the model", SECOND, "-", "^"),
     ("pressure_gradient_error", "exact filtered pressure gradient", DNS, "--", None),
-)
-LOSSES = (
-    ("loss", "total", DNS), ("trajectory_loss", "trajectory $L_t$", MODEL),
-    ("field_loss", "field $L_f$", TRUTH), ("velocity_kl_loss", "velocity KL", SECOND),
-    ("acceleration_kl_loss", "acceleration KL", FOURTH),
 )
 EDGES = bin_edges(8, 65)  # of the PDFs, in standard deviations of the truth
 METRICS = {  # key in the report: column of the table, label
@@ -50,26 +46,6 @@ def a_priori(table: Mapping[str, np.ndarray], acceleration: Mapping[str, np.ndar
     return figure
 
 
-@styled
-def training_history(history: Mapping[str, np.ndarray]) -> Figure:
-    """Losses and validation error over the training step."""
-    figure, axes = panels(1, 2, (5.0, 3.2))
-    for name, label, colour in LOSSES:
-        if np.any(history[name] > 0):
-            axes[0, 0].semilogy(history["step"], _positive(history[name]), color=colour, label=label,
-                                linewidth=1.2)
-    axes[0, 0].set(title="Losses", xlabel="training step", ylabel="loss")
-    legend_below(axes[0, 0], 3)
-    measured = np.isfinite(history["validation_error"])
-    axes[0, 1].plot(history["step"][measured], history["validation_error"][measured], color=MODEL, marker="o",
-                    markersize=3)
-    highest = np.nanmax(history["validation_error"], initial=0.0)
-    axes[0, 1].set(title="Error on an unseen frame", xlabel="training step", ylim=(0, 1.1 * highest or None),
-                   ylabel="normalised L2, acceleration")
-    letter(axes.flat)
-    return figure
-
-
 def _positive(values: np.ndarray) -> np.ndarray:
     return np.where(np.asarray(values) > 0, values, np.nan)
 
@@ -88,8 +64,9 @@ def _errors_panel(axis: Axes, table: Mapping[str, np.ndarray]) -> None:
             axis.plot(delay, table[column], color=colour, linestyle=style, marker=marker, markersize=4,
                       label=label)
     top = max(1.1, *(1.05 * table[column].max() for column, *_ in ERRORS if column in table))
-    axis.set(title="A-priori error", xlabel="delay after the training window", ylabel="normalised L2 error",
-             ylim=(0, top))
+    seen = delay.min() < 0
+    axis.set(title="A-priori error", ylabel="normalised L2 error", ylim=(0, top),
+             xlabel="delay after the training window" if seen else "time after the release of the tracers")
     legend_below(axis, 1)
 
 
@@ -109,16 +86,19 @@ def _pdf_panel(axis: Axes, sample: Mapping[str, np.ndarray], title: str, symbol:
 
 def section(description: Mapping[str, object], table: Mapping[str, np.ndarray],
             acceleration: Mapping[str, np.ndarray], density_rate: Mapping[str, np.ndarray] | None,
-            history: Mapping[str, np.ndarray]) -> Section:
-    """The pair-force model: a-priori figures and the errors at the last frame, from the tables."""
+            history: Mapping[str, np.ndarray], source: str | None = None) -> Section:
+    """The pair-force model: a-priori figures and the errors at the last frame, from the tables.
+
+    `source` names the run that the weights come from, if it is another; the history is that run's.
+    """
     last = int(np.argmax(table["delay"]))
     at = {name: float(values[last]) for name, values in table.items()}
     missing = f"closure {description['closure']} has none"
     metrics = [Metric(key, label, at.get(column), missing) for key, (column, label) in METRICS.items()]
-    metrics.append(Metric("delay", "delay of these errors after the training window", at["delay"]))
+    metrics.append(Metric("delay", "delay of these errors after what the model was trained on", at["delay"]))
+    since = "training window" if source is None else "release of the tracers, or the training window"
     text = (f"Basis {description['basis']}, closure {description['closure']}. A-priori: the model sees the "
-            "true particles of a frame. Numbers are of the last frame, "
-            f"{at['delay']:.3g} after the training window.")
+            f"true particles of a frame. Numbers are of the last frame, {at['delay']:.3g} after the {since}.")
     shown = Section("model", "Pair-force model", text, metrics=metrics,
                     main=("acceleration_error", "filtered_pressure_gradient_error"))
     truth, predicted = acceleration["truth"], acceleration["predicted"]
@@ -130,6 +110,6 @@ def section(description: Mapping[str, object], table: Mapping[str, np.ndarray],
         f"At the last frame the acceleration error is {at['acceleration_error']:.3f}; that of the exact "
         f"filtered pressure gradient alone is {at['pressure_gradient_error']:.3f}, that of no model 1. KL "
         f"divergence of the acceleration PDF {divergence:.2g}. Grey: frames of the training window.")
-    shown.add_figure("model-training", "Training of the model", png(training_history(history)),
-                     f"{int(history['step'][-1])} steps.")
+    shown.add_figure("model-training", "Training of the model", png(figures_learning.curves(history)),
+                     f"{int(history['step'][-1])} steps" + (f", in {source}." if source else "."))
     return shown

@@ -93,13 +93,18 @@ def open_product(comm: MPI.Comm, path: str | Path, kind: str | None) -> Iterator
         yield file
 
 
-def product_fingerprint(path: str | Path) -> str | None:
-    """The scene's fingerprint stored in a complete product; None if there is none."""
+def product_provenance(path: str | Path) -> dict[str, Any]:
+    """Where a complete product comes from, as `read_provenance`; empty if there is none."""
     try:
         with h5py.File(path, "r") as file:
-            return read_provenance(file).get("fingerprint") if file.attrs.get("complete", False) else None
+            return read_provenance(file) if file.attrs.get("complete", False) else {}
     except (OSError, ValueError, KeyError):
-        return None
+        return {}
+
+
+def product_fingerprint(path: str | Path) -> str | None:
+    """The scene's fingerprint stored in a complete product; None if there is none."""
+    return product_provenance(path).get("fingerprint")
 
 
 def read_provenance(file: h5py.File) -> dict[str, Any]:

@@ -73,7 +73,7 @@ def _closure_rate_error(truth: GroundTruth, closure: PoissonClosure, index: int,
 
     def density(frame: int) -> np.ndarray:
         particles = ParticleSet.from_numpy(truth.particles(frame), device)
-        return _by_id(comm, total, closure.apply(particles).to_numpy(), "density")
+        return _by_id(comm, total, closure.apply(particles)[0].to_numpy(), "density")
 
     rate = (density(index + 1) - density(index - 1)) / (truth.times[index + 1] - truth.times[index - 1])
     exact = _by_id(comm, total, truth.particles_with_rates(index), "density_rate")

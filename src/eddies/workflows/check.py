@@ -104,11 +104,12 @@ def time_lines(scene: Scene, ranks: int, speed: Speed) -> Iterator[str]:
 
 
 def cost_lines(scene: Scene, speed: Speed) -> Iterator[str]:
-    """Memory and wall time of the direct simulation on any number of ranks, and memory of the pair force."""
+    """Memory and wall time of the direct simulation on any number of ranks, and memory of the learned pair force."""
+    learned = scene.simulation is not None and scene.simulation.force == "learned"
     yield (f"estimates, from the work of the ranks at hand, for nodes of {NODE_RANKS} ranks that share "
            f"{NODE_BANDWIDTH / 1e9:g} GB/s, {1e6 * LATENCY:g} us a message")
     yield ("ranks  nodes  planes  memory a rank  s a step     wall time  core hours"
-           + ("  pair force a rank" if scene.simulation else ""))
+           + ("  pair force a rank" if learned else ""))
     most, most_alone = (min(most_ranks(case).values()) for case in (scene, ground_truth_alone(scene)))
     steps = expected_steps(scene)
     for row in costs(scene, most_alone, speed):
@@ -116,7 +117,7 @@ def cost_lines(scene: Scene, speed: Speed) -> Iterator[str]:
         if steps:
             seconds = row.seconds * steps
             line += f"  {duration(seconds):>12}  {row.ranks * seconds / 3600:10,.1f}"
-        if scene.simulation and row.ranks <= most:
+        if learned and row.ranks <= most:
             line += f"  {megabytes(pair_bytes(scene, row.ranks)):>17}"
         yield line
 
@@ -134,6 +135,9 @@ def warnings(scene: Scene, ranks: int) -> Iterator[str]:
         needed = math.ceil(3 / turbulence.kolmogorov_length) + 1
         yield (f"k_max eta is below 0.9, the dissipation is not resolved: raise [flow] cells to {needed} or "
                "the viscosity")
+    if scene.model and scene.model.path and not scene.model.weights_file.is_file():
+        yield (f'[model] path = "{scene.model.path}": there is no {scene.model.weights_file} yet, which `eddies train` '
+               "will want")
     if scene.tracers and scene.tracers.width < BOX_LENGTH / scene.flow.cells:
         yield "the filter is narrower than a cell of the grid: it filters nothing"
     if ranks > most:

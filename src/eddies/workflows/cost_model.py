@@ -123,7 +123,7 @@ def flow_bytes(scene: Scene, ranks: int) -> float:
 
 
 def pair_bytes(scene: Scene, ranks: int) -> float:
-    """Memory of a rank in the pair force: list, displacements, three copies of every activation."""
+    """Memory of a rank in the learned pair force: list, displacements, three copies of every activation."""
     pairs = scene.tracers.particles * scene.kernel.neighbors * (1 + scene.simulation.skin) ** 3
     item = 4 if scene.simulation.precision == "float32" else 8
     return PROCESS_BYTES + pairs / ranks * (16 + 4 * item + 3 * item * (5 + sum(scene.model.hidden) + 3))
@@ -177,4 +177,4 @@ def small_flow(scene: Scene, ranks: int) -> Scene:
         forcing = replace(forcing, wavenumber=min(forcing.wavenumber, cells / 3))
     return replace(scene, flow=replace(scene.flow, cells=cells), initial=initial, forcing=forcing,
                    time=replace(scene.time, duration=1.0), spin_up=None, tracers=None, kernel=None, model=None,
-                   training=None, simulation=None)
+                   training=None, simulation=None, wcsph=None, eulerian=None)

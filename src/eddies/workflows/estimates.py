@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, replace
 
 from eddies.clock import ladder_step
-from eddies.scene import BOX_LENGTH, Scene
+from eddies.scene import BOX_LENGTH, Eulerian, Scene
 
 DISSIPATION_CONSTANT = 0.5   # C_eps = eps L / u'^3 of developed turbulence
 PEAK_VELOCITY = 4.0          # largest component of the velocity of a particle over u'
@@ -114,21 +114,26 @@ def most_ranks(scene: Scene) -> dict[str, int]:
         support = scene.kernel.support(scene.tracers.particles)
         limits[f"slabs of the fields no thinner than the kernel's support {support:.3g}"] = thick_slabs(
             scene.tracers.cells, support)
-    if scene.model:
-        # The a-priori test interpolates filtered fields to the particles, the closure the pressure.
+    force = scene.simulation.force if scene.simulation else "none"
+    if "train" in scene.stages or force == "wcsph":
         reach = particle_reach(scene)
         limits[f"slabs no thinner than the particles' reach {reach:.3g}"] = thick_slabs(
             scene.tracers.particles_per_side, reach)
+    if "train" in scene.stages:
+        # The a-priori test interpolates filtered fields to the particles, the closure the pressure.
         limits["ghost planes of the filtered fields"] = max(scene.tracers.cells // GHOST_PLANES["quintic"], 1)
-        if scene.model.closure == "poisson":
+        if scene.model.closure.startswith("poisson"):
             planes = scene.tracers.particles_per_side
             limits["ghost planes of the Poisson closure"] = max(planes // closure_ghost_planes(scene), 1)
+    if force == "eulerian":
+        cells = (scene.eulerian or Eulerian()).cells_for(scene.tracers.width)
+        limits["ghost planes of the coarse grid"] = max(cells // GHOST_PLANES[scene.tracers.interpolation], 1)
     return limits
 
 
 def ground_truth_alone(scene: Scene) -> Scene:
     """The scene without what learns of its ground truth, which may use more ranks."""
-    return replace(scene, kernel=None, model=None, training=None, simulation=None)
+    return replace(scene, kernel=None, model=None, training=None, simulation=None, wcsph=None, eulerian=None)
 
 
 def thick_slabs(planes: int, width: float) -> int:

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from eddies.analysis import (
-    figures_comparison, figures_flow, figures_kernel, figures_model, figures_tracers, figures_turbulence,
+    figures_comparison, figures_flow, figures_kernel, figures_mach, figures_model, figures_tracers,
+    figures_turbulence,
 )
 from eddies.analysis.isotropic_turbulence import StationarySpan
 from eddies.analysis.page import Metric, RunRecord, Section, metrics_json, render_page, shown
@@ -133,9 +134,16 @@ def _read_kernel(file, record: Run) -> list[Section]:
 
 def _read_model(file, record: Run) -> list[Section]:
     density_rate = read_table(file, "density_rate_sample") if "density_rate_sample" in file else None
-    return [figures_model.section(
-        json.loads(file.attrs["description"]), read_table(file, "a_priori"),
-        read_table(file, "acceleration_sample"), density_rate, read_table(file, "history"))]
+    provenance, errors = record.provenance["model"], read_table(file, "a_priori")
+    source = provenance.get("source")
+    shown = figures_model.section(json.loads(file.attrs["description"]), errors,
+                                  read_table(file, "acceleration_sample"), density_rate, read_table(file, "history"),
+                                  source and source["path"])
+    if source:
+        own = figures_mach.FlowErrors("this flow", provenance["mach_turbulent"], errors)
+        figures_mach.add(shown, own, figures_mach.FlowErrors(source["path"], source["mach_turbulent"],
+                                                             read_table(file, "source_a_priori")))
+    return [shown]
 
 
 def _read_rollout(file, record: Run) -> list[Section]:

@@ -55,6 +55,15 @@ class GroundTruth:
         columns["density_rate"] = (after["density"] - before["density"]) / span
         return migrate(self.decomposition, columns)
 
+    def window(self, frame: int, length: int) -> dict[str, np.ndarray]:
+        """`particles` of a frame, and as `velocity_later` (n, length, 3) and `density_later` (n, length) what is true
+        of the same particles in the frames that follow."""
+        columns = self._block(frame)
+        later = [self._block(frame + number, ("velocity", "density")) for number in range(1, length + 1)]
+        for name in ("velocity", "density"):
+            columns[f"{name}_later"] = np.stack([block[name] for block in later], axis=1)
+        return migrate(self.decomposition, columns)
+
     def field(self, index: int, variable: str) -> np.ndarray:
         """This rank's planes of a filtered field, (components, z_local, y, x), in double precision."""
         planes = (self.decomposition.start, self.decomposition.stop)
@@ -78,8 +87,8 @@ def load_frame(truth: GroundTruth, index: int, model: PairModel, closure: Poisso
                device: torch.device) -> TrainingFrame:
     """A frame with its true rates; the particles carry the density of the closure, or the true one without it."""
     columns = truth.particles_with_rates(int(index))
-    particles = ParticleSet.from_numpy(columns, device)
+    particles, force = ParticleSet.from_numpy(columns, device), None
     if closure is not None:
-        particles = closure.apply(particles)
+        particles, force = closure.apply(particles)
     rates = [torch.from_numpy(columns[name]).to(device, dtype) for name in ("acceleration", "density_rate")]
-    return TrainingFrame(truth.decomposition, model, particles, *rates)
+    return TrainingFrame(truth.decomposition, model, particles, *rates, force)

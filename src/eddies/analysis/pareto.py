@@ -1,0 +1,58 @@
+"""Error against cost: what nothing else beats, and in words where a model is worth its cost."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+
+def pareto_front(cost: np.ndarray, error: np.ndarray) -> np.ndarray:
+    """Indices of what is not dominated, from the cheapest on; entries with a NaN are on no front.
+
+    One dominates another if neither its cost nor its error is larger, and one of them is smaller. cost, error: (n,).
+    """
+    cost, error = np.asarray(cost, float), np.asarray(error, float)
+    known = np.flatnonzero(np.isfinite(cost) & np.isfinite(error))
+    front = []
+    for index in known:
+        no_worse = (cost[known] <= cost[index]) & (error[known] <= error[index])
+        better = (cost[known] < cost[index]) | (error[known] < error[index])
+        if not np.any(no_worse & better):
+            front.append(index)
+    return np.array(sorted(front, key=lambda index: (cost[index], error[index])), dtype=int)
+
+
+def verdict(model: Mapping[str, Any], baselines: Sequence[Mapping[str, Any]], cost: str,
+            measures: Mapping[str, str]) -> list[str]:
+    """Two sentences: in which measures a model is worth its cost beside its baselines, and in which it is not.
+
+    It is worth it where no baseline that costs no more is as accurate. Rows hold `name`, `cost` and the measures by
+    key, None where there is no number; `measures` gives their names in words. A baseline without a number counts as
+    beaten.
+    """
+    worth, not_worth = [], []
+    for key, words in measures.items():
+        if None in (model[key], model[cost]):
+            not_worth.append(f"{words} (no number)")
+            continue
+        known = [row for row in baselines if None not in (row[key], row[cost])]
+        rivals = [row for row in known if row[cost] <= model[cost] and row[key] <= model[key]]
+        beaten = sum(row not in known or row[key] > model[key] for row in baselines)
+        score = f"{words} ({model[key]:.3g}, {beaten} of {len(baselines)} baselines beaten; "
+        if rivals:
+            named = ", ".join(_compared(row, model, key, cost) for row in rivals)
+            not_worth.append(f"{score}as accurate and no slower: {named})")
+        elif known:
+            best = min(known, key=lambda row: row[key])
+            worth.append(f"{score}the best of them: {_compared(best, model, key, cost)})")
+        else:
+            worth.append(f"{score}none of them has a number)")
+    name = model["name"]
+    return [f"{name} is worth its cost in {', '.join(worth)}: no baseline that is as fast is as accurate." if worth else
+            f"{name} is worth its cost in no measure.",
+            f"It is not in {', '.join(not_worth)}." if not_worth else
+            "There is no measure in which a baseline is as accurate and no slower."]
+
+
+def _compared(row: Mapping[str, Any], model: Mapping[str, Any], key: str, cost: str) -> str:
+    return f"{row['name']}, {row[key]:.3g} in {row[cost] / model[cost]:.2g} of its time"

@@ -1,0 +1,94 @@
+"""Error against run time: the variants of a scene, run one after the other from the same moment of one ground truth.
+
+Every variant has a run directory, so that `eddies report` can show each of them in full.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import logging
+from pathlib import Path
+from typing import Any
+
+from eddies.analysis import figures_compare
+from eddies.analysis.page import render_page
+from eddies.comparison import BASELINE, Comparison
+from eddies.io.hdf5 import ProductError, open_product, read_attributes, read_provenance
+from eddies.scene import SceneError
+from eddies.workflows.comparison_rows import COLUMNS, machine, rows
+from eddies.workflows.variant_run import RunStages, VariantRun, on_first_rank
+
+log = logging.getLogger("eddies")
+
+
+def run(comparison: Comparison, comm, output: Path, resume: bool, run_stages: RunStages) -> None:
+    """Run every variant and write comparison.csv, comparison.json, figures and index.html; all ranks call it.
+
+    A variant that fails does not end the comparison: its row says when and why. With `resume`, rollouts that are there,
+    made with the same settings on as many ranks, are kept.
+
+    Raises:
+        ProductError, SceneError: a ground truth is missing, or does not fit the comparison.
+    """
+    runs = [VariantRun(scene, output / name, comparison.ground_truth_of(name))
+            for name, scene in comparison.scenes.items()]
+    for variant in runs:
+        check_ground_truth(comparison, variant, comm)
+    errors = comm.Dup()
+    for done, variant in enumerate(runs):
+        log.info("compare: %s, %d of %d", variant.name, done + 1, len(runs))
+        on_first_rank(comm, lambda: variant.prepare(runs[:done], comm.size, resume))
+        variant.attempt(errors, lambda: variant.roll_out(run_stages))
+    for repeat in range(1, comparison.repeats):
+        log.info("compare: timing, round %d of %d", repeat + 1, comparison.repeats)
+        for variant in runs:
+            if variant.failure is None:
+                variant.attempt(errors, lambda: variant.time_block(comm, run_stages))
+    errors.Free()
+    alone = comm.Split(comm.rank)
+    if comm.rank == 0:
+        write(comparison, rows(comparison, runs, alone, comm.size), comm.size, output)
+    alone.Free()
+    comm.Barrier()
+
+
+def check_ground_truth(comparison: Comparison, variant: VariantRun, comm) -> None:
+    """Refuse a ground truth that is missing, of other settings than the variant's, or of too coarse frames."""
+    path, interval = variant.ground_truth / "ground_truth.h5", variant.scene.simulation.frame_interval
+    remedy = f"make it with `eddies dns {comparison.base} --output {variant.ground_truth}`"
+    try:
+        with open_product(comm, path, "ground_truth") as file:
+            fingerprint = read_provenance(file).get("fingerprint")
+            kolmogorov_time = read_attributes(file, "reference")["kolmogorov_time"]
+    except ProductError as error:
+        raise ProductError(f"{error}: {remedy}, or give --run with another run directory") from None
+    if fingerprint != variant.scene.fingerprint("dns"):
+        raise SceneError(f'{path}: was made with other settings than those of variant "{variant.name}"; {remedy}, or '
+                         "give --run with another run directory")
+    if interval > kolmogorov_time:
+        raise SceneError(f'variant "{variant.name}": [simulation] frame_interval = {interval:g}: no frame before '
+                         f"t_eta = {kolmogorov_time:.3g}, at which errors are compared; lower it")
+
+
+def write(comparison: Comparison, table: list[dict[str, Any]], ranks: int, output: Path) -> None:
+    """Write the rows and what is drawn of them; one rank calls it."""
+    computer = machine(comparison.base_scene.device, ranks)
+    with open(output / "comparison.csv", "w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, COLUMNS)
+        writer.writeheader()
+        writer.writerows(table)
+    record = {"name": comparison.name, "title": comparison.title, "machine": computer, "rows": table}
+    (output / "comparison.json").write_text(json.dumps(record, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    sections = figures_compare.sections(
+        figures_compare.ErrorAgainstTime(table, comparison.subject, BASELINE), comparison.turnovers)
+    page = figures_compare.run_record(comparison.name, comparison.title, comparison.base_scene.to_toml(), computer)
+    figures = output / "figures"
+    figures.mkdir(exist_ok=True)
+    for stale in figures.glob("*.png"):
+        stale.unlink()
+    for section in sections:
+        for illustration in section.illustrations:
+            (figures / f"{illustration.name}.png").write_bytes(illustration.image)
+    (output / "index.html").write_text(render_page(page, sections), encoding="utf-8")
+    log.info("compare: %s", output / "index.html")

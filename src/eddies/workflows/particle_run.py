@@ -1,0 +1,137 @@
+"""Particles moved by forces between them, learned or of SPH, or by none."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from eddies.io.weights import load_weights
+from eddies.parallel.broadcast import first_complaint
+from eddies.parallel.halo import HaloError
+from eddies.particles.body_forces import LinearForcing
+from eddies.particles.dynamics import ParticleDynamics
+from eddies.particles.faults import Limits, find_fault
+from eddies.particles.integrators import INTEGRATORS
+from eddies.particles.pair_forces import PairModel
+from eddies.particles.particle_set import ParticleSet
+from eddies.particles.smoothing_kernels import CubicSpline, WendlandC2
+from eddies.particles.terms import DensityClosure, PairTerm
+from eddies.particles.wcsph import WCSPH, SummationDensity
+from eddies.scene import Scene, Wcsph
+from eddies.workflows.closures import density_closure
+from eddies.workflows.truth import GroundTruth
+
+# A state is runaway, not turbulence, when a particle is this many times faster, or its density this many times
+# farther from the mean, than the rms of the truth.
+RUNAWAY_SPEED, RUNAWAY_DENSITY = 30.0, 300.0
+# Largest velocity component to be expected of a particle, over the rms: how far it may go within a step.
+PEAK_SPEED = 6.0
+SPH_KERNELS = {"cubic-spline": CubicSpline, "wendland": WendlandC2}
+
+
+@dataclass(frozen=True)
+class Force:
+    """What acts between particles: pair terms, and the closure that gives their density or None.
+
+    `largest_deviation`: of a particle's density from the mean, in a sound state. `description`: for the product.
+    """
+
+    terms: list[PairTerm] = field(default_factory=list)
+    closure: DensityClosure | None = None
+    largest_deviation: float = np.inf
+    description: dict[str, float | str] = field(default_factory=lambda: {"closure": "none"})
+
+
+class ParticleRun:
+    """The particles of a frame of the ground truth, with the force that [simulation] force names."""
+
+    def __init__(self, scene: Scene, truth: GroundTruth, start: int, directory: Path, device: torch.device) -> None:
+        self.settings, self.comm, scales = scene.simulation, truth.decomposition.comm, truth.scales
+        self.force = FORCES[self.settings.force](scene, truth, directory, device)
+        self.dynamics = build_dynamics(scene, truth, self.force)
+        self.integrator = INTEGRATORS[self.settings.integrator](self.dynamics)
+        self.particles = ParticleSet.from_numpy(truth.particles(start), device)
+        self.limits = Limits(RUNAWAY_SPEED * scales.velocity, scales.density_mean, self.force.largest_deviation)
+
+    def steps(self, interval: float) -> int:
+        """As many steps as are no longer than that of the scene."""
+        return max(int(np.ceil(interval / self.settings.step - 1e-9)), 1)
+
+    def advance(self, step: float, number: int) -> str | None:
+        """Take a step; what is wrong with the state after it, on all ranks, or None."""
+        try:
+            self.particles = self.integrator.step(self.particles, step)
+        except HaloError as error:  # on all ranks alike: particles outrun the halo
+            return f"step {number}: {error}"
+        fault = find_fault(self.particles, self.limits, self.dynamics.box, number, self.comm.rank)
+        return first_complaint(self.comm, fault)
+
+    def frame(self) -> tuple[ParticleSet, torch.Tensor]:
+        """The particles, with the density of the closure if there is one, and their acceleration."""
+        particles, _ = self.dynamics.settle(self.particles)
+        rates = self.dynamics.rates(particles)
+        return replace(particles, density=rates.get("closure_density", particles.density)), rates["velocity"]
+
+    def description(self) -> dict[str, float | str]:
+        """Integrator and force."""
+        return {"integrator": self.settings.integrator, **self.force.description}
+
+
+def no_force(scene: Scene, truth: GroundTruth, directory: Path, device: torch.device) -> Force:
+    """No term: neither neighbour list nor messages, and particles that keep their velocity."""
+    return Force()
+
+
+def learned_force(scene: Scene, truth: GroundTruth, directory: Path, device: torch.device) -> Force:
+    """The trained model of a run directory."""
+    settings, slab, scales = scene.simulation, truth.decomposition, truth.scales
+    dtype = getattr(torch, settings.precision)
+    model = load_model(slab.comm, directory / "model.h5", device).to(dtype)
+    drift = PEAK_SPEED * scales.velocity * settings.step
+    closure = density_closure(model, slab, dtype, settings.skin * model.cutoff, drift)
+    return Force([model], closure, RUNAWAY_DENSITY * scales.density, {"closure": model.closure})
+
+
+def smoothed_particles(scene: Scene, truth: GroundTruth, directory: Path, device: torch.device) -> Force:
+    """WCSPH with the fluid's sound speed; the density of a random particle deviates from the mean without a fault."""
+    form, scales = scene.wcsph or Wcsph(), truth.scales
+    kernel = SPH_KERNELS[form.kernel](scene.kernel.support(truth.total))
+    mass = scales.density_mean * truth.decomposition.length**3 / truth.total
+    term = WCSPH(kernel, mass, scales.density_mean, scales.sound_speed, form.alpha, form.beta, form.exponent)
+    closure = SummationDensity(kernel, mass, getattr(torch, scene.simulation.precision))
+    return Force([term.to(device)], closure, description={"closure": "summation", **asdict(form)})
+
+
+FORCES = {"learned": learned_force, "none": no_force, "wcsph": smoothed_particles}
+
+
+def build_dynamics(scene: Scene, truth: GroundTruth, force: Force) -> ParticleDynamics:
+    """The force between particles, and the forcing of the large scales if there is one."""
+    settings, slab = scene.simulation, truth.decomposition
+    terms = list(force.terms)
+    if settings.injection != "none":
+        terms.append(LinearForcing(injection_rate(scene, truth), forced_below(scene), slab.comm, slab.length))
+    skin = settings.skin * max((term.cutoff for term in force.terms), default=0.0)
+    return ParticleDynamics(slab, slab.length, terms, skin, force.closure, getattr(torch, settings.precision))
+
+
+def injection_rate(scene: Scene, truth: GroundTruth) -> float:
+    """Power per mass of the forcing: as given, or the dissipation rate of the ground truth."""
+    injection = scene.simulation.injection
+    return truth.reference["dissipation_rate"] if injection == "dissipation" else injection
+
+
+def forced_below(scene: Scene) -> float:
+    """Modes with 0 < |k| < this are forced."""
+    return scene.forcing.wavenumber if scene.forcing else 2.0
+
+
+def load_model(comm, path: str | Path, device: torch.device) -> PairModel:
+    """The trained model of a file."""
+    description, tensors = load_weights(comm, path, "model")
+    model = PairModel.from_description(description)
+    model.load_state_dict({name: torch.from_numpy(tensor) for name, tensor in tensors.items()})
+    return model.to(device)

@@ -1,0 +1,126 @@
+"""What a scene's model is trained and validated on: frames and windows of the ground truth, in phases of training."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+
+from eddies.learning.force_training import ForceTrainer, LossWeights, TrainingFrame
+from eddies.learning.losses import relative_error
+from eddies.learning.optimization import Descent
+from eddies.learning.rollout_training import RolloutTrainer, TrainingWindow
+from eddies.learning.training import Phase
+from eddies.particles.dynamics import ParticleDynamics
+from eddies.particles.integrators import INTEGRATORS
+from eddies.particles.pair_forces import PairModel
+from eddies.particles.particle_set import ParticleSet
+from eddies.particles.poisson_closure import PoissonClosure
+from eddies.particles.smoothing_kernels import SmoothingKernel
+from eddies.scene import BOX_LENGTH, Scene, SceneError
+from eddies.workflows.closures import density_closure
+from eddies.workflows.particle_run import PEAK_SPEED
+from eddies.workflows.truth import GroundTruth, load_frame
+
+# How many validations a phase has, and on how many particles the error of the acceleration is measured.
+VALIDATIONS, HORIZON_VALIDATIONS, VALIDATION_PARTICLES = 25, 8, 8192
+# The share of the training window, at its end, that is held out for validation; no less than the longest horizon.
+HELD_OUT = 0.1
+
+
+class TrainingData:
+    """The model of a scene with the frames and windows of the ground truth that it is trained and validated on.
+
+    `last` is the last frame of the training window, `learned` the last that is trained on; what lies between is for
+    validation.
+    """
+
+    def __init__(self, scene: Scene, truth: GroundTruth, kernel: SmoothingKernel, device: torch.device) -> None:
+        self.scene, self.settings, self.truth, self.kernel, self.device = scene, scene.training, truth, kernel, device
+        self.dtype = getattr(torch, self.settings.precision)
+        self.model = build_model(scene, truth, kernel.support).to(dtype=self.dtype, device=device)
+        self.longest = max(self.settings.horizons) if self.settings.horizon_steps else 0
+        self.last = truth.last_frame_seen(self.settings.window)
+        held_out = max(math.ceil(HELD_OUT * self.last), self.longest, 1)
+        self.learned = self.last - held_out
+        if self.learned - self.longest < 2:
+            raise SceneError(
+                f"[training] window = {self.settings.window:g}: holds {self.last} frames of the ground truth, too few "
+                f"with {held_out} held out for validation and horizons of {self.longest}; raise it or [tracers] "
+                "turnovers, or lower [tracers] frame_interval or horizons")
+        self.closure = density_closure(self.model, truth.decomposition, self.dtype)
+
+    def one_step_phase(self) -> Phase:
+        """Steps on the rates of single frames: on trajectories first, at the end on all losses."""
+        settings = self.settings
+        seen = np.unique(np.linspace(1, self.learned, settings.frames).astype(int))
+        frames = [self._frame(index) for index in seen]
+        validation = self._frame(max(self.last - 1, self.learned + 1))
+        weights = LossWeights(settings.trajectory_weight, settings.field_weight, settings.velocity_kl_weight,
+                              settings.acceleration_kl_weight)
+        trainer = ForceTrainer(self.model, frames, self.kernel, weights, settings.batch, self.scene.seed)
+
+        def take(descent: Descent, step: int) -> dict[str, float]:
+            combined = step >= settings.steps - settings.combined_steps
+            return (trainer.combined_step if combined else trainer.trajectory_step)(descent, step)
+
+        # Work in evaluations of the force of a particle.
+        work = np.full(settings.steps, float(trainer.batch))
+        return Phase("one step", work, (settings.learning_rate, settings.final_learning_rate), take,
+                     lambda: acceleration_error(trainer, validation), max(settings.steps // VALIDATIONS, 1))
+
+    def horizon_phase(self) -> Phase:
+        """Steps through windows of frames, of one horizon after the other."""
+        settings, scene = self.settings, self.scene
+        steps = settings.horizon_steps * len(settings.horizons)
+        rates = settings.horizon_learning_rate, settings.final_learning_rate
+        interval = scene.tracers.frame_interval
+        slab = self.truth.decomposition
+        dynamics = ParticleDynamics(slab, BOX_LENGTH, [self.model], 0.0, self._wide_closure(interval), self.dtype,
+                                    fixed_ranks=True)
+        starts = np.unique(np.linspace(0, self.learned - self.longest, settings.frames).astype(int))
+        windows = [self._window(start) for start in starts]
+        validation = self._window(self.last - self.longest)
+        substeps = round(interval / (settings.horizon_step or interval))
+        trainer = RolloutTrainer(slab.comm, INTEGRATORS[settings.horizon_integrator](dynamics), windows, interval,
+                                 substeps, settings.energy_weight, settings.noise * self.truth.scales.velocity,
+                                 scene.seed)
+
+        def take(descent: Descent, step: int) -> dict[str, float]:
+            return trainer.step(descent, step, settings.horizons[step // settings.horizon_steps])
+
+        # Each step through a window is evaluated, evaluated again on the way back, and differentiated.
+        evaluations = 3 * substeps * np.repeat(settings.horizons, settings.horizon_steps)
+        return Phase("horizons", evaluations * float(trainer.total), rates, take,
+                     lambda: trainer.validation_error(validation, self.longest), max(steps // HORIZON_VALIDATIONS, 1))
+
+    def _wide_closure(self, interval: float) -> PoissonClosure | None:
+        """The closure for particles that stray from their slab during the longest horizon."""
+        drift = PEAK_SPEED * self.truth.scales.velocity * interval * self.longest
+        return density_closure(self.model, self.truth.decomposition, self.dtype, drift=drift)
+
+    def _frame(self, index: int) -> TrainingFrame:
+        return load_frame(self.truth, index, self.model, self.closure, self.dtype, self.device)
+
+    def _window(self, start: int) -> TrainingWindow:
+        columns = {name: torch.from_numpy(column).to(self.device)
+                   for name, column in self.truth.window(start, self.longest).items()}
+        later = [columns.pop(f"{name}_later").movedim(1, 0).contiguous() for name in ("velocity", "density")]
+        return TrainingWindow(ParticleSet(**columns), *later)
+
+
+def build_model(scene: Scene, truth: GroundTruth, support: float) -> PairModel:
+    """An untrained model of the form that the scene asks for, with the scales of the ground truth."""
+    form = scene.model
+    return PairModel(truth.scales, support, scene.kernel.neighbors, form.hidden, basis=form.basis,
+                     closure=form.closure, symmetry=form.symmetry, eddy_viscosity=form.eddy_viscosity, seed=scene.seed)
+
+
+@torch.no_grad()
+def acceleration_error(trainer: ForceTrainer, frame: TrainingFrame) -> float:
+    """Normalised L2 error of the acceleration on a fixed sample of the particles of a frame; collective."""
+    total = trainer.total
+    ids = np.random.default_rng(trainer.seed).choice(total, min(VALIDATION_PARTICLES, total), replace=False)
+    rows = frame.rows(ids)
+    return relative_error(trainer.comm, frame.errors(rows)["velocity"], frame.acceleration[rows])

@@ -1,0 +1,84 @@
+"""What a part of a scene costs: times with and without it, side by side. A script, about a minute long.
+
+    python mpi_tools/launch.py -n 1 -- python tests/benchmarks/leave_out.py [--repetitions 20]
+
+Prints a Markdown table: median seconds of a call and messages that it sends, with the part and without. What belongs to
+a pair is measured in turn, so that both see the same machine.
+"""
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from mpi4py import MPI
+
+HERE = Path(__file__).resolve().parent
+sys.path[:0] = [str(HERE.parent / "validation"), str(HERE.parents[1])]
+
+from test_leave_out import CountingComm, combined_step, fluid_of, particle_step  # noqa: E402
+
+Call = tuple[Callable[[], object], list]  # what is measured, and the list that notes its messages
+
+
+def step_of(comm, **choices) -> Call:
+    counting = CountingComm(comm)
+    return particle_step(counting, **choices), counting.sent
+
+
+def evaluation_of(comm, compressible: bool, forced: bool) -> Call:
+    counting = CountingComm(comm)
+    _, fluid, state = fluid_of(counting, compressible, forced)
+    return lambda: fluid.nonlinear(state), counting.sent
+
+
+def pairs_of_calls(comm) -> dict[str, tuple[Call, Call]]:
+    """By part: the call with it, and without."""
+    everything = {"field": 1.0, "velocity_kl": 0.1, "acceleration_kl": 0.1}
+    without = {name: {key: weight for key, weight in everything.items() if key != name} for name in everything}
+    steps = {
+        "pair force": ({"closure": "learned-density"}, {"pairs": False}),
+        "Poisson closure": ({}, {"closure": "learned-density"}),
+        "force of the Poisson closure": ({"closure": "poisson-force"}, {}),
+        "eddy viscosity": ({"viscosity": "two-sided"}, {}),
+        "forcing of the particles": ({"forced": True}, {}),
+    }
+    found = {f"step: {name}": tuple(step_of(comm, **choices) for choices in pair) for name, pair in steps.items()}
+    for name, others in without.items():
+        found[f"training: {name.replace('_', ' ')} loss"] = combined_step(comm, **everything), combined_step(
+            comm, **others)
+    found["flow: density"] = evaluation_of(comm, True, False), evaluation_of(comm, False, False)
+    found["flow: forcing"] = evaluation_of(comm, False, True), evaluation_of(comm, False, False)
+    return found
+
+
+def measure(comm, pair: tuple[Call, Call], repetitions: int) -> list[tuple[float, int]]:
+    """Median seconds and messages of both calls."""
+    seconds, messages = [[], []], [0, 0]
+    for _ in range(repetitions):
+        for index, (call, sent) in enumerate(pair):
+            comm.Barrier()
+            sent.clear()
+            began = time.perf_counter()
+            call()
+            seconds[index].append(time.perf_counter() - began)
+            messages[index] = len(sent)
+    return [(float(np.median(times)), count) for times, count in zip(seconds, messages)]
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--repetitions", type=int, default=20)
+    repetitions, comm = parser.parse_args().repetitions, MPI.COMM_WORLD
+    rows = [(name, *measure(comm, pair, repetitions)) for name, pair in pairs_of_calls(comm).items()]
+    if comm.rank == 0:
+        print(f"| part, on {comm.size} rank(s) | with (ms) | without (ms) | messages with | without |",
+              "|---|---|---|---|---|", sep="\n")
+        for name, (with_it, sent), (without_it, fewer) in rows:
+            print(f"| {name} | {1e3 * with_it:.3g} | {1e3 * without_it:.3g} | {sent} | {fewer} |")
+
+
+if __name__ == "__main__":
+    main()

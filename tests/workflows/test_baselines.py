@@ -1,0 +1,195 @@
+"""What a rollout does without a learned force: of particles left alone, of WCSPH, and of a coarse Eulerian flow."""
+
+import numpy as np
+import pytest
+
+from eddies.io.fields import FieldSeries
+from eddies.io.hdf5 import open_product, read_attributes
+from eddies.io.trajectories import Trajectory
+from eddies.io.weights import save_weights
+from eddies.parallel.slab import SlabDecomposition
+from eddies.particles.smoothing_kernels import KernelNetwork
+from eddies.scene import BOX_LENGTH, load_scene
+
+SCENE = """
+[flow]
+fluid = "compressible"
+cells = 16
+viscosity = 0.05
+sound_speed = 15.0
+[tracers]
+particles_per_side = 8
+turnovers = 0.3
+frame_interval = 0.02
+field_every = 1
+[kernel]
+neighbors = 30
+steps = 1
+[simulation]
+force = "none"
+step = 0.02
+turnovers = 0.2
+frame_interval = 0.04
+start = 0
+"""
+COARSE = ["simulation.force=eulerian", "eulerian.cells=12"]
+SOUND = ["simulation.force=wcsph", "simulation.step=0.004", "simulation.precision=float64"]
+
+
+@pytest.fixture
+def folder(comm, tmp_path):
+    """A run directory with the scene, its ground truth, and a kernel with the weights that training starts from."""
+    from eddies.workflows import dns
+
+    path = tmp_path / "baseline.toml"
+    if comm.rank == 0:
+        path.write_text(SCENE)
+    comm.Barrier()
+    scene = load_scene(path)
+    dns.run(scene, comm, tmp_path)
+    network = KernelNetwork(scene.kernel.support(scene.tracers.particles), [4])
+    description = {"support": network.support, "hidden": [4], "cutoff": "smooth"}
+    weights = {name: tensor.numpy() for name, tensor in network.state_dict().items()}
+    provenance = {"scene": SCENE, "fingerprint": scene.fingerprint("train-kernel")}
+    save_weights(comm, tmp_path / "kernel.h5", "kernel", description, weights, provenance)
+    return tmp_path
+
+
+def simulate(comm, folder, *overrides):
+    from eddies.workflows import simulate as stage
+    stage.run(load_scene(folder / "baseline.toml", overrides), comm, folder)
+
+
+def read(folder):
+    """Attributes, times, and columns (frames, particles, ...) of model and truth by name, on rank 0."""
+    from mpi4py import MPI
+
+    with open_product(MPI.COMM_SELF, folder / "rollout.h5", "rollout") as file:
+        runs = {name: Trajectory(file, name) for name in ("model", "truth")}
+        columns = {name: {column: np.array([run.read(frame, column) for frame in range(len(run.times))])
+                          for column in ("position", "velocity", "density", "acceleration", "velocity_gradient")}
+                   for name, run in runs.items()}
+        assert len(FieldSeries(file, "model").times) == len(runs["model"].times)
+        return read_attributes(file, "rollout"), runs["model"].times, columns
+
+
+def said_in_the_report(attributes):
+    from eddies.analysis.figures_comparison import Rollout
+    return Rollout(attributes, None, None, {}, BOX_LENGTH, None, None).force
+
+
+def energy(columns):
+    return 0.5 * (columns["velocity"] ** 2).sum(axis=(1, 2)) / columns["velocity"].shape[1]
+
+
+@pytest.mark.mpi(1, 2)
+def test_particles_without_a_force_keep_their_velocity(comm, folder):
+    simulate(comm, folder)
+    if comm.rank == 0:
+        attributes, times, columns = read(folder)
+        model, truth = columns["model"], columns["truth"]
+        assert attributes["status"] == "complete" and said_in_the_report(attributes).startswith("no force")
+        assert np.array_equal(model["velocity"], np.broadcast_to(truth["velocity"][0], model["velocity"].shape))
+        assert not model["acceleration"].any()
+        path = truth["position"][0] + times[-1] * truth["velocity"][0] - model["position"][-1]
+        # Positions are stored in single precision.
+        assert np.abs(path - BOX_LENGTH * np.rint(path / BOX_LENGTH)).max() < 2e-6
+    comm.Barrier()
+
+
+@pytest.mark.mpi(1)
+def test_without_a_force_there_is_no_list_and_no_halo(comm, folder):
+    from eddies.workflows.particle_run import ParticleRun
+    from eddies.workflows.truth import GroundTruth
+
+    with open_product(comm, folder / "ground_truth.h5", "ground_truth") as file:
+        truth = GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, 8))
+        run = ParticleRun(load_scene(folder / "baseline.toml"), truth, 1, folder, "cpu")
+    dynamics = run.dynamics
+    assert dynamics.surroundings is None and not dynamics.pair_terms and not dynamics.body_terms
+    assert dynamics.closure is None
+
+
+@pytest.mark.mpi(1, 2)
+def test_wcsph_keeps_momentum_and_sums_its_density(comm, folder):
+    simulate(comm, folder, *SOUND, "simulation.turnovers=0.04")
+    if comm.rank == 0:
+        attributes, _, columns = read(folder)
+        model = columns["model"]
+        assert attributes["status"] == "complete"
+        assert said_in_the_report(attributes) == "WCSPH, cubic-spline kernel, density by summation, α = 1, β = 2, γ = 1"
+        momentum = model["velocity"].mean(axis=1)
+        assert len(momentum) > 1 and np.abs(momentum - momentum[0]).max() < 1e-6
+        # Clustered random particles push each other apart.
+        spread = model["density"].std(axis=1)
+        assert spread[-1] < 0.8 * spread[0] and energy(model)[-1] > energy(model)[0]
+        assert model["density"].mean() > 1
+    comm.Barrier()
+
+
+@pytest.mark.mpi(1, 2)
+def test_particles_follow_the_coarse_flow(comm, folder):
+    from mpi4py import MPI
+
+    simulate(comm, folder, *COARSE, "eulerian.smagorinsky=0")
+    if comm.rank == 0:
+        attributes, times, columns = read(folder)
+        model, truth = columns["model"], columns["truth"]
+        assert attributes["status"] == "complete"
+        assert said_in_the_report(attributes).endswith("on 12³ cells, |kᵢ| ≤ 3, Smagorinsky constant 0")
+        # It resolves |k| <= 3 of a filtered flow that has most of its energy there.
+        error = np.linalg.norm(model["velocity"] - truth["velocity"], axis=(1, 2))
+        error /= np.linalg.norm(truth["velocity"], axis=(1, 2))
+        assert 0 < error[0] < 0.2 and error[-1] < 0.35
+        # The acceleration is the rate of change of the velocity along the way: centred differences are of second order.
+        change = (model["velocity"][2:] - model["velocity"][:-2]) / (times[2:] - times[:-2])[:, None, None]
+        difference = np.linalg.norm(change - model["acceleration"][1:-1]) / np.linalg.norm(change)
+        assert difference < 0.05
+        assert np.ptp(model["density"]) < 0.05 and abs(model["density"].mean() - 1) < 1e-3
+        if comm.size > 1:
+            simulate(MPI.COMM_SELF, folder, *COARSE, "eulerian.smagorinsky=0")
+            alone = read(folder)[2]["model"]
+            # Stored in single precision.
+            assert np.abs(alone["acceleration"] - model["acceleration"]).max() < 1e-5
+            assert np.abs(alone["position"] - model["position"]).max() < 1e-5
+    comm.Barrier()
+
+
+@pytest.mark.mpi(1)
+def test_smagorinsky_takes_energy_and_forcing_puts_it_in(comm, folder):
+    ends = {}
+    for name, more in {"none": ["eulerian.smagorinsky=0"], "model": [],
+                       "forced": ["eulerian.smagorinsky=0", "simulation.injection=1.0"]}.items():
+        simulate(comm, folder, *COARSE, *more)
+        attributes, times, columns = read(folder)
+        ends[name] = energy(columns["model"])[-1]
+    assert ends["model"] < 0.97 * ends["none"]
+    # All modes below |k| = 2 are resolved, so the power goes into the particles' energy but for what is lost of it.
+    assert 0.7 * times[-1] < ends["forced"] - ends["none"] < 1.1 * times[-1]
+
+
+@pytest.mark.mpi(1)
+def test_a_coarse_flow_that_is_unstable_ends_the_rollout_in_words(comm, folder):
+    simulate(comm, folder, *COARSE, "eulerian.smagorinsky=500")
+    attributes, _, columns = read(folder)
+    assert attributes["status"].startswith("stopped: step") and "coarse flow is unstable" in attributes["status"]
+    assert len(columns["model"]["velocity"]) >= 1
+
+
+def test_seconds_of_a_step_leave_out_the_warm_up():
+    from eddies.workflows.simulate import quartiles
+    found = quartiles([100.0, 50.0, 1.0, 2.0, 3.0, 4.0, 5.0])
+    assert found == {"seconds_per_step": 3.0, "seconds_per_step_low": 2.0, "seconds_per_step_high": 4.0}
+    assert np.isnan(quartiles([1.0, 2.0])["seconds_per_step"])
+
+
+@pytest.mark.parametrize("overrides, limit", [
+    (["simulation.force=none"], None),
+    (["simulation.force=wcsph", "simulation.step=0.0025"], "slabs no thinner than the particles' reach"),
+    (["simulation.force=eulerian"], "ghost planes of the coarse grid"),
+])
+def test_ranks_are_limited_by_what_the_force_needs_alone(overrides, limit):
+    from eddies.workflows.estimates import most_ranks
+    alone = ("particles' reach", "filtered fields", "Poisson closure", "coarse grid")
+    found = [reason for reason in most_ranks(load_scene("tiny", overrides)) if any(part in reason for part in alone)]
+    assert len(found) == (limit is not None) and all(reason.startswith(limit) for reason in found)

@@ -1,0 +1,151 @@
+"""A comparison from end to end on a scene even smaller than tiny, and what it refuses before any work."""
+
+import csv
+import json
+
+import pytest
+
+from eddies.io.hdf5 import ProductError
+from eddies.scene import SceneError, load_scene
+from eddies.workflows.compare import check_ground_truth
+from eddies.workflows.variant_run import VariantRun
+from tests.workflows.synthetic_run import write_ground_truth
+
+SMALLER = ["flow.cells=16", "flow.viscosity=0.1", "spin_up.turnovers=0.3", "tracers.particles_per_side=8",
+           "tracers.field_cells=12", "tracers.frame_interval=0.1", "tracers.field_every=1", "kernel.neighbors=30",
+           "kernel.steps=4", "training.steps=6", "training.combined_steps=2", "training.batch=64",
+           "simulation.frame_interval=0.2"]
+FILE = """
+title = "small"
+base = "base.toml"
+run = "base"
+turnovers = 0.25
+repeats = 2
+set = ["training.frames=3"]
+[[variant]]
+name = "learned"
+[[variant]]
+name = "longer-steps"
+set = ["simulation.step=0.05"]
+[[variant]]
+name = "no-force"
+set = ["simulation.force=none"]
+group = "baseline"
+[[variant]]
+name = "stops"
+set = ["simulation.injection=1e5"]
+group = "baseline"
+"""
+
+
+def run_cli(*arguments):
+    from eddies.cli import main
+    return main([str(argument) for argument in arguments])
+
+
+@pytest.fixture
+def folder(comm, tmp_path, monkeypatch):
+    """A folder with a scene and a comparison, to work in."""
+    if comm.rank == 0:
+        (tmp_path / "base.toml").write_text(load_scene("tiny", [*SMALLER, "name=base"]).to_toml())
+        (tmp_path / "small.toml").write_text(FILE)
+    comm.Barrier()
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def rows_of(output):
+    record = json.loads((output / "comparison.json").read_text())
+    with open(output / "comparison.csv", newline="") as file:
+        table = list(csv.DictReader(file))
+    assert [row["name"] for row in table] == [row["name"] for row in record["rows"]]
+    return record, {row["name"]: row for row in record["rows"]}
+
+
+@pytest.mark.mpi(2, timeout=240)
+def test_variants_are_run_measured_and_kept(comm, folder, capfd):
+    assert run_cli("dns", "base.toml", "--output", "base") == 0
+    assert run_cli("compare", "small.toml", "--output", "out") == 0
+    comm.Barrier()
+    out = folder / "out"
+    record, rows = rows_of(out)
+    check_rows(rows)
+    assert record["machine"]["ranks"] == 2 and record["machine"]["cores"] >= 1 and record["machine"]["processor"]
+    assert (out / "learned/kernel.h5").resolve() == (out / "no-force/kernel.h5").resolve()
+    assert (out / "learned/model.h5").resolve() == (out / "longer-steps/model.h5").resolve()
+    assert not (out / "no-force/model.h5").exists() and not list(out.glob("*/timing"))
+    page = (out / "index.html").read_text()
+    assert "stops (at 0 T): stopped: step 1" in page and "learned is worth its cost in" in page
+    assert len(list((out / "figures").glob("*.png"))) == 5
+    capfd.readouterr()
+
+    before = {path: path.stat().st_mtime_ns for path in out.glob("*/*.h5")}
+    comm.Barrier()
+    if comm.rank == 0:
+        (out / "no-force/rollout.h5").unlink()
+    comm.Barrier()
+    assert run_cli("compare", "small.toml", "--output", "out", "--resume") == 0
+    comm.Barrier()
+    assert [str(path.relative_to(out)) for path, time in before.items() if path.stat().st_mtime_ns != time] == [
+        "no-force/rollout.h5"]
+    again = rows_of(out)[1]
+    assert all(again[name]["velocity_error_early"] == rows[name]["velocity_error_early"] for name in rows)
+
+
+def check_rows(rows):
+    learned, longer, none, stops = (rows[name] for name in ("learned", "longer-steps", "no-force", "stops"))
+    assert {row["status"] for row in (learned, longer, none)} == {"complete"}
+    assert stops["status"].startswith("stopped: step 1") and stops["stopped_at"] == 0
+    assert stops["velocity_kl"] is stops["wall_seconds"] is None
+    for row in (learned, longer, none):
+        # Of the velocity itself; the particles start from it.
+        assert 0 < row["velocity_error_early"] < 0.5 and 0.5 < row["energy_ratio"] < 2
+        assert row["wall_seconds_low"] <= row["wall_seconds"] <= row["wall_seconds_high"]
+        assert row["core_seconds"] == pytest.approx(2 * row["wall_seconds"])
+    assert none["acceleration_error"] == 1 and none["training_seconds"] is None
+    assert learned["training_seconds"] == longer["training_seconds"] > 0
+    assert (learned["time_step"], longer["time_step"]) == (pytest.approx(0.02), pytest.approx(0.05))
+
+
+@pytest.mark.mpi(1, 2)
+def test_a_comparison_without_its_ground_truth_writes_nothing(comm, folder, capfd):
+    assert run_cli("compare", "small.toml", "--output", "out") == 2
+    told = "run `eddies dns SCENE` first: make it with `eddies dns base.toml --output base`, or give --run"
+    assert comm.rank > 0 or told in capfd.readouterr().err
+    assert not (folder / "out").exists()
+
+
+@pytest.mark.mpi(1, 2)
+def test_more_ranks_than_a_variant_can_use_are_refused(comm, folder, capfd):
+    if comm.rank == 0:
+        (folder / "wide.toml").write_text(FILE + '[[variant]]\nname = "wide"\nset = ["kernel.neighbors=190"]\n')
+    comm.Barrier()
+    assert run_cli("compare", "wide.toml", "--output", "out") == 2
+    errors = capfd.readouterr().err
+    if comm.size == 2 and comm.rank == 0:
+        assert "wide: 2 ranks are more than the 1 that it can use" in errors
+
+
+def variant_of(scene, directory):
+    return VariantRun(scene, directory / "out", directory)
+
+
+@pytest.mark.mpi(1)
+def test_ground_truth_that_does_not_fit_is_refused(comm, tmp_path):
+    comparison, scene = type("File", (), {"base": "tiny", "name": "case"})(), load_scene("tiny", ["name=mine"])
+    with pytest.raises(ProductError, match=r"ground_truth.h5: no such file; .*`eddies dns tiny --output"):
+        check_ground_truth(comparison, variant_of(scene, tmp_path), comm)
+    write_ground_truth(comm, tmp_path)
+    with pytest.raises(SceneError, match='other settings than those of variant "mine"; make it with `eddies dns tiny'):
+        check_ground_truth(comparison, variant_of(scene, tmp_path), comm)
+
+
+@pytest.mark.mpi(1)
+def test_frames_must_come_before_the_first_comparison(comm, tmp_path, monkeypatch):
+    comparison, scene = type("File", (), {"base": "tiny", "name": "case"})(), load_scene("tiny", ["name=mine"])
+    write_ground_truth(comm, tmp_path)  # t_eta = 0.17
+    monkeypatch.setattr("eddies.workflows.compare.read_provenance", lambda _: {"fingerprint": scene.fingerprint("dns")})
+    check_ground_truth(comparison, variant_of(scene, tmp_path), comm)
+    coarser = load_scene("tiny", ["name=mine", "simulation.frame_interval=0.2"])
+    with pytest.raises(SceneError, match=r"frame_interval = 0.2: no frame before t_eta = 0.17"):
+        check_ground_truth(comparison, variant_of(coarser, tmp_path), comm)
