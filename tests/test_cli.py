@@ -267,6 +267,17 @@ def test_a_limit_of_wall_time_or_a_file_stops_the_job(comm, tmp_path, capfd):
 
 
 @pytest.mark.mpi(1)
+@pytest.mark.parametrize("options, seconds", [([], 600), (["--checkpoint-minutes", "3"], 180)])
+def test_a_comparison_makes_checkpoints_of_its_trainings(comm, tmp_path, monkeypatch, options, seconds):
+    from eddies.parallel import stop
+    made = []
+    monkeypatch.setattr(stop, "StopRequest", lambda *given: made.append(given))
+    monkeypatch.setattr("eddies.workflows.compare.run", lambda *_: None)
+    assert run_cli("compare", "compare-small", "--output", tmp_path, *options) == 0
+    assert [given[4] for given in made] == [seconds]
+
+
+@pytest.mark.mpi(1)
 def test_a_second_sigterm_ends_the_process(comm, tmp_path):
     code = ("import signal, eddies.cli; received = eddies.cli.catch_signals(); signal.raise_signal(15);"
             "print(received, flush=True); signal.raise_signal(15)")

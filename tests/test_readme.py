@@ -12,6 +12,7 @@ import pytest
 from eddies.cli import build_parser
 from eddies.comparison import Comparison, Variant, load_comparison
 from eddies.scene import BOX_LENGTH, Scene, builtin_scenes, load_scene
+from eddies.scene_sections import Model, Simulation
 from eddies.scene_values import Bounds, Choice, Integer, Integers, Number, Texts, quoted
 
 CHECKOUT = Path(__file__).parents[1]
@@ -165,6 +166,17 @@ def scene_reference():
 
 def test_scene_reference():
     assert marked("scene reference") == scene_reference()
+
+
+@pytest.mark.parametrize("section, key, heading", [
+    (Model, "closure", "| closure | density | acceleration besides the pair sum |"),
+    (Simulation, "force", "| `force` | what moves the particles |"),
+])
+def test_a_table_explains_every_choice(section, key, heading):
+    table = README.split(heading)[1].split("\n\n")[0]
+    field = section.__dataclass_fields__[key]
+    assert re.findall(r"^\| `([a-z-]+)`", table, re.MULTILINE) == list(field.metadata["rule"].words)
+    assert re.findall(r"^\| `([a-z-]+)` \(default\)", table, re.MULTILINE) == [field.default]
 
 
 def comparison_reference():

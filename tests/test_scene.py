@@ -84,6 +84,14 @@ def test_coarse_grid_of_the_filter():
         load_scene("tiny", ["simulation.force=eulerian", "eulerian.cells=20"])
 
 
+def test_rates_of_the_horizons_fall():
+    flat = ["training.horizon_learning_rate=1e-5", "training.horizon_steps=1"]
+    with pytest.raises(SceneError, match=r"\[training\] final_learning_rate = 0.0001: must be at most "
+                                         "horizon_learning_rate = 1e-05"):
+        load_scene("tiny", flat)
+    assert load_scene("tiny", flat[:1]).training.horizon_steps == 0
+
+
 def test_derived_lengths():
     tracers, kernel = load_scene("hit-small").tracers, load_scene("hit-small").kernel
     assert tracers.width == 2 * tracers.spacing == pytest.approx(0.3926990817)

@@ -133,9 +133,7 @@ def build_parser() -> argparse.ArgumentParser:
         add_scene_options(command)
         add_job_options(command, "run directory (default: runs/NAME)",
                         "skip stages whose product is complete and was made with the same settings, and go on from the "
-                        "newest checkpoint of the direct simulation")
-        command.add_argument("--checkpoint-minutes", type=positive, default=10.0, metavar="M",
-                             help="wall time between two checkpoints of the direct simulation (default: 10)")
+                        "newest checkpoint of the direct simulation or of the training")
         command.set_defaults(command=run_command, stage=name)
     report = commands.add_parser("report", help="figures, one page and metrics.json of a run directory")
     report.add_argument("run", type=Path, metavar="RUN", help="a run directory, such as runs/tiny")
@@ -146,7 +144,8 @@ def build_parser() -> argparse.ArgumentParser:
     compare.add_argument("--run", type=Path, metavar="DIR",
                          help="run directory with the ground truth (default: the comparison's, or runs/BASE)")
     add_job_options(compare, "directory of the comparison (default: runs/NAME)",
-                    "keep the rollouts that are complete and were made with the same settings on as many ranks")
+                    "keep the rollouts that are complete and were made with the same settings on as many ranks, and go "
+                    "on from the newest checkpoint of a training")
     compare.set_defaults(command=compare_command)
     export = commands.add_parser("export", help="fields and particles of a run directory, for ParaView")
     export.add_argument("run", type=Path, metavar="RUN", help="a run directory, such as runs/tiny")
@@ -181,6 +180,8 @@ def add_job_options(parser: argparse.ArgumentParser, output: str, resume: str) -
     """Options of commands that run for long: where the products go, what is kept, and when to stop."""
     parser.add_argument("--output", type=Path, metavar="DIR", help=output)
     parser.add_argument("--resume", action="store_true", help=resume)
+    parser.add_argument("--checkpoint-minutes", type=positive, default=10.0, metavar="M",
+                        help="wall time between two checkpoints of the direct simulation or a training (default: 10)")
     parser.add_argument("--max-minutes", type=positive, default=math.inf, metavar="M",
                         help="stop after M minutes of wall time, with exit code 75, to be resumed")
 
@@ -214,7 +215,7 @@ def compare_command(options: argparse.Namespace, comm, signals: list[int]) -> No
         check_ranks(scene.stages, scene, comm)
     directory = options.output or Path("runs") / comparison.name
     check_stop_file(comm, directory)
-    stop = StopRequest(comm, signals, directory / "STOP", 60 * options.max_minutes)
+    stop = StopRequest(comm, signals, directory / "STOP", 60 * options.max_minutes, 60 * options.checkpoint_minutes)
     import_module("eddies.workflows.compare").run(
         comparison, comm, directory, options.resume,
         lambda stages, scene, where: run_stages(stages, scene, comm, where, True, stop))

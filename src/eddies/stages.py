@@ -23,6 +23,8 @@ log = logging.getLogger("eddies")
 # The product of each stage, in order: kind, then file name. A stage reads the products before its own.
 PRODUCTS = {"dns": ("ground_truth", "ground_truth.h5"), "train-kernel": ("kernel", "kernel.h5"),
             "train": ("model", "model.h5"), "simulate": ("rollout", "rollout.h5")}
+# The directory of checkpoints of each stage that makes any.
+CHECKPOINTS = {"dns": "checkpoints", "train": "checkpoints-train"}
 
 
 def run_stages(stages: Sequence[str], scene: Scene, comm, directory: Path, resume: bool,
@@ -43,11 +45,11 @@ def run_stages(stages: Sequence[str], scene: Scene, comm, directory: Path, resum
     check_inputs(stages, scene, comm, directory)
     check_stop_file(comm, directory)
     prepare_directory(scene, comm, directory)
-    begin_anew = not resume
     for stage in stages:
-        resume = resume and is_done(stage, scene, comm, directory)
-        if stage == "dns" and (begin_anew or resume):  # left by another run, or by one killed in its last moment
-            CheckpointDirectory(comm, directory / "checkpoints", "").remove()
+        goes_on, resume = resume, resume and is_done(stage, scene, comm, directory)
+        # Left by another run, by one of products that have just been replaced, or by one killed in its last moment.
+        if stage in CHECKPOINTS and (resume or not goes_on):
+            CheckpointDirectory(comm, directory / CHECKPOINTS[stage], "").remove()
         if resume:
             log.info("%s: skipped, %s is complete and made with the same settings", stage, PRODUCTS[stage][1])
             continue

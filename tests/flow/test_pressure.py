@@ -65,6 +65,19 @@ def test_adjoints_against_central_differences_along_random_vectors(comm, name):
     assert slope(0, position_change) == pytest.approx(global_sum(comm, np.sum(by_position * position_change)), rel=1e-6)
 
 
+@pytest.mark.mpi(1, 2, 3)
+def test_energies_by_bands_and_their_adjoint(comm):
+    """Of sin y in x (shell 1, band 0) and 2 cos 3z in y (shell 3, band 1): 1/4 and 1."""
+    solver, _, random = solver_and_points(comm)
+    x, y, z = solver.points.T
+    field = np.stack([np.sin(y), 2 * np.cos(3 * z), 0 * x], axis=1)
+    assert np.allclose(solver.band_energies(field), [0.25, 1.0], atol=1e-12)
+    change, weights = random.standard_normal(field.shape), np.array([1.3, -0.7])
+    ends = [weights @ solver.band_energies(field + sign * change) for sign in (1, -1)]
+    found = global_sum(comm, np.sum(solver.band_energies_adjoint(field, weights) * change))
+    assert found == pytest.approx((ends[0] - ends[1]) / 2, rel=1e-10)  # the energy is quadratic
+
+
 @pytest.mark.mpi(1, 2)
 def test_derivatives_by_the_factors_of_the_force(comm):
     solver, positions, random = solver_and_points(comm)

@@ -2,12 +2,15 @@ import numpy as np
 import pytest
 import torch
 
+from eddies.analysis.figures_learning import LOSSES
 from eddies.flow.tracers import release
 from eddies.learning.force_training import ForceTrainer, LossWeights, TrainingFrame
 from eddies.learning.optimization import Descent
+from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.pair_forces import PairModel
 from eddies.particles.particle_set import ParticleSet
+from eddies.particles.poisson_closure import ResolvedForce
 from eddies.particles.reference_scales import ReferenceScales
 from eddies.particles.smoothing_kernels import WendlandC2
 
@@ -18,7 +21,7 @@ SCALES = ReferenceScales(length=2 * SPACING, spacing=SPACING, velocity=1.0, dens
                          acceleration=1.0, density_rate=0.02, sound_speed=10.0)
 
 
-def frame_of(comm, model, squeeze=1.0):
+def frame_of(comm, model, forced=False):
     """Particles in a smooth flow whose acceleration is a pressure gradient and a drag."""
     slab = SlabDecomposition(comm, LENGTH, PER_SIDE)
     columns = release(slab, 3, PER_SIDE, "random")
@@ -27,7 +30,12 @@ def frame_of(comm, model, squeeze=1.0):
     density = 1 + 0.01 * np.cos(x) * np.cos(y)
     acceleration = np.stack([np.sin(x) * np.cos(y), np.cos(x) * np.sin(y), 0 * z], axis=1) - 0.3 * velocity
     particles = ParticleSet.from_numpy({**columns, "velocity": velocity, "density": density})
-    return TrainingFrame(slab, model, particles, torch.from_numpy(acceleration), torch.from_numpy(0.02 * np.sin(y)))
+    force = None
+    if forced:
+        terms = [particles.velocity.roll(1, 1), particles.velocity.square(), particles.velocity.cos()]
+        force = ResolvedForce(0.5 * particles.velocity, torch.stack(terms), model.resolved_factors)
+    return TrainingFrame(slab, model, particles, torch.from_numpy(acceleration), torch.from_numpy(0.02 * np.sin(y)),
+                         force)
 
 
 def trainer_of(comm, closure="learned-density", weights=LossWeights(1.0, 1.0, 0.1, 0.1), batch=300):
@@ -93,10 +101,41 @@ def test_training_lowers_the_error_of_a_learnable_force(comm):
     assert np.mean(losses[-20:]) < 0.15 * losses[0]
 
 
+@pytest.mark.mpi(1, 2, 3)
+def test_the_force_of_a_closure_is_added_to_the_pair_sum_and_its_factors_are_learned(comm):
+    model = PairModel(SCALES, SUPPORT, 45, (8, 8), closure="poisson-stress", seed=2)
+    pairs_alone, frame = frame_of(comm, model), frame_of(comm, model, forced=True)
+    units, rows = model.resolved_factors().detach(), frame.rows(np.arange(0, frame.total, 3))
+    with torch.no_grad():
+        force = frame.force.constant[rows] + sum(unit * term[rows] for unit, term in zip(units, frame.force.terms))
+        expected = pairs_alone.errors(rows)["velocity"] + force
+        assert torch.allclose(frame.errors(rows)["velocity"], expected, rtol=1e-13, atol=1e-13)
+        error = frame.errors()["velocity"]
+    trainer = ForceTrainer(model, [frame], WendlandC2(SUPPORT), LossWeights(), frame.total, seed=5)
+    trainer.trajectory_step(Descent(comm, model.parameters(), 1, 1e-2, 1e-2), 0)
+    # Of the mean square of the error, which is linear in the factors.
+    slopes = units * (2 * error * frame.force.terms).sum((1, 2)) / (3 * frame.total * frame.acceleration_rms**2)
+    assert model.stress_factors.grad.numpy() == pytest.approx(global_sum(comm, slopes.numpy()), rel=1e-11)
+
+
 @pytest.mark.mpi(1)
+def test_every_loss_has_a_name_that_the_learning_curves_know(comm):
+    trainer = trainer_of(comm)
+    row = trainer.combined_step(Descent(comm, trainer.model.parameters(), 1, 1e-2, 1e-2), 0)
+    names = {"loss", "trajectory_loss", "field_loss", "velocity_kl_loss", "acceleration_kl_loss"}
+    assert set(row) == names | {"gradient_norm"} and names <= {name for name, *_ in LOSSES}
+    weighted = sum(weight * row[f"{name}_loss"] for name, weight in vars(trainer.weights).items())
+    assert row["loss"] == pytest.approx(weighted, rel=1e-12)
+
+
+@pytest.mark.mpi(1, 2)
 def test_losses_without_weight_are_not_computed(comm, monkeypatch):
-    trainer = trainer_of(comm, weights=LossWeights())
     for name in ("_field_share", "_divergence"):
         monkeypatch.setattr(ForceTrainer, name, lambda *args: pytest.fail("an unused loss was computed"))
-    row = trainer.combined_step(Descent(comm, trainer.model.parameters(), 1, 1e-2, 1e-2), 0)
-    assert set(row) == {"loss", "trajectory_loss", "gradient_norm"}
+    rows = []
+    for kind in ("trajectory_step", "combined_step"):
+        trainer = trainer_of(comm, weights=LossWeights())
+        rows.append(getattr(trainer, kind)(Descent(comm, trainer.model.parameters(), 1, 1e-2, 1e-2), 0))
+    assert set(rows[0]) == {"loss", "trajectory_loss", "gradient_norm"}
+    # Without the field loss there is no cube: both draw the same batch.
+    assert rows[0] == rows[1]

@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from eddies.learning.losses import kullback_leibler, mean_square_share, soft_histogram
-from eddies.learning.optimization import Descent, shared_value
+from eddies.learning.optimization import Descent, shared_values
 from eddies.parallel.reduction import global_sum
 
 
@@ -16,8 +16,12 @@ def my_share(comm, whole):
 @pytest.mark.mpi(1, 2, 3)
 def test_shares_of_the_mean_square_add_up(comm):
     error = np.random.default_rng(1).standard_normal((101, 3))
-    share = mean_square_share(torch.from_numpy(my_share(comm, error)), 2.0, 101)
-    assert shared_value(comm, share) == pytest.approx((error**2).mean() / 4, rel=1e-13)
+    own = torch.from_numpy(my_share(comm, error))
+    shares = {"halved": mean_square_share(own, 2.0, 101), "single": mean_square_share(own.float(), 1.0, 101)}
+    found = shared_values(comm, shares)
+    assert found.keys() == shares.keys()
+    assert found["halved"] == pytest.approx((error**2).mean() / 4, rel=1e-13)
+    assert found["single"] == pytest.approx((error**2).mean(), rel=1e-6)
 
 
 @pytest.mark.mpi(1, 2, 3)

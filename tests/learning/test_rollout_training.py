@@ -7,7 +7,7 @@ import torch
 from eddies.flow.pressure import PressureSolver
 from eddies.flow.tracers import release
 from eddies.learning.optimization import Descent
-from eddies.learning.rollout_training import RolloutTrainer, TrainingWindow
+from eddies.learning.rollout_training import RolloutTrainer, TrainingWindow, mean_losses
 from eddies.parallel.migration import migrate
 from eddies.parallel.reduction import global_max, global_sum
 from eddies.parallel.slab import SlabDecomposition
@@ -27,6 +27,12 @@ SCALES = ReferenceScales(length=2 * SPACING, spacing=SPACING, velocity=1.0, dens
 every_closure = pytest.mark.parametrize("closure", ["poisson", "poisson-stress", "learned-density"])
 
 
+def grid_closure(slab, factors=None):
+    """Within four intervals particles move farther than a grid plane out of their slab."""
+    return PoissonClosure(PressureSolver(slab, 5, margin=2), WendlandC2(1.6 * SPACING), 10.0, passes=2,
+                          dtype=torch.float64, factors=factors)
+
+
 def window_of(slab):
     """Particles in a smooth flow, and what it makes of them if it turns slowly."""
     columns = release(slab, 3, PER_SIDE, "random")
@@ -44,7 +50,10 @@ def window_of(slab):
     columns = migrate(slab, {**columns, "velocity": velocity(0.0), "density": density(0.0), **later})
     columns = {name: torch.from_numpy(column) for name, column in columns.items()}
     true = [columns.pop(f"{name}_later").movedim(1, 0).contiguous() for name in ("velocity", "density")]
-    return TrainingWindow(ParticleSet(**columns), *true)
+    particles = ParticleSet(**columns)
+    start = grid_closure(slab).band_energies(particles)
+    energies = torch.stack([start * 0.9**frame for frame in range(FRAMES + 1)])
+    return TrainingWindow(particles, *true, energies)
 
 
 def trainer_of(comm, closure="poisson-stress", integrator="verlet", steps=1, noise=0.0):
@@ -52,12 +61,11 @@ def trainer_of(comm, closure="poisson-stress", integrator="verlet", steps=1, noi
     model = PairModel(SCALES, SUPPORT, 34, (6, 5), closure=closure, seed=2)
     given = None
     if not model.learns_density:
-        # Within four intervals particles move farther than a grid plane out of their slab.
-        factors = model.resolved_factors if closure == "poisson-stress" else None
-        given = PoissonClosure(PressureSolver(slab, 5, margin=2), WendlandC2(1.6 * SPACING), 10.0, passes=2,
-                               dtype=torch.float64, factors=factors)
+        given = grid_closure(slab, model.resolved_factors if closure == "poisson-stress" else None)
     dynamics = ParticleDynamics(slab, LENGTH, [model], 0.0, given, torch.float64, fixed_ranks=True)
-    trainer = RolloutTrainer(comm, INTEGRATORS[integrator](dynamics), [window_of(slab)], INTERVAL, steps, 0.5, noise, 5)
+    energies = grid_closure(slab).band_energies
+    trainer = RolloutTrainer(comm, INTEGRATORS[integrator](dynamics), [window_of(slab)], INTERVAL, steps, 0.5, energies,
+                             noise, 5)
     return trainer, model
 
 
@@ -162,22 +170,29 @@ def test_memory_does_not_grow_with_the_steps(comm):
 
 
 @pytest.mark.mpi(1)
-def test_the_energy_counts_in_units_of_its_true_change(comm):
+def test_the_energies_count_in_units_of_their_mean_loss(comm):
     trainer, _ = trainer_of(comm)
     window = trainer.windows[0]
-    exact = replace(window.particles, velocity=window.velocity[1])
-    assert float(trainer._energy_share(window, 1, exact)) < 1e-20
-    assert float(trainer._energy_share(window, 1, window.particles)) == pytest.approx(1, rel=1e-9)
+    # All bands fall by a factor of 0.9 a frame; these particles keep what they had.
+    expected = ((1 - 0.9**2) / (0.9**2 * 2 * np.log(1 / 0.9))) ** 2
+    assert float(trainer._energy_share(window, 1, window.particles)) == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.mpi(1)
+def test_a_steady_band_counts_like_a_slow_one(comm):
+    window = trainer_of(comm)[0].windows[0]
+    steady = replace(window, energies=torch.tensor([[1.0, 1.0], [1.0, 0.5], [1.0, 0.25]]))
+    assert torch.allclose(mean_losses([steady]), torch.tensor([0.1, 1.0]) * np.log(2))
 
 
 @pytest.mark.mpi(1)
 def test_no_acceleration_has_an_error_of_one(comm):
     trainer, model = trainer_of(comm, closure="poisson")
+    trainer.energy_weight = 0.0
     with torch.no_grad():
         for parameter in model.parameters():
             parameter.zero_()
-    # The energy counts with a weight of a half.
-    assert trainer.validation_error(trainer.windows[0], FRAMES) == pytest.approx(1.5**0.5, rel=1e-9)
+    assert trainer.validation_error(trainer.windows[0], FRAMES) == pytest.approx(1, rel=1e-9)
 
 
 @pytest.mark.mpi(1, 2, 3)

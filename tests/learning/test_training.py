@@ -3,7 +3,7 @@ import pytest
 import torch
 from torch import nn
 
-from eddies.learning.training import Phase, Training
+from eddies.learning.training import Phase, Training, TrainingDiverged
 
 TARGET = torch.tensor([[1.0, -2.0, 0.5]], dtype=torch.float64)
 
@@ -56,7 +56,7 @@ def test_a_training_restored_at_any_step_is_bitwise_the_one_never_stopped(comm):
 
 @pytest.mark.mpi(1)
 def test_the_state_of_least_validation_error_is_kept(comm):
-    seen, errors = [], iter([3.0, 1.0, 2.0, 5.0, 4.0, 6.0])
+    seen, errors = [], iter([4.0, 3.0, 1.0, 2.0, 8.0, 5.0, 4.0, 6.0])
 
     def validate():
         seen.append(training.model.weight.detach().numpy().copy())
@@ -64,15 +64,33 @@ def test_the_state_of_least_validation_error_is_kept(comm):
 
     training = training_of(comm, validate)
     finished(training)
-    # Three validations in each phase: the second is the best of the first phase, and the second of the other.
-    assert np.array_equal(training.model.weight.detach().numpy(), seen[4])
+    # A validation at the start and three within each phase: the last but one is the best of both.
+    assert np.array_equal(training.model.weight.detach().numpy(), seen[6])
+    assert np.array_equal(seen[4], seen[2])  # the second phase begins with the best of the first
     starts = np.flatnonzero(training.columns()["phase"] == 1)
     assert starts[0] == 6
 
 
 @pytest.mark.mpi(1)
+def test_a_phase_that_only_does_harm_ends_where_it_began(comm):
+    errors = iter([1.0, 2.0, 3.0, 4.0])
+    training = training_of(comm, lambda: next(errors), steps=(6,))
+    start = training.model.weight.detach().numpy().copy()
+    assert np.array_equal(finished(training).model.weight.detach().numpy(), start)
+
+
+@pytest.mark.mpi(1, 2)
+def test_a_loss_that_is_not_finite_ends_the_training_on_all_ranks(comm):
+    training = training_of(comm)
+    with torch.no_grad():
+        training.model.weight[0, 1] = np.inf
+    with pytest.raises(TrainingDiverged, match=r"step 0 of the training \(phase 0\): loss is"):
+        finished(training)
+
+
+@pytest.mark.mpi(1)
 def test_a_phase_ends_after_too_many_validations_without_a_new_best(comm):
-    errors = iter([1.0, 2.0, 2.0, 9.0, 8.0, 7.0, 6.0, 5.0])
+    errors = iter([3.0, 1.0, 2.0, 2.0, 9.5, 9.0, 8.0, 7.0, 6.0])
     training = finished(training_of(comm, lambda: next(errors), patience=2, steps=(20, 8)))
     assert [np.sum(training.columns()["phase"] == number) for number in (0, 1)] == [6, 8]
 

@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from eddies.flow.tracers import release
-from eddies.parallel.reduction import global_max
+from eddies.parallel.reduction import global_max, global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.cloud import ParticleCloud, grid_points
 from eddies.particles.smoothing_kernels import WendlandC2
@@ -11,9 +11,9 @@ from eddies.particles.smoothing_kernels import WendlandC2
 LENGTH = 2 * np.pi
 
 
-def cloud_of(comm, field, per_side=16, cells=12):
+def cloud_of(comm, field, per_side=16, cells=12, placement="lattice"):
     slab = SlabDecomposition(comm, LENGTH, cells)
-    position = torch.from_numpy(release(slab, 3, per_side, "lattice")["position"])
+    position = torch.from_numpy(release(slab, 3, per_side, placement)["position"])
     return ParticleCloud(slab, 2.5 * LENGTH / per_side, position, field(position), torch.float64)
 
 
@@ -27,6 +27,20 @@ def test_constants_are_exact_and_have_no_gradient(comm):
     kernel = WendlandC2(2.5 * LENGTH / 16)
     for velocity, gradient in (cloud.on_whole_grid(kernel), cloud.at_particles(kernel)):
         assert largest(comm, velocity - 2) < 1e-12 and largest(comm, gradient) < 1e-11
+
+
+@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.parametrize("neighbors", [60, 2])
+def test_velocities_spread_on_the_grid_are_those_of_the_neighbours_of_its_points(comm, neighbors):
+    """Also with so few neighbours that some points have none, and a kernel of less support than the cloud."""
+    cloud = cloud_of(comm, torch.cos, per_side=12, cells=16, placement="random")
+    kernel = WendlandC2(LENGTH / 12 * (neighbors / (4 / 3 * np.pi)) ** (1 / 3))
+    expected, spread = cloud.on_whole_grid(kernel)[0], cloud.velocity_on_whole_grid(kernel)
+    assert spread.shape == expected.shape and largest(comm, expected) > 0.5
+    # The order of summation differs, and where the sum of weights nearly vanishes, so do its last digits.
+    assert largest(comm, spread - expected) < 1e-11
+    empty = float(global_sum(comm, float((expected == 0).all(1).sum())))
+    assert (empty > 100) == (neighbors == 2)
 
 
 @pytest.mark.mpi(1, 2, 3)

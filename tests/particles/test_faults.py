@@ -54,12 +54,11 @@ def test_the_nearest_particle_is_found_across_the_faces():
     assert "nearest particle 102 at a distance of 0.3" in description
 
 
-@pytest.mark.parametrize("value, complaint", [(torch.nan, "not finite"), (-torch.inf, "not finite"),
-                                              (-7.0 * LENGTH, "farther from the box than its length")])
-def test_a_particle_that_is_nowhere_near_the_box_is_described(value, complaint):
-    particles, box = sound(), PeriodicBox(LENGTH)
-    assert find_unplaced(particles, box, rank=3) is None
-    position = particles.position.clone()
-    position[4, 2] = value
-    description = find_unplaced(dataclasses.replace(particles, position=position), box, rank=3)
+@pytest.mark.parametrize("distance, complaint", [(torch.inf, "not finite"),
+                                                 (1.01 * LENGTH, "farther outside its slab than the box is long")])
+def test_a_particle_that_is_nowhere_near_its_slab_is_described(distance, complaint):
+    particles, box, outside = sound(), PeriodicBox(LENGTH), torch.full((6,), LENGTH, dtype=torch.float64)
+    assert find_unplaced(particles, outside, box, rank=3) is None
+    outside[4] = distance
+    description = find_unplaced(particles, outside, box, rank=3)
     assert description.startswith(f"rank 3, particle 104: {complaint}; position (")

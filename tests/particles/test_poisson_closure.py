@@ -124,6 +124,48 @@ def test_gradient_of_density_and_force_against_central_differences(comm):
         assert (values[0] - values[1]) / 2e-3 == pytest.approx(by_factors[number], rel=1e-8)
 
 
+def particles_around_a_void(comm):
+    """The slabs, and particles with random velocities in seven octants of the box."""
+    random = np.random.default_rng(8)
+    position = random.uniform(0, LENGTH, (700, 3))
+    position = position[(position > LENGTH / 2).any(1)]
+    columns = {"id": np.arange(len(position)), "position": position, "velocity": random.standard_normal(position.shape),
+               "density": np.ones(len(position))}
+    own = {name: column[columns["id"] % comm.size == comm.rank] for name, column in columns.items()}
+    slab = SlabDecomposition(comm, LENGTH, PER_SIDE)
+    return slab, ParticleSet.from_numpy(migrate(slab, own))
+
+
+@pytest.mark.mpi(1, 2, 3)
+def test_a_void_looks_the_same_from_every_frame_of_reference(comm):
+    """Density and force, and so their derivatives by a uniform velocity are zero."""
+    slab, particles = particles_around_a_void(comm)
+    factors = torch.tensor([0.02, 0.03, 0.7], dtype=torch.float64)
+    dynamics = ParticleDynamics(slab, LENGTH, [], 0.0, closure_on(comm, 2, lambda: factors), fixed_ranks=True)
+    velocity = particles.velocity.requires_grad_()
+    still = dynamics.rates(replace(particles, velocity=velocity))
+    carried = dynamics.rates(replace(particles, velocity=velocity.detach() + torch.tensor([5.0, -3.0, 10.0])))
+    for name in ("closure_density", "velocity"):
+        # Squares of 10 are rounded, but not as parts of what is solved for.
+        assert torch.allclose(carried[name], still[name].detach(), rtol=0, atol=1e-12)
+    weights = torch.from_numpy(np.random.default_rng(comm.rank).standard_normal(particles.position.shape))
+    ((weights * still["velocity"]).sum() + 100 * (weights[:, 0] * still["closure_density"]).sum()).backward()
+    by_frame = global_sum(comm, velocity.grad.sum(0).numpy())
+    by_each = float(global_sum(comm, float(velocity.grad.abs().sum())))
+    assert np.abs(by_frame).max() < 1e-13 * by_each
+
+
+@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.parametrize("factors", [(0.0, 0.0, 0.0), (0.02, 0.03, 0.7)])
+def test_the_force_keeps_the_momentum_of_the_particles(comm, factors):
+    """The grid's own has a mean, as the particles do not sample it evenly."""
+    slab, particles = particles_around_a_void(comm)
+    closure = closure_on(comm, 2, lambda: torch.tensor(factors, dtype=torch.float64))
+    force = ParticleDynamics(slab, LENGTH, [], 0.0, closure, fixed_ranks=True).rates(particles)["velocity"]
+    total, sizes = global_sum(comm, force.sum(0).numpy()), float(global_sum(comm, float(force.norm(dim=1).sum())))
+    assert sizes > 1 and np.abs(total).max() < 1e-13 * sizes
+
+
 @pytest.mark.mpi(1, 2)
 def test_force_at_fixed_particles_is_that_of_the_dynamics(comm):
     slab = SlabDecomposition(comm, LENGTH, PER_SIDE)

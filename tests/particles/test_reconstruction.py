@@ -44,6 +44,30 @@ def test_nothing_is_reconstructed_where_no_particle_is():
 
 
 @kernels
+def test_a_lone_particle_near_the_edge_gives_its_own_value(kernel):
+    """Its weight is a small part of that at the centre, but there is no other."""
+    senders = torch.tensor([[0.9 * SUPPORT, 0.0, 0.0], [3.0, 3.0, 3.0]], dtype=torch.float64)
+    values = torch.tensor([[2.0, -5.0], [100.0, 100.0]], dtype=torch.float64)
+    arguments = field(kernel, torch.zeros(1, 3, dtype=torch.float64), senders, values)
+    assert torch.allclose(reconstruct(*arguments), values[:1], rtol=1e-14)
+    # The field is constant there: what is left is rounding, over the distance in which the weight vanishes.
+    assert reconstruct_gradient(*arguments).abs().max() < 1e-12
+
+
+@pytest.mark.parametrize("seed", [0, 2, 3])
+def test_in_voids_values_lie_between_those_of_the_neighbours(seed):
+    """With seven neighbours on average some points have only distant ones, where weights are small, and where those of
+    a network that had no say in its sign would be of both signs."""
+    network = KernelNetwork(SUPPORT, seed=seed)
+    with torch.no_grad():
+        network.network.weights[-1].mul_(80)
+    senders, points = cloud(count=100), cloud(count=2000, seed=9)
+    values = torch.where(torch.arange(100) % 2 == 0, 1.0, -1.0).double()[:, None]
+    with torch.no_grad():
+        assert reconstruct(*field(network.table(), points, senders, values)).abs().max() <= 1 + 1e-12
+
+
+@kernels
 def test_gradient_is_the_derivative_of_the_reconstruction(kernel):
     senders, points = cloud(count=300), cloud(count=40, seed=9).requires_grad_()
     arguments = field(kernel, points, senders, torch.sin(senders))

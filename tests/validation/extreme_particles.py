@@ -20,7 +20,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from test_extreme_particles import (  # noqa: E402
     ARRANGEMENTS, CLOSURES, MACH_NUMBERS, NEIGHBORS, SEPARATIONS, SYSTEMS, TOTAL, amplification, arrangement,
     at_mach_number, boundary, broken_step, density_contrast, few_particles, gradient_error, lattice_at_rest,
-    measured_boundary, nearly_coincident, overdriven, precision_error, scales, translated_run, translation,
+    measured_boundary, momentum_gained, nearly_coincident, overdriven, precision_error, pushed_by_the_grid,
+    random_points, scales, translated_run, translation,
 )
 
 from eddies.particles.integrators import INTEGRATORS  # noqa: E402
@@ -43,7 +44,8 @@ def placements(comm) -> Iterator[Row]:
     for total in sorted({1, comm.size}):
         for kind in CLOSURES:
             off = max(few_particles(comm, kind, integrator, total) for integrator in INTEGRATORS)
-            wanted = "pushed by the pressure on the grid alone" if "force" in kind else "straight on"
+            pushed = total > 1 and pushed_by_the_grid(kind)
+            wanted = "pushed by the pressure on the grid alone" if pushed else "straight on"
             yield f"{total} particle(s) on {comm.size} rank(s); {kind}", wanted, f"off a straight line by {off:.0e}"
     for kind in CLOSURES:
         speeds = [lattice_at_rest(comm, kind, dtype) for dtype in (torch.float64, torch.float32)]
@@ -56,7 +58,14 @@ def states(comm) -> Iterator[Row]:
     fast = 1000 * scales(TOTAL).sound_speed
     for kind in CLOSURES:
         yield (f"moving at 1000 c; {kind}", "forces as at rest but for round-off",
-               f"relative change {translation(comm, kind, fast):.0e}")
+               f"relative change {translation(comm, kind, fast, random_points(TOTAL)):.0e}")
+        worst = max(translation(comm, kind, fast, place(TOTAL)) for place in ARRANGEMENTS.values())
+        yield (f"the same, {TOTAL} particles in any of the arrangements above; {kind}", "the same",
+               f"relative change {worst:.0e}")
+        gained = max(momentum_gained(comm, kind, place(TOTAL)) for name, place in ARRANGEMENTS.items()
+                     if name != "all at one point")  # where all forces are zero
+        yield (f"sum of all forces, pairs antisymmetric, in any arrangement; {kind}", "zero to round-off",
+               f"{gained:.0e} of the sum of their sizes")
     for step in (1e-5, 1e-4, 1e-2):
         yield (f"two steps of {step:g} at 1000 c, {comm.size} rank(s)", "as at rest, or refused by all ranks",
                shown(translated_run(comm, "learned-density, corrected", fast, step)))

@@ -155,7 +155,7 @@ def evaluation(comm, compressible, forced):
 
 
 @pytest.mark.mpi(1)
-@pytest.mark.parametrize("closure", ["poisson", "poisson-force", "learned-density", "paper-density"])
+@pytest.mark.parametrize("closure", ["poisson", "poisson-force", "poisson-stress", "learned-density", "paper-density"])
 def test_one_rank_sends_nothing(comm, closure):
     assert messages_of(comm, closure=closure, forced=True) == []
     calls, sent = losses_called(comm, field=1.0, velocity_kl=0.1, acceleration_kl=0.1)
@@ -168,12 +168,24 @@ def test_a_force_pays_with_messages_for_what_it_has_alone(comm):
     forcing = messages_of(comm, pairs=False, forced=True)
     learned, forced = messages_of(comm, closure="learned-density"), messages_of(comm, closure="learned-density",
                                                                                 forced=True)
-    poisson = messages_of(comm)
     assert nothing == [] and forcing == ["Allreduce"]
     # Votes on the list before the step and at its end; then position, velocity, density: up and down.
     assert sorted(learned) == ["Allreduce"] * 2 + ["Sendrecv"] * 6
     assert sorted(forced) == ["Allreduce"] * 3 + ["Sendrecv"] * 6
-    assert len(poisson) > len(learned)
+
+
+@pytest.mark.mpi(2)
+def test_a_closure_pays_with_transposes_for_the_terms_of_its_force_alone(comm):
+    sent = {closure: messages_of(comm, closure=closure)
+            for closure in ("learned-density", "poisson", "poisson-force", "poisson-stress")}
+    # Three passes of the field to the particles and what is missed there, two transposes each; the field to modes, its
+    # products back and forth, the pressure to the particles. The gradient of the pressure goes with it; the stress has
+    # products of its own, and its friction the velocity at the particles once more.
+    transposes = {closure: messages.count("Alltoallv") for closure, messages in sent.items()}
+    assert transposes == {"learned-density": 0, "poisson": 6 + 4, "poisson-force": 6 + 4, "poisson-stress": 6 + 4 + 2 + 2}
+    # Beside the two votes on the list: one on where particles are, their mean velocity, and of a force its mean.
+    sums = {closure: messages.count("Allreduce") for closure, messages in sent.items()}
+    assert sums == {"learned-density": 2, "poisson": 4, "poisson-force": 5, "poisson-stress": 5}
 
 
 @pytest.mark.mpi(1)

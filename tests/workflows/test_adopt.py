@@ -11,7 +11,7 @@ from eddies.particles.pair_forces import PairModel
 from eddies.particles.periodic_box import PeriodicBox
 from eddies.particles.reference_scales import ReferenceScales
 from eddies.scene import BOX_LENGTH, load_scene
-from eddies.workflows.adopt import adopted_model
+from eddies.workflows.adopt import adopted_model, trained_on
 from eddies.workflows.model_source import ModelSource
 
 SCALES = ReferenceScales(length=1.2, spacing=0.6, velocity=0.9, density_mean=1.0, density=0.02, acceleration=1.7,
@@ -45,3 +45,14 @@ def test_the_same_flow_in_other_units_gets_the_same_force_in_those_units():
     assert expected.norm() > 1
     # Single precision.
     assert (found - 2 * expected).norm() < 1e-5 * found.norm()
+
+
+def test_weights_that_go_from_run_to_run_keep_where_they_were_trained():
+    scene, errors = load_scene("tiny", ["model.path=runs/first"]), {"a_priori": {"acceleration_error": 0.3}}
+    first = ModelSource(Path("first"), {}, {}, errors, {"mach_turbulent": 0.08})
+    origin, own = trained_on(scene, first)
+    assert origin == {"path": "runs/first", "mach_turbulent": 0.08} and own == errors["a_priori"]
+
+    tables = {"a_priori": {"acceleration_error": 0.5}, "source_a_priori": own}
+    second = ModelSource(Path("second"), {}, {}, tables, {"mach_turbulent": 0.16, "source": origin})
+    assert trained_on(load_scene("tiny", ["model.path=runs/second"]), second) == (origin, own)

@@ -48,7 +48,7 @@ def folder(comm, tmp_path):
     scene = load_scene(path)
     dns.run(scene, comm, tmp_path)
     network = KernelNetwork(scene.kernel.support(scene.tracers.particles), [4])
-    description = {"support": network.support, "hidden": [4], "cutoff": "smooth"}
+    description = {"form": network.FORM, "support": network.support, "hidden": [4], "cutoff": "smooth"}
     weights = {name: tensor.numpy() for name, tensor in network.state_dict().items()}
     provenance = {"scene": SCENE, "fingerprint": scene.fingerprint("train-kernel")}
     save_weights(comm, tmp_path / "kernel.h5", "kernel", description, weights, provenance)

@@ -35,7 +35,7 @@ def test_check_of_any_scene_writes_nothing(comm, tmp_path, monkeypatch, caplog, 
 def test_numbers_of_the_small_case(comm, caplog, recorded):
     text = lines_of(load_scene("hit-small"), comm, caplog)
     for part in ("spacing 0.09817, k_max 21", "32^3 = 32768, mean spacing 0.1963 = 2 cells", "Re_lambda 50.3",
-                 "filter width 0.3927", "kernel support 0.4769, 60 neighbours", "at most 10"):
+                 "filter width 0.3927", "kernel support 0.4769, 60 neighbours", "at most 5"):
         assert part in text
 
 
@@ -104,6 +104,57 @@ def test_most_ranks_is_what_the_parts_accept(comm, neighbors, most):
             require_thick_slabs(particles, particle_reach(scene))
 
 
+@pytest.mark.mpi(1, 2, 3, 4)
+@pytest.mark.parametrize("frames, thick, planes", [(4, 3, 4), (8, 2, 3), (12, 1, 2)])
+def test_ranks_for_horizons_are_those_that_their_closure_and_their_particles_accept(comm, frames, thick, planes):
+    """With particles as fast as in stationary turbulence: what training builds, and a particle at its farthest."""
+    from types import SimpleNamespace
+
+    import torch
+
+    from eddies.parallel.halo import HaloError
+    from eddies.parallel.slab import SlabDecomposition
+    from eddies.particles.pair_forces import PairModel
+    from eddies.particles.particle_set import ParticleSet
+    from eddies.particles.reference_scales import ReferenceScales
+    from eddies.particles.surroundings import Surroundings
+    from eddies.scene import BOX_LENGTH
+    from eddies.workflows.estimates import (
+        expected_turbulence, horizon_time, most_training_ranks, particle_drift)
+    from eddies.workflows.training_data import TrainingData
+
+    def accepted(build):
+        try:
+            build()
+        except HaloError:
+            return False
+        return True
+
+    scene = load_scene("tiny", ["training.horizon_steps=5", f"training.horizons=[2, {frames}]"])
+    limits = most_training_ranks(scene)
+    by_reach, = (ranks for reason, ranks in limits.items() if reason.startswith("slabs no thinner"))
+    by_grid = limits["ghost planes of the grid in the training through horizons"]
+    assert (by_reach, by_grid) == (thick, planes)
+    speed, tracers = expected_turbulence(scene).velocity_rms, scene.tracers
+    scales = ReferenceScales(length=tracers.width, spacing=tracers.spacing, velocity=speed, density_mean=1.0,
+                             density=0.01, acceleration=1.0, density_rate=0.01, sound_speed=10.0)
+    slab, support = SlabDecomposition(comm, BOX_LENGTH, tracers.particles_per_side), scene.kernel.support(12**3)
+    data = SimpleNamespace(truth=SimpleNamespace(decomposition=slab, scales=scales), longest=frames,
+                           model=PairModel(scales, support, 56, (4,)), dtype=torch.float32)
+    assert accepted(lambda: TrainingData._wide_closures(data, tracers.frame_interval)) == (comm.size <= by_grid)
+    far = torch.tensor([[1.0, 1.0, slab.upper + particle_drift(scene, horizon_time(scene))]], dtype=torch.float64)
+    particles = ParticleSet(torch.tensor([comm.rank]), far, torch.zeros_like(far), torch.ones(1))
+    around = Surroundings(slab, BOX_LENGTH, support, support, 0.0)
+    assert accepted(lambda: around.update(particles)) == (comm.size <= by_reach)
+
+
+def test_ranks_are_not_limited_by_horizons_that_are_not_trained():
+    from eddies.workflows.estimates import most_ranks
+    for changes in (["training.horizon_steps=0"], ["model.path=runs/other"]):
+        scene = load_scene("hit-small", changes)
+        assert min(most_ranks(scene).values()) == 8 and not any("horizons" in reason for reason in most_ranks(scene))
+
+
 def test_ghost_planes_limit_the_ranks():
     from eddies.workflows.estimates import most_ranks
     fields = {planes: most_ranks(load_scene("tiny", [f"tracers.field_cells={planes}"])) for planes in (11, 12)}
@@ -166,7 +217,7 @@ def test_table_goes_to_the_most_slabs():
     assert [int(row[0]) for row in rows] == [2**m for m in range(9)]  # at most 341
     assert [int(row[1]) for row in rows] == [max(1, 2**m // NODE_RANKS) for m in range(9)]
     assert [int(row[2]) for row in rows] == [1024 // 2**m for m in range(9)]
-    assert [len(row) for row in rows] == [8] * 5 + [7] * 4  # the pair force is for 21 ranks and fewer
+    assert [len(row) for row in rows] == [8] * 5 + [7] * 4  # the pair force is for 16 ranks and fewer
     # without tracers: a plane each, twelve rows and no more
     scene = load_scene("taylor-green", ["flow.cells=4096"])
     assert [int(row[0]) for row in map(lambda row: [word for word in row if word], rows_of(scene))] == [

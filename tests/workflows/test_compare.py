@@ -65,6 +65,9 @@ def rows_of(output):
 @pytest.mark.mpi(2, timeout=240)
 def test_variants_are_run_measured_and_kept(comm, folder, capfd):
     assert run_cli("dns", "base.toml", "--output", "base") == 0
+    if comm.rank == 0:
+        (folder / "out/figures").mkdir(parents=True)
+        (folder / "out/figures/mine.png").write_text("precious")
     assert run_cli("compare", "small.toml", "--output", "out") == 0
     comm.Barrier()
     out = folder / "out"
@@ -76,7 +79,7 @@ def test_variants_are_run_measured_and_kept(comm, folder, capfd):
     assert not (out / "no-force/model.h5").exists() and not list(out.glob("*/timing"))
     page = (out / "index.html").read_text()
     assert "stops (at 0 T): stopped: step 1" in page and "learned is worth its cost in" in page
-    assert len(list((out / "figures").glob("*.png"))) == 5
+    assert len(list((out / "figures").glob("*.png"))) == 5 + 1 and (out / "figures/mine.png").exists()
     capfd.readouterr()
 
     before = {path: path.stat().st_mtime_ns for path in out.glob("*/*.h5")}
@@ -113,6 +116,29 @@ def test_a_comparison_without_its_ground_truth_writes_nothing(comm, folder, capf
     told = "run `eddies dns SCENE` first: make it with `eddies dns base.toml --output base`, or give --run"
     assert comm.rank > 0 or told in capfd.readouterr().err
     assert not (folder / "out").exists()
+
+
+@pytest.mark.mpi(1, 2)
+@pytest.mark.parametrize("name, change, told", [
+    ("learned", ('run = "base"', 'run = "work/learned"'), "would be that of the ground truth, work/learned; choose"),
+    ("stops", ('name = "stops"', 'name = "stops"\nrun = "work/stops"'), "would be that of the ground truth, work/stops;"),
+    ("stops", ("", ""), "work/stops holds files that no comparison has made; choose another --output or another name"),
+], ids=["the base's", "its own", "a run's"])
+def test_runs_of_others_are_left_as_they_are(comm, folder, capfd, name, change, told):
+    """A run directory that has the place of a variant's: `--output runs` and the base's name are enough for that."""
+    files = [folder / "work" / name / product for product in ("ground_truth.h5", "model.h5")]
+    if comm.rank == 0:
+        (folder / "small.toml").write_text(FILE.replace(*change))
+        for path in files:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text("precious")
+    comm.Barrier()
+    for options in ([], ["--resume"]):
+        assert run_cli("compare", "small.toml", "--output", "work", *options) == 2
+        assert comm.rank > 0 or told in capfd.readouterr().err
+    comm.Barrier()
+    assert all(path.read_text() == "precious" for path in files)
+    assert sorted(path for path in (folder / "work").rglob("*") if path.is_file()) == sorted(files)
 
 
 @pytest.mark.mpi(1, 2)

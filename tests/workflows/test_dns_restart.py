@@ -10,9 +10,11 @@ import pytest
 from eddies.io.checkpoint import Checkpoint
 from eddies.io.hdf5 import open_product, read_attributes, read_table
 from eddies.io.trajectories import Trajectory
-from eddies.parallel.stop import Stopped, StopRequest
+from eddies.parallel.stop import Stopped
 from eddies.scene import load_scene
 from eddies.workflows import dns
+
+from tests.workflows.stopping import StopAtStep
 
 # Eight steps of spin-up, twelve with tracers in four frame intervals.
 SPLIT = ["flow.cells=12", "tracers.particles_per_side=5", "tracers.field_cells=8", "spin_up.turnovers=0.08",
@@ -20,23 +22,6 @@ SPLIT = ["flow.cells=12", "tracers.particles_per_side=5", "tracers.field_cells=8
          "simulation.frame_interval=0.06", "tracers.field_every=2", "time.max_step=0.025", "kernel.neighbors=20",
          "training.batch=9"]
 STEPS = 20
-
-
-class StopAtStep(StopRequest):
-    """Stops a job after so many looks; with `every_step` a checkpoint is due at each."""
-
-    def __init__(self, comm, steps=10**9, every_step=False):
-        super().__init__(comm)
-        self.left, self.every_step = steps, every_step
-
-    def __call__(self):
-        self.signals = [10] if self.left <= 0 else []
-        self.left -= 1
-        return super().__call__()
-
-    @property
-    def checkpoint_due(self):
-        return self.every_step or super().checkpoint_due
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ from eddies.io.hdf5 import create_product, write_attributes
 from eddies.parallel import rendezvous
 from eddies.scene import SceneError, load_scene
 from eddies.workflows.comparison_rows import step_costs
-from eddies.stages import PRODUCTS
+from eddies.stages import CHECKPOINTS, PRODUCTS
 from eddies.workflows.variant_run import StepSeconds, VariantRun
 
 
@@ -30,7 +30,7 @@ def variants(comm, tmp_path):
 
 
 def names(variant):
-    return {path.name for path in variant.directory.iterdir()}
+    return {path.name for path in variant.directory.glob("*.h5")}
 
 
 @pytest.mark.mpi(1)
@@ -74,6 +74,57 @@ def test_resume_keeps_what_fits_and_a_fresh_start_keeps_nothing(comm, variants):
     write(comm, variant.directory, "simulate", variant.scene)
     variant.prepare([], 1, resume=False)
     assert names(variant) == {"ground_truth.h5", "kernel.h5"}
+
+
+@pytest.mark.mpi(1)
+def test_a_training_that_was_stopped_goes_on_with_resume_alone(comm, variants):
+    variant, checkpoint = variants[0], variants[0].directory / CHECKPOINTS["train"] / "step-00000003"
+    checkpoint.mkdir(parents=True)
+    variant.prepare([], 1, resume=True)
+    assert checkpoint.exists()
+    variant.prepare([], 1, resume=False)
+    assert not checkpoint.parent.exists()
+
+
+@pytest.mark.mpi(1)
+def test_a_directory_that_a_comparison_has_made_is_used_again(comm, variants):
+    for variant in variants[:2]:
+        variant.check_directory([variant.ground_truth])
+        variant.directory.mkdir(parents=True)  # empty: nothing is lost
+        variant.check_directory([variant.ground_truth])
+        variant.prepare([], 1, resume=False)
+        variant.check_directory([variant.ground_truth])
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("file", ["model.h5", "checkpoints/step-00000001/state.h5"])
+def test_a_directory_with_files_of_others_is_refused(comm, variants, file):
+    variant = variants[0]
+    path = variant.directory / file
+    path.parent.mkdir(parents=True)
+    path.write_text("precious")
+    with pytest.raises(SceneError, match='"first": its run directory .*first holds files that no comparison has made'):
+        variant.check_directory([variant.ground_truth])
+
+
+@pytest.mark.mpi(1)
+def test_a_ground_truth_put_where_a_link_was_is_refused(comm, variants):
+    variant = variants[0]
+    variant.prepare([], 1, resume=False)
+    (variant.directory / "ground_truth.h5").unlink()
+    write(comm, variant.directory, "dns", variant.scene)
+    with pytest.raises(SceneError, match="holds files that no comparison has made"):
+        variant.check_directory([variant.ground_truth])
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("place", ["first", "first/timing", "alias"])
+def test_a_directory_with_a_ground_truth_in_it_is_refused(comm, variants, tmp_path, place):
+    variant = variants[0]
+    variant.prepare([], 1, resume=False)
+    (tmp_path / "out/alias").symlink_to("first")
+    with pytest.raises(SceneError, match="would be that of the ground truth, .*another --output or another name"):
+        variant.check_directory([variant.ground_truth, tmp_path / "out" / place])
 
 
 def refusal():

@@ -1,4 +1,4 @@
-"""Learning curves: losses, validation error, learning rate and gradient over the wall time of a training."""
+"""Learning curves: losses, validation error, learning rate and gradient over the course of a training."""
 
 from collections.abc import Mapping
 
@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from eddies.analysis.figures import (
     DNS, FOURTH, GUIDE, MODEL, SECOND, THIRD, TRUTH, letter, panels, png, styled,
 )
+from eddies.clock import duration
 
 LOSSES = (
     ("loss", "total", DNS), ("trajectory_loss", "trajectory $L_t$", MODEL),
@@ -22,11 +23,13 @@ SMOOTHED = 0.04
 
 @styled
 def curves(history: Mapping[str, np.ndarray]) -> Figure:
-    """The four curves over wall time, in which the phases of a training are of like length; dotted lines part them.
+    """The four curves over the steps of a training, each phase as wide as any other; dotted lines part them.
 
     history: columns (steps,); a loss that was not in use at a step is NaN there, one never used is absent.
     """
-    figure, axes = panels(2, 2, (4.6, 2.9), sharex=True)
+    history = {"phase": np.zeros_like(history["step"]), **history}  # a training of one phase need not say so
+    history["place"] = _places(history["phase"])
+    figure, axes = panels(2, 2, (4.6, 3.0), sharex=True)
     (losses, errors), (rates, gradients) = axes
     for name, label, colour in LOSSES:
         if name in history and np.any(history[name] > 0):
@@ -35,13 +38,12 @@ def curves(history: Mapping[str, np.ndarray]) -> Figure:
     _validation(errors, history)
     for number in np.unique(history["phase"]):
         chosen = history["phase"] == number
-        rates.semilogy(history["seconds"][chosen], history["learning_rate"][chosen], color=MODEL)
-    rates.set(title="Learning rate", ylabel="learning rate", xlabel="wall time (s)")
+        rates.plot(history["place"][chosen], history["learning_rate"][chosen], color=MODEL, marker=_marker(chosen))
+    rates.set(title="Learning rate", ylabel="learning rate", yscale="log")
     _noisy(gradients, history, "gradient_norm", MODEL, None)
-    gradients.set(title="Norm of the gradient", ylabel="norm", xlabel="wall time (s)", yscale="log")
+    gradients.set(title="Norm of the gradient", ylabel="norm", yscale="log")
     for axis in axes.flat:
-        for start in history["seconds"][np.flatnonzero(np.diff(history["phase"]) > 0)]:
-            axis.axvline(start, color=GUIDE, linestyle=":", linewidth=1.0)
+        _mark_phases(axis, history)
     figure.legend(*losses.get_legend_handles_labels(), loc="outside lower center", ncols=4)
     letter(axes.flat)
     return figure
@@ -52,17 +54,41 @@ def picture(history: Mapping[str, np.ndarray]) -> bytes:
     return png(curves(history))
 
 
+def _places(phase: np.ndarray) -> np.ndarray:
+    """Where the steps are drawn: those of the first phase in (0, 1], those of the second in (1, 2], and so on."""
+    _, index, count = np.unique(phase, return_inverse=True, return_counts=True)
+    before = np.cumsum(count) - count
+    return index + (np.arange(len(phase)) - before[index] + 1) / count[index]
+
+
+def _marker(steps: np.ndarray) -> str | None:
+    """A single step makes no line."""
+    return "." if np.count_nonzero(steps) == 1 else None
+
+
+def _mark_phases(axis: Axes, history: Mapping[str, np.ndarray]) -> None:
+    """Lines between the phases, and ticks that give steps and wall time."""
+    phases = round(history["place"][-1])
+    for end in range(1, phases):
+        axis.axvline(end, color=GUIDE, linestyle=":", linewidth=1.0)
+    wanted = np.linspace(0, phases, 4 + 1)[1:]
+    shown = np.unique(np.searchsorted(history["place"], wanted - 1e-9))
+    labels = [f"{int(history['step'][row]) + 1}\n{duration(history['seconds'][row])}" for row in shown]
+    axis.set_xticks([0, *history["place"][shown]], ["0", *labels])
+    axis.set_xlabel("steps and wall time" if axis.get_subplotspec().is_last_row() else "")
+
+
 def _validation(axis: Axes, history: Mapping[str, np.ndarray]) -> None:
-    """Each phase has a measure of its own, so its points are joined with no others; the least is marked."""
-    axis.set(title="Error on what is held out", ylabel="validation error")
-    error = history.get("validation_error", np.full_like(history["step"], np.nan))
+    """Each phase has a measure of its own, so its points are joined with no others; the least is circled."""
+    axis.set(title="Error on what is held out, its least circled", ylabel="validation error")
+    error = history.get("validation_error", np.full(len(history["step"]), np.nan))
     phase = history["phase"]
     for number in np.unique(phase):
         chosen = np.isfinite(error) & (phase == number)
         if chosen.any():
-            seconds, best = history["seconds"][chosen], np.argmin(error[chosen])
-            axis.plot(seconds, error[chosen], color=MODEL, marker="o", markersize=3)
-            axis.plot(seconds[best], error[chosen][best], marker="o", markersize=8, markerfacecolor="none", color=DNS)
+            place, best = history["place"][chosen], np.argmin(error[chosen])
+            axis.plot(place, error[chosen], color=MODEL, marker="o", markersize=3)
+            axis.plot(place[best], error[chosen][best], marker="o", markersize=8, markerfacecolor="none", color=DNS)
     if np.isfinite(error).any():
         axis.set_ylim(0, 1.1 * np.nanmax(error))
 
@@ -74,9 +100,9 @@ def _noisy(axis: Axes, history: Mapping[str, np.ndarray], name: str, colour: str
         used = (values > 0) & (history["phase"] == number)
         if not used.any():
             continue
-        seconds, chosen = history["seconds"][used], values[used]
-        axis.plot(seconds, chosen, color=colour, alpha=0.25, linewidth=0.6)
+        place, chosen = history["place"][used], values[used]
+        axis.plot(place, chosen, color=colour, alpha=0.25, linewidth=0.6)
         width = max(int(SMOOTHED * len(chosen)), 1)
         mean = np.convolve(chosen, np.full(width, 1 / width), mode="valid")
-        axis.plot(seconds[width - 1:], mean, color=colour, label=label, linewidth=1.4)
+        axis.plot(place[width - 1:], mean, color=colour, label=label, linewidth=1.4, marker=_marker(used))
         label = None

@@ -111,5 +111,5 @@ def section(description: Mapping[str, object], table: Mapping[str, np.ndarray],
         f"filtered pressure gradient alone is {at['pressure_gradient_error']:.3f}, that of no model 1. KL "
         f"divergence of the acceleration PDF {divergence:.2g}. Grey: frames of the training window.")
     shown.add_figure("model-training", "Training of the model", png(figures_learning.curves(history)),
-                     f"{int(history['step'][-1])} steps" + (f", in {source}." if source else "."))
+                     f"{int(history['step'][-1]) + 1} steps" + (f", in {source}." if source else "."))
     return shown

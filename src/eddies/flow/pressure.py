@@ -10,7 +10,11 @@ from eddies.flow.operators import (
     project,
 )
 from eddies.flow.spectral_grid import SpectralGrid
+from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
+
+# Wavenumber shells in a band of the energy.
+BAND = 2
 
 
 class PressureSolver:
@@ -32,6 +36,9 @@ class PressureSolver:
         self.decomposition = decomposition
         self.grid = SpectralGrid(decomposition, cutoff=resolved)
         self._kept = self.grid.index_squared <= resolved**2
+        shell = np.rint(np.sqrt(self.grid.index_squared)).astype(int)
+        self._band, self._bands = np.where(shell > 0, (shell - 1) // BAND, -1), (resolved - 1) // BAND + 1
+        self._band[shell > resolved] = -1
         self.reach = margin * decomposition.spacing
         self._spline = SplineInterpolation(self.grid, "cubic", margin)
         x, y, z = np.broadcast_arrays(*self.grid.coordinates())
@@ -65,8 +72,8 @@ class PressureSolver:
     def force_at(self, field: np.ndarray, positions: np.ndarray, factors: np.ndarray) -> np.ndarray:
         """Pressure and force at positions, (n, 4): p, then -grad p - A div(grad u grad u^T) + B laplacian u.
 
-        `factors` (2,): A, of the gradient model's stress, in length^2; and B, a viscosity. Those that are zero cost
-        nothing.
+        `factors` (2,): A, of the gradient model's stress, in length^2; and B, a viscosity. A term whose factor is zero
+        costs nothing here. In `force_adjoint` it costs as much as any, since the derivative by its factor is not zero.
         """
         forces = self._pressure_and_force(self._modes(field), factors)
         return self._spline.at(self._spline.coefficients(forces), positions)
@@ -85,6 +92,19 @@ class PressureSolver:
         by_factors = np.array([grid.cells**3 * np.sum(grid.multiplicity * (spread[1:].conj() * term).real)
                                for term in terms])
         return self._on_points(by_modes), self._spline.slope_along(coefficients, positions, weights), by_factors
+
+    def band_energies(self, field: np.ndarray) -> np.ndarray:
+        """Mean kinetic energy <u.u>/2 of the resolved field by bands of `BAND` wavenumber shells, from shell 1 on:
+        (bands,), over all ranks."""
+        energy = 0.5 * self.grid.multiplicity * np.sum(np.abs(self._modes(field)) ** 2, axis=0)
+        inside = self._band >= 0
+        return global_sum(self.grid.decomposition.comm,
+                          np.bincount(self._band[inside], energy[inside], self._bands))
+
+    def band_energies_adjoint(self, field: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Adjoint of `band_energies`; weights (bands,), which must be those of all ranks together."""
+        weight = np.append(weights, 0.0)[self._band]  # the mean has no band: -1 is the zero at the end
+        return self._on_points(weight * self._modes(field)) / self.grid.cells**3
 
     def _modes(self, field: np.ndarray) -> np.ndarray:
         return project(self.grid, self._kept * self.grid.forward(field.T.reshape(3, *self.grid.physical_shape)))

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from eddies.learning.losses import kullback_leibler, mean_square_share, soft_histogram
-from eddies.learning.optimization import Descent, shared_value
+from eddies.learning.optimization import Descent, shared_values
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.cloud import grid_points
@@ -48,7 +48,7 @@ class TrainingFrame:
 
     def __init__(self, decomposition: SlabDecomposition, model: PairModel, particles: ParticleSet,
                  acceleration: Tensor, density_rate: Tensor, force: ResolvedForce | None = None) -> None:
-        self.decomposition, self.dtype = decomposition, acceleration.dtype
+        self.decomposition, self.model, self.dtype = decomposition, model, acceleration.dtype
         self.dynamics = ParticleDynamics(decomposition, decomposition.length, [model], skin=0.0, dtype=self.dtype)
         self.surroundings = self.dynamics.surroundings
         self.surroundings.update(particles)
@@ -101,13 +101,14 @@ class ForceTrainer:
     ----------
     model, frames : the frames all on the same slabs.
     kernel : of the field loss, which compares on a grid of one cell for each plane of the slabs.
-    weights : of the losses. batch : particles of a trajectory step.
+    weights : of the losses. batch : particles of a step without the field loss.
     """
 
     def __init__(self, model: PairModel, frames: Sequence[TrainingFrame], kernel: SmoothingKernel,
                  weights: LossWeights, batch: int, seed: int) -> None:
         self.decomposition, self.total = frames[0].decomposition, frames[0].total
-        self.comm, self.model, self.frames = self.decomposition.comm, model, frames
+        self.comm, self.length = self.decomposition.comm, self.decomposition.length
+        self.model, self.frames = model, frames
         self.kernel, self.weights, self.batch, self.seed = kernel, weights, min(batch, self.total), seed
         self._points = grid_points(self.decomposition).to(frames[0].particles.position.device)
         self._volumes: dict[int, Tensor] = {}
@@ -121,14 +122,17 @@ class ForceTrainer:
         return self._descend(descent, {"trajectory": self._trajectory_share(frame, errors, self.batch)})
 
     def combined_step(self, descent: Descent, step: int) -> dict[str, float]:
-        """One step on all losses of the particles in and around a random cube; returns the losses."""
+        """One step on all losses: of the particles in and around a random cube where the field loss is among them, of
+        a random batch otherwise; returns the losses."""
         random = np.random.default_rng([self.seed, step])
         number = random.integers(len(self.frames))
         frame = self.frames[number]
-        corner, side = random.uniform(0, self.decomposition.length, 3), self.decomposition.length / 4
-        reach = self.kernel.support
-        rows = self._within(frame.particles.position, corner - reach, side + 2 * reach)
-        count = int(global_sum(self.comm, len(rows)))
+        if self.weights.field > 0:
+            corner, side, reach = random.uniform(0, self.length, 3), self.length / 4, self.kernel.support
+            rows = self._within(frame.particles.position, corner - reach, side + 2 * reach)
+            count = int(global_sum(self.comm, len(rows)))
+        else:
+            rows, count = frame.rows(random.choice(self.total, self.batch, replace=False)), self.batch
         errors = frame.errors(rows)
         shares = {"trajectory": self._trajectory_share(frame, errors, count)}
         if self.weights.field > 0:
@@ -141,8 +145,8 @@ class ForceTrainer:
         """A step down the weighted sum of the losses; returns them."""
         total = sum(getattr(self.weights, name) * share for name, share in shares.items())
         norm = descent.step(total)
-        values = {name + "_loss": shared_value(self.comm, share) for name, share in shares.items()}
-        return {"loss": shared_value(self.comm, total), **values, "gradient_norm": norm}
+        named = {f"{name}_loss": share for name, share in shares.items()}
+        return {**shared_values(self.comm, {"loss": total, **named}), "gradient_norm": norm}
 
     def _trajectory_share(self, frame: TrainingFrame, errors: dict[str, Tensor], count: int) -> Tensor:
         """Eq. 12 with centred differences, each rate in units of its rms at that moment, so that all moments of a
@@ -191,5 +195,5 @@ class ForceTrainer:
 
     def _within(self, points: Tensor, corner: np.ndarray, side: float) -> Tensor:
         """Rows of the points (m, 3) that lie in a periodic cube."""
-        offset = (points - torch.from_numpy(corner).to(points.device)) % self.decomposition.length
+        offset = (points - torch.from_numpy(corner).to(points.device)) % self.length
         return torch.nonzero((offset < side).all(1)).squeeze(1)

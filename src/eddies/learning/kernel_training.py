@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from eddies.learning.losses import mean_square_share
-from eddies.learning.optimization import Descent, shared_value
+from eddies.learning.optimization import Descent, shared_values
 from eddies.parallel.reduction import global_sum
 from eddies.particles.cloud import ParticleCloud
 from eddies.particles.smoothing_kernels import KernelNetwork
@@ -88,4 +88,4 @@ class KernelTrainer:
             shares["normalization"] = (self.network.integral() - 1) ** 2 / self.comm.size
             total = total + self.weights.normalization * shares["normalization"]
         descent.step(total)
-        return {name: shared_value(self.comm, share) for name, share in {"loss": total, **shares}.items()}
+        return shared_values(self.comm, {"loss": total, **shares})

@@ -67,6 +67,7 @@ class Descent:
             self._adam.state[parameter] = {"step": torch.tensor(float(taken)), **moments}
 
 
-def shared_value(comm, share: Tensor) -> float:
-    """The global loss: the sum of the shares of all ranks."""
-    return float(global_sum(comm, share.detach().double().cpu().numpy()))
+def shared_values(comm, shares: Mapping[str, Tensor]) -> dict[str, float]:
+    """The global losses by name: sums of the shares of all ranks, in one message."""
+    own = torch.stack([share.detach().double() for share in shares.values()])
+    return dict(zip(shares, global_sum(comm, own.cpu().numpy()).tolist()))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,11 +10,14 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from eddies.learning.losses import mean_square_share, sum_over_ranks
-from eddies.learning.optimization import Descent, shared_value
+from eddies.learning.losses import mean_square_share
+from eddies.learning.optimization import Descent, shared_values
 from eddies.parallel.reduction import global_sum
 from eddies.particles.integrators import Integrator
 from eddies.particles.particle_set import ParticleSet
+
+# A band that loses less than this share of what the fastest loses counts as if it lost that.
+SLOWEST = 0.1
 
 
 @dataclass(frozen=True)
@@ -26,11 +29,13 @@ class TrainingWindow:
     particles : at the start.
     velocity : (frames, n, 3), true velocities at the end of frame intervals 1, 2, ...; rows as in `particles`.
     density : (frames, n), the same for the density.
+    energies : (frames + 1, bands), the kinetic energy by bands of wavenumbers, at the start and then as above.
     """
 
     particles: ParticleSet
     velocity: Tensor
     density: Tensor
+    energies: Tensor
 
 
 class RolloutTrainer:
@@ -39,9 +44,10 @@ class RolloutTrainer:
     Every step draws a window from (seed, step), advances all its particles by the integrator of the simulation, and
     takes for each frame k that is reached the mean of |v - v_true|^2 / |v_true - v_start|^2: the velocity error in
     units of that of particles without acceleration, so that all frames count alike. A density that has a rate of its
-    own counts in the same way. Added with a weight is the same for the mean kinetic energy, (E - E_true)^2 /
-    (E_true - E_start)^2: fitted forces are attenuated where what they are fitted to is noisy, the power of friction
-    among them, and an energy off by little at every step is hardly seen in the error of the velocity.
+    own counts in the same way. Added with a weight is the mean over bands of wavenumbers of the squared error of their
+    kinetic energy, in units of what the band loses in that time on average over all windows: fitted forces are
+    attenuated where what they are fitted to is noisy, they take too much from some scales and too little from others,
+    and an energy off by little at every step is hardly seen in the error of the velocity.
 
     The gradient goes through all steps: force, neighbours, halo, and the closure's grid. Each step is computed anew on
     the way back, so that memory holds one step and not all.
@@ -51,16 +57,18 @@ class RolloutTrainer:
     integrator : of dynamics with fixed ranks.
     windows : on the slabs of the dynamics.
     frame_interval : time between frames. steps_per_frame : time steps in it.
-    energy_weight : of the energy beside the velocity.
+    energy_weight : of the energies beside the velocity. energies : gives those of particles.
     noise : standard deviation of what is added to each component of the initial velocities.
     """
 
     def __init__(self, comm, integrator: Integrator, windows: Sequence[TrainingWindow], frame_interval: float,
-                 steps_per_frame: int, energy_weight: float, noise: float, seed: int) -> None:
+                 steps_per_frame: int, energy_weight: float, energies: Callable[[ParticleSet], Tensor], noise: float,
+                 seed: int) -> None:
         self.comm, self.integrator, self.windows = comm, integrator, windows
         self.steps_per_frame, self.time_step = steps_per_frame, frame_interval / steps_per_frame
-        self.energy_weight, self.noise, self.seed = energy_weight, noise, seed
+        self.energy_weight, self.energies, self.noise, self.seed = energy_weight, energies, noise, seed
         self.total = int(global_sum(comm, len(windows[0].particles)))
+        self.losses = mean_losses(windows)
 
     def step(self, descent: Descent, step: int, horizon: int) -> dict[str, float]:
         """One optimiser step on windows of `horizon` frames; returns the losses."""
@@ -70,7 +78,7 @@ class RolloutTrainer:
         shares = self.loss_shares(window, horizon)
         total = sum(shares.values())
         norm = descent.step(total)
-        values = {name: shared_value(self.comm, share) for name, share in shares.items()}
+        values = shared_values(self.comm, shares)
         return {"loss": sum(values.values()), **values, "gradient_norm": norm}
 
     def loss_shares(self, window: TrainingWindow, horizon: int) -> dict[str, Tensor]:
@@ -88,14 +96,18 @@ class RolloutTrainer:
     def validation_error(self, window: TrainingWindow, horizon: int) -> float:
         """Root of the loss of a window, without noise: but for the energy 1 without acceleration."""
         shares = self.loss_shares(window, horizon)
-        return sum(shared_value(self.comm, share) for share in shares.values()) ** 0.5
+        return sum(shared_values(self.comm, shares).values()) ** 0.5
 
     def _energy_share(self, window: TrainingWindow, frame: int, particles: ParticleSet) -> Tensor:
-        """This rank's part of the squared error of the mean kinetic energy; all ranks' parts are equal."""
-        start, true = (0.5 * float(global_sum(self.comm, float(velocity.double().square().sum()))) / self.total
-                       for velocity in (window.particles.velocity, window.velocity[frame]))
-        energy = sum_over_ranks(self.comm, 0.5 * particles.velocity.square().sum()) / self.total
-        return ((energy - true) / (true - start)).square() / self.comm.size
+        """This rank's part of the squared error of the energies by bands; all ranks' parts are equal."""
+        def found(position: Tensor, velocity: Tensor) -> Tensor:
+            return self.energies(replace(particles, position=position, velocity=velocity))
+
+        columns = particles.position, particles.velocity
+        energies = checkpoint(found, *columns, use_reentrant=False, preserve_rng_state=False) \
+            if torch.is_grad_enabled() else found(*columns)
+        true = window.energies[frame + 1]
+        return ((energies - true) / (true * self.losses * (frame + 1))).square().mean() / self.comm.size
 
     def _frames(self, particles: ParticleSet, horizon: int) -> Iterator[tuple[int, ParticleSet]]:
         """Number and particles of each frame reached."""
@@ -145,3 +157,10 @@ class RolloutTrainer:
             return particles
         noise = torch.from_numpy(random.normal(0.0, self.noise, (self.total, 3))).to(particles.velocity)
         return replace(particles, velocity=particles.velocity + noise[particles.id])
+
+
+def mean_losses(windows: Sequence[TrainingWindow]) -> Tensor:
+    """The share of its energy that each band loses or gains in a frame interval, on average over windows: (bands,)."""
+    ratios = torch.stack([window.energies[-1] / window.energies[0] for window in windows])
+    losses = (ratios.log().mean(0) / (len(windows[0].energies) - 1)).abs()
+    return losses.clamp_min(SLOWEST * float(losses.max()))

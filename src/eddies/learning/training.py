@@ -41,8 +41,13 @@ class Phase:
         return len(self.work)
 
 
+class TrainingDiverged(ValueError):
+    """A loss, a gradient or the error on what is held out is no longer finite; the same on all ranks."""
+
+
 class Training:
-    """Takes a model through phases. At the end of each it returns to the state of least validation error.
+    """Takes a model through phases. At the end of each it returns to the state of least validation error, its start
+    included.
 
     Parameters
     ----------
@@ -85,11 +90,17 @@ class Training:
     def step(self) -> None:
         """One step of the present phase, and the validation that may be due after it."""
         phase, rate = self.phase, self.descent.learning_rate
+        if self.descent.taken == 0:
+            self._validate()
         row = {"phase": float(self.number), "step": float(len(self.history)), "learning_rate": rate,
                **phase.take(self.descent, self.descent.taken)}
         last = self.descent.taken == phase.steps
         if last or self.descent.taken % phase.validate_every == 0:
             row["validation_error"] = self._validate()
+        broken = [name for name in ("loss", "gradient_norm", "validation_error") if not np.isfinite(row.get(name, 0.0))]
+        if broken:
+            raise TrainingDiverged(f"step {len(self.history)} of the training ({phase.name}): {broken[0]} is "
+                                   f"{row[broken[0]]}, at a learning rate of {rate:.3g}")
         row["seconds"] = self._seconds_before + time.perf_counter() - self._started
         self.history.append(row)
         if last or self.patience is not None and self.unimproved >= self.patience:

@@ -40,7 +40,7 @@ class PlaneHalo:
         return padded
 
     def adjoint(self, padded: np.ndarray) -> np.ndarray:
-        """Transpose of `forward`: ghost planes sent home and added, (below + z_local + above, ...) -> (z_local, ...)."""
+        """Transpose of `forward`: ghost planes added at home, (below + z_local + above, ...) -> (z_local, ...)."""
         slab, count = self.decomposition, len(padded) - self.below - self.above
         planes = padded[self.below : self.below + count].copy()
         lowest, highest = padded[self.below + count :], padded[: self.below]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.periodic_box import PeriodicBox
@@ -39,15 +40,15 @@ def find_fault(
     return f"step {step}, rank {rank}, {_description(particles, box, row, _complaint(particles, limits, row))}"
 
 
-def find_unplaced(particles: ParticleSet, box: PeriodicBox, rank: int) -> str | None:
-    """The first particle of this rank whose position is not finite, or farther than a period outside the box,
-    described as by `find_fault`; or None."""
-    placed = (particles.position - box.length / 2).abs() <= 1.5 * box.length
-    if bool(placed.all()):
+def find_unplaced(particles: ParticleSet, outside: Tensor, box: PeriodicBox, rank: int) -> str | None:
+    """The first particle of this rank that is farther outside its slab than the box is long, described as by
+    `find_fault`; or None. `outside` (n,): how far each one is, infinite where its position is not finite."""
+    unplaced = outside > box.length
+    if not bool(unplaced.any()):
         return None
-    row = int(torch.nonzero(~placed.all(1))[0])
-    finite = bool(torch.isfinite(particles.position[row]).all())
-    complaint = "farther from the box than its length" if finite else "not finite"
+    row = int(torch.nonzero(unplaced)[0])
+    finite = bool(torch.isfinite(outside[row]))
+    complaint = "farther outside its slab than the box is long" if finite else "not finite"
     return f"rank {rank}, {_description(particles, box, row, complaint)}"
 
 
@@ -79,5 +80,5 @@ def _nearest(particles: ParticleSet, box: PeriodicBox, row: int) -> str:
     return f"nearest particle {int(particles.id[other])} at a distance of {float(distance[other]):.6g}"
 
 
-def _numbers(values: torch.Tensor) -> str:
+def _numbers(values: Tensor) -> str:
     return "(" + ", ".join(f"{value:.6g}" for value in values.tolist()) + ")"

@@ -11,12 +11,13 @@ import torch
 from torch import Tensor
 
 from eddies.parallel.halo import HaloError, HaloExchange
-from eddies.parallel.reduction import any_rank
+from eddies.parallel.reduction import any_rank, global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.ghosts import exchange_ghosts
 from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.pairs import Pairs
 from eddies.particles.particle_set import ParticleSet, as_numpy
+from eddies.particles.rank_sums import mean_over_ranks
 from eddies.particles.smoothing_kernels import SmoothingKernel
 from eddies.particles.surroundings import LocalParticles, Surroundings
 
@@ -36,6 +37,10 @@ class GridSolver(Protocol):
     def pressure_at(self, field: np.ndarray, positions: np.ndarray) -> np.ndarray: ...
 
     def pressure_adjoint(self, field: np.ndarray, positions: np.ndarray, weights: np.ndarray) -> tuple: ...
+
+    def band_energies(self, field: np.ndarray) -> np.ndarray: ...
+
+    def band_energies_adjoint(self, field: np.ndarray, weights: np.ndarray) -> np.ndarray: ...
 
     def force_at(self, field: np.ndarray, positions: np.ndarray, factors: np.ndarray) -> np.ndarray: ...
 
@@ -62,7 +67,8 @@ class PoissonClosure:
 
     The velocity on the grid is a kernel average of the particles', which attenuates the smaller scales. So the
     average of what the grid field still misses at the particles is added to it, `passes` times in all: iterated
-    (van Cittert) deconvolution.
+    (van Cittert) deconvolution. Where a point has no particle in reach the average is zero. So all velocities are
+    taken relative to their mean over the particles: a void, too, looks the same from every frame of reference.
 
     Parameters
     ----------
@@ -72,7 +78,9 @@ class PoissonClosure:
     skin : extra radius of the list of particles around grid points.
     dtype : of the pair sums.
     factors : if given, the closure also gives a force, and this its factors (A, B, C) in the units of the flow:
-        -grad p - A div(grad u grad u^T) + B laplacian u  of the resolved velocity u,  - C (v - u)  of what it misses.
+        -grad p - A div(grad u grad u^T) + B laplacian u  of the resolved velocity u,  - C (v - u)  of what it misses,
+        less the mean of all this over the particles, so that it keeps their momentum. It would be zero in continuous
+        space, and is not where particles sample the grid unevenly.
 
     Differentiable in the particles' positions and velocities and in the factors. All ranks call it together. Raises
     HaloError, on all ranks, where a particle lies farther outside its slab than the grid reaches.
@@ -93,24 +101,29 @@ class PoissonClosure:
     @torch.no_grad()
     def apply(self, particles: ParticleSet) -> tuple[ParticleSet, ResolvedForce | None]:
         """The particles with the density of the closure, and the force if there is one; collective."""
-        field = self._resolved_velocity(particles, self._local(particles))
+        moving, field = self._resolved_velocity(particles, self._local(particles))
         if self.factors is None:
             pressure = _PressureAt.apply(field, particles.position, self.solver)[:, 0]
             return replace(particles, density=self._density(pressure, particles)), None
         none, units = torch.zeros(3, dtype=torch.float64), torch.eye(3, dtype=torch.float64)
-        pressure, constant = self._pressure_and_force(particles, field, none)
-        terms = [self._pressure_and_force(particles, field, unit)[1] - constant for unit in units]
+        pressure, constant = self._pressure_and_force(moving, field, none)
+        terms = [self._pressure_and_force(moving, field, unit)[1] - constant for unit in units]
         force = ResolvedForce(constant, torch.stack(terms), self.factors)
         return replace(particles, density=self._density(pressure, particles)), force
 
     def fields(self, particles: ParticleSet, local: LocalParticles) -> dict[str, Tensor]:
-        """The "density" (n,) of the owned particles, and if there is a force, the rate "velocity" (n, 3); collective."""
-        field = self._resolved_velocity(particles, local)
+        """The "density" (n,) of the owned particles, and of a force the rate "velocity" (n, 3); collective."""
+        moving, field = self._resolved_velocity(particles, local)
         if self.factors is None:
             pressure = _PressureAt.apply(field, particles.position, self.solver)[:, 0]
             return {"density": self._density(pressure, particles)}
-        pressure, force = self._pressure_and_force(particles, field, self.factors())
+        pressure, force = self._pressure_and_force(moving, field, self.factors())
         return {"density": self._density(pressure, particles), "velocity": force}
+
+    def band_energies(self, particles: ParticleSet) -> Tensor:
+        """Mean kinetic energy of the resolved velocity by bands of wavenumbers: (bands,); collective."""
+        _, field = self._resolved_velocity(particles, self._local(particles))
+        return _BandEnergies.apply(field, self.solver)
 
     def _density(self, pressure: Tensor, particles: ParticleSet) -> Tensor:
         return (self.density_mean * (1 + pressure / self.sound_speed**2)).to(particles.density)
@@ -121,7 +134,7 @@ class PoissonClosure:
         if factors[2] != 0:
             resolved = _VelocityAt.apply(field, particles.position, self.solver).to(particles.velocity)
             force = force - factors[2] * (particles.velocity - resolved)
-        return found[:, 0], force
+        return found[:, 0], force - mean_over_ranks(self.solver.decomposition.comm, force)
 
     def _local(self, particles: ParticleSet) -> LocalParticles:
         """What this rank sees of the particles."""
@@ -130,13 +143,16 @@ class PoissonClosure:
         surroundings.update(particles)
         return surroundings.local(particles, set(self.reads))
 
-    def _resolved_velocity(self, particles: ParticleSet, local: LocalParticles) -> Tensor:
-        """The velocity (m, 3) at the grid points whose resolved part is that of the particles, in double precision."""
+    def _resolved_velocity(self, particles: ParticleSet, local: LocalParticles) -> tuple[ParticleSet, Tensor]:
+        """The particles with velocities less their mean, and the velocity (m, 3) at the grid points whose resolved
+        part is theirs, in double precision."""
         self._require_reach(particles.position)
+        mean = mean_over_ranks(self.solver.decomposition.comm, particles.velocity)
+        particles = replace(particles, velocity=particles.velocity - mean)
         pairs = self._pairs_around_points(local)
         weight = self.kernel.value(pairs.distance)
         weight = weight / pairs.sum(weight).clamp_min(torch.finfo(weight.dtype).tiny).index_select(0, pairs.segment)
-        missing, field = local.columns["velocity"], 0
+        missing, field = local.columns["velocity"] - mean, 0
         for remaining in reversed(range(self.passes)):
             average = pairs.sum((weight * pairs.at_senders(missing.to(weight.dtype)).T).T)
             field = field + average.double()
@@ -144,7 +160,7 @@ class PoissonClosure:
                 resolved = _VelocityAt.apply(field, particles.position, self.solver)
                 owned = particles.velocity - resolved.to(particles.velocity)
                 missing = torch.cat([owned, exchange_ghosts(local.halo, owned)])
-        return field
+        return particles, field
 
     def _require_reach(self, position: Tensor) -> None:
         slab = self.solver.decomposition
@@ -209,6 +225,23 @@ class _ForceAt(torch.autograd.Function):
         by_field, by_position, by_factors = ctx.solver.force_adjoint(
             as_numpy(field), as_numpy(position), as_numpy(factors.double()), as_numpy(weights))
         return (*_tensors(by_field, field, by_position, position), torch.from_numpy(by_factors).to(factors), None)
+
+
+class _BandEnergies(torch.autograd.Function):
+    """`GridSolver.band_energies` of a field (m, 3), the same on all ranks."""
+
+    @staticmethod
+    def forward(ctx, field: Tensor, solver: GridSolver) -> Tensor:
+        ctx.save_for_backward(field)
+        ctx.solver = solver
+        return torch.from_numpy(solver.band_energies(as_numpy(field))).to(field.device)
+
+    @staticmethod
+    def backward(ctx, weights: Tensor) -> tuple[Tensor, None]:
+        # Each rank's loss depends on the energies, to which all ranks' fields contribute.
+        (field,), solver = ctx.saved_tensors, ctx.solver
+        together = global_sum(solver.decomposition.comm, as_numpy(weights))
+        return torch.from_numpy(solver.band_energies_adjoint(as_numpy(field), together)).to(field), None
 
 
 def _adjoint(apply, field: Tensor, position: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:

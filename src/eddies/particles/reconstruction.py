@@ -5,8 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.pairs import Pairs
 from eddies.particles.smoothing_kernels import SmoothingKernel
+
+# Points of the grid, near particles, that are looked at together: about a core's cache.
+POINTS_TOGETHER = 1 << 18
 
 
 def volumes(kernel: SmoothingKernel, pairs: Pairs) -> Tensor:
@@ -33,10 +37,39 @@ def reconstruct(
 
     A constant is reproduced to rounding. Zero where no particle lies within the support.
     """
-    weight = pairs.at_senders(sender_volumes) * kernel.value(pairs.distance)
-    weighted = weight * pairs.at_senders(sender_values).T
-    sums = pairs.sum(torch.cat([weight.unsqueeze(0), weighted]).T)
-    return sums[:, 1:] * _reciprocal(sums[:, :1])
+    return _average(kernel, pairs, pairs.at_senders(sender_volumes), pairs.at_senders(sender_values).T)[0]
+
+
+@torch.no_grad()
+def reconstruct_on_grid(
+    kernel: SmoothingKernel, slab: SlabDecomposition, position: Tensor, volumes: Tensor, values: Tensor
+) -> Tensor:
+    """`reconstruct` at this slab's points (m, components) of the grid with as many cells as the slabs have planes, z
+    slowest, from all local particles: position (s, 3), owned, then ghosts.
+
+    Each particle is added to the points in the cube around it. A regular grid needs no search for neighbours, most of
+    the cost of the other way.
+    """
+    cells, side = slab.planes, int(2 * kernel.support / slab.spacing) + 1
+    first = torch.ceil((position - kernel.support) / slab.spacing).to(torch.int64)
+    index = first.unsqueeze(2) + torch.arange(side, device=position.device)
+    gap = index.to(position.dtype) * slab.spacing - position.unsqueeze(2)
+    square = gap.to(values.dtype).square()
+    # On one rank z is periodic, as x and y are; on several the ghosts stand where they are seen from.
+    z = (index[:, 2] % cells if slab.size == 1 else index[:, 2]) - slab.start
+    square[:, 2].masked_fill_((z < 0) | (z >= slab.count), torch.inf)
+    columns = torch.cat([volumes.unsqueeze(0), volumes * values.T])
+    sums = columns.new_zeros(len(columns), slab.count * cells**2)
+    for some in torch.arange(len(position), device=position.device).split(max(POINTS_TOGETHER // side**3, 1)):
+        square_x, square_y, square_z = square[some].unbind(1)
+        distance = _outer_sum(square_z, square_y, square_x)
+        near = torch.nonzero(distance < kernel.support**2).squeeze(1)
+        weight = kernel.value(distance.index_select(0, near).sqrt())
+        point = _outer_sum(z[some] * cells**2, index[some, 1] % cells * cells, index[some, 0] % cells)
+        point, particle = point.index_select(0, near), some.index_select(0, near // side**3)
+        for column, total in zip(columns, sums):
+            total.index_add_(0, point, weight * column.index_select(0, particle))
+    return (sums[1:] * _reciprocal(sums[0])).T
 
 
 def reconstruct_gradient(
@@ -54,16 +87,29 @@ def reconstruct_with_gradient(
     kernel: SmoothingKernel, pairs: Pairs, sender_volumes: Tensor, sender_values: Tensor
 ) -> tuple[Tensor, Tensor]:
     """`reconstruct` and `reconstruct_gradient` at the cost of the second."""
-    values = reconstruct(kernel, pairs, sender_volumes, sender_values)
-    volume, distance = pairs.at_senders(sender_volumes), pairs.distance
+    volume, value, distance = pairs.at_senders(sender_volumes), pairs.at_senders(sender_values).T, pairs.distance
+    average, reciprocal = _average(kernel, pairs, volume, value)
     # Both the slope and the direction vanish with the distance.
     apart = torch.where(distance > 0, distance, torch.ones_like(distance))
     gradient = (volume * kernel.derivative(distance) / apart) * pairs.displacement.T
-    deviation = pairs.at_senders(sender_values).T - values.T.contiguous().index_select(1, pairs.segment)
+    deviation = value - average.T.contiguous().index_select(1, pairs.segment)
     products = deviation.unsqueeze(1) * gradient.unsqueeze(0)
     sums = pairs.sum(products.flatten(0, 1).T).reshape(pairs.count, *products.shape[:2])
-    total = pairs.sum(volume * kernel.value(distance))
-    return values, sums * _reciprocal(total)[:, None, None]
+    return average, sums * reciprocal[:, :, None]
+
+
+def _average(kernel: SmoothingKernel, pairs: Pairs, volume: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
+    """<A> (count, components) of volumes (m,) and values (components, m) of pairs, and 1 / sum_j V_j W (count, 1)."""
+    weight = volume * kernel.value(pairs.distance)
+    sums = pairs.sum(torch.cat([weight.unsqueeze(0), weight * value]).T)
+    reciprocal = _reciprocal(sums[:, :1])
+    return sums[:, 1:] * reciprocal, reciprocal
+
+
+def _outer_sum(z: Tensor, y: Tensor, x: Tensor) -> Tensor:
+    """z_i + y_j + x_k of each row of three (n, side): (n side^3,), x fastest."""
+    plane = y.unsqueeze(2) + x.unsqueeze(1)
+    return (z[:, :, None, None] + plane.unsqueeze(1)).flatten()
 
 
 def _reciprocal(denominator: Tensor) -> Tensor:

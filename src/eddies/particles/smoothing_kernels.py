@@ -1,6 +1,7 @@
-"""Smoothing kernels W(r) of compact support: SPH's own, tabulated ones, and the learned kernel of Eq. 7.
+"""Smoothing kernels W(r) of compact support: SPH's own, tabulated ones, and the learned kernel after Eq. 7.
 
-Every kernel has unit integral over space, W in units of 1/length^3, and is exactly zero for r >= support.
+Every kernel has unit integral over space, W in units of 1/length^3, is nowhere negative, and exactly zero for
+r >= support.
 """
 
 from __future__ import annotations
@@ -72,23 +73,25 @@ class HermiteKernel:
     Parameters
     ----------
     support : h.
-    values, slopes : (knots,), the dimensionless W h^3 and d(W h^3)/dq; what is computed is differentiable in
-        both.
+    values, slopes : (knots,), the dimensionless W h^3, not negative, and d(W h^3)/dq; what is computed is
+        differentiable in both. Slopes of more than three times the value within a cell are lowered to that: a cubic
+        between them would be negative somewhere.
     """
 
     def __init__(self, support: float, values: Tensor, slopes: Tensor) -> None:
         if values.dim() != 1 or values.shape != slopes.shape or len(values) < 2:
             raise ValueError(f"kernel table {(*values.shape,)}, {(*slopes.shape,)}: not two equal columns")
-        self.support, self.values, self.slopes = support, values, slopes
-        self.cells = len(values) - 1
+        self.support, self.values, self.cells = support, values, len(values) - 1
+        steepest = 3 * self.cells * values
+        self.slopes = torch.clamp(slopes, -steepest, steepest)
         start, rise = values[:-1], values[1:] - values[:-1]
-        first, last = slopes[:-1] / self.cells, slopes[1:] / self.cells
+        first, last = self.slopes[:-1] / self.cells, self.slopes[1:] / self.cells
         self._coefficients = (start, first, 3 * rise - 2 * first - last, first + last - 2 * rise)
 
     def value(self, distance: Tensor) -> Tensor:
         """W(r) in 1/length^3, same shape as `distance`."""
         inside, t, (a, b, c, d) = self._locate(distance)
-        value = a + t * (b + t * (c + t * d))
+        value = torch.clamp(a + t * (b + t * (c + t * d)), min=0)  # below zero by rounding alone
         return torch.where(inside, value, torch.zeros_like(value)) / self.support**3
 
     def derivative(self, distance: Tensor) -> Tensor:
@@ -107,7 +110,7 @@ class HermiteKernel:
 
 
 class KernelNetwork(nn.Module):
-    """The learned kernel of Eq. 7, W(r) = alpha NN(r/h) g(r/h), with unit integral by construction.
+    """The learned kernel W(r) = alpha exp(NN(r/h)) g(r/h), with unit integral by construction.
 
     Parameters
     ----------
@@ -117,10 +120,15 @@ class KernelNetwork(nn.Module):
         g = 1/(1 + exp(C (q - 1))), which is 1/2 at q = 1, so that the kernel ends there with a jump.
     seed : of the initial weights.
 
+    Eq. 7 has NN in place of exp(NN). That may turn negative near the edge, and where all neighbours are far away, in a
+    void, positive and negative weights then cancel in the denominator of an average, which has no bound. With positive
+    weights it lies between the values that it is taken of.
+
     The network sees 2 q^2 - 1, so W is an even function of q: smooth at r = 0, with no slope there, as the
-    gradient of a reconstructed field needs. The output layer starts small around 1, so that W starts near g,
-    a bell shape that is positive everywhere.
+    gradient of a reconstructed field needs. The output layer starts small, so that W starts near g, a bell shape.
     """
+
+    FORM = "exp(NN) g"  # stored with the weights, which mean nothing in another form
 
     def __init__(
         self, support: float, hidden: Sequence[int] = (20, 20, 20, 20), cutoff: str = "smooth", seed: int = 1
@@ -132,12 +140,13 @@ class KernelNetwork(nn.Module):
         self.network = DenseNetwork(1, hidden, 1, seed)
         with torch.no_grad():
             self.network.weights[-1].mul_(0.1)
-            self.network.biases[-1].fill_(1.0)
 
     def _unnormalised(self, knots: int) -> HermiteKernel:
         reference = self.network.weights[0]
         q = torch.linspace(0, 1, knots, dtype=reference.dtype, device=reference.device).unsqueeze(0)
-        shape, slope = self.network.with_tangent(2 * q * q - 1, 4 * q)
+        exponent, rise = self.network.with_tangent(2 * q * q - 1, 4 * q)
+        shape = torch.exp(exponent)
+        slope = shape * rise
         if self.cutoff == "smooth":
             bell, bell_slope = (1 - q * q) ** 2, -4 * q * (1 - q * q)
         else:
@@ -146,7 +155,7 @@ class KernelNetwork(nn.Module):
         return HermiteKernel(self.support, (shape * bell)[0], (slope * bell + shape * bell_slope)[0])
 
     def integral(self, knots: int = 129) -> Tensor:
-        """1/alpha, the integral of NN g over space; the loss of Eq. 11 on it keeps alpha near one."""
+        """1/alpha, the integral of exp(NN) g over space; the loss of Eq. 11 on it keeps alpha near one."""
         return integral(self._unnormalised(knots))
 
     def table(self, knots: int = 129) -> HermiteKernel:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from eddies.parallel.broadcast import first_complaint
-from eddies.parallel.halo import HaloError, HaloExchange
+from eddies.parallel.halo import HaloError, HaloExchange, require_thick_slabs
 from eddies.parallel.migration import migrate
 from eddies.parallel.reduction import any_rank, global_max
 from eddies.parallel.slab import SlabDecomposition
@@ -112,15 +112,19 @@ class Surroundings:
     def update(self, particles: ParticleSet) -> None:
         """Make halo and list fit the particles.
 
-        No particle changes rank: where one has left its slab, the halo is wider by the farthest it strayed. Raises
-        HaloError, on all ranks, where a position is not finite, or farther outside its slab than the box is long.
+        No particle changes rank: where one has left its slab, the halo is wider by the farthest it strayed, and slabs
+        must be thicker by twice that: into one slab particles may stray from both sides, whose ranks do not see each
+        other. Raises HaloError, on all ranks, where slabs are too thin, a position is not finite, or a particle is
+        farther outside its slab than the box is long.
         """
         if not self.outdated(particles):
             return
-        strayed = float(global_max(self.decomposition.comm, self._strayed(particles.position)))
+        outside = self._outside(particles.position)
+        strayed = float(global_max(self.decomposition.comm, float(outside.max()) if len(outside) else 0.0))
         if strayed > self.box.length:
-            self._refuse(particles)
+            self._refuse(particles, outside)
         width = self.halo_cutoff + self.skin + strayed
+        require_thick_slabs(self.decomposition, width + strayed)
         self.halo = HaloExchange(self.decomposition, as_numpy(particles.position), width)
         self._ids, self._built_at = particles.id, particles.position.detach().clone()
         self._moved_before, self._strayed_at_build = 0.0, strayed > 0
@@ -144,17 +148,17 @@ class Surroundings:
     def _with_ghosts(self, owned: Tensor, exchange) -> Tensor:
         return owned if self.decomposition.size == 1 else torch.cat([owned, exchange(self.halo, owned)])
 
-    def _refuse(self, particles: ParticleSet) -> None:
+    def _refuse(self, particles: ParticleSet, outside: Tensor) -> None:
         """Raise HaloError with the first particle, over the ranks, that is nowhere near its slab."""
         comm = self.decomposition.comm
-        found = find_unplaced(particles, PeriodicBox(self.box.length), comm.rank)
+        found = find_unplaced(particles, outside, PeriodicBox(self.box.length), comm.rank)
         raise HaloError(f"within the step, {first_complaint(comm, found)}")
 
-    def _strayed(self, position: Tensor) -> float:
-        """How far a particle is outside the slab, at most; infinite where a position is not finite."""
-        if not bool(torch.isfinite(position).all()):
-            return math.inf
-        slab, z = self.decomposition, position[:, 2].detach()
-        if slab.size == 1 or not len(z):
-            return 0.0
-        return max(slab.lower - float(z.min()), float(z.max()) - slab.upper, 0.0)
+    def _outside(self, position: Tensor) -> Tensor:
+        """How far each particle is outside the slab, (n,); infinite where its position is not finite."""
+        position, slab = position.detach(), self.decomposition
+        z = position[:, 2]
+        distance = torch.maximum(slab.lower - z, z - slab.upper).clamp_min(0)
+        if slab.size == 1:  # which has no outside
+            distance = torch.zeros_like(z)
+        return distance.where(torch.isfinite(position).all(1), torch.inf)

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from eddies.flow.pressure import PressureSolver
+from eddies.io.hdf5 import ProductError
 from eddies.io.weights import load_weights
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.pair_forces import PairModel
@@ -19,8 +20,15 @@ from eddies.particles.smoothing_kernels import HermiteKernel, KernelNetwork, Wen
 
 
 def load_kernel(comm, path: str | Path, device: torch.device | str = "cpu") -> HermiteKernel:
-    """The trained kernel as the table that is used at run time, in single precision."""
+    """The trained kernel as the table that is used at run time, in single precision.
+
+    ProductError, besides the reasons of `load_weights`, where the weights are those of another form of the kernel.
+    """
     description, tensors = load_weights(comm, path, "kernel")
+    form = description.get("form", "NN g")
+    if form != KernelNetwork.FORM:
+        raise ProductError(f'{path}: form = "{form}", which may be negative; the kernel is now "{KernelNetwork.FORM}": '
+                           "run `eddies train-kernel` again")
     network = KernelNetwork(description["support"], description["hidden"], description["cutoff"])
     network = network.to(dtype=torch.float32, device=device)
     network.load_state_dict({name: torch.from_numpy(tensor) for name, tensor in tensors.items()})

@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 import json
 import logging
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from eddies.analysis.page import render_page
 from eddies.comparison import BASELINE, Comparison
 from eddies.io.hdf5 import ProductError, open_product, read_attributes, read_provenance
 from eddies.scene import SceneError
-from eddies.workflows.comparison_rows import COLUMNS, machine, rows
+from eddies.workflows.comparison_rows import COLUMNS, machine, notes, rows
 from eddies.workflows.variant_run import RunStages, VariantRun, on_first_rank
 
 log = logging.getLogger("eddies")
@@ -29,10 +30,12 @@ def run(comparison: Comparison, comm, output: Path, resume: bool, run_stages: Ru
     made with the same settings on as many ranks, are kept.
 
     Raises:
-        ProductError, SceneError: a ground truth is missing, or does not fit the comparison.
+        ProductError, SceneError: a ground truth is missing, or does not fit the comparison; or the run directory of a
+            variant holds what no comparison has made. Nothing is written then.
     """
     runs = [VariantRun(scene, output / name, comparison.ground_truth_of(name))
             for name, scene in comparison.scenes.items()]
+    on_first_rank(comm, lambda: check_directories(runs))
     for variant in runs:
         check_ground_truth(comparison, variant, comm)
     errors = comm.Dup()
@@ -51,6 +54,12 @@ def run(comparison: Comparison, comm, output: Path, resume: bool, run_stages: Ru
         write(comparison, rows(comparison, runs, alone, comm.size), comm.size, output)
     alone.Free()
     comm.Barrier()
+
+
+def check_directories(runs: Sequence[VariantRun]) -> None:
+    """Refuse run directories of variants in which something of others would be replaced; one rank calls it."""
+    for variant in runs:
+        variant.check_directory([other.ground_truth for other in runs])
 
 
 def check_ground_truth(comparison: Comparison, variant: VariantRun, comm) -> None:
@@ -82,11 +91,10 @@ def write(comparison: Comparison, table: list[dict[str, Any]], ranks: int, outpu
     (output / "comparison.json").write_text(json.dumps(record, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     sections = figures_compare.sections(
         figures_compare.ErrorAgainstTime(table, comparison.subject, BASELINE), comparison.turnovers)
+    sections[0].notices += notes(comparison)
     page = figures_compare.run_record(comparison.name, comparison.title, comparison.base_scene.to_toml(), computer)
     figures = output / "figures"
     figures.mkdir(exist_ok=True)
-    for stale in figures.glob("*.png"):
-        stale.unlink()
     for section in sections:
         for illustration in section.illustrations:
             (figures / f"{illustration.name}.png").write_bytes(illustration.image)

@@ -16,10 +16,13 @@ from eddies.io.fields import FieldSeries
 from eddies.io.hdf5 import open_product, read_attributes, read_table
 from eddies.io.provenance import environment
 from eddies.io.trajectories import Trajectory
+from eddies.scene import Eulerian
 from eddies.workflows.variant_run import StepSeconds, VariantRun
 
 COST = ("seconds_per_step", "time_step", "wall_seconds", "wall_seconds_low", "wall_seconds_high", "core_seconds",
         "training_seconds")
+# Measured on fields and gradients that the kernel makes of the particles, of the model and of the truth.
+THROUGH_KERNEL = ("spectrum_error", "qr_kl")
 COLUMNS = ("name", "group", "status", "stopped_at", *MEASURES, "end", *COST, "settings")
 
 
@@ -34,9 +37,32 @@ def rows(comparison: Comparison, runs: list[VariantRun], alone, ranks: int) -> l
         row |= {"name": variant.name, "group": variant.group, "settings": " ".join(variant.set)}
         if run.failure is None:
             row |= measured(run, alone, ranks)
+            if has_own_kernel(comparison, variant.name):
+                row |= dict.fromkeys(THROUGH_KERNEL)
         else:
             row |= {"status": f"failed: {run.failure}"}
         found.append({key: finite(value) for key, value in row.items()})
+    return found
+
+
+def has_own_kernel(comparison: Comparison, name: str) -> bool:
+    """Whether a variant smooths with another kernel than the base: what is measured through it does not compare."""
+    kernels = (scene.fingerprint("train-kernel") for scene in (comparison.scenes[name], comparison.base_scene))
+    return len(set(kernels)) > 1
+
+
+def notes(comparison: Comparison) -> list[str]:
+    """What a reader of the numbers has to know of single variants."""
+    own = [name for name in comparison.scenes if has_own_kernel(comparison, name)]
+    blank = " and ".join(MEASURES[measure] for measure in THROUGH_KERNEL)
+    found = [f"{', '.join(own)}: no {blank}. These are measured on what the smoothing kernel makes of the particles; "
+             "one of other settings than the base's shows another part of the flow."] if own else []
+    grids = {name: (scene.eulerian or Eulerian()).cells_for(scene.tracers.width)
+             for name, scene in comparison.scenes.items() if scene.simulation.force == "eulerian"}
+    if grids:
+        kept = ", ".join(f"{(cells - 1) // 3} in {name}" for name, cells in grids.items())
+        found.append(f"Of a grid the 2/3 rule leaves the wavenumbers |k_i| < cells/3, at most: {kept}; k_d = "
+                     f"{np.pi / comparison.base_scene.tracers.width:.3g}.")
     return found
 
 

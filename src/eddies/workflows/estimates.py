@@ -8,6 +8,7 @@ from eddies.scene import BOX_LENGTH, Eulerian, Scene
 
 DISSIPATION_CONSTANT = 0.5   # C_eps = eps L / u'^3 of developed turbulence
 PEAK_VELOCITY = 4.0          # largest component of the velocity of a particle over u'
+ALLOWED_VELOCITY = 6.0       # the same, for which the closure's grid has ghost planes
 PEAK_SPEED = 7.0             # max(|u| + |v| + |w|) over u' in turbulence: four rms in each component at worst
 EXACT_PEAK_SPEED = {"taylor-green": 1.0, "abc": 3 * math.sqrt(2), "shear-wave": 1.0}  # over the amplitude
 GHOST_PLANES = {"cubic": 3, "quintic": 4}
@@ -120,14 +121,28 @@ def most_ranks(scene: Scene) -> dict[str, int]:
         limits[f"slabs no thinner than the particles' reach {reach:.3g}"] = thick_slabs(
             scene.tracers.particles_per_side, reach)
     if "train" in scene.stages:
-        # The a-priori test interpolates filtered fields to the particles, the closure the pressure.
-        limits["ghost planes of the filtered fields"] = max(scene.tracers.cells // GHOST_PLANES["quintic"], 1)
-        if scene.model.closure.startswith("poisson"):
-            planes = scene.tracers.particles_per_side
-            limits["ghost planes of the Poisson closure"] = max(planes // closure_ghost_planes(scene), 1)
+        limits |= most_training_ranks(scene)
     if force == "eulerian":
         cells = (scene.eulerian or Eulerian()).cells_for(scene.tracers.width)
         limits["ghost planes of the coarse grid"] = max(cells // GHOST_PLANES[scene.tracers.interpolation], 1)
+    return limits
+
+
+def most_training_ranks(scene: Scene) -> dict[str, int]:
+    """The same for what a model is trained on and by."""
+    # The a-priori test interpolates filtered fields to the particles, the closure the pressure.
+    limits = {"ghost planes of the filtered fields": max(scene.tracers.cells // GHOST_PLANES["quintic"], 1)}
+    support, simulation = scene.kernel.support(scene.tracers.particles), scene.simulation
+    if scene.model.closure.startswith("poisson"):
+        skin, step = (simulation.skin * support, simulation.step) if simulation else (0.0, 0.0)
+        limits["ghost planes of the Poisson closure"] = closure_ranks(scene, step, skin)
+    time = horizon_time(scene)
+    if time > 0:
+        reach = support + 2 * particle_drift(scene, time)
+        limits[f"slabs no thinner than the particles' reach {reach:.3g} in the training through horizons"] = (
+            thick_slabs(scene.tracers.particles_per_side, reach))
+        # Of the energies by bands, if not of the closure.
+        limits["ghost planes of the grid in the training through horizons"] = closure_ranks(scene, time)
     return limits
 
 
@@ -142,19 +157,29 @@ def thick_slabs(planes: int, width: float) -> int:
 
 
 def particle_reach(scene: Scene) -> float:
-    """How far a particle sees: kernel support, skin of the neighbour list, and a step's way out of its slab."""
-    skin = scene.simulation.skin if scene.simulation else 0.0
-    return scene.kernel.support(scene.tracers.particles) * (1 + skin) + particle_drift(scene)
+    """How thick slabs must be for the particles: kernel support, skin of the neighbour list, and twice a step's way out
+    of a slab, as two particles that see each other may stray into one from both sides."""
+    step, skin = (scene.simulation.step, scene.simulation.skin) if scene.simulation else (0.0, 0.0)
+    return scene.kernel.support(scene.tracers.particles) * (1 + skin) + 2 * particle_drift(scene, step)
 
 
-def particle_drift(scene: Scene) -> float:
-    """How far a particle of the model is expected to move in a step; 0 without [simulation]."""
+def particle_drift(scene: Scene, time: float, peak: float = PEAK_VELOCITY) -> float:
+    """How far a particle may move along z in a time if it has `peak` times u'; 0 where that is not foreseen."""
     turbulence = expected_turbulence(scene)
-    return PEAK_VELOCITY * turbulence.velocity_rms * scene.simulation.step if turbulence and scene.simulation else 0.0
+    return peak * turbulence.velocity_rms * time if turbulence else 0.0
 
 
-def closure_ghost_planes(scene: Scene) -> int:
-    """Ghost planes of the pressure's cubic splines: one more for each plane that a particle may be outside its slab."""
-    support, skin = scene.kernel.support(scene.tracers.particles), scene.simulation.skin if scene.simulation else 0.0
-    outside = (skin * support / 2 + particle_drift(scene)) / scene.tracers.spacing
-    return GHOST_PLANES["cubic"] - 1 + max(math.ceil(outside), 1)
+def horizon_time(scene: Scene) -> float:
+    """The longest time through which a model is trained and particles keep their rank; 0 without such training."""
+    settings = scene.training
+    if settings is None or settings.horizon_steps == 0 or scene.model.path is not None:
+        return 0.0
+    return max(settings.horizons) * scene.tracers.frame_interval
+
+
+def closure_ranks(scene: Scene, time: float, skin: float = 0.0) -> int:
+    """The largest number of ranks for the cubic splines on a grid of one cell a particle, which have one more ghost
+    plane for each plane that a particle may be outside its slab after a time."""
+    outside = (skin / 2 + particle_drift(scene, time, ALLOWED_VELOCITY)) / scene.tracers.spacing
+    ghosts = GHOST_PLANES["cubic"] - 1 + max(math.ceil(outside), 1)
+    return max(scene.tracers.particles_per_side // ghosts, 1)

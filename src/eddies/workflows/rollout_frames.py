@@ -56,7 +56,7 @@ class RolloutFrames:
         order = IdOrder(self._slab.comm, columns["id"], self.truth.total)
         by_id = {column: order.apply(columns[column]) for column in COLUMNS}
         self._trajectories[name].append(step, time, order.start, by_id)
-        field = as_numpy(cloud.on_whole_grid(self.kernel)[0]).T
+        field = as_numpy(cloud.velocity_on_whole_grid(self.kernel)).T
         n = self._slab.planes
         self._fields[name].append(time, self._slab.start, {"velocity": field.reshape(3, self._slab.count, n, n)})
 

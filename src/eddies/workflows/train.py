@@ -10,10 +10,11 @@ from eddies.clock import ProgressLine
 from eddies.io.checkpoint import CheckpointDirectory
 from eddies.io.hdf5 import open_product
 from eddies.io.weights import save_weights
-from eddies.learning.training import Training
+from eddies.learning.training import Training, TrainingDiverged
+from eddies.parallel.halo import HaloError
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import Stopped, StopRequest
-from eddies.scene import BOX_LENGTH, Scene
+from eddies.scene import BOX_LENGTH, Scene, SceneError
 from eddies.workflows import adopt
 from eddies.workflows.a_priori import evaluate, evaluation_frames
 from eddies.workflows.closures import load_kernel
@@ -25,7 +26,6 @@ log = logging.getLogger("eddies")
 
 # Wall seconds between two drawings of the learning curves.
 DRAWING_SECONDS = 30.0
-CHECKPOINTS = "checkpoints-train"
 
 
 def run(scene: Scene, comm, directory: str | Path, stop: StopRequest | None = None) -> None:
@@ -40,14 +40,14 @@ def run(scene: Scene, comm, directory: str | Path, stop: StopRequest | None = No
     with open_product(comm, directory / "ground_truth.h5", "ground_truth") as file:
         truth = GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, scene.tracers.particles_per_side))
         data = TrainingData(scene, truth, load_kernel(comm, directory / "kernel.h5", device), device)
-        model, last = data.model, data.last
+        model, last, tests = data.model, data.last, evaluation_frames(truth)
         log.info("train: frames up to %d of the times up to %.3g of %.3g, %d held out; %d weights", data.learned,
                  truth.times[last], truth.times[-1], last - data.learned, sum(p.numel() for p in model.parameters()))
         phases = [data.one_step_phase(), *([data.horizon_phase()] if data.longest else [])]
         training = Training(comm, model, phases, scene.training.patience)
-        checkpoints = CheckpointDirectory(comm, directory / CHECKPOINTS, scene.fingerprint("train"))
+        checkpoints = CheckpointDirectory(comm, directory / "checkpoints-train", scene.fingerprint("train"))
         take_all_steps(training, checkpoints, stop, LearningCurves(comm, directory / "learning.png"))
-        tables = evaluate(truth, model, data.closure, evaluation_frames(truth), last, data.dtype, device)
+        tables = evaluate(truth, model, data.closure, tests, last, data.dtype, device)
         mach = truth.reference["mach_turbulent"]
     weights = {name: tensor.cpu().numpy() for name, tensor in model.state_dict().items()}
     provenance = {"scene": scene.to_toml(), "fingerprint": scene.fingerprint("train"), "mach_turbulent": mach}
@@ -84,7 +84,11 @@ def take_all_steps(training: Training, checkpoints: CheckpointDirectory, stop: S
             stop.checkpoint_done()
         if stopping:
             raise Stopped(stop.reason, f"from step {len(training.history)} of the training")
-        training.step()
+        try:
+            training.step()
+        except (TrainingDiverged, HaloError) as error:
+            raise SceneError(f"[training] {error}; lower learning_rate or horizon_learning_rate"
+                             ", or shorten horizon_step") from None
         if training.running:
             progress(training.done, len(training.history))
         curves(training)

@@ -54,8 +54,8 @@ def run(scene: Scene, comm, directory: str | Path, stop: StopRequest | None = No
         kernels = {name: network.table() for name, network in networks.items()}
         kernels |= {"cubic_spline": CubicSpline(support), "wendland": WendlandC2(support)}
         tables = {"kernels": shapes(kernels, support), "history": history, **compare(kernels, unseen)}
-    description = {"support": support, "neighbors": settings.neighbors, "hidden": list(settings.hidden),
-                   "cutoff": settings.cutoff}
+    description = {"form": KernelNetwork.FORM, "support": support, "neighbors": settings.neighbors,
+                   "hidden": list(settings.hidden), "cutoff": settings.cutoff}
     weights = {name: tensor.numpy() for name, tensor in networks["learned"].state_dict().items()}
     provenance = {"scene": scene.to_toml(), "fingerprint": scene.fingerprint("train-kernel")}
     save_weights(comm, directory / "kernel.h5", "kernel", description, weights, provenance, tables)

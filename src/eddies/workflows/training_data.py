@@ -16,10 +16,11 @@ from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.pair_forces import PairModel
 from eddies.particles.particle_set import ParticleSet
+from eddies.particles.periodic_box import PeriodicBox
 from eddies.particles.poisson_closure import PoissonClosure
 from eddies.particles.smoothing_kernels import SmoothingKernel
 from eddies.scene import BOX_LENGTH, Scene, SceneError
-from eddies.workflows.closures import density_closure
+from eddies.workflows.closures import density_closure, poisson_closure
 from eddies.workflows.particle_run import PEAK_SPEED
 from eddies.workflows.truth import GroundTruth, load_frame
 
@@ -42,7 +43,7 @@ class TrainingData:
         self.model = build_model(scene, truth, kernel.support).to(dtype=self.dtype, device=device)
         self.longest = max(self.settings.horizons) if self.settings.horizon_steps else 0
         self.last = truth.last_frame_seen(self.settings.window)
-        held_out = max(math.ceil(HELD_OUT * self.last), self.longest, 1)
+        held_out = max(math.ceil(HELD_OUT * self.last), self.longest, 2)  # rates need a frame on both sides
         self.learned = self.last - held_out
         if self.learned - self.longest < 2:
             raise SceneError(
@@ -56,7 +57,7 @@ class TrainingData:
         settings = self.settings
         seen = np.unique(np.linspace(1, self.learned, settings.frames).astype(int))
         frames = [self._frame(index) for index in seen]
-        validation = self._frame(max(self.last - 1, self.learned + 1))
+        validation = self._frame(self.last - 1)
         weights = LossWeights(settings.trajectory_weight, settings.field_weight, settings.velocity_kl_weight,
                               settings.acceleration_kl_weight)
         trainer = ForceTrainer(self.model, frames, self.kernel, weights, settings.batch, self.scene.seed)
@@ -77,15 +78,15 @@ class TrainingData:
         rates = settings.horizon_learning_rate, settings.final_learning_rate
         interval = scene.tracers.frame_interval
         slab = self.truth.decomposition
-        dynamics = ParticleDynamics(slab, BOX_LENGTH, [self.model], 0.0, self._wide_closure(interval), self.dtype,
-                                    fixed_ranks=True)
+        closure, resolution = self._wide_closures(interval)
+        dynamics = ParticleDynamics(slab, BOX_LENGTH, [self.model], 0.0, closure, self.dtype, fixed_ranks=True)
         starts = np.unique(np.linspace(0, self.learned - self.longest, settings.frames).astype(int))
-        windows = [self._window(start) for start in starts]
-        validation = self._window(self.last - self.longest)
+        windows = [self._window(start, resolution) for start in starts]
+        validation = self._window(self.last - self.longest, resolution)
         substeps = round(interval / (settings.horizon_step or interval))
         trainer = RolloutTrainer(slab.comm, INTEGRATORS[settings.horizon_integrator](dynamics), windows, interval,
-                                 substeps, settings.energy_weight, settings.noise * self.truth.scales.velocity,
-                                 scene.seed)
+                                 substeps, settings.energy_weight, resolution.band_energies,
+                                 settings.noise * self.truth.scales.velocity, scene.seed)
 
         def take(descent: Descent, step: int) -> dict[str, float]:
             return trainer.step(descent, step, settings.horizons[step // settings.horizon_steps])
@@ -95,19 +96,29 @@ class TrainingData:
         return Phase("horizons", evaluations * float(trainer.total), rates, take,
                      lambda: trainer.validation_error(validation, self.longest), max(steps // HORIZON_VALIDATIONS, 1))
 
-    def _wide_closure(self, interval: float) -> PoissonClosure | None:
-        """The closure for particles that stray from their slab during the longest horizon."""
-        drift = PEAK_SPEED * self.truth.scales.velocity * interval * self.longest
-        return density_closure(self.model, self.truth.decomposition, self.dtype, drift=drift)
+    def _wide_closures(self, interval: float) -> tuple[PoissonClosure | None, PoissonClosure]:
+        """The closure for particles that stray from their slab during the longest horizon, and one that resolves their
+        velocity, also where the density is learned."""
+        slab, scales = self.truth.decomposition, self.truth.scales
+        drift = PEAK_SPEED * scales.velocity * interval * self.longest
+        return (density_closure(self.model, slab, self.dtype, drift=drift),
+                poisson_closure(slab, scales.sound_speed, self.dtype, drift=drift))
 
     def _frame(self, index: int) -> TrainingFrame:
         return load_frame(self.truth, index, self.model, self.closure, self.dtype, self.device)
 
-    def _window(self, start: int) -> TrainingWindow:
+    def _window(self, start: int, resolution: PoissonClosure) -> TrainingWindow:
         columns = {name: torch.from_numpy(column).to(self.device)
                    for name, column in self.truth.window(start, self.longest).items()}
-        later = [columns.pop(f"{name}_later").movedim(1, 0).contiguous() for name in ("velocity", "density")]
-        return TrainingWindow(ParticleSet(**columns), *later)
+        position, velocity, density = (columns.pop(f"{name}_later").movedim(1, 0).contiguous()
+                                       for name in ("position", "velocity", "density"))
+        particles = ParticleSet(**columns)
+        # Positions are stored within the box; here they go on from where the particles are.
+        position = particles.position + PeriodicBox(BOX_LENGTH).displacement(position, particles.position)
+        moments = [particles, *(ParticleSet(particles.id, *later) for later in zip(position, velocity, density))]
+        with torch.no_grad():
+            energies = torch.stack([resolution.band_energies(moment) for moment in moments])
+        return TrainingWindow(particles, velocity, density, energies)
 
 
 def build_model(scene: Scene, truth: GroundTruth, support: float) -> PairModel:

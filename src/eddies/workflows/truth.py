@@ -56,11 +56,12 @@ class GroundTruth:
         return migrate(self.decomposition, columns)
 
     def window(self, frame: int, length: int) -> dict[str, np.ndarray]:
-        """`particles` of a frame, and as `velocity_later` (n, length, 3) and `density_later` (n, length) what is true
-        of the same particles in the frames that follow."""
+        """`particles` of a frame, and what is true of them in the frames that follow: `position_later` and
+        `velocity_later` (n, length, 3), `density_later` (n, length)."""
         columns = self._block(frame)
-        later = [self._block(frame + number, ("velocity", "density")) for number in range(1, length + 1)]
-        for name in ("velocity", "density"):
+        names = ("position", "velocity", "density")
+        later = [self._block(frame + number, names) for number in range(1, length + 1)]
+        for name in names:
             columns[f"{name}_later"] = np.stack([block[name] for block in later], axis=1)
         return migrate(self.decomposition, columns)
 

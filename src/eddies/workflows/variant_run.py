@@ -25,6 +25,10 @@ log = logging.getLogger("eddies")
 FAILURES = (SceneError, ProductError, HaloError, FlowDiverged, ForcingError)
 # The product of each stage that a variant may have to run.
 PRODUCTS = {"train-kernel": "kernel.h5", "train": "model.h5", "simulate": "rollout.h5"}
+CHECKPOINTS = "checkpoints-train"  # of a training that was stopped
+# Lies in every run directory that a comparison has made: in no other does it remove anything.
+MARK = "made-by-compare.txt"
+MARK_TEXT = "`eddies compare` replaces the products in this directory when it runs again.\n"
 TIMED_STEPS = 6  # at least, in a block that is run for its time alone; a rollout leaves its first two out as warm-up
 
 # Runs stages of a scene in a run directory, all ranks together, and skips those whose product is there.
@@ -68,6 +72,22 @@ class VariantRun:
         """The stages that a variant runs where their product is not shared: all but ground truth and report."""
         return tuple(stage for stage in self.scene.stages if stage in PRODUCTS)
 
+    def check_directory(self, ground_truths: Sequence[Path]) -> None:
+        """Refuse a run directory in which a comparison would replace what it has not made. Sends nothing.
+
+        Raises SceneError: a ground truth of the comparison is in it, or files of others.
+        """
+        remedy = "choose another --output or another name"
+        for path in ground_truths:
+            if path.resolve().is_relative_to(self.directory.resolve()):
+                raise SceneError(f'variant "{self.name}": its run directory {self.directory} would be that of the '
+                                 f"ground truth, {path}; {remedy}")
+        truth = self.directory / "ground_truth.h5"
+        made_here = (self.directory / MARK).exists() and (truth.is_symlink() or not truth.exists())
+        if self.directory.exists() and any(self.directory.iterdir()) and not made_here:
+            raise SceneError(f'variant "{self.name}": its run directory {self.directory} holds files that no '
+                             f"comparison has made; {remedy}, or remove the directory")
+
     def prepare(self, earlier: Sequence[VariantRun], ranks: int, resume: bool) -> None:
         """Make the run directory with links to what is shared: ground truth, kernel, and a model trained before.
 
@@ -75,6 +95,9 @@ class VariantRun:
         for times, this number of ranks. Sends nothing: one rank does this.
         """
         self.directory.mkdir(parents=True, exist_ok=True)
+        (self.directory / MARK).write_text(MARK_TEXT, encoding="utf-8")
+        if not resume and (self.directory / CHECKPOINTS).exists():
+            shutil.rmtree(self.directory / CHECKPOINTS)
         for stage, name in PRODUCTS.items():
             product = self.directory / name
             fits = stage in self.stages and product_fingerprint(product) == self.scene.fingerprint(stage)
@@ -145,11 +168,13 @@ def link(product: Path, directory: Path) -> None:
 
 
 def on_first_rank(comm, work: Callable[[], None]) -> None:
-    """Work in directories that rank 0 does alone; all ranks raise SceneError where they cannot be written."""
+    """Work in directories that rank 0 does alone; all ranks raise its SceneError, or one where it cannot write."""
     complaint = None
     if comm.rank == 0:
         try:
             work()
+        except SceneError as error:
+            complaint = str(error)
         except OSError as error:
             complaint = f"{error.filename}: cannot be written ({error.strerror}); choose another --output"
     complaint = first_complaint(comm, complaint)

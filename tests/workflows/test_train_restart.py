@@ -1,0 +1,105 @@
+"""A training that is stopped and goes on is the one that was never stopped."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from eddies import stages
+from eddies.io.hdf5 import open_product, read_table
+from eddies.io.weights import load_weights
+from eddies.parallel.stop import Stopped, StopRequest
+from eddies.scene import SceneError, load_scene
+from eddies.workflows import dns, train, train_kernel
+
+from tests.workflows.stopping import StopAtStep
+
+# Ten frame intervals, all of them for training: six steps on single frames, two of them with every loss, and then two
+# of each horizon.
+SHORT = ["flow.cells=12", "tracers.particles_per_side=6", "tracers.field_cells=8", "spin_up.turnovers=0.01",
+         "tracers.turnovers=0.14", "tracers.frame_interval=0.02", "tracers.field_every=3", "kernel.neighbors=20",
+         "kernel.steps=2", "kernel.points=20", "model.hidden=[4]", "training.window=1", "training.frames=2",
+         "training.batch=50", "training.steps=6", "training.combined_steps=2", "training.horizon_steps=2",
+         "training.horizons=[1,2]", "training.noise=0.1", "simulation.start=0"]
+
+
+def prepared(comm, directory):
+    """A directory with the ground truth and the kernel of the short scene."""
+    scene = load_scene("tiny", SHORT)
+    if comm.rank == 0:
+        directory.mkdir(parents=True, exist_ok=True)
+    comm.Barrier()
+    dns.run(scene, comm, directory)
+    train_kernel.run(scene, comm, directory)
+    return scene
+
+
+def trained(comm, directory):
+    """Weights, learning history and a-priori errors."""
+    numbers = load_weights(comm, directory / "model.h5", "model")[1]
+    with open_product(comm, directory / "model.h5", "model") as file:
+        for table in ("history", "a_priori"):
+            numbers |= {f"{table}/{name}": values for name, values in read_table(file, table).items()}
+    return numbers
+
+
+@pytest.mark.mpi(1, 2)
+def test_a_stopped_training_is_the_one_never_stopped(comm, tmp_path):
+    scene = prepared(comm, tmp_path)
+    train.run(scene, comm, tmp_path)
+    whole = trained(comm, tmp_path)
+    assert np.array_equal(whole["history/phase"], [0] * 6 + [1] * 4)
+    comm.Barrier()
+    if comm.rank == 0:
+        (tmp_path / "learning.png").unlink()
+    # Before the first step, within the first phase, between the phases, and between two horizons.
+    for before, step in pairwise((0, 0, 3, 6, 8)):
+        with pytest.raises(Stopped, match=f"--resume goes on from step {step} of the training"):
+            train.run(scene, comm, tmp_path, StopAtStep(comm, step - before))
+    train.run(scene, comm, tmp_path)
+    parts = trained(comm, tmp_path)
+    assert parts.keys() == whole.keys()
+    assert np.all(np.diff(parts.pop("history/seconds")) > 0)
+    for name, values in parts.items():
+        assert np.array_equal(values, whole[name], equal_nan=True), name
+    comm.Barrier()
+    assert (tmp_path / "learning.png").read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
+    assert {path.name for path in tmp_path.iterdir()} == {"ground_truth.h5", "kernel.h5", "model.h5", "learning.png"}
+
+
+@pytest.mark.mpi(2)
+def test_a_training_goes_on_from_products_that_are_still_those_it_began_with(comm, tmp_path):
+    scene = prepared(comm, tmp_path)
+
+    def stopped(looks, step, resume, names=("train",)):
+        with pytest.raises(Stopped, match=f"from step {step} of the training"):
+            stages.run_stages(names, scene, comm, tmp_path, resume, StopAtStep(comm, looks))
+
+    # One look is before the stage begins.
+    stopped(3, 2, resume=False)
+    stopped(2, 3, resume=True)
+    stopped(2, 1, resume=False)
+    stopped(3, 3, resume=True)
+    if comm.rank == 0:
+        (tmp_path / "kernel.h5").unlink()
+    # The kernel is trained in two forms of two steps each.
+    stopped(1 + 2 * 2 + 2, 1, resume=True, names=("train-kernel", "train"))
+    stages.run_stages(["train"], scene, comm, tmp_path, True, StopRequest(comm))
+    leftover = tmp_path / "checkpoints-train"
+    assert not leftover.exists()
+    comm.Barrier()
+    if comm.rank == 0:
+        leftover.mkdir()
+    comm.Barrier()
+    stages.run_stages(["train"], scene, comm, tmp_path, True, StopRequest(comm))
+    assert not leftover.exists()
+
+
+@pytest.mark.mpi(1, 2)
+def test_a_window_too_short_for_its_horizons_is_refused(comm, tmp_path):
+    prepared(comm, tmp_path)
+    scene = load_scene("tiny", [*SHORT, "training.horizons=[1,5]"])
+    with pytest.raises(SceneError, match=r"\[training\] window = 1: holds 10 frames of the ground truth, too few with "
+                                         "5 held out for validation and horizons of 5; raise it or .* horizons"):
+        train.run(scene, comm, tmp_path)
+    assert not list(tmp_path.glob("model.h5*"))
