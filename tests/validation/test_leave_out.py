@@ -182,7 +182,8 @@ def test_a_closure_pays_with_transposes_for_the_terms_of_its_force_alone(comm):
     # products back and forth, the pressure to the particles. The gradient of the pressure goes with it; the stress has
     # products of its own, and its friction the velocity at the particles once more.
     transposes = {closure: messages.count("Alltoallv") for closure, messages in sent.items()}
-    assert transposes == {"learned-density": 0, "poisson": 6 + 4, "poisson-force": 6 + 4, "poisson-stress": 6 + 4 + 2 + 2}
+    assert transposes == {"learned-density": 0, "poisson": 6 + 4, "poisson-force": 6 + 4,
+                          "poisson-stress": 6 + 4 + 2 + 2}
     # Beside the two votes on the list: one on where particles are, their mean velocity, and of a force its mean.
     sums = {closure: messages.count("Allreduce") for closure, messages in sent.items()}
     assert sums == {"learned-density": 2, "poisson": 4, "poisson-force": 5, "poisson-stress": 5}
