@@ -110,8 +110,8 @@ def test_verlet_does_not_use_its_memory_for_other_particles(comm):
 class SineClosure:
     cutoff, reads = 1.0, ()
 
-    def density(self, particles, local):
-        return torch.sin(particles.position[:, 0])
+    def fields(self, particles, local):
+        return {"density": torch.sin(particles.position[:, 0])}
 
 
 @pytest.mark.mpi(1, 2)

@@ -39,9 +39,10 @@ def test_particles_that_stray_into_one_slab_from_both_sides_are_refused_where_th
 @pytest.mark.parametrize("z, complaint", [(-0.7 * LENGTH, "farther outside its slab than the box is long"),
                                           (math.nan, "not finite")])
 def test_a_particle_that_is_nowhere_near_its_slab_is_named_by_all_ranks(comm, z, complaint):
-    """Less than a length below the box, but more below the slab of the second rank. One rank has all of the box."""
+    """Less than a length below the box, but more below the slab of the second rank. One rank has all periods."""
     slab = SlabDecomposition(comm, LENGTH, 24)
-    heights = [slab.upper - 0.1, z if comm.rank == comm.size - 1 else slab.lower]
+    below = z if comm.size > 1 else z - LENGTH
+    heights = [slab.upper - 0.1, below if comm.rank == comm.size - 1 else slab.lower]
     surroundings, particles = Surroundings(slab, LENGTH, 1.0, 1.0, 0.0), particles_at(comm, heights)
     if comm.size == 1 and math.isfinite(z):
         surroundings.update(particles)
