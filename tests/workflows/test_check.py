@@ -161,7 +161,7 @@ def test_ghost_planes_limit_the_ranks():
     assert [limits["ghost planes of the filtered fields"] for limits in fields.values()] == [2, 3]
     assert fields[12]["ghost planes of the Poisson closure"] == 4
     fast = most_ranks(load_scene("tiny", ["simulation.step=0.2", "simulation.frame_interval=0.2"]))
-    assert fast["ghost planes of the Poisson closure"] == 3
+    assert fast["ghost planes of the Poisson closure"] == 2
     assert "ghost planes of the Poisson closure" not in most_ranks(load_scene("tiny", ["model.closure=paper-density"]))
 
 

@@ -121,11 +121,11 @@ def test_a_comparison_without_its_ground_truth_writes_nothing(comm, folder, capf
 @pytest.mark.mpi(1, 2)
 @pytest.mark.parametrize("name, change, told", [
     ("learned", ('run = "base"', 'run = "work/learned"'), "would be that of the ground truth, work/learned; choose"),
-    ("stops", ('name = "stops"', 'name = "stops"\nrun = "work/stops"'), "would be that of the ground truth, work/stops"),
+    ("stops", ('name = "stops"', 'name = "stops"\nrun = "work/stops"'), "would be that of the ground truth, work/"),
     ("stops", ("", ""), "work/stops holds files that no comparison has made; choose another --output or another name"),
 ], ids=["the base's", "its own", "a run's"])
 def test_runs_of_others_are_left_as_they_are(comm, folder, capfd, name, change, told):
-    """A run directory that has the place of a variant's: `--output runs` and the base's name are enough for that."""
+    """A run directory in the place of a variant's: `--output runs` and the base's name are enough for that."""
     files = [folder / "work" / name / product for product in ("ground_truth.h5", "model.h5")]
     if comm.rank == 0:
         (folder / "small.toml").write_text(FILE.replace(*change))
