@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from eddies.parallel.reduction import global_sum
-from eddies.particles.particle_set import as_numpy
+from eddies.particles.rank_sums import sum_over_ranks
 
 
 def mean_square_share(error: Tensor, scale: float, total: int) -> Tensor:
@@ -24,24 +24,6 @@ def relative_error(comm, error: Tensor, exact: Tensor) -> float:
     squares = [float(part.detach().double().square().sum()) for part in (error, exact)]
     wrong, whole = global_sum(comm, np.array(squares))
     return float(np.sqrt(wrong / whole))
-
-
-class _GlobalSum(torch.autograd.Function):
-    """Sum over ranks, on every rank. Its adjoint is the same sum: each rank's loss depends on each contribution."""
-
-    @staticmethod
-    def forward(ctx, values: Tensor, comm) -> Tensor:
-        ctx.comm = comm
-        return torch.from_numpy(global_sum(comm, as_numpy(values))).to(values.device)
-
-    @staticmethod
-    def backward(ctx, gradient: Tensor) -> tuple[Tensor, None]:
-        return torch.from_numpy(global_sum(ctx.comm, as_numpy(gradient))).to(gradient.device), None
-
-
-def sum_over_ranks(comm, values: Tensor) -> Tensor:
-    """Sum of a tensor over ranks, on every rank; differentiable, collective both ways."""
-    return _GlobalSum.apply(values, comm)
 
 
 def soft_histogram(comm, values: Tensor, bins: int, reach: float) -> Tensor:
