@@ -19,9 +19,9 @@ from eddies.particles.poisson_closure import PoissonClosure
 from eddies.particles.reference_scales import ReferenceScales
 from eddies.particles.smoothing_kernels import WendlandC2
 
-LENGTH, PER_SIDE, FRAMES, INTERVAL = 2 * np.pi, 12, 4, 0.1
+LENGTH, PER_SIDE, FRAMES, INTERVAL = 2 * np.pi, 12, 4, 0.06
 SPACING = LENGTH / PER_SIDE
-SUPPORT = 2.0 * SPACING
+SUPPORT = 1.6 * SPACING
 SCALES = ReferenceScales(length=2 * SPACING, spacing=SPACING, velocity=1.0, density_mean=1.0, density=0.01,
                          acceleration=1.0, density_rate=0.02, sound_speed=10.0)
 every_closure = pytest.mark.parametrize("closure", ["poisson", "poisson-stress", "learned-density"])
@@ -58,7 +58,7 @@ def window_of(slab):
 
 def trainer_of(comm, closure="poisson-stress", integrator="verlet", steps=1, noise=0.0):
     slab = SlabDecomposition(comm, LENGTH, PER_SIDE)
-    model = PairModel(SCALES, SUPPORT, 34, (6, 5), closure=closure, seed=2)
+    model = PairModel(SCALES, SUPPORT, 17, (6, 5), closure=closure, seed=2)
     given = None
     if not model.learns_density:
         given = grid_closure(slab, model.resolved_factors if closure == "poisson-stress" else None)
@@ -129,7 +129,7 @@ def test_particles_leave_their_slabs_within_a_window(comm):
     with torch.no_grad():
         *_, (_, particles) = trainer._frames(trainer.windows[0].particles, FRAMES)
     slab = trainer.integrator.dynamics.surroundings.decomposition
-    assert global_max(comm, float(particles.position[:, 2].max()) - slab.upper) > 1.5 * SPACING
+    assert global_max(comm, float(particles.position[:, 2].max()) - slab.upper) > SPACING
 
 
 @pytest.mark.mpi(1, 2, 3)

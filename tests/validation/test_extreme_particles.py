@@ -144,11 +144,13 @@ def nearly_coincident(comm, kind, separation, total=TOTAL):
 
 
 def arrangement(comm, kind, name, total=TOTAL, count=2):
-    """Largest difference of the accelerations from those on one rank, relative; and whether steps stay finite."""
+    """Largest difference of the accelerations from those on one rank, over the largest of them or the typical one; and
+    whether steps stay finite."""
     model, position = network_model(kind, total), ARRANGEMENTS[name](total)
     alone, here = (acceleration(group, model, position) for group in (MPI.COMM_SELF, comm))
     end = advance(*set_up(comm, model, position), "rk2", 0.01, count)
-    return float((here - alone).abs().max() / alone.abs().max().clamp_min(1e-300)), finite(comm, end)
+    largest = alone.abs().max().clamp_min(model.scales.acceleration)
+    return float((here - alone).abs().max() / largest), finite(comm, end)
 
 
 def few_particles(comm, kind, integrator, total):

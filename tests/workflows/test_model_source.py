@@ -14,7 +14,7 @@ from eddies.workflows.model_source import differences, read_source
 
 # Of the scene tiny: filter width two spacings, whatever their number.
 SCALES = {"length": 0.5, "spacing": 0.25}
-FORM = {"hidden": [8, 8], "basis": "corrected", "closure": "poisson", "eddy_viscosity": "none"}
+FORM = {"hidden": [8, 8], "basis": "corrected", "closure": "poisson-stress", "eddy_viscosity": "none"}
 DESCRIPTION = {"scales": SCALES, "neighbors": 56.0, "support": 0.6, **FORM}
 
 
