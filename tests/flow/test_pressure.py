@@ -34,7 +34,7 @@ def test_spreading_is_the_transpose_of_interpolation(comm, kind):
     assert global_sum(comm, found) == pytest.approx(global_sum(comm, expected), rel=1e-11)
 
 
-FACTORS = np.array([0.1, 0.3])
+FACTORS = np.array([0.1, 0.3, -0.2, 0.4])
 
 
 def methods(solver, name):
@@ -83,19 +83,20 @@ def test_derivatives_by_the_factors_of_the_force(comm):
     solver, positions, random = solver_and_points(comm)
     field, weights = random.standard_normal((len(solver.points), 3)), random.standard_normal((len(positions), 4))
     found = global_sum(comm, solver.force_adjoint(field, positions, FACTORS, weights)[2])
-    for number, unit in enumerate(np.eye(2)):
+    for number, unit in enumerate(np.eye(len(FACTORS))):
         ends = [global_sum(comm, np.sum(weights * solver.force_at(field, positions, FACTORS + part)))
                 for part in (unit, -unit)]
         assert found[number] == pytest.approx((ends[0] - ends[1]) / 2, rel=1e-10)  # the force is linear in them
 
 
 @pytest.mark.mpi(1)
-def test_pressure_and_force_of_a_known_flow(comm):
-    """u = (sin y, sin x, 0): lap p = -2 cos x cos y, so p = cos x cos y; lap u = -u."""
+@pytest.mark.parametrize("factors", [[0.0, 0.3, 0.0, 0.0, 0.0], [0.0, 0.6, 0.1]])
+def test_pressure_and_force_of_a_known_flow(comm, factors):
+    """u = (sin y, sin x, 0): lap p = -2 cos x cos y, so p = cos x cos y; wavenumber 1 of 4 is damped at a rate 0.3."""
     solver, positions, _ = solver_and_points(comm)
     x, y, z = solver.points.T
     field = np.stack([np.sin(y), np.sin(x), 0 * z], axis=1)
-    found = solver.force_at(field, positions, np.array([0.0, 0.3]))
+    found = solver.force_at(field, positions, np.array(factors))
     x, y, z = positions.T
     velocity = np.stack([np.sin(y), np.sin(x), 0 * z], axis=1)
     force = np.stack([np.sin(x) * np.cos(y), np.cos(x) * np.sin(y), 0 * z], axis=1) - 0.3 * velocity
@@ -123,7 +124,7 @@ def test_stress_of_the_gradient_model_at_grid_points_by_plain_fourier_transforms
     kept = (np.abs(wave) <= resolved).all(0)  # as the force is represented
     expected = physical(kept * (1j * wave[None] * stress).sum(1)).reshape(3, -1).T
     field = physical(modes).reshape(3, -1).T
-    forces = [solver.force_at(field, solver.points, np.array([factor, 0.0])) for factor in (0.0, 1.0)]
+    forces = [solver.force_at(field, solver.points, np.array([factor, 0.0, 0.0])) for factor in (0.0, 1.0)]
     assert np.allclose((forces[0] - forces[1])[:, 1:], expected, atol=1e-12 * np.abs(expected).max() * 10)
 
 

@@ -32,7 +32,7 @@ def frame_of(comm, model, forced=False):
     particles = ParticleSet.from_numpy({**columns, "velocity": velocity, "density": density})
     force = None
     if forced:
-        terms = [particles.velocity.roll(1, 1), particles.velocity.square(), particles.velocity.cos()]
+        terms = [particles.velocity.roll(1, 1), *((number * particles.velocity).cos() for number in range(7))]
         force = ResolvedForce(0.5 * particles.velocity, torch.stack(terms), model.resolved_factors)
     return TrainingFrame(slab, model, particles, torch.from_numpy(acceleration), torch.from_numpy(0.02 * np.sin(y)),
                          force)
@@ -105,17 +105,18 @@ def test_training_lowers_the_error_of_a_learnable_force(comm):
 def test_the_force_of_a_closure_is_added_to_the_pair_sum_and_its_factors_are_learned(comm):
     model = PairModel(SCALES, SUPPORT, 45, (8, 8), closure="poisson-stress", seed=2)
     pairs_alone, frame = frame_of(comm, model), frame_of(comm, model, forced=True)
-    units, rows = model.resolved_factors().detach(), frame.rows(np.arange(0, frame.total, 3))
+    factors, rows = model.resolved_factors().detach(), frame.rows(np.arange(0, frame.total, 3))
     with torch.no_grad():
-        force = frame.force.constant[rows] + sum(unit * term[rows] for unit, term in zip(units, frame.force.terms))
+        force = frame.force.constant[rows] + sum(factor * term[rows] for factor, term in zip(factors, frame.force.terms))
         expected = pairs_alone.errors(rows)["velocity"] + force
         assert torch.allclose(frame.errors(rows)["velocity"], expected, rtol=1e-13, atol=1e-13)
         error = frame.errors()["velocity"]
     trainer = ForceTrainer(model, [frame], WendlandC2(SUPPORT), LossWeights(), frame.total, seed=5)
+    units = factors / model.force_factors.detach()
     trainer.trajectory_step(Descent(comm, model.parameters(), 1, 1e-2, 1e-2), 0)
     # Of the mean square of the error, which is linear in the factors.
     slopes = units * (2 * error * frame.force.terms).sum((1, 2)) / (3 * frame.total * frame.acceleration_rms**2)
-    assert model.stress_factors.grad.numpy() == pytest.approx(global_sum(comm, slopes.numpy()), rel=1e-11)
+    assert model.force_factors.grad.numpy() == pytest.approx(global_sum(comm, slopes.numpy()), rel=1e-11)
 
 
 @pytest.mark.mpi(1)

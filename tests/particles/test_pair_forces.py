@@ -102,7 +102,7 @@ def test_degenerate_states_have_finite_rates_and_gradients(choices, case):
 def test_gradient_against_finite_differences(choices):
     force, particles = model(**choices), [column.requires_grad_() for column in state(12)]
     # The factors of the resolved stress are the closure's, and no part of the sum over pairs.
-    parameters = [parameter for name, parameter in force.named_parameters() if name != "stress_factors"]
+    parameters = [parameter for name, parameter in force.named_parameters() if name != "force_factors"]
 
     def along(direction, step):
         with torch.no_grad():

@@ -91,7 +91,7 @@ def test_gradient_of_density_and_force_against_central_differences(comm):
     """Through averages, ghosts, transforms and splines, in positions and velocities."""
     slab = SlabDecomposition(comm, LENGTH, PER_SIDE)
     particles = ParticleSet.from_numpy(migrate(slab, particles_in_turbulence(comm)[0].to_numpy()))
-    factors = torch.tensor([0.02, 0.03, 0.7], dtype=torch.float64, requires_grad=True)
+    factors = torch.tensor([0.02, 0.2, 0.5, 0.7], dtype=torch.float64, requires_grad=True)
     dynamics = ParticleDynamics(slab, LENGTH, [], 0.0, closure_on(comm, 3, lambda: factors), fixed_ranks=True)
     random = np.random.default_rng(comm.rank)
     weights = [torch.from_numpy(random.standard_normal(shape)) for shape in ((len(particles),), (len(particles), 3))]
@@ -114,7 +114,7 @@ def test_gradient_of_density_and_force_against_central_differences(comm):
         expected = global_sum(comm, float((columns[number].grad * change).sum()))
         # Particles that enter or leave a support add kinks of second order in the step.
         assert found == pytest.approx(expected, rel=1e-5)
-    for number in range(3):
+    for number in range(len(factors)):
         with torch.no_grad():
             values = []
             for sign in (1, -2, 1):
@@ -140,7 +140,7 @@ def particles_around_a_void(comm):
 def test_a_void_looks_the_same_from_every_frame_of_reference(comm):
     """Density and force, and so their derivatives by a uniform velocity are zero."""
     slab, particles = particles_around_a_void(comm)
-    factors = torch.tensor([0.02, 0.03, 0.7], dtype=torch.float64)
+    factors = torch.tensor([0.02, 0.2, 0.5, 0.7], dtype=torch.float64)
     dynamics = ParticleDynamics(slab, LENGTH, [], 0.0, closure_on(comm, 2, lambda: factors), fixed_ranks=True)
     velocity = particles.velocity.requires_grad_()
     still = dynamics.rates(replace(particles, velocity=velocity))
@@ -156,7 +156,7 @@ def test_a_void_looks_the_same_from_every_frame_of_reference(comm):
 
 
 @pytest.mark.mpi(1, 2, 3)
-@pytest.mark.parametrize("factors", [(0.0, 0.0, 0.0), (0.02, 0.03, 0.7)])
+@pytest.mark.parametrize("factors", [(0.0, 0.0, 0.0, 0.0), (0.02, 0.2, 0.5, 0.7)])
 def test_the_force_keeps_the_momentum_of_the_particles(comm, factors):
     """The grid's own has a mean, as the particles do not sample it evenly."""
     slab, particles = particles_around_a_void(comm)
@@ -170,7 +170,7 @@ def test_the_force_keeps_the_momentum_of_the_particles(comm, factors):
 def test_force_at_fixed_particles_is_that_of_the_dynamics(comm):
     slab = SlabDecomposition(comm, LENGTH, PER_SIDE)
     particles = ParticleSet.from_numpy(migrate(slab, particles_in_turbulence(comm)[0].to_numpy()))
-    closure = closure_on(comm, 2, lambda: torch.tensor([0.02, 0.03, 0.7], dtype=torch.float64))
+    closure = closure_on(comm, 2, lambda: torch.tensor([0.02, 0.2, 0.5, 0.7], dtype=torch.float64))
     rates = ParticleDynamics(slab, LENGTH, [], 0.0, closure, fixed_ranks=True).rates(particles)
     closed, force = closure.apply(particles)
     assert torch.allclose(force.at(slice(None)), rates["velocity"], rtol=0, atol=1e-12)

@@ -48,11 +48,11 @@ def test_a_stopped_training_is_the_one_never_stopped(comm, tmp_path):
     scene = prepared(comm, tmp_path)
     train.run(scene, comm, tmp_path)
     whole = trained(comm, tmp_path)
-    assert np.array_equal(whole["history/phase"], [0] * 6 + [1] * 4)
+    assert np.array_equal(whole["history/phase"], [0] * 4 + [1] * 2 + [2] * 4)
     comm.Barrier()
     if comm.rank == 0:
         (tmp_path / "learning.png").unlink()
-    # Before the first step, within the first phase, between the phases, and between two horizons.
+    # Before the first step, within the first phase, between two phases, and between two horizons.
     for before, step in pairwise((0, 0, 3, 6, 8)):
         with pytest.raises(Stopped, match=f"--resume goes on from step {step} of the training"):
             train.run(scene, comm, tmp_path, StopAtStep(comm, step - before))

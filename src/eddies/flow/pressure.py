@@ -35,7 +35,7 @@ class PressureSolver:
     def __init__(self, decomposition: SlabDecomposition, resolved: int, margin: int = 1) -> None:
         self.decomposition = decomposition
         self.grid = SpectralGrid(decomposition, cutoff=resolved)
-        self._kept = self.grid.index_squared <= resolved**2
+        self._resolved, self._kept = resolved, self.grid.index_squared <= resolved**2
         shell = np.rint(np.sqrt(self.grid.index_squared)).astype(int)
         self._band, self._bands = np.where(shell > 0, (shell - 1) // BAND, -1), (resolved - 1) // BAND + 1
         self._band[shell > resolved] = -1
@@ -70,10 +70,12 @@ class PressureSolver:
         return by_field, self._spline.slope_along(coefficients, positions, weights)
 
     def force_at(self, field: np.ndarray, positions: np.ndarray, factors: np.ndarray) -> np.ndarray:
-        """Pressure and force at positions, (n, 4): p, then -grad p - A div(grad u grad u^T) + B laplacian u.
+        """Pressure and force at positions, (n, 4): p, then -grad p - A div(grad u grad u^T) - D(k) u.
 
-        `factors` (2,): A, of the gradient model's stress, in length^2; and B, a viscosity. A term whose factor is zero
-        costs nothing here. In `force_adjoint` it costs as much as any, since the derivative by its factor is not zero.
+        `factors` (1 + m,): A, of the gradient model's stress, in length^2; and D, the rate at which modes are damped,
+        at m wavenumbers equally spaced up to the highest that is resolved, linear between them and from D(0) = 0. A
+        term whose factors are zero costs nothing here. In `force_adjoint` it costs as much as any, since the
+        derivatives by its factors are not zero.
         """
         forces = self._pressure_and_force(self._modes(field), factors)
         return self._spline.at(self._spline.coefficients(forces), positions)
@@ -87,10 +89,14 @@ class PressureSolver:
         # A derivative is antisymmetric: its transpose is itself with the other sign.
         by_modes = pressure_adjoint(grid, modes, spread[0] + divergence(grid, spread[1:]))
         by_modes -= factors[0] * gradient_stress_divergence_adjoint(grid, modes, spread[1:])
-        by_modes -= factors[1] * grid.wavenumber_squared * spread[1:]
-        terms = -gradient_stress_divergence(grid, modes), -grid.wavenumber_squared * modes
-        by_factors = np.array([grid.cells**3 * np.sum(grid.multiplicity * (spread[1:].conj() * term).real)
-                               for term in terms])
+        by_modes -= self._damping(factors[1:]) * spread[1:]
+
+        def along(term: np.ndarray) -> np.ndarray:
+            """What each mode of a term of the force contributes to the derivative by its factor."""
+            return grid.cells**3 * grid.multiplicity * np.sum((spread[1:].conj() * term).real, axis=0)
+
+        by_factors = -np.append(np.sum(along(gradient_stress_divergence(grid, modes))),
+                                self._damping_adjoint(along(modes), len(factors) - 1))
         return self._on_points(by_modes), self._spline.slope_along(coefficients, positions, weights), by_factors
 
     def band_energies(self, field: np.ndarray) -> np.ndarray:
@@ -119,6 +125,25 @@ class PressureSolver:
         force = -gradient(grid, found)
         if factors[0] != 0:
             force -= factors[0] * gradient_stress_divergence(grid, modes)
-        if factors[1] != 0:
-            force -= factors[1] * grid.wavenumber_squared * modes
+        if np.any(factors[1:]):
+            force -= self._damping(factors[1:]) * modes
         return np.concatenate([found[None], force])
+
+    def _damping(self, rates: np.ndarray) -> np.ndarray:
+        """D of each mode."""
+        below, fraction = self._places(len(rates))
+        rates = np.append(0.0, rates)
+        return (1 - fraction) * rates[below] + fraction * rates[below + 1]
+
+    def _damping_adjoint(self, weights: np.ndarray, count: int) -> np.ndarray:
+        """Adjoint of `_damping`: weights of each mode to those of the `count` rates."""
+        below, fraction = self._places(count)
+        spread = [np.bincount((below + above).ravel(), (share * weights).ravel(), count + 1)
+                  for above, share in ((0, 1 - fraction), (1, fraction))]
+        return sum(spread)[1:]
+
+    def _places(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Of each mode the interval of `count` between 0 and the highest resolved wavenumber, and the place in it."""
+        places = np.sqrt(self.grid.index_squared) * (count / self._resolved)
+        below = np.minimum(places.astype(int), count - 1)
+        return below, np.minimum(places - below, 1.0)

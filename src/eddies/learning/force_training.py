@@ -58,6 +58,7 @@ class TrainingFrame:
         self.total = int(count)
         self.acceleration_rms, self.density_rate_rms = np.sqrt(squares[0] / (3 * count)), np.sqrt(squares[1] / count)
         self._sorted_ids, self._row_of_sorted = torch.sort(particles.id)
+        self._volumes: Tensor | None = None
 
     def rows(self, ids: np.ndarray) -> Tensor:
         """Rows of those of the given particles that this rank owns."""
@@ -74,10 +75,12 @@ class TrainingFrame:
 
     @torch.no_grad()
     def volumes(self, kernel: SmoothingKernel) -> Tensor:
-        """Volumes (s,) of the particles, ghosts included; collective."""
-        own = self.position[: len(self.particles)]
-        pairs = self.surroundings.neighbors.pairs(own, self.position, dtype=self.dtype)
-        return self.surroundings.column(volumes(kernel, pairs))
+        """Volumes (s,) of the particles, ghosts included; collective, and kept for this kernel."""
+        if self._volumes is None:
+            own = self.position[: len(self.particles)]
+            pairs = self.surroundings.neighbors.pairs(own, self.position, dtype=self.dtype)
+            self._volumes = self.surroundings.column(volumes(kernel, pairs))
+        return self._volumes
 
     def errors(self, rows: Tensor | None = None) -> dict[str, Tensor]:
         """Predicted minus true rates at all owned particles or some of their rows; collective."""
@@ -111,22 +114,32 @@ class ForceTrainer:
         self.model, self.frames = model, frames
         self.kernel, self.weights, self.batch, self.seed = kernel, weights, min(batch, self.total), seed
         self._points = grid_points(self.decomposition).to(frames[0].particles.position.device)
-        self._volumes: dict[int, Tensor] = {}
 
     def trajectory_step(self, descent: Descent, step: int) -> dict[str, float]:
         """One step on the trajectory loss of a random batch of particles (Eq. 12); returns the losses."""
-        random = np.random.default_rng([self.seed, step])
-        frame = self.frames[random.integers(len(self.frames))]
+        frame, random = self._drawn(step)
         rows = frame.rows(random.choice(self.total, self.batch, replace=False))
-        errors = frame.errors(rows)
-        return self._descend(descent, {"trajectory": self._trajectory_share(frame, errors, self.batch)})
+        return self._descend(descent, {"trajectory": self._trajectory_share(frame, frame.errors(rows), self.batch)})
 
     def combined_step(self, descent: Descent, step: int) -> dict[str, float]:
         """One step on all losses: of the particles in and around a random cube where the field loss is among them, of
         a random batch otherwise; returns the losses."""
+        return self._descend(descent, self._combined_shares(*self._drawn(step)))
+
+    @torch.no_grad()
+    def combined_error(self, frame: TrainingFrame, draws: int) -> float:
+        """Root of the weighted sum of all losses on one frame, in the mean of always the same draws; collective."""
+        shares = [self._weighted(self._combined_shares(frame, np.random.default_rng([self.seed, draw])))
+                  for draw in range(draws)]
+        return float(shared_values(self.comm, {"loss": sum(shares)})["loss"] / draws) ** 0.5
+
+    def _drawn(self, step: int) -> tuple[TrainingFrame, np.random.Generator]:
+        """The frame of a step, and what draws its particles."""
         random = np.random.default_rng([self.seed, step])
-        number = random.integers(len(self.frames))
-        frame = self.frames[number]
+        return self.frames[random.integers(len(self.frames))], random
+
+    def _combined_shares(self, frame: TrainingFrame, random: np.random.Generator) -> dict[str, Tensor]:
+        """This rank's shares of all losses, unweighted."""
         if self.weights.field > 0:
             corner, side, reach = random.uniform(0, self.length, 3), self.length / 4, self.kernel.support
             rows = self._within(frame.particles.position, corner - reach, side + 2 * reach)
@@ -137,13 +150,15 @@ class ForceTrainer:
         shares = {"trajectory": self._trajectory_share(frame, errors, count)}
         if self.weights.field > 0:
             points = self._points[self._within(self._points, corner, side)]
-            shares["field"] = self._field_share(number, rows, errors["velocity"], points)
-        shares |= self._divergence_shares(frame, rows, errors["velocity"])
-        return self._descend(descent, shares)
+            shares["field"] = self._field_share(frame, rows, errors["velocity"], points)
+        return shares | self._divergence_shares(frame, rows, errors["velocity"])
+
+    def _weighted(self, shares: dict[str, Tensor]) -> Tensor:
+        return sum(getattr(self.weights, name) * share for name, share in shares.items())
 
     def _descend(self, descent: Descent, shares: dict[str, Tensor]) -> dict[str, float]:
         """A step down the weighted sum of the losses; returns them."""
-        total = sum(getattr(self.weights, name) * share for name, share in shares.items())
+        total = self._weighted(shares)
         norm = descent.step(total)
         named = {f"{name}_loss": share for name, share in shares.items()}
         return {**shared_values(self.comm, {"loss": total, **named}), "gradient_norm": norm}
@@ -156,21 +171,18 @@ class ForceTrainer:
             share = share + mean_square_share(errors["density"], frame.density_rate_rms, count)
         return share
 
-    def _field_share(self, number: int, rows: Tensor, error: Tensor, points: Tensor) -> Tensor:
+    def _field_share(self, frame: TrainingFrame, rows: Tensor, error: Tensor, points: Tensor) -> Tensor:
         """Eq. 13 per time step: the kernel average of the acceleration error at grid points (m, 3) of all ranks.
 
         The velocity predicted one step ahead is compared with that of the true particles, both through the kernel:
         its own error is many times what a step changes, and the force could not make up for it.
         """
-        frame = self.frames[number]
-        if number not in self._volumes:
-            self._volumes[number] = frame.volumes(self.kernel)
         spread = torch.zeros_like(frame.acceleration).index_add(0, rows, error)
         local = frame.surroundings.column(spread)
         around = NeighborList(frame.surroundings.box, self.kernel.support, 0.0)
         around.build(points, frame.position, exclude_self=False)
         pairs = around.pairs(points, frame.position, dtype=error.dtype)
-        field = reconstruct(self.kernel, pairs, self._volumes[number], local)
+        field = reconstruct(self.kernel, pairs, frame.volumes(self.kernel), local)
         count = int(global_sum(self.comm, len(points)))
         return mean_square_share(field, frame.acceleration_rms, max(count, 1))
 

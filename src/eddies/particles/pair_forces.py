@@ -24,6 +24,8 @@ ODD = ("push", "drag", "contrast")
 # Added to moment matrices and sums of weights, as a fraction of their values for evenly spread neighbours:
 # they stay invertible without neighbours or with coplanar ones, at a bias of a tenth of a percent elsewhere.
 REGULARISATION = 1e-3
+# The rates at which the closure damps the resolved velocity, to begin with: as a viscosity does, growing as k^2.
+DAMPING = (torch.arange(1, 7) / 6) ** 2
 
 
 class PairModel(nn.Module):
@@ -88,22 +90,22 @@ class PairModel(nn.Module):
         if eddy_viscosity != "none":
             self.viscosity = EddyViscosity(eddy_viscosity)
         if closure == "poisson-stress":
-            self.stress_factors = nn.Parameter(torch.ones(3, dtype=torch.float64))
+            self.force_factors = nn.Parameter(torch.cat([torch.ones(1), DAMPING, torch.ones(1)]).double())
         if closure == "learned-density":
             # The factors a and b of the divergence and of the density's relaxation.
             self.density_factors = nn.Parameter(torch.tensor([1.0, 0.4], dtype=torch.float64))
 
     def resolved_factors(self) -> Tensor:
-        """What the closure's force is made with, beside -grad p: A, B and C of `PoissonClosure`, (3,).
+        """What the closure's force is made with, beside -grad p: A, D_1 ... D_6 and C of `PoissonClosure`, (8,).
 
-        With "poisson-stress" each is learned, in units of the value that it has in filtered turbulence, more or less:
-        A = d^2/12 of the gradient model, B = 0.04 v_rms d, C = 2 v_rms/d. Otherwise they are zero.
+        With "poisson-stress" they are learned, in units of values that they have in filtered turbulence, more or less:
+        A = d^2/12 of the gradient model, v_rms/d for the rate D of damping, 2 v_rms/d for C. Otherwise they are zero.
         """
-        scales = self.scales
         if self.closure != "poisson-stress":
-            return torch.zeros(3, dtype=torch.float64)
-        units = (scales.length**2 / 12, 0.04 * scales.velocity * scales.length, 2 * scales.velocity / scales.length)
-        return self.stress_factors * self.stress_factors.new_tensor(units)
+            return torch.zeros(len(DAMPING) + 2, dtype=torch.float64)
+        length, rate = self.scales.length, self.scales.velocity / self.scales.length
+        units = length**2 / 12, *len(DAMPING) * (rate,), 2 * rate
+        return self.force_factors * self.force_factors.new_tensor(units)
 
     @property
     def learns_density(self) -> bool:

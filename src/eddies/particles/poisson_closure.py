@@ -50,7 +50,7 @@ class GridSolver(Protocol):
 
 @dataclass(frozen=True)
 class ResolvedForce:
-    """The force of a closure at fixed particles, as a function of its factors: constant (n, 3), terms (3, n, 3)."""
+    """The force of a closure at fixed particles, as a function of its factors: constant (n, 3), terms (k, n, 3)."""
 
     constant: Tensor
     terms: Tensor
@@ -77,10 +77,11 @@ class PoissonClosure:
     sound_speed : c. `density_mean` : rho_0.
     skin : extra radius of the list of particles around grid points.
     dtype : of the pair sums.
-    factors : if given, the closure also gives a force, and this its factors (A, B, C) in the units of the flow:
-        -grad p - A div(grad u grad u^T) + B laplacian u  of the resolved velocity u,  - C (v - u)  of what it misses,
-        less the mean of all this over the particles, so that it keeps their momentum. It would be zero in continuous
-        space, and is not where particles sample the grid unevenly.
+    factors : if given, the closure also gives a force, and this its factors (A, D_1, ..., D_m, C) in the units of the
+        flow:  -grad p - A div(grad u grad u^T) - D(k) u  of the resolved velocity u, where D(k) is linear between D_1
+        ... D_m (see `GridSolver.force_at`),  - C (v - u)  of what it misses, less the mean of all this over the
+        particles, so that it keeps their momentum. It would be zero in continuous space, and is not where particles
+        sample the grid unevenly.
 
     Differentiable in the particles' positions and velocities and in the factors. All ranks call it together. Raises
     HaloError, on all ranks, where a particle lies farther outside its slab than the grid reaches.
@@ -105,7 +106,8 @@ class PoissonClosure:
         if self.factors is None:
             pressure = _PressureAt.apply(field, particles.position, self.solver)[:, 0]
             return replace(particles, density=self._density(pressure, particles)), None
-        none, units = torch.zeros(3, dtype=torch.float64), torch.eye(3, dtype=torch.float64)
+        units = torch.eye(len(self.factors()), dtype=torch.float64)
+        none = torch.zeros_like(units[0])
         pressure, constant = self._pressure_and_force(moving, field, none)
         terms = [self._pressure_and_force(moving, field, unit)[1] - constant for unit in units]
         force = ResolvedForce(constant, torch.stack(terms), self.factors)
@@ -129,11 +131,11 @@ class PoissonClosure:
         return (self.density_mean * (1 + pressure / self.sound_speed**2)).to(particles.density)
 
     def _pressure_and_force(self, particles: ParticleSet, field: Tensor, factors: Tensor) -> tuple[Tensor, Tensor]:
-        found = _ForceAt.apply(field, particles.position, factors[:2], self.solver)
+        found = _ForceAt.apply(field, particles.position, factors[:-1], self.solver)
         force = found[:, 1:].to(particles.velocity)
-        if factors[2] != 0:
+        if factors[-1] != 0:
             resolved = _VelocityAt.apply(field, particles.position, self.solver).to(particles.velocity)
-            force = force - factors[2] * (particles.velocity - resolved)
+            force = force - factors[-1] * (particles.velocity - resolved)
         return found[:, 0], force - mean_over_ranks(self.solver.decomposition.comm, force)
 
     def _local(self, particles: ParticleSet) -> LocalParticles:
@@ -210,7 +212,7 @@ class _PressureAt(torch.autograd.Function):
 
 
 class _ForceAt(torch.autograd.Function):
-    """`GridSolver.force_at` of a field (m, 3) at positions (n, 3), with factors (2,)."""
+    """`GridSolver.force_at` of a field (m, 3) at positions (n, 3), with factors (1 + m,)."""
 
     @staticmethod
     def forward(ctx, field: Tensor, position: Tensor, factors: Tensor, solver: GridSolver) -> Tensor:

@@ -26,6 +26,8 @@ from eddies.workflows.truth import GroundTruth, load_frame
 
 # How many validations a phase has, and on how many particles the error of the acceleration is measured.
 VALIDATIONS, HORIZON_VALIDATIONS, VALIDATION_PARTICLES = 25, 8, 8192
+# How many cubes or batches the error of all losses together is measured on.
+COMBINED_DRAWS = 8
 # The share of the training window, at its end, that is held out for validation; no less than the longest horizon.
 HELD_OUT = 0.1
 
@@ -52,8 +54,8 @@ class TrainingData:
                 "turnovers, or lower [tracers] frame_interval or horizons")
         self.closure = density_closure(self.model, truth.decomposition, self.dtype)
 
-    def one_step_phase(self) -> Phase:
-        """Steps on the rates of single frames: on trajectories first, at the end on all losses."""
+    def one_step_phases(self) -> list[Phase]:
+        """Steps on the rates of single frames: on trajectories, then on all losses, as far as the scene has them."""
         settings = self.settings
         seen = np.unique(np.linspace(1, self.learned, settings.frames).astype(int))
         frames = [self._frame(index) for index in seen]
@@ -61,15 +63,20 @@ class TrainingData:
         weights = LossWeights(settings.trajectory_weight, settings.field_weight, settings.velocity_kl_weight,
                               settings.acceleration_kl_weight)
         trainer = ForceTrainer(self.model, frames, self.kernel, weights, settings.batch, self.scene.seed)
+        alone = settings.steps - settings.combined_steps
+        fall = settings.final_learning_rate / settings.learning_rate
+        between = settings.learning_rate * fall ** (alone / settings.steps)
 
-        def take(descent: Descent, step: int) -> dict[str, float]:
-            combined = step >= settings.steps - settings.combined_steps
-            return (trainer.combined_step if combined else trainer.trajectory_step)(descent, step)
+        def phase(name: str, steps: int, rates: tuple[float, float], take, validate) -> Phase:
+            # Work in evaluations of the force of a particle.
+            work = np.full(steps, float(trainer.batch))
+            return Phase(name, work, rates, take, validate, max(steps // VALIDATIONS, 1))
 
-        # Work in evaluations of the force of a particle.
-        work = np.full(settings.steps, float(trainer.batch))
-        return Phase("one step", work, (settings.learning_rate, settings.final_learning_rate), take,
-                     lambda: acceleration_error(trainer, validation), max(settings.steps // VALIDATIONS, 1))
+        phases = [phase("one step", alone, (settings.learning_rate, between), trainer.trajectory_step,
+                        lambda: acceleration_error(trainer, validation)),
+                  phase("all losses", settings.combined_steps, (between, settings.final_learning_rate),
+                        trainer.combined_step, lambda: trainer.combined_error(validation, COMBINED_DRAWS))]
+        return [phase for phase in phases if phase.steps]
 
     def horizon_phase(self) -> Phase:
         """Steps through windows of frames, of one horizon after the other."""
