@@ -107,8 +107,8 @@ def test_the_force_of_a_closure_is_added_to_the_pair_sum_and_its_factors_are_lea
     pairs_alone, frame = frame_of(comm, model), frame_of(comm, model, forced=True)
     factors, rows = model.resolved_factors().detach(), frame.rows(np.arange(0, frame.total, 3))
     with torch.no_grad():
-        force = frame.force.constant[rows] + sum(factor * term[rows] for factor, term in zip(factors, frame.force.terms))
-        expected = pairs_alone.errors(rows)["velocity"] + force
+        terms = sum(factor * term[rows] for factor, term in zip(factors, frame.force.terms))
+        expected = pairs_alone.errors(rows)["velocity"] + frame.force.constant[rows] + terms
         assert torch.allclose(frame.errors(rows)["velocity"], expected, rtol=1e-13, atol=1e-13)
         error = frame.errors()["velocity"]
     trainer = ForceTrainer(model, [frame], WendlandC2(SUPPORT), LossWeights(), frame.total, seed=5)
