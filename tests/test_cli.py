@@ -166,7 +166,7 @@ def test_limit_of_ranks_is_that_of_the_stages(comm):
     from eddies.scene import SceneError, load_scene
     from eddies.stages import check_ranks
     check_ranks(["dns"], load_scene("tiny"), SimpleNamespace(size=8))
-    check_ranks(load_scene("hit-small").stages, load_scene("hit-small"), SimpleNamespace(size=5))
+    check_ranks(load_scene("hit-small").stages, load_scene("hit-small"), SimpleNamespace(size=8))
     with pytest.raises(SceneError, match="start at most 4"):
         check_ranks(load_scene("tiny").stages, load_scene("tiny"), SimpleNamespace(size=5))
 

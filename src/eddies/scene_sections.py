@@ -149,7 +149,7 @@ class Model:
 
 @dataclass(frozen=True, kw_only=True)
 class Training:
-    """How the pair force is fitted to the tracers: first to trajectories, then to all losses together."""
+    """How the force is fitted to the tracers: to trajectories, to all losses together, to what the simulation does."""
 
     window: float = number("fraction of the ground truth that is used, the rest stays unseen",
                            default=DEFAULT_WINDOW, above=0, at_most=1)
@@ -170,11 +170,11 @@ class Training:
     horizon_step: float | None = number("time step of the horizons; absent: the interval of frames", default=None,
                                         above=0)
     horizon_integrator: str = choice("time stepping of the horizons", "verlet", "rk2", "rk4", default="verlet")
-    horizon_learning_rate: float = number("of the optimiser, at the start of the horizons", default=1e-2, above=0)
+    horizon_learning_rate: float = number("of the optimiser, at the start of each horizon", default=1e-3, above=0)
     energy_weight: float = number("weight of the energies by bands of wavenumbers in the loss of the horizons",
                                   default=0.1, at_least=0)
     noise: float = number("added to initial velocities of the horizons, in units of their rms", default=0.0, at_least=0)
-    patience: int | None = integer("validations without a new best that end steps or horizons early; absent: none",
+    patience: int | None = integer("validations without a new best that end a phase early; absent: none",
                                    default=None, at_least=1)
 
 

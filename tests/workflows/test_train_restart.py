@@ -48,7 +48,7 @@ def test_a_stopped_training_is_the_one_never_stopped(comm, tmp_path):
     scene = prepared(comm, tmp_path)
     train.run(scene, comm, tmp_path)
     whole = trained(comm, tmp_path)
-    assert np.array_equal(whole["history/phase"], [0] * 4 + [1] * 2 + [2] * 4)
+    assert np.array_equal(whole["history/phase"], [0] * 4 + [1] * 2 + [2] * 2 + [3] * 2)
     comm.Barrier()
     if comm.rank == 0:
         (tmp_path / "learning.png").unlink()

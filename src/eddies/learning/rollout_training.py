@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -149,7 +150,7 @@ class RolloutTrainer:
     def _scale(self, true: Tensor, start: Tensor) -> float:
         """Root mean square of the change of one component."""
         squares = global_sum(self.comm, float((true - start).double().square().sum()))
-        return float(np.sqrt(squares / (self.total * (true.numel() // max(len(true), 1) or 1))))
+        return float(np.sqrt(squares / (self.total * math.prod(true.shape[1:]))))
 
     def _disturbed(self, particles: ParticleSet, random: np.random.Generator) -> ParticleSet:
         """The particles with noise on their velocities, which depends on their ids alone."""

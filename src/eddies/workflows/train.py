@@ -43,7 +43,7 @@ def run(scene: Scene, comm, directory: str | Path, stop: StopRequest | None = No
         model, last, tests = data.model, data.last, evaluation_frames(truth)
         log.info("train: frames up to %d of the times up to %.3g of %.3g, %d held out; %d weights", data.learned,
                  truth.times[last], truth.times[-1], last - data.learned, sum(p.numel() for p in model.parameters()))
-        phases = [*data.one_step_phases(), *([data.horizon_phase()] if data.longest else [])]
+        phases = [*data.one_step_phases(), *data.horizon_phases()]
         training = Training(comm, model, phases, scene.training.patience)
         checkpoints = CheckpointDirectory(comm, directory / "checkpoints-train", scene.fingerprint("train"))
         take_all_steps(training, checkpoints, stop, LearningCurves(comm, directory / "learning.png"))

@@ -25,7 +25,7 @@ from eddies.workflows.particle_run import PEAK_SPEED
 from eddies.workflows.truth import GroundTruth, load_frame
 
 # How many validations a phase has, and on how many particles the error of the acceleration is measured.
-VALIDATIONS, HORIZON_VALIDATIONS, VALIDATION_PARTICLES = 25, 8, 8192
+VALIDATIONS, HORIZON_VALIDATIONS, VALIDATION_PARTICLES = 25, 4, 8192
 # How many cubes or batches the error of all losses together is measured on.
 COMBINED_DRAWS = 8
 # The share of the training window, at its end, that is held out for validation; no less than the longest horizon.
@@ -78,13 +78,12 @@ class TrainingData:
                         trainer.combined_step, lambda: trainer.combined_error(validation, COMBINED_DRAWS))]
         return [phase for phase in phases if phase.steps]
 
-    def horizon_phase(self) -> Phase:
-        """Steps through windows of frames, of one horizon after the other."""
+    def horizon_phases(self) -> list[Phase]:
+        """Steps through windows of frames, one phase for each horizon of the scene."""
         settings, scene = self.settings, self.scene
-        steps = settings.horizon_steps * len(settings.horizons)
-        rates = settings.horizon_learning_rate, settings.final_learning_rate
-        interval = scene.tracers.frame_interval
-        slab = self.truth.decomposition
+        if not settings.horizon_steps:
+            return []
+        interval, slab = scene.tracers.frame_interval, self.truth.decomposition
         closure, resolution = self._wide_closures(interval)
         dynamics = ParticleDynamics(slab, BOX_LENGTH, [self.model], 0.0, closure, self.dtype, fixed_ranks=True)
         starts = np.unique(np.linspace(0, self.learned - self.longest, settings.frames).astype(int))
@@ -94,14 +93,20 @@ class TrainingData:
         trainer = RolloutTrainer(slab.comm, INTEGRATORS[settings.horizon_integrator](dynamics), windows, interval,
                                  substeps, settings.energy_weight, resolution.band_energies,
                                  settings.noise * self.truth.scales.velocity, scene.seed)
+        rates = settings.horizon_learning_rate, settings.final_learning_rate
+        every = max(settings.horizon_steps // HORIZON_VALIDATIONS, 1)
 
-        def take(descent: Descent, step: int) -> dict[str, float]:
-            return trainer.step(descent, step, settings.horizons[step // settings.horizon_steps])
+        def phase(number: int, horizon: int) -> Phase:
+            def take(descent: Descent, step: int) -> dict[str, float]:
+                return trainer.step(descent, number * settings.horizon_steps + step, horizon)
 
-        # Each step through a window is evaluated, evaluated again on the way back, and differentiated.
-        evaluations = 3 * substeps * np.repeat(settings.horizons, settings.horizon_steps)
-        return Phase("horizons", evaluations * float(trainer.total), rates, take,
-                     lambda: trainer.validation_error(validation, self.longest), max(steps // HORIZON_VALIDATIONS, 1))
+            # Each step through a window is evaluated, evaluated again on the way back, and differentiated.
+            work = np.full(settings.horizon_steps, 3.0 * substeps * horizon * trainer.total)
+            # All horizons are measured by the longest: a shorter one is a way to it.
+            return Phase(f"horizon {horizon}", work, rates, take,
+                         lambda: trainer.validation_error(validation, self.longest), every)
+
+        return [phase(number, horizon) for number, horizon in enumerate(settings.horizons)]
 
     def _wide_closures(self, interval: float) -> tuple[PoissonClosure | None, PoissonClosure]:
         """The closure for particles that stray from their slab during the longest horizon, and one that resolves their
