@@ -165,9 +165,14 @@ class ForceTrainer:
 
     def _trajectory_share(self, frame: TrainingFrame, errors: dict[str, Tensor], count: int) -> Tensor:
         """Eq. 12 with centred differences, each rate in units of its rms at that moment, so that all moments of a
-        decaying flow count alike."""
+        decaying flow count alike.
+
+        The rates of "learned-density" do not count. Between scattered particles the divergence is mostly scatter, and a
+        regression on it makes both factors of the density vanish, without which it does not last: they show through
+        several steps alone.
+        """
         share = mean_square_share(errors["velocity"], frame.acceleration_rms, count)
-        if "density" in errors:
+        if self.model.closure == "paper-density":
             share = share + mean_square_share(errors["density"], frame.density_rate_rms, count)
         return share
 
