@@ -58,8 +58,8 @@ class ParticleCloud:
         return _joined(self.on_grid(kernel, volume, block) for block in self._around.blocks(PAIRS_TOGETHER))
 
     def velocity_on_whole_grid(self, kernel: SmoothingKernel) -> Tensor:
-        """Velocity (m, 3) at all of this rank's grid points, as of `on_whole_grid` at a fourth of its cost; collective,
-        not differentiable."""
+        """Velocity (m, 3) at all of this rank's grid points, cheaper than with its gradient; collective, not
+        differentiable."""
         return reconstruct_on_grid(kernel, self.decomposition, self._position, self.volumes(kernel), self._velocity)
 
     @torch.no_grad()

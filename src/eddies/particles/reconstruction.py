@@ -62,9 +62,9 @@ def reconstruct_on_grid(
     sums = columns.new_zeros(len(columns), slab.count * cells**2)
     for some in torch.arange(len(position), device=position.device).split(max(POINTS_TOGETHER // side**3, 1)):
         square_x, square_y, square_z = square[some].unbind(1)
-        distance = _outer_sum(square_z, square_y, square_x)
-        near = torch.nonzero(distance < kernel.support**2).squeeze(1)
-        weight = kernel.value(distance.index_select(0, near).sqrt())
+        square_distance = _outer_sum(square_z, square_y, square_x)
+        near = torch.nonzero(square_distance < kernel.support**2).squeeze(1)
+        weight = kernel.value(square_distance.index_select(0, near).sqrt())
         point = _outer_sum(z[some] * cells**2, index[some, 1] % cells * cells, index[some, 0] % cells)
         point, particle = point.index_select(0, near), some.index_select(0, near // side**3)
         for column, total in zip(columns, sums):
