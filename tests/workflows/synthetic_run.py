@@ -179,6 +179,7 @@ def write_rollout(comm, directory, status="complete", total=600, cells=16, frame
                   "seconds_per_step": 0.031, "particles": total, "ranks": 1, "eddy_turnover_time": TURNOVER}
     with create_product(comm, directory / "rollout.h5", "rollout", provenance()) as file:
         write_attributes(file.create_group("rollout"), attributes)
+        write_table(file, "outside_training", {"time": times, "share": 1e-3 * times * (0.9 - times)})
         runs = (("truth", times[:-3], PerturbedFlow(0.0)), ("model", times, PerturbedFlow(0.4)))
         for name, own, flow in runs:
             writer = TrajectoryWriter(file, name, total, LENGTH, shapes, np.float64)

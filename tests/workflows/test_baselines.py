@@ -70,6 +70,7 @@ def read(folder):
                           for column in ("position", "velocity", "density", "acceleration", "velocity_gradient")}
                    for name, run in runs.items()}
         assert len(FieldSeries(file, "model").times) == len(runs["model"].times)
+        assert "outside_training" not in file  # a matter of networks
         return read_attributes(file, "rollout"), runs["model"].times, columns
 
 

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -64,6 +65,38 @@ def test_every_product_and_the_page_are_there(run_directory):
     assert not list(run_directory.glob("*.partial"))
 
 
+def test_pairs_outside_the_training_data_are_counted(run_directory):
+    with h5py.File(run_directory / "model.h5") as file:
+        low, high = (file[f"feature_range/{bound}"][()] for bound in ("low", "high"))
+        description = json.loads(file.attrs["description"])
+    support = description["support"] / description["scales"]["length"]
+    # rho'_i, rho'_j, |x|, |v|, x.v
+    assert low.shape == high.shape == (5,) and np.all(low < high)
+    assert low[0] == low[1] and high[0] == high[1] and 0 < low[2] < 0.1 * support < 0.99 * support < high[2] <= support
+    with h5py.File(run_directory / "rollout.h5") as file:
+        share = file["outside_training/share"][()]
+        assert np.array_equal(file["outside_training/time"], file["particles/model/position/time"])
+    # The particles start from the flow that the network was trained on, a little later.
+    assert np.all((0 <= share) & (share < 0.01))
+    shown = json.loads((run_directory / "report" / "metrics.json").read_text())
+    assert shown["rollout"]["outside_training"] == share.max()
+
+
+def test_a_model_from_before_the_range_was_stored_runs_without_it(run_directory, tmp_path):
+    for name in ("ground_truth.h5", "kernel.h5"):
+        (tmp_path / name).symlink_to(run_directory / name)
+    shutil.copy(run_directory / "model.h5", tmp_path)
+    with h5py.File(tmp_path / "model.h5", "r+") as file:
+        del file["feature_range"]
+    result = eddies(2, "simulate", "tiny", "--output", str(tmp_path), "--set", "simulation.turnovers=0.1")
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert result.stdout.count("pairs outside the training range are not counted") == 1
+    with h5py.File(tmp_path / "rollout.h5") as file:
+        assert "outside_training" not in file and file["rollout"].attrs["status"] == "complete"
+    assert eddies(1, "report", str(tmp_path)).returncode == 0
+    assert "outside_training" not in json.loads((tmp_path / "report" / "metrics.json").read_text())["rollout"]
+
+
 def test_resume_skips_what_is_done_and_redoes_what_changed(run_directory):
     result = eddies(1, "run", "tiny", "--output", str(run_directory), "--resume")
     assert result.returncode == 0 and result.stderr.count("skipped") + result.stdout.count("skipped") == 4
@@ -73,7 +106,7 @@ def test_resume_skips_what_is_done_and_redoes_what_changed(run_directory):
 
 
 def test_the_rollout_is_the_same_on_any_number_of_ranks(run_directory, tmp_path):
-    positions = []
+    positions, shares = [], []
     for ranks in (1, 3):
         directory = tmp_path / str(ranks)
         directory.mkdir()
@@ -83,8 +116,10 @@ def test_the_rollout_is_the_same_on_any_number_of_ranks(run_directory, tmp_path)
         assert result.returncode == 0, result.stdout + result.stderr
         with h5py.File(directory / "rollout.h5") as file:
             positions.append(file["particles/model/position/value"][-1])
+            shares.append(file["outside_training/share"][()])
     # Stored in single precision.
     assert max(np.abs(positions[0] - other).max() for other in positions[1:]) < 2e-6
+    assert np.array_equal(*shares) and shares[0].max() > 0
 
 
 def test_a_rollout_that_goes_wrong_ends_there_and_keeps_its_frames(run_directory, tmp_path):
@@ -117,8 +152,9 @@ def test_a_trained_model_runs_on_another_flow(run_directory, tmp_path):
     result = eddies(2, "run", str(tmp_path / "slower.toml"), "--output", str(tmp_path / "run"))
     assert result.returncode == 0, result.stdout + result.stderr
     with h5py.File(run_directory / "model.h5") as trained, h5py.File(tmp_path / "run" / "model.h5") as adopted:
-        for name, weight in trained["weights"].items():
-            assert np.array_equal(adopted["weights"][name], weight)
+        for table in ("weights", "feature_range"):
+            for name, values in trained[table].items():
+                assert np.array_equal(adopted[table][name], values)
         scales = [json.loads(file.attrs["description"])["scales"] for file in (trained, adopted)]
         assert scales[0]["sound_speed"] == 22.5 and scales[1]["sound_speed"] == 11
         assert scales[1]["density"] > 2 * scales[0]["density"]

@@ -28,7 +28,7 @@ METRICS = {
     "model": {"acceleration_error", "density_rate_error", "filtered_pressure_gradient_error",
               "true_density_acceleration_error", "delay"},
     "rollout": {"turnovers", "stable", "energy_ratio", "velocity_error", "spectrum_error", "velocity_kl",
-                "acceleration_kl", "qr_kl", "nearest_distance_kl", "count_variance_ratio",
+                "acceleration_kl", "qr_kl", "outside_training", "nearest_distance_kl", "count_variance_ratio",
                 "high_wavenumber_energy_ratio"},
     "cost": {"seconds_per_step", "particles", "ranks", "stage_seconds"},
 }
@@ -100,6 +100,7 @@ def test_numbers_of_a_known_rollout(comm, tmp_path):
     assert rollout["velocity_error"] == pytest.approx(0.2, rel=0.15)
     assert rollout["energy_ratio"] == pytest.approx(1.04, abs=0.05)
     assert rollout["filter_wavenumber"] == pytest.approx(4)
+    assert rollout["outside_training"] == pytest.approx(0.2e-3)  # at t = 0.4 or 0.5
     assert 0 < rollout["velocity_kl"] < 0.1 and 0 < rollout["qr_kl"] < 0.5
     # Both start at the same random points. The field of the model is made without its error, and k <= 4.
     assert 0 < rollout["nearest_distance_kl"] < 0.1

@@ -31,7 +31,8 @@ class Rollout:
     """A rollout as stored, with what it is compared with.
 
     attributes: of the group `rollout`; model, truth: trajectories; fields: the series "model", "truth" and
-    "filtered"; length: box edge; filter_width and eulerian (table `spectra`): of the ground truth, or None.
+    "filtered"; length: box edge; filter_width and eulerian (table `spectra`): of the ground truth, or None;
+    outside_training: share of the pairs outside the training range, (frames,), where it was counted.
     """
 
     attributes: Mapping[str, float | str]
@@ -41,6 +42,7 @@ class Rollout:
     length: float
     filter_width: float | None
     eulerian: Mapping[str, np.ndarray] | None
+    outside_training: np.ndarray | None = None
 
     @property
     def turnover(self) -> float:
@@ -75,6 +77,9 @@ def section(run: Rollout) -> Section:
         Metric("stable", "stable to the end", run.status == "complete" and not np.isfinite(broken)),
         Metric("turnovers", "eddy turnovers run", float(run.attributes["turnovers"])),
     ])
+    if run.outside_training is not None:
+        shown.metrics.append(Metric("outside_training", "pairs outside the training range, largest share over time",
+                                    float(run.outside_training.max())))
     try:
         common = CommonFrames.of(run.model, run.truth, broken)
     except ValueError as error:

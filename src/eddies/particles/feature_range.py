@@ -2,19 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from eddies.parallel.reduction import global_max, global_min, global_sum
-from eddies.particles.dense_network import DenseNetwork
+from eddies.particles.dynamics import PAIR_VALUES_TOGETHER
+from eddies.particles.pair_forces import PairModel
+from eddies.particles.particle_set import ParticleSet
+from eddies.particles.surroundings import Surroundings
 
-Result = TypeVar("Result")
+
+def pair_features(model: PairModel, surroundings: Surroundings, particles: ParticleSet,
+                  dtype: torch.dtype) -> Iterator[Tensor]:
+    """What the network of a model is given, in blocks (features, m); collective, with at least one block on each rank.
+
+    Each pair stands in both orders, on the rank that owns its first particle, also where the model needs one order
+    alone: so counts are the same on any number of ranks. `surroundings` fit the particles, whose density is the one
+    that the model sees.
+    """
+    local = surroundings.local(particles, set(model.reads))
+    own, together = local.position[: len(particles)], PAIR_VALUES_TOGETHER[local.position.device.type] // model.width
+    for block in surroundings.neighbors.blocks(max(together, 1)):
+        yield model.features(surroundings.neighbors.pairs(own, local.position, block, dtype), local.columns)
 
 
 @dataclass(frozen=True)
@@ -28,41 +41,25 @@ class FeatureRange:
     high: np.ndarray
 
     @classmethod
-    def of(cls, comm, network: DenseNetwork, evaluate: Callable[[], object]) -> FeatureRange:
-        """The range of what the network is given while `evaluate` runs, on all ranks; collective."""
-        features = network.weights[0].shape[1]
-        low, high = np.full(features, np.inf), np.full(features, -np.inf)
+    def of(cls, comm, blocks: Iterable[Tensor]) -> FeatureRange:
+        """The range of blocks (features, m) of all ranks, of which each has at least one; collective."""
+        low, high = zip(*map(_extrema, blocks))
+        return cls(global_min(comm, np.min(low, axis=0)), global_max(comm, np.max(high, axis=0)))
 
-        def widen(values: Tensor) -> None:
-            if values.shape[1] > 0:
-                np.minimum(low, values.amin(1).double().cpu().numpy(), out=low)
-                np.maximum(high, values.amax(1).double().cpu().numpy(), out=high)
-
-        with _watched(network, widen):
-            evaluate()
-        return cls(global_min(comm, low), global_max(comm, high))
-
-    def share_outside(self, comm, network: DenseNetwork, evaluate: Callable[[], Result]) -> tuple[Result, float]:
-        """What `evaluate` returns, and the share of the pairs that the network is given meanwhile, on all ranks, of
-        which some input lies outside the range, or is not a number; collective. Zero without pairs."""
-        counts = np.zeros(2)
-
-        def count(values: Tensor) -> None:
-            low, high = (torch.from_numpy(bound).to(values).unsqueeze(1) for bound in (self.low, self.high))
-            inside = ((values >= low) & (values <= high)).all(0)
-            counts[:] += len(inside) - int(inside.sum()), len(inside)
-
-        with _watched(network, count):
-            result = evaluate()
+    def share_outside(self, comm, blocks: Iterable[Tensor]) -> float:
+        """The share of the pairs in blocks (features, m) of all ranks of which some feature lies outside the range, or
+        is not a number; collective. Zero without pairs."""
+        counts = np.zeros(2, np.int64)
+        for block in blocks:
+            low, high = (torch.from_numpy(bound).to(block).unsqueeze(1) for bound in (self.low, self.high))
+            inside = ((block >= low) & (block <= high)).all(0)
+            counts += len(inside) - int(inside.sum()), len(inside)
         outside, total = global_sum(comm, counts)
-        return result, float(outside / max(total, 1.0))
+        return float(outside / max(total, 1))
 
 
-@contextmanager
-def _watched(network: DenseNetwork, observe: Callable[[Tensor], None]) -> Iterator[None]:
-    """Show all inputs (features, m) of the network to `observe`; afterwards nothing is left that costs time."""
-    handle = network.register_forward_pre_hook(lambda module, inputs: observe(inputs[0].detach()))
-    try:
-        yield
-    finally:
-        handle.remove()
+def _extrema(block: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    if block.shape[1] == 0:
+        return np.full(len(block), np.inf), np.full(len(block), -np.inf)
+    low, high = torch.aminmax(block, dim=1)
+    return low.double().cpu().numpy(), high.double().cpu().numpy()

@@ -144,12 +144,11 @@ class PairModel(nn.Module):
     def pair_values(self, pairs: Pairs, columns: dict[str, Tensor]) -> Tensor:
         """What is summed over neighbours: (components, m)."""
         x, v, own_density, other_density = self._dimensionless(pairs, columns)
-        distance, approach = pairs.distance / self.scales.length, (x * v).sum(0)
-        densities = self._density_invariants(own_density, other_density)
-        outputs = self.network(torch.stack([*densities, distance, safe_norm(v, dim=0), approach]))
+        features = self._invariants(pairs, x, v, own_density, other_density)
+        outputs = self.network(features)
         push, drag = outputs[0], outputs[1]
         if self.eddy_viscosity != "none":
-            push = push + self.viscosity(distance, approach)
+            push = push + self.viscosity(features[2], features[4])
         w = moments.weight(pairs.distance, self.cutoff)
         terms = [(w * push) * x, (w * drag) * v]
         if self._needs_moment:
@@ -161,6 +160,10 @@ class PairModel(nn.Module):
             terms.append(w * outputs[2])
         return torch.cat([torch.atleast_2d(term) for term in terms])
 
+    def features(self, pairs: Pairs, columns: dict[str, Tensor]) -> Tensor:
+        """What the network is given: the invariants (5, m) of the pairs."""
+        return self._invariants(pairs, *self._dimensionless(pairs, columns))
+
     @property
     def _summed(self) -> list[str]:
         """Names of what is summed over neighbours, in the order of `pair_values`."""
@@ -169,9 +172,10 @@ class PairModel(nn.Module):
         names += ["strain", "contrast"] if self.closure == "learned-density" else []
         return names + (["flux"] if self.learns_density else [])
 
-    def _density_invariants(self, own: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
-        """The first two invariants (m,), from rho'_i and rho'_j."""
-        return (own + other, (own - other).square()) if self.mutual else (own, other)
+    def _invariants(self, pairs: Pairs, x: Tensor, v: Tensor, own: Tensor, other: Tensor) -> Tensor:
+        """The invariants (5, m), from what `_dimensionless` gives."""
+        densities = (own + other, (own - other).square()) if self.mutual else (own, other)
+        return torch.stack([*densities, pairs.distance / self.scales.length, safe_norm(v, dim=0), (x * v).sum(0)])
 
     def _dimensionless(self, pairs: Pairs, columns: dict[str, Tensor]) -> tuple[Tensor, ...]:
         """x and v (3, m), rho'_i and rho'_j (m,) of the pairs."""

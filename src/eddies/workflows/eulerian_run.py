@@ -89,6 +89,10 @@ class EulerianRun:
         along = np.einsum("nij,nj->ni", values[:, 3:].reshape(-1, 3, 3), self.tracers.columns["velocity"])
         return values[:, :3] + along
 
+    def series(self) -> dict[str, dict[str, list[float]]]:
+        """None."""
+        return {}
+
     def description(self) -> dict[str, float | str]:
         """Grid and model; `flow_seconds_per_step` (median) is the flow's share of a step, without the particles."""
         grid = self.fluid.grid

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from eddies.io.hdf5 import open_product, read_table
 from eddies.io.weights import load_weights
 from eddies.parallel.broadcast import first_complaint
 from eddies.parallel.halo import HaloError
 from eddies.particles.body_forces import LinearForcing
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.faults import Limits, find_fault
+from eddies.particles.feature_range import FeatureRange, pair_features
 from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.pair_forces import PairModel
 from eddies.particles.particle_set import ParticleSet
@@ -23,6 +26,8 @@ from eddies.particles.wcsph import WCSPH, SummationDensity
 from eddies.scene import Scene, Wcsph
 from eddies.workflows.closures import density_closure
 from eddies.workflows.truth import GroundTruth
+
+log = logging.getLogger("eddies")
 
 # A state is runaway, not turbulence, when a particle is this many times faster, or its density this many times
 # farther from the mean, than the rms of the truth.
@@ -37,12 +42,14 @@ class Force:
     """What acts between particles: pair terms, and the closure that gives their density or None.
 
     `largest_deviation`: of a particle's density from the mean, in a sound state. `description`: for the product.
+    `learned`: a trained model and the range of what it was given in training, where that is known.
     """
 
     terms: list[PairTerm] = field(default_factory=list)
     closure: DensityClosure | None = None
     largest_deviation: float = np.inf
     description: dict[str, float | str] = field(default_factory=lambda: {"closure": "none"})
+    learned: tuple[PairModel, FeatureRange] | None = None
 
 
 class ParticleRun:
@@ -55,6 +62,7 @@ class ParticleRun:
         self.integrator = INTEGRATORS[self.settings.integrator](self.dynamics)
         self.particles = ParticleSet.from_numpy(truth.particles(start), device)
         self.limits = Limits(RUNAWAY_SPEED * scales.velocity, scales.density_mean, self.force.largest_deviation)
+        self._shares_outside: list[float] = []
 
     def steps(self, interval: float) -> int:
         """As many steps as are no longer than that of the scene."""
@@ -73,7 +81,16 @@ class ParticleRun:
         """The particles, with the density of the closure if there is one, and their acceleration."""
         particles, _ = self.dynamics.settle(self.particles)
         rates = self.dynamics.rates(particles)
-        return replace(particles, density=rates.get("closure_density", particles.density)), rates["velocity"]
+        particles = replace(particles, density=rates.get("closure_density", particles.density))
+        if self.force.learned is not None:
+            model, seen = self.force.learned
+            blocks = pair_features(model, self.dynamics.surroundings, particles, self.dynamics.dtype)
+            self._shares_outside.append(seen.share_outside(self.comm, blocks))
+        return particles, rates["velocity"]
+
+    def series(self) -> dict[str, dict[str, list[float]]]:
+        """`outside_training`: the share of pairs that give the network inputs outside the range of its training."""
+        return {} if self.force.learned is None else {"outside_training": {"share": self._shares_outside}}
 
     def description(self) -> dict[str, float | str]:
         """Integrator and force."""
@@ -92,7 +109,9 @@ def learned_force(scene: Scene, truth: GroundTruth, directory: Path, device: tor
     model = load_model(slab.comm, directory / "model.h5", device).to(dtype)
     drift = PEAK_SPEED * scales.velocity * settings.step
     closure = density_closure(model, slab, dtype, settings.skin * model.cutoff, drift)
-    return Force([model], closure, RUNAWAY_DENSITY * scales.density, {"closure": model.closure})
+    seen = load_feature_range(slab.comm, directory / "model.h5")
+    return Force([model], closure, RUNAWAY_DENSITY * scales.density, {"closure": model.closure},
+                 None if seen is None else (model, seen))
 
 
 def smoothed_particles(scene: Scene, truth: GroundTruth, directory: Path, device: torch.device) -> Force:
@@ -135,3 +154,16 @@ def load_model(comm, path: str | Path, device: torch.device) -> PairModel:
     model = PairModel.from_description(description)
     model.load_state_dict({name: torch.from_numpy(tensor) for name, tensor in tensors.items()})
     return model.to(device)
+
+
+def load_feature_range(comm, path: str | Path) -> FeatureRange | None:
+    """The range of what the network of a file was given in training.
+
+    None, and a line in the log, where the file is older than this table.
+    """
+    with open_product(comm, path, "model") as file:
+        if "feature_range" in file:
+            return FeatureRange(**read_table(file, "feature_range"))
+    log.info("rollout: %s holds no feature_range, pairs outside the training range are not counted; `eddies train` "
+             "stores it", path)
+    return None

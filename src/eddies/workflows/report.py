@@ -151,8 +151,9 @@ def _read_rollout(file, record: Run) -> list[Section]:
     record.cost += [Metric(key, label, attributes[key]) for key, label in ROLLOUT_COST.items()]
     model, truth = Trajectory(file, "model"), Trajectory(file, "truth")
     fields = {name: FieldSeries(file, name) for name in ("model", "truth", "filtered")}
+    outside = read_table(file, "outside_training")["share"] if "outside_training" in file else None
     return [figures_comparison.section(figures_comparison.Rollout(
-        attributes, model, truth, fields, model.length, record.filter_width, record.eulerian))]
+        attributes, model, truth, fields, model.length, record.filter_width, record.eulerian, outside))]
 
 
 def _cost_section(record: Run) -> Section:

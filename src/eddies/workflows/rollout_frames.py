@@ -21,11 +21,12 @@ class RolloutFrames:
     """Stores frames of the model and, as long as the ground truth lasts, of the true tracers and the filtered field.
 
     Velocity gradients at the particles and velocities on the grid of the filtered fields are averages with the
-    learned kernel, for model and truth alike.
+    learned kernel, for model and truth alike. `times` are those of the model's frames.
     """
 
     def __init__(self, file, truth: GroundTruth, kernel: SmoothingKernel, start_time: float) -> None:
         self.truth, self.kernel, self.start_time = truth, kernel, start_time
+        self.times: list[float] = []
         comm, length = truth.decomposition.comm, truth.decomposition.length
         cells = truth.fields.cells
         self._slab = SlabDecomposition(comm, length, cells)
@@ -36,6 +37,7 @@ class RolloutFrames:
 
     def store(self, step: int, time: float, particles: ParticleSet, acceleration: torch.Tensor) -> None:
         """Store the model's particles and what is true at that time; `time` counts from the start of the rollout."""
+        self.times.append(time)
         self._store("model", step, time, {**particles.to_numpy(), "acceleration": as_numpy(acceleration)})
         frame = self._true_frame(time)
         if frame is None:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from eddies.clock import Clock, ProgressLine
-from eddies.io.hdf5 import create_product, open_product, write_attributes
+from eddies.io.hdf5 import create_product, open_product, write_attributes, write_table
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import StopRequest
@@ -43,6 +43,9 @@ class Mover(Protocol):
     def frame(self) -> tuple[ParticleSet, torch.Tensor]:
         """The particles now, in any order, and their acceleration (n, 3)."""
 
+    def series(self) -> dict[str, dict[str, list[float]]]:
+        """Tables for the product, with a value in each column for each call of `frame`."""
+
     def description(self) -> dict[str, float | str]:
         """The settings of what moves the particles, for the attributes of the product."""
 
@@ -71,6 +74,8 @@ def run(scene: Scene, comm, directory: str | Path, stop: StopRequest | None = No
             **outcome, **mover.description(), "force": settings.force, "turnovers": outcome["time"] / turnover,
             "eddy_turnover_time": turnover, "start_time": float(truth.times[start]), "particles": truth.total,
             "ranks": comm.size})
+        for name, columns in mover.series().items():
+            write_table(file, name, {"time": frames.times, **columns})
     log.info("rollout: %s after %.2f turnovers, %.3f s/step", outcome["status"], outcome["time"] / turnover,
              outcome["seconds_per_step"])
 

@@ -29,7 +29,8 @@ DRAWING_SECONDS = 30.0
 
 
 def run(scene: Scene, comm, directory: str | Path, stop: StopRequest | None = None) -> None:
-    """Train the model of a scene and write model.h5: weights, learning history and a-priori tests.
+    """Train the model of a scene and write model.h5: weights, learning history, a-priori tests, and the range of
+    what the network was given.
 
     With [model] path its weights are adopted instead. A training that is stopped goes on from a checkpoint.
     """
@@ -48,6 +49,7 @@ def run(scene: Scene, comm, directory: str | Path, stop: StopRequest | None = No
         checkpoints = CheckpointDirectory(comm, directory / "checkpoints-train", scene.fingerprint("train"))
         take_all_steps(training, checkpoints, stop, LearningCurves(comm, directory / "learning.png"))
         tables = evaluate(truth, model, data.closure, tests, last, data.dtype, device)
+        tables["feature_range"] = vars(data.feature_range())
         mach = truth.reference["mach_turbulent"]
     weights = {name: tensor.cpu().numpy() for name, tensor in model.state_dict().items()}
     provenance = {"scene": scene.to_toml(), "fingerprint": scene.fingerprint("train"), "mach_turbulent": mach}

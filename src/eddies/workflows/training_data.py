@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -13,6 +14,7 @@ from eddies.learning.optimization import Descent
 from eddies.learning.rollout_training import RolloutTrainer, TrainingWindow
 from eddies.learning.training import Phase
 from eddies.particles.dynamics import ParticleDynamics
+from eddies.particles.feature_range import FeatureRange, pair_features
 from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.pair_forces import PairModel
 from eddies.particles.particle_set import ParticleSet
@@ -54,15 +56,28 @@ class TrainingData:
                 "turnovers, or lower [tracers] frame_interval or horizons")
         self.closure = density_closure(self.model, truth.decomposition, self.dtype)
 
+    @cached_property
+    def frames(self) -> list[TrainingFrame]:
+        """The single frames that are trained on; the first use is collective."""
+        seen = np.unique(np.linspace(1, self.learned, self.settings.frames).astype(int))
+        return [self._frame(index) for index in seen]
+
+    def feature_range(self) -> FeatureRange:
+        """The range of what the network is given by all pairs of these frames; collective.
+
+        Where the simulation leads within the horizons is left out, as it is not the truth.
+        """
+        blocks = (block for frame in self.frames
+                  for block in pair_features(self.model, frame.surroundings, frame.particles, self.dtype))
+        return FeatureRange.of(self.truth.decomposition.comm, blocks)
+
     def one_step_phases(self) -> list[Phase]:
         """Steps on the rates of single frames: on trajectories, then on all losses, as far as the scene has them."""
         settings = self.settings
-        seen = np.unique(np.linspace(1, self.learned, settings.frames).astype(int))
-        frames = [self._frame(index) for index in seen]
         validation = self._frame(self.last - 1)
         weights = LossWeights(settings.trajectory_weight, settings.field_weight, settings.velocity_kl_weight,
                               settings.acceleration_kl_weight)
-        trainer = ForceTrainer(self.model, frames, self.kernel, weights, settings.batch, self.scene.seed)
+        trainer = ForceTrainer(self.model, self.frames, self.kernel, weights, settings.batch, self.scene.seed)
         alone = settings.steps - settings.combined_steps
         fall = settings.final_learning_rate / settings.learning_rate
         between = settings.learning_rate * fall ** (alone / settings.steps)
