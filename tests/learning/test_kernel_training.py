@@ -53,10 +53,10 @@ def test_training_is_the_same_on_any_number_of_ranks(comm):
 def test_the_learned_kernel_beats_the_cubic_spline_on_the_field_it_was_fitted_to(comm, spacings):
     """The spline is as wide as its support makes it: right for this flow at 2.4 spacings, here too narrow or wide."""
     support = spacings * SPACING
-    sample, network, losses = fit(comm, support, 60, (2e-2, 2e-3))
+    sample, network, _ = fit(comm, support, 60, (2e-2, 2e-3))
     with torch.no_grad():
         learned = network.table()
         errors = [sample.errors_of(*sample.cloud.on_whole_grid(kernel)) for kernel in (learned, CubicSpline(support))]
     assert float(integral(learned)) == pytest.approx(1, rel=1e-12)
     fitted, spline = (velocity**2 + gradient**2 for velocity, gradient in errors)
-    assert fitted < 0.8 * spline and losses[-1]["loss"] < losses[0]["loss"]
+    assert fitted < 0.8 * spline

@@ -35,7 +35,7 @@ def test_check_of_any_scene_writes_nothing(comm, tmp_path, monkeypatch, caplog, 
 def test_numbers_of_the_small_case(comm, caplog, recorded):
     text = lines_of(load_scene("hit-small"), comm, caplog)
     for part in ("spacing 0.09817, k_max 21", "32^3 = 32768, mean spacing 0.1963 = 2 cells", "Re_lambda 50.3",
-                 "filter width 0.3927", "kernel support 0.4769, 60 neighbours", "at most 5"):
+                 "filter width 0.3927", "kernel support 0.4769, 60 neighbours", "at most 8"):
         assert part in text
 
 
