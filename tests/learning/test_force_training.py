@@ -44,7 +44,7 @@ def trainer_of(comm, closure="learned-density", weights=LossWeights(1.0, 1.0, 0.
     return ForceTrainer(model, [frame], WendlandC2(SUPPORT), weights, batch, seed=5)
 
 
-@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.mpi(2, 3)
 @pytest.mark.parametrize("kind", ["trajectory_step", "combined_step"])
 def test_training_is_the_same_on_any_number_of_ranks(comm, kind):
     from mpi4py import MPI

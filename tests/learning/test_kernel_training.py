@@ -36,7 +36,7 @@ def fit(comm, support=2.4 * SPACING, steps=4, rates=(1e-3, 1e-3)):
     return sample, network, [trainer.step(descent, step) for step in range(steps)]
 
 
-@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.mpi(2, 3)
 def test_training_is_the_same_on_any_number_of_ranks(comm):
     from mpi4py import MPI
 

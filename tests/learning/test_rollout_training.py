@@ -91,7 +91,7 @@ def gradient_of(comm, horizon, **choices):
 
 
 @every_closure
-@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.mpi(2, 3)
 @pytest.mark.parametrize("horizon", [1, 4])
 def test_gradient_is_the_same_on_any_number_of_ranks(comm, horizon, closure):
     from mpi4py import MPI
@@ -103,7 +103,7 @@ def test_gradient_is_the_same_on_any_number_of_ranks(comm, horizon, closure):
 
 
 @every_closure
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_gradient_through_several_steps_against_finite_differences(comm, integrator, closure):
     trainer, model = trainer_of(comm, closure, integrator, steps=2)
@@ -132,7 +132,7 @@ def test_particles_leave_their_slabs_within_a_window(comm):
     assert global_max(comm, float(particles.position[:, 2].max()) - slab.upper) > SPACING
 
 
-@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.mpi(2, 3)
 def test_twenty_steps_have_the_same_losses_on_any_number_of_ranks(comm):
     from mpi4py import MPI
 
