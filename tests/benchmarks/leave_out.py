@@ -42,6 +42,7 @@ def pairs_of_calls(comm) -> dict[str, tuple[Call, Call]]:
         "pair force": ({"closure": "learned-density"}, {"pairs": False}),
         "Poisson closure": ({}, {"closure": "learned-density"}),
         "force of the Poisson closure": ({"closure": "poisson-force"}, {}),
+        "resolved stress, damping and friction": ({"closure": "poisson-stress"}, {"closure": "poisson-force"}),
         "eddy viscosity": ({"viscosity": "two-sided"}, {}),
         "forcing of the particles": ({"forced": True}, {}),
     }

@@ -102,6 +102,36 @@ def test_training_lowers_the_error_of_a_learnable_force(comm):
 
 
 @pytest.mark.mpi(1, 2, 3)
+def test_the_error_of_all_losses_is_that_of_the_acceleration_where_nothing_else_has_weight(comm):
+    trainer = trainer_of(comm, weights=LossWeights(trajectory=4.0), batch=10**6)
+    frame = trainer.frames[0]
+    with torch.no_grad():
+        squares = global_sum(comm, float(frame.errors()["velocity"].square().sum()))
+    expected = 2 * (squares / (3 * frame.total)) ** 0.5 / frame.acceleration_rms
+    assert trainer.combined_error(frame, draws=3) == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.mpi(2, 3)
+def test_the_error_of_all_losses_is_the_same_on_any_number_of_ranks_and_at_every_call(comm):
+    from mpi4py import MPI
+    trainer, alone = trainer_of(comm), trainer_of(MPI.COMM_SELF)
+    error = trainer.combined_error(trainer.frames[0], draws=3)
+    assert error == trainer.combined_error(trainer.frames[0], draws=3)
+    assert error == pytest.approx(alone.combined_error(alone.frames[0], draws=3), rel=1e-9)
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("closure, counts", [("learned-density", False), ("paper-density", True)])
+def test_of_learned_rates_of_density_only_the_paper_s_counts_in_single_frames(comm, closure, counts):
+    trainer = trainer_of(comm, closure, weights=LossWeights())
+    trainer.trajectory_step(Descent(comm, trainer.model.parameters(), 1, 1e-2, 1e-2), 0)
+    flux = trainer.model.network.weights[-1].grad[2]
+    assert bool(flux.any()) == counts
+    if closure == "learned-density":
+        assert trainer.model.density_factors.grad is None or not trainer.model.density_factors.grad.any()
+
+
+@pytest.mark.mpi(1, 2, 3)
 def test_the_force_of_a_closure_is_added_to_the_pair_sum_and_its_factors_are_learned(comm):
     model = PairModel(SCALES, SUPPORT, 45, (8, 8), closure="poisson-stress", seed=2)
     pairs_alone, frame = frame_of(comm, model), frame_of(comm, model, forced=True)
