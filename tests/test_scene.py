@@ -1,6 +1,7 @@
 """Scenes: what is read, what is refused and in which words."""
 
 import dataclasses
+import re
 
 import pytest
 from bad_scenes import BAD_OVERRIDES, BAD_TEXTS
@@ -168,6 +169,14 @@ def test_bad_override(override, message):
     with pytest.raises(SceneError) as error:
         load_scene("tiny", [override])
     assert message in str(error.value)
+
+
+@pytest.mark.parametrize("override, message", [
+    ("model.closure=poisson-force", 'basis = "none": leaves nothing to learn of closure = "poisson-force"; set'),
+    ("model.eddy_viscosity=monaghan", 'eddy_viscosity = "monaghan": acts between pairs, and with basis = "none"')])
+def test_without_a_pair_sum_the_closure_must_have_a_force_and_no_viscosity(override, message):
+    with pytest.raises(SceneError, match=re.escape(message)):
+        load_scene("tiny", ["model.basis=none", override])
 
 
 def test_override_is_named_as_the_origin():

@@ -126,8 +126,8 @@ class Kernel:
 class Model:
     """The form of the pair force, of the density closure and of the eddy viscosity."""
 
-    basis: str = choice("of the pair sum; corrected: times the inverse moment matrix", "paper", "corrected",
-                        default="corrected")
+    basis: str = choice("of the pair sum; corrected: times the inverse moment matrix; none: no pair sum, with closure "
+                        "poisson-stress", "paper", "corrected", "none", default="corrected")
     closure: str = choice("where the density comes from; -force: with -grad p as a force, -stress: and resolved stress",
                           "poisson", "poisson-force", "poisson-stress", "learned-density", "paper-density",
                           default="poisson-stress")

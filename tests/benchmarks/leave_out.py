@@ -43,6 +43,7 @@ def pairs_of_calls(comm) -> dict[str, tuple[Call, Call]]:
         "Poisson closure": ({}, {"closure": "learned-density"}),
         "force of the Poisson closure": ({"closure": "poisson-force"}, {}),
         "resolved stress, damping and friction": ({"closure": "poisson-stress"}, {"closure": "poisson-force"}),
+        "pair sum beside them": ({"closure": "poisson-stress"}, {"closure": "poisson-stress", "basis": "none"}),
         "eddy viscosity": ({"viscosity": "two-sided"}, {}),
         "forcing of the particles": ({"forced": True}, {}),
     }

@@ -12,7 +12,7 @@ from eddies.particles.periodic_box import PeriodicBox
 
 CHOICES = [
     dict(zip(("basis", "closure", "eddy_viscosity"), choice))
-    for choice in itertools.product(BASES, CLOSURES, EDDY_VISCOSITIES)
+    for choice in itertools.product(sorted({*BASES} - {"none"}), CLOSURES, EDDY_VISCOSITIES)
 ]
 ANTISYMMETRIC = [dict(basis="paper", closure=closure, eddy_viscosity="monaghan", symmetry="antisymmetric")
                  for closure in ("poisson", "learned-density")]
@@ -124,6 +124,15 @@ def test_gradient_against_finite_differences(choices):
     step = 1e-5
     difference = (along(direction, step) - along(direction, -step)).item() / (2 * step)
     assert difference == pytest.approx(expected, rel=1e-6)
+
+
+def test_without_a_basis_there_is_no_pair_sum_and_nothing_but_the_closure_s_factors():
+    alone = model(basis="none", closure="poisson-stress")
+    assert alone.pair_terms == [] and list(alone.state_dict()) == ["force_factors"]
+    assert PairModel.from_description(alone.state_description()).pair_terms == []
+    for choices in (dict(closure="poisson-force"), dict(closure="poisson-stress", eddy_viscosity="two-sided")):
+        with pytest.raises(ValueError, match='basis "none" goes with closure "poisson-stress"'):
+            model(basis="none", **choices)
 
 
 @every_model

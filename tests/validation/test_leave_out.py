@@ -18,6 +18,7 @@ from eddies.particles import body_forces
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.eddy_viscosity import EddyViscosity
 from eddies.particles.integrators import INTEGRATORS
+from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.pair_forces import PairModel
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.reference_scales import ReferenceScales
@@ -66,7 +67,7 @@ def counted(*methods):
             setattr(owner, name, original)
 
 
-def particle_step(comm, closure="poisson", viscosity="none", forced=False, pairs=True):
+def particle_step(comm, closure="poisson", viscosity="none", basis="corrected", forced=False, pairs=True):
     """A function that takes a step of velocity Verlet, halo and list being there; the rates are evaluated once."""
     slab = SlabDecomposition(comm, LENGTH, PER_SIDE)
     z = (np.arange(slab.start, slab.stop) + 0.5) * SPACING
@@ -76,9 +77,9 @@ def particle_step(comm, closure="poisson", viscosity="none", forced=False, pairs
     ids = np.arange(len(position)) + slab.start * PER_SIDE**2
     particles = ParticleSet.from_numpy({"id": ids, "position": position, "velocity": velocity,
                                         "density": np.ones(len(position))})
-    model = PairModel(SCALES, 1.5 * SPACING, 14, (8,), closure=closure, eddy_viscosity=viscosity)
+    model = PairModel(SCALES, 1.5 * SPACING, 14, (8,), basis, closure, viscosity)
     density = density_closure(model, slab, torch.float64, SPACING) if pairs else None
-    terms = [model] if pairs else []
+    terms = model.pair_terms if pairs else []
     terms += [body_forces.LinearForcing(0.5, 2.0, comm)] if forced else []
     stepper = INTEGRATORS["verlet"](ParticleDynamics(slab, LENGTH, terms, SPACING, density))
     with torch.no_grad():
@@ -187,6 +188,21 @@ def test_a_closure_pays_with_transposes_for_the_terms_of_its_force_alone(comm):
     # Beside the two votes on the list: one on where particles are, their mean velocity, and of a force its mean.
     sums = {closure: messages.count("Allreduce") for closure, messages in sent.items()}
     assert sums == {"learned-density": 2, "poisson": 4, "poisson-force": 5, "poisson-stress": 5}
+
+
+@pytest.mark.mpi(2)
+def test_without_a_pair_sum_no_neighbours_are_searched_and_no_density_travels(comm):
+    found = {}
+    for basis in ("corrected", "none"):
+        with counted((NeighborList, "build"), (NeighborList, "pairs")) as calls:
+            counting = CountingComm(comm)
+            step = particle_step(counting, "poisson-stress", basis=basis)
+            counting.sent.clear()
+            step()
+        found[basis] = calls.count("build"), calls.count("pairs"), counting.sent.count("Sendrecv")
+    # What is left is the list of particles around the points of the grid; the density would go up and down.
+    (builds, pairs, sent), (builds_left, pairs_left, sent_left) = found["corrected"], found["none"]
+    assert builds_left < builds and pairs_left < pairs and sent_left == sent - 2
 
 
 @pytest.mark.mpi(1)

@@ -167,14 +167,18 @@ def test_a_trained_model_runs_on_another_flow(run_directory, tmp_path):
     assert shown["mach_turbulent"] == pytest.approx(2 * shown["source_mach_turbulent"], rel=0.2)
 
 
-@pytest.mark.parametrize("closure", ["learned-density", "paper-density"])
-def test_the_other_closures_run(run_directory, tmp_path, closure):
+@pytest.mark.parametrize("form, weights", [("closure=learned-density", 1 + 6), ("closure=paper-density", 6),
+                                           ("basis=none", 1)])
+def test_the_other_forms_run(run_directory, tmp_path, form, weights):
     for name in ("ground_truth.h5", "kernel.h5"):
         (tmp_path / name).symlink_to(run_directory / name)
-    change = ("--output", str(tmp_path), "--set", f"model.closure={closure}")
+    change = ("--output", str(tmp_path), "--set", f"model.{form}")
     for stage in ("train", "simulate"):
         result = eddies(2, stage, "tiny", *change)
         assert result.returncode == 0, result.stdout + result.stderr
     assert eddies(1, "report", str(tmp_path)).returncode == 0
     metrics = json.loads((tmp_path / "report" / "metrics.json").read_text())
     assert metrics["model"]["density_rate_error"] is not None
+    assert form.replace("=", " ") in metrics["rollout"]["force"]
+    with h5py.File(tmp_path / "model.h5") as file:
+        assert len(file["weights"]) == weights and ("feature_range" in file) == (form != "basis=none")

@@ -17,7 +17,7 @@ MAIN = ("turnovers", "energy_ratio", "velocity_error", "spectrum_error", "veloci
         "qr_kl")
 # What moved the particles, by [simulation] force, from the attributes of the rollout.
 FORCES = {
-    "learned": "learned pair force, closure {closure}",
+    "learned": "learned force, basis {basis}, closure {closure}",
     "none": "no force: every particle keeps its velocity",
     "wcsph": "WCSPH, {kernel} kernel, density by summation, α = {alpha:g}, β = {beta:g}, γ = {exponent:g}",
     "eulerian": "Eulerian large-eddy simulation on {cells}³ cells, |kᵢ| ≤ {largest_wavenumber}, Smagorinsky constant "
@@ -57,8 +57,8 @@ class Rollout:
     @property
     def force(self) -> str:
         """What moved the particles, in words."""
-        # A file without this attribute was written before there were baselines.
-        return FORCES[str(self.attributes.get("force", "learned"))].format_map(self.attributes)
+        # A file without these attributes was written before there was a choice of baselines, or of no pair sum.
+        return FORCES[str(self.attributes.get("force", "learned"))].format_map({"basis": "unknown", **self.attributes})
 
     @property
     def status(self) -> str:

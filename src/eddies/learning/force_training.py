@@ -22,6 +22,7 @@ from eddies.particles.particle_set import ParticleSet
 from eddies.particles.poisson_closure import ResolvedForce
 from eddies.particles.reconstruction import reconstruct, volumes
 from eddies.particles.smoothing_kernels import SmoothingKernel
+from eddies.particles.surroundings import Surroundings
 
 # Histograms of the divergence losses: bins over this many standard deviations to each side.
 HISTOGRAM_BINS, HISTOGRAM_REACH = 41, 5.0
@@ -49,8 +50,9 @@ class TrainingFrame:
     def __init__(self, decomposition: SlabDecomposition, model: PairModel, particles: ParticleSet,
                  acceleration: Tensor, density_rate: Tensor, force: ResolvedForce | None = None) -> None:
         self.decomposition, self.model, self.dtype = decomposition, model, acceleration.dtype
-        self.dynamics = ParticleDynamics(decomposition, decomposition.length, [model], skin=0.0, dtype=self.dtype)
-        self.surroundings = self.dynamics.surroundings
+        length, reach = decomposition.length, model.cutoff
+        self.dynamics = ParticleDynamics(decomposition, length, model.pair_terms, skin=0.0, dtype=self.dtype)
+        self.surroundings = self.dynamics.surroundings or Surroundings(decomposition, length, reach, reach, 0.0)
         self.surroundings.update(particles)
         self.particles, self.acceleration, self.density_rate, self.force = particles, acceleration, density_rate, force
         squares = [float(rate.double().square().sum()) for rate in (acceleration, density_rate)]

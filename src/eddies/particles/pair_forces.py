@@ -14,7 +14,7 @@ from eddies.particles.pairs import Pairs
 from eddies.particles.periodic_box import safe_norm
 from eddies.particles.reference_scales import ReferenceScales
 
-BASES = ("paper", "corrected")
+BASES = ("paper", "corrected", "none")
 CLOSURES = ("poisson", "poisson-force", "poisson-stress", "learned-density", "paper-density")
 EDDY_VISCOSITIES = ("none", *EddyViscosity.FORMS)
 SYMMETRIES = ("none", "antisymmetric")
@@ -43,6 +43,7 @@ class PairModel(nn.Module):
     dv_i/dt = a_rms A_i with
         A_i = 1/n (sum_j w (NN_1 + Pi) x + sum_j w NN_2 v)                          basis "paper"
         A_i = M_i^-1 sum_j w (NN_1 + Pi) x + sum_j w NN_2 v / sum_j w               basis "corrected"
+        A_i = 0, and no network                                                     basis "none"
     where n is the expected number of neighbours and M_i = sum_j w x x^T. With symmetry "antisymmetric" the first two
     invariants are rho'_i + rho'_j and (rho'_i - rho'_j)^2: i and j get opposite forces, which keep the total momentum.
 
@@ -52,7 +53,8 @@ class PairModel(nn.Module):
     cutoff : h, the radius of interaction.
     neighbors : n, the expected number of particles within the cutoff.
     hidden : widths of the tanh layers.
-    basis : "paper" or "corrected".
+    basis : "paper", "corrected"; or "none", with closure "poisson-stress" only: its force alone, whose factors are all
+        that is learned.
     closure : "poisson", "poisson-force", "poisson-stress": no density rate, the density is given, and but in the first
         case a force with it, to which the pair sum is added (`resolved_factors`); "paper-density": r_rms/n sum_j w
         NN_rho, r_rms the rms of the density rate; "learned-density": -a rho_0 div v + b (c/h) (mean_j rho_j - rho_i)
@@ -89,7 +91,11 @@ class PairModel(nn.Module):
             raise ValueError(f'symmetry "antisymmetric" does not go with basis "{basis}", only with "paper"')
         self.scales, self.cutoff, self.neighbors, self.hidden = scales, cutoff, neighbors, tuple(hidden)
         self.basis, self.closure, self.eddy_viscosity, self.symmetry = basis, closure, eddy_viscosity, symmetry
-        self.network = DenseNetwork(5, hidden, 3 if self.learns_density else 2, seed)
+        if basis == "none" and (closure != "poisson-stress" or eddy_viscosity != "none"):
+            raise ValueError(f'basis "none" goes with closure "poisson-stress" and without eddy viscosity, not with '
+                             f'"{closure}" and "{eddy_viscosity}"')
+        if basis != "none":
+            self.network = DenseNetwork(5, hidden, 3 if self.learns_density else 2, seed)
         if eddy_viscosity != "none":
             self.viscosity = EddyViscosity(eddy_viscosity)
         if closure == "poisson-stress":
@@ -111,6 +117,11 @@ class PairModel(nn.Module):
         length, rate = self.scales.length, self.scales.velocity / self.scales.length
         units = length**2 / 12, *len(DAMPING) * (rate,), 2 * rate
         return self.force_factors * self.force_factors.new_tensor(units)
+
+    @property
+    def pair_terms(self) -> list[PairModel]:
+        """What `ParticleDynamics` is to sum over pairs: the model, or nothing with basis "none"."""
+        return [] if self.basis == "none" else [self]
 
     @property
     def learns_density(self) -> bool:

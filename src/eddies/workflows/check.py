@@ -105,11 +105,11 @@ def time_lines(scene: Scene, ranks: int, speed: Speed) -> Iterator[str]:
 
 def cost_lines(scene: Scene, speed: Speed) -> Iterator[str]:
     """Memory and wall time of the direct simulation on any number of ranks, and memory of the learned pair force."""
-    learned = scene.simulation is not None and scene.simulation.force == "learned"
+    pairs = scene.simulation is not None and scene.simulation.force == "learned" and scene.model.basis != "none"
     yield (f"estimates, from the work of the ranks at hand, for nodes of {NODE_RANKS} ranks that share "
            f"{NODE_BANDWIDTH / 1e9:g} GB/s, {1e6 * LATENCY:g} us a message")
     yield ("ranks  nodes  planes  memory a rank  s a step     wall time  core hours"
-           + ("  pair force a rank" if learned else ""))
+           + ("  pair force a rank" if pairs else ""))
     most, most_alone = (min(most_ranks(case).values()) for case in (scene, ground_truth_alone(scene)))
     steps = expected_steps(scene)
     for row in costs(scene, most_alone, speed):
@@ -117,7 +117,7 @@ def cost_lines(scene: Scene, speed: Speed) -> Iterator[str]:
         if steps:
             seconds = row.seconds * steps
             line += f"  {duration(seconds):>12}  {row.ranks * seconds / 3600:10,.1f}"
-        if learned and row.ranks <= most:
+        if pairs and row.ranks <= most:
             line += f"  {megabytes(pair_bytes(scene, row.ranks)):>17}"
         yield line
 

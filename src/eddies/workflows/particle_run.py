@@ -109,9 +109,9 @@ def learned_force(scene: Scene, truth: GroundTruth, directory: Path, device: tor
     model = load_model(slab.comm, directory / "model.h5", device).to(dtype)
     drift = PEAK_SPEED * scales.velocity * settings.step
     closure = density_closure(model, slab, dtype, settings.skin * model.cutoff, drift)
-    seen = load_feature_range(slab.comm, directory / "model.h5")
-    return Force([model], closure, RUNAWAY_DENSITY * scales.density, {"closure": model.closure},
-                 None if seen is None else (model, seen))
+    seen = load_feature_range(slab.comm, directory / "model.h5") if model.pair_terms else None
+    return Force(model.pair_terms, closure, RUNAWAY_DENSITY * scales.density,
+                 {"basis": model.basis, "closure": model.closure}, None if seen is None else (model, seen))
 
 
 def smoothed_particles(scene: Scene, truth: GroundTruth, directory: Path, device: torch.device) -> Force:
@@ -133,7 +133,7 @@ def build_dynamics(scene: Scene, truth: GroundTruth, force: Force) -> ParticleDy
     terms = list(force.terms)
     if settings.injection != "none":
         terms.append(LinearForcing(injection_rate(scene, truth), forced_below(scene), slab.comm, slab.length))
-    skin = settings.skin * max((term.cutoff for term in force.terms), default=0.0)
+    skin = settings.skin * scene.kernel.support(truth.total)
     return ParticleDynamics(slab, slab.length, terms, skin, force.closure, getattr(torch, settings.precision))
 
 

@@ -49,7 +49,8 @@ def run(scene: Scene, comm, directory: str | Path, stop: StopRequest | None = No
         checkpoints = CheckpointDirectory(comm, directory / "checkpoints-train", scene.fingerprint("train"))
         take_all_steps(training, checkpoints, stop, LearningCurves(comm, directory / "learning.png"))
         tables = evaluate(truth, model, data.closure, tests, last, data.dtype, device)
-        tables["feature_range"] = vars(data.feature_range())
+        if model.pair_terms:
+            tables["feature_range"] = vars(data.feature_range())
         mach = truth.reference["mach_turbulent"]
     weights = {name: tensor.cpu().numpy() for name, tensor in model.state_dict().items()}
     provenance = {"scene": scene.to_toml(), "fingerprint": scene.fingerprint("train"), "mach_turbulent": mach}

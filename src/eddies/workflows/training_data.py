@@ -100,7 +100,7 @@ class TrainingData:
             return []
         interval, slab = scene.tracers.frame_interval, self.truth.decomposition
         closure, resolution = self._wide_closures(interval)
-        dynamics = ParticleDynamics(slab, BOX_LENGTH, [self.model], 0.0, closure, self.dtype, fixed_ranks=True)
+        dynamics = ParticleDynamics(slab, BOX_LENGTH, self.model.pair_terms, 0.0, closure, self.dtype, fixed_ranks=True)
         starts = np.unique(np.linspace(0, self.learned - self.longest, settings.frames).astype(int))
         windows = [self._window(start, resolution) for start in starts]
         validation = self._window(self.last - self.longest, resolution)
