@@ -173,8 +173,9 @@ def test_bad_override(override, message):
 
 @pytest.mark.parametrize("override, message", [
     ("model.closure=poisson-force", 'basis = "none": leaves nothing to learn of closure = "poisson-force"; set'),
-    ("model.eddy_viscosity=monaghan", 'eddy_viscosity = "monaghan": acts between pairs, and with basis = "none"')])
-def test_without_a_pair_sum_the_closure_must_have_a_force_and_no_viscosity(override, message):
+    ("model.eddy_viscosity=monaghan", 'eddy_viscosity = "monaghan": is about pairs, and with basis = "none"'),
+    ("model.symmetry=antisymmetric", 'symmetry = "antisymmetric": is about pairs, and with basis = "none"')])
+def test_without_a_pair_sum_the_closure_must_have_a_force_and_pairs_no_part(override, message):
     with pytest.raises(SceneError, match=re.escape(message)):
         load_scene("tiny", ["model.basis=none", override])
 

@@ -105,10 +105,11 @@ def section_problems(scene: Scene) -> Iterator[str]:
     if scene.model and scene.model.basis == "none" and scene.model.closure != "poisson-stress":
         yield (f'[model] basis = "none": leaves nothing to learn of closure = "{scene.model.closure}"; set closure = '
                '"poisson-stress", or another basis')
-    if scene.model and scene.model.basis == "none" and scene.model.eddy_viscosity != "none":
-        yield (f'[model] eddy_viscosity = "{scene.model.eddy_viscosity}": acts between pairs, and with basis = "none" '
-               'there is no pair sum; set eddy_viscosity = "none", or another basis')
-    if scene.model and scene.model.symmetry == "antisymmetric" and scene.model.basis != "paper":
+    for key in ("eddy_viscosity", "symmetry"):
+        if scene.model and scene.model.basis == "none" and getattr(scene.model, key) != "none":
+            yield (f'[model] {key} = "{getattr(scene.model, key)}": is about pairs, and with basis = "none" there '
+                   f'is no pair sum; set {key} = "none", or another basis')
+    if scene.model and scene.model.symmetry == "antisymmetric" and scene.model.basis == "corrected":
         yield (f'[model] symmetry = "antisymmetric": with basis = "{scene.model.basis}" the forces of a pair are not '
                'opposite, as each particle has a moment matrix of its own; set basis = "paper", or symmetry = "none"')
     if scene.model and scene.flow.fluid != "compressible":

@@ -131,7 +131,8 @@ class Model:
     closure: str = choice("where the density comes from; -force: with -grad p as a force, -stress: and resolved stress",
                           "poisson", "poisson-force", "poisson-stress", "learned-density", "paper-density",
                           default="poisson-stress")
-    hidden: tuple[int, ...] = integers("widths of the pair network's layers", default=(16, 16), at_least=1)
+    hidden: tuple[int, ...] = integers("widths of the pair network's layers; without a basis unused", default=(16, 16),
+                                       at_least=1)
     eddy_viscosity: str = choice("explicit eddy viscosity between pairs", "none", "two-sided", "monaghan",
                                  default="none")
     symmetry: str = choice("antisymmetric: pairs get opposite forces, which keep the momentum; with basis paper only",

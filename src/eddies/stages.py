@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from eddies.clock import duration
-from eddies.io.checkpoint import CheckpointDirectory
+from eddies.io.checkpoint import DIRECTORIES, CheckpointDirectory
 from eddies.io.hdf5 import open_product, product_fingerprint
 from eddies.parallel.stop import StopRequest
 from eddies.scene import Scene, SceneError
@@ -23,8 +23,6 @@ log = logging.getLogger("eddies")
 # The product of each stage, in order: kind, then file name. A stage reads the products before its own.
 PRODUCTS = {"dns": ("ground_truth", "ground_truth.h5"), "train-kernel": ("kernel", "kernel.h5"),
             "train": ("model", "model.h5"), "simulate": ("rollout", "rollout.h5")}
-# The directory of checkpoints of each stage that makes any.
-CHECKPOINTS = {"dns": "checkpoints", "train": "checkpoints-train"}
 
 
 def run_stages(stages: Sequence[str], scene: Scene, comm, directory: Path, resume: bool,
@@ -47,12 +45,13 @@ def run_stages(stages: Sequence[str], scene: Scene, comm, directory: Path, resum
     prepare_directory(scene, comm, directory)
     for stage in stages:
         goes_on, resume = resume, resume and is_done(stage, scene, comm, directory)
-        # Left by another run, by one of products that have just been replaced, or by one killed in its last moment.
-        if stage in CHECKPOINTS and (resume or not goes_on):
-            CheckpointDirectory(comm, directory / CHECKPOINTS[stage], "").remove()
+        # Left by another run, or by one killed in its last moment.
+        if stage in DIRECTORIES and (resume or not goes_on):
+            CheckpointDirectory(comm, directory / DIRECTORIES[stage], "").remove()
         if resume:
             log.info("%s: skipped, %s is complete and made with the same settings", stage, PRODUCTS[stage][1])
             continue
+        remove_later_checkpoints(stage, comm, directory)
         log.info("%s: starts on %d %s", stage, comm.size, "rank" if comm.size == 1 else "ranks")
         start = time.perf_counter()
         workflow = import_module(f"eddies.workflows.{stage.replace('-', '_')}")
@@ -63,6 +62,14 @@ def run_stages(stages: Sequence[str], scene: Scene, comm, directory: Path, resum
             workflow.run(scene, comm, directory, stop)
         comm.Barrier()
         record_seconds(stage, time.perf_counter() - start, comm, directory)
+
+
+def remove_later_checkpoints(stage: str, comm, directory: Path) -> None:
+    """Remove the checkpoints of the stages that start from the product which a stage is about to replace."""
+    order = list(PRODUCTS)
+    for later in order[order.index(stage) + 1:] if stage in order else ():
+        if later in DIRECTORIES:
+            CheckpointDirectory(comm, directory / DIRECTORIES[later], "").remove()
 
 
 def check_ranks(stages: Sequence[str], scene: Scene, comm) -> None:

@@ -12,6 +12,10 @@ def history(phases, **columns):
             "loss": np.linspace(2, 1, steps), "gradient_norm": np.ones(steps), **columns}
 
 
+def circled(axis):
+    return [(line.get_xdata()[0], line.get_ydata()[0]) for line in axis.lines if line.get_markersize() == 8]
+
+
 def test_phases_are_equally_wide_and_ticks_count_steps_and_seconds():
     figure = figures_learning.curves(history([1000, 4]))
     axis = figure.axes[2]
@@ -24,12 +28,16 @@ def test_phases_are_equally_wide_and_ticks_count_steps_and_seconds():
 def test_each_phase_has_its_least_error_circled():
     errors = np.array([np.nan, 0.5, 0.3, 0.4, 0.9, np.nan, 0.8])
     axis = figures_learning.curves(history([4, 3], validation_error=errors)).axes[1]
-    circled = [line.get_ydata()[0] for line in axis.lines if line.get_markersize() == 8]
-    assert circled == [0.3, 0.8]
+    assert circled(axis) == [(0.75, 0.3), (2.0, 0.8)]
+
+
+def test_a_phase_that_did_only_harm_has_its_start_circled():
+    errors, starts = np.array([np.nan, 0.5, np.nan, np.inf, 0.9]), np.array([0.7, np.nan, 0.4, np.nan, np.nan])
+    axis = figures_learning.curves(history([2, 3], validation_error=errors, start_error=starts)).axes[1]
+    assert circled(axis) == [(1.0, 0.5), (1.0, 0.4)]
 
 
 @pytest.mark.filterwarnings("error")
 def test_a_history_of_one_step_without_anything_positive_is_drawn():
     nothing = history([1], loss=np.zeros(1), gradient_norm=np.zeros(1), energy_loss=np.full(1, np.nan))
-    del nothing["phase"]
     assert figures_learning.picture(nothing).startswith(b"\x89PNG\r\n\x1a\n")

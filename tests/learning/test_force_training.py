@@ -6,6 +6,7 @@ from eddies.analysis.figures_learning import LOSSES
 from eddies.flow.tracers import release
 from eddies.learning.force_training import ForceTrainer, LossWeights, TrainingFrame
 from eddies.learning.optimization import Descent
+from eddies.learning.training import Phase, Training, TrainingDiverged
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.pair_forces import PairModel
@@ -118,6 +119,18 @@ def test_the_error_of_all_losses_is_the_same_on_any_number_of_ranks_and_at_every
     error = trainer.combined_error(trainer.frames[0], draws=3)
     assert error == trainer.combined_error(trainer.frames[0], draws=3)
     assert error == pytest.approx(alone.combined_error(alone.frames[0], draws=3), rel=1e-9)
+
+
+@pytest.mark.mpi(1, 2)
+def test_a_force_that_is_not_a_number_ends_the_training_on_all_ranks(comm):
+    """Found in the loss of the step, also on ranks that own no particle of its cube."""
+    trainer = trainer_of(comm)
+    with torch.no_grad():
+        trainer.model.network.biases[-1][0] = torch.nan
+    phase = Phase("all losses", np.ones(3), (1e-2, 1e-3), trainer.combined_step,
+                  lambda: trainer.combined_error(trainer.frames[0], 2), 1)
+    with pytest.raises(TrainingDiverged, match="step 0 of the training .all losses.: loss is nan"):
+        Training(comm, trainer.model, [phase]).step()
 
 
 @pytest.mark.mpi(1)

@@ -47,6 +47,13 @@ def test_histogram_keeps_all_mass_and_its_gradient_is_that_of_one_rank(comm):
     assert np.all(whole_gradient[np.abs(values) > 3] == 0)
 
 
+@pytest.mark.mpi(1, 2, 3)
+def test_a_value_that_is_not_a_number_shows_in_the_histogram_of_every_rank(comm):
+    values = torch.ones(4)
+    values[2] = torch.nan if comm.rank == 0 else 0.5
+    assert soft_histogram(comm, values, 11, 3.0).isnan().all()
+
+
 @pytest.mark.mpi(1)
 def test_histogram_gradient_against_finite_differences(comm):
     values = torch.tensor(np.random.default_rng(3).uniform(-2, 2, 40), requires_grad=True)

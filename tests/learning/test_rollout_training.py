@@ -169,6 +169,15 @@ def test_memory_does_not_grow_with_the_steps(comm):
     assert four - one < 3 * 4 * columns
 
 
+@pytest.mark.mpi(2)
+def test_without_a_weight_nobody_asks_for_energies(comm):
+    with_energies, _ = trainer_of(comm)
+    windows = [replace(window, energies=None) for window in with_energies.windows]
+    trainer = RolloutTrainer(comm, with_energies.integrator, windows, INTERVAL, 1, 0.0, None, 0.0, 5)
+    shares, expected = (each.loss_shares(each.windows[0], 2) for each in (trainer, with_energies))
+    assert shares == {"rollout_loss": expected["rollout_loss"]}
+
+
 @pytest.mark.mpi(1)
 def test_the_energies_count_in_units_of_their_mean_loss(comm):
     trainer, _ = trainer_of(comm)

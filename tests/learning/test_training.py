@@ -4,6 +4,7 @@ import torch
 from torch import nn
 
 from eddies.learning.training import Phase, Training, TrainingDiverged
+from eddies.parallel.halo import HaloError
 
 TARGET = torch.tensor([[1.0, -2.0, 0.5]], dtype=torch.float64)
 
@@ -86,6 +87,24 @@ def test_a_loss_that_is_not_finite_ends_the_training_on_all_ranks(comm):
         training.model.weight[0, 1] = np.inf
     with pytest.raises(TrainingDiverged, match=r"step 0 of the training \(phase 0\): loss is"):
         finished(training)
+
+
+@pytest.mark.mpi(1)
+def test_errors_that_are_no_numbers_are_no_best_and_nothing_else(comm):
+    def validate():
+        error = next(errors)
+        if error is HaloError:
+            raise HaloError("too far")
+        return error
+
+    errors = iter([HaloError, np.nan, 3.0, HaloError])
+    training = finished(training_of(comm, validate, steps=(6,)))
+    assert training.best_error == np.inf and not training.running  # of a next phase that there is not
+    assert training.columns()["validation_error"][[1, 3, 5]].tolist() == [np.inf, 3.0, np.inf]
+    assert training.columns()["start_error"][0] == np.inf
+    errors = iter([np.nan] * 4)
+    with pytest.raises(TrainingDiverged, match=r"step 5 of the training \(phase 0\): at no time .* finite"):
+        finished(training_of(comm, validate, steps=(6,)))
 
 
 @pytest.mark.mpi(1)

@@ -57,7 +57,7 @@ def test_a_lone_particle_near_the_edge_gives_its_own_value(kernel):
 @pytest.mark.parametrize("seed", [0, 2, 3])
 def test_in_voids_values_lie_between_those_of_the_neighbours(seed):
     """With seven neighbours on average some points have only distant ones, where weights are small, and where those of
-    a network that had no say in its sign would be of both signs."""
+    a network without a fixed sign would nearly cancel: with these seeds values then leave the range."""
     network = KernelNetwork(SUPPORT, seed=seed)
     with torch.no_grad():
         network.network.weights[-1].mul_(80)

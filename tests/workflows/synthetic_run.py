@@ -168,7 +168,7 @@ class PerturbedFlow:
                 "velocity_gradient": self.gradient(start, time)}
 
 
-def write_rollout(comm, directory, status="complete", total=600, cells=16, frames=9, broken=None):
+def write_rollout(comm, directory, status="complete", total=600, cells=16, frames=9, broken=None, injection_rate=0.0):
     """The truth ends three frames before the model. Velocities of the model's frame `broken` are NaN."""
     start = np.random.default_rng(5).uniform(0, LENGTH, (total, 3))
     shapes = {"position": (3,), "velocity": (3,), "density": (), "acceleration": (3,),
@@ -176,7 +176,8 @@ def write_rollout(comm, directory, status="complete", total=600, cells=16, frame
     times = 0.1 * np.arange(frames)
     attributes = {"status": status, "start_time": 0.6, "time_step": 0.02, "integrator": "verlet",
                   "force": "learned", "closure": "poisson", "turnovers": times[-1] / TURNOVER,
-                  "seconds_per_step": 0.031, "particles": total, "ranks": 1, "eddy_turnover_time": TURNOVER}
+                  "seconds_per_step": 0.031, "particles": total, "ranks": 1, "eddy_turnover_time": TURNOVER,
+                  "injection_rate": injection_rate}
     with create_product(comm, directory / "rollout.h5", "rollout", provenance()) as file:
         write_attributes(file.create_group("rollout"), attributes)
         write_table(file, "outside_training", {"time": times, "share": 1e-3 * times * (0.9 - times)})

@@ -108,8 +108,6 @@ def test_most_ranks_is_what_the_parts_accept(comm, neighbors, most):
 @pytest.mark.parametrize("frames, thick, planes", [(4, 3, 4), (8, 2, 3), (12, 1, 2)])
 def test_ranks_for_horizons_are_those_that_their_closure_and_their_particles_accept(comm, frames, thick, planes):
     """With particles as fast as in stationary turbulence: what training builds, and a particle at its farthest."""
-    from types import SimpleNamespace
-
     import torch
 
     from eddies.parallel.halo import HaloError
@@ -121,7 +119,7 @@ def test_ranks_for_horizons_are_those_that_their_closure_and_their_particles_acc
     from eddies.scene import BOX_LENGTH
     from eddies.workflows.estimates import (
         expected_turbulence, horizon_time, most_training_ranks, particle_drift)
-    from eddies.workflows.training_data import TrainingData
+    from eddies.workflows.training_data import wide_closures
 
     def accepted(build):
         try:
@@ -139,10 +137,9 @@ def test_ranks_for_horizons_are_those_that_their_closure_and_their_particles_acc
     scales = ReferenceScales(length=tracers.width, spacing=tracers.spacing, velocity=speed, density_mean=1.0,
                              density=0.01, acceleration=1.0, density_rate=0.01, sound_speed=10.0)
     slab, support = SlabDecomposition(comm, BOX_LENGTH, tracers.particles_per_side), scene.kernel.support(12**3)
-    data = SimpleNamespace(truth=SimpleNamespace(decomposition=slab, scales=scales), longest=frames,
-                           model=PairModel(scales, support, 56, (4,)), dtype=torch.float32)
-    assert accepted(lambda: TrainingData._wide_closures(data, tracers.frame_interval)) == (comm.size <= by_grid)
-    far = torch.tensor([[1.0, 1.0, slab.upper + particle_drift(scene, horizon_time(scene))]], dtype=torch.float64)
+    model, time = PairModel(scales, support, 56, (4,)), horizon_time(scene)
+    assert accepted(lambda: wide_closures(model, slab, torch.float32, time, energies=True)) == (comm.size <= by_grid)
+    far = torch.tensor([[1.0, 1.0, slab.upper + particle_drift(scene, time)]], dtype=torch.float64)
     particles = ParticleSet(torch.tensor([comm.rank]), far, torch.zeros_like(far), torch.ones(1))
     around = Surroundings(slab, BOX_LENGTH, support, support, 0.0)
     assert accepted(lambda: around.update(particles)) == (comm.size <= by_reach)

@@ -108,6 +108,19 @@ def test_numbers_of_a_known_rollout(comm, tmp_path):
 
 
 @pytest.mark.mpi(1)
+def test_a_forced_rollout_is_compared_with_the_stationary_state_if_there_is_one(comm, tmp_path):
+    write_run(comm, tmp_path, {"stationary": True}, injection_rate=0.5)
+    report.run(tmp_path, comm)
+    metrics, page = written(tmp_path)
+    assert "The model is forced and the true tracers decay" in page and "forced" in figures(tmp_path)
+    assert all(math.isfinite(value) for value in numbers(metrics["forced"].values()))
+    write_ground_truth(comm, tmp_path)
+    report.run(tmp_path, comm)
+    metrics, page = written(tmp_path)
+    assert "The model is forced and the true tracers decay" in page and "forced" not in metrics
+
+
+@pytest.mark.mpi(1)
 def test_a_stopped_rollout_is_said_to_be_stopped(comm, tmp_path):
     write_run(comm, tmp_path, status="stopped: particle 17 is not finite at t=0.62", broken=4)
     report.run(tmp_path, comm)

@@ -84,6 +84,8 @@ def test_a_training_goes_on_from_products_that_are_still_those_it_began_with(com
         (tmp_path / "kernel.h5").unlink()
     # The kernel is trained in two forms of two steps each.
     stopped(1 + 2 * 2 + 2, 1, resume=True, names=("train-kernel", "train"))
+    stages.run_stages(["train-kernel"], scene, comm, tmp_path, False, StopRequest(comm))
+    stopped(2, 1, resume=True)
     stages.run_stages(["train"], scene, comm, tmp_path, True, StopRequest(comm))
     leftover = tmp_path / "checkpoints-train"
     assert not leftover.exists()

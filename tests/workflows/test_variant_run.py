@@ -2,11 +2,12 @@
 
 import pytest
 
+from eddies.io.checkpoint import DIRECTORIES
 from eddies.io.hdf5 import create_product, write_attributes
 from eddies.parallel import rendezvous
 from eddies.scene import SceneError, load_scene
+from eddies.stages import PRODUCTS
 from eddies.workflows.comparison_rows import step_costs
-from eddies.stages import CHECKPOINTS, PRODUCTS
 from eddies.workflows.variant_run import StepSeconds, VariantRun
 
 
@@ -78,7 +79,7 @@ def test_resume_keeps_what_fits_and_a_fresh_start_keeps_nothing(comm, variants):
 
 @pytest.mark.mpi(1)
 def test_a_training_that_was_stopped_goes_on_with_resume_alone(comm, variants):
-    variant, checkpoint = variants[0], variants[0].directory / CHECKPOINTS["train"] / "step-00000003"
+    variant, checkpoint = variants[0], variants[0].directory / DIRECTORIES["train"] / "step-00000003"
     checkpoint.mkdir(parents=True)
     variant.prepare([], 1, resume=True)
     assert checkpoint.exists()

@@ -55,6 +55,11 @@ class Rollout:
         return None if self.filter_width is None else np.pi / self.filter_width
 
     @property
+    def forced(self) -> bool:
+        """Whether its large scales were forced, as the truth's are not."""
+        return float(self.attributes.get("injection_rate", 0.0)) > 0
+
+    @property
     def force(self) -> str:
         """What moved the particles, in words."""
         # A file without these attributes was written before there was a choice of baselines, or of no pair sum.
@@ -104,6 +109,10 @@ def section(run: Rollout) -> Section:
 def _notices(run: Rollout, last: float, broken: float) -> list[str]:
     end, turnover = run.model.times[-1], run.turnover
     notices = []
+    if run.forced:
+        notices.append("The model is forced and the true tracers decay: from the start on they are two flows, and what "
+                       "is compared here says little of the model. Where the ground truth has a stationary state "
+                       "([spin_up] stationary), the next section compares the model with that.")
     if run.status != "complete":
         notices.append(f"The rollout {run.status} (last frame at {end / turnover:.3g} T).")
     if np.isfinite(broken):

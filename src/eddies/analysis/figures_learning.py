@@ -23,12 +23,12 @@ SMOOTHED = 0.04
 
 @styled
 def curves(history: Mapping[str, np.ndarray]) -> Figure:
-    """The four curves over the steps of a training, each phase as wide as any other; dotted lines part them.
+    """The four curves over the steps of a training, each phase as wide as any other, also one that is not at its end;
+    dotted lines part them.
 
     history: columns (steps,); a loss that was not in use at a step is NaN there, one never used is absent.
     """
-    history = {"phase": np.zeros_like(history["step"]), **history}  # a training of one phase need not say so
-    history["place"] = _places(history["phase"])
+    history = {**history, "place": _places(history["phase"])}
     figure, axes = panels(2, 2, (4.6, 3.0), sharex=True)
     (losses, errors), (rates, gradients) = axes
     for name, label, colour in LOSSES:
@@ -79,18 +79,22 @@ def _mark_phases(axis: Axes, history: Mapping[str, np.ndarray]) -> None:
 
 
 def _validation(axis: Axes, history: Mapping[str, np.ndarray]) -> None:
-    """Each phase has a measure of its own, so its points are joined with no others; the least is circled."""
+    """Each phase has a measure of its own, so its points, from the one before its first step on, are joined with no
+    others; the least is circled."""
     axis.set(title="Error on what is held out, its least circled", ylabel="validation error")
-    error = history.get("validation_error", np.full(len(history["step"]), np.nan))
-    phase = history["phase"]
-    for number in np.unique(phase):
-        chosen = np.isfinite(error) & (phase == number)
-        if chosen.any():
-            place, best = history["place"][chosen], np.argmin(error[chosen])
-            axis.plot(place, error[chosen], color=MODEL, marker="o", markersize=3)
-            axis.plot(place[best], error[chosen][best], marker="o", markersize=8, markerfacecolor="none", color=DNS)
-    if np.isfinite(error).any():
-        axis.set_ylim(0, 1.1 * np.nanmax(error))
+    missing, highest = np.full(len(history["step"]), np.nan), 0.0
+    after, before = (history.get(name, missing) for name in ("validation_error", "start_error"))
+    for index, number in enumerate(np.unique(history["phase"])):
+        chosen = history["phase"] == number
+        place = np.append(index, history["place"][chosen])
+        error = np.append(before[chosen][0], after[chosen])
+        place, error = place[np.isfinite(error)], error[np.isfinite(error)]
+        if len(error):
+            best, highest = np.argmin(error), max(highest, error.max())
+            axis.plot(place, error, color=MODEL, marker="o", markersize=3)
+            axis.plot(place[best], error[best], marker="o", markersize=8, markerfacecolor="none", color=DNS)
+    if highest > 0:
+        axis.set_ylim(0, 1.1 * highest)
 
 
 def _noisy(axis: Axes, history: Mapping[str, np.ndarray], name: str, colour: str, label: str | None) -> None:

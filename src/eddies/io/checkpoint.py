@@ -54,6 +54,10 @@ class Checkpoint:
             return file[name][(slice(None),) * axis + (slice(start, stop),)]
 
 
+# The directory within a run directory, of each stage that makes checkpoints.
+DIRECTORIES = {"dns": "checkpoints", "train": "checkpoints-train"}
+
+
 class CheckpointDirectory:
     """The checkpoints of a run, made with settings of a `fingerprint`. All methods are collective."""
 

@@ -60,7 +60,7 @@ class TrainingFrame:
         self.total = int(count)
         self.acceleration_rms, self.density_rate_rms = np.sqrt(squares[0] / (3 * count)), np.sqrt(squares[1] / count)
         self._sorted_ids, self._row_of_sorted = torch.sort(particles.id)
-        self._volumes: Tensor | None = None
+        self._volumes: tuple[SmoothingKernel, Tensor] | None = None
 
     def rows(self, ids: np.ndarray) -> Tensor:
         """Rows of those of the given particles that this rank owns."""
@@ -77,12 +77,12 @@ class TrainingFrame:
 
     @torch.no_grad()
     def volumes(self, kernel: SmoothingKernel) -> Tensor:
-        """Volumes (s,) of the particles, ghosts included; collective, and kept for this kernel."""
-        if self._volumes is None:
+        """Volumes (s,) of the particles, ghosts included; collective, and kept until another kernel comes."""
+        if self._volumes is None or self._volumes[0] is not kernel:
             own = self.position[: len(self.particles)]
             pairs = self.surroundings.neighbors.pairs(own, self.position, dtype=self.dtype)
-            self._volumes = self.surroundings.column(volumes(kernel, pairs))
-        return self._volumes
+            self._volumes = kernel, self.surroundings.column(volumes(kernel, pairs))
+        return self._volumes[1]
 
     def errors(self, rows: Tensor | None = None) -> dict[str, Tensor]:
         """Predicted minus true rates at all owned particles or some of their rows; collective."""

@@ -30,10 +30,10 @@ def soft_histogram(comm, values: Tensor, bins: int, reach: float) -> Tensor:
     """Global histogram of `values` (any shape) over [-reach, reach], mass 1, differentiable: (bins,).
 
     Each value spreads its mass linearly over the two nearest bin centres. Values beyond the ends count at the ends, so
-    no mass is lost. Collective.
+    no mass is lost. NaN where a value is NaN. Collective.
     """
     position = (values.flatten().clamp(-reach, reach) + reach) * ((bins - 1) / (2 * reach))
-    lower = position.detach().floor().clamp(max=bins - 2).long()
+    lower = position.detach().nan_to_num().floor().clamp(max=bins - 2).long()
     fraction = position - lower
     counts = torch.zeros(bins, dtype=values.dtype, device=values.device)
     counts = counts.index_add(0, lower, 1 - fraction).index_add(0, lower + 1, fraction)

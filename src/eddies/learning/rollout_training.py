@@ -30,13 +30,13 @@ class TrainingWindow:
     particles : at the start.
     velocity : (frames, n, 3), true velocities at the end of frame intervals 1, 2, ...; rows as in `particles`.
     density : (frames, n), the same for the density.
-    energies : (frames + 1, bands), the kinetic energy by bands of wavenumbers, at the start and then as above.
+    energies : (frames + 1, bands), the kinetic energy by bands of wavenumbers, at the start and then as above; or None.
     """
 
     particles: ParticleSet
     velocity: Tensor
     density: Tensor
-    energies: Tensor
+    energies: Tensor | None = None
 
 
 class RolloutTrainer:
@@ -58,18 +58,19 @@ class RolloutTrainer:
     integrator : of dynamics with fixed ranks.
     windows : on the slabs of the dynamics.
     frame_interval : time between frames. steps_per_frame : time steps in it.
-    energy_weight : of the energies beside the velocity. energies : gives those of particles.
+    energy_weight : of the energies beside the velocity; if it is zero, neither windows nor `energies` give any.
+    energies : gives those of particles.
     noise : standard deviation of what is added to each component of the initial velocities.
     """
 
     def __init__(self, comm, integrator: Integrator, windows: Sequence[TrainingWindow], frame_interval: float,
-                 steps_per_frame: int, energy_weight: float, energies: Callable[[ParticleSet], Tensor], noise: float,
-                 seed: int) -> None:
+                 steps_per_frame: int, energy_weight: float, energies: Callable[[ParticleSet], Tensor] | None,
+                 noise: float, seed: int) -> None:
         self.comm, self.integrator, self.windows = comm, integrator, windows
         self.steps_per_frame, self.time_step = steps_per_frame, frame_interval / steps_per_frame
         self.energy_weight, self.energies, self.noise, self.seed = energy_weight, energies, noise, seed
         self.total = int(global_sum(comm, len(windows[0].particles)))
-        self.losses = mean_losses(windows)
+        self.losses = mean_losses(windows) if energy_weight > 0 else None
 
     def step(self, descent: Descent, step: int, horizon: int) -> dict[str, float]:
         """One optimiser step on windows of `horizon` frames; returns the losses."""

@@ -12,6 +12,7 @@ import torch
 from torch import nn
 
 from eddies.learning.optimization import Descent
+from eddies.parallel.halo import HaloError
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class Phase:
 
 
 class TrainingDiverged(ValueError):
-    """A loss, a gradient or the error on what is held out is no longer finite; the same on all ranks."""
+    """A loss or a gradient is no longer finite, or the error on what is held out never was; the same on all ranks."""
 
 
 class Training:
@@ -54,7 +55,8 @@ class Training:
     phases : in order, each of at least one step.
     patience : validations without a new best after which a phase ends early; None: it never does.
 
-    `history` holds a row for each step. All ranks hold the same state.
+    `history` holds a row for each step, with `start_error` in the first of each phase: the validation error before it.
+    All ranks hold the same state.
     """
 
     def __init__(self, comm, model: nn.Module, phases: Sequence[Phase], patience: int | None = None) -> None:
@@ -90,17 +92,18 @@ class Training:
     def step(self) -> None:
         """One step of the present phase, and the validation that may be due after it."""
         phase, rate = self.phase, self.descent.learning_rate
-        if self.descent.taken == 0:
-            self._validate()
-        row = {"phase": float(self.number), "step": float(len(self.history)), "learning_rate": rate,
+        start = {"start_error": self._validate()} if self.descent.taken == 0 else {}
+        row = {"phase": float(self.number), "step": float(len(self.history)), "learning_rate": rate, **start,
                **phase.take(self.descent, self.descent.taken)}
+        place = f"step {len(self.history)} of the training ({phase.name})"
+        for name in ("loss", "gradient_norm"):
+            if not np.isfinite(row[name]):
+                raise TrainingDiverged(f"{place}: {name} is {row[name]}, at a learning rate of {rate:.3g}")
         last = self.descent.taken == phase.steps
         if last or self.descent.taken % phase.validate_every == 0:
             row["validation_error"] = self._validate()
-        broken = [name for name in ("loss", "gradient_norm", "validation_error") if not np.isfinite(row.get(name, 0.0))]
-        if broken:
-            raise TrainingDiverged(f"step {len(self.history)} of the training ({phase.name}): {broken[0]} is "
-                                   f"{row[broken[0]]}, at a learning rate of {rate:.3g}")
+        if last and self.best_error == np.inf:
+            raise TrainingDiverged(f"{place}: at no time of this phase was the error on what is held out finite")
         row["seconds"] = self._seconds_before + time.perf_counter() - self._started
         self.history.append(row)
         if last or self.patience is not None and self.unimproved >= self.patience:
@@ -130,11 +133,16 @@ class Training:
         self.descent.restore(known["taken"], {name: read(f"descent {name}") for name in known["moments"]})
         columns = {name: read(f"history {name}") for name in known["columns"]}
         rows = zip(*columns.values())
-        self.history = [{name: float(value) for name, value in zip(columns, row) if np.isfinite(value)} for row in rows]
+        self.history = [{name: float(value) for name, value in zip(columns, row) if value == value} for row in rows]
         self._seconds_before = self.history[-1]["seconds"] if self.history else 0.0
 
     def _validate(self) -> float:
-        error = self.phase.validate()
+        """The error on what is held out; infinite where it is no number, or particles outrun their slabs."""
+        try:
+            error = self.phase.validate()
+        except HaloError:
+            error = np.inf
+        error = error if np.isfinite(error) else np.inf
         self.unimproved += 1
         if error < self.best_error:
             self.best_error, self.best, self.unimproved = error, self._weights(), 0

@@ -156,8 +156,13 @@ class ParticleDynamics:
         if rows is not None or torch.is_grad_enabled():
             yield rows
             return
-        together = PAIR_VALUES_TOGETHER[device.type] // max(term.width for term in self.pair_terms)
-        yield from self.surroundings.neighbors.blocks(max(together, 1))
+        yield from self.surroundings.neighbors.blocks(
+            pairs_together(max(term.width for term in self.pair_terms), device))
+
+
+def pairs_together(width: int, device: torch.device) -> int:
+    """How many pairs to take together where `width` numbers are held for each."""
+    return max(PAIR_VALUES_TOGETHER[device.type] // width, 1)
 
 
 def _added(rates: Iterable[dict[str, Tensor]]) -> dict[str, Tensor]:

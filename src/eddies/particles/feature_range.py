@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from eddies.parallel.reduction import global_max, global_min, global_sum
-from eddies.particles.dynamics import PAIR_VALUES_TOGETHER
+from eddies.particles.dynamics import pairs_together
 from eddies.particles.pair_forces import PairModel
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.surroundings import Surroundings
@@ -25,8 +25,8 @@ def pair_features(model: PairModel, surroundings: Surroundings, particles: Parti
     that the model sees.
     """
     local = surroundings.local(particles, set(model.reads))
-    own, together = local.position[: len(particles)], PAIR_VALUES_TOGETHER[local.position.device.type] // model.width
-    for block in surroundings.neighbors.blocks(max(together, 1)):
+    own = local.position[: len(particles)]
+    for block in surroundings.neighbors.blocks(pairs_together(model.width, own.device)):
         yield model.features(surroundings.neighbors.pairs(own, local.position, block, dtype), local.columns)
 
 

@@ -59,7 +59,7 @@ class PairModel(nn.Module):
         case a force with it, to which the pair sum is added (`resolved_factors`); "paper-density": r_rms/n sum_j w
         NN_rho, r_rms the rms of the density rate; "learned-density": -a rho_0 div v + b (c/h) (mean_j rho_j - rho_i)
         + the same flux, with the divergence from moment-corrected differences, the mean weighted by w, and a, b
-        learned.
+        learned through steps of the simulation alone (see `ForceTrainer`): without these they stay where they start.
     eddy_viscosity : "none" (Pi = 0 and no parameters), "two-sided" or "monaghan".
     symmetry : "none", or "antisymmetric", with basis "paper" only: M_i^-1 differs from particle to particle.
     seed : of the initial weights.
@@ -159,7 +159,8 @@ class PairModel(nn.Module):
         outputs = self.network(features)
         push, drag = outputs[0], outputs[1]
         if self.eddy_viscosity != "none":
-            push = push + self.viscosity(features[2], features[4])
+            _, _, distance, _, approach = features
+            push = push + self.viscosity(distance, approach)
         w = moments.weight(pairs.distance, self.cutoff)
         terms = [(w * push) * x, (w * drag) * v]
         if self._needs_moment:

@@ -50,16 +50,18 @@ class GridSolver(Protocol):
 
 @dataclass(frozen=True)
 class ResolvedForce:
-    """The force of a closure at fixed particles, as a function of its factors: constant (n, 3), terms (k, n, 3)."""
+    """The force of a closure at fixed particles, as a function of the factors that are learned, if any are: constant
+    (n, 3), terms (k, n, 3) or None."""
 
     constant: Tensor
-    terms: Tensor
+    terms: Tensor | None
     factors: Callable[[], Tensor]
 
     def at(self, rows: Tensor | slice) -> Tensor:
         """The force (k, 3) on some of the particles; differentiable in the factors."""
-        factors = self.factors().to(self.terms)
-        return self.constant[rows] + torch.tensordot(factors, self.terms[:, rows], 1)
+        if self.terms is None:
+            return self.constant[rows]
+        return self.constant[rows] + torch.tensordot(self.factors().to(self.terms), self.terms[:, rows], 1)
 
 
 class PoissonClosure:
@@ -106,12 +108,16 @@ class PoissonClosure:
         if self.factors is None:
             pressure = _PressureAt.apply(field, particles.position, self.solver)[:, 0]
             return replace(particles, density=self._density(pressure, particles)), None
-        units = torch.eye(len(self.factors()), dtype=torch.float64)
-        none = torch.zeros_like(units[0])
-        pressure, constant = self._pressure_and_force(moving, field, none)
-        terms = [self._pressure_and_force(moving, field, unit)[1] - constant for unit in units]
-        force = ResolvedForce(constant, torch.stack(terms), self.factors)
-        return replace(particles, density=self._density(pressure, particles)), force
+        with torch.enable_grad():
+            factors = self.factors()
+        learned = factors.requires_grad
+        pressure, constant = self._pressure_and_force(moving, field, torch.zeros_like(factors) if learned else factors)
+        terms = None
+        if learned:
+            units = torch.eye(len(factors), dtype=factors.dtype)
+            terms = torch.stack([self._pressure_and_force(moving, field, unit)[1] - constant for unit in units])
+        return replace(particles, density=self._density(pressure, particles)), ResolvedForce(constant, terms,
+                                                                                             self.factors)
 
     def fields(self, particles: ParticleSet, local: LocalParticles) -> dict[str, Tensor]:
         """The "density" (n,) of the owned particles, and of a force the rate "velocity" (n, 3); collective."""

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from eddies.io.hdf5 import open_product
 from eddies.io.weights import save_weights
@@ -18,6 +17,7 @@ from eddies.workflows.a_priori import evaluate, evaluation_frames
 from eddies.workflows.closures import density_closure
 from eddies.workflows.devices import prepare_torch
 from eddies.workflows.model_source import ModelSource, read_source
+from eddies.workflows.trained_model import model_from
 from eddies.workflows.truth import GroundTruth
 
 log = logging.getLogger("eddies")
@@ -62,7 +62,5 @@ def trained_on(scene: Scene, source: ModelSource) -> tuple[dict[str, Any], dict[
 def adopted_model(scene: Scene, source: ModelSource, truth: GroundTruth) -> PairModel:
     """The source's model with the scales of a ground truth and the support of the scene's kernel."""
     support = scene.kernel.support(scene.tracers.particles)
-    model = PairModel.from_description(source.description | {"scales": truth.scales.to_dict(), "support": support})
-    weights = {name: torch.from_numpy(tensor) for name, tensor in source.weights.items()}
-    model.to(next(iter(weights.values())).dtype).load_state_dict(weights)
-    return model
+    description = source.description | {"scales": truth.scales.to_dict(), "support": support}
+    return model_from(description, source.weights, source.path)

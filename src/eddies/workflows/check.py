@@ -138,6 +138,9 @@ def warnings(scene: Scene, ranks: int) -> Iterator[str]:
     if scene.model and scene.model.path and not scene.model.weights_file.is_file():
         yield (f'[model] path = "{scene.model.path}": there is no {scene.model.weights_file} yet, which `eddies train` '
                "will want")
+    if scene.training and scene.model.closure == "learned-density" and not scene.training.horizon_steps:
+        yield ('[model] closure = "learned-density": its rate of density is trained through horizons alone, and stays '
+               "as it starts without them: set [training] horizon_steps")
     if scene.tracers and scene.tracers.width < BOX_LENGTH / scene.flow.cells:
         yield "the filter is narrower than a cell of the grid: it filters nothing"
     if ranks > most:

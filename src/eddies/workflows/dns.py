@@ -15,7 +15,7 @@ from eddies.flow.history import FlowHistory
 from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid
 from eddies.flow.operators import project
 from eddies.flow.spectral_grid import SpectralGrid
-from eddies.io.checkpoint import Checkpoint
+from eddies.io.checkpoint import DIRECTORIES, Checkpoint
 from eddies.io.fields import FieldSeries, FieldWriter
 from eddies.io.hdf5 import create_product, open_product, write_attributes, write_table
 from eddies.parallel.slab import SlabDecomposition
@@ -39,7 +39,7 @@ def run(scene: Scene, comm, directory: str | Path, stop: StopRequest | None = No
     Raises Stopped, after a checkpoint, when `stop` asks for it.
     """
     directory, fingerprint = Path(directory), scene.fingerprint("dns")
-    guard = Guard(comm, directory / "checkpoints", fingerprint, stop or StopRequest(comm))
+    guard = Guard(comm, directory / DIRECTORIES["dns"], fingerprint, stop or StopRequest(comm))
     saved = guard.checkpoints.newest()
     flow = build_run(scene, comm, guard, saved)
     provenance = {"scene": scene.to_toml(), "fingerprint": fingerprint}

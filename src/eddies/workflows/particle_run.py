@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from eddies.io.hdf5 import open_product, read_table
-from eddies.io.weights import load_weights
 from eddies.parallel.broadcast import first_complaint
 from eddies.parallel.halo import HaloError
 from eddies.particles.body_forces import LinearForcing
@@ -25,15 +22,13 @@ from eddies.particles.terms import DensityClosure, PairTerm
 from eddies.particles.wcsph import WCSPH, SummationDensity
 from eddies.scene import Scene, Wcsph
 from eddies.workflows.closures import density_closure
+from eddies.workflows.estimates import ALLOWED_VELOCITY
+from eddies.workflows.trained_model import load_feature_range, load_model
 from eddies.workflows.truth import GroundTruth
-
-log = logging.getLogger("eddies")
 
 # A state is runaway, not turbulence, when a particle is this many times faster, or its density this many times
 # farther from the mean, than the rms of the truth.
 RUNAWAY_SPEED, RUNAWAY_DENSITY = 30.0, 300.0
-# Largest velocity component to be expected of a particle, over the rms: how far it may go within a step.
-PEAK_SPEED = 6.0
 SPH_KERNELS = {"cubic-spline": CubicSpline, "wendland": WendlandC2}
 
 
@@ -107,7 +102,7 @@ def learned_force(scene: Scene, truth: GroundTruth, directory: Path, device: tor
     settings, slab, scales = scene.simulation, truth.decomposition, truth.scales
     dtype = getattr(torch, settings.precision)
     model = load_model(slab.comm, directory / "model.h5", device).to(dtype)
-    drift = PEAK_SPEED * scales.velocity * settings.step
+    drift = ALLOWED_VELOCITY * scales.velocity * settings.step
     closure = density_closure(model, slab, dtype, settings.skin * model.cutoff, drift)
     seen = load_feature_range(slab.comm, directory / "model.h5") if model.pair_terms else None
     return Force(model.pair_terms, closure, RUNAWAY_DENSITY * scales.density,
@@ -138,32 +133,12 @@ def build_dynamics(scene: Scene, truth: GroundTruth, force: Force) -> ParticleDy
 
 
 def injection_rate(scene: Scene, truth: GroundTruth) -> float:
-    """Power per mass of the forcing: as given, or the dissipation rate of the ground truth."""
+    """Power per mass of the forcing: as given, the dissipation rate of the ground truth, or zero."""
+    named = {"none": 0.0, "dissipation": truth.reference["dissipation_rate"]}
     injection = scene.simulation.injection
-    return truth.reference["dissipation_rate"] if injection == "dissipation" else injection
+    return named.get(injection, injection)
 
 
 def forced_below(scene: Scene) -> float:
     """Modes with 0 < |k| < this are forced."""
     return scene.forcing.wavenumber if scene.forcing else 2.0
-
-
-def load_model(comm, path: str | Path, device: torch.device) -> PairModel:
-    """The trained model of a file."""
-    description, tensors = load_weights(comm, path, "model")
-    model = PairModel.from_description(description)
-    model.load_state_dict({name: torch.from_numpy(tensor) for name, tensor in tensors.items()})
-    return model.to(device)
-
-
-def load_feature_range(comm, path: str | Path) -> FeatureRange | None:
-    """The range of what the network of a file was given in training.
-
-    None, and a line in the log, where the file is older than this table.
-    """
-    with open_product(comm, path, "model") as file:
-        if "feature_range" in file:
-            return FeatureRange(**read_table(file, "feature_range"))
-    log.info("rollout: %s holds no feature_range, pairs outside the training range are not counted; `eddies train` "
-             "stores it", path)
-    return None

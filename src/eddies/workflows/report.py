@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from eddies.analysis import (
-    figures_comparison, figures_flow, figures_kernel, figures_mach, figures_model, figures_tracers,
+    figures_comparison, figures_flow, figures_forced, figures_kernel, figures_mach, figures_model, figures_tracers,
     figures_turbulence,
 )
 from eddies.analysis.isotropic_turbulence import StationarySpan
@@ -41,6 +41,7 @@ class Run:
     cost: list[Metric] = field(default_factory=list)
     filter_width: float | None = None
     eulerian: dict[str, np.ndarray] | None = None
+    stationary: StationarySpan | None = None
 
 
 def run(directory: str | Path, comm) -> None:
@@ -95,16 +96,17 @@ def _read_ground_truth(file, record: Run) -> list[Section]:
     reference, statistics = read_attributes(file, "reference"), read_table(file, "statistics")
     sections = [_read_flow(file, record, reference, statistics)]
     if "stationary" in file:
-        sections.append(_read_stationary(file, statistics))
+        sections.append(_read_stationary(file, record, statistics))
     if "particles/tracers" in file:
         found = tracer_statistics(Trajectory(file, "tracers"), record.eulerian, reference["spacing"])
         sections.append(figures_tracers.section(found, reference))
     return sections
 
 
-def _read_stationary(file, statistics: dict[str, np.ndarray]) -> Section:
+def _read_stationary(file, record: Run, statistics: dict[str, np.ndarray]) -> Section:
     try:
-        return figures_turbulence.section(statistics, read_stationary_span(file))
+        record.stationary = read_stationary_span(file)
+        return figures_turbulence.section(statistics, record.stationary)
     except ProductError as error:
         return Section("stationary", "Stationary turbulence", notices=[str(error)])
 
@@ -152,8 +154,12 @@ def _read_rollout(file, record: Run) -> list[Section]:
     model, truth = Trajectory(file, "model"), Trajectory(file, "truth")
     fields = {name: FieldSeries(file, name) for name in ("model", "truth", "filtered")}
     outside = read_table(file, "outside_training")["share"] if "outside_training" in file else None
-    return [figures_comparison.section(figures_comparison.Rollout(
-        attributes, model, truth, fields, model.length, record.filter_width, record.eulerian, outside))]
+    rollout = figures_comparison.Rollout(attributes, model, truth, fields, model.length, record.filter_width,
+                                         record.eulerian, outside)
+    sections = [figures_comparison.section(rollout)]
+    if rollout.forced and record.stationary is not None and record.filter_width is not None:
+        sections.append(figures_forced.section(rollout, record.stationary))
+    return sections
 
 
 def _cost_section(record: Run) -> Section:

@@ -21,7 +21,7 @@ from eddies.scene import BOX_LENGTH, Scene, SceneError
 from eddies.workflows.closures import load_kernel
 from eddies.workflows.devices import prepare_torch
 from eddies.workflows.eulerian_run import EulerianRun
-from eddies.workflows.particle_run import ParticleRun
+from eddies.workflows.particle_run import ParticleRun, injection_rate
 from eddies.workflows.rollout_frames import RolloutFrames
 from eddies.workflows.truth import GroundTruth
 
@@ -72,8 +72,8 @@ def run(scene: Scene, comm, directory: str | Path, stop: StopRequest | None = No
             outcome = roll_out(mover, frames, count, settings.frame_interval, truth, stop or StopRequest(comm))
         write_attributes(file.create_group("rollout"), {
             **outcome, **mover.description(), "force": settings.force, "turnovers": outcome["time"] / turnover,
-            "eddy_turnover_time": turnover, "start_time": float(truth.times[start]), "particles": truth.total,
-            "ranks": comm.size})
+            "injection_rate": injection_rate(scene, truth), "eddy_turnover_time": turnover,
+            "start_time": float(truth.times[start]), "particles": truth.total, "ranks": comm.size})
         for name, columns in mover.series().items():
             write_table(file, name, {"time": frames.times, **columns})
     log.info("rollout: %s after %.2f turnovers, %.3f s/step", outcome["status"], outcome["time"] / turnover,

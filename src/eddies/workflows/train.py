@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 
 from eddies.clock import ProgressLine
-from eddies.io.checkpoint import CheckpointDirectory
+from eddies.io.checkpoint import DIRECTORIES, CheckpointDirectory
 from eddies.io.hdf5 import open_product
 from eddies.io.weights import save_weights
 from eddies.learning.training import Training, TrainingDiverged
@@ -46,7 +46,7 @@ def run(scene: Scene, comm, directory: str | Path, stop: StopRequest | None = No
                  truth.times[last], truth.times[-1], last - data.learned, sum(p.numel() for p in model.parameters()))
         phases = [*data.one_step_phases(), *data.horizon_phases()]
         training = Training(comm, model, phases, scene.training.patience)
-        checkpoints = CheckpointDirectory(comm, directory / "checkpoints-train", scene.fingerprint("train"))
+        checkpoints = CheckpointDirectory(comm, directory / DIRECTORIES["train"], scene.fingerprint("train"))
         take_all_steps(training, checkpoints, stop, LearningCurves(comm, directory / "learning.png"))
         tables = evaluate(truth, model, data.closure, tests, last, data.dtype, device)
         if model.pair_terms:

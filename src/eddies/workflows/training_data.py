@@ -13,6 +13,7 @@ from eddies.learning.losses import relative_error
 from eddies.learning.optimization import Descent
 from eddies.learning.rollout_training import RolloutTrainer, TrainingWindow
 from eddies.learning.training import Phase
+from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.feature_range import FeatureRange, pair_features
 from eddies.particles.integrators import INTEGRATORS
@@ -23,7 +24,7 @@ from eddies.particles.poisson_closure import PoissonClosure
 from eddies.particles.smoothing_kernels import SmoothingKernel
 from eddies.scene import BOX_LENGTH, Scene, SceneError
 from eddies.workflows.closures import density_closure, poisson_closure
-from eddies.workflows.particle_run import PEAK_SPEED
+from eddies.workflows.estimates import ALLOWED_VELOCITY
 from eddies.workflows.truth import GroundTruth, load_frame
 
 # How many validations a phase has, and on how many particles the error of the acceleration is measured.
@@ -99,14 +100,15 @@ class TrainingData:
         if not settings.horizon_steps:
             return []
         interval, slab = scene.tracers.frame_interval, self.truth.decomposition
-        closure, resolution = self._wide_closures(interval)
+        closure, resolution = wide_closures(self.model, slab, self.dtype, interval * self.longest,
+                                            settings.energy_weight > 0)
         dynamics = ParticleDynamics(slab, BOX_LENGTH, self.model.pair_terms, 0.0, closure, self.dtype, fixed_ranks=True)
         starts = np.unique(np.linspace(0, self.learned - self.longest, settings.frames).astype(int))
         windows = [self._window(start, resolution) for start in starts]
         validation = self._window(self.last - self.longest, resolution)
         substeps = round(interval / (settings.horizon_step or interval))
         trainer = RolloutTrainer(slab.comm, INTEGRATORS[settings.horizon_integrator](dynamics), windows, interval,
-                                 substeps, settings.energy_weight, resolution.band_energies,
+                                 substeps, settings.energy_weight, resolution and resolution.band_energies,
                                  settings.noise * self.truth.scales.velocity, scene.seed)
         rates = settings.horizon_learning_rate, settings.final_learning_rate
         every = max(settings.horizon_steps // HORIZON_VALIDATIONS, 1)
@@ -123,18 +125,10 @@ class TrainingData:
 
         return [phase(number, horizon) for number, horizon in enumerate(settings.horizons)]
 
-    def _wide_closures(self, interval: float) -> tuple[PoissonClosure | None, PoissonClosure]:
-        """The closure for particles that stray from their slab during the longest horizon, and one that resolves their
-        velocity, also where the density is learned."""
-        slab, scales = self.truth.decomposition, self.truth.scales
-        drift = PEAK_SPEED * scales.velocity * interval * self.longest
-        return (density_closure(self.model, slab, self.dtype, drift=drift),
-                poisson_closure(slab, scales.sound_speed, self.dtype, drift=drift))
-
     def _frame(self, index: int) -> TrainingFrame:
         return load_frame(self.truth, index, self.model, self.closure, self.dtype, self.device)
 
-    def _window(self, start: int, resolution: PoissonClosure) -> TrainingWindow:
+    def _window(self, start: int, resolution: PoissonClosure | None) -> TrainingWindow:
         columns = {name: torch.from_numpy(column).to(self.device)
                    for name, column in self.truth.window(start, self.longest).items()}
         position, velocity, density = (columns.pop(f"{name}_later").movedim(1, 0).contiguous()
@@ -143,9 +137,20 @@ class TrainingData:
         # Positions are stored within the box; here they go on from where the particles are.
         position = particles.position + PeriodicBox(BOX_LENGTH).displacement(position, particles.position)
         moments = [particles, *(ParticleSet(particles.id, *later) for later in zip(position, velocity, density))]
-        with torch.no_grad():
-            energies = torch.stack([resolution.band_energies(moment) for moment in moments])
+        energies = None
+        if resolution is not None:
+            with torch.no_grad():
+                energies = torch.stack([resolution.band_energies(moment) for moment in moments])
         return TrainingWindow(particles, velocity, density, energies)
+
+
+def wide_closures(model: PairModel, slab: SlabDecomposition, dtype: torch.dtype, time: float,
+                  energies: bool) -> tuple[PoissonClosure | None, PoissonClosure | None]:
+    """The closure of a model for particles that stray from their slab for a time, and one that resolves their velocity,
+    also where the density is learned, if their energies count."""
+    drift = ALLOWED_VELOCITY * model.scales.velocity * time
+    return (density_closure(model, slab, dtype, drift=drift),
+            poisson_closure(slab, model.scales.sound_speed, dtype, drift=drift) if energies else None)
 
 
 def build_model(scene: Scene, truth: GroundTruth, support: float) -> PairModel:

@@ -13,6 +13,7 @@ from typing import Any
 
 from eddies.flow.forcing import ForcingError
 from eddies.flow.stability import FlowDiverged
+from eddies.io.checkpoint import DIRECTORIES
 from eddies.io.hdf5 import ProductError, open_product, product_fingerprint, product_provenance, read_attributes
 from eddies.parallel.broadcast import first_complaint
 from eddies.parallel.halo import HaloError
@@ -25,7 +26,6 @@ log = logging.getLogger("eddies")
 FAILURES = (SceneError, ProductError, HaloError, FlowDiverged, ForcingError)
 # The product of each stage that a variant may have to run.
 PRODUCTS = {"train-kernel": "kernel.h5", "train": "model.h5", "simulate": "rollout.h5"}
-CHECKPOINTS = "checkpoints-train"  # of a training that was stopped
 # Lies in every run directory that a comparison has made: in no other does it remove anything.
 MARK = "made-by-compare.txt"
 MARK_TEXT = "`eddies compare` replaces the products in this directory when it runs again.\n"
@@ -96,8 +96,9 @@ class VariantRun:
         """
         self.directory.mkdir(parents=True, exist_ok=True)
         (self.directory / MARK).write_text(MARK_TEXT, encoding="utf-8")
-        if not resume and (self.directory / CHECKPOINTS).exists():
-            shutil.rmtree(self.directory / CHECKPOINTS)
+        checkpoints = self.directory / DIRECTORIES["train"]
+        if not resume and checkpoints.exists():
+            shutil.rmtree(checkpoints)
         for stage, name in PRODUCTS.items():
             product = self.directory / name
             fits = stage in self.stages and product_fingerprint(product) == self.scene.fingerprint(stage)
