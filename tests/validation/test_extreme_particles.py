@@ -26,6 +26,7 @@ CLOSURES = {
     "poisson, corrected": {},
     "poisson-force, corrected": {"closure": "poisson-force"},
     "poisson-stress, corrected": {"closure": "poisson-stress"},
+    "poisson-stress, none": {"closure": "poisson-stress", "basis": "none"},
     "learned-density, corrected": {"closure": "learned-density", "eddy_viscosity": "monaghan"},
     "paper-density, paper": {"closure": "paper-density", "basis": "paper", "eddy_viscosity": "two-sided"},
 }
@@ -84,7 +85,7 @@ def set_up(comm, model, position, velocity=None, density=None, dtype=torch.float
     density = torch.ones(len(position), dtype=torch.float64) if density is None else density
     slab, particles = distributed(comm, position, velocity, density, planes=PLANES)
     closure = density_closure(model, slab, dtype, skin)
-    return ParticleDynamics(slab, LENGTH, [model.to(dtype)], skin, closure, dtype), particles
+    return ParticleDynamics(slab, LENGTH, model.to(dtype).pair_terms, skin, closure, dtype), particles
 
 
 @torch.no_grad()
