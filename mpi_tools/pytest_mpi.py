@@ -5,10 +5,11 @@
         assert comm.allreduce(1) == comm.size
 
 The pytest process that the user starts (outer) never initialises MPI: Open MPI 4 cannot start mpirun from
-a process that has. It starts one `mpirun -n RANKS python -m pytest MODULE` (inner) for the selected tests of
-a module with the same number of ranks and reports each of them from the JSON lines that every rank writes.
-Where the ranks disagree about a test, or it lasts longer than its time limit, that mpirun ends and a new one
-runs the tests after it. `tmp_path` is one folder for all ranks of a test; `tmp_path_factory` is not shared.
+a process that has. It starts one `mpirun -n RANKS python -m pytest MODULES` (inner) for all selected tests with
+the same number of ranks, as starting ranks takes longer than most tests, and reports each of them from the JSON
+lines that every rank writes. Where the ranks disagree about a test, or it lasts longer than its time limit, that
+mpirun ends and a new one runs the tests after it. So tests run in the order of their ranks. `tmp_path` is one
+folder for all ranks of a test; `tmp_path_factory` is not shared.
 """
 
 import json
@@ -77,31 +78,32 @@ def tmp_path(request, pytestconfig, tmp_path):
     folder = pytestconfig.getoption("--mpi-run")
     if not folder:
         return tmp_path
-    shared = Path(folder, "tmp", "".join(c if c.isalnum() else "-" for c in request.node.name))
+    name = f"{request.node.path.stem}-{request.node.name}"
+    shared = Path(folder, "tmp", "".join(c if c.isalnum() else "-" for c in name))
     shared.mkdir(parents=True, exist_ok=True)
     return shared
 
 
 class OuterRun:
-    """Puts an `MpiItem` in the place of each marked test and keeps the mpirun of the module at hand."""
+    """Puts an `MpiItem` in the place of each marked test and keeps the mpirun of their ranks at hand."""
 
     def __init__(self, config):
         self.config = config
         self.run = None
-        self.waiting = {}  # (module, ranks) -> items still to be reported, in order
+        self.waiting = {}  # ranks -> items still to be reported, in order
 
     @pytest.hookimpl(trylast=True)
     def pytest_collection_modifyitems(self, items):
         items[:] = [MpiItem.replace(item, self) if item.get_closest_marker("mpi") else item for item in items]
         modules = list(dict.fromkeys(item.path for item in items))
-        items.sort(key=lambda item: (modules.index(item.path), getattr(item, "ranks", 0)))
+        items.sort(key=lambda item: (getattr(item, "ranks", 0), modules.index(item.path)))
         for item in items:
             if isinstance(item, MpiItem):
-                self.waiting.setdefault((item.path, item.ranks), []).append(item)
+                self.waiting.setdefault(item.ranks, []).append(item)
 
     def records(self, item) -> list[dict]:
         """Records of all ranks for a test; where no mpirun reaches it, one starts with it."""
-        group = self.waiting[item.path, item.ranks]
+        group = self.waiting[item.ranks]
         del group[:group.index(item)]
         if self.run is None or not self.run.reaches(item):
             self.close()
@@ -162,17 +164,19 @@ class MpiItem(pytest.Item):
 
 
 class RankRun:
-    """One mpirun of tests of one module on a number of ranks."""
+    """One mpirun of tests on a number of ranks."""
 
     def __init__(self, config, ranks: int, items: list[MpiItem]):
         self.ranks, self.items = ranks, list(items)
         self.folder = Path(tempfile.mkdtemp(prefix="pytest-mpi-"))
         (self.folder / "tests.json").write_text(json.dumps({item.nodeid: item.timeout for item in items}))
+        self.read, self.found = [0] * ranks, {}  # bytes of each rank's records, and what they say by event and test
         self.output = open(self.folder / "output", "w+b")
         shown = config.option.capture == "no"
-        inner = [sys.executable, "-m", "pytest", str(items[0].path), f"--mpi-run={self.folder}", "-q",
-                 "--color=no", "-p", "mpi_tools.pytest_mpi", "-p", "no:cacheprovider",
-                 f"--rootdir={config.rootpath}", f"--tb={config.option.tbstyle}",
+        modules = dict.fromkeys(str(item.path) for item in items)
+        inner = [sys.executable, "-m", "pytest", *modules, f"--mpi-run={self.folder}", "-q", "--color=no",
+                 "-p", "mpi_tools.pytest_mpi", "-p", "no:cacheprovider", f"--rootdir={config.rootpath}",
+                 f"--tb={config.option.tbstyle}",
                  *(["-c", str(config.inipath)] if config.inipath else []), *(["-s"] if shown else [])]
         path = [str(Path(__file__).parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
         environment = mpi_environment(ranks) | {"PYTHONPATH": os.pathsep.join(path)}
@@ -183,13 +187,20 @@ class RankRun:
 
     def entries(self, item: MpiItem, event: str) -> dict[int, dict]:
         """What the ranks have written about the "start" or the "end" of a test so far."""
-        found = {}
         for rank in range(self.ranks):
             path = self.folder / f"{rank}.jsonl"
-            for line in path.read_text().splitlines(keepends=True) if path.exists() else ():
-                if line.endswith("\n") and json.loads(line).get(event) == item.nodeid:
-                    found[rank] = json.loads(line)
-        return found
+            if not path.exists():
+                continue
+            with open(path, "rb") as file:
+                file.seek(self.read[rank])
+                for line in file:
+                    if not line.endswith(b"\n"):  # still being written
+                        break
+                    self.read[rank] += len(line)
+                    entry = json.loads(line)
+                    kind = "start" if "start" in entry else "end"
+                    self.found.setdefault((kind, entry[kind]), {})[rank] = entry
+        return self.found.get((event, item.nodeid), {})
 
     def wait(self, item: MpiItem, event: str, ranks: int) -> dict[int, dict]:
         """Entries of the event once so many ranks have written one, or the run has ended."""

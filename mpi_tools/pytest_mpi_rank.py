@@ -1,4 +1,4 @@
-"""The inner half of the plugin `pytest_mpi`: one rank of `mpirun -n RANKS python -m pytest MODULE`."""
+"""The inner half of the plugin `pytest_mpi`: one rank of `mpirun -n RANKS python -m pytest MODULES`."""
 
 import faulthandler
 import json
