@@ -109,7 +109,8 @@ def test_numbers_of_a_known_rollout(comm, tmp_path):
 
 @pytest.mark.mpi(1)
 def test_a_forced_rollout_is_compared_with_the_stationary_state_if_there_is_one(comm, tmp_path):
-    write_run(comm, tmp_path, {"stationary": True}, injection_rate=0.5)
+    write_rollout(comm, tmp_path, injection_rate=0.5)
+    write_ground_truth(comm, tmp_path, stationary=True)
     report.run(tmp_path, comm)
     metrics, page = written(tmp_path)
     assert "The model is forced and the true tracers decay" in page and "forced" in figures(tmp_path)
