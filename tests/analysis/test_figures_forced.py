@@ -67,6 +67,12 @@ def test_frames_after_the_first_broken_one_do_not_count():
     assert found.times.tolist() == [0, 0.5, 1.0] and found.late.tolist() == [1, 2]
 
 
+def test_a_rollout_that_broke_at_once_is_not_compared():
+    run, _, field = rollout(np.array([np.nan, 1.0]))
+    shown = section(run, stationary(field))
+    assert shown.notices == ["It is not compared: the model has no finite frame."] and not shown.metrics
+
+
 def test_only_a_rollout_with_an_injection_is_forced():
     run, *_ = rollout()
     assert run.forced

@@ -50,26 +50,30 @@ class ForcedStatistics:
 
     @classmethod
     def of(cls, run: Rollout, span: StationarySpan) -> "ForcedStatistics":
-        """From a rollout whose filter width is known; the frames before it broke, if it did."""
+        """From a rollout whose filter width is known; the frames before it broke, if it did.
+
+        Raises ValueError if there is no such frame.
+        """
         frames = np.flatnonzero(run.model.times < first_broken_time(run.model))
+        if not len(frames):
+            raise ValueError("the model has no finite frame")
         times = run.model.times[frames]
         late = frames[times >= times[-1] / 2]
         energy = np.array([0.5 * np.mean(np.sum(run.model.read(frame, "velocity") ** 2, axis=1)) for frame in frames])
         shells = np.arange(span.spectra.shape[1])
-        filtered = span.spectra * np.exp(-((shells * run.filter_width) ** 2) / 12)
+        transfer = np.exp(-((shells * run.filter_width) ** 2) / 12)
         wavenumber, spectrum = mean_spectrum(run.fields["model"], times[len(times) - len(late):])
         start = run.model.times[:1]
         # What the kernel makes of a filtered field, shell by shell: both reconstructions are attenuated alike.
         _, through_kernel = mean_spectrum(run.fields["truth"], start)
         _, unsmoothed = mean_spectrum(run.fields["filtered"], start)
         resolved = slice(0, min(len(wavenumber), len(shells)))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            attenuation = np.nan_to_num(through_kernel / unsmoothed)[resolved]
+        attenuation = np.divide(through_kernel, unsmoothed, out=np.zeros_like(unsmoothed), where=unsmoothed > 0)
         accelerations = [run.model.read(frame, "acceleration") for frame in late]
         flow = {name: run.truth.read(0, name) for name in ("velocity", "acceleration", "velocity_gradient")}
         return cls(
-            times, energy, late, span.average(filtered.sum(1)), wavenumber[resolved], spectrum[resolved],
-            attenuation * (span.spectrum * np.exp(-((shells * run.filter_width) ** 2) / 12))[resolved],
+            times, energy, late, span.average(span.spectra @ transfer), wavenumber[resolved], spectrum[resolved],
+            attenuation[resolved] * (transfer * span.spectrum)[resolved],
             np.concatenate([standardized(run.model.read(frame, "velocity")) for frame in late]),
             standardized(flow["velocity"]),
             np.concatenate([standardized(acceleration) for acceleration in accelerations]),
@@ -114,13 +118,17 @@ def _normalized(gradient: np.ndarray) -> np.ndarray:
 
 def section(run: Rollout, span: StationarySpan) -> Section:
     """A forced rollout beside the stationary state of a ground truth whose filter width is known."""
-    found, turnover = ForcedStatistics.of(run, span), run.turnover
+    title = "Forced rollout beside the stationary state"
+    try:
+        found, turnover = ForcedStatistics.of(run, span), run.turnover
+    except ValueError as error:
+        return Section("forced", title, notices=[f"It is not compared: {error}."])
     half = run.filter_wavenumber / 2
     (energy, deviation), (flow_energy, flow_deviation) = found.late_energy, found.flow_energy
     error = spectrum_error(found.wavenumber, found.spectrum, found.flow_spectrum, max(1.0, half))
     begin = run.model.times[found.late[0]]
     shown = Section(
-        "forced", "Forced rollout beside the stationary state",
+        "forced", title,
         f"The model is forced with a power of {float(run.attributes['injection_rate']):.3g} a mass. Its averages, from "
         f"{begin / turnover:.3g} to {found.times[-1] / turnover:.3g} T, beside those of the filtered flow over the "
         f"{span.turnovers:.3g} turnovers in which it was stationary. PDFs are compared with those of the true tracers "
