@@ -105,6 +105,9 @@ def test_errors_that_are_no_numbers_are_no_best_and_nothing_else(comm):
     errors = iter([np.nan] * 4)
     with pytest.raises(TrainingDiverged, match=r"step 5 of the training \(phase 0\): at no time .* finite"):
         finished(training_of(comm, validate, steps=(6,)))
+    errors = iter([np.nan] * 3)
+    with pytest.raises(TrainingDiverged, match="step 3 of the training"):
+        finished(training_of(comm, validate, patience=3, steps=(20,)))
 
 
 @pytest.mark.mpi(1)

@@ -102,11 +102,12 @@ class Training:
         last = self.descent.taken == phase.steps
         if last or self.descent.taken % phase.validate_every == 0:
             row["validation_error"] = self._validate()
-        if last and self.best_error == np.inf:
+        over = last or self.patience is not None and self.unimproved >= self.patience
+        if over and self.best_error == np.inf:
             raise TrainingDiverged(f"{place}: at no time of this phase was the error on what is held out finite")
         row["seconds"] = self._seconds_before + time.perf_counter() - self._started
         self.history.append(row)
-        if last or self.patience is not None and self.unimproved >= self.patience:
+        if over:
             self._load(self.best)
             self._begin(self.number + 1)
 
