@@ -12,9 +12,9 @@ from eddies.analysis.figures_comparison import Rollout
 from eddies.analysis.isotropic_turbulence import StationarySpan
 from eddies.analysis.page import Metric, Section
 from eddies.analysis.pdfs import bin_probabilities, gaussian, kl_divergence, pdf, standardized
-from eddies.analysis.rollout_comparison import EDGES, Frames, first_broken_time
+from eddies.analysis.rollout_comparison import EDGES, Frames, first_broken_time, normalized_invariants
 from eddies.analysis.spectra import energy_spectrum, spectrum_error
-from eddies.analysis.velocity_gradients import InvariantBins, enstrophy_scale, invariants
+from eddies.analysis.velocity_gradients import InvariantBins, enstrophy_scale
 
 
 @dataclass(frozen=True)
@@ -104,16 +104,9 @@ def mean_spectrum(fields: Frames, times: np.ndarray) -> tuple[np.ndarray, np.nda
 
 def invariant_divergence(model: Sequence[np.ndarray], flow: np.ndarray) -> float:
     """Forward KL divergence of the joint PDFs of Q and R, of all frames of the model together."""
-    planes = [_normalized(gradient) for gradient in model]
-    bins = InvariantBins.covering(*_normalized(flow))
-    return kl_divergence(bins.probabilities(*_normalized(flow)), bins.probabilities(*np.concatenate(planes, axis=1)))
-
-
-def _normalized(gradient: np.ndarray) -> np.ndarray:
-    """Q and R (2, n) in units of <Q_w>."""
-    second, third = invariants(gradient)
-    scale = enstrophy_scale(gradient)
-    return np.stack([second / scale, third / scale**1.5])
+    true_plane, *planes = (normalized_invariants(gradient, enstrophy_scale(gradient)) for gradient in (flow, *model))
+    bins = InvariantBins.covering(*true_plane)
+    return kl_divergence(bins.probabilities(*true_plane), bins.probabilities(*np.concatenate(planes, axis=1)))
 
 
 def section(run: Rollout, span: StationarySpan) -> Section:

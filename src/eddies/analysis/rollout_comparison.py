@@ -157,14 +157,15 @@ def invariant_statistics(model: Frames, truth: Frames, common: CommonFrames) -> 
     """
     last = particle_pair(model, truth, common, common.times.size - 1, "velocity_gradient")
     scale = enstrophy_scale(last.truth)
-    model_plane, truth_plane = (_normalized_invariants(run, scale) for run in (last.model, last.truth))
+    model_plane, truth_plane = (normalized_invariants(run, scale) for run in (last.model, last.truth))
     bins = InvariantBins.covering(*truth_plane)
     flows = _conditional_flows(model, truth, common, bins) if common.times.size > 1 else (None, None)
     probabilities = bins.probabilities(*model_plane), bins.probabilities(*truth_plane)
     return InvariantStatistics(bins, *probabilities, *flows)
 
 
-def _normalized_invariants(gradient: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
+def normalized_invariants(gradient: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """Q and R (n,) of velocity gradients (n, 3, 3) in units of <Q_w> = `scale`."""
     second, third = invariants(gradient)
     return second / scale, third / scale**1.5
 
