@@ -17,6 +17,7 @@ LAYERS = (
     (("scene*", "comparison*"), ("clock*",), ("time_stepping*",)),
     (("parallel*",),),
     (("io*",),),
+    (("spectral*",),),
     (("flow*",), ("particles*",)),
     (("learning*",), ("analysis*",)),
     (("workflows*",),),
@@ -27,7 +28,7 @@ LAYERS = (
 ONLY_IN = {
     "mpi4py*": ("parallel*", "io*", "cli"),
     "h5py*": ("io*",),
-    "pyfftw*": ("flow*",),
+    "pyfftw*": ("spectral*",),
     "torch*": ("particles*", "learning*", "workflows*"),
     "matplotlib*": ("analysis.figures*", "workflows.report", "workflows.compare"),
     "eddies.analysis.figures*": ("analysis.figures*", "workflows.report", "workflows.compare", "workflows.train"),

@@ -23,10 +23,10 @@ from statistics import median
 import numpy as np
 from mpi4py import MPI
 
-from eddies.flow.fourier_passes import PlanePass
+from eddies.spectral.fourier_passes import PlanePass
 from eddies.flow.initial_fields import balanced_density, random_velocity
 from eddies.flow.navier_stokes import CompressibleFluid
-from eddies.flow.spectral_grid import Collector, SpectralGrid
+from eddies.spectral.spectral_grid import Collector, SpectralGrid
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.transpose import TransposeBuffers
 from eddies.time_stepping import ETDRK4

@@ -15,7 +15,7 @@ import numpy as np
 from mpi4py import MPI
 from mpi4py_fft import PFFT, newDistArray
 
-from eddies.flow.spectral_grid import SpectralGrid
+from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.parallel.slab import SlabDecomposition
 
 REPEATS = 15

@@ -6,7 +6,7 @@ from eddies.flow.forcing import ForcingError, LinearForcing
 from eddies.flow.history import FlowHistory
 from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid
 from eddies.flow.operators import divergence, gradient
-from eddies.flow.spectral_grid import SpectralGrid
+from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.flow.statistics import compressible_budget, gradient_moments
 from eddies.clock import Clock
 from eddies.parallel.migration import Redistribution

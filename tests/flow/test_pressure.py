@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from eddies.flow.interpolation import SplineInterpolation
+from eddies.spectral.interpolation import SplineInterpolation
 from eddies.flow.pressure import PressureSolver
-from eddies.flow.spectral_grid import SpectralGrid
+from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 

@@ -6,7 +6,7 @@ from eddies.flow.forcing import LinearForcing
 from eddies.flow.history import FlowHistory
 from eddies.flow.initial_fields import balanced_density, random_velocity
 from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid
-from eddies.flow.spectral_grid import SpectralGrid
+from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.flow.stability import (
     GROWTH, IMAGINARY_REACH, REAL_REACH, FlowDiverged, StabilityWatch, advice, quadratic_energy, step_limits,
 )

@@ -3,8 +3,8 @@ import pytest
 
 from eddies.flow import initial_fields
 from eddies.flow.filtering import gaussian_transfer
-from eddies.flow.interpolation import SplineInterpolation
-from eddies.flow.spectral_grid import SpectralGrid
+from eddies.spectral.interpolation import SplineInterpolation
+from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.flow.tracers import FilteredField, TracerParticles, lattice_positions, random_positions, release
 from eddies.parallel.migration import IdOrder, census
 from eddies.parallel.reduction import global_max

@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from eddies.flow import initial_fields
-from eddies.flow.interpolation import SplineInterpolation
+from eddies.spectral.interpolation import SplineInterpolation
 from eddies.flow.operators import pressure
 from eddies.flow.pressure import PressureSolver
-from eddies.flow.spectral_grid import SpectralGrid
+from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.flow.tracers import release
 from eddies.parallel.halo import HaloError
 from eddies.parallel.migration import IdOrder, migrate

@@ -5,7 +5,7 @@ import numpy as np
 from eddies.flow import initial_fields
 from eddies.flow.forcing import LinearForcing
 from eddies.flow.navier_stokes import CompressibleFluid
-from eddies.flow.spectral_grid import SpectralGrid
+from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.parallel.slab import SlabDecomposition
 from eddies.time_stepping import STEPPERS
 

@@ -22,7 +22,7 @@ from eddies.clock import ProgressLine
 from eddies.flow import initial_fields
 from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid, advective_speed
 from eddies.flow.operators import project
-from eddies.flow.spectral_grid import SpectralGrid
+from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.flow.statistics import compressible_budget, energy_spectrum, gradient_moments, turbulence_scales
 from eddies.logs import configure_logging
 from eddies.parallel.reduction import global_max

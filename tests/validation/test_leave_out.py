@@ -9,7 +9,7 @@ import torch
 from eddies.flow import initial_fields
 from eddies.flow.forcing import LinearForcing
 from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid
-from eddies.flow.spectral_grid import SpectralGrid
+from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.learning import force_training
 from eddies.learning.force_training import ForceTrainer, LossWeights, TrainingFrame
 from eddies.learning.optimization import Descent

@@ -5,7 +5,7 @@ import pytest
 
 from eddies.analysis.tracer_statistics import tracer_statistics
 from eddies.flow import initial_fields
-from eddies.flow.spectral_grid import SpectralGrid
+from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.flow.statistics import energy_spectrum
 from eddies.flow.tracers import FilteredField, TracerParticles, release
 from eddies.parallel.slab import SlabDecomposition

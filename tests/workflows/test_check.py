@@ -83,8 +83,8 @@ def test_expected_step_is_the_one_taken_at_the_start(comm):
 @pytest.mark.mpi(1, 2, 3, 4)
 @pytest.mark.parametrize("neighbors, most", [(56, 4), (100, 3)])
 def test_most_ranks_is_what_the_parts_accept(comm, neighbors, most):
-    from eddies.flow.interpolation import SplineInterpolation
-    from eddies.flow.spectral_grid import SpectralGrid
+    from eddies.spectral.interpolation import SplineInterpolation
+    from eddies.spectral.spectral_grid import SpectralGrid
     from eddies.parallel.halo import HaloError, require_thick_slabs
     from eddies.parallel.slab import SlabDecomposition
     from eddies.scene import BOX_LENGTH

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from eddies.flow.spectral_grid import SpectralGrid
+from eddies.spectral.spectral_grid import SpectralGrid
 
 BLOCK_BYTES = 2**16  # of one component: a state, its result and the factors then fit a second-level cache
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from eddies.flow.spectral_grid import SpectralGrid
+from eddies.spectral.spectral_grid import SpectralGrid
 
 
 def gradient(grid: SpectralGrid, scalar: np.ndarray) -> np.ndarray:

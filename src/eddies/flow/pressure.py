@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from eddies.flow.interpolation import SplineInterpolation
+from eddies.spectral.interpolation import SplineInterpolation
 from eddies.flow.operators import (
     divergence, gradient, gradient_stress_divergence, gradient_stress_divergence_adjoint, pressure, pressure_adjoint,
     project,
 )
-from eddies.flow.spectral_grid import SpectralGrid
+from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from eddies.flow.operators import dot_wavevector
-from eddies.flow.spectral_grid import SpectralGrid
+from eddies.spectral.spectral_grid import SpectralGrid
 
 
 class Smagorinsky:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from eddies.flow.filtering import gaussian_transfer
-from eddies.flow.interpolation import SplineInterpolation
-from eddies.flow.spectral_grid import SpectralGrid
+from eddies.spectral.interpolation import SplineInterpolation
+from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.parallel.migration import id_block, migrate, wrap
 from eddies.parallel.slab import SlabDecomposition
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from eddies.flow.interpolation import SplineInterpolation
+from eddies.spectral.interpolation import SplineInterpolation
 from eddies.flow.operators import gradient
-from eddies.flow.spectral_grid import SpectralGrid
+from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.learning.force_training import TrainingFrame
 from eddies.learning.losses import relative_error
 from eddies.parallel.migration import IdOrder, migrate

@@ -14,7 +14,7 @@ from eddies.flow.forcing import LinearForcing
 from eddies.flow.history import FlowHistory
 from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid
 from eddies.flow.operators import project
-from eddies.flow.spectral_grid import SpectralGrid
+from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.io.checkpoint import DIRECTORIES, Checkpoint
 from eddies.io.fields import FieldSeries, FieldWriter
 from eddies.io.hdf5 import create_product, open_product, write_attributes, write_table

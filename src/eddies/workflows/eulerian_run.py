@@ -14,7 +14,7 @@ from eddies.flow.forcing import LinearForcing
 from eddies.flow.initial_fields import balanced_density
 from eddies.flow.navier_stokes import CompressibleFluid
 from eddies.flow.operators import gradient
-from eddies.flow.spectral_grid import SpectralGrid, restrict
+from eddies.spectral.spectral_grid import SpectralGrid, restrict
 from eddies.flow.stability import quadratic_energy
 from eddies.flow.subgrid import Smagorinsky
 from eddies.flow.tracers import FilteredField, TracerParticles

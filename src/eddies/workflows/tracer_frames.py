@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from eddies.clock import Clock
-from eddies.flow.spectral_grid import SpectralGrid, restrict
+from eddies.spectral.spectral_grid import SpectralGrid, restrict
 from eddies.flow.statistics import energy_spectrum
 from eddies.flow.tracers import TracerParticles
 from eddies.io.checkpoint import Checkpoint

@@ -10,7 +10,7 @@ import torch
 
 from eddies.clock import ProgressLine
 from eddies.flow.operators import gradient
-from eddies.flow.spectral_grid import SpectralGrid
+from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.io.hdf5 import open_product
 from eddies.io.weights import save_weights
 from eddies.learning.kernel_training import KernelLossWeights, KernelSample, KernelTrainer

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from eddies.flow.spectral_grid import SpectralGrid
+from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.parallel.halo import HaloError
 from eddies.parallel.plane_halo import PlaneHalo
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from eddies.flow.fourier_passes import ColumnPass, PlanePass
+from eddies.spectral.fourier_passes import ColumnPass, PlanePass
 from eddies.parallel.migration import Redistribution
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from eddies.flow.spectral_grid import SpectralGrid, restrict
+from eddies.spectral.spectral_grid import SpectralGrid, restrict
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.transpose import TransposeBuffers
 
