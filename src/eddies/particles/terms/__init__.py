@@ -1,0 +1,1 @@
+"""The terms of a particle model, a file each. Nothing here is imported before a scene or a program names it."""

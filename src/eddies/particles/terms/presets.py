@@ -1,0 +1,39 @@
+"""Lists of terms that go by a name, each with the settings that make it what it is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+#: Where the words of a scene's [model] terms lead: class of the term, and class of its settings.
+TERMS = {
+    word: (f"eddies.particles.terms.{module}:{name}", f"eddies.particles.terms.settings:{name}")
+    for word, module, name in (
+        ("pairs", "pair_network", "PairNetwork"),
+        ("eddy-viscosity", "eddy_viscosity", "EddyViscosity"),
+        ("density-flux", "density_flux", "DensityFlux"),
+        ("density-transport", "density_transport", "DensityTransport"),
+        ("pressure", "pressure", "Pressure"),
+        ("stress", "stress", "Stress"),
+        ("viscosity", "viscosity", "Viscosity"),
+        ("damping", "damping", "Damping"),
+        ("relaxation", "relaxation", "Relaxation"),
+        ("forcing", "forcing", "Forcing"),
+        ("summation-density", "summation_density", "SummationDensity"),
+        ("wcsph", "wcsph", "WCSPH"),
+    )
+}
+
+RESOLVED = ("pressure", "stress", "damping", "relaxation")
+
+#: Of each preset the settings that differ from the terms' own, by term, in the order of the terms.
+PRESETS: dict[str, dict[str, Mapping[str, Any]]] = {
+    "poisson-stress": dict.fromkeys((*RESOLVED, "pairs"), {}),
+    "resolved": dict.fromkeys(RESOLVED, {}),
+    "poisson-force": {"pressure": {}, "pairs": {}},
+    "poisson": {"pressure": {"force": False}, "pairs": {}},
+    "learned-density": {"pairs": {}, "density-flux": {"zero_at_first": True}, "density-transport": {}},
+    "paper-density": {"pairs": {"basis": "paper", "hidden": (20, 100, 20)}, "density-flux": {"hidden": (20, 100, 20)}},
+    "wcsph": {"summation-density": {}, "wcsph": {}},
+}
+DEFAULT_PRESET = "poisson-stress"

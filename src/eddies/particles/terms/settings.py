@@ -1,0 +1,158 @@
+"""What a scene can say of each term, and what each term reads: known without torch, so that a scene can be read and
+checked where no particle is computed.
+
+A class of settings is a frozen dataclass whose fields declare their keys as those of a scene's sections do.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from eddies.scene_values import boolean, choice, integers, number, text, texts
+
+#: What a network can be told of a pair, in units of the flow: the densities of both, |x|, |v| and x.v.
+INPUTS = ("density", "distance", "speed", "approach")
+BASES = ("corrected", "paper")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TermSettings:
+    """The keys of [model.NAME], and what a term that is set so declares.
+
+    reads : of "pairs" (neighbours within the interaction radius), "resolved" (the velocity that a grid resolves of the
+        particles'), "density" (so that it is computed, stored, and wanted of the ground truth). What no term reads is
+        not built.
+    gives : of "acceleration", "density" (a part of it) and "density_rate".
+    learns_through_horizons : its parameters are trained through several steps of the simulation alone.
+    """
+
+    reads = ()
+    gives = ("acceleration",)
+    learns_through_horizons = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkSettings(TermSettings):
+    """A network of the invariants of a pair."""
+
+    hidden: tuple[int, ...] = integers("widths of the network's layers", default=(16, 16), at_least=1)
+    inputs: tuple[str, ...] = texts("what the network is told of a pair", *INPUTS, default=INPUTS)
+    network: str = text('"dense", or the import path of a class', default="dense", path=True)
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """Pairs, and with that input the density."""
+        return ("pairs", "density") if "density" in self.inputs else ("pairs",)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairNetwork(NetworkSettings):
+    """The learned pair force, Eqs. 3 and 4."""
+
+    basis: str = choice("of the sum over pairs; corrected: times the inverse moment matrix", *BASES,
+                        default="corrected")
+    symmetry: str = choice("antisymmetric: pairs get opposite forces, which keep the momentum; with basis paper only",
+                           "none", "antisymmetric", default="none")
+
+
+@dataclass(frozen=True, kw_only=True)
+class EddyViscosity(TermSettings):
+    """Explicit eddy viscosity between pairs, the term Pi of Eq. 3."""
+
+    form: str = choice("two-sided: of all pairs; monaghan: of approaching ones", "two-sided", "monaghan",
+                       default="two-sided")
+    basis: str = choice("of the sum over pairs, as of the pair network", *BASES, default="corrected")
+
+    reads = ("pairs",)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DensityFlux(NetworkSettings):
+    """The paper's rate of density: a learned flux between pairs."""
+
+    zero_at_first: bool = boolean("begin without flux", default=False)
+
+    gives = ("density_rate",)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DensityTransport(TermSettings):
+    """A rate of density from the divergence of the velocity and from relaxation to the neighbours' density."""
+
+    reads = ("pairs", "density")
+    gives = ("density_rate",)
+    learns_through_horizons = True
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pressure(TermSettings):
+    """The pressure of the resolved velocity: the density that belongs to it, and its force."""
+
+    force: bool = boolean("whether -grad p acts on the particles", default=True)
+
+    reads = ("resolved",)
+
+    @property
+    def gives(self) -> tuple[str, ...]:
+        """The density, and the force unless it is left out."""
+        return ("acceleration", "density") if self.force else ("density",)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stress(TermSettings):
+    """The stress that the filter hides, by the gradient model, and its pressure."""
+
+    reads = ("resolved",)
+    gives = ("acceleration", "density")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Viscosity(TermSettings):
+    """Molecular viscosity of the resolved velocity."""
+
+    reads = ("resolved",)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Damping(TermSettings):
+    """Spectral eddy damping of the resolved velocity, learned as a function of the wavenumber."""
+
+    reads = ("resolved",)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Relaxation(TermSettings):
+    """Relaxation of the particles' velocity to what the grid resolves of it."""
+
+    reads = ("resolved",)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Forcing(TermSettings):
+    """Linear forcing of the large scales at a prescribed power."""
+
+    injection_rate: float = number("power injected per unit mass", at_least=0)
+    wavenumber: float = number("modes with 0 < |k| < this are forced", default=2.0, above=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SummationDensity(TermSettings):
+    """The density of smoothed particle hydrodynamics: a sum over the neighbours."""
+
+    kernel: str = choice("smoothing kernel", "cubic-spline", "wendland", default="cubic-spline")
+
+    reads = ("pairs",)
+    gives = ("density",)
+
+
+@dataclass(frozen=True, kw_only=True)
+class WCSPH(TermSettings):
+    """Pressure and artificial viscosity of weakly compressible smoothed particle hydrodynamics."""
+
+    kernel: str = choice("smoothing kernel", "cubic-spline", "wendland", default="cubic-spline")
+    alpha: float = number("linear coefficient of the artificial viscosity", default=1.0, at_least=0)
+    beta: float = number("quadratic coefficient of the artificial viscosity", default=2.0, at_least=0)
+    exponent: float = number("gamma of the pressure c^2 rho_0 / gamma ((rho / rho_0)^gamma - 1)", default=1.0,
+                             at_least=1)
+
+    reads = ("pairs", "density")
