@@ -13,7 +13,7 @@ from eddies.particles.pairs import Pairs
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.periodic_box import PeriodicBox
 from eddies.particles.surroundings import LocalParticles, Surroundings
-from eddies.particles.terms import BodyTerm, DensityClosure, MutualPairTerm, PairTerm
+from eddies.particles.term_protocols import BodyTerm, DensityClosure, MutualPairTerm, PairTerm
 
 # Numbers held at once while pairs are summed without a gradient: about a core's cache, or a part of a
 # device's memory.

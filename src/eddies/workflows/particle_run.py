@@ -18,7 +18,7 @@ from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.pair_forces import PairModel
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.smoothing_kernels import CubicSpline, WendlandC2
-from eddies.particles.terms import DensityClosure, PairTerm
+from eddies.particles.term_protocols import DensityClosure, PairTerm
 from eddies.particles.wcsph import WCSPH, SummationDensity
 from eddies.scene import Scene, Wcsph
 from eddies.workflows.closures import density_closure
