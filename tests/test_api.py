@@ -1,5 +1,6 @@
 """The Python face: what `import eddies` brings, and a rollout set going from a program."""
 
+import logging
 import subprocess
 import sys
 from dataclasses import replace
@@ -48,6 +49,18 @@ def test_a_flow_from_a_program(comm, tmp_path):
     comm.Barrier()
     eddies.run(replace(scene, title="another"), output=tmp_path, resume=True, comm=comm)
     assert (tmp_path / "ground_truth.h5").stat().st_mtime_ns == before
+
+
+@pytest.mark.mpi(1, 2)
+def test_classes_of_the_users_are_told_once(comm, tmp_path, own, caplog, monkeypatch):
+    own("own_start", "from eddies.flow.initial_fields import abc\n"
+        "def twice(grid, initial, seed):\n    return abc(grid, 2 * initial.amplitude, 1)\n")
+    scene = eddies.load_scene("abc", ["time.duration=0.1", "initial.kind=own_start:twice"])
+    monkeypatch.setattr(logging.getLogger("eddies"), "propagate", True)
+    with caplog.at_level(logging.INFO, logger="eddies"):
+        eddies.run(scene, output=tmp_path, comm=comm)
+    told = [record.getMessage() for record in caplog.records if "own_start" in record.getMessage()]
+    assert told == ["abc: uses classes that are not of this package: own_start:twice"]
 
 
 @pytest.mark.mpi(1)

@@ -258,6 +258,24 @@ def test_keys_of_an_own_initial_flow():
     assert (initial.amplitude, initial.wavenumber) == (2.0, 3)
 
 
+@pytest.mark.parametrize("needs", ["'model'", "('pressure',)"])
+def test_a_method_needs_what_there_is(own, needs):
+    own("own_run", f"class Run:\n    needs = {needs}\n    steps = advance = frame = series = description = None\n")
+    refused('[simulation] method: "own_run:Run": needs = ',
+            lambda: load_scene("tiny", ["simulation.method=own_run:Run"]))
+
+
+def test_the_command_line_is_named_as_the_origin_of_a_terms_key():
+    refused("tiny.toml, --set: [model.pairs] hidden = 3: ", lambda: load_scene("tiny", ["model.pairs.hidden=3"]))
+
+
+def test_a_key_that_a_term_must_have(tmp_path):
+    text = COMPRESSIBLE + '[model]\nterms = ["pressure", "forcing"]\n'
+    refused("[model.forcing] injection_rate: this key is missing (power injected per unit mass); give it a number at "
+            "least 0", lambda: read(tmp_path, text))
+    assert read(tmp_path, text, "model.forcing.injection_rate=1").model.settings["forcing"].wavenumber == 2.0
+
+
 def test_what_methods_need():
     assert Simulation(step=1, turnovers=1, frame_interval=1).needs == ("model",)
     needs = {method: Simulation(method=method, step=1, turnovers=1, frame_interval=1).needs
