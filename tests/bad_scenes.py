@@ -2,6 +2,8 @@
 
 FLOW = '[flow]\nfluid = "incompressible"\ncells = 16\nviscosity = 0.1\n'
 TIME = "[time]\nduration = 1\n"
+LEARNING = "[tracers]\nparticles_per_side = 8\nturnovers = 1\nframe_interval = 1\n[kernel]\nsteps = 3\n"
+MODEL = "[training]\nframes = 2\nbatch = 9\nsteps = 3\n[model]\n"
 
 BAD_TEXTS = [
     (TIME, "[flow]: this section is missing"),
@@ -17,12 +19,17 @@ BAD_TEXTS = [
     (FLOW + TIME + "[kernel]\nsteps = 3\n", "[kernel]: needs a section [tracers]"),
     (FLOW + TIME + "[simulation]\nstep = 1\nturnovers = 1\nframe_interval = 1\n",
      "[simulation]: needs a section [model]"),
-    (FLOW + '[tracers]\nparticles_per_side = 8\nturnovers = 1\nframe_interval = 1\n[kernel]\nsteps = 3\n'
-     '[simulation]\nforce = "none"\nstep = 1\nturnovers = 1\nframe_interval = 1\n',
-     "[simulation]: starts from the density, which an incompressible flow does not have"),
+    (FLOW + LEARNING + '[simulation]\nmethod = "wcsph"\nstep = 1\nturnovers = 1\nframe_interval = 1\n',
+     '[simulation] method = "wcsph": starts from the density, which an incompressible flow does not have; choose another, '
+     'or set [flow] fluid = "compressible" and sound_speed'),
+    (FLOW + LEARNING + MODEL, '[model.pairs]: reads the density, which an incompressible flow does not have; leave '
+     '"density" out of [model.pairs] inputs, or set [flow] fluid = "compressible" and sound_speed'),
+    (FLOW + LEARNING + MODEL + 'terms = ["eddy-viscosity", "density-transport"]\n',
+     '[model.density-transport]: reads the density, which an incompressible flow does not have; remove '
+     '"density-transport", or set [flow] fluid'),
     (FLOW + "[tracers]\nparticles_per_side = 12\nturnovers = 1\nframe_interval = 1\n",
      "[tracers] field_cells = 18 (from particles_per_side): must be at most [flow] cells = 16"),
-    (FLOW + "[tracers]\nparticles_per_side = 8\nturnovers = 1\nframe_interval = 1\n[kernel]\nsteps = 3\n[model]\n",
+    (FLOW + LEARNING + "[model]\n",
      "[model]: needs a section [training], which the scene lacks; add it, give [model] path"),
 ]
 
@@ -38,7 +45,8 @@ BAD_OVERRIDES = [
     ("flow.fluid=incompressible", "an incompressible fluid has none; remove it or set fluid"),
     ("flow=3", "flow = 3: must be a section"),
     ("flow.cells", "must be section.key=value"),
-    ("flow.a.b=3", "must be section.key=value"),
+    ("flow.a.b=3", "[flow] a: no such key"),
+    ("model.pairs.hidden.first=3", "must be section.key=value"),
     ("seed.x=3", "seed is a value, not a section"),
     ("device=tpu", 'device = "tpu": must be one of "cpu", "cuda"'),
     ("initial.path=a.h5", "[initial] path = a.h5: only read with kind = file"),
@@ -53,12 +61,27 @@ BAD_OVERRIDES = [
     ("kernel.neighbors=2000", "half the cube is 3.14; lower neighbors or raise [tracers] particles_per_side"),
     ("kernel.hidden=[]", "must be a list such as [16, 16]"),
     ("kernel.hidden=16", "must be a list such as [16, 16]"),
-    ("model.hidden=[16, 0]", "each at least 1"),
-    ("model.closure=wide", '[model] closure = "wide": must be one of "poisson", "poisson-force", "poisson-stress", '
-     '"learned-density", "paper-density"'),
-    ("model.eddy_viscosity=smagorinsky", 'must be one of "none", "two-sided", "monaghan"'),
-    ("model.symmetry=odd", '[model] symmetry = "odd": must be one of "none", "antisymmetric"'),
-    ("model.symmetry=antisymmetric", 'with basis = "corrected" the forces of a pair are not opposite'),
+    ("model.hidden=[16]", "[model] hidden: no such key; valid here: preset, terms, path"),
+    ("model.closure=poisson", "[model] closure: no such key; valid here: preset, terms, path"),
+    ("model.preset=wide", '[model] preset = "wide": must be one of "poisson-stress", "resolved", "poisson-force", '
+     '"poisson", "learned-density", "paper-density", "wcsph" ('),
+    ("model.preset=resolve", "did you mean resolved?"),
+    ('model.terms=["pressure", "pairs"]', '[model] preset = "poisson-stress": with terms = ["pressure", "pairs"] the '
+     "list is given twice; remove one of the two"),
+    ("model.pairs=3", "[model] pairs: no such key"),
+    ("model.pair.hidden=[8]", "[model.pair]: no such term; did you mean pairs? the terms are pressure, stress, damping, "
+     "relaxation, pairs; remove the section, or add the term to the list"),
+    ("model.pairs.hiden=[8]", "[model.pairs] hiden: no such key; did you mean hidden? valid here: hidden, inputs, "),
+    ("model.pairs.hidden=[16, 0]", "[model.pairs] hidden = [16, 0]: must be a list such as [16, 16] of whole numbers, "
+     "each at least 1"),
+    ('model.pairs.inputs=["densty"]', '[model.pairs] inputs = ["densty"]: must be a list of any of "density", '
+     '"distance", "speed", "approach" (what the network is told of a pair); did you mean density?'),
+    ("model.pairs.network=deep", '[model.pairs] network = "deep": must be one of "dense", or the import path'),
+    ("model.pairs.network=deep:", '[model.pairs] network: "deep:": an import path is "module:name"'),
+    ("model.pairs.symmetry=odd", '[model.pairs] symmetry = "odd": must be one of "none", "antisymmetric"'),
+    ("model.pairs.symmetry=antisymmetric", 'with basis = "corrected" the forces of a pair are not opposite'),
+    ("model.pressure.force=yes", '[model.pressure] force = "yes": must be true or false (whether -grad p acts'),
+    ("model.damping.strength=1", "[model.damping] strength: no such key; valid here: no key"),
     ("model.path=3", "[model] path = 3: must be a text in quotes (run directory or model.h5"),
     ("training.window=1.5", "must be a number above 0 and at most 1"),
     ("training.window=1", "[simulation] start: this key is missing"),
@@ -79,8 +102,12 @@ BAD_OVERRIDES = [
     ("training.patience=0", "[training] patience = 0: must be a whole number at least 1"),
     ("simulation.step=0.03", "must be a whole multiple of step = 0.03"),
     ("simulation.frame_interval=0.05", "must be a whole multiple of"),
-    ("simulation.force=magnetic", 'must be one of "learned", "none", "wcsph", "eulerian"'),
-    ("simulation.force=wcsph", "[simulation] step = 0.02: force = \"wcsph\" must resolve sound, with a step of"),
+    ("simulation.force=none", "[simulation] force: no such key; valid here: method, "),
+    ("simulation.method=magnetic", 'must be one of "learned", "none", "wcsph", "eulerian", or the import path'),
+    ("simulation.method=nowhere:Run", '[simulation] method: "nowhere:Run": it is not found; put it beside the scene'),
+    ("flow.fluid=eddies.flow.navier_stokes:Honey", 'eddies.flow.navier_stokes has no Honey'),
+    ("initial.kind=eddies.logs:log", '[initial] kind: "eddies.logs:log": eddies.logs has no log'),
+    ("simulation.method=wcsph", "[simulation] step = 0.02: method = \"wcsph\" must resolve sound, with a step of"),
     ("simulation.start=1", "[simulation] start = 1: must be a number at least 0 and below 1"),
     ("simulation.skin=2", "[simulation] skin = 2: must be a number at least 0 and at most 1"),
     ("wcsph.kernel=gaussian", '[wcsph] kernel = "gaussian": must be one of "cubic-spline", "wendland"'),
@@ -89,7 +116,7 @@ BAD_OVERRIDES = [
     ("wcsph.gamma=7", "[wcsph] gamma: no such key; valid here: kernel, alpha, beta, exponent"),
     ("eulerian.cells=4", "[eulerian] cells = 4: must be a whole number at least 8"),
     ("eulerian.smagorinsky=-0.1", "[eulerian] smagorinsky = -0.1: must be a number at least 0"),
-    ("wcsph.alpha=2", '[wcsph]: only read with [simulation] force = "wcsph"; set it, or remove [wcsph]'),
-    ("eulerian.cells=16", '[eulerian]: only read with [simulation] force = "eulerian"'),
+    ("wcsph.alpha=2", '[wcsph]: only read with [simulation] method = "wcsph"; set it, or remove [wcsph]'),
+    ("eulerian.cells=16", '[eulerian]: only read with [simulation] method = "eulerian"'),
     ("simulation.injection=some", 'must be a number above 0 or "none" or "dissipation"'),
 ]

@@ -23,10 +23,10 @@ def written(tmp_path, text):
 def test_variants_are_the_base_with_changes(tmp_path):
     shared = 'set = ["training.steps=50"]\n'
     comparison = load_comparison(written(tmp_path, HEAD + shared + variant("plain") + variant(
-        "wide", "model.hidden=[32, 32]", "training.steps=70", group="size")))
+        "wide", "model.pairs.hidden=[32, 32]", "training.steps=70", group="size")))
     plain, wide = comparison.scenes["plain"], comparison.scenes["wide"]
     assert (plain.name, plain.training.steps, plain.simulation.turnovers) == ("plain", 50, 0.25)
-    assert (wide.model.hidden, wide.training.steps, wide.simulation) == ((32, 32), 70, plain.simulation)
+    assert (wide.model.settings["pairs"].hidden, wide.training.steps, wide.simulation) == ((32, 32), 70, plain.simulation)
     assert [one.group for one in comparison.variant] == ["model", "size"]
     assert (comparison.name, comparison.subject, comparison.repeats) == ("case", "plain", 3)
 
@@ -43,8 +43,8 @@ def test_built_in_comparison(name):
     comparison = load_comparison(name)
     groups = {one.name: one.group for one in comparison.variant}
     assert groups[comparison.subject] != "baseline" and "baseline" in groups.values()
-    forces = {scene.simulation.force for scene in comparison.scenes.values()}
-    assert forces == {"learned", "none", "wcsph", "eulerian"}
+    methods = {scene.simulation.method for scene in comparison.scenes.values()}
+    assert methods == {"learned", "none", "wcsph", "eulerian"}
 
 
 BAD = [
@@ -61,7 +61,7 @@ BAD = [
     (HEAD + variant("a/b"), 'variant "a/b": its name is that of a directory'),
     (HEAD + variant("figures"), 'variant "figures": its name is that of a directory'),
     (HEAD + variant("a", "model.hiden=[8]"), 'variant "a": '),
-    (HEAD + variant("a", "model.hiden=[8]"), "[model] hiden: no such key; did you mean hidden?"),
+    (HEAD + variant("a", "model.pairs.hiden=[8]"), "[model.pairs] hiden: no such key; did you mean hidden?"),
     (HEAD + variant("a", "flow.viscosity=0.07"), 'variant "a": its changes concern the ground truth'),
     (HEAD + variant("a", "simulation.turnovers=0.1"), "[simulation] turnovers = 0.1 where the base has 0.25"),
     (HEAD + variant("a", "simulation.start=0.6"), "[simulation] start = 0.6 where the base has None"),

@@ -1,6 +1,5 @@
 """A comparison: variants of one scene that are run from the same moment on one machine, as read from one TOML file."""
 
-import difflib
 import re
 from dataclasses import dataclass
 from functools import cached_property
@@ -8,7 +7,8 @@ from pathlib import Path
 
 from eddies.scene import Scene, SceneError, load_scene
 from eddies.scene_reader import find_document, parse_document, read_section, read_text
-from eddies.scene_values import integer, number, sections, text, texts
+from eddies.scene_rules import nearest
+from eddies.scene_values import Document, Section, integer, number, sections, text, texts
 
 __all__ = ["BASELINE", "Comparison", "Variant", "load_comparison"]
 
@@ -18,7 +18,7 @@ RESERVED = ("figures",)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Variant:
+class Variant(Section):
     """The base scene with some keys changed."""
 
     name: str = text("its run directory and its label in figures")
@@ -30,7 +30,7 @@ class Variant:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Comparison:
+class Comparison(Document):
     """A whole comparison; making one loads the scenes of all variants and checks that they can be compared."""
 
     name: str = text("names the output directory; absent: the file's name", default="comparison")
@@ -44,6 +44,7 @@ class Comparison:
     variant: tuple[Variant, ...] = sections(Variant)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         self._check_names()
         if load_scene(self.base).simulation is None:
             raise SceneError(f'base = "{self.base}": has no [simulation], of which errors are compared; add it, '
@@ -100,9 +101,8 @@ class Comparison:
             if names.count(name) > 1:
                 raise SceneError(f'variant "{name}": {names.count(name)} variants have this name; rename all but one')
         if self.subject not in names:
-            near = difflib.get_close_matches(self.subject, names, n=1)
-            advice = f"did you mean {near[0]}? " if near else ""
-            raise SceneError(f'model = "{self.subject}": no such variant; {advice}there are: {", ".join(names)}')
+            hint = f"{nearest(self.subject, names)} ".lstrip()
+            raise SceneError(f'model = "{self.subject}": no such variant; {hint}there are: {", ".join(names)}')
 
     def _difference(self, variant: Variant) -> str | None:
         """Why a variant cannot be compared with the base: other data, another start, other times of its frames."""

@@ -5,16 +5,20 @@ A section that is optional and absent is None, and then nothing is built for it.
 
 import hashlib
 import json
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
+from eddies.composition import origins, search_in
 from eddies.scene_checks import first_inconsistency
 from eddies.scene_reader import (apply_overrides, find_document, parse_document, read_section, read_text,
                                  write_section)
-from eddies.scene_sections import (BOX_LENGTH, DEFAULT_WINDOW, Eulerian, Flow, Forcing, Initial, Kernel, Model,
-                                   Simulation, SpinUp, Time, Tracers, Training, Wcsph)
-from eddies.scene_values import SceneError, choice, integer, section, text
+from eddies.scene_model import Model
+from eddies.scene_sections import (BOX_LENGTH, DEFAULT_WINDOW, Eulerian, Flow, Forcing, Initial, Kernel, Simulation,
+                                   SpinUp, Time, Tracers, Training, Wcsph)
+from eddies.scene_values import Document, SceneError, choice, import_paths, integer, section, text
 
 __all__ = ["BOX_LENGTH", "STAGES", "Scene", "SceneError", "builtin_scenes", "load_scene", "Eulerian",
            "Flow", "Forcing", "Initial", "Kernel", "Model", "Simulation", "SpinUp", "Time", "Tracers", "Training",
@@ -25,8 +29,8 @@ BUILT_IN = Path(__file__).with_name("scenes")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scene:
-    """A whole scene; making one checks that its sections fit together (SceneError)."""
+class Scene(Document):
+    """A whole scene; making one checks its values and that its sections fit together (SceneError)."""
 
     name: str = text("names the run; absent: the file's name", default="scene")
     title: str = text("one line for lists and reports", default="untitled scene")
@@ -46,6 +50,7 @@ class Scene:
     eulerian: Eulerian | None = section(Eulerian, default=None)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         problem = first_inconsistency(self)
         if problem:
             raise SceneError(problem)
@@ -53,7 +58,7 @@ class Scene:
     @property
     def stages(self) -> tuple[str, ...]:
         """The stages that this scene asks for, in the order in which they run."""
-        learned = self.simulation is None or self.simulation.force == "learned"
+        learned = self.simulation is None or "model" in self.simulation.needs
         needs = {"train-kernel": self.kernel, "train": self.model if learned else None, "simulate": self.simulation}
         return tuple(stage for stage in STAGES if needs.get(stage, self) is not None)
 
@@ -67,35 +72,63 @@ class Scene:
         """Fraction of the ground truth that the model was trained on; 0 without [training], as with [model] path."""
         return self.training.window if self.training else 0.0
 
+    @property
+    def foreign(self) -> tuple[str, ...]:
+        """The import paths of classes and functions that the scene names: fluid, initial flow, terms, networks, method
+        of the simulation."""
+        return tuple(dict.fromkeys(path for name in ("flow", "initial", "model", "simulation")
+                                   for path in self._foreign_in(name)))
+
     def to_toml(self) -> str:
         """The scene as a TOML text with a comment on every key; reading it back gives an equal scene."""
         lines = write_section(self)
         for field in fields(self):
             part = getattr(self, field.name)
             if "section" in field.metadata and part is not None:
-                lines += ["", f"[{field.name}]", *write_section(part)]
+                lines += ["", f"[{field.name}]", *write_section(part, field.name)]
         return "\n".join(lines) + "\n"
 
     def fingerprint(self, stage: str) -> str:
         """SHA-256 over what a stage's product depends on: its own settings and those of the earlier stages that
-        the scene has, and the content of the files that the flow starts from and that trained weights come from."""
-        reads = {"dns": ("seed", "flow", "initial", "start", "forcing", "time", "spin_up", "tracers"),
-                 "train-kernel": ("kernel", "window"), "train": ("device", "model", "weights", "training"),
-                 "simulate": ("device", "simulation", "wcsph", "eulerian")}
+        the scene has, and the content of the files that the flow starts from, that trained weights come from, and that
+        hold the source of foreign classes."""
+        reads = {"dns": ("seed", "flow", "initial", "start", "forcing", "time", "spin_up", "tracers", "own_flow",
+                         "own_initial"),
+                 "train-kernel": ("kernel", "window"), "train": ("device", "model", "weights", "training", "own_model"),
+                 "simulate": ("device", "simulation", "wcsph", "eulerian", "own_simulation")}
         settings = asdict(self) | {"window": self.window, "start": _digest(self.initial.path),
                                    "weights": _digest(self.model and self.model.weights_file)}
+        settings |= {f"own_{name}": origins(self._foreign_in(name)) for name in ("flow", "initial", "model", "simulation")}
         keys = [key for earlier in STAGES[:STAGES.index(stage) + 1]
                 if earlier in self.stages for key in reads.get(earlier, ())]
         return hashlib.sha256(json.dumps([[key, settings[key]] for key in keys]).encode()).hexdigest()
+
+    def provenance(self, stage: str) -> dict[str, Any]:
+        """What the product of a stage keeps of the scene: its text, the stage's fingerprint and, if the scene names
+        any, where foreign classes come from."""
+        foreign = {"foreign": origins(self.foreign)} if self.foreign else {}
+        return {"scene": self.to_toml(), "fingerprint": self.fingerprint(stage), **foreign}
+
+    def _foreign_in(self, name: str) -> Iterator[str]:
+        part = getattr(self, name)
+        if name == "model":
+            yield from part.foreign if part else ()
+        elif part is not None:
+            yield from (path for _, path in import_paths(part))
 
 
 def load_scene(name_or_path: str | Path, overrides: list[str] | tuple[str, ...] = ()) -> Scene:
     """Read a built-in scene by name, or a TOML file by path, and write overrides "section.key=value" over it.
 
+    Modules of the classes that it names are looked for where Python looks, then beside the file, then in the working
+    directory.
+
     Raises:
         SceneError: names the file (or --set), the section and the key, what is allowed and what to do.
     """
     path = find_document(str(name_or_path), BUILT_IN, "scene")
+    search_in(path.parent)
+    search_in(Path())
     keys: set[str] = set()
     try:
         document = {"name": path.stem, **parse_document(read_text(path))}

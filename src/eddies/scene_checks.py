@@ -11,7 +11,10 @@ from collections.abc import Iterator
 from itertools import chain
 from typing import TYPE_CHECKING
 
+from eddies.composition import is_path, load
+from eddies.scene_rules import quoted
 from eddies.scene_sections import Eulerian, Wcsph
+from eddies.scene_values import SceneError, import_paths
 
 if TYPE_CHECKING:
     from eddies.scene import Scene
@@ -20,21 +23,42 @@ if TYPE_CHECKING:
 INITIAL_KEYS = {
     "amplitude": ("random", "taylor-green", "abc", "shear-wave", "sound-wave"),
     "peak_wavenumber": ("random",), "wavenumber": ("abc", "shear-wave", "sound-wave"), "path": ("file",)}
+# What a class of the user's must have, by the key that names it.
+REQUIRED = {"fluid": ("nonlinear", "linear", "linear_function", "combine", "compressible"), "kind": ("__call__",),
+              "method": ("steps", "advance", "frame", "series", "description"), "network": ("forward",)}
 
 
 def first_inconsistency(scene: Scene) -> str | None:
     """The first problem found, or None."""
-    subjects = (flow_problems, initial_problems, time_problems, tracer_problems, section_problems,
-                support_problems, training_problems, simulation_problems, baseline_problems)
+    subjects = (foreign_problems, flow_problems, initial_problems, time_problems, tracer_problems, section_problems,
+                model_problems, density_problems, support_problems, training_problems, simulation_problems,
+                baseline_problems)
     return next(chain.from_iterable(subject(scene) for subject in subjects), None)
+
+
+def foreign_problems(scene: Scene) -> Iterator[str]:
+    """Import paths that lead nowhere, or to what cannot do what it is named for; those of terms are checked before."""
+    sections = {"flow": scene.flow, "initial": scene.initial, "simulation": scene.simulation}
+    if scene.model:
+        sections |= {f"model.{name}": settings for name, settings in scene.model.settings.items()}
+    for section, part in sections.items():
+        for key, path in import_paths(part) if part else ():
+            try:
+                found = load(path)
+            except SceneError as error:
+                yield f"[{section}] {key}: {error}"
+                continue
+            lacking = [name for name in REQUIRED.get(key, ()) if not hasattr(found, name)]
+            if lacking:
+                yield f"[{section}] {key}: {quoted(path)}: cannot be used here, it has no {', '.join(lacking)}"
 
 
 def flow_problems(scene: Scene) -> Iterator[str]:
     """The fluid and its sound speed; forcing within the resolved scales."""
     flow = scene.flow
-    if flow.fluid == "compressible" and flow.sound_speed is None:
+    if flow.compressible and flow.sound_speed is None:
         yield "[flow] sound_speed: this key is missing; a compressible fluid needs a number above 0"
-    if flow.fluid == "incompressible" and flow.sound_speed is not None:
+    if not flow.compressible and flow.sound_speed is not None:
         yield (f"[flow] sound_speed = {flow.sound_speed:g}: an incompressible fluid has none; remove it or "
                'set fluid = "compressible"')
     if scene.forcing and scene.forcing.wavenumber > flow.cells / 3:
@@ -47,9 +71,9 @@ def initial_problems(scene: Scene) -> Iterator[str]:
     initial, defaults = scene.initial, type(scene.initial)()
     if initial.kind == "file" and initial.path is None:
         yield '[initial] path: this key is missing; kind = "file" needs the path of an HDF5 file'
-    if initial.kind == "sound-wave" and scene.flow.fluid != "compressible":
+    if initial.kind == "sound-wave" and not scene.flow.compressible:
         yield '[initial] kind = "sound-wave": needs sound; set [flow] fluid = "compressible"'
-    for key, kinds in INITIAL_KEYS.items():
+    for key, kinds in INITIAL_KEYS.items() if not is_path(initial.kind) else ():
         value = getattr(initial, key)
         if value != getattr(defaults, key) and initial.kind not in kinds:
             yield (f'[initial] {key} = {value}: only read with kind = {" or ".join(kinds)}, not '
@@ -93,7 +117,7 @@ def section_problems(scene: Scene) -> Iterator[str]:
     """Which sections need which others."""
     needs = {"kernel": ("tracers",), "model": ("tracers", "kernel"), "training": ("model",),
              "simulation": ("tracers", "kernel")}
-    if scene.simulation and scene.simulation.force == "learned":
+    if scene.simulation and "model" in scene.simulation.needs:
         needs["simulation"] = ("model",)
     for name, others in needs.items():
         for other in others:
@@ -102,22 +126,47 @@ def section_problems(scene: Scene) -> Iterator[str]:
     if scene.model and scene.model.path is None and scene.training is None:
         yield ("[model]: needs a section [training], which the scene lacks; add it, give [model] path, a run directory "
                "with trained weights, or remove [model]")
-    if scene.model and scene.model.basis == "none" and scene.model.closure != "poisson-stress":
-        yield (f'[model] basis = "none": leaves nothing to learn of closure = "{scene.model.closure}"; set closure = '
-               '"poisson-stress", or another basis')
-    for key in ("eddy_viscosity", "symmetry"):
-        if scene.model and scene.model.basis == "none" and getattr(scene.model, key) != "none":
-            yield (f'[model] {key} = "{getattr(scene.model, key)}": is about pairs, and with basis = "none" there '
-                   f'is no pair sum; set {key} = "none", or another basis')
-    if scene.model and scene.model.symmetry == "antisymmetric" and scene.model.basis == "corrected":
-        yield (f'[model] symmetry = "antisymmetric": with basis = "{scene.model.basis}" the forces of a pair are not '
-               'opposite, as each particle has a moment matrix of its own; set basis = "paper", or symmetry = "none"')
-    if scene.model and scene.flow.fluid != "compressible":
-        yield ('[model]: learns from the density, which an incompressible flow does not have; set [flow] '
-               'fluid = "compressible" and sound_speed, or remove [model]')
-    if scene.simulation and scene.flow.fluid != "compressible":
-        yield ('[simulation]: starts from the density, which an incompressible flow does not have; set [flow] '
-               'fluid = "compressible" and sound_speed, or remove [simulation]')
+
+
+def model_problems(scene: Scene) -> Iterator[str]:
+    """Terms that read a density which no term gives, or that give it twice."""
+    if scene.model is None:
+        return
+    settings, gives = scene.model.settings, scene.model.gives
+    if {"density", "density_rate"} <= gives:
+        first, second = (next(name for name, one in settings.items() if what in one.gives)
+                         for what in ("density", "density_rate"))
+        yield (f'[model] terms = {quoted(scene.model.terms)}: "{first}" gives the density and "{second}" its rate, which '
+               "are two densities; remove one of the two")
+    if not gives & {"density", "density_rate"}:
+        for name, one in settings.items():
+            if "density" in one.reads:
+                yield (f'[model] terms = {quoted(scene.model.terms)}: "{name}" reads the density, which no term gives; add '
+                       f'a term that does, such as "pressure" or "density-transport", or {_without_density(name, one)}')
+
+
+def density_problems(scene: Scene) -> Iterator[str]:
+    """What reads a density in an incompressible flow, which has none."""
+    if scene.flow.compressible:
+        return
+    remedy = 'or set [flow] fluid = "compressible" and sound_speed'
+    for name, one in scene.model.settings.items() if scene.model else ():
+        if "density" in one.reads:
+            yield (f"[model.{name}]: reads the density, which an incompressible flow does not have; "
+                   f"{_without_density(name, one)}, {remedy}")
+        if "density_rate" in one.gives:
+            yield (f'[model] terms = {quoted(scene.model.terms)}: "{name}" gives a rate of density, which an '
+                   f"incompressible flow does not have; remove it, {remedy}")
+    if scene.simulation and "density" in scene.simulation.needs:
+        yield (f'[simulation] method = "{scene.simulation.method}": starts from the density, which an incompressible flow '
+               f"does not have; choose another, {remedy}")
+
+
+def _without_density(name: str, settings) -> str:
+    """How a term does without the density."""
+    if "density" in getattr(settings, "inputs", ()):
+        return f'leave "density" out of [model.{name}] inputs'
+    return f'remove "{name}"'
 
 
 def support_problems(scene: Scene) -> Iterator[str]:
@@ -178,16 +227,16 @@ def simulation_problems(scene: Scene) -> Iterator[str]:
 
 
 def baseline_problems(scene: Scene) -> Iterator[str]:
-    """Sections of another force; a step that sound outruns; a coarse grid that is finer than what it starts from."""
+    """Sections of another method; a step that sound outruns; a coarse grid that is finer than what it starts from."""
     simulation = scene.simulation
     for name in ("wcsph", "eulerian"):
-        if getattr(scene, name) is not None and (simulation is None or simulation.force != name):
-            yield f'[{name}]: only read with [simulation] force = "{name}"; set it, or remove [{name}]'
-    if simulation and simulation.force == "wcsph" and simulation.step > acoustic_step(scene):
-        yield (f'[simulation] step = {simulation.step:g}: force = "wcsph" must resolve sound, with a step of at most '
+        if getattr(scene, name) is not None and (simulation is None or simulation.method != name):
+            yield f'[{name}]: only read with [simulation] method = "{name}"; set it, or remove [{name}]'
+    if simulation and simulation.method == "wcsph" and simulation.step > acoustic_step(scene):
+        yield (f'[simulation] step = {simulation.step:g}: method = "wcsph" must resolve sound, with a step of at most '
                f"0.4 h / (c (1 + 0.6 alpha)) = {acoustic_step(scene):.3g}, h half the support of [kernel] neighbors "
                "and c [flow] sound_speed; lower step")
-    if simulation and simulation.force == "eulerian":
+    if simulation and simulation.method == "eulerian":
         cells = (scene.eulerian or Eulerian()).cells_for(scene.tracers.width)
         if cells > scene.tracers.cells:
             yield (f"[eulerian] cells = {cells}: must be at most the {scene.tracers.cells} of the filtered fields that "

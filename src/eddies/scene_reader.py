@@ -1,17 +1,17 @@
-"""Turns a TOML document and the user's `--set` overrides into checked dataclasses.
+"""Turns a TOML document and the user's `--set` overrides into sections, and sections into TOML.
 
 Nothing here knows a particular section or key: what is allowed stands beside the fields of the dataclasses
-(`scene_values`).
+(`scene_values`), which check their values themselves.
 """
 
 import dataclasses
-import difflib
 import tomllib
 from dataclasses import MISSING
 from pathlib import Path
 from typing import Any
 
-from eddies.scene_values import SceneError, quoted
+from eddies.scene_rules import nearest, quoted
+from eddies.scene_values import KeyProblem, SceneError, Section, rule_of
 
 
 def find_document(name_or_path: str, built_in: Path, what: str) -> Path:
@@ -21,9 +21,8 @@ def find_document(name_or_path: str, built_in: Path, what: str) -> Path:
         return built_in / f"{name_or_path}.toml"
     if Path(name_or_path).is_file():
         return Path(name_or_path)
-    near = difflib.get_close_matches(name_or_path, names, n=1)
-    advice = f"did you mean {near[0]}? " if near else ""
-    raise SceneError(f"{name_or_path}: no such {what}; {advice}give the path of a TOML file, or one of "
+    hint = f"{nearest(name_or_path, names)} ".lstrip()
+    raise SceneError(f"{name_or_path}: no such {what}; {hint}give the path of a TOML file, or one of "
                      f"{', '.join(names)}")
 
 
@@ -49,7 +48,8 @@ def read_text(path: Path) -> str:
 
 
 def apply_overrides(document: dict[str, Any], overrides: list[str]) -> set[str]:
-    """Write each "section.key=value" (or "key=value") over the document; returns the keys written.
+    """Write each "section.key=value" (or "key=value", or "section.sub.key=value") over the document; returns the keys
+    written, with the sections that hold them.
 
     The value is read as TOML; what is not TOML, such as a bare word, is a string. A section that the document
     lacks is made.
@@ -57,20 +57,21 @@ def apply_overrides(document: dict[str, Any], overrides: list[str]) -> set[str]:
     keys = set()
     for override in overrides:
         path, equals, value = (part.strip() for part in override.partition("="))
-        names = path.split(".")
-        if not equals or not value or len(names) > 2 or not all(names):
-            raise SceneError(f"--set {override}: must be section.key=value, or key=value outside sections")
+        *outer, last = names = path.split(".")
+        if not equals or not value or len(names) > 3 or not all(names):
+            raise SceneError(f"--set {override}: must be section.key=value, or key=value outside sections, or "
+                             "section.name.key=value in a section of a section")
         table = document
-        if len(names) == 2:
-            table = document.setdefault(names[0], {})
+        for name in outer:
+            table = table.setdefault(name, {})
             if not isinstance(table, dict):
-                raise SceneError(f"--set {override}: {names[0]} is a value, not a section")
-        table[names[-1]] = _override_value(value)
-        keys.add(path)
+                raise SceneError(f"--set {override}: {name} is a value, not a section")
+        table[last] = _override_value(value)
+        keys |= {".".join(names[:depth]) for depth in range(1, len(names) + 1)}
     return keys
 
 
-def read_section(kind: type, table: Any, name: str = "") -> Any:
+def read_section(kind: type[Section], table: Any, name: str = "") -> Any:
     """The dataclass `kind` filled from a TOML table; `name` is the section's, empty for the whole document.
 
     Raises:
@@ -79,25 +80,39 @@ def read_section(kind: type, table: Any, name: str = "") -> Any:
     if not isinstance(table, dict):
         message = f"{name} = {quoted(table)}: must be a section; write [{name}] and its keys below"
         raise SceneError(message, name)
-    fields = {field.name: field for field in dataclasses.fields(kind)}
-    for key in table:
-        if key not in fields:
-            raise _unknown(key, table[key], name, fields)
-    values = {key: _read_value(fields[key], value, name) for key, value in table.items()}
+    every = {field.name: field for field in dataclasses.fields(kind)}
+    fields = {key: field for key, field in every.items() if "sub_sections" not in field.metadata}
+    holder = next((key for key in every if key not in fields), None)
+    values, inner = {}, {}
+    for key, value in table.items():
+        if key in fields:
+            values[key] = _read_value(fields[key], value)
+        elif holder and isinstance(value, dict):
+            inner[key] = value
+        else:
+            raise _unknown(key, value, name, fields)
     for key, field in fields.items():
-        if key not in values and field.default is MISSING:
-            raise _missing(field, name)
-    return kind(**values)
+        if key not in values and field.default is field.default_factory is MISSING:
+            raise _missing(kind, field, name)
+    try:
+        return kind(**values, **({holder: inner} if inner else {}))
+    except KeyProblem as problem:
+        raise (problem.within(name) if problem.section == kind.section_name() else problem) from None
 
 
-def write_section(section: Any) -> list[str]:
-    """The lines `key = value  # meaning` of a section; keys that are None are left out."""
-    lines = []
+def write_section(section: Section, name: str = "") -> list[str]:
+    """The lines `key = value  # meaning` of a section, and below them those of its own sections [name.NAME] that have
+    keys; keys that are None are left out."""
+    lines, inner = [], []
     for field in dataclasses.fields(section):
-        value = getattr(section, field.name)
-        if "rule" in field.metadata and value is not None:
-            lines.append(f"{field.name} = {quoted(value)}  # {field.metadata['rule'].about}")
-    return lines
+        value, rule = getattr(section, field.name), rule_of(type(section), field)
+        if "sub_sections" in field.metadata:
+            for key, part in value.items():
+                if written := write_section(part):
+                    inner += ["", f"[{name}.{key}]", *written]
+        elif rule is not None and value is not None:
+            lines.append(f"{field.name} = {quoted(value)}" + (f"  # {rule.about}" if rule.about else ""))
+    return lines + inner
 
 
 def _override_value(value: str) -> Any:
@@ -108,21 +123,15 @@ def _override_value(value: str) -> Any:
     return parsed["value"] if len(parsed) == 1 else value
 
 
-def _read_value(field: dataclasses.Field, value: Any, section: str) -> Any:
+def _read_value(field: dataclasses.Field, value: Any) -> Any:
     if "section" in field.metadata:
         return read_section(field.metadata["section"], value, field.name)
     if "sections" in field.metadata:
         return _read_sections(field.metadata["sections"], value, field.name)
-    rule = field.metadata["rule"]
-    try:
-        return rule.accept(value)
-    except ValueError:
-        where = _where(field.name, section)
-        message = f"{where} = {quoted(value)}: must be {rule.allowed} ({rule.about})"
-        raise SceneError(message, _path(field.name, section)) from None
+    return value
 
 
-def _read_sections(kind: type, tables: Any, name: str) -> tuple:
+def _read_sections(kind: type[Section], tables: Any, name: str) -> tuple:
     """A dataclass for each [[name]]; an error says which by its number, and by its name if it has one."""
     if not isinstance(tables, list):
         raise SceneError(f"{name} = {quoted(tables)}: must be sections; write [[{name}]] before each", name)
@@ -137,25 +146,15 @@ def _read_sections(kind: type, tables: Any, name: str) -> tuple:
 
 
 def _unknown(key: str, value: Any, section: str, fields: dict[str, dataclasses.Field]) -> SceneError:
-    near = difflib.get_close_matches(key, fields, n=1, cutoff=0.5)
-    advice = f"did you mean {near[0]}? " if near else ""
-    what = "section" if isinstance(value, dict) and not section else "key"
-    where = f"[{key}]" if what == "section" else _where(key, section)
-    valid = ", ".join(fields)
-    return SceneError(f"{where}: no such {what}; {advice}valid here: {valid}", _path(key, section))
+    hint = f"{nearest(key, fields, cutoff=0.5)} ".lstrip()
+    is_section = isinstance(value, dict) and not section
+    problem = f": no such {'section' if is_section else 'key'}; {hint}valid here: {', '.join(fields) or 'no key'}"
+    return SceneError(f"[{key}]{problem}", key) if is_section else KeyProblem(section, key, problem)
 
 
-def _missing(field: dataclasses.Field, section: str) -> SceneError:
-    if "section" in field.metadata:
+def _missing(kind: type[Section], field: dataclasses.Field, section: str) -> SceneError:
+    rule = rule_of(kind, field)
+    if rule is None:
         return SceneError(f"[{field.name}]: this section is missing; every scene needs it", field.name)
-    rule = field.metadata["rule"]
-    message = f"{_where(field.name, section)}: this key is missing ({rule.about}); give it {rule.allowed}"
-    return SceneError(message, _path(field.name, section))
-
-
-def _where(key: str, section: str) -> str:
-    return f"[{section}] {key}" if section else key
-
-
-def _path(key: str, section: str) -> str:
-    return f"{section}.{key}" if section else key
+    about = f" ({rule.about})" if rule.about else ""
+    return KeyProblem(section, field.name, f": this key is missing{about}; give it {rule.allowed}")

@@ -6,31 +6,37 @@ cube [0, 2 pi)^3, the mean density is 1, and times are in the unit that follows 
 
 import math
 from dataclasses import dataclass
-from pathlib import Path
 
-from eddies.scene_values import choice, integer, integers, number, text
+from eddies.composition import is_path, load
+from eddies.methods import METHODS, needs_of
+from eddies.scene_values import Section, choice, integer, integers, named, number, text
 
 BOX_LENGTH = 2 * math.pi
 DEFAULT_WINDOW = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
-class Flow:
+class Flow(Section):
     """The fluid and the grid on which the direct numerical simulation resolves it."""
 
-    fluid: str = choice("equations of motion", "incompressible", "compressible")
+    fluid: str = named("equations of motion", "incompressible", "compressible")
     cells: int = integer("grid cells along each side of the cube", at_least=8)
     viscosity: float = number("kinematic viscosity", at_least=0)
     sound_speed: float | None = number("speed of sound, compressible fluid only", default=None, above=0)
     precision: str = choice("of the grid arrays", "float64", "float32", default="float64")
 
+    @property
+    def compressible(self) -> bool:
+        """Whether the fluid has a density, and sound."""
+        return load(self.fluid).compressible if is_path(self.fluid) else self.fluid == "compressible"
+
 
 @dataclass(frozen=True, kw_only=True)
-class Initial:
+class Initial(Section):
     """The velocity, and with a compressible fluid the density, at time 0."""
 
-    kind: str = choice("initial flow", "random", "taylor-green", "abc", "shear-wave", "sound-wave", "file",
-                       default="random")
+    kind: str = named("initial flow", "random", "taylor-green", "abc", "shear-wave", "sound-wave", "file",
+                      default="random")
     amplitude: float = number("of velocity, random: rms of a component; sound-wave: of ln density",
                               default=1.0, above=0)
     peak_wavenumber: float = number("wavenumber of the spectrum's peak, random only", default=3.0, above=0)
@@ -39,7 +45,7 @@ class Initial:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Forcing:
+class Forcing(Section):
     """Linear solenoidal forcing of the largest scales at a prescribed power."""
 
     injection_rate: float = number("power injected per unit mass", at_least=0)
@@ -47,7 +53,7 @@ class Forcing:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Time:
+class Time(Section):
     """The time step and, without tracers, the run time."""
 
     stepper: str = choice("time stepping method", "etdrk4", "rk4", default="etdrk4")
@@ -58,7 +64,7 @@ class Time:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SpinUp:
+class SpinUp(Section):
     """The time before tracers are released, in which forced turbulence becomes stationary."""
 
     turnovers: float = number("large-eddy turnovers", above=0)
@@ -67,7 +73,7 @@ class SpinUp:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Tracers:
+class Tracers(Section):
     """Particles that follow the filtered flow: the ground truth of learning."""
 
     particles_per_side: int = integer("the number of particles is the cube of this", at_least=2)
@@ -103,7 +109,7 @@ class Tracers:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Kernel:
+class Kernel(Section):
     """The smoothing kernel W, learned by reconstructing the filtered field from the particles."""
 
     neighbors: float = number("mean number of particles within the support", default=60.0, at_least=8)
@@ -123,33 +129,7 @@ class Kernel:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Model:
-    """The form of the pair force, of the density closure and of the eddy viscosity."""
-
-    basis: str = choice("of the pair sum; corrected: times the inverse moment matrix; none: no pair sum, with closure "
-                        "poisson-stress", "paper", "corrected", "none", default="corrected")
-    closure: str = choice("where the density comes from; -force: with -grad p as a force, -stress: and resolved stress",
-                          "poisson", "poisson-force", "poisson-stress", "learned-density", "paper-density",
-                          default="poisson-stress")
-    hidden: tuple[int, ...] = integers("widths of the pair network's layers; without a basis unused", default=(16, 16),
-                                       at_least=1)
-    eddy_viscosity: str = choice("explicit eddy viscosity between pairs", "none", "two-sided", "monaghan",
-                                 default="none")
-    symmetry: str = choice("antisymmetric: pairs get opposite forces, which keep the momentum; with basis paper only",
-                           "none", "antisymmetric", default="none")
-    path: str | None = text("run directory or model.h5 whose trained weights are used; absent: they are trained",
-                            default=None)
-
-    @property
-    def weights_file(self) -> Path | None:
-        """The file of the weights: `path` where it ends in .h5, model.h5 within it otherwise; None without it."""
-        if self.path is None:
-            return None
-        return Path(self.path) if self.path.endswith(".h5") else Path(self.path) / "model.h5"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Training:
+class Training(Section):
     """How the force is fitted to the tracers: to trajectories, to all losses together, to what the simulation does."""
 
     window: float = number("fraction of the ground truth that is used, the rest stays unseen",
@@ -180,11 +160,10 @@ class Training:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Simulation:
+class Simulation(Section):
     """The run of the particles, without the direct simulation."""
 
-    force: str = choice("what moves the particles; see Baselines", "learned", "none", "wcsph", "eulerian",
-                        default="learned")
+    method: str = named("what moves the particles; see Baselines", *METHODS, default="learned")
     integrator: str = choice("time stepping of the particles", "verlet", "rk2", "rk4", default="verlet")
     step: float = number("time step; eulerian: the longest", above=0)
     turnovers: float = number("large-eddy turnovers to simulate", above=0)
@@ -196,10 +175,15 @@ class Simulation:
     injection: float | str = number("large-scale forcing power per mass; dissipation: as the flow loses",
                                     default="none", words=("none", "dissipation"), above=0)
 
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """What the method needs, of "model", "density" and "pairs"."""
+        return needs_of(self.method)
+
 
 @dataclass(frozen=True, kw_only=True)
-class Wcsph:
-    """Weakly compressible smoothed particle hydrodynamics, with force = "wcsph"; absent: the defaults."""
+class Wcsph(Section):
+    """Weakly compressible smoothed particle hydrodynamics, with method = "wcsph"; absent: the defaults."""
 
     kernel: str = choice("smoothing kernel, of the support of [kernel]", "cubic-spline", "wendland",
                          default="cubic-spline")
@@ -210,8 +194,8 @@ class Wcsph:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Eulerian:
-    """Large-eddy simulation on a coarse grid, with force = "eulerian"; absent: the defaults."""
+class Eulerian(Section):
+    """Large-eddy simulation on a coarse grid, with method = "eulerian"; absent: the defaults."""
 
     cells: int | None = integer("of the coarse grid; absent: its Nyquist wavenumber is pi / filter width, at least 8",
                                 default=None, at_least=8)

@@ -1,16 +1,19 @@
-"""What a single value of a scene may be.
+"""What a section of a scene is: a frozen dataclass whose fields declare their keys.
 
-Every key of a scene is declared once, beside the dataclass field that holds it, by one of the functions
-`number`, `integer`, `integers`, `choice`, `text` and `texts`. The declaration carries a line on what the key means,
-which values it accepts, and its default; the reader, the error messages and the written scene all use that
-one declaration.
+Every key of a scene is declared once, beside the dataclass field that holds it, by one of the functions `number`,
+`integer`, `integers`, `boolean`, `choice`, `named`, `text` and `texts`. The declaration carries a line on what the key
+means, which values it accepts, and its default; the reader, the error messages and the written scene all use that one
+declaration. It is applied where an object is made, from a TOML file or in a program.
 """
 
 import dataclasses
-import json
-import math
-from dataclasses import MISSING, dataclass
+import inspect
+import re
+from collections.abc import Iterator
+from dataclasses import MISSING
 from typing import Any
+
+from eddies.scene_rules import Boolean, Bounds, Choice, Integer, Integers, Number, Text, Texts, quoted
 
 
 class SceneError(ValueError):
@@ -24,127 +27,42 @@ class SceneError(ValueError):
         self.key = key
 
 
-@dataclass(frozen=True)
-class Bounds:
-    """The interval a number must lie in, open (`above`, `below`) or closed (`at_least`, `at_most`)."""
+class KeyProblem(SceneError):
+    """What is wrong with one key of a section, known by the section's name."""
 
-    above: float = -math.inf
-    at_least: float = -math.inf
-    below: float = math.inf
-    at_most: float = math.inf
+    def __init__(self, section: str, key: str, problem: str):
+        super().__init__(f"{place(key, section)}{problem}", f"{section}.{key}" if section else key)
+        self.section, self._parts = section, (key, problem)
 
-    def __contains__(self, number: float) -> bool:
-        return self.above < number < self.below and self.at_least <= number <= self.at_most
-
-    def __str__(self) -> str:
-        limits = [f"{field.name.replace('_', ' ')} {getattr(self, field.name):g}"
-                  for field in dataclasses.fields(self) if getattr(self, field.name) != field.default]
-        return " and ".join(limits)
+    def within(self, section: str) -> "KeyProblem":
+        """The same of a section of another name."""
+        return KeyProblem(section, *self._parts)
 
 
-@dataclass(frozen=True)
-class Number:
-    """A finite real number within bounds, or one of a few words."""
+class Section:
+    """Base of the dataclasses of a scene: making one checks every value, and holds it in the form of its rule.
 
-    about: str
-    bounds: Bounds = Bounds()
-    words: tuple[str, ...] = ()
+    Raises KeyProblem for a value that its declaration refuses.
+    """
 
-    def accept(self, value: Any) -> float | str:
-        if isinstance(value, str) and value in self.words:
-            return value
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-            raise ValueError
-        if value not in self.bounds:
-            raise ValueError
-        return float(value)
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if not (value is None and field.default is None):
+                object.__setattr__(self, field.name, _accepted(type(self), field, value))
 
-    @property
-    def allowed(self) -> str:
-        return " or ".join([f"a number {self.bounds}".rstrip(), *map(quoted, self.words)])
+    @classmethod
+    def section_name(cls) -> str:
+        """The name of the section in errors: that of the class, as a scene writes it."""
+        return re.sub(r"(?<!^)(?=[A-Z])", "_", cls.__name__).lower()
 
 
-@dataclass(frozen=True)
-class Integer:
-    """A whole number within bounds."""
+class Document(Section):
+    """Base of what a whole TOML file describes: its keys stand outside all sections."""
 
-    about: str
-    bounds: Bounds = Bounds()
-
-    def accept(self, value: Any) -> int:
-        if isinstance(value, bool) or not isinstance(value, int) or value not in self.bounds:
-            raise ValueError
-        return value
-
-    @property
-    def allowed(self) -> str:
-        return f"a whole number {self.bounds}".rstrip()
-
-
-@dataclass(frozen=True)
-class Integers:
-    """A non-empty list of whole numbers, each within bounds; held as a tuple."""
-
-    about: str
-    bounds: Bounds = Bounds()
-
-    def accept(self, value: Any) -> tuple[int, ...]:
-        if not isinstance(value, list) or not value:
-            raise ValueError
-        return tuple(Integer(self.about, self.bounds).accept(entry) for entry in value)
-
-    @property
-    def allowed(self) -> str:
-        return f"a list such as [16, 16] of whole numbers, each {self.bounds}"
-
-
-@dataclass(frozen=True)
-class Texts:
-    """A list of non-empty strings; held as a tuple."""
-
-    about: str
-
-    def accept(self, value: Any) -> tuple[str, ...]:
-        if not isinstance(value, list):
-            raise ValueError
-        return tuple(Text(self.about).accept(entry) for entry in value)
-
-    @property
-    def allowed(self) -> str:
-        return 'a list of texts, such as ["one", "two"]'
-
-
-@dataclass(frozen=True)
-class Choice:
-    """One of a few words."""
-
-    about: str
-    words: tuple[str, ...] = ()
-
-    def accept(self, value: Any) -> str:
-        if not isinstance(value, str) or value not in self.words:
-            raise ValueError
-        return value
-
-    @property
-    def allowed(self) -> str:
-        return "one of " + ", ".join(map(quoted, self.words))
-
-
-@dataclass(frozen=True)
-class Text:
-    """A non-empty string."""
-
-    about: str
-
-    def accept(self, value: Any) -> str:
-        if not isinstance(value, str) or not value:
-            raise ValueError
-        return value
-
-    @property
-    def allowed(self) -> str:
-        return "a text in quotes"
+    @classmethod
+    def section_name(cls) -> str:
+        return ""
 
 
 def number(about: str, default: Any = MISSING, words: tuple[str, ...] = (), **bounds: float) -> Any:
@@ -162,9 +80,19 @@ def integers(about: str, default: Any = MISSING, **bounds: float) -> Any:
     return _declare(Integers(about, Bounds(**bounds)), default)
 
 
+def boolean(about: str, default: Any = MISSING) -> Any:
+    """Declare a dataclass field that holds True or False."""
+    return _declare(Boolean(about), default)
+
+
 def choice(about: str, *words: str, default: Any = MISSING) -> Any:
     """Declare a dataclass field that holds one of `words`."""
     return _declare(Choice(about, words), default)
+
+
+def named(about: str, *words: str, default: Any = MISSING) -> Any:
+    """Declare a dataclass field that holds one of `words`, or the import path "module:name" of something else."""
+    return _declare(Choice(about, words, paths=True), default)
 
 
 def text(about: str, default: Any = MISSING) -> Any:
@@ -172,9 +100,10 @@ def text(about: str, default: Any = MISSING) -> Any:
     return _declare(Text(about), default)
 
 
-def texts(about: str, default: Any = MISSING) -> Any:
-    """Declare a dataclass field that holds a tuple of strings."""
-    return _declare(Texts(about), default)
+def texts(about: str, *words: str, default: Any = MISSING, paths: bool = False) -> Any:
+    """Declare a dataclass field that holds a tuple of strings, of `words` if any are given or, with `paths`, import
+    paths."""
+    return _declare(Texts(about, words, paths), default)
 
 
 def section(kind: type, default: Any = MISSING) -> Any:
@@ -187,15 +116,73 @@ def sections(kind: type) -> Any:
     return dataclasses.field(default=(), metadata={"sections": kind})
 
 
-def quoted(value: Any) -> str:
-    """The value as TOML writes it: strings in double quotes, tuples as lists, floats to full precision."""
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{key} = {quoted(entry)}" for key, entry in value.items()) + "}"
-    if isinstance(value, (list, tuple)):
-        return "[" + ", ".join(map(quoted, value)) + "]"
-    if isinstance(value, (bool, str)):
-        return json.dumps(value, ensure_ascii=False)
-    return repr(value) if isinstance(value, (int, float)) else str(value)
+def sub_sections() -> Any:
+    """Declare a dataclass field that holds a dict of the section's own sections [section.NAME], by NAME.
+
+    The dataclass makes objects of their tables when it is made.
+    """
+    return dataclasses.field(default_factory=dict, metadata={"sub_sections": True})
+
+
+def rule_of(kind: type, field: dataclasses.Field) -> Any:
+    """The rule of a field: as declared, or else that of its annotation; None for a field that holds sections.
+
+    Raises SceneError where there is neither.
+    """
+    if field.metadata.keys() & {"section", "sections", "sub_sections"}:
+        return None
+    if "rule" in field.metadata:
+        return field.metadata["rule"]
+    annotation = field.type if isinstance(field.type, str) else inspect.formatannotation(field.type)
+    rule = ANNOTATIONS.get(annotation.removesuffix(" | None"))
+    if rule is None:
+        raise SceneError(f"{kind.__qualname__}.{field.name}: {annotation}: a key is declared by number, integer, "
+                         f"boolean, text, ... of eddies, or its annotation is one of {', '.join(ANNOTATIONS)}")
+    return rule
+
+
+#: The rules of fields that a dataclass does not declare.
+ANNOTATIONS = {"float": Number(""), "int": Integer(""), "bool": Boolean(""), "str": Text(""),
+               "tuple[int, ...]": Integers("")}
+
+
+def import_paths(part: Section) -> Iterator[tuple[str, str]]:
+    """Each key of a section that may hold an import path, with the import paths that it holds."""
+    for field in dataclasses.fields(part):
+        if getattr(rule_of(type(part), field), "paths", False):
+            value = getattr(part, field.name)
+            for name in (value,) if isinstance(value, str) else value or ():
+                if ":" in name:
+                    yield field.name, name
+
+
+def place(key: str, section: str) -> str:
+    """A key in words."""
+    return f"[{section}] {key}" if section else key
+
+
+def _accepted(kind: type[Section], field: dataclasses.Field, value: Any) -> Any:
+    """The value of a field as its rule holds it."""
+    def refusal(allowed: str, hint: str = "") -> KeyProblem:
+        return KeyProblem(kind.section_name(), field.name,
+                          f" = {quoted(value)}: must be {allowed}" + (f"; {hint}" if hint else ""))
+
+    if "sub_sections" in field.metadata:
+        return value
+    if "section" in field.metadata:
+        if not isinstance(value, field.metadata["section"]):
+            raise refusal(f"a {field.metadata['section'].__name__}")
+        return value
+    if "sections" in field.metadata:
+        if not all(isinstance(entry, field.metadata["sections"]) for entry in value):
+            raise refusal(f"a list of {field.metadata['sections'].__name__}")
+        return tuple(value)
+    rule = rule_of(kind, field)
+    try:
+        return rule.accept(value)
+    except ValueError as error:
+        about = f" ({rule.about})" if rule.about else ""
+        raise refusal(f"{rule.allowed}{about}", str(error)) from None
 
 
 def _declare(rule: Any, default: Any) -> Any:

@@ -8,15 +8,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from eddies.scene_values import boolean, choice, integers, number, text, texts
+from eddies.scene_values import KeyProblem, Section, boolean, choice, integers, named, number, texts
 
+READS = ("pairs", "resolved", "density")
+GIVES = ("acceleration", "density", "density_rate")
 #: What a network can be told of a pair, in units of the flow: the densities of both, |x|, |v| and x.v.
 INPUTS = ("density", "distance", "speed", "approach")
 BASES = ("corrected", "paper")
 
 
 @dataclass(frozen=True, kw_only=True)
-class TermSettings:
+class TermSettings(Section):
     """The keys of [model.NAME], and what a term that is set so declares.
 
     reads : of "pairs" (neighbours within the interaction radius), "resolved" (the velocity that a grid resolves of the
@@ -24,11 +26,18 @@ class TermSettings:
         not built.
     gives : of "acceleration", "density" (a part of it) and "density_rate".
     learns_through_horizons : its parameters are trained through several steps of the simulation alone.
+    numbers_per_pair : how many numbers it keeps of each pair while it is evaluated, for an estimate of the memory.
     """
 
     reads = ()
     gives = ("acceleration",)
     learns_through_horizons = False
+    numbers_per_pair = 0
+
+    @classmethod
+    def section_name(cls) -> str:
+        """The class: a scene names the section by the term's place in its list, which is not known here."""
+        return cls.__qualname__
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,12 +46,17 @@ class NetworkSettings(TermSettings):
 
     hidden: tuple[int, ...] = integers("widths of the network's layers", default=(16, 16), at_least=1)
     inputs: tuple[str, ...] = texts("what the network is told of a pair", *INPUTS, default=INPUTS)
-    network: str = text('"dense", or the import path of a class', default="dense", path=True)
+    network: str = named("class of the network", "dense", default="dense")
 
     @property
     def reads(self) -> tuple[str, ...]:
         """Pairs, and with that input the density."""
         return ("pairs", "density") if "density" in self.inputs else ("pairs",)
+
+    @property
+    def numbers_per_pair(self) -> int:
+        """The inputs, of which the density counts for both particles, what every layer gives, and a vector."""
+        return len(self.inputs) + ("density" in self.inputs) + sum(self.hidden) + 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,6 +67,13 @@ class PairNetwork(NetworkSettings):
                         default="corrected")
     symmetry: str = choice("antisymmetric: pairs get opposite forces, which keep the momentum; with basis paper only",
                            "none", "antisymmetric", default="none")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.symmetry == "antisymmetric" and self.basis != "paper":
+            raise KeyProblem(self.section_name(), "symmetry", f' = "{self.symmetry}": with basis = "{self.basis}" the '
+                             "forces of a pair are not opposite, as each particle has a moment matrix of its own; set "
+                             'basis = "paper", or symmetry = "none"')
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,0 +1,22 @@
+"""What can move the particles of a rollout: the words of [simulation] method."""
+
+from eddies.composition import is_path, load
+
+#: Of each word the class behind it, and what it needs: a trained "model"; the "density" of the ground truth; "pairs",
+#: neighbours within the support of the kernel. A class of the user's says so in its attribute `needs`.
+METHODS = {
+    "learned": ("eddies.workflows.particle_run:LearnedRun", ("model",)),
+    "none": ("eddies.workflows.particle_run:BallisticRun", ()),
+    "wcsph": ("eddies.workflows.particle_run:SmoothedRun", ("density", "pairs")),
+    "eulerian": ("eddies.workflows.eulerian_run:EulerianRun", ("density",)),
+}
+
+
+def method_class(method: str) -> type:
+    """The class of a word or an import path, built as Class(scene, truth, start, directory, device)."""
+    return load(method if is_path(method) else METHODS[method][0])
+
+
+def needs_of(method: str) -> tuple[str, ...]:
+    """What a method needs; its class is loaded only where it is the user's."""
+    return tuple(getattr(load(method), "needs", ())) if is_path(method) else METHODS[method][1]
