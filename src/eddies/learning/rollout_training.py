@@ -146,7 +146,7 @@ class RolloutTrainer:
                 particles: ParticleSet) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
         """Error, truth, and value at the start of each column that has a rate."""
         yield particles.velocity - window.velocity[frame], window.velocity[frame], window.particles.velocity
-        if "density_rate" in self.integrator.dynamics.model.gives:
+        if self.integrator.dynamics.model.integrates_density:
             yield particles.density - window.density[frame], window.density[frame], window.particles.density
 
     def _scale(self, true: Tensor, start: Tensor) -> float:

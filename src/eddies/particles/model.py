@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
@@ -60,6 +60,11 @@ class LagrangianModel(nn.Module):
         return self.reads_density and "density" in self.gives
 
     @property
+    def integrates_density(self) -> bool:
+        """Whether the density is a state of its own, as terms give its rate."""
+        return "density_rate" in self.gives
+
+    @property
     def regresses_density(self) -> bool:
         """Whether a rate of density is learned from the rates of single moments."""
         giving = [term for term in self.terms.values() if "density_rate" in term.gives]
@@ -94,10 +99,6 @@ class LagrangianModel(nn.Module):
         """Of the terms that are linear in their parameters and do not read the density, by name, what the single
         parameters do at given particles: what a training that looks at them again and again keeps; collective."""
         return {name: self._linear_rates(term, context) for name, term in self._stages[0] if term.linear}
-
-    def describe(self) -> list[dict]:
-        """Name and settings of each term, ready for JSON."""
-        return [{"name": name, "settings": asdict(term.settings)} for name, term in self.terms.items()]
 
     @property
     def _stages(self) -> list[list[tuple[str, Term]]]:

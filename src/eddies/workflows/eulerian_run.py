@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -37,7 +38,9 @@ class EulerianRun:
     start makes no sound. The true particles follow the resolved velocity.
     """
 
-    def __init__(self, scene: Scene, truth: GroundTruth, start: int) -> None:
+    has_density = True
+
+    def __init__(self, scene: Scene, truth: GroundTruth, start: int, directory: Path, device: torch.device) -> None:
         self.settings, self.longest_step = scene.eulerian or Eulerian(), scene.simulation.step
         comm, length = truth.decomposition.comm, truth.decomposition.length
         cells = self.settings.cells_for(scene.tracers.width)
@@ -96,7 +99,7 @@ class EulerianRun:
     def description(self) -> dict[str, float | str]:
         """Grid and model; `flow_seconds_per_step` (median) is the flow's share of a step, without the particles."""
         grid = self.fluid.grid
-        return {"integrator": "etdrk4", "closure": "none", "cells": grid.cells, "largest_wavenumber": grid.cutoff,
+        return {"integrator": "etdrk4", "cells": grid.cells, "largest_wavenumber": grid.cutoff,
                 "smagorinsky": self.settings.smagorinsky,
                 "flow_seconds_per_step": float(np.median(self.flow_seconds or [np.nan]))}
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -13,9 +14,9 @@ from eddies.io.trajectories import Trajectory
 from eddies.learning.force_training import TrainingFrame
 from eddies.parallel.migration import id_block, migrate
 from eddies.parallel.slab import SlabDecomposition
-from eddies.particles.pair_forces import PairModel
+from eddies.particles.dynamics import ParticleDynamics
+from eddies.particles.model import LagrangianModel
 from eddies.particles.particle_set import ParticleSet
-from eddies.particles.poisson_closure import PoissonClosure
 from eddies.particles.reference_scales import ReferenceScales
 
 
@@ -84,12 +85,18 @@ class GroundTruth:
         return {"id": np.arange(start, stop, dtype=np.int64), **columns}
 
 
-def load_frame(truth: GroundTruth, index: int, model: PairModel, closure: PoissonClosure | None, dtype: torch.dtype,
+def load_frame(truth: GroundTruth, index: int, model: LagrangianModel, dtype: torch.dtype,
                device: torch.device) -> TrainingFrame:
-    """A frame with its true rates; the particles carry the density of the closure, or the true one without it."""
+    """A frame with its true rates; its particles carry the true density where the model integrates it."""
     columns = truth.particles_with_rates(int(index))
-    particles, force = ParticleSet.from_numpy(columns, device), None
-    if closure is not None:
-        particles, force = closure.apply(particles)
-    rates = [torch.from_numpy(columns[name]).to(device, dtype) for name in ("acceleration", "density_rate")]
-    return TrainingFrame(truth.decomposition, model, particles, *rates, force)
+    rates = {name: torch.from_numpy(columns[name]).to(device, dtype)
+             for name in ("acceleration", "density_rate") if name in columns}
+    dynamics = ParticleDynamics(truth.decomposition, model, skin=0.0, dtype=dtype)
+    return TrainingFrame(dynamics, particles_for(model, columns, device), rates["acceleration"],
+                         rates.get("density_rate"))
+
+
+def particles_for(model: LagrangianModel, columns: dict[str, np.ndarray], device: torch.device) -> ParticleSet:
+    """The true particles as a model sets them going: with their density where it integrates that."""
+    particles = ParticleSet.from_numpy(columns, device)
+    return particles if model.integrates_density else replace(particles, density=None)
