@@ -20,8 +20,8 @@ BAD_TEXTS = [
     (FLOW + TIME + "[simulation]\nstep = 1\nturnovers = 1\nframe_interval = 1\n",
      "[simulation]: needs a section [model]"),
     (FLOW + LEARNING + '[simulation]\nmethod = "wcsph"\nstep = 1\nturnovers = 1\nframe_interval = 1\n',
-     '[simulation] method = "wcsph": starts from the density, which an incompressible flow does not have; choose another, '
-     'or set [flow] fluid = "compressible" and sound_speed'),
+     '[simulation] method = "wcsph": starts from the density, which an incompressible flow does not have; choose '
+     'another, or set [flow] fluid = "compressible" and sound_speed'),
     (FLOW + LEARNING + MODEL, '[model.pairs]: reads the density, which an incompressible flow does not have; leave '
      '"density" out of [model.pairs] inputs, or set [flow] fluid = "compressible" and sound_speed'),
     (FLOW + LEARNING + MODEL + 'terms = ["eddy-viscosity", "density-transport"]\n',
@@ -69,8 +69,8 @@ BAD_OVERRIDES = [
     ('model.terms=["pressure", "pairs"]', '[model] preset = "poisson-stress": with terms = ["pressure", "pairs"] the '
      "list is given twice; remove one of the two"),
     ("model.pairs=3", "[model] pairs: no such key"),
-    ("model.pair.hidden=[8]", "[model.pair]: no such term; did you mean pairs? the terms are pressure, stress, damping, "
-     "relaxation, pairs; remove the section, or add the term to the list"),
+    ("model.pair.hidden=[8]", "[model.pair]: no such term; did you mean pairs? the terms are pressure, stress, "
+     "damping, relaxation, pairs; remove the section, or add the term to the list"),
     ("model.pairs.hiden=[8]", "[model.pairs] hiden: no such key; did you mean hidden? valid here: hidden, inputs, "),
     ("model.pairs.hidden=[16, 0]", "[model.pairs] hidden = [16, 0]: must be a list such as [16, 16] of whole numbers, "
      "each at least 1"),

@@ -25,6 +25,8 @@ __all__ = ["BOX_LENGTH", "STAGES", "Scene", "SceneError", "builtin_scenes", "loa
            "Wcsph"]
 
 STAGES = ("dns", "train-kernel", "train", "simulate", "report")
+# Sections that may name classes and functions of the user's.
+FOREIGN_IN = ("flow", "initial", "model", "simulation")
 BUILT_IN = Path(__file__).with_name("scenes")
 
 
@@ -76,7 +78,7 @@ class Scene(Document):
     def foreign(self) -> tuple[str, ...]:
         """The import paths of classes and functions that the scene names: fluid, initial flow, terms, networks, method
         of the simulation."""
-        return tuple(dict.fromkeys(path for name in ("flow", "initial", "model", "simulation")
+        return tuple(dict.fromkeys(path for name in FOREIGN_IN
                                    for path in self._foreign_in(name)))
 
     def to_toml(self) -> str:
@@ -98,7 +100,7 @@ class Scene(Document):
                  "simulate": ("device", "simulation", "wcsph", "eulerian", "own_simulation")}
         settings = asdict(self) | {"window": self.window, "start": _digest(self.initial.path),
                                    "weights": _digest(self.model and self.model.weights_file)}
-        settings |= {f"own_{name}": origins(self._foreign_in(name)) for name in ("flow", "initial", "model", "simulation")}
+        settings |= {f"own_{name}": origins(self._foreign_in(name)) for name in FOREIGN_IN}
         keys = [key for earlier in STAGES[:STAGES.index(stage) + 1]
                 if earlier in self.stages for key in reads.get(earlier, ())]
         return hashlib.sha256(json.dumps([[key, settings[key]] for key in keys]).encode()).hexdigest()

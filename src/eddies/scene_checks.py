@@ -25,7 +25,7 @@ INITIAL_KEYS = {
     "peak_wavenumber": ("random",), "wavenumber": ("abc", "shear-wave", "sound-wave"), "path": ("file",)}
 # What a class of the user's must have, by the key that names it.
 REQUIRED = {"fluid": ("nonlinear", "linear", "linear_function", "combine", "compressible"), "kind": ("__call__",),
-              "method": ("steps", "advance", "frame", "series", "description"), "network": ("forward",)}
+            "method": ("steps", "advance", "frame", "series", "description"), "network": ("forward",)}
 
 
 def first_inconsistency(scene: Scene) -> str | None:
@@ -136,13 +136,14 @@ def model_problems(scene: Scene) -> Iterator[str]:
     if {"density", "density_rate"} <= gives:
         first, second = (next(name for name, one in settings.items() if what in one.gives)
                          for what in ("density", "density_rate"))
-        yield (f'[model] terms = {quoted(scene.model.terms)}: "{first}" gives the density and "{second}" its rate, which '
-               "are two densities; remove one of the two")
+        yield (f'[model] terms = {quoted(scene.model.terms)}: "{first}" gives the density and "{second}" its rate, '
+               "which are two densities; remove one of the two")
     if not gives & {"density", "density_rate"}:
         for name, one in settings.items():
             if "density" in one.reads:
-                yield (f'[model] terms = {quoted(scene.model.terms)}: "{name}" reads the density, which no term gives; add '
-                       f'a term that does, such as "pressure" or "density-transport", or {_without_density(name, one)}')
+                yield (f'[model] terms = {quoted(scene.model.terms)}: "{name}" reads the density, which no term gives; '
+                       'add a term that does, such as "pressure" or "density-transport", or '
+                       f"{_without_density(name, one)}")
 
 
 def density_problems(scene: Scene) -> Iterator[str]:
@@ -158,8 +159,8 @@ def density_problems(scene: Scene) -> Iterator[str]:
             yield (f'[model] terms = {quoted(scene.model.terms)}: "{name}" gives a rate of density, which an '
                    f"incompressible flow does not have; remove it, {remedy}")
     if scene.simulation and "density" in scene.simulation.needs:
-        yield (f'[simulation] method = "{scene.simulation.method}": starts from the density, which an incompressible flow '
-               f"does not have; choose another, {remedy}")
+        yield (f'[simulation] method = "{scene.simulation.method}": starts from the density, which an incompressible '
+               f"flow does not have; choose another, {remedy}")
 
 
 def _without_density(name: str, settings) -> str:

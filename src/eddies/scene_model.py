@@ -102,8 +102,8 @@ def _settings(term: str, name: str, preset: Mapping[str, Any],
         raise SceneError(f"[model] terms: {error}", "model.terms") from None
     if isinstance(given, Section):
         if type(given) is not kind:
-            raise SceneError(f"[model.{name}]: must be settings of the class {kind.__qualname__}, or a dict of its keys, "
-                             f"not of {type(given).__qualname__}", f"model.{name}")
+            raise SceneError(f"[model.{name}]: must be settings of the class {kind.__qualname__}, or a dict of its "
+                             f"keys, not of {type(given).__qualname__}", f"model.{name}")
         made = given
     else:
         made = read_section(kind, {**preset, **given} if isinstance(given, Mapping) else given, f"model.{name}")

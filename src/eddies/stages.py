@@ -43,6 +43,8 @@ def run_stages(stages: Sequence[str], scene: Scene, comm, directory: Path, resum
     check_inputs(stages, scene, comm, directory)
     check_stop_file(comm, directory)
     prepare_directory(scene, comm, directory)
+    if scene.foreign:
+        log.info("%s: uses classes that are not of this package: %s", scene.name, ", ".join(scene.foreign))
     for stage in stages:
         goes_on, resume = resume, resume and is_done(stage, scene, comm, directory)
         # Left by another run, or by one killed in its last moment.
@@ -87,8 +89,8 @@ def check_inputs(stages: Sequence[str], scene: Scene, comm, directory: Path) -> 
     for stage in stages:
         if stage not in scene.stages:
             if stage == "train" and scene.model is not None:
-                raise SceneError(f'{scene.name}: [simulation] force = "{scene.simulation.force}" needs no trained '
-                                 'model; set force = "learned" to train one')
+                raise SceneError(f'{scene.name}: [simulation] method = "{scene.simulation.method}" needs no trained '
+                                 'model; set method = "learned" to train one')
             section = {"train-kernel": "kernel", "train": "model", "simulate": "simulation"}[stage]
             raise SceneError(f"{scene.name}: has no [{section}], which `eddies {stage}` is about; add it")
     if "train" in stages and scene.model.path is not None:

@@ -78,7 +78,7 @@ def test_incompressible_flow_stays_solenoidal_and_single_precision_follows(comm)
     ends = {}
     for precision in ("float64", "float32"):
         grid = SpectralGrid(SlabDecomposition(comm, 2 * np.pi, 16), precision)
-        fluid = IncompressibleFluid(grid, 0.02, LinearForcing(grid, 0.5, 2.0))
+        fluid = IncompressibleFluid(grid, 0.02, forcing=LinearForcing(grid, 0.5, 2.0))
         ends[precision] = march(fluid, initial_fields.random_velocity(grid, 3, 1.0, 2.0), 0.02, 20)
         assert ends[precision].dtype == grid.complex
         assert np.abs(divergence(grid, ends[precision])).max() < (1e-15 if precision == "float64" else 1e-6)
@@ -121,7 +121,7 @@ def test_forcing_does_not_amplify_what_no_real_field_has(comm):
     # but viscosity acts on it. Round-off makes such a part; linear forcing of it would grow without bound.
     grid = SpectralGrid(SlabDecomposition(comm, 2 * np.pi, 12))
     nu, seed, step, count = 0.01, 1e-9, 0.05, 400
-    fluid = IncompressibleFluid(grid, nu, LinearForcing(grid, 1.0, 2.0))
+    fluid = IncompressibleFluid(grid, nu, forcing=LinearForcing(grid, 1.0, 2.0))
     state = initial_fields.random_velocity(grid, 3, 1.0, 1.5)
     state[0, 1, 0, 0] += seed  # u_x at kz = 1, half of which its mirror image lacks
     state = march(fluid, state, step, count)

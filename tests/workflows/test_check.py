@@ -156,10 +156,10 @@ def test_ghost_planes_limit_the_ranks():
     from eddies.workflows.estimates import most_ranks
     fields = {planes: most_ranks(load_scene("tiny", [f"tracers.field_cells={planes}"])) for planes in (11, 12)}
     assert [limits["ghost planes of the filtered fields"] for limits in fields.values()] == [2, 3]
-    assert fields[12]["ghost planes of the Poisson closure"] == 4
+    assert fields[12]["ghost planes of the resolved velocity"] == 4
     fast = most_ranks(load_scene("tiny", ["simulation.step=0.2", "simulation.frame_interval=0.2"]))
-    assert fast["ghost planes of the Poisson closure"] == 2
-    assert "ghost planes of the Poisson closure" not in most_ranks(load_scene("tiny", ["model.closure=paper-density"]))
+    assert fast["ghost planes of the resolved velocity"] == 2
+    assert "ghost planes of the resolved velocity" not in most_ranks(load_scene("tiny", ["model.preset=paper-density"]))
 
 
 @pytest.mark.mpi(1)

@@ -7,7 +7,7 @@ import time
 import numpy as np
 
 from eddies.clock import Clock
-from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid
+from eddies.flow.navier_stokes import Fluid
 from eddies.flow.stability import FlowDiverged
 from eddies.flow.statistics import (
     component_energies, compressible_budget, energy_spectrum, gradient_moments, incompressible_budget,
@@ -23,7 +23,7 @@ class FlowHistory:
     the dissipated energy (over E(0) where nothing is dissipated).
     """
 
-    def __init__(self, fluid: IncompressibleFluid | CompressibleFluid, every: int = 4) -> None:
+    def __init__(self, fluid: Fluid, every: int = 4) -> None:
         self.fluid, self.every = fluid, every
         self.rows: list[dict[str, float]] = []
         self.spectra: list[np.ndarray] = []
@@ -92,7 +92,7 @@ class FlowHistory:
     def _measure(self, state: np.ndarray) -> tuple[dict[str, float], np.ndarray]:
         fluid, grid = self.fluid, self.fluid.grid
         velocity = state[:3]
-        if isinstance(fluid, CompressibleFluid):
+        if fluid.compressible:
             row = compressible_budget(grid, state, fluid.viscosity, fluid.sound_speed)
         else:
             row = incompressible_budget(grid, velocity, fluid.viscosity)
@@ -102,6 +102,6 @@ class FlowHistory:
         row |= component_energies(grid, velocity)
         row |= turbulence_scales(spectrum, row["dissipation_rate"], fluid.viscosity, grid.cutoff)
         row["injection_rate"] = fluid.forcing.injection_rate if fluid.forcing is not None else 0.0
-        if isinstance(fluid, CompressibleFluid):
+        if fluid.compressible:
             row["mach_turbulent"] = float(np.sqrt(2 * row["energy"]) / fluid.sound_speed)
         return row, spectrum

@@ -76,6 +76,16 @@ def balanced_density(grid: SpectralGrid, velocity: np.ndarray, sound_speed: floa
     return pressure(grid, velocity) / sound_speed**2
 
 
+#: Initial velocities by the words of [initial] kind, from the grid, the section's values and the seed: (3, kz, ky, kx).
+INITIAL_FLOWS = {
+    "random": lambda grid, initial, seed: random_velocity(grid, seed, initial.amplitude, initial.peak_wavenumber),
+    "taylor-green": lambda grid, initial, seed: taylor_green(grid, initial.amplitude),
+    "abc": lambda grid, initial, seed: abc(grid, initial.amplitude, initial.wavenumber),
+    "shear-wave": lambda grid, initial, seed: shear_wave(grid, initial.amplitude, initial.wavenumber),
+    "sound-wave": lambda grid, initial, seed: np.zeros((3, *grid.spectral_shape), grid.complex),
+}
+
+
 def _transformed(grid: SpectralGrid, amplitude: float, components: list) -> np.ndarray:
     field = np.stack([np.broadcast_to(np.asarray(c, grid.real), grid.physical_shape) for c in components])
     return grid.forward(amplitude * field)

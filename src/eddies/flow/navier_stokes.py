@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from typing import Any, Protocol
+
 import numpy as np
 
 from eddies.flow.forcing import LinearForcing
@@ -12,14 +15,45 @@ from eddies.flow.subgrid import Smagorinsky
 from eddies.time_stepping import ScalarFunction, divided_difference
 
 
+class Fluid(Protocol):
+    """What the direct simulation solves, built as Fluid(grid, viscosity, sound_speed, forcing); a class of your own
+    best derives from one of the two below.
+
+    `compressible`: the state is (u, v, w, s), s = ln(rho / rho_0), as modes (4, kz, ky, kx); otherwise the velocity
+    alone, (3, kz, ky, kx), and the sound speed is infinite. `forcing` is None, or adds to a tendency; it is removed
+    when tracers are released. Steppers and statistics read these attributes.
+    """
+
+    compressible: bool
+    grid: SpectralGrid
+    viscosity: float
+    sound_speed: float
+    forcing: LinearForcing | None
+
+    def nonlinear(self, state: np.ndarray) -> np.ndarray:
+        """N(u), with the forcing."""
+
+    def linear(self, state: np.ndarray) -> np.ndarray:
+        """L u."""
+
+    def linear_function(self, function: ScalarFunction, step: float) -> Any:
+        """f(step L), in a form that `combine` applies."""
+
+    def combine(self, *terms: tuple[Any, np.ndarray]) -> np.ndarray:
+        """The sum of linear functions applied to states."""
+
+
 class IncompressibleFluid:
     """u_t = P[u x omega + f] + nu laplacian u,  P the projection on solenoidal fields (it absorbs p + |u|^2 / 2).
 
     The state is the velocity, (3, kz, ky, kx). Nine transforms an evaluation, of which eight are sent.
     """
 
-    def __init__(self, grid: SpectralGrid, viscosity: float, forcing: LinearForcing | None = None) -> None:
-        self.grid, self.viscosity, self.forcing = grid, viscosity, forcing
+    compressible = False
+
+    def __init__(self, grid: SpectralGrid, viscosity: float, sound_speed: float = math.inf,
+                 forcing: LinearForcing | None = None) -> None:
+        self.grid, self.viscosity, self.sound_speed, self.forcing = grid, viscosity, sound_speed, forcing
 
     def nonlinear(self, state: np.ndarray) -> np.ndarray:
         """P[u x omega + f]."""
@@ -60,6 +94,8 @@ class CompressibleFluid:
     transforms back (u and the gradients of u and s), four forth; of the first eight are sent, because derivatives along
     x and y are taken after the transform along z.
     """
+
+    compressible = True
 
     def __init__(self, grid: SpectralGrid, viscosity: float, sound_speed: float,
                  forcing: LinearForcing | None = None, subgrid: Smagorinsky | None = None) -> None:
@@ -163,3 +199,7 @@ def _cross_vorticity(fields: np.ndarray, out: np.ndarray) -> None:
 def advective_speed(grid: SpectralGrid, velocity: np.ndarray) -> float:
     """Largest |u| + |v| + |w| on this rank's grid points: the speed of the advective Courant number."""
     return float(np.abs(grid.backward(velocity)).sum(axis=0).max(initial=0.0))
+
+
+#: The fluids that [flow] fluid names by a word.
+FLUIDS: dict[str, type[Fluid]] = {"incompressible": IncompressibleFluid, "compressible": CompressibleFluid}

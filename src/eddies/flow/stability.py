@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from eddies.clock import Clock
-from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid, advective_speed
+from eddies.flow.navier_stokes import Fluid, advective_speed
 from eddies.parallel.reduction import global_max, global_sum
 from eddies.time_stepping import RungeKutta4
 
@@ -64,8 +64,7 @@ class StepLimit:
         return f"{self.name}, {self.expression} = {self.number:.3g}, stable up to {self.boundary:.3g}"
 
 
-def step_limits(fluid: IncompressibleFluid | CompressibleFluid, stepper: Callable, step: float,
-                speed: float) -> list[StepLimit]:
+def step_limits(fluid: Fluid, stepper: Callable, step: float, speed: float) -> list[StepLimit]:
     """The limits of a step in a flow with the largest |u| + |v| + |w| = `speed`; k_max is the cutoff of each axis.
 
     The eigenvalues of the largest modulus, all at |k| = sqrt(3) k_max: advection i k_max (|u| + |v| + |w|), sound on
@@ -84,7 +83,7 @@ def step_limits(fluid: IncompressibleFluid | CompressibleFluid, stepper: Callabl
     limits = [StepLimit("advection", "step x k_max x max(|u| + |v| + |w|)", step * k_max * speed, IMAGINARY_REACH)]
     if isinstance(stepper, RungeKutta4):
         stretch = 3.0
-        if isinstance(fluid, CompressibleFluid):
+        if fluid.compressible:
             stretch = 4.0
             number = step * k_max * (speed + math.sqrt(3) * fluid.sound_speed)
             limits.append(StepLimit("sound", "step x k_max x (max(|u| + |v| + |w|) + sqrt(3) sound_speed)", number,
@@ -94,7 +93,7 @@ def step_limits(fluid: IncompressibleFluid | CompressibleFluid, stepper: Callabl
     return limits
 
 
-def advice(fluid: IncompressibleFluid | CompressibleFluid, limits: Sequence[StepLimit], kmax_eta: float) -> str:
+def advice(fluid: Fluid, limits: Sequence[StepLimit], kmax_eta: float) -> str:
     """What an unstable run should change: for the limits that its step broke, or for the resolution if none."""
     broken = [limit for limit in limits if limit.exceeded]
     if broken:
@@ -102,15 +101,15 @@ def advice(fluid: IncompressibleFluid | CompressibleFluid, limits: Sequence[Step
     resolution = f"k_max eta was {kmax_eta:.2g}, about 1 is needed" if fluid.viscosity > 0 else "there is no viscosity"
     text = ("The step broke no limit (" + "; ".join(map(str, limits)) + f"), so the grid is likely too coarse "
             f"({resolution}): raise [flow] cells or viscosity")
-    if isinstance(fluid, CompressibleFluid) and len(limits) == 1 and limits[0].number > LEAK:
+    if fluid.compressible and len(limits) == 1 and limits[0].number > LEAK:
         text += ". Or sound grows that is hardly damped: lower [time] courant or step"
     return text
 
 
-def quadratic_energy(fluid: IncompressibleFluid | CompressibleFluid, state: np.ndarray) -> float:
+def quadratic_energy(fluid: Fluid, state: np.ndarray) -> float:
     """<u.u>/2, and for sound + c^2 <s^2>/2, which the linear terms never raise: one pass over the modes."""
     energy = _half_square(state[:3])
-    if isinstance(fluid, CompressibleFluid):
+    if fluid.compressible:
         energy += fluid.sound_speed**2 * _half_square(state[3:])
     return float(global_sum(fluid.grid.decomposition.comm, energy))
 
@@ -124,7 +123,7 @@ def _half_square(modes: np.ndarray) -> float:
 class StabilityWatch:
     """Looks at the energy after every step of a flow, for a small message and 0.1 % of a step's work."""
 
-    def __init__(self, fluid: IncompressibleFluid | CompressibleFluid, stepper: Callable, history: FlowHistory) -> None:
+    def __init__(self, fluid: Fluid, stepper: Callable, history: FlowHistory) -> None:
         self.fluid, self.stepper, self.history = fluid, stepper, history
         self._ceiling = math.inf
 

@@ -8,7 +8,7 @@ from eddies.clock import duration
 from eddies.scene import BOX_LENGTH, Scene
 from eddies.workflows.cost_model import LATENCY, NODE_BANDWIDTH, NODE_RANKS, Speed, cost, costs, pair_bytes, probe
 from eddies.workflows.estimates import (expected_step, expected_turbulence, ground_truth_alone, largest_wavenumber,
-                                        most_ranks, particle_reach, run_time)
+                                        learns_pairs, most_ranks, particle_reach, run_time)
 
 log = logging.getLogger("eddies")
 
@@ -74,7 +74,7 @@ def step_lines(scene: Scene) -> Iterator[str]:
     """Time steps and how many of them."""
     expected, span = expected_step(scene), run_time(scene)
     if expected is None:
-        yield "not foreseen: the flow comes from a file"
+        yield "not foreseen: the speed of the initial flow is not known"
         return
     step, limit = expected
     steps = f", about {expected_steps(scene)} steps for a time of {span:.3g}" if span else ""
@@ -105,7 +105,7 @@ def time_lines(scene: Scene, ranks: int, speed: Speed) -> Iterator[str]:
 
 def cost_lines(scene: Scene, speed: Speed) -> Iterator[str]:
     """Memory and wall time of the direct simulation on any number of ranks, and memory of the learned pair force."""
-    pairs = scene.simulation is not None and scene.simulation.force == "learned" and scene.model.basis != "none"
+    pairs = scene.simulation is not None and learns_pairs(scene)
     yield (f"estimates, from the work of the ranks at hand, for nodes of {NODE_RANKS} ranks that share "
            f"{NODE_BANDWIDTH / 1e9:g} GB/s, {1e6 * LATENCY:g} us a message")
     yield ("ranks  nodes  planes  memory a rank  s a step     wall time  core hours"
@@ -138,9 +138,11 @@ def warnings(scene: Scene, ranks: int) -> Iterator[str]:
     if scene.model and scene.model.path and not scene.model.weights_file.is_file():
         yield (f'[model] path = "{scene.model.path}": there is no {scene.model.weights_file} yet, which `eddies train` '
                "will want")
-    if scene.training and scene.model.closure == "learned-density" and not scene.training.horizon_steps:
-        yield ('[model] closure = "learned-density": its rate of density is trained through horizons alone, and stays '
-               "as it starts without them: set [training] horizon_steps")
+    if scene.training and scene.model.path is None and not scene.training.horizon_steps:
+        for name, settings in scene.model.settings.items():
+            if settings.learns_through_horizons:
+                yield (f'[model] terms: "{name}" is trained through horizons alone, and stays as it starts without '
+                       "them: set [training] horizon_steps")
     if scene.tracers and scene.tracers.width < BOX_LENGTH / scene.flow.cells:
         yield "the filter is narrower than a cell of the grid: it filters nothing"
     if ranks > most:

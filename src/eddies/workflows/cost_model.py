@@ -27,14 +27,15 @@ from eddies.workflows.estimates import expected_turbulence, largest_wavenumber
 
 PROBE_CELLS = 64
 EVALUATIONS = 4              # of the nonlinear term in a step, of either stepper
-SENT_COMPONENTS = {"compressible": (8, 4), "incompressible": (5, 3)}  # to planes, and back to columns
+# Of a compressible fluid (True) and of an incompressible one (False): what is sent to planes, and back to columns.
+SENT_COMPONENTS = {True: (8, 4), False: (5, 3)}
 # Work of a cell over that at 64^3. It outgrows the transforms' log n because planes and their blocks outgrow the
 # caches. From tests/benchmarks/step.py, from 256^3 on for the slab of one of many ranks (--share-of).
 WORK_GROWTH = {64: 1.0, 128: 1.0, 256: 1.35, 512: 1.7, 1024: 2.75, 2048: 4.8}
 # Memory of a rank, from runs at 64^3 to 128^3 on 1 and 2 ranks, and from thin slabs of 1024^3: of a cell in float64; of
 # the block of planes that is worked on, in real arrays of a pair of planes; and what there is before any field.
-FLOW_BYTES = {"compressible": 320, "incompressible": 220}
-BLOCK_ARRAYS = {"compressible": 64, "incompressible": 32}
+FLOW_BYTES = {True: 320, False: 220}
+BLOCK_ARRAYS = {True: 64, False: 32}
 PROCESS_BYTES = 100e6
 # The cluster that a job on more ranks than are at hand is imagined on.
 NODE_RANKS = 64
@@ -97,7 +98,8 @@ def work_growth(cells: int) -> float:
 def sent_bytes(scene: Scene) -> float:
     """Bytes of all modes that change between columns and planes for one nonlinear term, over all ranks."""
     K = largest_wavenumber(scene)
-    return sum(SENT_COMPONENTS[scene.flow.fluid]) * scene.flow.cells * (2 * K + 1) * (K + 1) * 2 * real_bytes(scene)
+    components = sum(SENT_COMPONENTS[scene.flow.compressible])
+    return components * scene.flow.cells * (2 * K + 1) * (K + 1) * 2 * real_bytes(scene)
 
 
 def exchange_seconds(scene: Scene, ranks: int, speed: Speed) -> float:
@@ -117,16 +119,18 @@ def real_bytes(scene: Scene) -> int:
 
 def flow_bytes(scene: Scene, ranks: int) -> float:
     """Memory of a rank in the direct simulation."""
-    fluid, cells, real = scene.flow.fluid, scene.flow.cells, real_bytes(scene)
+    fluid, cells, real = scene.flow.compressible, scene.flow.cells, real_bytes(scene)
     block = BLOCK_ARRAYS[fluid] * max(BLOCK_BYTES, 2 * cells**2 * real)
     return PROCESS_BYTES + FLOW_BYTES[fluid] * real / 8 * cells**2 * math.ceil(cells / ranks) + block
 
 
 def pair_bytes(scene: Scene, ranks: int) -> float:
-    """Memory of a rank in the learned pair force: list, displacements, three copies of every activation."""
+    """Memory of a rank in the learned pair force: list, displacements, three copies of what the term that keeps most
+    of a pair keeps."""
     pairs = scene.tracers.particles * scene.kernel.neighbors * (1 + scene.simulation.skin) ** 3
     item = 4 if scene.simulation.precision == "float32" else 8
-    return PROCESS_BYTES + pairs / ranks * (16 + 4 * item + 3 * item * (5 + sum(scene.model.hidden) + 3))
+    kept = max(settings.numbers_per_pair for settings in scene.model.settings.values())
+    return PROCESS_BYTES + pairs / ranks * (16 + 4 * item + 3 * item * kept)
 
 
 def probe(scene: Scene, comm, steps: int = 5) -> Speed:
@@ -160,7 +164,7 @@ def probe(scene: Scene, comm, steps: int = 5) -> Speed:
 def exchange_once(grid: SpectralGrid, scene: Scene, comm) -> float:
     """Seconds in which the messages of one nonlinear term are sent."""
     to_planes, to_columns = (grid.buffers(direction, components) for direction, components
-                             in zip(("backward", "forward"), SENT_COMPONENTS[scene.flow.fluid]))
+                             in zip(("backward", "forward"), SENT_COMPONENTS[scene.flow.compressible]))
     comm.Barrier()
     start = time.perf_counter()
     to_planes.to_planes()

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import logging
+import math
 from pathlib import Path
 
 import numpy as np
 
 from eddies.clock import Clock, ProgressLine
-from eddies.flow import initial_fields
+from eddies.composition import is_path, load
 from eddies.flow.courant import CourantLimit, FixedStep
 from eddies.flow.forcing import LinearForcing
 from eddies.flow.history import FlowHistory
-from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid
+from eddies.flow.initial_fields import INITIAL_FLOWS, balanced_density, sound_wave_density
+from eddies.flow.navier_stokes import FLUIDS, Fluid
 from eddies.flow.operators import project
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.io.checkpoint import DIRECTORIES, Checkpoint
@@ -42,8 +44,7 @@ def run(scene: Scene, comm, directory: str | Path, stop: StopRequest | None = No
     guard = Guard(comm, directory / DIRECTORIES["dns"], fingerprint, stop or StopRequest(comm))
     saved = guard.checkpoints.newest()
     flow = build_run(scene, comm, guard, saved)
-    provenance = {"scene": scene.to_toml(), "fingerprint": fingerprint}
-    with create_product(comm, directory / "ground_truth.h5", "ground_truth", provenance) as file:
+    with create_product(comm, directory / "ground_truth.h5", "ground_truth", scene.provenance("dns")) as file:
         if saved is None:
             flow.history.sample(flow.state, flow.clock)
         in_tracers = saved is not None and "tracers" in saved.description
@@ -111,9 +112,8 @@ def stationary_span(settings: SpinUp, history: FlowHistory) -> dict[str, float]:
 
 def follow_tracers(scene: Scene, file, flow: FlowRun, saved: Checkpoint | None) -> None:
     """Release tracers into the flow, forcing off, and store their frames, the filtered fields and the scales."""
-    compressible = isinstance(flow.fluid, CompressibleFluid)
     comm, names = flow.fluid.grid.decomposition.comm, saved.files if saved is not None else ()
-    with FrameSegments(comm, flow.guard.checkpoints.path, scene.tracers, compressible, names) as segments:
+    with FrameSegments(comm, flow.guard.checkpoints.path, scene.tracers, flow.fluid.compressible, names) as segments:
         run = flow.guard.tracers = TracerRun(scene, flow, segments, saved)
         run.follow()
         segments.assemble(file)
@@ -123,16 +123,15 @@ def follow_tracers(scene: Scene, file, flow: FlowRun, saved: Checkpoint | None) 
     run.frames.write_spectra(file)
 
 
-def build_fluid(scene: Scene, comm) -> IncompressibleFluid | CompressibleFluid:
+def build_fluid(scene: Scene, comm) -> Fluid:
     """The fluid of a scene on its grid, with its forcing if it has one."""
     flow = scene.flow
     grid = SpectralGrid(SlabDecomposition(comm, BOX_LENGTH, flow.cells), flow.precision)
     forcing = None
     if scene.forcing is not None:
         forcing = LinearForcing(grid, scene.forcing.injection_rate, scene.forcing.wavenumber)
-    if flow.fluid == "incompressible":
-        return IncompressibleFluid(grid, flow.viscosity, forcing)
-    return CompressibleFluid(grid, flow.viscosity, flow.sound_speed, forcing)
+    kind = load(flow.fluid) if is_path(flow.fluid) else FLUIDS[flow.fluid]
+    return kind(grid, flow.viscosity, flow.sound_speed if flow.compressible else math.inf, forcing)
 
 
 def build_step_limit(scene: Scene, grid: SpectralGrid) -> CourantLimit | FixedStep:
@@ -140,33 +139,38 @@ def build_step_limit(scene: Scene, grid: SpectralGrid) -> CourantLimit | FixedSt
     time = scene.time
     if time.step is not None:
         return FixedStep(time.step)
-    explicit_sound = scene.flow.sound_speed if time.stepper == "rk4" and scene.flow.fluid == "compressible" else 0.0
+    explicit_sound = scene.flow.sound_speed if time.stepper == "rk4" and scene.flow.compressible else 0.0
     return CourantLimit(grid, time.courant, time.max_step, explicit_sound)
 
 
-def initial_state(scene: Scene, fluid: IncompressibleFluid | CompressibleFluid) -> np.ndarray:
+def initial_state(scene: Scene, fluid: Fluid) -> np.ndarray:
     """The state at time 0: velocity, and for a compressible fluid s = ln(rho / rho_0)."""
     initial, grid = scene.initial, fluid.grid
     if initial.kind == "file":
         return _state_from_file(initial.path, fluid)
-    velocities = {
-        "random": lambda: initial_fields.random_velocity(grid, scene.seed, initial.amplitude, initial.peak_wavenumber),
-        "taylor-green": lambda: initial_fields.taylor_green(grid, initial.amplitude),
-        "abc": lambda: initial_fields.abc(grid, initial.amplitude, initial.wavenumber),
-        "shear-wave": lambda: initial_fields.shear_wave(grid, initial.amplitude, initial.wavenumber),
-        "sound-wave": lambda: np.zeros((3, *grid.spectral_shape), grid.complex),
-    }
-    velocity = velocities[initial.kind]()
-    if isinstance(fluid, IncompressibleFluid):
+    velocity = _own_velocity(scene, grid) if is_path(initial.kind) else INITIAL_FLOWS[initial.kind](
+        grid, initial, scene.seed)
+    if not fluid.compressible:
         return velocity
     if initial.kind == "sound-wave":
-        density = initial_fields.sound_wave_density(grid, initial.amplitude, initial.wavenumber)
+        density = sound_wave_density(grid, initial.amplitude, initial.wavenumber)
     else:
-        density = initial_fields.balanced_density(grid, velocity, fluid.sound_speed)
+        density = balanced_density(grid, velocity, fluid.sound_speed)
     return np.concatenate([velocity, density[None]])
 
 
-def _state_from_file(path: str, fluid: IncompressibleFluid | CompressibleFluid) -> np.ndarray:
+def _own_velocity(scene: Scene, grid: SpectralGrid) -> np.ndarray:
+    """What the user's function of an initial flow returns, its solenoidal part; SceneError where it is no velocity."""
+    initial, shape = scene.initial, (3, *grid.spectral_shape)
+    velocity = load(initial.kind)(grid, initial, scene.seed)
+    if not isinstance(velocity, np.ndarray) or velocity.shape != shape:
+        found = f"an array {velocity.shape}" if isinstance(velocity, np.ndarray) else f"a {type(velocity).__name__}"
+        raise SceneError(f'[initial] kind = "{initial.kind}": returned {found}; must be the modes (3, kz, ky, kx) = '
+                         f"{shape} of the velocity on this rank, such as grid.forward(velocity) gives")
+    return project(grid, velocity.astype(grid.complex))
+
+
+def _state_from_file(path: str, fluid: Fluid) -> np.ndarray:
     grid = fluid.grid
     with open_product(grid.decomposition.comm, path, "ground_truth") as file:
         fields = FieldSeries(file, "final")
@@ -175,11 +179,11 @@ def _state_from_file(path: str, fluid: IncompressibleFluid | CompressibleFluid) 
                              f"{grid.cells}; make them equal")
         planes = (grid.decomposition.start, grid.decomposition.stop)
         state = grid.forward(fields.read(-1, "velocity", *planes))
-        if isinstance(fluid, CompressibleFluid):
+        if fluid.compressible:
             if "density" in fields.variables:
                 s = grid.forward(np.log(fields.read(-1, "density", *planes)))
             else:
-                s = initial_fields.balanced_density(grid, state, fluid.sound_speed)[None]
+                s = balanced_density(grid, state, fluid.sound_speed)[None]
             return np.concatenate([state, s])
     # A velocity of a compressible flow, or in single precision, is not solenoidal.
     return project(grid, state)

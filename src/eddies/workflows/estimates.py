@@ -69,7 +69,7 @@ def expected_turbulence(scene: Scene) -> ExpectedTurbulence | None:
 
 
 def peak_speed(scene: Scene) -> float | None:
-    """Expected largest |u| + |v| + |w|; None for a flow from a file without forcing."""
+    """Expected largest |u| + |v| + |w|; None without forcing for a flow from a file or of the user's."""
     initial, turbulence = scene.initial, expected_turbulence(scene)
     if turbulence:
         return PEAK_SPEED * turbulence.velocity_rms
@@ -115,14 +115,13 @@ def most_ranks(scene: Scene) -> dict[str, int]:
         support = scene.kernel.support(scene.tracers.particles)
         limits[f"slabs of the fields no thinner than the kernel's support {support:.3g}"] = thick_slabs(
             scene.tracers.cells, support)
-    force = scene.simulation.force if scene.simulation else "none"
-    if "train" in scene.stages or force == "wcsph":
+    if learns_pairs(scene) or (scene.simulation and "pairs" in scene.simulation.needs):
         reach = particle_reach(scene)
         limits[f"slabs no thinner than the particles' reach {reach:.3g}"] = thick_slabs(
             scene.tracers.particles_per_side, reach)
     if "train" in scene.stages:
         limits |= most_training_ranks(scene)
-    if force == "eulerian":
+    if scene.simulation and scene.simulation.method == "eulerian":
         cells = (scene.eulerian or Eulerian()).cells_for(scene.tracers.width)
         limits["ghost planes of the coarse grid"] = max(cells // GHOST_PLANES[scene.tracers.interpolation], 1)
     return limits
@@ -130,20 +129,26 @@ def most_ranks(scene: Scene) -> dict[str, int]:
 
 def most_training_ranks(scene: Scene) -> dict[str, int]:
     """The same for what a model is trained on and by."""
-    # The a-priori test interpolates filtered fields to the particles, the closure the pressure.
+    # The a-priori test interpolates filtered fields to the particles, terms what they make of the resolved velocity.
     limits = {"ghost planes of the filtered fields": max(scene.tracers.cells // GHOST_PLANES["quintic"], 1)}
     support, simulation = scene.kernel.support(scene.tracers.particles), scene.simulation
-    if scene.model.closure.startswith("poisson"):
+    if "resolved" in scene.model.reads:
         skin, step = (simulation.skin * support, simulation.step) if simulation else (0.0, 0.0)
-        limits["ghost planes of the Poisson closure"] = closure_ranks(scene, step, skin)
+        limits["ghost planes of the resolved velocity"] = closure_ranks(scene, step, skin)
     time = horizon_time(scene)
     if time > 0:
-        reach = support + 2 * particle_drift(scene, time)
-        limits[f"slabs no thinner than the particles' reach {reach:.3g} in the training through horizons"] = (
-            thick_slabs(scene.tracers.particles_per_side, reach))
-        if scene.training.energy_weight > 0 or scene.model.closure.startswith("poisson"):
+        if learns_pairs(scene):
+            reach = support + 2 * particle_drift(scene, time)
+            limits[f"slabs no thinner than the particles' reach {reach:.3g} in the training through horizons"] = (
+                thick_slabs(scene.tracers.particles_per_side, reach))
+        if scene.training.energy_weight > 0 or "resolved" in scene.model.reads:
             limits["ghost planes of the grid in the training through horizons"] = closure_ranks(scene, time)
     return limits
+
+
+def learns_pairs(scene: Scene) -> bool:
+    """Whether a model is trained or adopted that looks at pairs of particles."""
+    return "train" in scene.stages and "pairs" in scene.model.reads
 
 
 def ground_truth_alone(scene: Scene) -> Scene:

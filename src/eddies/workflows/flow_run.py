@@ -12,7 +12,7 @@ import numpy as np
 from eddies.clock import Clock
 from eddies.flow.courant import CourantLimit, FixedStep
 from eddies.flow.history import FlowHistory
-from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid
+from eddies.flow.navier_stokes import Fluid
 from eddies.flow.stability import StabilityWatch
 from eddies.io.checkpoint import Checkpoint, CheckpointDirectory
 from eddies.io.contiguous import Block
@@ -26,7 +26,7 @@ class FlowRun:
     `guard` looks on before each step; after it `watch` ends a run that became unstable.
     """
 
-    fluid: IncompressibleFluid | CompressibleFluid
+    fluid: Fluid
     state: np.ndarray
     stepper: Callable[[np.ndarray, float], np.ndarray]
     step_limit: CourantLimit | FixedStep

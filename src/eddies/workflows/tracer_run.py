@@ -8,7 +8,6 @@ import numpy as np
 
 from eddies.clock import ProgressLine
 from eddies.flow.courant import FixedStep
-from eddies.flow.navier_stokes import CompressibleFluid
 from eddies.flow.tracers import FilteredField, TracerParticles, release
 from eddies.io.checkpoint import Checkpoint
 from eddies.io.contiguous import Block
@@ -29,7 +28,7 @@ class TracerRun:
     def __init__(self, scene: Scene, flow: FlowRun, segments: FrameSegments, saved: Checkpoint | None) -> None:
         self.scene, self.flow, self.segments, self.settings = scene, flow, segments, scene.tracers
         flow.fluid.forcing = None
-        compressible = isinstance(flow.fluid, CompressibleFluid)
+        compressible = flow.fluid.compressible
         field = FilteredField(flow.fluid.grid, self.settings.width, self.settings.interpolation)
         self.comm = flow.fluid.grid.decomposition.comm
         if saved is None:
