@@ -15,8 +15,9 @@ import eddies
 
 
 def kida(grid, initial, seed: int) -> np.ndarray:
-    """Fourier modes (3, kz, ky, kx) of the velocity (Kida 1985), solenoidal: u = sin x (cos 3y cos z - cos y cos 3z), and v, w
-    with x, y, z exchanged in turn. `initial` holds the keys of [initial]: `amplitude` is the rms of a component here."""
+    """Fourier modes (3, kz, ky, kx) of the velocity (Kida 1985), solenoidal: u = sin x (cos 3y cos z - cos y cos 3z),
+    and v, w with x, y, z exchanged in turn. `initial` holds the keys of [initial]: `amplitude` is the rms of a
+    component here."""
     x, y, z = grid.coordinates()  # of this rank's points
 
     def component(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:

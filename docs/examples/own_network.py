@@ -17,8 +17,8 @@ import eddies
 class Waves(torch.nn.Module):
     """Sums of sines of random combinations of the features, their amplitudes, phases and wavevectors learned.
 
-    Made with the number of features of a pair, the widths of [model.pairs] hidden, the number of outputs and a seed; takes
-    features (inputs, m) of m pairs to outputs (outputs, m).
+    Made with the number of features of a pair, the widths of [model.pairs] hidden, the number of outputs and a seed;
+    takes features (inputs, m) of m pairs to outputs (outputs, m).
     """
 
     def __init__(self, inputs: int, hidden: tuple[int, ...], outputs: int, seed: int) -> None:

@@ -2,8 +2,8 @@
 
     python docs/examples/own_term.py                # or: mpirun -n 2 python docs/examples/own_term.py
 
-runs the scene `tiny` with it: ground truth, training of its coefficient, rollout, report. A scene names it by its import
-path, in a TOML file beside this one or on the command line:
+runs the scene `tiny` with it: ground truth, training of its coefficient, rollout, report. A scene names it by its
+import path, in a TOML file beside this one or on the command line:
 
     [model]
     terms = ["pressure", "own_term:SmagorinskyStress", "relaxation", "pairs"]
@@ -30,7 +30,8 @@ class Settings(eddies.TermSettings):
 
 
 class SmagorinskyStress(eddies.Term):
-    """-P[div tau] with  tau = -2 nu_t S,  nu_t = (C d)^2 |S|,  |S| = (2 S:S)^(1/2),  d the filter width; C^2 is learned."""
+    """-P[div tau] with  tau = -2 nu_t S,  nu_t = (C d)^2 |S|,  |S| = (2 S:S)^(1/2),  d the filter width; C^2 is
+    learned."""
 
     Settings = Settings
     linear = True  # in its parameter, C^2

@@ -100,8 +100,8 @@ class TrainingFrame:
         return self._volumes[1]
 
     def errors(self, rows: Tensor | None = None, density: Tensor | None = None) -> dict[str, Tensor]:
-        """Predicted minus true "acceleration" (k, 3), and "density_rate" (k,) if the model has one, at all owned particles
-        or some of their rows; with another `density` (n,) than terms give. Collective."""
+        """Predicted minus true "acceleration" (k, 3), and "density_rate" (k,) if the model has one, at all owned
+        particles or some of their rows; with another `density` (n,) than terms give. Collective."""
         kept = slice(None) if rows is None else rows
         rates = self.dynamics.rates(self.particles, rows, self.kept, density)
         errors = {"acceleration": rates.acceleration.to(self.acceleration) - self.acceleration[kept]}

@@ -76,7 +76,7 @@ class Context:
     def local(self) -> LocalParticles:
         """The particles that this rank sees, ghosts included, without columns."""
         if self._surroundings is None:
-            raise LookupError('no term of this model reads "pairs" or "resolved": add it to the `reads` of the settings')
+            raise LookupError('no term of this model reads "pairs" or "resolved": add it to the settings\' `reads`')
         return self._surroundings.local(self.particles)
 
     def column(self, name: str) -> Tensor:
@@ -156,8 +156,8 @@ class Context:
         yield from self.blocks(max(summand.width for summand in summands))
 
     def blocks(self, width: int) -> Iterator[slice]:
-        """Consecutive particles whose pairs hold about as many numbers as fit the cache, `width` for each pair; at least
-        one block."""
+        """Consecutive particles whose pairs hold about as many numbers as fit the cache, `width` for each pair; at
+        least one block."""
         together = max(PAIR_VALUES_TOGETHER[self.particles.position.device.type] // width, 1)
         yield from self.local.neighbors.blocks(together)
 

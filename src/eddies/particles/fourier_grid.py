@@ -97,8 +97,8 @@ class FourierGrid:
         return self.to_fields(modes).unflatten(0, (3, 3))
 
     def products(self, first: Tensor, second: Tensor) -> Tensor:
-        """Modes (6, kz, ky, kx) of a_i.b_j, symmetric in i and j, of fields (3, ..., z_local, y, x); what stands between
-        is summed over."""
+        """Modes (6, kz, ky, kx) of a_i.b_j, symmetric in i and j, of fields (3, ..., z_local, y, x); what stands
+        between is summed over."""
         pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
         fields = [first[i] * second[j] for i, j in pairs]
         return self.to_modes(torch.stack([field.sum(0) if field.dim() > 3 else field for field in fields]))
@@ -112,8 +112,8 @@ class FourierGrid:
         return kx * vector[0] + ky * vector[1] + kz * vector[2]
 
 
-# Modes with kx > 0 stand for two, so the transform back is the adjoint of the transform forth but for `multiplicity` and
-# the number of points.
+# Modes with kx > 0 stand for two, so the transform back is the adjoint of the transform forth but for `multiplicity`
+# and the number of points.
 
 
 class _ToModes(torch.autograd.Function):

@@ -53,7 +53,8 @@ class VelocityVerlet(Integrator):
         end = self.dynamics.rates(replace(_kicked(particles, start, time_step), position=position))
         kicked = _kicked(_kicked(particles, start, 0.5 * time_step), end, 0.5 * time_step)
         result = replace(kicked, position=position)
-        self.restore(result, {name: rate for name, rate in vars(end).items() if name in REMEMBERED and rate is not None})
+        remembered = {name: getattr(end, name) for name in REMEMBERED}
+        self.restore(result, {name: rate for name, rate in remembered.items() if rate is not None})
         return result
 
 

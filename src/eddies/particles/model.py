@@ -37,7 +37,7 @@ class LagrangianModel(nn.Module):
         self.terms, self.flow = nn.ModuleDict(terms), flow
         for name, term in self.terms.items():
             if "density" in term.reads and "density" in term.gives:
-                raise SceneError(f'term "{name}": reads the density and gives a part of it; it can do only one of the two')
+                raise SceneError(f'term "{name}": reads the density and gives a part of it; it can do only one of both')
 
     @property
     def reads(self) -> set[str]:
@@ -76,8 +76,8 @@ class LagrangianModel(nn.Module):
         return [term for term in self.terms.values() if hasattr(term, "features")]
 
     def rates(self, context: Context, kept: Mapping[str, LinearRates] | None = None) -> Rates:
-        """The sum of the terms: `acceleration` (k, 3), `density_rate` (k,) if some term gives one, and the `density` (n,)
-        itself, not its deviation, if terms give it. Differentiable; collective.
+        """The sum of the terms: `acceleration` (k, 3), `density_rate` (k,) if some term gives one, and the `density`
+        (n,) itself, not its deviation, if terms give it. Differentiable; collective.
 
         `kept` stands for terms at these very particles: see `linear_rates`.
         """
@@ -154,15 +154,16 @@ _GIVEN = ("acceleration", "density_rate", "density")
 
 @dataclass(frozen=True)
 class LinearRates:
-    """Rates of a term at given particles as a function of its parameters: `origin` where they are zero, and by name what
-    each of them adds, (parameters, n, ...)."""
+    """Rates of a term at given particles as a function of its parameters: `origin` where they are zero, and by name
+    what each of them adds, (parameters, n, ...)."""
 
     origin: Rates
     slopes: dict[str, Tensor]
     parameters: list[nn.Parameter]
 
     def at(self, rows: Tensor | None) -> Rates:
-        """With acceleration and rate of some rows (k,) of the particles, or of all; differentiable in the parameters."""
+        """With acceleration and rate of some rows (k,) of the particles, or of all; differentiable in the
+        parameters."""
         values = {}
         for name in _GIVEN:
             value, slope = getattr(self.origin, name), self.slopes.get(name)
@@ -196,7 +197,8 @@ def build_model(settings: Mapping[str, TermSettings], paths: Iterable[str], flow
 
     Raises SceneError where an import path does not lead to a Term, or it cannot be made.
     """
-    return LagrangianModel({short_name(path): _build_term(path, settings[short_name(path)], flow) for path in paths}, flow)
+    terms = {short_name(path): _build_term(path, settings[short_name(path)], flow) for path in paths}
+    return LagrangianModel(terms, flow)
 
 
 def _build_term(path: str, settings: TermSettings, flow: FlowUnits) -> Term:

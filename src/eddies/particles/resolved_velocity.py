@@ -1,4 +1,5 @@
-"""The velocity that a grid resolves of the particles': averages, deconvolved, of which the solenoidal modes are kept."""
+"""The velocity that a grid resolves of the particles': averages, deconvolved, of which the solenoidal modes are
+kept."""
 
 from __future__ import annotations
 
@@ -21,10 +22,10 @@ from eddies.particles.rank_sums import mean_over_ranks, sum_over_ranks
 from eddies.particles.smoothing_kernels import SmoothingKernel, WendlandC2
 from eddies.particles.surroundings import LocalParticles, Surroundings
 
-# Particles in an average, and the share of the Nyquist wavenumber up to which modes are resolved: the best of a trial on
-# filtered turbulence (32^3 particles, four passes): error of -grad p at the particles 0.366 in `hit` and 0.343 in
-# `hit-small`, against 0.415 and 0.365 of the exact filtered pressure gradient, and 0.377 and 0.350 with two passes. More
-# passes gain less than 0.002; more neighbours smooth more and cost more.
+# Particles in an average, and the share of the Nyquist wavenumber up to which modes are resolved: the best of a trial
+# on filtered turbulence (32^3 particles, four passes): error of -grad p at the particles 0.366 in `hit` and 0.343 in
+# `hit-small`, against 0.415 and 0.365 of the exact filtered pressure gradient, and 0.377 and 0.350 with two passes.
+# More passes gain less than 0.002; more neighbours smooth more and cost more.
 NEIGHBORS, RESOLVED_SHARE, PASSES = 16, 7 / 8, 4
 # Wavenumber shells in a band of the energy.
 BAND = 2
@@ -59,12 +60,12 @@ class ResolvedFlow:
 class ResolvedVelocity:
     """Makes a `ResolvedFlow` of particles.
 
-    The velocity on the grid is a kernel average of the particles', which attenuates the smaller scales. So the average of
-    what the grid still misses at the particles is added to it, `passes` times in all: iterated (van Cittert)
-    deconvolution. Only solenoidal modes count: with a divergence, which scattered particles always leave in a field made
-    of them, the pressure would depend on the mean velocity, and oscillate with it faster than particles can be stepped.
-    Where a point has no particle in reach the average is zero. So all velocities are taken relative to their mean over
-    the particles: a void, too, looks the same from every frame of reference.
+    The velocity on the grid is a kernel average of the particles', which attenuates the smaller scales. So the average
+    of what the grid still misses at the particles is added to it, `passes` times in all: iterated (van Cittert)
+    deconvolution. Only solenoidal modes count: with a divergence, which scattered particles always leave in a field
+    made of them, the pressure would depend on the mean velocity, and oscillate with it faster than particles can be
+    stepped. Where a point has no particle in reach the average is zero. So all velocities are taken relative to their
+    mean over the particles: a void, too, looks the same from every frame of reference.
 
     Products of modes above a third of the number of cells alias; for fields known from particles that is far below the
     error of the highest modes themselves.
@@ -76,8 +77,8 @@ class ResolvedVelocity:
     skin : extra radius of the list of particles around grid points.
     dtype : of the pair sums.
 
-    Differentiable in the particles' positions and velocities. All ranks call it together. Raises HaloError, on all ranks,
-    where a particle lies farther outside its slab than the grid reaches.
+    Differentiable in the particles' positions and velocities. All ranks call it together. Raises HaloError, on all
+    ranks, where a particle lies farther outside its slab than the grid reaches.
     """
 
     def __init__(self, grid: FourierGrid, kernel: SmoothingKernel, skin: float = 0.0, passes: int = PASSES,

@@ -39,7 +39,8 @@ def scene_model(scene: Scene, scales: ReferenceScales) -> LagrangianModel:
 
 
 def describe(scene: Scene, scales: ReferenceScales) -> dict[str, Any]:
-    """What is stored with the weights of a scene's model, ready for JSON: the terms with their settings, and the flow."""
+    """What is stored with the weights of a scene's model, ready for JSON: the terms with their settings, and the
+    flow."""
     settings = {term: asdict(scene.model.settings[short_name(term)]) for term in scene.model.terms}
     return {"terms": settings, "scales": scales.to_dict(), "neighbors": scene.kernel.neighbors}
 
@@ -79,13 +80,13 @@ def with_weights(scene: Scene, description: Mapping[str, Any], weights: Mapping[
                  scales: ReferenceScales) -> LagrangianModel:
     """The scene's model with weights that were stored with a description, in their precision."""
     for key, wanted, trained in differences(scene, description):
-        raise ProductError(f"{path}: was trained with {key} = {trained}, and the scene has {wanted}; run `eddies train` "
-                           "again, or set the key to that")
+        raise ProductError(f"{path}: was trained with {key} = {trained}, and the scene has {wanted}; run "
+                           "`eddies train` again, or set the key to that")
     model = scene_model(scene, scales)
     expected = {name: tuple(tensor.shape) for name, tensor in model.state_dict().items()}
     if expected != {name: tensor.shape for name, tensor in weights.items()}:
-        raise ProductError(f"{path}: its terms have other parameters now than when this was written; run `eddies train` "
-                           "again")
+        raise ProductError(f"{path}: its terms have other parameters now than when this was written; run "
+                           "`eddies train` again")
     precision = next((tensor.dtype.name for tensor in weights.values()), "float64")
     model.to(getattr(torch, precision))
     model.load_state_dict({name: torch.from_numpy(tensor) for name, tensor in weights.items()})

@@ -19,8 +19,8 @@ RATES = (torch.arange(1, 7, dtype=torch.float64) / 6) ** 2
 class Damping(Term):
     """-D(k) u of the modes of the resolved velocity u, a spectral eddy viscosity (Kraichnan 1976).
 
-    D is v_rms/d times six learned values at wavenumbers equally spaced up to the highest that is resolved, linear between
-    them and from D(0) = 0.
+    D is v_rms/d times six learned values at wavenumbers equally spaced up to the highest that is resolved, linear
+    between them and from D(0) = 0.
     """
 
     Settings = declared.Damping

@@ -22,8 +22,8 @@ class DensityTransport(PairTerm):
     """d rho_i/dt = -a rho_0 div v + b (c/h) (mean_j rho_j - rho_i)
 
     with the divergence from moment-corrected differences, the mean weighted by w, and a, b learned. Between scattered
-    particles the divergence is mostly scatter, and a regression on the rates of single moments makes both factors vanish,
-    without which the density does not last: they show through several steps alone.
+    particles the divergence is mostly scatter, and a regression on the rates of single moments makes both factors
+    vanish, without which the density does not last: they show through several steps alone.
     """
 
     Settings = declared.DensityTransport

@@ -13,7 +13,8 @@ from eddies.particles.terms.term import Term
 
 
 class Stress(Term):
-    """-grad p_tau - div tau = -P[div tau] with  tau = A (d^2/12) grad u grad u^T,  P the projection on solenoidal fields.
+    """-grad p_tau - div tau = -P[div tau] with  tau = A (d^2/12) grad u grad u^T,  P the projection on solenoidal
+    fields.
 
     The leading term of what a filter of width d hides (Leonard 1975; Clark et al. 1979), for which A = 1; A is learned.
     The pressure p_tau of the stress belongs to the density too.

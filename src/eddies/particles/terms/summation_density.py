@@ -22,7 +22,8 @@ def particle_mass(flow: FlowUnits) -> float:
 
 
 class SummationDensity(PairTerm):
-    """rho_i = sum_j m W(x_i - x_j), the particle itself counted once; W with the radius of interaction as its support."""
+    """rho_i = sum_j m W(x_i - x_j), the particle itself counted once; W with the radius of interaction as its
+    support."""
 
     Settings = declared.SummationDensity
     parity, mutual = torch.ones(1), True

@@ -25,9 +25,9 @@ class WCSPH(PairTerm):
         Pi_ij = (-alpha c mu + beta mu^2)/mean(rho_i, rho_j),   mu = h x.v/(r^2 + 0.01 h^2)
 
     Pi only for approaching pairs, x.v < 0. The smoothing length h is half the support of W, which is the radius of
-    interaction. Forces of a pair are opposite and central, so momentum and angular momentum are kept. In three dimensions
-    Pi acts like a viscosity of about alpha c h / 10. The sound speed c, at first that of the flow, alpha, beta and gamma
-    are parameters in double precision.
+    interaction. Forces of a pair are opposite and central, so momentum and angular momentum are kept. In three
+    dimensions Pi acts like a viscosity of about alpha c h / 10. The sound speed c, at first that of the flow, alpha,
+    beta and gamma are parameters in double precision.
     """
 
     Settings = declared.WCSPH
