@@ -50,8 +50,8 @@ class RolloutTrainer:
     attenuated where what they are fitted to is noisy, they take too much from some scales and too little from others,
     and an energy off by little at every step is hardly seen in the error of the velocity.
 
-    The gradient goes through all steps: force, neighbours, halo, and the closure's grid. Each step is computed anew on
-    the way back, so that memory holds one step and not all.
+    The gradient goes through all steps: force, neighbours, halo, and the grid of the resolved velocity. Each step is
+    computed anew on the way back, so that memory holds one step and not all.
 
     Parameters
     ----------

@@ -37,7 +37,7 @@ def run(scene: Scene, comm, directory: str | Path) -> None:
         dtype = next((parameter.dtype for parameter in model.parameters()), torch.float64)
         last = truth.last_frame_seen(scene.seen) if scene.seen else 0
         tables = evaluate(truth, model, evaluation_frames(truth), last, dtype, device)
-        mach, description = truth.reference["mach_turbulent"], describe(scene, truth.scales)
+        mach, description = truth.reference.get("mach_turbulent"), describe(scene, truth.scales)
     origin, own_errors = trained_on(scene, source)
     provenance = {**scene.provenance("train"), "mach_turbulent": mach, "source": origin}
     kept = source.tables | {"source_a_priori": own_errors}

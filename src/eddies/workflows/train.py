@@ -52,7 +52,7 @@ def run(scene: Scene, comm, directory: str | Path, stop: StopRequest | None = No
         tables = evaluate(truth, model, tests, last, data.dtype, device)
         if model.networks:
             tables["feature_range"] = vars(data.feature_range())
-        mach, description = truth.reference["mach_turbulent"], describe(scene, truth.scales)
+        mach, description = truth.reference.get("mach_turbulent"), describe(scene, truth.scales)
     weights = {name: tensor.cpu().numpy() for name, tensor in model.state_dict().items()}
     save_weights(comm, directory / "model.h5", "model", description, weights,
                  {**scene.provenance("train"), "mach_turbulent": mach}, {"history": training.columns(), **tables})

@@ -89,7 +89,7 @@ def with_weights(scene: Scene, description: Mapping[str, Any], weights: Mapping[
                            "`eddies train` again")
     precision = next((tensor.dtype.name for tensor in weights.values()), "float64")
     model.to(getattr(torch, precision))
-    model.load_state_dict({name: torch.from_numpy(tensor) for name, tensor in weights.items()})
+    model.load_state_dict({name: torch.from_numpy(np.asarray(tensor)) for name, tensor in weights.items()})
     return model
 
 
