@@ -61,8 +61,8 @@ def over_mach(flows: Sequence[FlowErrors]) -> Figure:
 def add(shown: Section, this: FlowErrors, source: FlowErrors) -> None:
     """The figure and the numbers of a model whose weights come from another flow; a notice if they are not known."""
     if None in (this.mach, source.mach) or not len(source.unseen("acceleration_error")):
-        shown.notices.append(f"{source.name} or this flow has no Mach number, or {source.name} holds no error at an unseen time: no "
-                             "figure over the Mach number; train it again, with a window below 1.")
+        shown.notices.append(f"{source.name} or this flow has no Mach number, or {source.name} holds no error at an "
+                             "unseen time: no figure over the Mach number; train it again, with a window below 1.")
         return
     shown.metrics += [
         Metric("mach_turbulent", "turbulent Mach number M_t", this.mach),

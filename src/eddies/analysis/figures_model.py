@@ -98,7 +98,8 @@ def section(description: Mapping[str, object], table: Mapping[str, np.ndarray],
     metrics = [Metric(key, label, at.get(column), missing) for key, (column, label) in METRICS.items()]
     metrics.append(Metric("delay", "delay of these errors after what the model was trained on", at["delay"]))
     since = "training window" if source is None else "release of the tracers, or the training window"
-    text = (f"Terms: {terms}. A-priori: the model sees the true particles of a frame. Numbers are of the last frame, {at['delay']:.3g} after the {since}.")
+    text = (f"Terms: {terms}. A-priori: the model sees the true particles of a frame. Numbers are of the last frame, "
+            f"{at['delay']:.3g} after the {since}.")
     shown = Section("model", "Model", text, metrics=metrics,
                     main=("acceleration_error", "filtered_pressure_gradient_error"))
     truth, predicted = acceleration["truth"], acceleration["predicted"]
