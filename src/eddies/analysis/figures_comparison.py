@@ -10,7 +10,7 @@ from eddies.analysis import rollout_comparison as comparison
 from eddies.analysis.errors import normalized_l2
 from eddies.analysis.figures import png
 from eddies.analysis.page import Metric, Section
-from eddies.analysis.rollout_comparison import CommonFrames, Frames, Pair
+from eddies.analysis.rollout_comparison import CommonFrames, Frames, Pair, ParticleFrames
 from eddies.analysis.spectra import spectrum_error, vorticity
 
 MAIN = ("turnovers", "energy_ratio", "velocity_error", "spectrum_error", "velocity_kl", "acceleration_kl",
@@ -36,8 +36,8 @@ class Rollout:
     """
 
     attributes: Mapping[str, float | str]
-    model: Frames
-    truth: Frames
+    model: ParticleFrames
+    truth: ParticleFrames
     fields: Mapping[str, Frames]
     length: float
     filter_width: float | None
