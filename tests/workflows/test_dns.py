@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 
 from eddies.io.fields import FieldSeries
-from eddies.io.hdf5 import open_product, read_attributes, read_provenance, read_table
+from eddies.io.hdf5 import open_product, read_attributes, read_table
 from eddies.io.trajectories import Trajectory
-from eddies.scene import SceneError, load_scene
+from eddies.parallel.slab import SlabDecomposition
+from eddies.scene import BOX_LENGTH, SceneError, load_scene
 from eddies.workflows import dns
 
 SMALL = ["flow.cells=16", "tracers.particles_per_side=6", "tracers.turnovers=0.05", "tracers.field_cells=8"]
@@ -16,7 +17,8 @@ LEFT_OUT = """
 import sys
 from mpi4py import MPI
 from eddies.parallel import halo
-from eddies.scene import load_scene
+from eddies.parallel.slab import SlabDecomposition
+from eddies.scene import BOX_LENGTH, SceneError, load_scene
 from eddies.workflows import dns
 calls = []
 halo.HaloExchange.__init__ = lambda *a: calls.append("halo")
@@ -117,6 +119,8 @@ def test_statistics_are_sampled_every_few_steps_at_the_release_and_at_the_end(co
 @pytest.mark.mpi(1, 2)
 @pytest.mark.parametrize("name", ["tiny", "tracers-only"])
 def test_scales_are_those_of_the_release_however_long_the_flow_is_followed(comm, tmp_path, name):
+    from eddies.workflows.truth import GroundTruth
+
     overrides = ["flow.cells=16", "tracers.particles_per_side=6", "tracers.field_cells=8"]
     if name == "tiny":
         overrides += ["spin_up.turnovers=0.05", "spin_up.stationary=0.03", "kernel.neighbors=20", "training.batch=9"]
@@ -134,6 +138,10 @@ def test_scales_are_those_of_the_release_however_long_the_flow_is_followed(comm,
             columns = {column: np.stack([trajectory.read(frame, column) for frame in (0, 1)])
                        for column in trajectory.columns if column != "position"}
             interval = trajectory.times[1] - trajectory.times[0]
+            truth = GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, 16))
+            release, later = truth.scales, truth.scales_at(1)
+    assert (later.acceleration, later.density_rate) == (release.acceleration, release.density_rate)
+    assert truth.has_density == (name == "tiny") == (release.sound_speed is not None)
     assert len(trajectory.times) > 2 and scales[0.02] == scales[0.2]
     rates = {"velocity": ("acceleration", 0.0), "density": ("density_rate", 1.0)}
     for column, values in columns.items():
@@ -166,67 +174,6 @@ def test_kernel_of_an_incompressible_flow(comm, tmp_path):
     dns.run(scene, comm, tmp_path)
     train_kernel.run(scene, comm, tmp_path)
     assert (tmp_path / "kernel.h5").exists()
-
-
-OWN_FLOW = """
-import numpy as np
-from eddies.flow.navier_stokes import IncompressibleFluid
-
-
-class Sticky(IncompressibleFluid):
-    def nonlinear(self, state):
-        return super().nonlinear(state) - 0.5 * state
-
-
-def jet(grid, initial, seed):
-    x, y, z = grid.coordinates()
-    u = initial.amplitude * np.sin(initial.wavenumber * y) + 0 * x + 0 * z
-    return grid.forward(np.stack([u, 0 * u, 0 * u]).astype(grid.real))
-
-
-def flat(grid, initial, seed):
-    return np.zeros((3, 4, 4, 3))
-
-
-def nothing(grid, initial, seed):
-    return None
-"""
-OWN = ["flow.cells=16", "time.duration=0.5", "time.step=0.05", "flow.fluid=own_flow:Sticky", "initial.kind=own_flow:jet",
-       "initial.wavenumber=2"]
-
-
-@pytest.mark.mpi(1, 2)
-def test_a_fluid_and_a_start_of_the_users(comm, tmp_path, own):
-    own("own_flow", OWN_FLOW)
-    scene = load_scene("taylor-green", OWN)
-    dns.run(scene, comm, tmp_path)
-    with open_product(comm, tmp_path / "ground_truth.h5", "ground_truth") as file:
-        energy = read_table(file, "statistics")["energy"]
-        provenance = read_provenance(file)
-    assert provenance["foreign"].keys() == {"own_flow:Sticky", "own_flow:jet"}
-    assert energy[0] == pytest.approx(0.25)
-    decay = 2 * (0.5 + scene.flow.viscosity * scene.initial.wavenumber**2) * 0.5
-    assert energy[-1] == pytest.approx(0.25 * np.exp(-decay), rel=1e-6)
-
-
-@pytest.mark.mpi(1)
-@pytest.mark.parametrize("name, message", [("flat", "returned an array \\(3, 4, 4, 3\\); must be the modes"),
-                                           ("nothing", "returned a NoneType; must be the modes \\(3, kz, ky, kx\\) = ")])
-def test_a_start_that_is_no_velocity(comm, own, name, message):
-    own("own_flow", OWN_FLOW)
-    scene = load_scene("taylor-green", [*OWN, f"initial.kind=own_flow:{name}"])
-    with pytest.raises(SceneError, match=message):
-        dns.initial_state(scene, dns.build_fluid(scene, comm))
-
-
-@pytest.mark.mpi(1)
-def test_a_start_of_the_users_in_a_compressible_fluid_makes_no_sound(comm, own):
-    own("own_flow", OWN_FLOW)
-    scene = load_scene("taylor-green", ["flow.cells=16", "flow.fluid=compressible", "flow.sound_speed=10",
-                                        "initial.kind=own_flow:jet"])
-    fluid = dns.build_fluid(scene, comm)
-    state = dns.initial_state(scene, fluid)
-    assert state.shape == (4, *fluid.grid.spectral_shape) and np.abs(state[3]).max() < 1e-16  # a jet has no pressure
 
 
 class SilentComm:
