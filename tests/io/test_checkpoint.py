@@ -75,6 +75,15 @@ def test_leftovers_are_removed_and_other_settings_not_used(comm, tmp_path, caplo
     assert list(directory.path.iterdir()) == []
 
 
+@pytest.mark.mpi(1, 2)
+def test_a_checkpoint_of_another_version_is_not_used(comm, tmp_path, caplog, monkeypatch):
+    monkeypatch.setattr("eddies.io.checkpoint.FORMAT", 1)
+    directory = fill(comm, tmp_path, [1])
+    monkeypatch.undo()
+    assert directory.newest() is None
+    assert comm.rank > 0 or "step-00000001: was made by another version of eddies; this" in caplog.text
+
+
 def harm(path, kind, chooser):
     """Flip a random bit of a file or cut it off; what was harmed, in words."""
     content = bytearray(path.read_bytes())

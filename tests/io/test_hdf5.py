@@ -1,12 +1,14 @@
 """Products: complete or absent, refused when they are not what they should be."""
 
+import json
+
 import h5py
 import numpy as np
 import pytest
 
 from eddies.io.hdf5 import (CHUNK_BYTES, ProductError, append_frame, create_product, growing_dataset,
-                            open_product, product_fingerprint, read_provenance, read_table, write_attributes,
-                            write_table)
+                            open_product, product_fingerprint, product_provenance, read_provenance, read_table,
+                            write_attributes, write_table)
 
 
 def write(comm, path, kind="kernel"):
@@ -68,6 +70,37 @@ def test_missing_and_wrong_kind(comm, tmp_path):
         with open_product(comm, path, "ground_truth"):
             pass
     assert product_fingerprint(tmp_path / "b.h5") is None
+
+
+def change_format(comm, path, number):
+    """As another version writes it: with another number, or None, as eddies 0.1.0 wrote none."""
+    if comm.rank == 0:
+        with h5py.File(path, "a") as file:
+            del file.attrs["format"]
+            if number is not None:
+                file.attrs["format"] = number
+            provenance = json.loads(file.attrs["provenance"])
+            file.attrs["provenance"] = json.dumps({**provenance, "eddies": "7.8.9"})
+    comm.Barrier()
+
+
+@pytest.mark.mpi(1, 2)
+@pytest.mark.parametrize("number", [None, 1, 3])
+@pytest.mark.parametrize("kind, remedy", [
+    ("ground_truth", "run `eddies dns` again"), ("kernel", "run `eddies train-kernel` again"),
+    ("model", "run `eddies train` again"), ("rollout", "run `eddies simulate` again"), ("frames", "make it again")])
+def test_another_format_is_refused_and_is_no_result(comm, tmp_path, kind, remedy, number):
+    path = write(comm, tmp_path / "a.h5", kind)
+    assert product_fingerprint(path) == "abc"
+    comm.Barrier()
+    change_format(comm, path, number)
+    for asked in (kind, None):
+        with pytest.raises(ProductError) as refused:
+            with open_product(comm, path, asked):
+                pass
+        assert str(refused.value) == (f"{path}: written by eddies 7.8.9, whose {kind.replace('_', ' ')} this version "
+                                      f"does not read; {remedy}")
+    assert product_fingerprint(path) is None and product_provenance(path) == {}
 
 
 @pytest.mark.mpi(1, 2)

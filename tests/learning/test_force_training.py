@@ -19,7 +19,7 @@ LENGTH, PER_SIDE = 2 * np.pi, 12
 SPACING = LENGTH / PER_SIDE
 SUPPORT = 2.2 * SPACING
 SCALES = ReferenceScales(length=2 * SPACING, spacing=SPACING, velocity=1.0, density_mean=1.0, density=0.01,
-                         acceleration=1.0, density_rate=0.02, sound_speed=10.0)
+                         acceleration=1.0, density_rate=0.02, sound_speed=10.0, viscosity=0.01)
 
 
 def frame_of(comm, model, forced=False):

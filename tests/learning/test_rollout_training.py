@@ -23,7 +23,7 @@ LENGTH, PER_SIDE, FRAMES, INTERVAL = 2 * np.pi, 12, 4, 0.06
 SPACING = LENGTH / PER_SIDE
 SUPPORT = 1.6 * SPACING
 SCALES = ReferenceScales(length=2 * SPACING, spacing=SPACING, velocity=1.0, density_mean=1.0, density=0.01,
-                         acceleration=1.0, density_rate=0.02, sound_speed=10.0)
+                         acceleration=1.0, density_rate=0.02, sound_speed=10.0, viscosity=0.01)
 every_closure = pytest.mark.parametrize("closure", ["poisson", "poisson-stress", "learned-density"])
 
 

@@ -24,6 +24,7 @@ SCALES = ReferenceScales(
     acceleration=1.7,
     density_rate=0.05,
     sound_speed=11.0,
+    viscosity=0.01,
 )
 CUTOFF = 1.5
 CLOUDS = {

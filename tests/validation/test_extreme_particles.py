@@ -42,7 +42,7 @@ def scales(total, mach=0.1):
     spacing = LENGTH / round(total ** (1 / 3))
     return ReferenceScales(
         length=2 * spacing, spacing=spacing, velocity=1.0, density_mean=1.0, density=0.3 * mach**2, acceleration=3.0,
-        density_rate=0.5 * mach**2, sound_speed=math.sqrt(3) / mach)
+        density_rate=0.5 * mach**2, sound_speed=math.sqrt(3) / mach, viscosity=0.0)
 
 
 def network_model(kind, total, neighbors=24.0, mach=0.1):

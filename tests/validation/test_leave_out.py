@@ -28,7 +28,7 @@ from eddies.workflows.closures import density_closure
 LENGTH, PER_SIDE, STEP = 2 * np.pi, 9, 0.001
 SPACING = LENGTH / PER_SIDE
 SCALES = ReferenceScales(length=2 * SPACING, spacing=SPACING, velocity=1.0, density_mean=1.0, density=0.01,
-                         acceleration=1.0, density_rate=0.02, sound_speed=10.0)
+                         acceleration=1.0, density_rate=0.02, sound_speed=10.0, viscosity=0.01)
 
 
 class CountingComm:

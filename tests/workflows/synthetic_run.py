@@ -17,6 +17,7 @@ SCALES = {
     "flatness": 4.5, "velocity_rms": 1.0, "energy_x": 0.6, "energy_y": 0.5, "energy_z": 0.4,
     "kolmogorov_length": 0.05, "time_step": 0.05, "seconds_per_step": 0.04, "turnovers": 2.0,
 }
+COMPRESSIBLE = ("mach_turbulent", "density_rms", "compressible_fraction")
 
 
 class RandomFlow:
@@ -57,22 +58,26 @@ def provenance(forcing="", fingerprint="0" * 64):
     return {"scene": f'title = "synthetic"\nseed = 1\n{forcing}', "fingerprint": fingerprint}
 
 
-def write_ground_truth(comm, directory, tracers=True, cells=16, frames=0, stationary=False):
-    """With `frames` of the tracers, and with a span over which the stationary state is averaged."""
+def write_ground_truth(comm, directory, tracers=True, cells=16, frames=0, stationary=False, density=True):
+    """With `frames` of the tracers, and with a span over which the stationary state is averaged; without `density` as
+    of an incompressible fluid."""
     flow, forced = RandomFlow(1), '[forcing]\nwavenumber = 2.0\n' if stationary else ""
     with create_product(comm, directory / "ground_truth.h5", "ground_truth", provenance(forcing=forced)) as file:
         time = np.linspace(0, 4, 81)
         wiggle = 1 + 0.1 * np.sin(3 * time)
-        columns = {name: value * wiggle for name, value in SCALES.items()} | {"turnovers": time / TURNOVER}
+        scales = {name: value for name, value in SCALES.items() if density or name not in COMPRESSIBLE}
+        columns = {name: value * wiggle for name, value in scales.items()} | {"turnovers": time / TURNOVER}
         write_table(file, "statistics", {"time": time, **columns})
-        reference = {**SCALES, "energy_budget_error": 2e-4, "viscosity": 0.014, "kolmogorov_time": 0.17}
+        reference = {**scales, "energy_budget_error": 2e-4, "viscosity": 0.014, "kolmogorov_time": 0.17}
         series = FieldWriter(file, "filtered" if tracers else "final", cells, {"velocity": 3})
         series.append(0.0, 0, {"velocity": flow.field(cells, 0.0)})
         if tracers:
-            reference |= {"released_at": 2.0, "length": WIDTH, "spacing": WIDTH / 2, "acceleration_rms": 1.4}
+            reference |= {"released_at": 2.0, "length": WIDTH, "spacing": WIDTH / 2, "acceleration_rms": 1.4,
+                          "density_mean": 1.0, "sound_speed": 20.0 if density else np.inf}
+            reference |= {"density_rate_rms": 0.01} if density else {}
             write_table(file, "spectra", decaying_spectra())
         if frames:
-            write_tracers(file, frames)
+            write_tracers(file, frames, density)
         if stationary:
             spectra = np.outer(wiggle, decaying_spectra()["energy"][0])
             write_table(file, "spectra_of_statistics", {"energy": spectra})
@@ -80,13 +85,13 @@ def write_ground_truth(comm, directory, tracers=True, cells=16, frames=0, statio
         write_attributes(file.create_group("reference"), reference)
 
 
-def write_tracers(file, frames, total=600):
+def write_tracers(file, frames, density, total=600):
     """Frames of tracers until the last of the spectra."""
+    shapes = {"position": (3,), "velocity": (3,)} | ({"density": ()} if density else {})
     flow, start = PerturbedFlow(0.0), np.random.default_rng(6).uniform(0, LENGTH, (total, 3))
-    writer = TrajectoryWriter(file, "tracers", total, LENGTH, {"position": (3,), "velocity": (3,)}, np.float64)
+    writer = TrajectoryWriter(file, "tracers", total, LENGTH, shapes, np.float64)
     for step, time in enumerate(np.linspace(0, 1.2, frames)):
-        columns = flow.particles(start, time)
-        writer.append(step, time, 0, {name: columns[name] for name in ("position", "velocity")})
+        writer.append(step, time, 0, flow.particles(start, time))
 
 
 def decaying_spectra():
@@ -168,11 +173,12 @@ class PerturbedFlow:
                 "velocity_gradient": self.gradient(start, time)}
 
 
-def write_rollout(comm, directory, status="complete", total=600, cells=16, frames=9, broken=None, injection_rate=0.0):
+def write_rollout(comm, directory, status="complete", total=600, cells=16, frames=9, broken=None, injection_rate=0.0,
+                  density=True):
     """The truth ends three frames before the model. Velocities of the model's frame `broken` are NaN."""
     start = np.random.default_rng(5).uniform(0, LENGTH, (total, 3))
-    shapes = {"position": (3,), "velocity": (3,), "density": (), "acceleration": (3,),
-              "velocity_gradient": (3, 3)}
+    shapes = {"position": (3,), "velocity": (3,), "acceleration": (3,), "velocity_gradient": (3, 3)}
+    shapes |= {"density": ()} if density else {}
     times = 0.1 * np.arange(frames)
     attributes = {"status": status, "start_time": 0.6, "time_step": 0.02, "integrator": "verlet",
                   "force": "learned", "closure": "poisson", "turnovers": times[-1] / TURNOVER,

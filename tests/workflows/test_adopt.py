@@ -15,7 +15,7 @@ from eddies.workflows.adopt import adopted_model, trained_on
 from eddies.workflows.model_source import ModelSource
 
 SCALES = ReferenceScales(length=1.2, spacing=0.6, velocity=0.9, density_mean=1.0, density=0.02, acceleration=1.7,
-                         density_rate=0.05, sound_speed=11.0)
+                         density_rate=0.05, sound_speed=11.0, viscosity=0.01)
 
 
 def rates(model, position, velocity, density):

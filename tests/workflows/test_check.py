@@ -135,7 +135,7 @@ def test_ranks_for_horizons_are_those_that_their_closure_and_their_particles_acc
     assert (by_reach, by_grid) == (thick, planes)
     speed, tracers = expected_turbulence(scene).velocity_rms, scene.tracers
     scales = ReferenceScales(length=tracers.width, spacing=tracers.spacing, velocity=speed, density_mean=1.0,
-                             density=0.01, acceleration=1.0, density_rate=0.01, sound_speed=10.0)
+                             density=0.01, acceleration=1.0, density_rate=0.01, sound_speed=10.0, viscosity=0.01)
     slab, support = SlabDecomposition(comm, BOX_LENGTH, tracers.particles_per_side), scene.kernel.support(12**3)
     model, time = PairModel(scales, support, 56, (4,)), horizon_time(scene)
     assert accepted(lambda: wide_closures(model, slab, torch.float32, time, energies=True)) == (comm.size <= by_grid)

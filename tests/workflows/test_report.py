@@ -5,11 +5,14 @@ import re
 import h5py
 import pytest
 
-from eddies.io.hdf5 import ProductError
+from eddies.analysis.figures_rollout import errors_over_time
+from eddies.analysis.rollout_comparison import CommonFrames, error_series, particle_series
+from eddies.io.hdf5 import ProductError, open_product
+from eddies.io.trajectories import Trajectory
 from eddies.workflows import report
 
 from tests.workflows.synthetic_run import (
-    write_ground_truth, write_kernel, write_model, write_rollout, write_run,
+    LENGTH, write_ground_truth, write_kernel, write_model, write_rollout, write_run,
 )
 
 FIGURES = {
@@ -67,6 +70,42 @@ def test_a_complete_run_shows_everything(comm, tmp_path):
         assert missing == ({"density_rate_error"} if section == "model" else set())
     assert "closure poisson has none" in page
     check_stationary(metrics["stationary"], page)
+
+
+@pytest.mark.mpi(1)
+def test_a_run_without_density_shows_all_but_that(comm, tmp_path):
+    write_run(comm, tmp_path, {"frames": 17, "stationary": True, "density": False}, density=False)
+    report.run(tmp_path, comm)
+    metrics, page = written(tmp_path)
+    assert figures(tmp_path) == FIGURES
+    assert METRICS["rollout"] <= metrics["rollout"].keys() and None not in metrics["rollout"].values()
+    assert "density_rms" not in metrics["ground_truth"] and "an incompressible fluid has none" in page
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("density", [True, False])
+def test_the_series_of_a_rollout_have_the_density_that_is_stored(comm, tmp_path, density):
+    write_rollout(comm, tmp_path, density=density)
+    with open_product(comm, tmp_path / "rollout.h5", "rollout") as file:
+        model, truth = Trajectory(file, "model"), Trajectory(file, "truth")
+        series = [particle_series(run, range(6), LENGTH) for run in (model, truth)]
+        errors = error_series(model, truth, CommonFrames.of(model, truth))
+        spread = model.read(2, "density").std() if density else None
+    assert all(("density_rms" in run) == density for run in series)
+    assert not density or series[0]["density_rms"][2] == spread
+    figure = errors_over_time(*series, errors, 1.0)
+    titles = [axis.get_title(loc="left") for axis in figure.axes]
+    assert titles == ["A   Kinetic energy", "B   Velocity error", "C   PDF divergence", "D   Density fluctuation"][
+        :4 if density else 3]
+
+
+@pytest.mark.mpi(1)
+def test_a_product_of_another_version_is_said_in_one_line(comm, tmp_path):
+    write_run(comm, tmp_path)
+    with h5py.File(tmp_path / "kernel.h5", "r+") as file:
+        del file.attrs["format"]
+    with pytest.raises(ProductError, match="kernel.h5: written by eddies .* run `eddies train-kernel` again$"):
+        report.run(tmp_path, comm)
 
 
 def check_stationary(shown, page):

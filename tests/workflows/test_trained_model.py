@@ -8,7 +8,7 @@ from eddies.particles.reference_scales import ReferenceScales
 from eddies.workflows.trained_model import load_model
 
 SCALES = ReferenceScales(length=0.8, spacing=0.4, velocity=0.9, density_mean=1.0, density=0.02, acceleration=1.7,
-                         density_rate=0.05, sound_speed=20.0)
+                         density_rate=0.05, sound_speed=20.0, viscosity=0.01)
 
 
 def saved(comm, directory, change=lambda weights: weights):

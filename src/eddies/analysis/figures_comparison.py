@@ -10,14 +10,14 @@ from eddies.analysis import rollout_comparison as comparison
 from eddies.analysis.errors import normalized_l2
 from eddies.analysis.figures import png
 from eddies.analysis.page import Metric, Section
-from eddies.analysis.rollout_comparison import CommonFrames, Frames, Pair
+from eddies.analysis.rollout_comparison import CommonFrames, Frames, Pair, ParticleFrames
 from eddies.analysis.spectra import spectrum_error, vorticity
 
 MAIN = ("turnovers", "energy_ratio", "velocity_error", "spectrum_error", "velocity_kl", "acceleration_kl",
         "qr_kl")
-# What moved the particles, by [simulation] force, from the attributes of the rollout.
-FORCES = {
-    "learned": "learned force, basis {basis}, closure {closure}",
+# What moved the particles, by [simulation] method, from the attributes of the rollout.
+METHODS = {
+    "learned": "the trained model, terms {terms}",
     "none": "no force: every particle keeps its velocity",
     "wcsph": "WCSPH, {kernel} kernel, density by summation, α = {alpha:g}, β = {beta:g}, γ = {exponent:g}",
     "eulerian": "Eulerian large-eddy simulation on {cells}³ cells, |kᵢ| ≤ {largest_wavenumber}, Smagorinsky constant "
@@ -36,8 +36,8 @@ class Rollout:
     """
 
     attributes: Mapping[str, float | str]
-    model: Frames
-    truth: Frames
+    model: ParticleFrames
+    truth: ParticleFrames
     fields: Mapping[str, Frames]
     length: float
     filter_width: float | None
@@ -60,10 +60,10 @@ class Rollout:
         return float(self.attributes.get("injection_rate", 0.0)) > 0
 
     @property
-    def force(self) -> str:
+    def method(self) -> str:
         """What moved the particles, in words."""
-        # A file without these attributes was written before there was a choice of baselines, or of no pair sum.
-        return FORCES[str(self.attributes.get("force", "learned"))].format_map({"basis": "unknown", **self.attributes})
+        name = str(self.attributes["method"])
+        return METHODS.get(name, name).format_map(self.attributes)
 
     @property
     def status(self) -> str:
@@ -74,10 +74,10 @@ class Rollout:
 def section(run: Rollout) -> Section:
     """The rollout: figures 4 to 9 and Lagrangian statistics; `run` is read frame by frame."""
     broken = comparison.first_broken_time(run.model)
-    text = (f"Moved by: {run.force}; integrator {run.attributes['integrator']}, time step "
+    text = (f"Moved by: {run.method}; integrator {run.attributes['integrator']}, time step "
             f"{float(run.attributes['time_step']):.3g}. T = {run.turnover:.3g} is the eddy turnover time. ")
     shown = Section("rollout", "Rollout against the truth", text, main=MAIN, metrics=[
-        Metric("force", "what moved the particles", run.force),
+        Metric("method", "what moved the particles", run.method),
         Metric("status", "status", run.status),
         Metric("stable", "stable to the end", run.status == "complete" and not np.isfinite(broken)),
         Metric("turnovers", "eddy turnovers run", float(run.attributes["turnovers"])),

@@ -188,8 +188,7 @@ def section(flow: GroundTruth) -> Section:
     when = "at the end" if flow.released_at is None else "when the tracers start"
     metrics = [Metric(key, label, at.get(key), "an incompressible fluid has none")
                for key, label in METRICS.items() if key in at or key == "mach_turbulent"]
-    text = (f"Direct numerical simulation. Numbers {when}, t = {at['time']:.3g}; those of tracers are means "
-            "over all frames.")
+    text = f"Direct numerical simulation. Numbers {when}, t = {at['time']:.3g}."
     shown = Section("ground_truth", "Ground truth", text, metrics=metrics,
                     main=("reynolds_lambda", "kmax_eta", "mach_turbulent"))
     first, last = flow.statistics["time"][[0, -1]]

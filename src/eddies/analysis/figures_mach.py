@@ -36,6 +36,8 @@ def over_mach(flows: Sequence[FlowErrors]) -> Figure:
     axis, flows = axes[0, 0], sorted(flows, key=lambda flow: flow.mach)
     mach = np.array([flow.mach for flow in flows])
     for column, label, colour, marker, apart in CURVES:
+        if any(column not in flow.table for flow in flows):
+            continue
         errors = [flow.unseen(column) for flow in flows]
         mean = np.array([each.mean() for each in errors])
         spread = np.array([[each.mean() - each.min(), each.max() - each.mean()] for each in errors]).T
@@ -58,9 +60,9 @@ def over_mach(flows: Sequence[FlowErrors]) -> Figure:
 
 def add(shown: Section, this: FlowErrors, source: FlowErrors) -> None:
     """The figure and the numbers of a model whose weights come from another flow; a notice if they are not known."""
-    if source.mach is None or not len(source.unseen("acceleration_error")):
-        shown.notices.append(f"{source.name} does not say its Mach number, or holds no error at an unseen time: no "
-                             "figure over the Mach number; train it again, with a window below 1.")
+    if None in (this.mach, source.mach) or not len(source.unseen("acceleration_error")):
+        shown.notices.append(f"{source.name} or this flow has no Mach number, or {source.name} holds no error at an "
+                             "unseen time: no figure over the Mach number; train it again, with a window below 1.")
         return
     shown.metrics += [
         Metric("mach_turbulent", "turbulent Mach number M_t", this.mach),

@@ -1,4 +1,4 @@
-"""Figures of the trained pair-force model: a-priori errors and PDFs (the paper's Fig. 3) and its training."""
+"""Figures of the trained model: a-priori errors and PDFs (the paper's Fig. 3) and its training."""
 
 from collections.abc import Mapping
 
@@ -87,28 +87,31 @@ def _pdf_panel(axis: Axes, sample: Mapping[str, np.ndarray], title: str, symbol:
 def section(description: Mapping[str, object], table: Mapping[str, np.ndarray],
             acceleration: Mapping[str, np.ndarray], density_rate: Mapping[str, np.ndarray] | None,
             history: Mapping[str, np.ndarray], source: str | None = None) -> Section:
-    """The pair-force model: a-priori figures and the errors at the last frame, from the tables.
+    """The model: a-priori figures and the errors at the last frame, from the tables.
 
     `source` names the run that the weights come from, if it is another; the history is that run's.
     """
     last = int(np.argmax(table["delay"]))
     at = {name: float(values[last]) for name, values in table.items()}
-    missing = f"closure {description['closure']} has none"
+    terms = ", ".join(description["terms"])
+    missing = f"terms {terms} have none"
     metrics = [Metric(key, label, at.get(column), missing) for key, (column, label) in METRICS.items()]
     metrics.append(Metric("delay", "delay of these errors after what the model was trained on", at["delay"]))
     since = "training window" if source is None else "release of the tracers, or the training window"
-    text = (f"Basis {description['basis']}, closure {description['closure']}. A-priori: the model sees the "
-            f"true particles of a frame. Numbers are of the last frame, {at['delay']:.3g} after the {since}.")
-    shown = Section("model", "Pair-force model", text, metrics=metrics,
+    text = (f"Terms: {terms}. A-priori: the model sees the true particles of a frame. Numbers are of the last frame, "
+            f"{at['delay']:.3g} after the {since}.")
+    shown = Section("model", "Model", text, metrics=metrics,
                     main=("acceleration_error", "filtered_pressure_gradient_error"))
     truth, predicted = acceleration["truth"], acceleration["predicted"]
     divergence = kl_divergence(bin_probabilities(standardized(truth), EDGES),
                                bin_probabilities(standardized(predicted, truth), EDGES))
+    beside = ", that of no model 1"
+    if "pressure_gradient_error" in at:
+        beside = f"; that of the exact filtered pressure gradient alone is {at['pressure_gradient_error']:.3f}{beside}"
     shown.add_figure(
         "figure-3-a-priori", "A-priori errors and PDFs (the paper's Fig. 3)",
         png(a_priori(table, acceleration, density_rate)),
-        f"At the last frame the acceleration error is {at['acceleration_error']:.3f}; that of the exact "
-        f"filtered pressure gradient alone is {at['pressure_gradient_error']:.3f}, that of no model 1. KL "
+        f"At the last frame the acceleration error is {at['acceleration_error']:.3f}{beside}. KL "
         f"divergence of the acceleration PDF {divergence:.2g}. Grey: frames of the training window.")
     shown.add_figure("model-training", "Training of the model", png(figures_learning.curves(history)),
                      f"{int(history['step'][-1]) + 1} steps" + (f", in {source}." if source else "."))

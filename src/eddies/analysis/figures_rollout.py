@@ -85,16 +85,21 @@ def energy_spectra(series: Sequence[SpectraAt], eulerian: Mapping[str, np.ndarra
 @styled
 def errors_over_time(model: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray],
                      errors: Mapping[str, np.ndarray], turnover: float) -> Figure:
-    """Energy, density rms, velocity error and PDF divergences over time; the model may outlast the truth."""
+    """Energy, velocity error, PDF divergences and, where there is one, density rms over time; the model may outlast the
+    truth."""
     figure, axes = panels(2, 2, (4.6, 2.8))
-    energy, density, error, divergence = axes.flat
+    energy, error, divergence, density = axes.flat
     initial = truth["energy"][0]
     for run, line in ((truth, LINES["truth"]), (model, LINES["model"])):
         time = run["time"] / turnover
         energy.plot(time, run["energy"] / initial, **line)
-        density.plot(time, run["density_rms"], **line)
+        if "density_rms" in run:
+            density.plot(time, run["density_rms"], **line)
     energy.set(title="Kinetic energy", ylabel="$E(t)/E(0)$", ylim=(0, None))
-    density.set(title="Density fluctuation", ylabel=r"$\rho_{rms}/\rho_0$", ylim=(0, None))
+    if density.lines:
+        density.set(title="Density fluctuation", ylabel=r"$\rho_{rms}/\rho_0$", ylim=(0, None))
+    else:
+        density.remove()
     energy.legend()
     error.plot(errors["time"] / turnover, errors["velocity_error"], color=MODEL)
     error.axhline(1, color=GUIDE, linestyle=":", linewidth=1.2)
@@ -104,9 +109,9 @@ def errors_over_time(model: Mapping[str, np.ndarray], truth: Mapping[str, np.nda
                         label=column.removesuffix("_kl"))
     divergence.set(title="PDF divergence", ylabel="KL divergence (nats)", ylim=(0, None))
     divergence.legend()
-    for axis in axes.flat:
+    for axis in figure.axes:
         axis.set(xlabel="time $t/T$", xlim=(0, model["time"][-1] / turnover))
-    letter(axes.flat)
+    letter(figure.axes)
     return figure
 
 

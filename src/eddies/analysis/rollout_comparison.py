@@ -4,7 +4,7 @@ Trajectories and field series are objects with `.times` and `.read(frame, column
 one and never all held at once. `CommonFrames` pairs the frames of model and truth; the truth may end earlier.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -28,6 +28,12 @@ class Frames(Protocol):
 
     def read(self, frame: int, column: str, start: int = 0, stop: int | None = None) -> np.ndarray:
         """Rows (or planes) start to stop of one column (or field variable) of one frame."""
+
+
+class ParticleFrames(Frames, Protocol):
+    """A trajectory as stored."""
+
+    columns: Collection[str]
 
 
 @dataclass(frozen=True)
@@ -76,9 +82,9 @@ def particle_pair(model: Frames, truth: Frames, common: CommonFrames, index: int
                 truth.read(int(common.truth[index]), column))
 
 
-def particle_series(frames: Frames, chosen: Sequence[int], length: float) -> dict[str, np.ndarray]:
-    """Columns over the chosen frames of one run: time, energy 1/2 <v.v>, density_rms, and two Lagrangian
-    statistics.
+def particle_series(frames: ParticleFrames, chosen: Sequence[int], length: float) -> dict[str, np.ndarray]:
+    """Columns over the chosen frames of one run: time, energy 1/2 <v.v>, density_rms where a density is stored, and two
+    Lagrangian statistics.
 
     correlation: of v with the first frame. dispersion: of pairs of neighbours among the first particles, in
     units of their mean-square separation.
@@ -87,9 +93,10 @@ def particle_series(frames: Frames, chosen: Sequence[int], length: float) -> dic
     rows = []
     for frame in map(int, chosen):
         velocity = frames.read(frame, "velocity")
-        rows.append((0.5 * np.mean(np.sum(velocity**2, axis=1)), np.std(frames.read(frame, "density")),
-                     velocity_correlation(first, velocity)))
-    columns = dict(zip(("energy", "density_rms", "correlation"), np.array(rows).T))
+        rows.append((0.5 * np.mean(np.sum(velocity**2, axis=1)), velocity_correlation(first, velocity)))
+    columns = dict(zip(("energy", "correlation"), np.array(rows).T))
+    if "density" in frames.columns:
+        columns["density_rms"] = np.array([np.std(frames.read(int(frame), "density")) for frame in chosen])
     followed = np.stack([frames.read(int(frame), "position", 0, FOLLOWED) for frame in chosen])
     columns["dispersion"] = neighbor_dispersion(followed, length)
     return {"time": frames.times[np.asarray(chosen)], **columns}

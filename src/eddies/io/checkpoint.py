@@ -21,7 +21,7 @@ import numpy as np
 from mpi4py import MPI
 
 from eddies.io.contiguous import Block, lay_out, write_arrays
-from eddies.io.hdf5 import ProductError
+from eddies.io.hdf5 import FORMAT, ProductError
 from eddies.io.manifest import find_damage, hash_file, manifest_text, parse_manifest
 from eddies.parallel.broadcast import first_complaint, share_text
 
@@ -81,7 +81,7 @@ class CheckpointDirectory:
             self._by_first_rank(lambda: _make_empty(partial))
             regions = json.loads(self._by_first_rank(lambda: json.dumps(lay_out(partial / STATE, arrays))))
             self._by_all(lambda: write_arrays(self.comm.rank, partial / STATE, regions, arrays))
-            content = {"step": step, "fingerprint": self.fingerprint,
+            content = {"step": step, "format": FORMAT, "fingerprint": self.fingerprint,
                        "state": hash_file(self.comm, partial / STATE, regions, (partial / STATE).stat().st_size),
                        "files": {name: self._hash_whole(name) for name in files}}
             self._by_first_rank(lambda: _finish(partial, final, manifest_text(content)))
@@ -120,6 +120,8 @@ class CheckpointDirectory:
         # All ranks must read the same before they compare hashes together.
         complaint = f"{manifest}: missing, or not what was written" if content is None else None
         complaint = first_complaint(self.comm, complaint)
+        if complaint is None and content.get("format") != FORMAT:
+            complaint = f"{path}: was made by another version of eddies"
         if complaint is None and content["fingerprint"] != self.fingerprint:
             complaint = f"{path}: was made with other settings"
         if complaint is None:

@@ -21,6 +21,9 @@ from eddies.io.provenance import environment
 from eddies.parallel.broadcast import share_text
 from eddies.parallel.stop import Stopped
 
+# Of the products of this version: no other is read. 1 is that of eddies 0.1, whose files do not say so. Since 2 the
+# scales of a ground truth are those of the release, and a model is a list of terms.
+FORMAT = 2
 CHUNK_BYTES = 2**20
 REMEDIES = {"ground_truth": "dns", "kernel": "train-kernel", "model": "train", "rollout": "simulate"}
 
@@ -49,7 +52,7 @@ def create_product(comm: MPI.Comm, path: str | Path, kind: str,
     partial = path.with_name(path.name + ".partial")
     file = _create(comm, partial)
     origin = json.dumps({**environment(comm.size), **provenance})
-    write_attributes(file, {"kind": kind, "complete": False, "provenance": share_text(comm, origin)})
+    write_attributes(file, {"kind": kind, "format": FORMAT, "complete": False, "provenance": share_text(comm, origin)})
     try:
         yield file
     except Stopped:  # on all ranks alike, so that they can close the file together
@@ -75,7 +78,7 @@ def open_product(comm: MPI.Comm, path: str | Path, kind: str | None) -> Iterator
     """Read a complete product of a kind (None: any); all ranks call it, and if one cannot open it, all raise.
 
     Raises:
-        ProductError: no such file, truncated or not HDF5, unfinished, or of another kind.
+        ProductError: no such file, truncated or not HDF5, unfinished, of another kind, or of another format.
     """
     file, problem = None, ""
     try:
@@ -94,16 +97,17 @@ def open_product(comm: MPI.Comm, path: str | Path, kind: str | None) -> Iterator
 
 
 def product_provenance(path: str | Path) -> dict[str, Any]:
-    """Where a complete product comes from, as `read_provenance`; empty if there is none."""
+    """Where a complete product of this format comes from, as `read_provenance`; empty if there is none."""
     try:
         with h5py.File(path, "r") as file:
-            return read_provenance(file) if file.attrs.get("complete", False) else {}
+            sound = file.attrs.get("complete", False) and _has_this_format(file)
+            return read_provenance(file) if sound else {}
     except (OSError, ValueError, KeyError):
         return {}
 
 
 def product_fingerprint(path: str | Path) -> str | None:
-    """The scene's fingerprint stored in a complete product; None if there is none."""
+    """The scene's fingerprint stored in a complete product of this format; None if there is none."""
     return product_provenance(path).get("fingerprint")
 
 
@@ -205,10 +209,26 @@ def _open_checked(path: Path, kind: str | None) -> h5py.File:
     except OSError as error:
         message = f"{path}: damaged or not an HDF5 file ({error}); delete it and make it again"
         raise ProductError(message) from None
-    found, complete = file.attrs.get("kind", "unknown"), bool(file.attrs.get("complete", False))
-    if complete and kind in (None, found):
+    problem = _problem(file, kind, remedy)
+    if problem is None:
         return file
     file.close()
+    raise ProductError(f"{path}: {problem}")
+
+
+def _problem(file: h5py.File, kind: str | None, remedy: str) -> str | None:
+    """Why an open file is not to be read as a product of a kind, and what to do; None if it may be."""
+    found = file.attrs.get("kind", "unknown")
     if kind not in (None, found):
-        raise ProductError(f"{path}: is of kind {found}, expected {kind}: {remedy}")
-    raise ProductError(f"{path}: unfinished, its writer was stopped: {remedy}")
+        return f"is of kind {found}, expected {kind}: {remedy}"
+    if not file.attrs.get("complete", False):
+        return f"unfinished, its writer was stopped: {remedy}"
+    if not _has_this_format(file):
+        version = json.loads(file.attrs.get("provenance", "{}")).get("eddies", "of unknown version")
+        again = f"run `eddies {REMEDIES[found]}` again" if found in REMEDIES else "make it again"
+        return f"written by eddies {version}, whose {found.replace('_', ' ')} this version does not read; {again}"
+    return None
+
+
+def _has_this_format(file: h5py.File) -> bool:
+    return bool(file.attrs.get("format", 1) == FORMAT)

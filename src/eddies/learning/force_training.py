@@ -1,9 +1,9 @@
-"""Training of the pair-force model on frames of the ground truth (Eqs. 12 to 15)."""
+"""Training of the particle model on frames of the ground truth (Eqs. 12 to 15)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -13,13 +13,11 @@ from torch import Tensor
 from eddies.learning.losses import kullback_leibler, mean_square_share, soft_histogram
 from eddies.learning.optimization import Descent, shared_values
 from eddies.parallel.reduction import global_sum
-from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.cloud import grid_points
 from eddies.particles.dynamics import ParticleDynamics
+from eddies.particles.model import LagrangianModel
 from eddies.particles.neighbor_list import NeighborList
-from eddies.particles.pair_forces import PairModel
 from eddies.particles.particle_set import ParticleSet
-from eddies.particles.poisson_closure import ResolvedForce
 from eddies.particles.reconstruction import reconstruct, volumes
 from eddies.particles.smoothing_kernels import SmoothingKernel
 from eddies.particles.surroundings import Surroundings
@@ -39,28 +37,34 @@ class LossWeights:
 
 
 class TrainingFrame:
-    """The particles of one moment with their true rates, and the dynamics around them; making one is collective.
+    """The particles of one moment with their true rates, and the model's terms around them; making one is collective.
 
-    `particles` carry the density that the model will see in a simulation; `acceleration` (n, 3) and `density_rate`
-    (n,) are what it should answer, and `acceleration_rms` and `density_rate_rms` their rms over all ranks, of one
-    component. `force` is an acceleration that the closure gives besides the pair sum. `total`
-    is the number of particles of all ranks.
+    Parameters
+    ----------
+    dynamics : of the model that is trained, on the slabs of the particles; for this frame alone.
+    particles : as they are at that moment.
+    acceleration, density_rate : (n, 3) and (n,), what the model should answer; the latter None where nothing reads the
+        density.
+
+    `acceleration_rms` and `density_rate_rms` are their rms over all ranks, of one component; `total` is the number of
+    particles of all ranks. What terms that are linear in their parameters do at these particles is computed once.
     """
 
-    def __init__(self, decomposition: SlabDecomposition, model: PairModel, particles: ParticleSet,
-                 acceleration: Tensor, density_rate: Tensor, force: ResolvedForce | None = None) -> None:
-        self.decomposition, self.model, self.dtype = decomposition, model, acceleration.dtype
-        length, reach = decomposition.length, model.cutoff
-        self.dynamics = ParticleDynamics(decomposition, length, model.pair_terms, skin=0.0, dtype=self.dtype)
-        self.surroundings = self.dynamics.surroundings or Surroundings(decomposition, length, reach, reach, 0.0)
-        self.surroundings.update(particles)
-        self.particles, self.acceleration, self.density_rate, self.force = particles, acceleration, density_rate, force
-        squares = [float(rate.double().square().sum()) for rate in (acceleration, density_rate)]
-        *squares, count = global_sum(decomposition.comm, np.array([*squares, len(particles)]))
-        self.total = int(count)
-        self.acceleration_rms, self.density_rate_rms = np.sqrt(squares[0] / (3 * count)), np.sqrt(squares[1] / count)
+    def __init__(self, dynamics: ParticleDynamics, particles: ParticleSet, acceleration: Tensor,
+                 density_rate: Tensor | None) -> None:
+        self.dynamics, self.model, self.decomposition = dynamics, dynamics.model, dynamics.decomposition
+        self.particles, self.acceleration, self.density_rate = particles, acceleration, density_rate
+        self.kept = self.model.linear_rates(dynamics.context(particles))
+        self.acceleration_rms, self.total = self._rms(acceleration)
+        self.density_rate_rms = None if density_rate is None else self._rms(density_rate)[0]
         self._sorted_ids, self._row_of_sorted = torch.sort(particles.id)
         self._volumes: tuple[SmoothingKernel, Tensor] | None = None
+
+    def _rms(self, rate: Tensor) -> tuple[float, int]:
+        """Root mean square of a component over all ranks, and the number of rows."""
+        square = float(rate.double().square().sum())
+        square, count = global_sum(self.decomposition.comm, np.array([square, len(rate)]))
+        return float(np.sqrt(square / (count * rate.shape[1:].numel()))), int(count)
 
     def rows(self, ids: np.ndarray) -> Tensor:
         """Rows of those of the given particles that this rank owns."""
@@ -71,33 +75,49 @@ class TrainingFrame:
         return self._row_of_sorted[place[self._sorted_ids[place] == wanted]]
 
     @cached_property
+    def surroundings(self) -> Surroundings:
+        """Halo and list of the pairs that the field loss looks at: the model's, if it has a list; the first use is
+        collective."""
+        if self.dynamics.surroundings is not None and self.dynamics.surroundings.neighbors is not None:
+            return self.dynamics.surroundings
+        slab, reach = self.decomposition, self.model.flow.cutoff
+        found = Surroundings(slab, slab.length, reach, reach, 0.0)
+        found.update(self.particles)
+        return found
+
+    @cached_property
     def position(self) -> Tensor:
         """Positions (s, 3) of the particles, then of the ghosts; its first use is collective."""
-        return self.surroundings.local(self.particles, set()).position
+        return self.surroundings.local(self.particles).position
 
     @torch.no_grad()
     def volumes(self, kernel: SmoothingKernel) -> Tensor:
         """Volumes (s,) of the particles, ghosts included; collective, and kept until another kernel comes."""
         if self._volumes is None or self._volumes[0] is not kernel:
             own = self.position[: len(self.particles)]
-            pairs = self.surroundings.neighbors.pairs(own, self.position, dtype=self.dtype)
+            pairs = self.surroundings.neighbors.pairs(own, self.position, dtype=self.acceleration.dtype)
             self._volumes = kernel, self.surroundings.column(volumes(kernel, pairs))
         return self._volumes[1]
 
-    def errors(self, rows: Tensor | None = None) -> dict[str, Tensor]:
-        """Predicted minus true rates at all owned particles or some of their rows; collective."""
+    def errors(self, rows: Tensor | None = None, density: Tensor | None = None) -> dict[str, Tensor]:
+        """Predicted minus true "acceleration" (k, 3), and "density_rate" (k,) if the model has one, at all owned
+        particles or some of their rows; with another `density` (n,) than terms give. Collective."""
         kept = slice(None) if rows is None else rows
-        rates = self.dynamics.rates(self.particles, rows)
-        errors = {"velocity": rates["velocity"].to(self.acceleration) - self.acceleration[kept]}
-        if self.force is not None:
-            errors["velocity"] = errors["velocity"] + self.force.at(kept).to(self.acceleration)
-        if "density" in rates:
-            errors["density"] = rates["density"].to(self.density_rate) - self.density_rate[kept]
+        rates = self.dynamics.rates(self.particles, rows, self.kept, density)
+        errors = {"acceleration": rates.acceleration.to(self.acceleration) - self.acceleration[kept]}
+        if rates.density_rate is not None:
+            errors["density_rate"] = rates.density_rate.to(self.density_rate) - self.density_rate[kept]
         return errors
+
+    @torch.no_grad()
+    def seen(self) -> ParticleSet:
+        """The particles with the density that the model sees; collective."""
+        rates = self.dynamics.rates(self.particles, self._row_of_sorted[:0], self.kept)
+        return self.particles if rates.density is None else replace(self.particles, density=rates.density)
 
 
 class ForceTrainer:
-    """Trains a pair-force model, first on trajectories, then on all losses of Eq. 15 together.
+    """Trains a particle model, first on trajectories, then on all losses of Eq. 15 together.
 
     Every step draws a frame, and then either `batch` particles by their ids, or for the field loss all particles in
     and around a cube of the box; both from (seed, step) alone. So the loss is the same on any number of ranks.
@@ -109,7 +129,7 @@ class ForceTrainer:
     weights : of the losses. batch : particles of a step without the field loss.
     """
 
-    def __init__(self, model: PairModel, frames: Sequence[TrainingFrame], kernel: SmoothingKernel,
+    def __init__(self, model: LagrangianModel, frames: Sequence[TrainingFrame], kernel: SmoothingKernel,
                  weights: LossWeights, batch: int, seed: int) -> None:
         self.decomposition, self.total = frames[0].decomposition, frames[0].total
         self.comm, self.length = self.decomposition.comm, self.decomposition.length
@@ -152,8 +172,8 @@ class ForceTrainer:
         shares = {"trajectory": self._trajectory_share(frame, errors, count)}
         if self.weights.field > 0:
             points = self._points[self._within(self._points, corner, side)]
-            shares["field"] = self._field_share(frame, rows, errors["velocity"], points)
-        return shares | self._divergence_shares(frame, rows, errors["velocity"])
+            shares["field"] = self._field_share(frame, rows, errors["acceleration"], points)
+        return shares | self._divergence_shares(frame, rows, errors["acceleration"])
 
     def _weighted(self, shares: dict[str, Tensor]) -> Tensor:
         return sum(getattr(self.weights, name) * share for name, share in shares.items())
@@ -169,13 +189,11 @@ class ForceTrainer:
         """Eq. 12 with centred differences, each rate in units of its rms at that moment, so that all moments of a
         decaying flow count alike.
 
-        The rates of "learned-density" do not count. Between scattered particles the divergence is mostly scatter, and a
-        regression on it makes both factors of the density vanish, without which it does not last: they show through
-        several steps alone.
+        A rate of density counts only if none of its terms has to be learned through several steps of the simulation.
         """
-        share = mean_square_share(errors["velocity"], frame.acceleration_rms, count)
-        if self.model.closure == "paper-density":
-            share = share + mean_square_share(errors["density"], frame.density_rate_rms, count)
+        share = mean_square_share(errors["acceleration"], frame.acceleration_rms, count)
+        if self.model.regresses_density:
+            share = share + mean_square_share(errors["density_rate"], frame.density_rate_rms, count)
         return share
 
     def _field_share(self, frame: TrainingFrame, rows: Tensor, error: Tensor, points: Tensor) -> Tensor:
@@ -197,7 +215,7 @@ class ForceTrainer:
         """Eq. 14, components together, for the acceleration, and for the velocity that the error of the acceleration
         leads to after a time v_rms / a_rms."""
         shares = {}
-        scales, truth = self.model.scales, frame.acceleration[rows]
+        scales, truth = self.model.flow.scales, frame.acceleration[rows]
         if self.weights.acceleration_kl > 0:
             shares["acceleration_kl"] = self._divergence(truth / frame.acceleration_rms, error / frame.acceleration_rms)
         if self.weights.velocity_kl > 0:

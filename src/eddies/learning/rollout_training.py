@@ -29,13 +29,13 @@ class TrainingWindow:
     ----------
     particles : at the start.
     velocity : (frames, n, 3), true velocities at the end of frame intervals 1, 2, ...; rows as in `particles`.
-    density : (frames, n), the same for the density.
+    density : (frames, n), the same for the density; or None.
     energies : (frames + 1, bands), the kinetic energy by bands of wavenumbers, at the start and then as above; or None.
     """
 
     particles: ParticleSet
     velocity: Tensor
-    density: Tensor
+    density: Tensor | None
     energies: Tensor | None = None
 
 
@@ -50,8 +50,8 @@ class RolloutTrainer:
     attenuated where what they are fitted to is noisy, they take too much from some scales and too little from others,
     and an energy off by little at every step is hardly seen in the error of the velocity.
 
-    The gradient goes through all steps: force, neighbours, halo, and the closure's grid. Each step is computed anew on
-    the way back, so that memory holds one step and not all.
+    The gradient goes through all steps: force, neighbours, halo, and the grid of the resolved velocity. Each step is
+    computed anew on the way back, so that memory holds one step and not all.
 
     Parameters
     ----------
@@ -121,31 +121,32 @@ class RolloutTrainer:
 
     def _advanced(self, particles: ParticleSet, memory: dict[str, Tensor]) -> tuple[ParticleSet, dict[str, Tensor]]:
         """One time step; where gradients are recorded, without keeping what happens within it."""
-        names = list(memory)
-        after: list[str] = []
+        given, carried, after = particles.columns(), list(memory), ([], [])
+        del given["id"]
 
-        def advance(position: Tensor, velocity: Tensor, density: Tensor, *remembered: Tensor) -> tuple[Tensor, ...]:
+        def advance(*columns: Tensor) -> tuple[Tensor, ...]:
             # Lists built anew, so that the way back does the very same.
             self.integrator.dynamics.forget()
-            start = ParticleSet(particles.id, position, velocity, density)
-            self.integrator.restore(start, dict(zip(names, remembered)))
-            end = self.integrator.step(start, self.time_step)
-            after[:] = self.integrator.memory
-            return end.position, end.velocity, end.density, *self.integrator.memory.values()
+            start = ParticleSet(particles.id, **dict(zip(given, columns)))
+            self.integrator.restore(start, dict(zip(carried, columns[len(given):])))
+            end = self.integrator.step(start, self.time_step).columns()
+            del end["id"]
+            after[0][:], after[1][:] = end, self.integrator.memory
+            return *end.values(), *self.integrator.memory.values()
 
-        columns = particles.position, particles.velocity, particles.density, *memory.values()
+        columns = *given.values(), *memory.values()
         if torch.is_grad_enabled():
             columns = checkpoint(advance, *columns, use_reentrant=False, preserve_rng_state=False)
         else:
             columns = advance(*columns)
-        moved = ParticleSet(particles.id, *columns[:3])
-        return moved, dict(zip(after, columns[3:]))
+        moved = ParticleSet(particles.id, **dict(zip(after[0], columns)))
+        return moved, dict(zip(after[1], columns[len(after[0]):]))
 
     def _errors(self, window: TrainingWindow, frame: int,
                 particles: ParticleSet) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
         """Error, truth, and value at the start of each column that has a rate."""
         yield particles.velocity - window.velocity[frame], window.velocity[frame], window.particles.velocity
-        if self.integrator.dynamics.closure is None:
+        if self.integrator.dynamics.model.integrates_density:
             yield particles.density - window.density[frame], window.density[frame], window.particles.density
 
     def _scale(self, true: Tensor, start: Tensor) -> float:

@@ -153,7 +153,7 @@ class Training:
         return {name: tensor.detach().cpu().numpy().copy() for name, tensor in self.model.state_dict().items()}
 
     def _load(self, weights: Mapping[str, np.ndarray]) -> None:
-        self.model.load_state_dict({name: torch.from_numpy(array) for name, array in weights.items()})
+        self.model.load_state_dict({name: torch.from_numpy(np.asarray(array)) for name, array in weights.items()})
 
 
 def _named(prefix: str, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -10,24 +10,21 @@ import torch
 from torch import Tensor
 
 from eddies.parallel.reduction import global_max, global_min, global_sum
-from eddies.particles.dynamics import pairs_together
-from eddies.particles.pair_forces import PairModel
+from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.particle_set import ParticleSet
-from eddies.particles.surroundings import Surroundings
 
 
-def pair_features(model: PairModel, surroundings: Surroundings, particles: ParticleSet,
-                  dtype: torch.dtype) -> Iterator[Tensor]:
-    """What the network of a model is given, in blocks (features, m); collective, with at least one block on each rank.
+def pair_features(dynamics: ParticleDynamics, particles: ParticleSet) -> Iterator[Tensor]:
+    """What the networks of a model are given of particles with the density that it sees, in blocks (features, m), those
+    of all networks one after the other; collective, with at least one block on each rank.
 
-    Each pair stands in both orders, on the rank that owns its first particle, also where the model needs one order
-    alone: so counts are the same on any number of ranks. `surroundings` fit the particles, whose density is the one
-    that the model sees.
+    Each pair stands in both orders, on the rank that owns its first particle, also where a term needs one order
+    alone: so counts are the same on any number of ranks.
     """
-    local = surroundings.local(particles, set(model.reads))
-    own = local.position[: len(particles)]
-    for block in surroundings.neighbors.blocks(pairs_together(model.width, own.device)):
-        yield model.features(surroundings.neighbors.pairs(own, local.position, block, dtype), local.columns)
+    terms = dynamics.model.networks
+    context = dynamics.context(particles, density=particles.density)
+    for pairs in context.scaled_pairs(max(term.width for term in terms)):
+        yield torch.cat([term.features(pairs) for term in terms])
 
 
 @dataclass(frozen=True)

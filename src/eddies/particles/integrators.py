@@ -8,6 +8,7 @@ from torch import Tensor
 
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.particle_set import ParticleSet
+from eddies.particles.rates import Rates
 
 
 class Integrator:
@@ -30,8 +31,8 @@ class VelocityVerlet(Integrator):
 
     Rates may depend on velocity and density: they are evaluated at the velocity and density predicted for the
     end of the step by an Euler step, v + dt a (Groot and Warren 1997, with lambda = 1), and serve the next
-    step's first half kick as well. A density with a rate is integrated by the trapezoidal rule; one given by
-    a closure is left as last evaluated.
+    step's first half kick as well. A density with a rate is integrated by the trapezoidal rule; one that terms give
+    is left as last evaluated.
 
     `memory` holds those rates, rows as in the particles last returned: a checkpoint must keep it, and
     `restore` gives it back. For any other particles than those last returned the rates are evaluated anew.
@@ -47,15 +48,13 @@ class VelocityVerlet(Integrator):
     def step(self, particles: ParticleSet, time_step: float) -> ParticleSet:
         memory = self.memory if particles is self._last else {}
         particles, memory = self.dynamics.settle(particles, memory)
-        start = memory or self.dynamics.rates(particles)
-        half = particles.velocity + 0.5 * time_step * start["velocity"]
-        predicted = replace(
-            _advanced(particles, start, time_step), position=particles.position + time_step * half
-        )
-        end = self.dynamics.rates(predicted)
-        kicked = _advanced(_advanced(particles, start, 0.5 * time_step), end, 0.5 * time_step)
-        result = replace(kicked, position=predicted.position)
-        self.restore(result, {name: rate for name, rate in end.items() if name != "closure_density"})
+        start = Rates(**memory) if memory else self.dynamics.rates(particles)
+        position = particles.position + time_step * (particles.velocity + 0.5 * time_step * start.acceleration)
+        end = self.dynamics.rates(replace(_kicked(particles, start, time_step), position=position))
+        kicked = _kicked(_kicked(particles, start, 0.5 * time_step), end, 0.5 * time_step)
+        result = replace(kicked, position=position)
+        remembered = {name: getattr(end, name) for name in REMEMBERED}
+        self.restore(result, {name: rate for name, rate in remembered.items() if rate is not None})
         return result
 
 
@@ -64,8 +63,8 @@ class Midpoint(Integrator):
 
     def step(self, particles: ParticleSet, time_step: float) -> ParticleSet:
         start, _ = self.dynamics.settle(particles)
-        middle = _advanced(start, _all_rates(self.dynamics, start), 0.5 * time_step)
-        return _advanced(start, _all_rates(self.dynamics, middle), time_step)
+        middle = _advanced(start, start, self.dynamics.rates(start), 0.5 * time_step)
+        return _advanced(start, middle, self.dynamics.rates(middle), time_step)
 
 
 class RungeKutta4(Integrator):
@@ -73,30 +72,30 @@ class RungeKutta4(Integrator):
 
     def step(self, particles: ParticleSet, time_step: float) -> ParticleSet:
         start, _ = self.dynamics.settle(particles)
-        rates = [_all_rates(self.dynamics, start)]
+        stages = [(start, self.dynamics.rates(start))]
         for fraction in (0.5, 0.5, 1.0):
-            stage = _advanced(start, rates[-1], fraction * time_step)
-            rates.append(_all_rates(self.dynamics, stage))
+            stage = _advanced(start, *stages[-1], fraction * time_step)
+            stages.append((stage, self.dynamics.rates(stage)))
         result = start
-        for weight, rate in zip((1, 2, 2, 1), rates):
-            result = _advanced(result, rate, weight * time_step / 6)
+        for weight, stage in zip((1, 2, 2, 1), stages):
+            result = _advanced(result, *stage, weight * time_step / 6)
         return result
 
 
 INTEGRATORS = {"verlet": VelocityVerlet, "rk2": Midpoint, "rk4": RungeKutta4}
+REMEMBERED = ("acceleration", "density_rate")
 
 
-def _all_rates(dynamics: ParticleDynamics, particles: ParticleSet) -> dict[str, Tensor]:
-    """The rates, with that of the position."""
-    return {**dynamics.rates(particles), "position": particles.velocity}
+def _kicked(particles: ParticleSet, rates: Rates, time_step: float) -> ParticleSet:
+    """Velocity and, where it has a rate, density moved on by one Euler step; a density that terms give replaced."""
+    density = particles.density
+    if rates.density is not None:
+        density = rates.density
+    elif rates.density_rate is not None:
+        density = density + time_step * rates.density_rate
+    return replace(particles, velocity=particles.velocity + time_step * rates.acceleration, density=density)
 
 
-def _advanced(particles: ParticleSet, rates: dict[str, Tensor], time_step: float) -> ParticleSet:
-    """Each column that has a rate moved on by one Euler step; a density given by a closure replaced."""
-    columns = {}
-    for name, rate in rates.items():
-        if name == "closure_density":
-            columns["density"] = rate
-        else:
-            columns[name] = getattr(particles, name) + time_step * rate
-    return replace(particles, **columns)
+def _advanced(particles: ParticleSet, stage: ParticleSet, rates: Rates, time_step: float) -> ParticleSet:
+    """All columns moved on by one Euler step with the velocity and the rates of a stage."""
+    return replace(_kicked(particles, rates, time_step), position=particles.position + time_step * stage.velocity)

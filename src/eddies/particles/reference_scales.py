@@ -1,4 +1,4 @@
-"""Measured scales by which the pair-force model is made dimensionless."""
+"""Measured scales by which a model is made dimensionless."""
 
 from __future__ import annotations
 
@@ -14,38 +14,42 @@ class ReferenceScales:
     ----------
     length : filter width d, the unit of length in Eq. 4.
     spacing : mean distance of particles, (box volume / particles)^(1/3).
-    velocity : rms of one velocity component.
-    density_mean : mean density rho_0.
-    density : rms of the density fluctuation rho - rho_0.
+    velocity : rms of one velocity component, its mean not subtracted.
     acceleration : rms of one component of the acceleration along trajectories.
+    density_mean : mean density rho_0.
+    viscosity : kinematic viscosity nu of the fluid; may be 0.
+    density : rms of the density fluctuation rho - rho_0.
     density_rate : rms of the rate of change of density along trajectories.
     sound_speed : speed of sound c.
 
-    A flow at another Mach number supplies its own scales to the same network. Raises ValueError unless all
-    are finite and positive.
+    The last three are None for a ground truth without density, that of an incompressible fluid. A flow at another Mach
+    number supplies its own scales to the same network. Raises ValueError unless all that are given are finite and
+    positive.
     """
 
     length: float
     spacing: float
     velocity: float
-    density_mean: float
-    density: float
     acceleration: float
-    density_rate: float
-    sound_speed: float
+    density_mean: float
+    viscosity: float
+    density: float | None = None
+    density_rate: float | None = None
+    sound_speed: float | None = None
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if not (math.isfinite(value) and value > 0):
-                raise ValueError(f"reference scale {field.name} = {value}: must be finite and positive")
+        if not (math.isfinite(self.viscosity) and self.viscosity >= 0):
+            raise ValueError(f"reference scale viscosity = {self.viscosity}: must be finite and not negative")
+        for name, value in asdict(self).items():
+            if name != "viscosity" and value is not None and not (math.isfinite(value) and value > 0):
+                raise ValueError(f"reference scale {name} = {value}: must be finite and positive")
 
-    def to_dict(self) -> dict[str, float]:
+    def to_dict(self) -> dict[str, float | None]:
         """The scales by name, ready for JSON."""
-        return {name: float(value) for name, value in asdict(self).items()}
+        return {name: None if value is None else float(value) for name, value in asdict(self).items()}
 
     @classmethod
-    def from_dict(cls, scales: dict[str, float]) -> ReferenceScales:
+    def from_dict(cls, scales: dict[str, float | None]) -> ReferenceScales:
         """Inverse of `to_dict`; raises ValueError when a scale is missing or unknown."""
         expected = {field.name for field in fields(cls)}
         if set(scales) != expected:

@@ -28,14 +28,12 @@ class LocalParticles:
     Parameters
     ----------
     position : (s, 3); on several ranks z is not periodic here, and ghosts stand where they are seen from.
-    columns : the columns that were asked for, (s, ...).
     neighbors : the list of pairs, built from these rows; or None.
     halo : for further columns, with `ghosts.exchange_ghosts`; another one whenever rows of ghosts change.
     box : the box in which differences of these positions are taken.
     """
 
     position: Tensor
-    columns: dict[str, Tensor]
     neighbors: NeighborList | None
     halo: HaloExchange
     box: PeriodicBox
@@ -134,12 +132,11 @@ class Surroundings:
                 position = self._with_ghosts(particles.position, exchange_ghost_positions)
             self.neighbors.build(position[: len(particles)], position, exclude_self=True)
 
-    def local(self, particles: ParticleSet, names: set[str]) -> LocalParticles:
-        """Positions and the named columns with ghosts, as of now."""
+    def local(self, particles: ParticleSet) -> LocalParticles:
+        """Positions with ghosts, as of now."""
         # Stored component by component, as the gathering of pairs wants it.
         position = self._with_ghosts(particles.position, exchange_ghost_positions).T.contiguous().T
-        columns = {name: self.column(getattr(particles, name)) for name in sorted(names)}
-        return LocalParticles(position, columns, self.neighbors, self.halo, self.box)
+        return LocalParticles(position, self.neighbors, self.halo, self.box)
 
     def column(self, owned: Tensor) -> Tensor:
         """A column (n, ...) of owned particles followed by its ghost rows."""

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.parallel.halo import HaloError
 from eddies.parallel.plane_halo import PlaneHalo
+from eddies.spectral.spectral_grid import SpectralGrid
 
 ORDERS = {"cubic": 3, "quintic": 5}
 
@@ -32,11 +32,15 @@ class SplineInterpolation:
         self._halo = PlaneHalo(grid.decomposition, reach + margin, reach + 1 + margin)
         angle = 2 * np.pi / grid.cells
         transforms = [_spline_transform(self.degree, angle * axis) for axis in grid.index]
-        self._inverse = (1.0 / (transforms[0] * transforms[1] * transforms[2])).astype(grid.real)
+        #: by which each mode is multiplied to make it one of spline coefficients
+        self.inverse = (1.0 / (transforms[0] * transforms[1] * transforms[2])).astype(grid.real)
 
     def coefficients(self, spectral: np.ndarray) -> np.ndarray:
         """Spline coefficients of fields (c, kz, ky, kx), with ghost planes: (ghosts + z_local, y, x, c)."""
-        planes = self.grid.backward(spectral * self._inverse)
+        return self.with_ghosts(self.grid.backward(spectral * self.inverse))
+
+    def with_ghosts(self, planes: np.ndarray) -> np.ndarray:
+        """Planes (c, z_local, y, x) of coefficients as `at` wants them: (ghosts + z_local, y, x, c)."""
         return self._halo.forward(np.ascontiguousarray(np.moveaxis(planes, 0, -1)))
 
     def at(self, coefficients: np.ndarray, positions: np.ndarray) -> np.ndarray:
@@ -57,9 +61,9 @@ class SplineInterpolation:
         return slope
 
     def spread(self, values: np.ndarray, positions: np.ndarray) -> np.ndarray:
-        """Transpose of `at` with the ghost planes' exchange: values (n, c) added to planes (c, z_local, y, x).
+        """Transpose of `at` on `with_ghosts`: values (n, c) added to planes (c, z_local, y, x).
 
-        For all planes f and values g, the sum over ranks of at(ghosts of f).g equals that of f.spread(g).
+        For all planes f and values g, the sum over ranks of at(with_ghosts(f)).g equals that of f.spread(g).
         """
         n, planes = self.grid.cells, self.grid.physical_shape[0] + self._halo.below + self._halo.above
         flat = np.zeros((values.shape[1], planes * n * n))
@@ -67,13 +71,6 @@ class SplineInterpolation:
             for component, column in zip(flat, values.T):
                 component += np.bincount(rows, weight * column, planes * n * n)
         return np.moveaxis(self._halo.adjoint(np.moveaxis(flat.reshape(-1, planes, n, n), 0, -1)), -1, 0)
-
-    def from_coefficients(self, planes: np.ndarray) -> np.ndarray:
-        """Transpose of `coefficients` without the ghost planes: planes (c, z, y, x) to modes, (c, kz, ky, kx).
-
-        Division by the B-spline's transform is symmetric, so it is the same on the way back.
-        """
-        return self.grid.forward(planes) * self._inverse
 
     def _stencil(self, positions: np.ndarray, planes: int,
                  derivative: int | None = None) -> Iterator[tuple[np.ndarray, np.ndarray]]:

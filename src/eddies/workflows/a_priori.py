@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import torch
 
-from eddies.spectral.interpolation import SplineInterpolation
 from eddies.flow.operators import gradient
-from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.learning.force_training import TrainingFrame
 from eddies.learning.losses import relative_error
 from eddies.parallel.migration import IdOrder, migrate
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
-from eddies.particles.pair_forces import PairModel
+from eddies.particles.dynamics import ParticleDynamics
+from eddies.particles.model import LagrangianModel
 from eddies.particles.particle_set import ParticleSet, as_numpy
-from eddies.particles.poisson_closure import PoissonClosure
 from eddies.scene import SceneError
-from eddies.workflows.truth import GroundTruth, load_frame
+from eddies.spectral.interpolation import SplineInterpolation
+from eddies.spectral.spectral_grid import SpectralGrid
+from eddies.workflows.truth import GroundTruth, load_frame, particles_for
 
 EVALUATIONS, SAMPLE = 9, 20000
 
@@ -38,51 +36,47 @@ def evaluation_frames(truth: GroundTruth) -> np.ndarray:
 
 
 @torch.no_grad()
-def evaluate(truth: GroundTruth, model: PairModel, closure: PoissonClosure | None, frames: np.ndarray, last_seen: int,
-             dtype: torch.dtype, device: torch.device) -> dict[str, dict[str, np.ndarray]]:
+def evaluate(truth: GroundTruth, model: LagrangianModel, frames: np.ndarray, last_seen: int, dtype: torch.dtype,
+             device: torch.device) -> dict[str, dict[str, np.ndarray]]:
     """Normalised L2 errors over time delay, and samples of true and predicted rates at the last frame; collective.
 
-    `acceleration_error` is that of the model as it runs: with the density of its closure if it has one.
-    `density_rate_error` is that of the learned rate, or of the rate at which the closure's density changes.
+    `acceleration_error` is that of the model as it runs: with the density that its terms give.
+    `density_rate_error` is that of the learned rate, or of the rate at which a given density changes.
     `true_density_acceleration_error` is that with the true density, `pressure_gradient_error` that of
-    -c^2 grad ln(rho) of the filtered field, without any model.
+    -c^2 grad ln(rho) of the filtered field, without any model, of a truth that has a density.
     """
     rows, comm = [], truth.decomposition.comm
     for index in frames:
-        frame = load_frame(truth, index, model, closure, dtype, device)
+        frame = load_frame(truth, index, model, dtype, device)
         errors = frame.errors()
-        exact = _pressure_force(truth, int(index), frame.particles).to(frame.acceleration)
         row = {"delay": truth.times[index] - truth.times[last_seen],
-               "acceleration_error": relative_error(comm, errors["velocity"], frame.acceleration),
-               "pressure_gradient_error": relative_error(comm, exact - frame.acceleration, frame.acceleration)}
-        if closure is not None:
-            given = with_density(frame, torch.from_numpy(truth.particles(int(index))["density"]).to(device)).errors()
-            row["true_density_acceleration_error"] = relative_error(comm, given["velocity"], frame.acceleration)
-            row["density_rate_error"] = _closure_rate_error(truth, closure, int(index), device)
-        if "density" in errors:
-            row["density_rate_error"] = relative_error(comm, errors["density"], frame.density_rate)
+               "acceleration_error": relative_error(comm, errors["acceleration"], frame.acceleration)}
+        if truth.has_density:
+            exact = _pressure_force(truth, int(index), frame.particles).to(frame.acceleration)
+            row["pressure_gradient_error"] = relative_error(comm, exact - frame.acceleration, frame.acceleration)
+        if model.density_is_given:
+            true = torch.from_numpy(truth.particles(int(index))["density"]).to(device)
+            given = frame.errors(density=true)["acceleration"]
+            row["true_density_acceleration_error"] = relative_error(comm, given, frame.acceleration)
+            row["density_rate_error"] = _given_rate_error(truth, frame.dynamics, int(index), device)
+        if "density_rate" in errors:
+            row["density_rate_error"] = relative_error(comm, errors["density_rate"], frame.density_rate)
         rows.append(row)
     tables = {"a_priori": {name: np.array([row[name] for row in rows]) for name in rows[0]},
-              "acceleration_sample": _sample(truth, frame, frame.acceleration, errors["velocity"])}
-    if "density" in errors:
-        tables["density_rate_sample"] = _sample(truth, frame, frame.density_rate, errors["density"])
+              "acceleration_sample": _sample(truth, frame, frame.acceleration, errors["acceleration"])}
+    if "density_rate" in errors:
+        tables["density_rate_sample"] = _sample(truth, frame, frame.density_rate, errors["density_rate"])
     return tables
 
 
-def with_density(frame: TrainingFrame, density: torch.Tensor) -> TrainingFrame:
-    """The frame with another density (n,) of its particles; the force of its closure is kept."""
-    particles = replace(frame.particles, density=density.to(frame.particles.density))
-    return TrainingFrame(frame.decomposition, frame.model, particles, frame.acceleration, frame.density_rate,
-                         frame.force)
-
-
-def _closure_rate_error(truth: GroundTruth, closure: PoissonClosure, index: int, device: torch.device) -> float:
-    """Error of the rate of the closure's density along the true trajectories, by centred differences."""
+def _given_rate_error(truth: GroundTruth, dynamics: ParticleDynamics, index: int, device: torch.device) -> float:
+    """Error of the rate of the density that terms give, along the true trajectories, by centred differences."""
     comm, total = truth.decomposition.comm, truth.total
 
     def density(frame: int) -> np.ndarray:
-        particles = ParticleSet.from_numpy(truth.particles(frame), device)
-        return _by_id(comm, total, closure.apply(particles)[0].to_numpy(), "density")
+        particles = particles_for(dynamics.model, truth.particles(frame), device)
+        found = dynamics.rates(particles).density
+        return _by_id(comm, total, {"id": as_numpy(particles.id), "density": as_numpy(found)}, "density")
 
     rate = (density(index + 1) - density(index - 1)) / (truth.times[index + 1] - truth.times[index - 1])
     exact = _by_id(comm, total, truth.particles_with_rates(index), "density_rate")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -14,7 +15,6 @@ from eddies.flow.forcing import LinearForcing
 from eddies.flow.initial_fields import balanced_density
 from eddies.flow.navier_stokes import CompressibleFluid
 from eddies.flow.operators import gradient
-from eddies.spectral.spectral_grid import SpectralGrid, restrict
 from eddies.flow.stability import quadratic_energy
 from eddies.flow.subgrid import Smagorinsky
 from eddies.flow.tracers import FilteredField, TracerParticles
@@ -22,6 +22,7 @@ from eddies.parallel.migration import migrate
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.particle_set import ParticleSet
 from eddies.scene import Eulerian, Scene
+from eddies.spectral.spectral_grid import SpectralGrid, restrict
 from eddies.time_stepping import ETDRK4
 from eddies.workflows.particle_run import forced_below, injection_rate
 from eddies.workflows.truth import GroundTruth
@@ -37,7 +38,9 @@ class EulerianRun:
     start makes no sound. The true particles follow the resolved velocity.
     """
 
-    def __init__(self, scene: Scene, truth: GroundTruth, start: int) -> None:
+    has_density = True
+
+    def __init__(self, scene: Scene, truth: GroundTruth, start: int, directory: Path, device: torch.device) -> None:
         self.settings, self.longest_step = scene.eulerian or Eulerian(), scene.simulation.step
         comm, length = truth.decomposition.comm, truth.decomposition.length
         cells = self.settings.cells_for(scene.tracers.width)
@@ -96,7 +99,7 @@ class EulerianRun:
     def description(self) -> dict[str, float | str]:
         """Grid and model; `flow_seconds_per_step` (median) is the flow's share of a step, without the particles."""
         grid = self.fluid.grid
-        return {"integrator": "etdrk4", "closure": "none", "cells": grid.cells, "largest_wavenumber": grid.cutoff,
+        return {"integrator": "etdrk4", "cells": grid.cells, "largest_wavenumber": grid.cutoff,
                 "smagorinsky": self.settings.smagorinsky,
                 "flow_seconds_per_step": float(np.median(self.flow_seconds or [np.nan]))}
 

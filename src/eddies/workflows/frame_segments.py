@@ -14,6 +14,7 @@ from eddies.io.trajectories import Trajectory, TrajectoryWriter
 from eddies.parallel.migration import id_block
 from eddies.parallel.slab import SlabDecomposition
 from eddies.scene import BOX_LENGTH, Tracers
+from eddies.workflows.measured_scales import measured_scales
 
 
 class FrameSegments:
@@ -46,18 +47,27 @@ class FrameSegments:
             self.names.append(self._name)
             self._name = ""
 
+    def release_scales(self) -> dict[str, float]:
+        """Scales of the first frame, with the rates between the first two; of closed segments."""
+        frames = []
+        for name in self.names[:2]:  # the first may hold one frame alone
+            with open_product(self.comm, self.directory / name, "frames") as segment:
+                stored = Trajectory(segment, "tracers")
+                frames += [(time, self._values(stored, frame)) for frame, time in enumerate(stored.times[:2])]
+        (start, first), (end, second) = frames[:2]
+        return measured_scales(self.comm, first, first, second, end - start)
+
     def assemble(self, file) -> None:
         """Copy the frames of all segments into a product."""
         self.close()
         trajectory, fields = self._writers(file)
         slab = SlabDecomposition(self.comm, BOX_LENGTH, self.settings.cells)
-        start, stop = id_block(self.comm, self.settings.particles)
+        start, _ = id_block(self.comm, self.settings.particles)
         for name in self.names:
             with open_product(self.comm, self.directory / name, "frames") as segment:
                 frames, series = Trajectory(segment, "tracers"), FieldSeries(segment, "filtered")
                 for frame, (step, time) in enumerate(zip(frames.steps, frames.times)):
-                    columns = {column: frames.read(frame, column, start, stop) for column in frames.columns}
-                    trajectory.append(step, time, start, columns)
+                    trajectory.append(step, time, start, self._values(frames, frame))
                 for index, time in enumerate(series.times):
                     planes = {name: series.read(index, name, slab.start, slab.stop) for name in series.variables}
                     fields.append(time, slab.start, planes)
@@ -67,6 +77,11 @@ class FrameSegments:
 
     def __exit__(self, *raised) -> None:
         self._file.__exit__(*raised)
+
+    def _values(self, frames: Trajectory, frame: int) -> dict[str, np.ndarray]:
+        """This rank's block of all columns of a frame."""
+        block = id_block(self.comm, self.settings.particles)
+        return {column: frames.read(frame, column, *block) for column in frames.columns}
 
     def _writers(self, file) -> tuple[TrajectoryWriter, FieldWriter]:
         settings = self.settings

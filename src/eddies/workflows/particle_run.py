@@ -1,8 +1,8 @@
-"""Particles moved by forces between them, learned or of SPH, or by none."""
+"""Particles moved by the terms of a model, learned or of SPH, or by none."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,54 +10,64 @@ import torch
 
 from eddies.parallel.broadcast import first_complaint
 from eddies.parallel.halo import HaloError
-from eddies.particles.body_forces import LinearForcing
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.faults import Limits, find_fault
 from eddies.particles.feature_range import FeatureRange, pair_features
+from eddies.particles.flow_units import FlowUnits
 from eddies.particles.integrators import INTEGRATORS
-from eddies.particles.pair_forces import PairModel
+from eddies.particles.model import LagrangianModel, build_model
 from eddies.particles.particle_set import ParticleSet
-from eddies.particles.smoothing_kernels import CubicSpline, WendlandC2
-from eddies.particles.term_protocols import DensityClosure, PairTerm
-from eddies.particles.wcsph import WCSPH, SummationDensity
+from eddies.particles.terms.forcing import Forcing
+from eddies.particles.terms.presets import PRESETS
+from eddies.particles.terms.settings import SummationDensity, WCSPH
 from eddies.scene import Scene, Wcsph
-from eddies.workflows.closures import density_closure
 from eddies.workflows.estimates import ALLOWED_VELOCITY
 from eddies.workflows.trained_model import load_feature_range, load_model
-from eddies.workflows.truth import GroundTruth
+from eddies.workflows.truth import GroundTruth, particles_for
 
 # A state is runaway, not turbulence, when a particle is this many times faster, or its density this many times
 # farther from the mean, than the rms of the truth.
 RUNAWAY_SPEED, RUNAWAY_DENSITY = 30.0, 300.0
-SPH_KERNELS = {"cubic-spline": CubicSpline, "wendland": WendlandC2}
-
-
-@dataclass(frozen=True)
-class Force:
-    """What acts between particles: pair terms, and the closure that gives their density or None.
-
-    `largest_deviation`: of a particle's density from the mean, in a sound state. `description`: for the product.
-    `learned`: a trained model and the range of what it was given in training, where that is known.
-    """
-
-    terms: list[PairTerm] = field(default_factory=list)
-    closure: DensityClosure | None = None
-    largest_deviation: float = np.inf
-    description: dict[str, float | str] = field(default_factory=lambda: {"closure": "none"})
-    learned: tuple[PairModel, FeatureRange] | None = None
 
 
 class ParticleRun:
-    """The particles of a frame of the ground truth, with the force that [simulation] force names."""
+    """The particles of a frame of the ground truth, moved by a model.
+
+    Its units are the scales of the flow at that frame: nothing is measured after it. A subclass says which model it is
+    (`build`), and how far a particle's density may deviate from the mean in a sound state (`largest_deviation`).
+    """
+
+    largest_deviation = np.inf
+    seen: FeatureRange | None = None
 
     def __init__(self, scene: Scene, truth: GroundTruth, start: int, directory: Path, device: torch.device) -> None:
-        self.settings, self.comm, scales = scene.simulation, truth.decomposition.comm, truth.scales
-        self.force = FORCES[self.settings.force](scene, truth, directory, device)
-        self.dynamics = build_dynamics(scene, truth, self.force)
+        self.settings, self.comm, self.scales = scene.simulation, truth.decomposition.comm, truth.scales_at(start)
+        self.flow = FlowUnits(self.scales, scene.kernel.support(truth.total), scene.kernel.neighbors, scene.seed)
+        dtype = getattr(torch, self.settings.precision)
+        self.model = self.with_forcing(self.build(scene, directory), scene, truth).to(dtype=dtype, device=device)
+        drift = ALLOWED_VELOCITY * self.scales.velocity * self.settings.step
+        self.dynamics = ParticleDynamics(truth.decomposition, self.model, self.settings.skin * self.flow.cutoff, dtype,
+                                         drift)
         self.integrator = INTEGRATORS[self.settings.integrator](self.dynamics)
-        self.particles = ParticleSet.from_numpy(truth.particles(start), device)
-        self.limits = Limits(RUNAWAY_SPEED * scales.velocity, scales.density_mean, self.force.largest_deviation)
+        self.particles = particles_for(self.model, truth.particles(start), device)
+        self.limits = Limits(RUNAWAY_SPEED * self.scales.velocity, self.scales.density_mean, self.largest_deviation)
         self._shares_outside: list[float] = []
+
+    def build(self, scene: Scene, directory: Path) -> LagrangianModel:
+        """The model, without forcing; collective."""
+        raise NotImplementedError
+
+    def with_forcing(self, model: LagrangianModel, scene: Scene, truth: GroundTruth) -> LagrangianModel:
+        """The model with the forcing of the large scales that a simulation asks for, if it asks for any."""
+        if self.settings.injection == "none":
+            return model
+        settings = Forcing.Settings(injection_rate=injection_rate(scene, truth), wavenumber=forced_below(scene))
+        return LagrangianModel({**model.terms, "injection": Forcing(settings, self.flow)}, self.flow)
+
+    @property
+    def has_density(self) -> bool:
+        """Whether the particles of its frames have a density."""
+        return self.model.reads_density
 
     def steps(self, interval: float) -> int:
         """As many steps as are no longer than that of the scene."""
@@ -73,63 +83,56 @@ class ParticleRun:
         return first_complaint(self.comm, fault)
 
     def frame(self) -> tuple[ParticleSet, torch.Tensor]:
-        """The particles, with the density of the closure if there is one, and their acceleration."""
+        """The particles, with the density that terms give if they do, and their acceleration."""
         particles, _ = self.dynamics.settle(self.particles)
         rates = self.dynamics.rates(particles)
-        particles = replace(particles, density=rates.get("closure_density", particles.density))
-        if self.force.learned is not None:
-            model, seen = self.force.learned
-            blocks = pair_features(model, self.dynamics.surroundings, particles, self.dynamics.dtype)
-            self._shares_outside.append(seen.share_outside(self.comm, blocks))
-        return particles, rates["velocity"]
+        if rates.density is not None:
+            particles = replace(particles, density=rates.density)
+        if self.seen is not None:
+            self._shares_outside.append(self.seen.share_outside(self.comm, pair_features(self.dynamics, particles)))
+        return particles, rates.acceleration
 
     def series(self) -> dict[str, dict[str, list[float]]]:
-        """`outside_training`: the share of pairs that give the network inputs outside the range of its training."""
-        return {} if self.force.learned is None else {"outside_training": {"share": self._shares_outside}}
+        """`outside_training`: the share of pairs that give the networks inputs outside the range of their training."""
+        return {} if self.seen is None else {"outside_training": {"share": self._shares_outside}}
 
     def description(self) -> dict[str, float | str]:
-        """Integrator and force."""
-        return {"integrator": self.settings.integrator, **self.force.description}
+        """Integrator and terms."""
+        return {"integrator": self.settings.integrator, "terms": ", ".join(self.model.terms) or "none"}
 
 
-def no_force(scene: Scene, truth: GroundTruth, directory: Path, device: torch.device) -> Force:
-    """No term: neither neighbour list nor messages, and particles that keep their velocity."""
-    return Force()
+class LearnedRun(ParticleRun):
+    """Moved by the trained model of the run directory."""
+
+    def build(self, scene: Scene, directory: Path) -> LagrangianModel:
+        path = directory / "model.h5"
+        model = load_model(scene, self.comm, path, self.scales)
+        if self.scales.density is not None:
+            self.largest_deviation = RUNAWAY_DENSITY * self.scales.density
+        if model.networks:
+            self.seen = load_feature_range(self.comm, path)
+        return model
 
 
-def learned_force(scene: Scene, truth: GroundTruth, directory: Path, device: torch.device) -> Force:
-    """The trained model of a run directory."""
-    settings, slab, scales = scene.simulation, truth.decomposition, truth.scales
-    dtype = getattr(torch, settings.precision)
-    model = load_model(slab.comm, directory / "model.h5", device).to(dtype)
-    drift = ALLOWED_VELOCITY * scales.velocity * settings.step
-    closure = density_closure(model, slab, dtype, settings.skin * model.cutoff, drift)
-    seen = load_feature_range(slab.comm, directory / "model.h5") if model.pair_terms else None
-    return Force(model.pair_terms, closure, RUNAWAY_DENSITY * scales.density,
-                 {"basis": model.basis, "closure": model.closure}, None if seen is None else (model, seen))
+class BallisticRun(ParticleRun):
+    """Not moved by anything: particles keep their velocity. Neither neighbour list nor messages."""
+
+    def build(self, scene: Scene, directory: Path) -> LagrangianModel:
+        return LagrangianModel({}, self.flow)
 
 
-def smoothed_particles(scene: Scene, truth: GroundTruth, directory: Path, device: torch.device) -> Force:
-    """WCSPH with the fluid's sound speed; the density of a random particle deviates from the mean without a fault."""
-    form, scales = scene.wcsph or Wcsph(), truth.scales
-    kernel = SPH_KERNELS[form.kernel](scene.kernel.support(truth.total))
-    mass = scales.density_mean * truth.decomposition.length**3 / truth.total
-    term = WCSPH(kernel, mass, scales.density_mean, scales.sound_speed, form.alpha, form.beta, form.exponent)
-    closure = SummationDensity(kernel, mass, getattr(torch, scene.simulation.precision))
-    return Force([term.to(device)], closure, description={"closure": "summation", **asdict(form)})
+class SmoothedRun(ParticleRun):
+    """Moved by weakly compressible SPH with the fluid's sound speed. The summed density of particles at random deviates
+    far from the mean without a fault."""
 
+    def build(self, scene: Scene, directory: Path) -> LagrangianModel:
+        form = scene.wcsph or Wcsph()
+        settings = {"summation-density": SummationDensity(kernel=form.kernel), "wcsph": WCSPH(**asdict(form))}
+        return build_model(settings, PRESETS["wcsph"], self.flow)
 
-FORCES = {"learned": learned_force, "none": no_force, "wcsph": smoothed_particles}
-
-
-def build_dynamics(scene: Scene, truth: GroundTruth, force: Force) -> ParticleDynamics:
-    """The force between particles, and the forcing of the large scales if there is one."""
-    settings, slab = scene.simulation, truth.decomposition
-    terms = list(force.terms)
-    if settings.injection != "none":
-        terms.append(LinearForcing(injection_rate(scene, truth), forced_below(scene), slab.comm, slab.length))
-    skin = settings.skin * scene.kernel.support(truth.total)
-    return ParticleDynamics(slab, slab.length, terms, skin, force.closure, getattr(torch, settings.precision))
+    def description(self) -> dict[str, float | str]:
+        """The coefficients too."""
+        return {**super().description(), **asdict(self.model.terms["wcsph"].settings)}
 
 
 def injection_rate(scene: Scene, truth: GroundTruth) -> float:

@@ -13,16 +13,16 @@ import torch
 
 from eddies.clock import Clock, ProgressLine
 from eddies.io.hdf5 import create_product, open_product, write_attributes, write_table
+from eddies.methods import method_class
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import StopRequest
 from eddies.particles.particle_set import ParticleSet
 from eddies.scene import BOX_LENGTH, Scene, SceneError
-from eddies.workflows.closures import load_kernel
 from eddies.workflows.devices import prepare_torch
-from eddies.workflows.eulerian_run import EulerianRun
-from eddies.workflows.particle_run import ParticleRun, injection_rate
+from eddies.workflows.particle_run import injection_rate
 from eddies.workflows.rollout_frames import RolloutFrames
+from eddies.workflows.trained_kernel import load_kernel
 from eddies.workflows.truth import GroundTruth
 
 log = logging.getLogger("eddies")
@@ -32,7 +32,10 @@ WARM_UP_STEPS = 2
 
 
 class Mover(Protocol):
-    """What moves the particles of a rollout. All methods are collective."""
+    """What moves the particles of a rollout, made as Class(scene, truth, start, directory, device) where `start` is the
+    frame of the ground truth that it starts from. All methods are collective."""
+
+    has_density: bool  # of the particles of its frames
 
     def steps(self, interval: float) -> int:
         """Number of equal steps into which the next interval is divided."""
@@ -56,22 +59,19 @@ def run(scene: Scene, comm, directory: str | Path, stop: StopRequest | None = No
     device = prepare_torch(scene.device, comm)
     directory, settings = Path(directory), scene.simulation
     slab = SlabDecomposition(comm, BOX_LENGTH, scene.tracers.particles_per_side)
-    provenance = {"scene": scene.to_toml(), "fingerprint": scene.fingerprint("simulate")}
     with (open_product(comm, directory / "ground_truth.h5", "ground_truth") as truth_file,
-          create_product(comm, directory / "rollout.h5", "rollout", provenance) as file):
+          create_product(comm, directory / "rollout.h5", "rollout", scene.provenance("simulate")) as file):
         truth = GroundTruth(truth_file, slab)
         start = start_frame(scene, truth)
-        if settings.force == "eulerian":
-            mover = EulerianRun(scene, truth, start)
-        else:
-            mover = ParticleRun(scene, truth, start, directory, device)
-        frames = RolloutFrames(file, truth, load_kernel(comm, directory / "kernel.h5"), truth.times[start])
+        mover = method_class(settings.method)(scene, truth, start, directory, device)
+        frames = RolloutFrames(file, truth, load_kernel(comm, directory / "kernel.h5"), truth.times[start],
+                               mover.has_density)
         turnover = truth.reference["eddy_turnover_time"]
         count = int(np.ceil(settings.turnovers * turnover / settings.frame_interval - 1e-9))
         with torch.no_grad():
             outcome = roll_out(mover, frames, count, settings.frame_interval, truth, stop or StopRequest(comm))
         write_attributes(file.create_group("rollout"), {
-            **outcome, **mover.description(), "force": settings.force, "turnovers": outcome["time"] / turnover,
+            **outcome, **mover.description(), "method": settings.method, "turnovers": outcome["time"] / turnover,
             "injection_rate": injection_rate(scene, truth), "eddy_turnover_time": turnover,
             "start_time": float(truth.times[start]), "particles": truth.total, "ranks": comm.size})
         for name, columns in mover.series().items():

@@ -15,6 +15,7 @@ from eddies.parallel.migration import IdOrder, id_block, migrate
 from eddies.scene import Scene
 from eddies.workflows.flow_run import FlowRun
 from eddies.workflows.frame_segments import FrameSegments
+from eddies.workflows.measured_scales import MEAN_DENSITY
 from eddies.workflows.tracer_frames import TracerFrames
 
 
@@ -49,9 +50,9 @@ class TracerRun:
 
     @property
     def intervals(self) -> int:
-        """Number of frame intervals."""
+        """Number of frame intervals, at least the one that the rates of the release are measured over."""
         duration = self.settings.turnovers * self.released["eddy_turnover_time"]
-        return int(np.ceil(duration / self.settings.frame_interval - 1e-9))
+        return max(int(np.ceil(duration / self.settings.frame_interval - 1e-9)), 1)
 
     def follow(self) -> None:
         """Follow the tracers to the end of the last interval."""
@@ -67,9 +68,10 @@ class TracerRun:
         flow.history.sample(flow.state, flow.clock)
 
     def scales(self) -> dict[str, float]:
-        """Scales of the filtered flow and of the frames."""
+        """Scales of the filtered flow at the release: what the same flow does later does not change them."""
         return {"released_at": self.released_at, "sound_speed": self.scene.flow.sound_speed or np.inf,
-                "length": self.settings.width, "spacing": self.settings.spacing, **self.frames.scales()}
+                "length": self.settings.width, "spacing": self.settings.spacing, "density_mean": MEAN_DENSITY,
+                **self.segments.release_scales()}
 
     def memory(self) -> tuple[dict[str, Any], dict[str, np.ndarray | Block], list[str]]:
         """What a checkpoint keeps: a description, arrays, and the files with the frames so far, which are closed."""

@@ -1,4 +1,4 @@
-"""The pair-force model: trained on tracers of the training window, then tested a priori at other times."""
+"""The particle model: trained on tracers of the training window, then tested a priori at other times."""
 
 from __future__ import annotations
 
@@ -17,8 +17,9 @@ from eddies.parallel.stop import Stopped, StopRequest
 from eddies.scene import BOX_LENGTH, Scene, SceneError
 from eddies.workflows import adopt
 from eddies.workflows.a_priori import evaluate, evaluation_frames
-from eddies.workflows.closures import load_kernel
 from eddies.workflows.devices import prepare_torch
+from eddies.workflows.trained_kernel import load_kernel
+from eddies.workflows.trained_model import describe
 from eddies.workflows.training_data import TrainingData
 from eddies.workflows.truth import GroundTruth
 
@@ -30,7 +31,7 @@ DRAWING_SECONDS = 30.0
 
 def run(scene: Scene, comm, directory: str | Path, stop: StopRequest | None = None) -> None:
     """Train the model of a scene and write model.h5: weights, learning history, a-priori tests, and the range of
-    what the network was given.
+    what its networks were given.
 
     With [model] path its weights are adopted instead. A training that is stopped goes on from a checkpoint.
     """
@@ -48,19 +49,19 @@ def run(scene: Scene, comm, directory: str | Path, stop: StopRequest | None = No
         training = Training(comm, model, phases, scene.training.patience)
         checkpoints = CheckpointDirectory(comm, directory / DIRECTORIES["train"], scene.fingerprint("train"))
         take_all_steps(training, checkpoints, stop, LearningCurves(comm, directory / "learning.png"))
-        tables = evaluate(truth, model, data.closure, tests, last, data.dtype, device)
-        if model.pair_terms:
+        tables = evaluate(truth, model, tests, last, data.dtype, device)
+        if model.networks:
             tables["feature_range"] = vars(data.feature_range())
-        mach = truth.reference["mach_turbulent"]
+        mach, description = truth.reference.get("mach_turbulent"), describe(scene, truth.scales)
     weights = {name: tensor.cpu().numpy() for name, tensor in model.state_dict().items()}
-    provenance = {"scene": scene.to_toml(), "fingerprint": scene.fingerprint("train"), "mach_turbulent": mach}
-    save_weights(comm, directory / "model.h5", "model", model.state_description(), weights, provenance,
-                 {"history": training.columns(), **tables})
+    save_weights(comm, directory / "model.h5", "model", description, weights,
+                 {**scene.provenance("train"), "mach_turbulent": mach}, {"history": training.columns(), **tables})
     checkpoints.remove()
     errors = tables["a_priori"]
-    log.info("model: acceleration error %.3f at a time %.3g after the training window (exact filtered pressure "
-             "gradient %.3f)", errors["acceleration_error"][-1], errors["delay"][-1],
-             errors["pressure_gradient_error"][-1])
+    beside = (f" (exact filtered pressure gradient {errors['pressure_gradient_error'][-1]:.3f})"
+              if "pressure_gradient_error" in errors else "")
+    log.info("model: acceleration error %.3f at a time %.3g after the training window%s",
+             errors["acceleration_error"][-1], errors["delay"][-1], beside)
 
 
 def take_all_steps(training: Training, checkpoints: CheckpointDirectory, stop: StopRequest,

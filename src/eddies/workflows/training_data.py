@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -13,18 +14,16 @@ from eddies.learning.losses import relative_error
 from eddies.learning.optimization import Descent
 from eddies.learning.rollout_training import RolloutTrainer, TrainingWindow
 from eddies.learning.training import Phase
-from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.feature_range import FeatureRange, pair_features
 from eddies.particles.integrators import INTEGRATORS
-from eddies.particles.pair_forces import PairModel
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.periodic_box import PeriodicBox
-from eddies.particles.poisson_closure import PoissonClosure
+from eddies.particles.resolved_velocity import ResolvedVelocity
 from eddies.particles.smoothing_kernels import SmoothingKernel
 from eddies.scene import BOX_LENGTH, Scene, SceneError
-from eddies.workflows.closures import density_closure, poisson_closure
 from eddies.workflows.estimates import ALLOWED_VELOCITY
+from eddies.workflows.trained_model import scene_model
 from eddies.workflows.truth import GroundTruth, load_frame
 
 # How many validations a phase has, and on how many particles the error of the acceleration is measured.
@@ -45,7 +44,7 @@ class TrainingData:
     def __init__(self, scene: Scene, truth: GroundTruth, kernel: SmoothingKernel, device: torch.device) -> None:
         self.scene, self.settings, self.truth, self.kernel, self.device = scene, scene.training, truth, kernel, device
         self.dtype = getattr(torch, self.settings.precision)
-        self.model = build_model(scene, truth, kernel.support).to(dtype=self.dtype, device=device)
+        self.model = scene_model(scene, truth.scales).to(dtype=self.dtype, device=device)
         self.longest = max(self.settings.horizons) if self.settings.horizon_steps else 0
         self.last = truth.last_frame_seen(self.settings.window)
         held_out = max(math.ceil(HELD_OUT * self.last), self.longest, 2)  # rates need a frame on both sides
@@ -55,7 +54,6 @@ class TrainingData:
                 f"[training] window = {self.settings.window:g}: holds {self.last} frames of the ground truth, too few "
                 f"with {held_out} held out for validation and horizons of {self.longest}; raise it or [tracers] "
                 "turnovers, or lower [tracers] frame_interval or horizons")
-        self.closure = density_closure(self.model, truth.decomposition, self.dtype)
 
     @cached_property
     def frames(self) -> list[TrainingFrame]:
@@ -64,12 +62,11 @@ class TrainingData:
         return [self._frame(index) for index in seen]
 
     def feature_range(self) -> FeatureRange:
-        """The range of what the network is given by all pairs of these frames; collective.
+        """The range of what the networks are given by all pairs of these frames; collective.
 
         Where the simulation leads within the horizons is left out, as it is not the truth.
         """
-        blocks = (block for frame in self.frames
-                  for block in pair_features(self.model, frame.surroundings, frame.particles, self.dtype))
+        blocks = (block for frame in self.frames for block in pair_features(frame.dynamics, frame.seen()))
         return FeatureRange.of(self.truth.decomposition.comm, blocks)
 
     def one_step_phases(self) -> list[Phase]:
@@ -100,9 +97,11 @@ class TrainingData:
         if not settings.horizon_steps:
             return []
         interval, slab = scene.tracers.frame_interval, self.truth.decomposition
-        closure, resolution = wide_closures(self.model, slab, self.dtype, interval * self.longest,
-                                            settings.energy_weight > 0)
-        dynamics = ParticleDynamics(slab, BOX_LENGTH, self.model.pair_terms, 0.0, closure, self.dtype, fixed_ranks=True)
+        drift = ALLOWED_VELOCITY * self.model.flow.scales.velocity * interval * self.longest
+        dynamics = ParticleDynamics(slab, self.model, 0.0, self.dtype, drift, fixed_ranks=True)
+        resolution = None
+        if settings.energy_weight > 0:
+            resolution = dynamics.resolution or ResolvedVelocity.on_slabs(slab, self.dtype, drift=drift)
         starts = np.unique(np.linspace(0, self.learned - self.longest, settings.frames).astype(int))
         windows = [self._window(start, resolution) for start in starts]
         validation = self._window(self.last - self.longest, resolution)
@@ -126,38 +125,24 @@ class TrainingData:
         return [phase(number, horizon) for number, horizon in enumerate(settings.horizons)]
 
     def _frame(self, index: int) -> TrainingFrame:
-        return load_frame(self.truth, index, self.model, self.closure, self.dtype, self.device)
+        return load_frame(self.truth, index, self.model, self.dtype, self.device)
 
-    def _window(self, start: int, resolution: PoissonClosure | None) -> TrainingWindow:
+    def _window(self, start: int, resolution: ResolvedVelocity | None) -> TrainingWindow:
         columns = {name: torch.from_numpy(column).to(self.device)
                    for name, column in self.truth.window(start, self.longest).items()}
-        position, velocity, density = (columns.pop(f"{name}_later").movedim(1, 0).contiguous()
-                                       for name in ("position", "velocity", "density"))
+        later = {name: columns.pop(f"{name}_later").movedim(1, 0).contiguous()
+                 for name in ("position", "velocity", "density") if f"{name}_later" in columns}
         particles = ParticleSet(**columns)
+        if not self.model.integrates_density:
+            particles = replace(particles, density=None)
         # Positions are stored within the box; here they go on from where the particles are.
-        position = particles.position + PeriodicBox(BOX_LENGTH).displacement(position, particles.position)
-        moments = [particles, *(ParticleSet(particles.id, *later) for later in zip(position, velocity, density))]
+        position = particles.position + PeriodicBox(BOX_LENGTH).displacement(later["position"], particles.position)
+        moments = [particles, *(ParticleSet(particles.id, *moved) for moved in zip(position, later["velocity"]))]
         energies = None
         if resolution is not None:
             with torch.no_grad():
                 energies = torch.stack([resolution.band_energies(moment) for moment in moments])
-        return TrainingWindow(particles, velocity, density, energies)
-
-
-def wide_closures(model: PairModel, slab: SlabDecomposition, dtype: torch.dtype, time: float,
-                  energies: bool) -> tuple[PoissonClosure | None, PoissonClosure | None]:
-    """The closure of a model for particles that stray from their slab for a time, and one that resolves their velocity,
-    also where the density is learned, if their energies count."""
-    drift = ALLOWED_VELOCITY * model.scales.velocity * time
-    return (density_closure(model, slab, dtype, drift=drift),
-            poisson_closure(slab, model.scales.sound_speed, dtype, drift=drift) if energies else None)
-
-
-def build_model(scene: Scene, truth: GroundTruth, support: float) -> PairModel:
-    """An untrained model of the form that the scene asks for, with the scales of the ground truth."""
-    form = scene.model
-    return PairModel(truth.scales, support, scene.kernel.neighbors, form.hidden, basis=form.basis,
-                     closure=form.closure, symmetry=form.symmetry, eddy_viscosity=form.eddy_viscosity, seed=scene.seed)
+        return TrainingWindow(particles, later["velocity"], later.get("density"), energies)
 
 
 @torch.no_grad()
@@ -166,4 +151,4 @@ def acceleration_error(trainer: ForceTrainer, frame: TrainingFrame) -> float:
     total = trainer.total
     ids = np.random.default_rng(trainer.seed).choice(total, min(VALIDATION_PARTICLES, total), replace=False)
     rows = frame.rows(ids)
-    return relative_error(trainer.comm, frame.errors(rows)["velocity"], frame.acceleration[rows])
+    return relative_error(trainer.comm, frame.errors(rows)["acceleration"], frame.acceleration[rows])

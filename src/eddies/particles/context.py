@@ -1,0 +1,184 @@
+"""What terms may ask for when they are evaluated: built at first use, then shared."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Protocol
+
+import torch
+from torch import Tensor
+
+from eddies.parallel.slab import SlabDecomposition
+from eddies.particles import moments
+from eddies.particles.flow_units import FlowUnits
+from eddies.particles.particle_set import ParticleSet
+from eddies.particles.rank_sums import mean_over_ranks
+from eddies.particles.scaled_pairs import ScaledPairs
+from eddies.particles.surroundings import LocalParticles, Surroundings
+
+if TYPE_CHECKING:
+    from eddies.particles.resolved_velocity import ResolvedFlow, ResolvedVelocity
+
+# Numbers held at once while pairs are summed without a gradient: about a core's cache, or a part of a
+# device's memory.
+PAIR_VALUES_TOGETHER = {"cpu": 1 << 19, "cuda": 1 << 26}
+# Added to moment matrices and sums of weights, as a fraction of their values for evenly spread neighbours:
+# they stay invertible without neighbours or with coplanar ones, at a bias of a tenth of a percent elsewhere.
+REGULARISATION = 1e-3
+
+
+class Summand(Protocol):
+    """What is summed over pairs: a pair term, or the moments that several of them share."""
+
+    width: int
+    mutual: bool
+    parity: Tensor
+
+    def pair_values(self, pairs: ScaledPairs) -> Tensor: ...
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Moments of the particles' neighbourhoods: inverse (6, k), of sum_j w x x^T, and weight (1, k), sum_j w."""
+
+    inverse: Tensor
+    weight: Tensor
+
+
+class Context:
+    """One evaluation of the terms of a model at given particles.
+
+    Parameters
+    ----------
+    decomposition : slabs, with the communicator.
+    particles : the owned ones.
+    flow : units of the model.
+    surroundings : halo and neighbour list that fit the particles; None where no term looks at others.
+    resolution : what resolves the particles' velocity; None where no term reads it.
+    rows : (k,), the particles whose acceleration and density rate are asked for; None: all.
+    dtype : of the pair arithmetic; None: that of the positions.
+    density : (n,), the particles' density unless terms give it.
+    """
+
+    def __init__(self, decomposition: SlabDecomposition, particles: ParticleSet, flow: FlowUnits,
+                 surroundings: Surroundings | None, resolution: ResolvedVelocity | None, rows: Tensor | None = None,
+                 dtype: torch.dtype | None = None, density: Tensor | None = None) -> None:
+        self.decomposition, self.comm = decomposition, decomposition.comm
+        self.particles, self.flow, self.rows, self.density = particles, flow, rows, density
+        self.dtype = dtype or particles.position.dtype
+        self._surroundings, self._resolution = surroundings, resolution
+        self._columns: dict[str, Tensor] = {}
+        self._sums: dict[Summand, Tensor] = {}
+
+    @cached_property
+    def local(self) -> LocalParticles:
+        """The particles that this rank sees, ghosts included, without columns."""
+        if self._surroundings is None:
+            raise LookupError('no term of this model reads "pairs" or "resolved": add it to the settings\' `reads`')
+        return self._surroundings.local(self.particles)
+
+    def column(self, name: str) -> Tensor:
+        """"velocity" (s, 3) or "density" (s,) of the particles that this rank sees, owned first; collective."""
+        if name not in self._columns:
+            owned = self.density if name == "density" else getattr(self.particles, name)
+            if owned is None:
+                raise LookupError(f'no term of this model reads "{name}": add it to the `reads` of the settings')
+            self._columns[name] = self._surroundings.column(owned)
+        return self._columns[name]
+
+    @cached_property
+    def resolved(self) -> ResolvedFlow:
+        """The velocity that a grid resolves of the particles'; collective."""
+        if self._resolution is None:
+            raise LookupError('no term of this model reads "resolved": add it to the `reads` of the settings')
+        return self._resolution.of(self.particles, self.local)
+
+    def without_mean(self, rows: Tensor) -> Tensor:
+        """Rows (n, c) of the owned particles less their mean over all particles of all ranks; collective."""
+        return rows - mean_over_ranks(self.comm, rows)
+
+    # ---- sums over pairs
+
+    def pair_sums(self, term: Summand) -> Tensor:
+        """Sums (components, k) of a term's pair values over each particle's neighbours."""
+        if term not in self._sums:
+            self.sum_pairs([term], self.rows)
+        return self._sums[term]
+
+    def forget_sums(self, term: Summand) -> None:
+        """Take a term's sums anew where they are asked for next, since its parameters are others."""
+        self._sums.pop(term, None)
+
+    @cached_property
+    def moments(self) -> Moments:
+        """Moments of the neighbourhoods, regularised so that they can be inverted without neighbours."""
+        sums, flow = self.pair_sums(_MOMENTS), self.flow
+        expected = moments.expected_moment(flow.neighbors, flow.cutoff / flow.scales.length)
+        diagonal = sums.new_tensor([1, 0, 0, 1, 0, 1]).unsqueeze(1)
+        return Moments(moments.invert_symmetric(sums[1:] + REGULARISATION * expected * diagonal),
+                       sums[:1] + REGULARISATION * moments.expected_weight(flow.neighbors))
+
+    def sum_pairs(self, terms: Sequence[Summand], rows: Tensor | None) -> None:
+        """Take the sums of terms together, with the moments that some of them need, for rows (k,) of the particles or
+        for all; collective."""
+        summands = [*terms, *([_MOMENTS] if any(getattr(term, "needs_moments", False) for term in terms) else [])]
+        if summands:
+            mutual = rows is None and all(summand.mutual for summand in summands)
+            found = self._mutual_sums(summands) if mutual else self._sums_of(summands, rows)
+            self._sums |= dict(zip(summands, found))
+
+    def _sums_of(self, summands: Sequence[Summand], rows: Tensor | None) -> Sequence[Tensor]:
+        blocks = []
+        for block in self._blocks(summands, rows):
+            pairs = self._pairs(block)
+            values = [summand.pair_values(pairs) for summand in summands]
+            blocks.append(pairs.pairs.sum(torch.cat(values).T).T)
+        return torch.cat(blocks, dim=1).split([len(value) for value in values])
+
+    def _mutual_sums(self, summands: Sequence[Summand]) -> list[Tensor]:
+        """Each pair of owned particles evaluated once; those with ghosts on both sides."""
+        totals = [self.local.position.new_zeros((len(summand.parity), len(self.particles)), dtype=self.dtype)
+                  for summand in summands]
+        for block in self._blocks(summands, None):
+            pairs = self._pairs(block, once=True)
+            for summand, total in zip(summands, totals):
+                pairs.pairs.add_to_both(summand.pair_values(pairs), summand.parity.to(total), total)
+        return totals
+
+    def _pairs(self, block: Tensor | slice | None, once: bool = False) -> ScaledPairs:
+        position = self.local.position
+        pairs = self.local.neighbors.pairs(position[: len(self.particles)], position, block, self.dtype, once)
+        return ScaledPairs(pairs, self.column, self.flow)
+
+    def _blocks(self, summands: Sequence[Summand], rows: Tensor | None) -> Iterator[Tensor | slice | None]:
+        """Receivers to take together: few enough for the cache, or all where a gradient is recorded."""
+        if rows is not None or torch.is_grad_enabled():
+            yield rows
+            return
+        yield from self.blocks(max(summand.width for summand in summands))
+
+    def blocks(self, width: int) -> Iterator[slice]:
+        """Consecutive particles whose pairs hold about as many numbers as fit the cache, `width` for each pair; at
+        least one block."""
+        together = max(PAIR_VALUES_TOGETHER[self.particles.position.device.type] // width, 1)
+        yield from self.local.neighbors.blocks(together)
+
+    def scaled_pairs(self, width: int) -> Iterator[ScaledPairs]:
+        """All pairs, in both orders, in such blocks."""
+        for block in self.blocks(width):
+            yield self._pairs(block)
+
+
+class _SharedMoments:
+    """The sums of `Moments`: w, then the entries of w x x^T."""
+
+    width, mutual, parity = 8, True, torch.ones(7)
+
+    def pair_values(self, pairs: ScaledPairs) -> Tensor:
+        weighted = pairs.weight * pairs.x
+        return torch.stack([pairs.weight, *moments.products(weighted, pairs.x)])
+
+
+_MOMENTS = _SharedMoments()

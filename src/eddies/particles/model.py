@@ -1,0 +1,214 @@
+"""The particle model: a list of terms."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor, nn
+from torch.func import functional_call
+
+from eddies.composition import is_path, load, short_name
+from eddies.particles.context import Context
+from eddies.particles.flow_units import FlowUnits
+from eddies.particles.rates import Rates, total
+from eddies.particles.terms.presets import TERMS
+from eddies.particles.terms.settings import TermSettings
+from eddies.particles.terms.term import PairTerm, Term
+from eddies.scene_values import SceneError
+
+
+class LagrangianModel(nn.Module):
+    """dv_i/dt, and d rho_i/dt where some term gives it, as the sum of terms.
+
+    Parameters
+    ----------
+    terms : by name, in the order in which they are evaluated.
+    flow : what they were made for.
+
+    Terms that do not read the density come first; what they give of it is the density that the others see. What no term
+    reads is not built, and the density is not computed where nobody reads it. Raises SceneError where a term both reads
+    the density and gives a part of it.
+    """
+
+    def __init__(self, terms: Mapping[str, Term], flow: FlowUnits) -> None:
+        super().__init__()
+        self.terms, self.flow = nn.ModuleDict(terms), flow
+        for name, term in self.terms.items():
+            if "density" in term.reads and "density" in term.gives:
+                raise SceneError(f'term "{name}": reads the density and gives a part of it; it can do only one of both')
+
+    @property
+    def reads(self) -> set[str]:
+        """What some term reads."""
+        return {name for term in self.terms.values() for name in term.reads}
+
+    @property
+    def gives(self) -> set[str]:
+        """What some term contributes to."""
+        return {name for term in self.terms.values() for name in term.gives}
+
+    @property
+    def reads_density(self) -> bool:
+        """Whether the particles need a density."""
+        return "density" in self.reads
+
+    @property
+    def density_is_given(self) -> bool:
+        """Whether terms give the density that others read, instead of its rate."""
+        return self.reads_density and "density" in self.gives
+
+    @property
+    def integrates_density(self) -> bool:
+        """Whether the density is a state of its own, as terms give its rate."""
+        return "density_rate" in self.gives
+
+    @property
+    def regresses_density(self) -> bool:
+        """Whether a rate of density is learned from the rates of single moments."""
+        giving = [term for term in self.terms.values() if "density_rate" in term.gives]
+        return bool(giving) and not any(term.settings.learns_through_horizons for term in giving)
+
+    @property
+    def networks(self) -> list[PairTerm]:
+        """The terms with a network of pairs, which can tell what it is given by `features`."""
+        return [term for term in self.terms.values() if hasattr(term, "features")]
+
+    def rates(self, context: Context, kept: Mapping[str, LinearRates] | None = None) -> Rates:
+        """The sum of the terms: `acceleration` (k, 3), `density_rate` (k,) if some term gives one, and the `density`
+        (n,) itself, not its deviation, if terms give it. Differentiable; collective.
+
+        `kept` stands for terms at these very particles: see `linear_rates`.
+        """
+        kept, sums = kept or {}, []
+        for stage in self._stages:
+            self._sum_pairs([term for name, term in stage if name not in kept], context)
+            found = [kept[name].at(context.rows) if name in kept else _evaluated(term, context) for name, term in stage]
+            sums.append(self._at_particles(total(found), context))
+            if context.density is None and self.density_is_given:
+                context.density = self.flow.scales.density_mean + sums[0].density
+        result = total(sums)
+        if result.acceleration is None:
+            at_rest = torch.zeros_like(context.particles.velocity)
+            result = replace(result, acceleration=at_rest if context.rows is None else at_rest[context.rows])
+        return replace(result, density=context.density if self.density_is_given else None)
+
+    @torch.no_grad()
+    def linear_rates(self, context: Context) -> dict[str, LinearRates]:
+        """Of the terms that are linear in their parameters and do not read the density, by name, what the single
+        parameters do at given particles: what a training that looks at them again and again keeps; collective."""
+        return {name: self._linear_rates(term, context) for name, term in self._stages[0] if term.linear}
+
+    @property
+    def _stages(self) -> list[list[tuple[str, Term]]]:
+        """The terms that do not read the density, then those that do."""
+        named = list(self.terms.items())
+        stages = [[item for item in named if ("density" in item[1].reads) == reading] for reading in (False, True)]
+        return stages if stages[1] else stages[:1]
+
+    def _sum_pairs(self, terms: Iterable[Term], context: Context) -> None:
+        """Take the sums over pairs together that are for all particles, and those that are for the ones asked for."""
+        pair_terms = [term for term in terms if isinstance(term, PairTerm)]
+        for everywhere in (True, False):
+            together = [term for term in pair_terms if ("density" in term.gives) == everywhere]
+            if together:
+                context.sum_pairs(together, None if everywhere else context.rows)
+
+    def _at_particles(self, rates: Rates, context: Context) -> Rates:
+        """With what was given as modes taken to the particles: the force less its mean over them, as it keeps their
+        momentum. It would have none in continuous space, and has one where particles sample the grid unevenly."""
+        pressure = rates.pressure_modes if self.density_is_given else None
+        modes = [part for part in (rates.force_modes, None if pressure is None else pressure[None]) if part is not None]
+        local = Rates(rates.acceleration, rates.density_rate, rates.density)
+        if not modes:
+            return local
+        values = context.resolved.at_particles(torch.cat(modes)).to(context.particles.velocity)
+        parts = [local]
+        if rates.force_modes is not None:
+            parts.append(Rates(acceleration=context.without_mean(values[:, :3])).at(context.rows))
+        if pressure is not None:
+            scales = self.flow.scales
+            parts.append(Rates(density=values[:, -1] * (scales.density_mean / scales.sound_speed**2)))
+        return total(parts)
+
+    def _linear_rates(self, term: Term, context: Context) -> LinearRates:
+        parameters = dict(term.named_parameters())
+
+        def at(values: Tensor) -> Rates:
+            split = values.split([parameter.numel() for parameter in parameters.values()])
+            named = {name: part.reshape(parameter.shape) for part, (name, parameter) in zip(split, parameters.items())}
+            context.forget_sums(term)
+            return self._at_particles(functional_call(term, named, (context,)), context)
+
+        count = sum(parameter.numel() for parameter in parameters.values())
+        like = next(iter(parameters.values()), context.particles.position)
+        origin = at(like.new_zeros(count))
+        units = [at(unit) for unit in torch.eye(count, dtype=like.dtype, device=like.device)]
+        return LinearRates(origin, {name: torch.stack([getattr(unit, name) - getattr(origin, name) for unit in units])
+                                    for name in _GIVEN if units and getattr(origin, name) is not None},
+                           list(parameters.values()))
+
+
+_GIVEN = ("acceleration", "density_rate", "density")
+
+
+@dataclass(frozen=True)
+class LinearRates:
+    """Rates of a term at given particles as a function of its parameters: `origin` where they are zero, and by name
+    what each of them adds, (parameters, n, ...)."""
+
+    origin: Rates
+    slopes: dict[str, Tensor]
+    parameters: list[nn.Parameter]
+
+    def at(self, rows: Tensor | None) -> Rates:
+        """With acceleration and rate of some rows (k,) of the particles, or of all; differentiable in the
+        parameters."""
+        values = {}
+        for name in _GIVEN:
+            value, slope = getattr(self.origin, name), self.slopes.get(name)
+            if value is None:
+                continue
+            if rows is not None and name != "density":
+                value, slope = value[rows], None if slope is None else slope[:, rows]
+            if slope is not None:
+                factors = torch.cat([parameter.flatten() for parameter in self.parameters]).to(slope)
+                value = value + torch.tensordot(factors, slope, 1)
+            values[name] = value
+        return Rates(**values)
+
+
+def _evaluated(term: Term, context: Context) -> Rates:
+    """A term's rates, those of the particles that are asked for."""
+    rates = term(context)
+    if not isinstance(rates, Rates):
+        raise SceneError(f"{type(term).__name__}: forward returns a {type(rates).__name__}; it must return Rates")
+    return rates if isinstance(term, PairTerm) else rates.at(context.rows)
+
+
+def build_model(settings: Mapping[str, TermSettings], paths: Iterable[str], flow: FlowUnits) -> LagrangianModel:
+    """A model with initial parameters, in double precision.
+
+    Parameters
+    ----------
+    settings : of each term, by the name that it goes by.
+    paths : the word or import path of each.
+    flow : what it is made for.
+
+    Raises SceneError where an import path does not lead to a Term, or it cannot be made.
+    """
+    terms = {short_name(path): _build_term(path, settings[short_name(path)], flow) for path in paths}
+    return LagrangianModel(terms, flow)
+
+
+def _build_term(path: str, settings: TermSettings, flow: FlowUnits) -> Term:
+    kind = load(path if is_path(path) else TERMS[path][0])
+    if not (isinstance(kind, type) and issubclass(kind, Term)):
+        raise SceneError(f'term "{path}": must be a class derived from eddies.Term')
+    if not isinstance(settings, TermSettings):
+        raise SceneError(f'term "{path}": its Settings must be a frozen dataclass derived from eddies.TermSettings')
+    try:
+        return kind(settings, flow).double()
+    except (TypeError, AttributeError) as error:
+        raise SceneError(f'term "{path}": cannot be made: {error}') from error

@@ -1,0 +1,44 @@
+"""Spectral eddy damping of the resolved velocity."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from eddies.particles.context import Context
+from eddies.particles.flow_units import FlowUnits
+from eddies.particles.fourier_grid import FourierGrid
+from eddies.particles.rates import Rates
+from eddies.particles.terms import settings as declared
+from eddies.particles.terms.term import Term
+
+# The rates D to begin with: as those of a viscosity, growing as k^2.
+RATES = (torch.arange(1, 7, dtype=torch.float64) / 6) ** 2
+
+
+class Damping(Term):
+    """-D(k) u of the modes of the resolved velocity u, a spectral eddy viscosity (Kraichnan 1976).
+
+    D is v_rms/d times six learned values at wavenumbers equally spaced up to the highest that is resolved, linear
+    between them and from D(0) = 0.
+    """
+
+    Settings = declared.Damping
+    linear = True
+
+    def __init__(self, settings: declared.Damping, flow: FlowUnits) -> None:
+        super().__init__(settings, flow)
+        self.rates = nn.Parameter(RATES.clone())
+
+    def forward(self, context: Context) -> Rates:
+        """Modes of the force."""
+        flow, scales = context.resolved, self.flow.scales
+        return Rates(force_modes=-scales.velocity / scales.length * self._damping(flow.grid) * flow.velocity)
+
+    def _damping(self, grid: FourierGrid) -> Tensor:
+        """D of each mode (kz, ky, kx), in units of v_rms/d."""
+        rates = torch.cat([self.rates.new_zeros(1), self.rates]).double().cpu()
+        place = grid.shell * (len(self.rates) / grid.resolved)
+        below = place.long().clamp_max(len(self.rates) - 1)
+        fraction = (place - below).clamp_max(1.0)
+        return (1 - fraction) * rates[below] + fraction * rates[below + 1]

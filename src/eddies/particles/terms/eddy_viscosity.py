@@ -1,0 +1,51 @@
+"""The eddy viscosity between two particles: the term Pi of Eq. 3."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from eddies.particles.context import Context
+from eddies.particles.flow_units import FlowUnits
+from eddies.particles.rates import Rates
+from eddies.particles.scaled_pairs import ScaledPairs
+from eddies.particles.terms import settings as declared
+from eddies.particles.terms.pair_basis import acceleration, along_separation
+from eddies.particles.terms.term import PairTerm
+
+# Softens the approach speed at small distances, in squared units of the reference length.
+SOFTENING = 0.1
+
+
+class EddyViscosity(PairTerm):
+    """a_rms times the sum of w Pi x, as that of the pair network, with
+
+        Pi = -|a_1| mu + |a_2| mu^2,   mu = x.v / (|x|^2 + 0.1),
+
+    in the units of `ScaledPairs`. A positive Pi pushes apart. The two-sided form's mu^2 part also pushes apart receding
+    pairs; "monaghan" acts on approaching ones only (mu < 0), as in SPH. Both coefficients are learned.
+    """
+
+    Settings = declared.EddyViscosity
+    parity, mutual = -torch.ones(3), True
+
+    def __init__(self, settings: declared.EddyViscosity, flow: FlowUnits) -> None:
+        super().__init__(settings, flow)
+        self.needs_moments = settings.basis == "corrected"
+        self.coefficients = nn.Parameter(torch.full((2,), 0.1, dtype=torch.float64))
+
+    def strength(self, distance: Tensor, approach: Tensor) -> Tensor:
+        """Pi (m,) from |x| (m,) and x.v (m,)."""
+        mu = approach / (distance * distance + SOFTENING)
+        if self.settings.form == "monaghan":
+            mu = torch.clamp(mu, max=0)
+        linear, quadratic = self.coefficients.abs()
+        return mu * (quadratic * mu - linear)
+
+    def pair_values(self, pairs: ScaledPairs) -> Tensor:
+        """w Pi x, (3, m)."""
+        return (pairs.weight * self.strength(pairs.distance, pairs.approach)) * pairs.x
+
+    def rates_of(self, sums: Tensor, context: Context) -> Rates:
+        """The acceleration."""
+        return Rates(acceleration(along_separation(sums, self.settings.basis, context), context))

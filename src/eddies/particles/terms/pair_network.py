@@ -1,0 +1,50 @@
+"""The learned pair force, Eqs. 3 and 4."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from eddies.particles.context import Context
+from eddies.particles.flow_units import FlowUnits
+from eddies.particles.rates import Rates
+from eddies.particles.scaled_pairs import ScaledPairs
+from eddies.particles.terms import settings as declared
+from eddies.particles.terms.pair_basis import acceleration, along_separation, along_velocity, build_network
+from eddies.particles.terms.term import PairTerm
+
+
+class PairNetwork(PairTerm):
+    """dv_i/dt = a_rms A_i with
+
+        A_i = 1/n (sum_j w NN_1 x + sum_j w NN_2 v)                          basis "paper"
+        A_i = M_i^-1 sum_j w NN_1 x + sum_j w NN_2 v / sum_j w               basis "corrected"
+
+    NN_1 and NN_2 of the invariants of a pair (rho'_i, rho'_j, |x|, |v|, x.v) in the units of `ScaledPairs`, n the
+    expected number of neighbours, M_i = sum_j w x x^T. With symmetry "antisymmetric" the first two invariants are
+    rho'_i + rho'_j and (rho'_i - rho'_j)^2: i and j get opposite forces, which keep the total momentum.
+    """
+
+    Settings = declared.PairNetwork
+    parity = -torch.ones(6)
+
+    def __init__(self, settings: declared.PairNetwork, flow: FlowUnits) -> None:
+        super().__init__(settings, flow)
+        self.network = build_network(settings, 2, flow.seed)
+        self.mutual, self.needs_moments = settings.symmetry == "antisymmetric", settings.basis == "corrected"
+        self.width = max(settings.hidden)
+
+    def features(self, pairs: ScaledPairs) -> Tensor:
+        """What the network is given, (features, m)."""
+        return pairs.invariants(self.settings.inputs, self.mutual)
+
+    def pair_values(self, pairs: ScaledPairs) -> Tensor:
+        """w NN_1 x and w NN_2 v, (6, m)."""
+        along_x, along_v = self.network(self.features(pairs))
+        return torch.cat([(pairs.weight * along_x) * pairs.x, (pairs.weight * along_v) * pairs.v])
+
+    def rates_of(self, sums: Tensor, context: Context) -> Rates:
+        """The acceleration."""
+        basis = self.settings.basis
+        return Rates(acceleration(along_separation(sums[:3], basis, context)
+                                  + along_velocity(sums[3:], basis, context), context))

@@ -1,0 +1,24 @@
+"""The pressure of the resolved velocity."""
+
+from __future__ import annotations
+
+from eddies.particles.context import Context
+from eddies.particles.rates import Rates
+from eddies.particles.terms import settings as declared
+from eddies.particles.terms.term import Term
+
+
+class Pressure(Term):
+    """-grad p with  laplacian p = -d_i d_j (u_i u_j)  of the resolved velocity u, and the density rho_0 (1 + p / c^2)
+    that belongs to p: no density equation, no sound."""
+
+    Settings = declared.Pressure
+    linear = True
+
+    def forward(self, context: Context) -> Rates:
+        """Modes of pressure and force."""
+        grid, velocity = context.resolved.grid, context.resolved.velocity
+        fields = grid.to_fields(velocity)
+        pressure = grid.pressure_of(grid.products(fields, fields))
+        force = -grid.gradient(pressure) if self.settings.force else None
+        return Rates(force_modes=force, pressure_modes=pressure)

@@ -1,0 +1,43 @@
+"""The density of smoothed particle hydrodynamics."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from eddies.particles.context import Context
+from eddies.particles.flow_units import FlowUnits
+from eddies.particles.rates import Rates
+from eddies.particles.scaled_pairs import ScaledPairs
+from eddies.particles.smoothing_kernels import CubicSpline, SmoothingKernel, WendlandC2
+from eddies.particles.terms import settings as declared
+from eddies.particles.terms.term import PairTerm
+
+KERNELS: dict[str, type[SmoothingKernel]] = {"cubic-spline": CubicSpline, "wendland": WendlandC2}
+
+
+def particle_mass(flow: FlowUnits) -> float:
+    """Mass of a particle: that of all fluid over the number of particles."""
+    return flow.scales.density_mean * flow.scales.spacing**3
+
+
+class SummationDensity(PairTerm):
+    """rho_i = sum_j m W(x_i - x_j), the particle itself counted once; W with the radius of interaction as its
+    support."""
+
+    Settings = declared.SummationDensity
+    parity, mutual = torch.ones(1), True
+
+    def __init__(self, settings: declared.SummationDensity, flow: FlowUnits) -> None:
+        super().__init__(settings, flow)
+        self.kernel, self.mass = KERNELS[settings.kernel](flow.cutoff), particle_mass(flow)
+
+    def pair_values(self, pairs: ScaledPairs) -> Tensor:
+        """W, (1, m)."""
+        return self.kernel.value(pairs.pairs.distance).unsqueeze(0)
+
+    def rates_of(self, sums: Tensor, context: Context) -> Rates:
+        """The density's deviation from the mean."""
+        itself = self.kernel.value(sums.new_zeros(()))
+        density = (self.mass * (sums[0] + itself)).to(context.particles.velocity.dtype)
+        return Rates(density=density - self.flow.scales.density_mean)

@@ -1,0 +1,84 @@
+"""What a term of the particle equations is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor, nn
+
+from eddies.particles.flow_units import FlowUnits
+from eddies.particles.rates import Rates
+from eddies.particles.terms.settings import TermSettings
+
+if TYPE_CHECKING:
+    from eddies.particles.context import Context
+    from eddies.particles.scaled_pairs import ScaledPairs
+
+
+class Term(nn.Module):
+    """One term of dv_i/dt or d rho_i/dt: a module with named parameters, made for a flow with its settings.
+
+    A term of one's own subclasses it, declares what it reads and gives on its class of `Settings`, and computes its
+    contribution in `forward`. All ranks evaluate a term together, also those without particles.
+
+    Attributes
+    ----------
+    Settings : class of its settings, a frozen dataclass derived from TermSettings.
+    linear : true where the rates at given particles are a linear function of the parameters plus a constant. Then
+        training keeps what single parameters do at a moment instead of computing it at every step.
+    """
+
+    Settings: type[TermSettings] = TermSettings
+    linear = False
+
+    def __init__(self, settings: TermSettings, flow: FlowUnits) -> None:
+        super().__init__()
+        self.settings, self.flow = settings, flow
+
+    @property
+    def reads(self) -> Sequence[str]:
+        """What it reads: see TermSettings."""
+        return self.settings.reads
+
+    @property
+    def gives(self) -> Sequence[str]:
+        """What it contributes to: see TermSettings."""
+        return self.settings.gives
+
+    def forward(self, context: Context) -> Rates:
+        """The contribution to all owned particles; may be collective."""
+        raise NotImplementedError(f"{type(self).__name__} has no forward(context)")
+
+
+class PairTerm(Term):
+    """A term that is a sum over neighbours within the radius of interaction, of `pair_values`.
+
+    Sums of all such terms of a model are taken together, pairs being gathered once. Its rates are those of the
+    particles that are asked for, which in training are some of the owned ones.
+
+    Attributes
+    ----------
+    width : most numbers that are held for a pair at once, for choosing how many pairs to take together.
+    needs_moments : whether `rates_of` asks for `context.moments()`.
+    mutual : whether what j gets from i is what i gets from j times `parity`, so that a pair is evaluated once.
+    parity : (components,), 1 or -1.
+    """
+
+    width = 8
+    needs_moments = False
+    mutual = False
+    parity: Tensor = torch.ones(1)
+
+    def pair_values(self, pairs: ScaledPairs) -> Tensor:
+        """What is summed over neighbours, (components, m); zero at the radius of interaction."""
+        raise NotImplementedError(f"{type(self).__name__} has no pair_values(pairs)")
+
+    def rates_of(self, sums: Tensor, context: Context) -> Rates:
+        """The contribution from the sums (components, k) over each particle's neighbours."""
+        raise NotImplementedError(f"{type(self).__name__} has no rates_of(sums, context)")
+
+    def forward(self, context: Context) -> Rates:
+        """The contribution to the particles that are asked for; collective."""
+        return self.rates_of(context.pair_sums(self), context)

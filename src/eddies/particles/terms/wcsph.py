@@ -1,0 +1,71 @@
+"""Weakly compressible smoothed particle hydrodynamics: forces from the particles' density."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from eddies.particles.context import Context
+from eddies.particles.flow_units import FlowUnits
+from eddies.particles.rates import Rates
+from eddies.particles.scaled_pairs import ScaledPairs
+from eddies.particles.terms import settings as declared
+from eddies.particles.terms.summation_density import KERNELS, particle_mass
+from eddies.particles.terms.term import PairTerm
+
+# Softens the approach rate at small distances, in squared smoothing lengths (Monaghan 1992).
+SOFTENING = 0.01
+
+
+class WCSPH(PairTerm):
+    """Pressure and artificial viscosity of WCSPH (Monaghan 1992),
+
+        dv_i/dt = -sum_j m (P_i/rho_i^2 + P_j/rho_j^2 + Pi_ij) grad W(x_i - x_j)
+        P = c^2 rho_0/gamma ((rho/rho_0)^gamma - 1)
+        Pi_ij = (-alpha c mu + beta mu^2)/mean(rho_i, rho_j),   mu = h x.v/(r^2 + 0.01 h^2)
+
+    Pi only for approaching pairs, x.v < 0. The smoothing length h is half the support of W, which is the radius of
+    interaction. Forces of a pair are opposite and central, so momentum and angular momentum are kept. In three
+    dimensions Pi acts like a viscosity of about alpha c h / 10. The sound speed c, at first that of the flow, alpha,
+    beta and gamma are parameters in double precision.
+    """
+
+    Settings = declared.WCSPH
+    # The forces of a pair are opposite, so each pair is evaluated once.
+    parity, mutual = -torch.ones(3), True
+
+    def __init__(self, settings: declared.WCSPH, flow: FlowUnits) -> None:
+        super().__init__(settings, flow)
+        self.kernel, self.mass = KERNELS[settings.kernel](flow.cutoff), particle_mass(flow)
+        self.density = flow.scales.density_mean
+        self.sound_speed, self.alpha, self.beta, self.exponent = (
+            nn.Parameter(torch.tensor(value, dtype=torch.float64))
+            for value in (flow.scales.sound_speed, settings.alpha, settings.beta, settings.exponent))
+
+    def pair_values(self, pairs: ScaledPairs) -> Tensor:
+        """What each pair (i, j) accelerates i by, (3, m)."""
+        listed = pairs.pairs
+        x = listed.displacement.T
+        density = pairs.column("density").to(x.dtype)
+        push = self.pressure(density) / density**2
+        strength = listed.at_receivers(push) + listed.at_senders(push) + self._viscosity(pairs, density)
+        # The slope of W vanishes at r = 0, so that the quotient is 0 for coincident particles.
+        slope = self.kernel.derivative(listed.distance) / listed.distance.clamp(min=torch.finfo(x.dtype).tiny)
+        return -self.mass * strength * slope * x
+
+    def rates_of(self, sums: Tensor, context: Context) -> Rates:
+        """The acceleration."""
+        return Rates(acceleration=sums.T.to(context.particles.velocity.dtype))
+
+    def pressure(self, density: Tensor) -> Tensor:
+        """P of densities of any shape."""
+        c, gamma, rho_0 = self.sound_speed, self.exponent, self.density
+        return c**2 * rho_0 / gamma * ((density / rho_0) ** gamma - 1)
+
+    def _viscosity(self, pairs: ScaledPairs, density: Tensor) -> Tensor:
+        """Pi (m,) of the pairs."""
+        listed, h = pairs.pairs, self.kernel.support / 2
+        approach = (listed.displacement.T * pairs.velocity_difference).sum(0)
+        mu = torch.clamp(h * approach / (listed.distance**2 + SOFTENING * h**2), max=0)
+        mean = (listed.at_receivers(density) + listed.at_senders(density)) / 2
+        return mu * (self.beta * mu - self.alpha * self.sound_speed) / mean
