@@ -35,7 +35,7 @@ ONLY_IN = {
     "eddies.analysis.figures*": ("analysis.figures*", "workflows.report", "workflows.compare", "workflows.train"),
     **dict.fromkeys(("eddies.scene", "eddies.scene.*", "eddies.scene_[!v]*"),
                     ("scene*", "comparison", "workflows*", "cli", "api", "stages", "logs")),
-    "eddies.scene_v*": ("scene*", "comparison", "composition", "particles.terms.*", "workflows*"),
+    "eddies.scene_v*": ("scene*", "comparison", "composition", "particles.model", "particles.terms.*", "workflows*"),
     "eddies.comparison*": ("workflows*", "cli"),
     "pickle*": (),
 }

@@ -111,7 +111,7 @@ def test_what_terms_read_and_give():
     (dict(terms=("pressure",), settings={"pairs": {}}), "[model.pairs]: no such term; the terms are pressure; remove"),
     (dict(settings={"pairs": Pressure()}), "[model.pairs]: must be settings of the class PairNetwork, or a dict"),
     (dict(settings={"pairs": 3}), "model.pairs = 3: must be a section"),
-    (dict(terms=("own_nowhere:Term",)), '[model] terms: "own_nowhere:Term": it is not found'),
+    (dict(terms=("own_nowhere:Term",)), '[model] terms: "own_nowhere:Term": there is no module "own_nowhere"'),
     (dict(terms=("eddies.scene:load_scene",)), "must be the class of a term, with a method forward"),
 ])
 def test_bad_model(changes, message):
