@@ -222,7 +222,7 @@ def comparison_reference():
 
 def test_comparison_reference(tmp_path):
     assert marked("comparison reference") == comparison_reference()
-    (example,) = (block for block in blocks("toml") if "[[variant]]" in block)
+    example = next(block for block in blocks("toml") if "[[variant]]" in block)
     (tmp_path / "example.toml").write_text(example, encoding="utf-8")
     assert list(load_comparison(tmp_path / "example.toml").scenes) == ["learned", "small", "no-force"]
 
@@ -247,7 +247,7 @@ def test_links_and_files_of_a_page_exist(page):
 
 
 @pytest.mark.mpi(1)
-@pytest.mark.parametrize("program", [text for text in blocks("python") if "h5py" in text], ids=lambda _: "program")
+@pytest.mark.parametrize("program", [code for code in blocks("python") if "h5py" in code], ids=["of README"])
 def test_python_runs_on_the_files_of_a_run(comm, tmp_path, monkeypatch, capsys, program):
     from tests.workflows.synthetic_run import write_run
     write_run(comm, tmp_path / "runs/hit-small")

@@ -111,7 +111,7 @@ def test_what_terms_read_and_give():
     (dict(terms=("pressure",), settings={"pairs": {}}), "[model.pairs]: no such term; the terms are pressure; remove"),
     (dict(settings={"pairs": Pressure()}), "[model.pairs]: must be settings of the class PairNetwork, or a dict"),
     (dict(settings={"pairs": 3}), "model.pairs = 3: must be a section"),
-    (dict(terms=("own_nowhere:Term",)), '[model] terms: "own_nowhere:Term": there is no module'),
+    (dict(terms=("own_nowhere:Term",)), '[model] terms: "own_nowhere:Term": there is no module "own_nowhere"'),
     (dict(terms=("eddies.scene:load_scene",)), "must be the class of a term, with a method forward"),
 ])
 def test_bad_model(changes, message):
@@ -256,24 +256,6 @@ def test_a_wrong_class_is_told_before_any_work(key, path, message):
 def test_keys_of_an_own_initial_flow():
     initial = Initial(kind="own:swirl", amplitude=2, peak_wavenumber=4.5, wavenumber=3)
     assert (initial.amplitude, initial.wavenumber) == (2.0, 3)
-
-
-@pytest.mark.parametrize("needs", ["'model'", "('pressure',)"])
-def test_a_method_needs_what_there_is(own, needs):
-    own("own_run", f"class Run:\n    needs = {needs}\n    steps = advance = frame = series = description = None\n")
-    refused('[simulation] method: "own_run:Run": needs = ',
-            lambda: load_scene("tiny", ["simulation.method=own_run:Run"]))
-
-
-def test_the_command_line_is_named_as_the_origin_of_a_terms_key():
-    refused("tiny.toml, --set: [model.pairs] hidden = 3: ", lambda: load_scene("tiny", ["model.pairs.hidden=3"]))
-
-
-def test_a_key_that_a_term_must_have(tmp_path):
-    text = COMPRESSIBLE + '[model]\nterms = ["pressure", "forcing"]\n'
-    refused("[model.forcing] injection_rate: this key is missing (power injected per unit mass); give it a number at "
-            "least 0", lambda: read(tmp_path, text))
-    assert read(tmp_path, text, "model.forcing.injection_rate=1").model.settings["forcing"].wavenumber == 2.0
 
 
 def test_what_methods_need():
