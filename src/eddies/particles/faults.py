@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -13,11 +14,12 @@ from eddies.particles.periodic_box import PeriodicBox
 
 @dataclass(frozen=True)
 class Limits:
-    """Largest magnitudes a sound state can have: `speed`, and `density_deviation` from `density_mean`."""
+    """Largest magnitudes a sound state can have: `speed`, and `density_deviation` from `density_mean` where particles
+    have a density."""
 
     speed: float
-    density_mean: float
-    density_deviation: float
+    density_mean: float = 0.0
+    density_deviation: float = math.inf
 
 
 def find_fault(
@@ -28,12 +30,12 @@ def find_fault(
     Faulty are values that are not finite, and those beyond the limits. The description has the step, rank,
     particle id, position, velocity, density, and the nearest other particle of this rank.
     """
-    position, velocity, density = particles.position, particles.velocity, particles.density
-    speed = torch.linalg.vector_norm(velocity, dim=1)
-    deviation = (density - limits.density_mean).abs()
     # Comparisons with NaN are false, so what is asked is whether a particle is sound.
-    sound = (speed <= limits.speed) & (deviation <= limits.density_deviation)
-    sound &= torch.isfinite(position).all(1)
+    sound = torch.linalg.vector_norm(particles.velocity, dim=1) <= limits.speed
+    sound &= torch.isfinite(particles.position).all(1)
+    if particles.density is not None:
+        sound &= torch.isfinite(particles.density)
+        sound &= (particles.density - limits.density_mean).abs() <= limits.density_deviation
     if bool(sound.all()):
         return None
     row = int(torch.nonzero(~sound)[0])
@@ -53,16 +55,15 @@ def find_unplaced(particles: ParticleSet, outside: Tensor, box: PeriodicBox, ran
 
 
 def _description(particles: ParticleSet, box: PeriodicBox, row: int, complaint: str) -> str:
+    density = "" if particles.density is None else f"density {float(particles.density[row]):.6g}, "
     return (
         f"particle {int(particles.id[row])}: {complaint}; position {_numbers(particles.position[row])}, "
-        f"velocity {_numbers(particles.velocity[row])}, density {float(particles.density[row]):.6g}, "
-        f"{_nearest(particles, box, row)}"
+        f"velocity {_numbers(particles.velocity[row])}, {density}{_nearest(particles, box, row)}"
     )
 
 
 def _complaint(particles: ParticleSet, limits: Limits, row: int) -> str:
-    columns = (particles.position, particles.velocity, particles.density)
-    if not all(bool(torch.isfinite(column[row]).all()) for column in columns):
+    if not all(bool(torch.isfinite(column[row]).all()) for column in particles.columns().values()):
         return "not finite"
     if float(torch.linalg.vector_norm(particles.velocity[row])) > limits.speed:
         return f"faster than {limits.speed:.6g}"
