@@ -46,9 +46,9 @@ CLOUDS = {
     "lattice": lambda random, n: np.argwhere(np.ones((8, 8, n // 64))) * (LENGTH / 8),
     "coincident": lambda random, n: np.full((n, 3), 6.28),
 }
-#: Models of pairs, by what they are; without the first three the density has a rate, or the resolved velocity gives it.
+#: Models of pairs.
 PAIR_MODELS = {
-    "paper": {**PRESETS["paper-density"], "eddy-viscosity": dict(form="two-sided", basis="paper")},
+    "paper": {"pairs": dict(basis="paper"), "density-flux": {}, "eddy-viscosity": dict(form="two-sided", basis="paper")},
     "corrected": {**PRESETS["learned-density"], "eddy-viscosity": dict(form="monaghan")},
     "pairs": {"pairs": {}},
     "antisymmetric": {"pairs": dict(basis="paper", symmetry="antisymmetric"), "density-transport": {},
@@ -90,6 +90,26 @@ def _settings(kind, chosen):
 @dataclass(frozen=True, kw_only=True)
 class ReadsNothing(TermSettings):
     """Settings of an acceleration that looks at each particle alone."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadsDensity(TermSettings):
+    """Settings of a term that reads the density."""
+
+    reads = ("density",)
+
+
+class DensityReader(Term):
+    """A term of a test that wants a density, and gives nothing."""
+
+    Settings = ReadsDensity
+
+    def __init__(self):
+        super().__init__(ReadsDensity(), FLOW)
+
+    def forward(self, context):
+        assert context.density.shape == (len(context.particles),)
+        return Rates()
 
 
 class Field(Term):
