@@ -137,12 +137,14 @@ class LagrangianModel(nn.Module):
         def at(values: Tensor) -> Rates:
             split = values.split([parameter.numel() for parameter in parameters.values()])
             named = {name: part.reshape(parameter.shape) for part, (name, parameter) in zip(split, parameters.items())}
+            context.forget_sums(term)
             return self._at_particles(functional_call(term, named, (context,)), context)
 
         count = sum(parameter.numel() for parameter in parameters.values())
         like = next(iter(parameters.values()), context.particles.position)
         origin = at(like.new_zeros(count))
         units = [at(unit) for unit in torch.eye(count, dtype=like.dtype, device=like.device)]
+        context.forget_sums(term)
         return LinearRates(origin, {name: torch.stack([getattr(unit, name) - getattr(origin, name) for unit in units])
                                     for name in _GIVEN if units and getattr(origin, name) is not None},
                            list(parameters.values()))
