@@ -5,8 +5,8 @@ import dataclasses
 import pytest
 from bad_scenes import BAD_OVERRIDES, BAD_TEXTS
 
-from eddies.scene_values import rule_of
 from eddies.scene import STAGES, Eulerian, Flow, Scene, SceneError, Time, builtin_scenes, load_scene
+from eddies.scene_values import rule_of
 
 SMALLEST = '[flow]\nfluid = "incompressible"\ncells = 16\nviscosity = 0.1\n[time]\nduration = 1\n'
 NAMES = [name for name, _ in builtin_scenes()]

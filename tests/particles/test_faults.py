@@ -45,6 +45,17 @@ def test_a_faulty_particle_is_described(name, value, complaint):
     assert "nearest particle" in description or name == "position"
 
 
+def test_particles_without_a_density_have_none_that_could_be_wrong():
+    particles = dataclasses.replace(sound(), density=None)
+    limits = Limits(speed=20.0)
+    assert find_fault(particles, limits, PeriodicBox(LENGTH), step=1, rank=0) is None
+    particles.velocity[2] = torch.nan
+    description = find_fault(particles, limits, PeriodicBox(LENGTH), step=1, rank=0)
+    assert "particle 102: not finite" in description and "density" not in description
+    infinite = dataclasses.replace(sound(), density=torch.full((6,), torch.inf, dtype=torch.float64))
+    assert "not finite" in find_fault(infinite, limits, PeriodicBox(LENGTH), step=1, rank=0)
+
+
 def test_the_nearest_particle_is_found_across_the_faces():
     particles = sound(3)
     position = torch.tensor([[0.1, 1, 1], [3, 3, 3], [LENGTH - 0.2, 1, 1]], dtype=torch.float64)
@@ -62,3 +73,5 @@ def test_a_particle_that_is_nowhere_near_its_slab_is_described(distance, complai
     outside[4] = distance
     description = find_unplaced(particles, outside, box, rank=3)
     assert description.startswith(f"rank 3, particle 104: {complaint}; position (")
+    described = find_unplaced(dataclasses.replace(particles, density=None), outside, box, rank=3)
+    assert described.startswith(f"rank 3, particle 104: {complaint}; position (")

@@ -1,12 +1,11 @@
 import numpy as np
 import pytest
 import torch
-from clouds import CUTOFF, LENGTH, SCALES, distributed, model, state
+from clouds import CUTOFF, SCALES, distributed, dynamics_of, model, state
 from mpi4py import MPI
 
-from eddies.particles import dynamics as dynamics_module
+from eddies.particles import context
 from eddies.particles.dense_network import DenseNetwork
-from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.feature_range import FeatureRange, pair_features
 
 CHOICES = {"corrected": dict(), "antisymmetric": dict(basis="paper", symmetry="antisymmetric")}
@@ -16,21 +15,17 @@ every_model = pytest.mark.parametrize("choices", CHOICES.values(), ids=CHOICES)
 def set_up(comm, choices, speed=1.0):
     position, velocity, density = state()
     slab, particles = distributed(comm, position, speed * velocity, density)
-    force = model(**choices)
-    dynamics = ParticleDynamics(slab, LENGTH, [force], 0.2)
-    dynamics.surroundings.update(particles)
-    return force, dynamics, particles
+    return dynamics_of(slab, model(pairs=choices)), particles
 
 
 def blocks(comm, choices, speed=1.0):
-    force, dynamics, particles = set_up(comm, choices, speed)
-    return pair_features(force, dynamics.surroundings, particles, torch.float64)
+    return pair_features(*set_up(comm, choices, speed))
 
 
 @every_model
 @pytest.mark.mpi(1, 2, 3)
 def test_pairs_of_the_training_data_lie_inside_the_range_and_faster_ones_outside(comm, choices, monkeypatch):
-    monkeypatch.setitem(dynamics_module.PAIR_VALUES_TOGETHER, "cpu", 300)
+    monkeypatch.setitem(context.PAIR_VALUES_TOGETHER, "cpu", 300)
     seen = FeatureRange.of(comm, blocks(comm, choices))
     # rho'_i, rho'_j, |x|, |v|, x.v, or rho'_i + rho'_j and (rho'_i - rho'_j)^2 at first
     if choices:
@@ -55,7 +50,7 @@ def test_range_and_share_are_the_same_on_any_number_of_ranks(comm, choices):
 
 @pytest.mark.mpi(1)
 def test_features_are_what_the_network_is_given(comm, monkeypatch):
-    force, dynamics, particles = set_up(comm, {})
+    dynamics, particles = set_up(comm, {})
     given, plain = [], DenseNetwork.forward
 
     def noting(network, features):
@@ -65,8 +60,25 @@ def test_features_are_what_the_network_is_given(comm, monkeypatch):
     monkeypatch.setattr(DenseNetwork, "forward", noting)
     with torch.no_grad():
         dynamics.rates(particles)
-    shown = list(pair_features(force, dynamics.surroundings, particles, torch.float64))
+    shown = list(pair_features(dynamics, particles))
     assert len(given) == len(shown) and all(map(torch.equal, given, shown))
+
+
+@pytest.mark.mpi(1)
+def test_features_of_two_networks_stand_one_after_the_other(comm):
+    slab, particles = distributed(comm, *state())
+    both = model(pairs=dict(inputs=("distance", "approach")), density_flux={})
+    (found,) = pair_features(dynamics_of(slab, both), particles)
+    parts = [next(iter(pair_features(dynamics_of(slab, model(terms)), particles)))
+             for terms in ({"pairs": dict(inputs=("distance", "approach"))}, {"density-flux": {}})]
+    assert torch.equal(found, torch.cat(parts)) and len(found) == 2 + 5
+
+
+@pytest.mark.mpi(1)
+def test_a_network_that_is_told_no_density_needs_none(comm):
+    slab, particles = distributed(comm, *state()[:2])
+    (found,) = pair_features(dynamics_of(slab, model(pairs=dict(inputs=("distance", "speed", "approach")))), particles)
+    assert len(found) == 3
 
 
 @pytest.mark.mpi(1, 2)

@@ -24,3 +24,10 @@ def test_particles_survive_the_way_through_arrays():
 def test_columns_of_another_length_are_refused(name):
     with pytest.raises(ValueError, match=name):
         ParticleSet(**{**columns(), name: columns(4)[name]})
+
+
+def test_without_a_density_there_is_no_such_column():
+    given = {name: column for name, column in columns().items() if name != "density"}
+    particles = ParticleSet.from_numpy(ParticleSet(**given).to_numpy())
+    assert particles.density is None
+    assert set(particles.columns()) == set(particles.to_numpy()) == set(given)

@@ -68,8 +68,8 @@ def states(comm) -> Iterator[Row]:
                f"{gained:.0e} of the sum of their sizes")
     for step in (1e-5, 1e-4, 1e-2):
         yield (f"two steps of {step:g} at 1000 c, {comm.size} rank(s)", "as at rest, or refused by all ranks",
-               shown(translated_run(comm, "learned-density, corrected", fast, step)))
-    for kind, factors in (("poisson, corrected", (0.2,)), ("learned-density, corrected", (0.1, 20.0))):
+               shown(translated_run(comm, "learned-density", fast, step)))
+    for kind, factors in (("poisson", (0.2,)), ("learned-density", (0.1, 20.0))):
         for mach in MACH_NUMBERS:
             for factor in factors:
                 step = 0.02 if kind.startswith("poisson") else factor * mach
@@ -83,7 +83,7 @@ def states(comm) -> Iterator[Row]:
     for rate in (1.0, 10.0):
         yield (f"injection {rate:g}", "that much energy", f"{overdriven(comm, rate):.9f} of it")
     for value in (math.nan, 1e200):
-        told = broken_step(comm, "poisson-force, corrected", "rk4", value, 2)
+        told = broken_step(comm, "poisson-force", "rk4", value, 2)
         yield (f"a force of {value:g} in a stage of rk4", "all ranks say where",
                told[0] if len(set(told)) == 1 else f"ranks differ: {told}")
 

@@ -12,23 +12,28 @@ from eddies.parallel.broadcast import first_complaint
 from eddies.parallel.halo import HaloError
 from eddies.parallel.reduction import any_rank, global_max
 from eddies.particles import moments
-from eddies.particles.body_forces import LinearForcing
+from eddies.particles.context import REGULARISATION
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.faults import Limits, find_fault
+from eddies.particles.flow_units import FlowUnits
 from eddies.particles.integrators import INTEGRATORS
-from eddies.particles.pair_forces import REGULARISATION, PairModel
-from eddies.particles.reference_scales import ReferenceScales
-from eddies.workflows.closures import density_closure
-from tests.particles.clouds import LENGTH, by_id, distributed
+from eddies.particles.model import LagrangianModel
+from eddies.particles.terms.presets import PRESETS
+from tests.particles.clouds import LENGTH, Field, by_id, distributed, of_terms, scales_of
+from tests.particles.clouds import model as model_of
 
 TOTAL, PLANES, SKIN = 343, 7, 0.1  # one cell of the grid a particle
+PAPER = {"pairs": dict(basis="paper", hidden=(8, 8)), "density-flux": dict(hidden=(8, 8)),
+         "eddy-viscosity": dict(form="two-sided", basis="paper")}
 CLOSURES = {
-    "poisson, corrected": {},
-    "poisson-force, corrected": {"closure": "poisson-force"},
-    "poisson-stress, corrected": {"closure": "poisson-stress"},
-    "poisson-stress, none": {"closure": "poisson-stress", "basis": "none"},
-    "learned-density, corrected": {"closure": "learned-density", "eddy_viscosity": "monaghan"},
-    "paper-density, paper": {"closure": "paper-density", "basis": "paper", "eddy_viscosity": "two-sided"},
+    "poisson": PRESETS["poisson"],
+    "poisson-force": PRESETS["poisson-force"],
+    "poisson-stress": PRESETS["poisson-stress"],
+    "resolved": PRESETS["resolved"],
+    "pairs without density": {"pairs": dict(inputs=("distance", "speed", "approach"))},
+    "learned-density": {**PRESETS["learned-density"], "eddy-viscosity": dict(form="monaghan")},
+    "paper-density": PAPER,
+    "wcsph": PRESETS["wcsph"],
 }
 every_closure = pytest.mark.parametrize("kind", CLOSURES)
 every_integrator = pytest.mark.parametrize("integrator", INTEGRATORS)
@@ -40,28 +45,32 @@ NEIGHBORS = [30, 60, 120, 200]
 def scales(total, mach=0.1):
     """Of turbulence with v_rms = 1 and the largest eddies of the box; density fluctuations go with M_t^2."""
     spacing = LENGTH / round(total ** (1 / 3))
-    return ReferenceScales(
+    return scales_of(
         length=2 * spacing, spacing=spacing, velocity=1.0, density_mean=1.0, density=0.3 * mach**2, acceleration=3.0,
-        density_rate=0.5 * mach**2, sound_speed=math.sqrt(3) / mach, viscosity=0.0)
+        density_rate=0.5 * mach**2, sound_speed=math.sqrt(3) / mach,
+        viscosity=0.02)
+
+
+def units(total, neighbors=24.0, mach=0.1):
+    """So many neighbours on average."""
+    flow = scales(total, mach)
+    return FlowUnits(flow, flow.spacing * (neighbors * 3 / (4 * math.pi)) ** (1 / 3), neighbors)
 
 
 def network_model(kind, total, neighbors=24.0, mach=0.1):
-    """A model with initial weights; so many neighbours on average."""
-    flow = scales(total, mach)
-    cutoff = flow.spacing * (neighbors * 3 / (4 * math.pi)) ** (1 / 3)
-    return PairModel(flow, cutoff, neighbors, hidden=(8, 8), **CLOSURES[kind])
+    """A model with initial weights."""
+    return model_of(CLOSURES[kind], units(total, neighbors, mach))
 
 
 def sound_model(total, neighbors=24.0, mach=0.1, relaxation=0.0):
     """Linear gas dynamics: dv/dt = -c^2 grad rho / rho_0, d rho/dt = -rho_0 div v (+ relaxation of the density)."""
-    model = network_model("learned-density, corrected", total, neighbors, mach)
-    flow, small = model.scales, 1e-3  # tanh is linear for small arguments
-    linear = PairModel(flow, model.cutoff, neighbors, hidden=(1,), closure="learned-density")
+    linear = model_of({"pairs": dict(hidden=(1,)), "density-transport": {}}, units(total, neighbors, mach))
+    flow, small, network = linear.flow.scales, 1e-3, linear.terms["pairs"].network  # tanh is linear for small arguments
     gain = flow.sound_speed**2 * flow.density / (flow.density_mean * flow.acceleration * flow.length)
     with torch.no_grad():
-        linear.network.weights[0][:] = torch.tensor([[-small, small, 0, 0, 0]])
-        linear.network.weights[1][:] = torch.tensor([[gain / small], [0], [0]])
-        linear.density_factors[:] = torch.tensor([1.0, relaxation])
+        network.weights[0][:] = torch.tensor([[-small, small, 0, 0, 0]])
+        network.weights[1][:] = torch.tensor([[gain / small], [0]])
+        linear.terms["density-transport"].factors[:] = torch.tensor([1.0, relaxation])
     return linear
 
 
@@ -84,8 +93,7 @@ def set_up(comm, model, position, velocity=None, density=None, dtype=torch.float
     velocity = flow_velocity(position) if velocity is None else velocity
     density = torch.ones(len(position), dtype=torch.float64) if density is None else density
     slab, particles = distributed(comm, position, velocity, density, planes=PLANES)
-    closure = density_closure(model, slab, dtype, skin)
-    return ParticleDynamics(slab, LENGTH, model.to(dtype).pair_terms, skin, closure, dtype), particles
+    return ParticleDynamics(slab, model.to(dtype), skin, dtype), particles
 
 
 @torch.no_grad()
@@ -93,7 +101,7 @@ def acceleration(comm, model, position, **given):
     """Of all particles by id, on every rank."""
     dynamics, particles = set_up(comm, model, position, **given)
     particles, _ = dynamics.settle(particles)
-    return by_id(comm, particles, dynamics.rates(particles)["velocity"], len(position))
+    return by_id(comm, particles, dynamics.rates(particles).acceleration, len(position))
 
 
 @torch.no_grad()
@@ -106,12 +114,12 @@ def advance(dynamics, particles, integrator, step, count):
 
 def fault(comm, dynamics, particles, model):
     """The complaint about a state, by the limits that a rollout has."""
-    limits = Limits(30 * model.scales.velocity, model.scales.density_mean, 300 * model.scales.density)
+    limits = Limits(30 * model.flow.scales.velocity, model.flow.scales.density_mean, 300 * model.flow.scales.density)
     return find_fault(particles, limits, dynamics.box, step=1, rank=comm.rank)
 
 
 def finite(comm, particles):
-    columns = (particles.position, particles.velocity, particles.density)
+    columns = [column for name, column in particles.columns().items() if name != "id"]
     return not any_rank(comm, not all(bool(torch.isfinite(column).all()) for column in columns))
 
 
@@ -150,7 +158,7 @@ def arrangement(comm, kind, name, total=TOTAL, count=2):
     model, position = network_model(kind, total), ARRANGEMENTS[name](total)
     alone, here = (acceleration(group, model, position) for group in (MPI.COMM_SELF, comm))
     end = advance(*set_up(comm, model, position), "rk2", 0.01, count)
-    largest = alone.abs().max().clamp_min(model.scales.acceleration)
+    largest = alone.abs().max().clamp_min(model.flow.scales.acceleration)
     return float((here - alone).abs().max() / largest), finite(comm, end)
 
 
@@ -167,8 +175,8 @@ def few_particles(comm, kind, integrator, total):
 
 
 def pushed_by_the_grid(kind):
-    """Whether the closure has a force from its grid."""
-    return CLOSURES[kind].get("closure") in ("poisson-force", "poisson-stress")
+    """Whether the model has a force from its grid."""
+    return "resolved" in network_model(kind, TOTAL).reads and kind != "poisson"
 
 
 def lattice_at_rest(comm, kind, dtype=torch.float64, side=PLANES, count=5):
@@ -177,7 +185,7 @@ def lattice_at_rest(comm, kind, dtype=torch.float64, side=PLANES, count=5):
     dynamics, particles = set_up(comm, model, position, torch.zeros_like(position), dtype=dtype)
     end = advance(dynamics, particles, "verlet", 0.02, count)
     speed = global_max(comm, float(end.velocity.abs().max()) if len(end) else 0.0)
-    return float(speed) / (0.02 * model.scales.acceleration)
+    return float(speed) / (0.02 * model.flow.scales.acceleration)
 
 
 def translation(comm, kind, speed, position):
@@ -185,14 +193,17 @@ def translation(comm, kind, speed, position):
     model = network_model(kind, len(position))
     moving = flow_velocity(position) + torch.tensor([0.5, -0.3, 1.0]) * speed
     still, carried = acceleration(comm, model, position), acceleration(comm, model, position, velocity=moving)
-    return float((carried - still).abs().max() / still.abs().max().clamp_min(model.scales.acceleration))
+    return float((carried - still).abs().max() / still.abs().max().clamp_min(model.flow.scales.acceleration))
 
 
 def momentum_gained(comm, kind, position):
     """Sum of the accelerations over the sum of their sizes, the pair sum being antisymmetric."""
-    flow = scales(TOTAL)
-    choices = {**CLOSURES[kind], "basis": "paper", "symmetry": "antisymmetric"}
-    force = acceleration(comm, PairModel(flow, 1.8 * flow.spacing, 24.0, hidden=(8, 8), **choices), position)
+    terms = dict(CLOSURES[kind])
+    if "pairs" in terms:
+        terms["pairs"] = {**terms["pairs"], "basis": "paper", "symmetry": "antisymmetric"}
+    if "eddy-viscosity" in terms:
+        terms["eddy-viscosity"] = {**terms["eddy-viscosity"], "basis": "paper"}
+    force = acceleration(comm, model_of(terms, units(TOTAL)), position)
     return float(force.sum(0).norm() / force.norm(dim=1).sum())
 
 
@@ -226,7 +237,7 @@ def density_contrast(comm, kind, contrast, total=TOTAL):
     """Acceleration of particles half of which are denser by a factor, in typical accelerations: its largest."""
     model, position = network_model(kind, total), random_points(total)
     density = torch.where(position[:, 0] > math.pi, contrast, 1.0).double()
-    return float(acceleration(comm, model, position, density=density).abs().max()) / model.scales.acceleration
+    return float(acceleration(comm, model, position, density=density).abs().max()) / model.flow.scales.acceleration
 
 
 def precision_error(comm, kind, count, total=TOTAL):
@@ -241,19 +252,19 @@ def precision_error(comm, kind, count, total=TOTAL):
 def gradient_error(neighbors, total=1728):
     """Relative error of -c^2 grad rho of a linear density where the gradient is seen whole, by random neighbours."""
     model, position = sound_model(total, neighbors), random_points(total)
-    slope = torch.tensor([1e-3, -2e-3, 0.5e-3], dtype=torch.float64) * model.scales.density
+    slope = torch.tensor([1e-3, -2e-3, 0.5e-3], dtype=torch.float64) * model.flow.scales.density
     rest = torch.zeros_like(position)
     found = acceleration(MPI.COMM_SELF, model, position, velocity=rest, density=1 + (position - math.pi) @ slope)
-    inside = ((position > model.cutoff) & (position < LENGTH - model.cutoff)).all(1)
-    exact = -model.scales.sound_speed**2 * slope
+    inside = ((position > model.flow.cutoff) & (position < LENGTH - model.flow.cutoff)).all(1)
+    exact = -model.flow.scales.sound_speed**2 * slope
     return float((found[inside] - exact).norm(dim=1).median() / exact.norm()), int(inside.sum())
 
 
 def overdriven(comm, rate, count=20, total=TOTAL):
     """Energy gained by forced particles without another force, over the energy injected."""
     position = random_points(total)
-    slab, particles = distributed(comm, position, flow_velocity(position), torch.ones(total), planes=PLANES)
-    dynamics = ParticleDynamics(slab, LENGTH, [LinearForcing(rate, 2.0, comm)], SKIN)
+    slab, particles = distributed(comm, position, flow_velocity(position), planes=PLANES)
+    dynamics = ParticleDynamics(slab, model_of(forcing=dict(injection_rate=rate)), SKIN)
     end = advance(dynamics, particles, "rk4", 0.02, count)
     energies = [0.5 * float(by_id(comm, state, state.velocity, total).square().sum(1).mean())
                 for state in (particles, end)]
@@ -263,16 +274,9 @@ def overdriven(comm, rate, count=20, total=TOTAL):
 # Steps of known stiffness. A step multiplies a wave or a mode by `amplification` of z = step times its rate.
 
 
-class Spring:
+def spring(frequency=0.0, drag=0.0):
     """Acceleration -frequency^2 x from the middle of the box, or -rate v."""
-
-    cutoff, reads = 0.0, ("velocity",)
-
-    def __init__(self, frequency=0.0, drag=0.0):
-        self.frequency, self.drag = frequency, drag
-
-    def __call__(self, position, velocity):
-        return -self.frequency**2 * (position - math.pi) - self.drag * velocity
+    return of_terms(Field(lambda position, velocity: -frequency**2 * (position - math.pi) - drag * velocity))
 
 
 def amplification(integrator, system, z):
@@ -297,10 +301,10 @@ def boundary(integrator, system, growth):
 
 def oscillator_growth(integrator, system, z, count=32):
     """Growth a step of one particle on a spring, or braked, from the last two quarters of the steps."""
-    term = Spring(frequency=1.0) if system == "oscillator" else Spring(drag=1.0)
+    force = spring(frequency=1.0) if system == "oscillator" else spring(drag=1.0)
     position, velocity = torch.full((1, 3), math.pi, dtype=torch.float64), torch.full((1, 3), 1e-9).double()
-    slab, particles = distributed(MPI.COMM_SELF, position, velocity, torch.ones(1), planes=PLANES)
-    stepper, sizes = INTEGRATORS[integrator](ParticleDynamics(slab, LENGTH, [term], SKIN)), []
+    slab, particles = distributed(MPI.COMM_SELF, position, velocity, planes=PLANES)
+    stepper, sizes = INTEGRATORS[integrator](ParticleDynamics(slab, force, SKIN)), []
     for _ in range(count):
         particles = stepper.step(particles, z)
         away = float(particles.position[0, 0] - position[0, 0]) if system == "oscillator" else 0.0
@@ -311,27 +315,27 @@ def oscillator_growth(integrator, system, z, count=32):
 
 def sound_frequency(model, side, waves):
     """Frequency of a wave along x on a lattice by the sums over its neighbours, c sum w x sin(kx) / sum w x^2."""
-    reach = math.ceil(model.cutoff / (LENGTH / side))
+    reach = math.ceil(model.flow.cutoff / (LENGTH / side))
     offsets = np.argwhere(np.ones((2 * reach + 1,) * 3)) - reach
     x = offsets[np.any(offsets, axis=1)] * LENGTH / side
-    weight = np.clip(1 - np.sum(x**2, axis=1) / model.cutoff**2, 0, None) ** 2
-    kept = REGULARISATION * moments.expected_moment(model.neighbors, model.cutoff)
+    weight = np.clip(1 - np.sum(x**2, axis=1) / model.flow.cutoff**2, 0, None) ** 2
+    kept = REGULARISATION * moments.expected_moment(model.flow.neighbors, model.flow.cutoff)
     slope = np.sum(weight * x[:, 0] * np.sin(waves * x[:, 0])) / (np.sum(weight * x[:, 0] ** 2) + kept)
-    return model.scales.sound_speed * slope
+    return model.flow.scales.sound_speed * slope
 
 
 @torch.no_grad()
 def sound_growth(integrator, z, count=20, side=8, waves=2):
     """Growth a step of a standing sound wave of the learned-density closure on a lattice; z: step times frequency."""
     model, position = sound_model(side**3), lattice(side)
-    density = 1 + 1e-6 * model.scales.density * torch.cos(waves * position[:, 0])
+    density = 1 + 1e-6 * model.flow.scales.density * torch.cos(waves * position[:, 0])
     dynamics, particles = set_up(MPI.COMM_SELF, model, position, torch.zeros_like(position), density)
     stepper, sizes = INTEGRATORS[integrator](dynamics), []
     for _ in range(count):
         particles = stepper.step(particles, z / sound_frequency(model, side, waves))
         # Other waves grow out of round-off: this one alone is measured.
         phase = waves * particles.position[:, 0]
-        sizes.append(math.hypot(float((particles.density - 1) @ torch.cos(phase)) * model.scales.sound_speed,
+        sizes.append(math.hypot(float((particles.density - 1) @ torch.cos(phase)) * model.flow.scales.sound_speed,
                                 float(particles.velocity[:, 0] @ torch.sin(phase))))
     return (sizes[-1] / sizes[count // 2]) ** (1 / (count - 1 - count // 2))
 
@@ -356,13 +360,14 @@ def measured_boundary(integrator, system, growth, low=0.02, high=4.0):
 def test_nearly_coincident_particles_move_as_coincident_ones(comm, kind):
     for separation in SEPARATIONS:
         difference, sound = nearly_coincident(comm, kind, separation)
-        # Accelerations vary over the cutoff, here two spacings, by a few times themselves.
-        assert sound and difference <= 100 * separation + 1e-12
+        # Accelerations vary over the cutoff, here two spacings, by a few times themselves; where the few neighbours
+        # are nearly in a plane, by a hundred times.
+        assert sound and difference <= 300 * separation + 1e-12
 
 
 @pytest.mark.mpi(2)
 @pytest.mark.parametrize("name", ARRANGEMENTS)
-@pytest.mark.parametrize("kind", ["poisson-stress, corrected", "learned-density, corrected"])
+@pytest.mark.parametrize("kind", ["poisson-stress", "learned-density"])
 def test_any_arrangement_has_finite_rates_that_are_the_same_on_all_ranks(comm, kind, name):
     difference, sound = arrangement(comm, kind, name)
     assert sound and difference < 1e-9
@@ -382,7 +387,8 @@ def test_few_particles_move_straight_on(comm, integrator, total):
 @every_closure
 def test_a_lattice_at_rest_stays_at_rest(comm, kind):
     assert lattice_at_rest(comm, kind) < 1e-13
-    assert lattice_at_rest(comm, kind, torch.float32) < 1e-5
+    # The pressures of WCSPH are c^2, a hundred times the accelerations, and cancel.
+    assert lattice_at_rest(comm, kind, torch.float32) < (1e-3 if kind == "wcsph" else 1e-5)
 
 
 @pytest.mark.mpi(1)
@@ -391,13 +397,13 @@ def test_a_uniform_velocity_of_a_thousand_times_sound_changes_no_force(comm, kin
     """Wherever particles are. 1000 c is 1.7e4 v_rms: its round-off is 2e-12, which differences of velocities keep."""
     speed = 1000 * scales(TOTAL).sound_speed
     assert translation(comm, kind, speed, random_points(TOTAL)) < 1e-10
-    for name in ARRANGEMENTS if kind.startswith("poisson") else ():
+    for name in ARRANGEMENTS if kind.startswith("poisson") or kind == "resolved" else ():
         assert translation(comm, kind, speed, ARRANGEMENTS[name](TOTAL)) < 1e-10, name
 
 
 @pytest.mark.mpi(1)
 @every_closure
-def test_opposite_forces_keep_the_momentum_with_every_closure(comm, kind):
+def test_opposite_forces_keep_the_momentum_with_every_model(comm, kind):
     for name in ("in 1 % of the box", "empty octant"):
         assert momentum_gained(comm, kind, ARRANGEMENTS[name](TOTAL)) < 1e-13, name
 
@@ -405,21 +411,20 @@ def test_opposite_forces_keep_the_momentum_with_every_closure(comm, kind):
 @pytest.mark.mpi(1, 2)
 def test_particles_that_outrun_their_slab_are_refused_by_all_ranks(comm):
     speed = 1000 * scales(TOTAL).sound_speed
-    assert translated_run(comm, "learned-density, corrected", speed, 1e-5) < 1e-9
-    assert comm.size == 1 or "thinner than the halo" in translated_run(comm, "learned-density, corrected", speed, 1e-4)
-    told = translated_run(comm, "learned-density, corrected", speed, 1e-2)
+    assert translated_run(comm, "learned-density", speed, 1e-5) < 1e-9
+    assert comm.size == 1 or "thinner than the halo" in translated_run(comm, "learned-density", speed, 1e-4)
+    told = translated_run(comm, "learned-density", speed, 1e-2)
     assert told < 1e-9 if comm.size == 1 else "farther outside its slab" in told
 
 
-class Breaking:
+class Breaking(Field):
     """An acceleration that is `value` for one particle of the last rank, at one of its calls."""
 
-    cutoff, reads = 0.0, ("velocity",)
-
     def __init__(self, comm, value, call):
+        super().__init__(self.acceleration)
         self.last, self.value, self.calls_left = comm.rank == comm.size - 1, value, call
 
-    def __call__(self, position, velocity):
+    def acceleration(self, position, velocity):
         self.calls_left -= 1
         force = torch.zeros_like(velocity)
         if self.last and self.calls_left == 0:
@@ -429,9 +434,9 @@ class Breaking:
 
 def broken_step(comm, kind, integrator, value, call, total=TOTAL):
     """What is said, on every rank, of a step in which a force breaks."""
-    model = network_model(kind, total)
+    sound = network_model(kind, total)
+    model = LagrangianModel({**sound.terms, "breaking": Breaking(comm, value, call)}, sound.flow)
     dynamics, particles = set_up(comm, model, random_points(total))
-    dynamics.body_terms.append(Breaking(comm, value, call))
     try:
         end = advance(dynamics, particles, integrator, 0.02, 1)
     except HaloError as told:
@@ -440,7 +445,7 @@ def broken_step(comm, kind, integrator, value, call, total=TOTAL):
 
 
 @pytest.mark.mpi(2)
-@pytest.mark.parametrize("kind", ["poisson-force, corrected", "learned-density, corrected"])
+@pytest.mark.parametrize("kind", ["poisson-force", "learned-density"])
 @every_integrator
 def test_a_force_that_breaks_within_a_step_is_reported_by_all_ranks(comm, kind, integrator):
     """With the second rate a stage of Runge-Kutta 4 breaks, and the end of the others' steps."""
@@ -453,7 +458,7 @@ def test_a_force_that_breaks_within_a_step_is_reported_by_all_ranks(comm, kind, 
 
 @pytest.mark.mpi(1)
 def test_the_poisson_closure_is_the_same_at_any_mach_number(comm):
-    ends = [at_mach_number(comm, "poisson, corrected", mach, 0.02) for mach in MACH_NUMBERS]
+    ends = [at_mach_number(comm, "poisson", mach, 0.02) for mach in MACH_NUMBERS]
     assert all(complaint is None for complaint, _ in ends)
     assert all(torch.allclose(velocity, ends[0][1], atol=1e-9) for _, velocity in ends)
 
@@ -461,14 +466,14 @@ def test_the_poisson_closure_is_the_same_at_any_mach_number(comm):
 @pytest.mark.mpi(1)
 @pytest.mark.parametrize("mach", MACH_NUMBERS)
 def test_a_learned_density_needs_steps_that_resolve_sound(comm, mach):
-    complaint, velocity = at_mach_number(comm, "learned-density, corrected", mach, 0.1 * mach)
+    complaint, velocity = at_mach_number(comm, "learned-density", mach, 0.1 * mach)
     assert complaint is None and velocity.abs().max() < 4
-    complaint, _ = at_mach_number(comm, "learned-density, corrected", mach, 20 * mach)
+    complaint, _ = at_mach_number(comm, "learned-density", mach, 20 * mach)
     assert re.search(r"rank 0, particle \d+: (not finite|faster than|density farther)", complaint)
 
 
 @pytest.mark.mpi(1)
-@every_closure
+@pytest.mark.parametrize("kind", [kind for kind, terms in CLOSURES.items() if "pairs" in terms])
 def test_a_density_contrast_of_a_thousand_leaves_forces_bounded(comm, kind):
     """The outputs of saturated tanh layers are bounded by sums of weights."""
     assert density_contrast(comm, kind, 1000.0) < 50

@@ -14,21 +14,25 @@ from eddies.learning import force_training
 from eddies.learning.force_training import ForceTrainer, LossWeights, TrainingFrame
 from eddies.learning.optimization import Descent
 from eddies.parallel.slab import SlabDecomposition
-from eddies.particles import body_forces
+from eddies.particles.context import Context
 from eddies.particles.dynamics import ParticleDynamics
-from eddies.particles.eddy_viscosity import EddyViscosity
+from eddies.particles.flow_units import FlowUnits
+from eddies.particles.fourier_grid import FourierGrid
 from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.neighbor_list import NeighborList
-from eddies.particles.pair_forces import PairModel
 from eddies.particles.particle_set import ParticleSet
-from eddies.particles.reference_scales import ReferenceScales
+from eddies.particles.resolved_velocity import ResolvedVelocity
 from eddies.particles.smoothing_kernels import WendlandC2
-from eddies.workflows.closures import density_closure
+from eddies.particles.terms.eddy_viscosity import EddyViscosity
+from eddies.particles.terms.presets import PRESETS
+from tests.particles.clouds import model, scales_of
 
 LENGTH, PER_SIDE, STEP = 2 * np.pi, 9, 0.001
 SPACING = LENGTH / PER_SIDE
-SCALES = ReferenceScales(length=2 * SPACING, spacing=SPACING, velocity=1.0, density_mean=1.0, density=0.01,
-                         acceleration=1.0, density_rate=0.02, sound_speed=10.0, viscosity=0.01)
+SCALES = scales_of(length=2 * SPACING, spacing=SPACING, velocity=1.0, density_mean=1.0, density=0.01,
+                   acceleration=1.0, density_rate=0.02, sound_speed=10.0, viscosity=0.01)
+FORCING = {"forcing": dict(injection_rate=0.5)}
+NO_DENSITY = {"pairs": dict(inputs=("distance", "speed", "approach"))}
 
 
 class CountingComm:
@@ -67,34 +71,37 @@ def counted(*methods):
             setattr(owner, name, original)
 
 
-def particle_step(comm, closure="poisson", viscosity="none", basis="corrected", forced=False, pairs=True):
-    """A function that takes a step of velocity Verlet, halo and list being there; the rates are evaluated once."""
+def set_up(comm, terms, density=True):
+    """Dynamics of these terms, and particles on a lattice."""
     slab = SlabDecomposition(comm, LENGTH, PER_SIDE)
     z = (np.arange(slab.start, slab.stop) + 0.5) * SPACING
     across = (np.arange(PER_SIDE) + 0.5) * SPACING
     position = np.stack(np.meshgrid(across, across, z, indexing="ij"), axis=-1).reshape(-1, 3)
-    velocity = np.sin(position[:, [1, 2, 0]])
-    ids = np.arange(len(position)) + slab.start * PER_SIDE**2
-    particles = ParticleSet.from_numpy({"id": ids, "position": position, "velocity": velocity,
-                                        "density": np.ones(len(position))})
-    model = PairModel(SCALES, 1.5 * SPACING, 14, (8,), basis, closure, viscosity)
-    density = density_closure(model, slab, torch.float64, SPACING) if pairs else None
-    terms = model.pair_terms if pairs else []
-    terms += [body_forces.LinearForcing(0.5, 2.0, comm)] if forced else []
-    stepper = INTEGRATORS["verlet"](ParticleDynamics(slab, LENGTH, terms, SPACING, density))
+    columns = {"id": np.arange(len(position)) + slab.start * PER_SIDE**2, "position": position,
+               "velocity": np.sin(position[:, [1, 2, 0]]), "density": np.ones(len(position))}
+    particles = ParticleSet.from_numpy({name: column for name, column in columns.items() if density or name != "density"})
+    lagrangian = model(terms, FlowUnits(SCALES, 1.5 * SPACING, 14.0))
+    return ParticleDynamics(slab, lagrangian, SPACING), particles
+
+
+def particle_step(comm, terms, density=True):
+    """A function that takes a step of velocity Verlet, halo and list being there; the rates are evaluated once."""
+    dynamics, particles = set_up(comm, terms, density)
+    stepper = INTEGRATORS["verlet"](dynamics)
     with torch.no_grad():
         state = [stepper.step(particles, STEP)]
 
     @torch.no_grad()
     def step():
         state[0] = stepper.step(state[0], STEP)
+        return state[0]
 
     return step
 
 
-def messages_of(comm, **choices):
+def messages_of(comm, terms, density=True):
     counting = CountingComm(comm)
-    step = particle_step(counting, **choices)
+    step = particle_step(counting, terms, density)
     counting.sent.clear()
     step()
     return counting.sent
@@ -108,10 +115,10 @@ def trainer(comm, weights):
     ids = np.arange(len(position)) + (0 if comm.rank == 0 else PER_SIDE**3 - len(position))
     particles = ParticleSet.from_numpy({"id": ids, "position": position, "velocity": np.sin(position[:, [1, 2, 0]]),
                                         "density": np.ones(len(position))})
-    model = PairModel(SCALES, 1.7 * SPACING, 20, (8,), closure="learned-density")
+    learned = model(PRESETS["learned-density"], FlowUnits(SCALES, 1.7 * SPACING, 20.0))
     truth = torch.from_numpy(np.cos(position))
-    frame = TrainingFrame(slab, model, particles, truth, truth[:, 0])
-    return ForceTrainer(model, [frame], WendlandC2(1.7 * SPACING), weights, 100, seed=5)
+    frame = TrainingFrame(ParticleDynamics(slab, learned, 0.0), particles, truth, truth[:, 0])
+    return ForceTrainer(learned, [frame], WendlandC2(1.7 * SPACING), weights, 100, seed=5)
 
 
 def combined_step(comm, **weights):
@@ -140,7 +147,7 @@ def fluid_of(comm, compressible, forced):
     state = initial_fields.random_velocity(grid, 3, 1.0, 2.0)
     forcing = LinearForcing(grid, 0.5, 2.0) if forced else None
     if not compressible:
-        return grid, IncompressibleFluid(grid, 0.1, forcing=forcing), state
+        return grid, IncompressibleFluid(grid, 0.1, forcing), state
     density = initial_fields.balanced_density(grid, state, 10.0)
     return grid, CompressibleFluid(grid, 0.1, 10.0, forcing), np.concatenate([state, density[None]])
 
@@ -156,71 +163,136 @@ def evaluation(comm, compressible, forced):
 
 
 @pytest.mark.mpi(1)
-@pytest.mark.parametrize("closure", ["poisson", "poisson-force", "poisson-stress", "learned-density", "paper-density"])
-def test_one_rank_sends_nothing(comm, closure):
-    assert messages_of(comm, closure=closure, forced=True) == []
+@pytest.mark.parametrize("preset", PRESETS)
+def test_one_rank_sends_nothing(comm, preset):
+    assert messages_of(comm, {**PRESETS[preset], **FORCING}) == []
     calls, sent = losses_called(comm, field=1.0, velocity_kl=0.1, acceleration_kl=0.1)
     assert sent == []
 
 
 @pytest.mark.mpi(2)
 def test_a_force_pays_with_messages_for_what_it_has_alone(comm):
-    nothing = messages_of(comm, pairs=False)
-    forcing = messages_of(comm, pairs=False, forced=True)
-    learned, forced = messages_of(comm, closure="learned-density"), messages_of(comm, closure="learned-density",
-                                                                                forced=True)
+    nothing, forcing = messages_of(comm, {}), messages_of(comm, FORCING)
+    learned = messages_of(comm, PRESETS["learned-density"])
+    forced = messages_of(comm, {**PRESETS["learned-density"], **FORCING})
     assert nothing == [] and forcing == ["Allreduce"]
     # Votes on the list before the step and at its end; then position, velocity, density: up and down.
     assert sorted(learned) == ["Allreduce"] * 2 + ["Sendrecv"] * 6
     assert sorted(forced) == ["Allreduce"] * 3 + ["Sendrecv"] * 6
+    # Who reads no density sends none, and neither do pairs that look at distances alone send velocities.
+    assert sorted(messages_of(comm, NO_DENSITY, density=False)) == ["Allreduce"] * 2 + ["Sendrecv"] * 4
+    assert sorted(messages_of(comm, {"summation-density": {}}, density=False)) == ["Allreduce"] * 2 + ["Sendrecv"] * 2
 
 
 @pytest.mark.mpi(2)
-def test_a_closure_pays_with_transposes_for_the_terms_of_its_force_alone(comm):
-    sent = {closure: messages_of(comm, closure=closure)
-            for closure in ("learned-density", "poisson", "poisson-force", "poisson-stress")}
-    # Three passes of the field to the particles and what is missed there, two transposes each; the field to modes, its
-    # products back and forth, the pressure to the particles. The gradient of the pressure goes with it; the stress has
-    # products of its own, and its friction the velocity at the particles once more.
-    transposes = {closure: messages.count("Alltoallv") for closure, messages in sent.items()}
-    assert transposes == {"learned-density": 0, "poisson": 6 + 4, "poisson-force": 6 + 4,
-                          "poisson-stress": 6 + 4 + 2 + 2}
+def test_a_model_pays_with_transposes_for_the_terms_that_it_has_alone(comm):
+    def of(*words):
+        return messages_of(comm, {word: PRESETS["poisson-stress"].get(word, {}) for word in words})
+
+    sent = {words: of(*words) for words in (
+        ("pairs",), ("pressure",), ("stress",), ("damping",), ("relaxation",), ("pressure", "stress"),
+        ("pressure", "stress", "damping", "relaxation"), ("pressure", "stress", "damping", "relaxation", "pairs"))}
+    transposes = {words: messages.count("Alltoallv") for words, messages in sent.items()}
+    # Of the resolved velocity: four averages to modes, three times what is missed at the particles.
+    resolved = 4 + 3
+    # Its products: the field to the grid, they back; what all terms give as modes goes to the particles once.
+    assert transposes == {
+        ("pairs",): 0, ("pressure",): resolved + 2 + 1, ("stress",): resolved + 2 + 1, ("damping",): resolved + 1,
+        ("relaxation",): resolved + 1, ("pressure", "stress"): resolved + 4 + 1,
+        ("pressure", "stress", "damping", "relaxation"): resolved + 4 + 1 + 1,
+        ("pressure", "stress", "damping", "relaxation", "pairs"): resolved + 4 + 1 + 1}
     # Beside the two votes on the list: one on where particles are, their mean velocity, and of a force its mean.
-    sums = {closure: messages.count("Allreduce") for closure, messages in sent.items()}
-    assert sums == {"learned-density": 2, "poisson": 4, "poisson-force": 5, "poisson-stress": 5}
+    sums = {words: messages.count("Allreduce") for words, messages in sent.items()}
+    assert sums["pairs",] == 2 and sums["pressure",] == sums["relaxation",] == 5
+    assert sums["pressure", "stress", "damping", "relaxation"] == 6  # relaxation has a mean of its own
 
 
 @pytest.mark.mpi(2)
 def test_without_a_pair_sum_no_neighbours_are_searched_and_no_density_travels(comm):
     found = {}
-    for basis in ("corrected", "none"):
+    for name in ("poisson-stress", "resolved"):
         with counted((NeighborList, "build"), (NeighborList, "pairs")) as calls:
             counting = CountingComm(comm)
-            step = particle_step(counting, "poisson-stress", basis=basis)
+            step = particle_step(counting, PRESETS[name])
             counting.sent.clear()
             step()
-        found[basis] = calls.count("build"), calls.count("pairs"), counting.sent.count("Sendrecv")
-    # What is left is the list of particles around the points of the grid; the density would go up and down.
-    (builds, pairs, sent), (builds_left, pairs_left, sent_left) = found["corrected"], found["none"]
-    assert builds_left < builds and pairs_left < pairs and sent_left == sent - 2
+        found[name] = calls.count("build"), calls.count("pairs"), counting.sent.count("Sendrecv")
+    # What is left is the list of particles around the points of the grid; velocity and density go up and down.
+    (builds, pairs, sent), (builds_left, pairs_left, sent_left) = found["poisson-stress"], found["resolved"]
+    assert builds_left < builds and pairs_left < pairs and sent_left == sent - 4
+
+
+@pytest.mark.mpi(1, 2)
+def test_a_model_without_pairs_has_no_list_of_them_and_looks_no_farther_than_its_averages(comm):
+    resolved, both, pairs = (set_up(comm, PRESETS[name])[0] for name in ("resolved", "poisson-stress", "learned-density"))
+    assert resolved.surroundings.neighbors is None
+    assert resolved.surroundings.halo_cutoff == resolved.resolution.reach
+    assert both.surroundings.neighbors is not None and pairs.resolution is None
+    assert pairs.surroundings.halo_cutoff == pairs.model.flow.cutoff
+    assert both.surroundings.halo_cutoff == max(both.resolution.reach, both.model.flow.cutoff)
+    for terms in ({}, FORCING):
+        nothing, _ = set_up(comm, terms)
+        assert nothing.surroundings is None and nothing.resolution is None
+
+
+@pytest.mark.mpi(1, 2)
+@pytest.mark.parametrize("terms", [PRESETS["resolved"], NO_DENSITY, FORCING, {}], ids=["resolved", "pairs", "forcing", ""])
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_a_density_that_no_term_reads_is_neither_computed_nor_kept(comm, terms, integrator):
+    dynamics, particles = set_up(comm, terms, density=False)
+    with counted((FourierGrid, "at")) as calls, torch.no_grad():
+        rates = dynamics.rates(particles)
+        end = INTEGRATORS[integrator](dynamics).step(particles, STEP)
+    assert rates.density is None and rates.density_rate is None and end.density is None
+    assert "density" not in end.columns() and "density" not in end.to_numpy()
+    if terms is PRESETS["resolved"]:  # the force of all terms, what is missed, and three passes: no pressure
+        with_density, _ = set_up(comm, PRESETS["poisson-stress"])
+        values = []
+        grid = FourierGrid.at
+        for each in (dynamics, with_density):
+            with pytest.MonkeyPatch.context() as patch, torch.no_grad():
+                patch.setattr(FourierGrid, "at", lambda self, modes, at: values.append(len(modes)) or grid(self, modes, at))
+                each.rates(particles)
+        assert values == [3, 3, 3, 3, 3] + [3, 3, 3, 3, 4] and len(calls) >= 5
+
+
+@pytest.mark.mpi(1, 2)
+@pytest.mark.parametrize("word, parameter", [("stress", "amplitude"), ("damping", "rates"), ("relaxation", "factor"),
+                                             ("forcing", None), ("eddy-viscosity", "coefficients"),
+                                             ("density-transport", "factors")])
+def test_a_term_of_zero_amplitude_gives_the_numbers_of_the_model_without_it(comm, word, parameter):
+    others = {"pressure": {}, "pairs": {}} if word != "density-transport" else {"pairs": {}}
+    without, particles = set_up(comm, others)
+    given = dict(injection_rate=0.0) if word == "forcing" else {}
+    with_it, _ = set_up(comm, {**others, word: given})
+    with torch.no_grad():
+        if parameter is not None:
+            getattr(with_it.model.terms[word], parameter).zero_()
+        expected, found = without.rates(particles), with_it.rates(particles)
+        # Sums over pairs are the same to the last bit; a force on the grid is interpolated with another zero added.
+        assert torch.allclose(found.acceleration, expected.acceleration, rtol=0, atol=1e-14)
+        if expected.density is not None:
+            assert torch.allclose(found.density, expected.density, rtol=0, atol=1e-15)
+        if word == "density-transport":
+            assert found.density_rate.abs().max() == 0 and expected.density_rate is None
 
 
 @pytest.mark.mpi(1)
-def test_without_an_eddy_viscosity_none_is_evaluated(comm):
+def test_a_term_that_is_not_there_is_not_evaluated(comm):
     found = {}
-    for viscosity in ("none", "two-sided"):
-        step = particle_step(comm, viscosity=viscosity)
-        with counted((EddyViscosity, "forward")) as calls:
+    for name, terms in (("none", {"pairs": {}}), ("both", {"pairs": {}, "eddy-viscosity": {}})):
+        step = particle_step(comm, terms)
+        with counted((EddyViscosity, "pair_values"), (ResolvedVelocity, "of"), (Context, "without_mean")) as calls:
             step()
-        found[viscosity] = len(calls)
-    assert found["none"] == 0 < found["two-sided"]
+        found[name] = calls
+    assert found["none"] == [] and set(found["both"]) == {"pair_values"}
 
 
 @pytest.mark.mpi(1)
-def test_the_rates_of_a_given_density_have_no_flux(comm):
-    models = {closure: PairModel(SCALES, 1.0, 14, (8,), closure=closure) for closure in ("poisson", "paper-density")}
-    outputs = {closure: len(model.network.biases[-1]) for closure, model in models.items()}
-    assert outputs == {"poisson": 2, "paper-density": 3}
+def test_a_given_density_has_no_flux(comm):
+    names = {name for name, _ in model(PRESETS["poisson"]).named_parameters()}
+    assert names and all(name.startswith("terms.pairs.network") for name in names)
+    assert len(model(PRESETS["poisson"]).terms["pairs"].network.biases[-1]) == 2
 
 
 @pytest.mark.mpi(1, 2)

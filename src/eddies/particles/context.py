@@ -27,6 +27,7 @@ PAIR_VALUES_TOGETHER = {"cpu": 1 << 19, "cuda": 1 << 26}
 # Added to moment matrices and sums of weights, as a fraction of their values for evenly spread neighbours:
 # they stay invertible without neighbours or with coplanar ones, at a bias of a tenth of a percent elsewhere.
 REGULARISATION = 1e-3
+UNSEEN = 'no term of this model reads "pairs" or "resolved": add it to the `reads` of the settings'
 
 
 class Summand(Protocol):
@@ -76,11 +77,13 @@ class Context:
     def local(self) -> LocalParticles:
         """The particles that this rank sees, ghosts included, without columns."""
         if self._surroundings is None:
-            raise LookupError('no term of this model reads "pairs" or "resolved": add it to the settings\' `reads`')
+            raise LookupError(UNSEEN)
         return self._surroundings.local(self.particles)
 
     def column(self, name: str) -> Tensor:
         """"velocity" (s, 3) or "density" (s,) of the particles that this rank sees, owned first; collective."""
+        if self._surroundings is None:
+            raise LookupError(UNSEEN)
         if name not in self._columns:
             owned = self.density if name == "density" else getattr(self.particles, name)
             if owned is None:
@@ -107,8 +110,8 @@ class Context:
             self.sum_pairs([term], self.rows)
         return self._sums[term]
 
-    def forget_sums(self, term: Summand) -> None:
-        """Take a term's sums anew where they are asked for next, since its parameters are others."""
+    def forget_sums(self, term: object) -> None:
+        """Take a term's sums over pairs anew when they are asked for next: its parameters are others."""
         self._sums.pop(term, None)
 
     @cached_property
@@ -160,8 +163,8 @@ class Context:
         yield from self.blocks(max(summand.width for summand in summands))
 
     def blocks(self, width: int) -> Iterator[slice]:
-        """Consecutive particles whose pairs hold about as many numbers as fit the cache, `width` for each pair; at
-        least one block."""
+        """Consecutive particles whose pairs hold about as many numbers as fit the cache, `width` for each pair; at least
+        one block."""
         together = max(PAIR_VALUES_TOGETHER[self.particles.position.device.type] // width, 1)
         yield from self.local.neighbors.blocks(together)
 

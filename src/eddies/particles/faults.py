@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -13,11 +14,12 @@ from eddies.particles.periodic_box import PeriodicBox
 
 @dataclass(frozen=True)
 class Limits:
-    """Largest magnitudes a sound state can have: `speed`, and `density_deviation` from `density_mean`."""
+    """Largest magnitudes a sound state can have: `speed`, and `density_deviation` from `density_mean` where particles
+    have a density."""
 
     speed: float
-    density_mean: float
-    density_deviation: float
+    density_mean: float = 0.0
+    density_deviation: float = math.inf
 
 
 def find_fault(
@@ -26,12 +28,13 @@ def find_fault(
     """What is wrong with the first faulty particle of this rank, or None.
 
     Faulty are values that are not finite, and those beyond the limits. The description has the step, rank,
-    particle id, position, velocity, density if there is one, and the nearest other particle of this rank.
+    particle id, position, velocity, density, and the nearest other particle of this rank.
     """
     # Comparisons with NaN are false, so what is asked is whether a particle is sound.
     sound = torch.linalg.vector_norm(particles.velocity, dim=1) <= limits.speed
     sound &= torch.isfinite(particles.position).all(1)
     if particles.density is not None:
+        sound &= torch.isfinite(particles.density)
         sound &= (particles.density - limits.density_mean).abs() <= limits.density_deviation
     if bool(sound.all()):
         return None

@@ -145,6 +145,7 @@ class LagrangianModel(nn.Module):
         like = next(iter(parameters.values()), context.particles.position)
         origin = at(like.new_zeros(count))
         units = [at(unit) for unit in torch.eye(count, dtype=like.dtype, device=like.device)]
+        context.forget_sums(term)
         return LinearRates(origin, {name: torch.stack([getattr(unit, name) - getattr(origin, name) for unit in units])
                                     for name in _GIVEN if units and getattr(origin, name) is not None},
                            list(parameters.values()))

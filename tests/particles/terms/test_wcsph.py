@@ -1,43 +1,35 @@
 import numpy as np
 import pytest
 import torch
-from clouds import LENGTH, by_id, distributed, state
-from mpi4py import MPI
 
-from eddies.particles.dynamics import ParticleDynamics
+from eddies.particles.flow_units import FlowUnits
 from eddies.particles.integrators import VelocityVerlet
-from eddies.particles.neighbor_list import NeighborList
-from eddies.particles.particle_set import ParticleSet
-from eddies.particles.periodic_box import PeriodicBox
 from eddies.particles.smoothing_kernels import CubicSpline, WendlandC2
-from eddies.particles.surroundings import Surroundings
-from eddies.particles.wcsph import WCSPH, SummationDensity
+from tests.particles.clouds import (
+    LENGTH, SCALES, alone, by_id, distributed, dynamics_of, model, rates, scales_of, state,
+)
 
 SUPPORT, COUNT = 1.5, 200
-MASS = LENGTH**3 / COUNT
 TRUE = {"sound_speed": 10.0, "alpha": 1.0, "beta": 2.0, "exponent": 7.0}
-both_kernels = pytest.mark.parametrize("kernel", [CubicSpline(SUPPORT), WendlandC2(SUPPORT)],
-                                       ids=["cubic-spline", "wendland"])
+KERNELS = {"cubic-spline": CubicSpline, "wendland": WendlandC2}
+both_kernels = pytest.mark.parametrize("kernel", KERNELS)
 
 
-def sph(kernel, mass=MASS, **values):
-    return WCSPH(kernel, mass, 1.0, **{**TRUE, **values})
+def sph(kernel, spacing=LENGTH / COUNT ** (1 / 3), support=SUPPORT, sound_speed=TRUE["sound_speed"], **values):
+    """Summation density and forces; a particle has the mass of a cube of the spacing."""
+    flow = FlowUnits(scales_of(**{**SCALES.to_dict(), "spacing": spacing, "sound_speed": sound_speed,
+                                  "viscosity": 0.01}), support, 20.0)
+    forces = {name: TRUE[name] for name in ("alpha", "beta", "exponent")} | values
+    return model({"summation-density": dict(kernel=kernel), "wcsph": dict(kernel=kernel, **forces)}, flow)
 
 
-def dynamics_of(slab, kernel, mass=MASS, **values):
-    return ParticleDynamics(slab, LENGTH, [sph(kernel, mass, **values)], 0.0, SummationDensity(kernel, mass))
-
-
-def alone(position, velocity, density):
-    return distributed(MPI.COMM_SELF, position, velocity, density)
-
-
-def rates_alone(position, velocity, kernel, mass=MASS, **values):
+def rates_alone(position, velocity, kernel, **values):
     """Acceleration and summation density of particles on one rank."""
-    slab, particles = alone(position, velocity, torch.ones(len(position), dtype=torch.float64))
-    order = torch.argsort(particles.id)
-    rates = dynamics_of(slab, kernel, mass, **values).rates(particles)
-    return rates["velocity"][order].detach(), rates["closure_density"][order].detach()
+    found = rates(sph(kernel, **values), position, velocity)
+    return found.acceleration.detach(), found.density.detach()
+
+
+MASS = LENGTH**3 / COUNT
 
 
 def internal_energy(density, c, gamma):
@@ -50,9 +42,9 @@ def internal_energy(density, c, gamma):
 def test_density_of_a_particle_alone_and_of_a_lattice(comm, kernel):
     single = torch.zeros(1, 3, dtype=torch.float64)
     density = rates_alone(single, single, kernel)[1]
-    assert float(density) == pytest.approx(MASS * float(kernel.value(torch.zeros(()))))
+    assert float(density) == pytest.approx(MASS * float(KERNELS[kernel](SUPPORT).value(torch.zeros(()))))
     points = torch.as_tensor(np.argwhere(np.ones((10, 10, 10))) * (LENGTH / 10))
-    acceleration, density = rates_alone(points, torch.zeros_like(points), kernel, mass=(LENGTH / 10) ** 3)
+    acceleration, density = rates_alone(points, torch.zeros_like(points), kernel, spacing=LENGTH / 10)
     # The kernel's integral by the points of the lattice, 57 of them within the support.
     assert density.numpy() == pytest.approx(1, abs=0.02)
     assert np.ptp(density.numpy()) < 1e-12 and acceleration.abs().max() < 1e-9
@@ -66,11 +58,7 @@ def test_pressure_is_the_gradient_of_the_internal_energy(comm, kernel):
     c, gamma = 3.0, 2.5
     acceleration, _ = rates_alone(position, velocity, kernel, sound_speed=c, alpha=0.0, beta=0.0, exponent=gamma)
     moved = position.clone().requires_grad_(True)
-    particles = ParticleSet(torch.arange(COUNT), moved, velocity, torch.ones(COUNT, dtype=torch.float64))
-    slab = distributed(MPI.COMM_SELF, *state(COUNT))[0]
-    surroundings = Surroundings(slab, LENGTH, SUPPORT, SUPPORT, 0.0)
-    surroundings.update(particles)
-    density = SummationDensity(kernel, MASS).fields(particles, surroundings.local(particles, set()))["density"]
+    density = rates(sph(kernel), moved, velocity).density
     (gradient,) = torch.autograd.grad(internal_energy(density, c, gamma).sum(), moved)
     assert (acceleration + gradient).abs().max() < 1e-11 * acceleration.abs().max()
 
@@ -80,7 +68,7 @@ def test_pressure_is_the_gradient_of_the_internal_energy(comm, kernel):
 def test_momentum_is_kept_and_ranks_do_not_matter(comm, kernel):
     position, velocity, density = state(COUNT)
     slab, particles = distributed(comm, position, velocity, density)
-    acceleration = by_id(comm, particles, dynamics_of(slab, kernel).rates(particles)["velocity"], COUNT)
+    acceleration = by_id(comm, particles, dynamics_of(slab, sph(kernel)).rates(particles).acceleration, COUNT)
     size = acceleration.abs().max()
     assert acceleration.sum(0).abs().max() < 1e-11 * size
     if comm.rank == 0:
@@ -90,15 +78,9 @@ def test_momentum_is_kept_and_ranks_do_not_matter(comm, kernel):
 
 @pytest.mark.mpi(1)
 def test_viscosity_acts_on_approaching_pairs_alone_and_takes_energy(comm):
-    kernel = CubicSpline(SUPPORT)
-    position, velocity, density = state(COUNT)
-    listed = NeighborList(PeriodicBox(LENGTH), SUPPORT, 0.0)
-    listed.build(position, position, exclude_self=True)
-    pairs = listed.pairs(position, position)
-    term = sph(kernel, alpha=1.0, beta=2.0)
-    pressure = sph(kernel, alpha=0.0, beta=0.0)
-    columns = {"velocity": velocity, "density": density}
-    viscous = (term(pairs, columns)["velocity"] - pressure(pairs, columns)["velocity"]).detach()
+    kernel = "cubic-spline"
+    position, velocity, _ = state(COUNT)
+    viscous = rates_alone(position, velocity, kernel)[0] - rates_alone(position, velocity, kernel, alpha=0.0, beta=0.0)[0]
     assert float((viscous * velocity).sum()) < 0
     # A pair that moves along its line, at a distance r: the closed form of Monaghan's term, or nothing.
     r, c, h = 0.4, TRUE["sound_speed"], SUPPORT / 2
@@ -109,7 +91,7 @@ def test_viscosity_acts_on_approaching_pairs_alone_and_takes_energy(comm):
         resting, density = rates_alone(two, torch.zeros_like(two), kernel)
         mu = min(h * r * speed / (r**2 + 0.01 * h**2), 0)
         expected = (-c * mu + 2 * mu**2) / float(density[0])
-        slope = float(kernel.derivative(torch.tensor(r, dtype=torch.float64)))
+        slope = float(KERNELS[kernel](SUPPORT).derivative(torch.tensor(r, dtype=torch.float64)))
         assert float((moving - resting)[1, 0]) == pytest.approx(-MASS * expected * slope, rel=1e-12, abs=1e-12)
 
 
@@ -117,19 +99,19 @@ def test_viscosity_acts_on_approaching_pairs_alone_and_takes_energy(comm):
 @pytest.mark.parametrize("distance", [0.0, 1e-300, 1e-16, 1e-8])
 def test_coincident_particles_do_not_push_each_other(comm, distance):
     position = torch.tensor([[1.0, 1, 1], [1.0 + distance, 1, 1], [1.5, 1, 1]], dtype=torch.float64)
-    acceleration, density = rates_alone(position, torch.zeros_like(position), CubicSpline(SUPPORT))
+    acceleration, density = rates_alone(position, torch.zeros_like(position), "cubic-spline")
     assert torch.isfinite(acceleration).all() and torch.isfinite(density).all()
     assert (acceleration[0] - acceleration[1]).abs().max() < 1e-6 * acceleration[2].abs().max()
 
 
-def relaxed_states(kernel, mass, side, step, count):
+def relaxed_states(terms, side, step, count):
     """States along a WCSPH run with the true parameters, from a jittered lattice with a vigorous large-scale motion."""
     random = np.random.default_rng(2)
     cell = LENGTH / side
     position = torch.as_tensor((np.argwhere(np.ones((side,) * 3)) + random.uniform(0.3, 0.7, (side**3, 3))) * cell)
     velocity = 3 * torch.sin(position[:, [1, 2, 0]]) + torch.as_tensor(random.normal(0, 0.5, position.shape))
-    slab, particles = alone(position, velocity, torch.ones(len(position), dtype=torch.float64))
-    integrator = VelocityVerlet(dynamics_of(slab, kernel, mass))
+    slab, particles = alone(position, velocity)
+    integrator = VelocityVerlet(dynamics_of(slab, terms, 0.0))
     states = [particles]
     with torch.no_grad():
         for _ in range(count):
@@ -146,10 +128,10 @@ def in_order(particles):
 def test_parameters_are_recovered_from_trajectories(comm):
     """Trained through steps of the integrator, from values far off, the form finds those that made the trajectories."""
     side, step, together = 5, 0.01, 2
-    mass, kernel = (LENGTH / side) ** 3, CubicSpline(2.3)
-    slab, states = relaxed_states(kernel, mass, side, step, 18)
-    dynamics = dynamics_of(slab, kernel, mass, sound_speed=5.0, alpha=0.3, beta=0.5, exponent=3.0)
-    (term,) = dynamics.pair_terms
+    scales = dict(spacing=LENGTH / side, support=2.3)
+    slab, states = relaxed_states(sph("cubic-spline", **scales), side, step, 18)
+    learned = sph("cubic-spline", **scales, sound_speed=5.0, alpha=0.3, beta=0.5, exponent=3.0)
+    dynamics, term = dynamics_of(slab, learned, 0.0), learned.terms["wcsph"]
     optimiser = torch.optim.LBFGS(term.parameters(), max_iter=25, tolerance_change=0, line_search_fn="strong_wolfe")
 
     def loss():

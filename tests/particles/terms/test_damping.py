@@ -1,0 +1,102 @@
+"""Spectral damping, viscosity and relaxation of a resolved velocity of few modes."""
+
+import pytest
+import torch
+from mpi4py import MPI
+
+from eddies.parallel.slab import SlabDecomposition
+from eddies.particles.flow_units import FlowUnits
+from eddies.particles.fourier_grid import FourierGrid
+from eddies.particles.particle_set import ParticleSet
+from eddies.particles.resolved_velocity import ResolvedFlow
+from eddies.particles.terms.damping import RATES
+from tests.particles.clouds import CUTOFF, LENGTH, NEIGHBORS, SCALES, dynamics_of, model, scales_of
+
+pytestmark = pytest.mark.mpi(1)
+RESOLVED, CELLS = 6, 18
+
+
+class Known:
+    """In place of what resolves the particles' velocity: modes that are there."""
+
+    reach = LENGTH / CELLS
+
+    def __init__(self, *fields):
+        slab = SlabDecomposition(MPI.COMM_SELF, LENGTH, CELLS)
+        self.grid = FourierGrid(slab, RESOLVED)
+        x, y, z = map(torch.from_numpy, self.grid.spectral.coordinates())
+        shape = self.grid.spectral.physical_shape
+        self.modes = self.grid.to_modes(torch.stack([each.expand(shape) for each in fields[0](x, y, z)]))
+
+    def of(self, particles, local):
+        return ResolvedFlow(self.grid, self.modes, particles.position, particles.velocity)
+
+
+@torch.no_grad()
+def evaluated(lagrangian, field, position, velocity):
+    """Rates of particles on the points of the grid, where splines are exact."""
+    dynamics = dynamics_of(SlabDecomposition(MPI.COMM_SELF, LENGTH, CELLS), lagrangian, 0.1)
+    dynamics.resolution = Known(field)
+    return dynamics.rates(ParticleSet(torch.arange(len(position)), position, velocity))
+
+
+def acceleration(lagrangian, field, position, velocity):
+    return evaluated(lagrangian, field, position, velocity).acceleration
+
+
+def lattice():
+    axis = torch.arange(CELLS, dtype=torch.float64) * (LENGTH / CELLS)
+    return torch.cartesian_prod(axis, axis, axis)
+
+
+def waves(x, y, z):
+    """Wavenumber 2 in the first component, 5 = |(0, 3, 4)| in the second, the smallest in the third."""
+    return torch.sin(2 * y), torch.cos(3 * x) * torch.cos(4 * z), torch.cos(y)
+
+
+def test_each_mode_is_damped_at_the_rate_of_its_wavenumber():
+    """Of the six rates, one for each wavenumber here."""
+    lagrangian = model(damping={})
+    with torch.no_grad():
+        lagrangian.terms["damping"].rates.copy_(torch.tensor([0.3, 1.1, 0.0, 0.0, 0.7, 0.0]))
+    position = lattice()
+    force = acceleration(lagrangian, waves, position, torch.zeros_like(position))
+    unit = SCALES.velocity / SCALES.length
+    for component, (wave, rate) in enumerate(zip(waves(*position.T), (1.1, 0.7, 0.3))):
+        assert torch.allclose(force[:, component], -unit * rate * wave, atol=1e-12)
+
+
+def test_between_the_wavenumbers_of_two_rates_damping_is_linear():
+    lagrangian = model(damping={})
+    position = lattice()
+
+    def wave(x, y, z):  # |k| = sqrt(5)
+        return torch.zeros_like(x), torch.zeros_like(x), torch.cos(x) * torch.sin(2 * y)
+
+    force = acceleration(lagrangian, wave, position, torch.zeros_like(position))
+    share = 5**0.5 - 2
+    rate = float((1 - share) * RATES[1] + share * RATES[2]) * SCALES.velocity / SCALES.length
+    assert torch.allclose(force[:, 2], -rate * wave(*position.T)[2], atol=1e-12)
+
+
+@pytest.mark.skipif(not hasattr(SCALES, "viscosity"), reason="the viscosity is no reference scale yet")
+def test_viscosity_damps_with_the_square_of_the_wavenumber():
+    nu = 0.07
+    flow = FlowUnits(scales_of(**{**SCALES.to_dict(), "viscosity": nu}), CUTOFF, NEIGHBORS)
+    position = lattice()
+    force = acceleration(model(viscosity={}, flow=flow), waves, position, torch.zeros_like(position))
+    for component, (wave, squared) in enumerate(zip(waves(*position.T), (4, 25, 1))):
+        assert torch.allclose(force[:, component], -nu * squared * wave, atol=1e-12)
+
+
+def test_relaxation_takes_what_is_not_resolved_and_keeps_the_momentum():
+    position = lattice()
+    resolved = torch.stack(waves(*position.T), dim=1)
+    missing = 0.1 * torch.randn(position.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) + 0.3
+    lagrangian = model(relaxation={})
+    with torch.no_grad():
+        lagrangian.terms["relaxation"].factor.fill_(1.5)
+    force = acceleration(lagrangian, waves, position, resolved + missing)
+    rate = 1.5 * 2 * SCALES.velocity / SCALES.length
+    assert torch.allclose(force, -rate * (missing - missing.mean(0)), atol=1e-12)
+    assert force.sum(0).abs().max() < 1e-12 * force.abs().sum()

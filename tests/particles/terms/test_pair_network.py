@@ -1,0 +1,250 @@
+"""What holds for every model of pairs, and the learned force of Eqs. 3 and 4."""
+
+import pytest
+import torch
+
+from eddies.particles import moments
+from eddies.particles.flow_units import FlowUnits
+from eddies.scene_values import SceneError
+from tests.particles.clouds import (
+    CUTOFF, FLOW, LENGTH, NEIGHBORS, PAIR_MODELS, SCALES, along, cloud, given, model, rates, scaled_pairs, scales_of,
+    state,
+)
+
+pytestmark = pytest.mark.mpi(1)
+SPH = {"summation": {"summation-density": {}, "wcsph": dict(exponent=7.0)}}
+every_model = pytest.mark.parametrize("terms", [*PAIR_MODELS.values(), *SPH.values()], ids=[*PAIR_MODELS, *SPH])
+
+
+def assert_same(actual, expected, tolerance=1e-10):
+    actual, expected = (each if isinstance(each, dict) else given(each) for each in (actual, expected))
+    assert actual.keys() == expected.keys()
+    for name in expected:
+        assert torch.allclose(actual[name], expected[name], rtol=0, atol=tolerance * max(
+            1.0, float(expected[name].detach().abs().max()))), name
+
+
+def rotation(seed=1):
+    matrix, _ = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64, generator=torch.manual_seed(seed)))
+    return matrix * torch.sign(torch.det(matrix))
+
+
+@every_model
+def test_translation_boost_and_period_change_nothing(terms):
+    force, (position, velocity, density) = model(terms), state()
+    expected = rates(force, position, velocity, density)
+    shift = torch.tensor([1.1, -2.3, 0.7], dtype=torch.float64)
+    assert_same(rates(force, (position + shift) % LENGTH, velocity + 5 * shift, density), expected)
+    periods = LENGTH * torch.randint(-2, 3, (200, 3), generator=torch.manual_seed(1)).double()
+    assert_same(rates(force, position + periods, velocity, density), expected)
+
+
+@every_model
+def test_rates_turn_with_the_particles(terms):
+    # Far from the faces, so that the box has no say.
+    force, (position, velocity, density) = model(terms), state(60)
+    position, turn = LENGTH / 2 + 0.3 * (position - LENGTH / 2), rotation()
+    expected = given(rates(force, position, velocity, density))
+    turned = rates(force, LENGTH / 2 + (position - LENGTH / 2) @ turn.T, velocity @ turn.T, density)
+    assert_same(turned, {**expected, "acceleration": expected["acceleration"] @ turn.T})
+    assert expected["acceleration"].norm() > 1
+
+
+@every_model
+def test_order_of_particles_does_not_matter(terms):
+    force, particles = model(terms), state()
+    order = torch.randperm(200, generator=torch.manual_seed(1))
+    expected = {name: rate[order] for name, rate in given(rates(force, *particles)).items()}
+    assert_same(rates(force, *(column[order] for column in particles)), expected)
+
+
+@every_model
+def test_neighbours_fade_out_at_the_cutoff(terms):
+    force, (position, velocity, density) = model(terms), state(3)
+    position = torch.full((3, 3), 1.0, dtype=torch.float64)
+    position[1, 0] += 0.4
+    alone = given(rates(force, position[:2], velocity[:2], density[:2]))
+    # Beyond the cutoff: matrix products of another width round otherwise.
+    for distance, most in ((1.0001, 1e-14), (0.99999, 1e-6), (0.7, torch.inf)):
+        position[2, 0] = 1.0 - CUTOFF * distance
+        with_third = given(rates(force, position, velocity, density))
+        for name, expected in alone.items():
+            assert (with_third[name][:2] - expected).abs().max() <= most * max(1.0, float(expected.detach().abs().max()))
+
+
+DEGENERATE = {
+    "coincident": lambda: (cloud("coincident", 5), *state(5)[1:]),
+    "equal velocities": lambda: (cloud(count=50), torch.ones(50, 3, dtype=torch.float64), state(50)[2]),
+    "equal densities": lambda: (*state(50)[:2], torch.ones(50, dtype=torch.float64)),
+    "alone": lambda: state(1),
+    "a pair": lambda: (torch.tensor([[1.0, 1, 1], [1.2, 1, 1]], dtype=torch.float64), *state(2)[1:]),
+    "coplanar": lambda: (cloud(count=30) * torch.tensor([1, 1, 0]), *state(30)[1:]),
+    "all the same": lambda: tuple(column[:1].expand(4, *column.shape[1:]).clone() for column in state(4)),
+}
+
+
+@every_model
+def test_degenerate_states_have_finite_rates_and_gradients(terms):
+    for case, make in DEGENERATE.items():
+        force = model(terms)
+        particles = [column.clone().requires_grad_() for column in make()]
+        result = given(rates(force, *particles))
+        sum((rate**2).sum() for rate in result.values()).backward()
+        assert all(torch.isfinite(rate).all() for rate in result.values()), case
+        gradients = [tensor.grad for tensor in (*particles, *force.parameters())]
+        assert all(gradient is None or torch.isfinite(gradient).all() for gradient in gradients), case
+        if case == "alone":
+            assert all((rate == 0).all() for name, rate in result.items() if name != "density")
+
+
+@every_model
+def test_gradient_against_finite_differences(terms):
+    force, particles = model(terms), [column.requires_grad_() for column in state(12)]
+    parameters, inputs = dict(force.named_parameters()), [*particles, *force.parameters()]
+
+    def total(position, velocity, density, *values):
+        with_them = torch.func.functional_call(_RatesOf(force), {f"force.{name}": value for name, value in
+                                                                 zip(parameters, values)},
+                                               (position, velocity, density))
+        return sum((rate**2).sum() for rate in given(with_them).values())
+
+    generator = torch.manual_seed(6)
+    direction = [torch.randn(x.shape, dtype=x.dtype, generator=generator) for x in inputs]
+    direction[2] = direction[2] * SCALES.density
+    gradients = torch.autograd.grad(total(*inputs), inputs, materialize_grads=True)
+    expected = sum((gradient * d).sum() for gradient, d in zip(gradients, direction)).item()
+    assert along(total, inputs, direction, 1e-5).item() == pytest.approx(expected, rel=1e-6)
+
+
+class _RatesOf(torch.nn.Module):
+    def __init__(self, force):
+        super().__init__()
+        self.force = force
+
+    def forward(self, *columns):
+        return rates(self.force, *columns)
+
+
+def test_only_what_terms_give_is_there():
+    particles = state()
+    assert set(given(rates(model(pairs={}), *particles))) == {"acceleration"}
+    assert set(given(rates(model(PAIR_MODELS["corrected"]), *particles))) == {"acceleration", "density_rate"}
+    names = {name.split(".")[:3][-1] for name, _ in model(pairs=dict(basis="paper")).named_parameters()}
+    assert names == {"network"}
+
+
+def test_corrected_push_of_a_linear_profile_is_its_gradient():
+    """With NN_1 replaced by a linear function of place, M^-1 sum w NN_1 x is that function's gradient."""
+    x = torch.randn(3, 40, dtype=torch.float64, generator=torch.manual_seed(2))
+    w = torch.rand(40, dtype=torch.float64)
+    slope = torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64)
+    moment = torch.stack(moments.products(w * x, x)).sum(1, keepdim=True)
+    push = (w * (slope @ x) * x).sum(1, keepdim=True)
+    assert torch.allclose(moments.apply_symmetric(moments.invert_symmetric(moment), push)[:, 0], slope)
+
+
+class Constant(torch.nn.Module):
+    """NN_1 and NN_2 that are always the same."""
+
+    def __init__(self, along_x, along_v):
+        super().__init__()
+        self.values = torch.tensor([along_x, along_v], dtype=torch.float64)
+
+    def forward(self, features):
+        return self.values[:, None].expand(2, features.shape[1])
+
+
+@pytest.mark.parametrize("basis", ["paper", "corrected"])
+def test_the_sums_of_equation_3_over_one_neighbour(basis):
+    """With constant NN: a_rms/n w (2 x + 3 v), or a_rms (2 M^-1 w x + 3 w v / W) with M and W of one neighbour and the
+    small part that keeps them invertible."""
+    force = model(pairs=dict(basis=basis))
+    force.terms["pairs"].network = Constant(2.0, 3.0)
+    position = torch.tensor([[1.0, 1, 1], [1.5, 1, 1]], dtype=torch.float64)
+    velocity = torch.tensor([[0.0, 0, 0], [0.2, 0.7, 0]], dtype=torch.float64)
+    found = rates(force, position, velocity, torch.ones(2, dtype=torch.float64)).acceleration[0]
+    w = (1 - (0.5 / CUTOFF) ** 2) ** 2
+    x = torch.tensor([-0.5, 0, 0], dtype=torch.float64) / SCALES.length
+    v = -velocity[1] / SCALES.velocity
+    if basis == "paper":
+        expected = w * (2 * x + 3 * v) / NEIGHBORS
+    else:
+        # Sums over n evenly spread neighbours: 8/35 n of w, and 8/315 n h^2 of w x x^T.
+        matrix = w * torch.outer(x, x) + 1e-3 * 8 / 315 * NEIGHBORS * (CUTOFF / SCALES.length) ** 2 * torch.eye(3)
+        expected = torch.linalg.solve(matrix, 2 * w * x) + 3 * w * v / (w + 1e-3 * 8 / 35 * NEIGHBORS)
+    assert torch.allclose(found, SCALES.acceleration * expected, rtol=1e-12)
+
+
+def test_forces_scale_with_the_units_of_the_flow():
+    """The same network in a flow twice as large, three times as fast: accelerations in units of a_rms."""
+    position, velocity, density = state()
+    small = position / 2 + 1.0  # far from the faces
+    half = FlowUnits(scales_of(**{**SCALES.to_dict(), "length": SCALES.length / 2, "velocity": 3 * SCALES.velocity,
+                                  "acceleration": 5.0, "viscosity": 0.01}), CUTOFF / 2, NEIGHBORS)
+    inside = ((position > CUTOFF) & (position < LENGTH - CUTOFF)).all(1)
+    first = rates(model(pairs={}), position, velocity, density).acceleration[inside] / SCALES.acceleration
+    second = rates(model(pairs={}, flow=half), small, 3 * velocity, density).acceleration[inside] / 5.0
+    assert inside.sum() > 10 and torch.allclose(first, second, atol=1e-11)
+
+
+def test_single_precision_agrees_with_double():
+    particles = state()
+    double = rates(model(pairs={}), *particles).acceleration
+    single = rates(model(pairs={}).float(), *particles, dtype=torch.float32).acceleration
+    assert 0 < (single - double).norm() < 1e-5 * double.norm()
+
+
+ANTISYMMETRIC = PAIR_MODELS["antisymmetric"]
+
+
+def test_antisymmetric_forces_of_a_pair_are_opposite_to_the_last_bit():
+    force = model(ANTISYMMETRIC)
+    alike = model({**ANTISYMMETRIC, "pairs": dict(basis="paper")})
+    for seed in range(5):
+        position, velocity, density = state(2, seed)
+        position[1] = position[0] + 0.5 * torch.randn(3, dtype=torch.float64, generator=torch.manual_seed(seed))
+        first, second = rates(force, position, velocity, density).acceleration
+        assert torch.equal(first, -second) and first.norm() > 1e-3
+        first, second = rates(alike, position, velocity, density).acceleration
+        assert (first + second).norm() > 1e-6
+
+
+@pytest.mark.parametrize("name", ["antisymmetric", "corrected", "summation"])
+def test_one_evaluation_of_a_pair_serves_both_particles(name):
+    """All pairs in both orders, and each pair once with its values times their parity for the other one."""
+    terms = model((PAIR_MODELS | SPH)[name]).terms.values()
+    mutual = [term for term in terms if getattr(term, "mutual", False)]
+    assert mutual
+    both, once = (scaled_pairs(*state(), once=each) for each in (False, True))
+    assert 2 * len(once.pairs.sender) == len(both.pairs.sender)
+    for term in mutual:
+        sums = torch.zeros(len(term.parity), 200, dtype=torch.float64)
+        once.pairs.add_to_both(term.pair_values(once), term.parity.double(), sums)
+        expected = both.pairs.sum(term.pair_values(both).T).T
+        assert torch.allclose(sums, expected, rtol=0, atol=1e-12 * float(expected.detach().abs().max()))
+
+
+def test_opposite_forces_do_not_go_with_moment_matrices():
+    with pytest.raises(SceneError, match='basis = "corrected"'):
+        model(pairs=dict(symmetry="antisymmetric"))
+
+
+@pytest.mark.parametrize("choice, value", [("basis", "other"), ("symmetry", "other"), ("network", "other"),
+                                           ("inputs", ("place",)), ("hidden", ())])
+def test_unknown_choices_are_refused(choice, value):
+    with pytest.raises(SceneError, match=choice):
+        model(pairs={choice: value})
+
+
+def test_what_the_network_is_told():
+    pairs = scaled_pairs(*state())
+    own, other = pairs.densities
+    everything = pairs.invariants(("density", "distance", "speed", "approach"), symmetric=False)
+    x, v = (each.T for each in (pairs.x, pairs.v))
+    expected = [own, other, x.norm(dim=1), v.norm(dim=1), (x * v).sum(1)]
+    assert torch.allclose(everything, torch.stack(expected), atol=1e-14)
+    listed = pairs.pairs
+    assert torch.allclose(x, listed.displacement / FLOW.scales.length)
+    # In the order of the list, however they are named.
+    assert torch.equal(pairs.invariants(("approach", "distance"), False), everything[[2, 4]])
+    assert torch.allclose(pairs.invariants(("density",), True), torch.stack([own + other, (own - other) ** 2]))

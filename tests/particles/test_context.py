@@ -1,0 +1,126 @@
+"""What terms ask for is built at first use and shared; what none asks for is not built."""
+
+from dataclasses import dataclass
+
+import pytest
+import torch
+
+from eddies.particles import context as context_module
+from eddies.particles import moments
+from eddies.particles.neighbor_list import NeighborList
+from eddies.particles.rates import Rates
+from eddies.particles.resolved_velocity import ResolvedVelocity
+from eddies.particles.terms.settings import TermSettings
+from eddies.particles.terms.term import Term
+from tests.particles.clouds import (
+    CUTOFF, MODELS, NEIGHBORS, SCALES, ReadsNothing, alone, distributed, dynamics_of, model, of_terms, state,
+)
+
+
+class Counted:
+    """Counts calls of methods of a class while a test runs."""
+
+    def __init__(self, monkeypatch, owner, *names):
+        self.calls = {name: 0 for name in names}
+        for name in names:
+            monkeypatch.setattr(owner, name, self._counting(name, getattr(owner, name)))
+
+    def _counting(self, name, method):
+        def counted(*arguments, **named):
+            self.calls[name] += 1
+            return method(*arguments, **named)
+
+        return counted
+
+
+@pytest.mark.mpi(1, 2)
+def test_terms_share_pairs_columns_and_the_resolved_velocity(comm, monkeypatch):
+    slab, particles = distributed(comm, *state())
+    terms = {**MODELS["poisson-stress"], "eddy-viscosity": {}, "density-flux": {}}
+    dynamics = dynamics_of(slab, model(terms))
+    dynamics.rates(particles)
+    pairs = Counted(monkeypatch, NeighborList, "pairs")
+    resolved = Counted(monkeypatch, ResolvedVelocity, "of")
+    with torch.no_grad():
+        dynamics.rates(particles, torch.arange(3))
+    # Particles around grid points; pairs before the density is known, and after.
+    assert resolved.calls["of"] == 1 and pairs.calls["pairs"] == 3
+
+
+@pytest.mark.mpi(1, 2)
+def test_a_model_without_pairs_lists_none_and_sees_as_far_as_its_averages(comm):
+    slab, particles = distributed(comm, *state())
+    dynamics = dynamics_of(slab, model(MODELS["resolved"]))
+    dynamics.rates(particles)
+    assert dynamics.surroundings.neighbors is None
+    assert dynamics.surroundings.halo_cutoff == dynamics.resolution.reach < CUTOFF
+    both = dynamics_of(slab, model(MODELS["poisson-stress"]))
+    assert both.surroundings.halo_cutoff == CUTOFF
+
+
+class Asking(Term):
+    """Asks for what it does not declare."""
+
+    Settings = ReadsNothing
+
+    def __init__(self, name, settings=None):
+        super().__init__(settings or ReadsNothing(), of_terms().flow)
+        self.name = name
+
+    def forward(self, context):
+        if self.name == "resolved":
+            return Rates(acceleration=context.resolved.missing())
+        return Rates(acceleration=context.local.position if self.name == "pairs" else context.column(self.name))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadsPairs(TermSettings):
+    """Settings of a term that reads pairs, but no density."""
+
+    reads = ("pairs",)
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("name, settings, wanted", [
+    ("pairs", None, '"pairs" or "resolved"'), ("velocity", None, '"pairs" or "resolved"'), ("resolved", None, '"resolved"'),
+    ("density", ReadsPairs(), '"density"'), ("resolved", ReadsPairs(), '"resolved"')])
+def test_what_a_term_does_not_declare_it_is_told_to(comm, name, settings, wanted):
+    slab, particles = alone(*state()[:2])
+    with pytest.raises(LookupError, match=f"no term of this model reads {wanted}: add it to the `reads`"):
+        dynamics_of(slab, of_terms(Asking(name, settings))).rates(particles)
+
+
+@pytest.mark.mpi(1, 2)
+def test_the_mean_over_all_particles_of_all_ranks_is_taken_off(comm):
+    slab, particles = distributed(comm, *state(kind="void"))
+    context = dynamics_of(slab, model()).context(particles)
+    rows = particles.position * torch.tensor([1.0, 2.0, 3.0])
+    everything = state(kind="void")[0] * torch.tensor([1.0, 2.0, 3.0])
+    assert torch.allclose(context.without_mean(rows), rows - everything.mean(0), atol=1e-12)
+
+
+@pytest.mark.mpi(1)
+def test_moments_of_evenly_spread_neighbours_are_the_expected_ones(comm):
+    """On a fine lattice: 8/315 n h^2 on the diagonal and 8/35 n, with a thousandth more."""
+    side = 16
+    axis = torch.arange(side, dtype=torch.float64) * (2 * torch.pi / side)
+    position = torch.cartesian_prod(axis, axis, axis)
+    slab, particles = alone(position, torch.zeros_like(position))
+    around = dynamics_of(slab, model(pairs={}, eddy_viscosity={})).context(particles).moments
+    found = (4 / 3 * torch.pi * CUTOFF**3) / (2 * torch.pi / side) ** 3  # neighbours that there are, not the NEIGHBORS
+    weight = around.weight - 1e-3 * moments.expected_weight(NEIGHBORS)
+    assert torch.allclose(weight, torch.tensor(found * 8 / 35 - 1).double(), rtol=2e-2)
+    diagonal = torch.tensor([1.0, 0, 0, 1, 0, 1], dtype=torch.float64)[:, None]
+    expected = moments.expected_moment(found, CUTOFF / SCALES.length)
+    small = 1e-3 * moments.expected_moment(NEIGHBORS, CUTOFF / SCALES.length)
+    assert torch.allclose(around.inverse * (expected + small), diagonal.expand_as(around.inverse), atol=2e-2)
+
+
+@pytest.mark.mpi(1)
+def test_pairs_are_taken_in_blocks_that_fit_the_cache(comm, monkeypatch):
+    slab, particles = distributed(comm, *state())
+    monkeypatch.setitem(context_module.PAIR_VALUES_TOGETHER, "cpu", 400)
+    context = dynamics_of(slab, model(pairs={})).context(particles)
+    sizes = [len(pairs.distance) for pairs in context.scaled_pairs(8)]
+    assert len(sizes) > 10 and max(sizes) <= 400 / 8 + 60  # at least a particle's neighbours
+    assert sum(sizes) == sum(len(pairs.distance) for pairs in context.scaled_pairs(1))
