@@ -1,6 +1,8 @@
 """Loads the MPI plugin: mark a test with `@pytest.mark.mpi(1, 2)` and ask for the fixture `comm`."""
 
+import importlib
 import logging
+import sys
 
 import pytest
 
@@ -15,3 +17,22 @@ def logger_as_before():
     yield
     logger.handlers, logger.propagate = handlers, propagate
     logger.setLevel(level)
+
+
+@pytest.fixture
+def own(tmp_path, monkeypatch):
+    """A function that writes a module of a user's, NAME and text, into tmp_path, where modules are found as long as the
+    test lasts."""
+    monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path)])
+    written = []
+
+    def write(name, text):
+        path = tmp_path / f"{name}.py"
+        path.write_text(text)
+        importlib.invalidate_caches()
+        written.append(name)
+        return path
+
+    yield write
+    for name in written:
+        sys.modules.pop(name, None)

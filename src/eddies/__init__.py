@@ -1,3 +1,32 @@
 """Lagrangian large-eddy simulation of turbulence, learned from direct numerical simulation, on MPI."""
 
+from importlib import import_module
+from typing import Any
+
 __version__ = "0.2.0"
+
+# What a program uses, by the module that it comes from. Each is imported when it is first asked for: a program that
+# reads a scene starts neither MPI nor torch.
+_HOMES = {
+    "eddies.api": ("check", "run", "simulate", "train"),
+    "eddies.scene": ("Scene", "SceneError", "load_scene", "Eulerian", "Flow", "Forcing", "Initial", "Kernel", "Model",
+                     "Simulation", "SpinUp", "Time", "Tracers", "Training", "Wcsph"),
+    "eddies.scene_values": ("boolean", "choice", "integer", "integers", "named", "number", "text", "texts"),
+    "eddies.particles.terms.settings": ("TermSettings",),
+    "eddies.particles.terms.term": ("PairTerm", "Term"),
+    "eddies.particles.rates": ("Rates",),
+    "eddies.particles.model": ("LagrangianModel",),
+}
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
+__all__ = [*_HOME_OF]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME_OF:
+        raise AttributeError(f"module 'eddies' has no attribute '{name}'")
+    value = globals()[name] = getattr(import_module(_HOME_OF[name]), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_HOME_OF})

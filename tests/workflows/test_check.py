@@ -152,6 +152,41 @@ def test_ranks_are_not_limited_by_horizons_that_are_not_trained():
         assert min(most_ranks(scene).values()) == 8 and not any("horizons" in reason for reason in most_ranks(scene))
 
 
+def test_what_no_term_reads_limits_no_ranks():
+    from eddies.workflows.check import cost_lines, warnings
+    from eddies.workflows.cost_model import Speed
+    from eddies.workflows.estimates import most_ranks
+    fast, speed = ["training.horizon_steps=5", "training.horizons=[12]"], Speed(1e-6, 1e9)
+    limits = {preset: most_ranks(load_scene("tiny", [*fast, f"model.preset={preset}"]))
+              for preset in ("poisson-stress", "resolved", "learned-density")}
+    found = {preset: {word for word in ("reach", "resolved") if any(word in reason for reason in reasons)}
+             for preset, reasons in limits.items()}
+    assert found["resolved"] == {"resolved"} and "resolved" not in found["learned-density"]
+    assert "reach" in found["learned-density"] and {"reach", "resolved"} <= found["poisson-stress"]
+    tables = {preset: next(line for line in cost_lines(load_scene("tiny", [f"model.preset={preset}"]), speed)
+                           if line.startswith("ranks")) for preset in limits}
+    assert [("pair force" in table) for table in tables.values()] == [True, False, True]
+    told = {preset: [line for line in warnings(load_scene("tiny", [f"model.preset={preset}"]), 1) if "horizons" in line]
+            for preset in limits}
+    assert told == {"poisson-stress": [], "resolved": [], "learned-density": [
+        '[model] terms: "density-transport" is trained through horizons alone, and stays as it starts without them: set '
+        "[training] horizon_steps"]}
+
+
+def test_memory_of_pairs_is_that_of_the_widest_network():
+    from eddies.workflows.cost_model import pair_bytes
+    sizes = [pair_bytes(load_scene("tiny", ["model.preset=paper-density", f"model.{term}.hidden=[{width}]"]), 1)
+             for term, width in (("pairs", 4), ("density-flux", 4), ("pairs", 200), ("density-flux", 200))]
+    assert sizes[0] == sizes[1] < sizes[2] == sizes[3]
+
+
+@pytest.mark.mpi(1)
+def test_check_of_a_start_of_the_users(comm, own, caplog, recorded):
+    own("own_start", "def swirl(grid, initial, seed): pass\n")
+    text = lines_of(load_scene("taylor-green", ["initial.kind=own_start:swirl"]), comm, caplog)
+    assert "not foreseen: the speed of the initial flow is not known" in text
+
+
 def test_ghost_planes_limit_the_ranks():
     from eddies.workflows.estimates import most_ranks
     fields = {planes: most_ranks(load_scene("tiny", [f"tracers.field_cells={planes}"])) for planes in (11, 12)}

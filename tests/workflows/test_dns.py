@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from eddies.io.fields import FieldSeries
-from eddies.io.hdf5 import open_product, read_attributes, read_table
+from eddies.io.hdf5 import open_product, read_attributes, read_provenance, read_table
 from eddies.io.trajectories import Trajectory
-from eddies.scene import load_scene
+from eddies.scene import SceneError, load_scene
 from eddies.workflows import dns
 
 SMALL = ["flow.cells=16", "tracers.particles_per_side=6", "tracers.turnovers=0.05", "tracers.field_cells=8"]
@@ -166,6 +166,67 @@ def test_kernel_of_an_incompressible_flow(comm, tmp_path):
     dns.run(scene, comm, tmp_path)
     train_kernel.run(scene, comm, tmp_path)
     assert (tmp_path / "kernel.h5").exists()
+
+
+OWN_FLOW = """
+import numpy as np
+from eddies.flow.navier_stokes import IncompressibleFluid
+
+
+class Sticky(IncompressibleFluid):
+    def nonlinear(self, state):
+        return super().nonlinear(state) - 0.5 * state
+
+
+def jet(grid, initial, seed):
+    x, y, z = grid.coordinates()
+    u = initial.amplitude * np.sin(initial.wavenumber * y) + 0 * x + 0 * z
+    return grid.forward(np.stack([u, 0 * u, 0 * u]).astype(grid.real))
+
+
+def flat(grid, initial, seed):
+    return np.zeros((3, 4, 4, 3))
+
+
+def nothing(grid, initial, seed):
+    return None
+"""
+OWN = ["flow.cells=16", "time.duration=0.5", "time.step=0.05", "flow.fluid=own_flow:Sticky", "initial.kind=own_flow:jet",
+       "initial.wavenumber=2"]
+
+
+@pytest.mark.mpi(1, 2)
+def test_a_fluid_and_a_start_of_the_users(comm, tmp_path, own):
+    own("own_flow", OWN_FLOW)
+    scene = load_scene("taylor-green", OWN)
+    dns.run(scene, comm, tmp_path)
+    with open_product(comm, tmp_path / "ground_truth.h5", "ground_truth") as file:
+        energy = read_table(file, "statistics")["energy"]
+        provenance = read_provenance(file)
+    assert provenance["foreign"].keys() == {"own_flow:Sticky", "own_flow:jet"}
+    assert energy[0] == pytest.approx(0.25)
+    decay = 2 * (0.5 + scene.flow.viscosity * scene.initial.wavenumber**2) * 0.5
+    assert energy[-1] == pytest.approx(0.25 * np.exp(-decay), rel=1e-6)
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("name, message", [("flat", "returned an array \\(3, 4, 4, 3\\); must be the modes"),
+                                           ("nothing", "returned a NoneType; must be the modes \\(3, kz, ky, kx\\) = ")])
+def test_a_start_that_is_no_velocity(comm, own, name, message):
+    own("own_flow", OWN_FLOW)
+    scene = load_scene("taylor-green", [*OWN, f"initial.kind=own_flow:{name}"])
+    with pytest.raises(SceneError, match=message):
+        dns.initial_state(scene, dns.build_fluid(scene, comm))
+
+
+@pytest.mark.mpi(1)
+def test_a_start_of_the_users_in_a_compressible_fluid_makes_no_sound(comm, own):
+    own("own_flow", OWN_FLOW)
+    scene = load_scene("taylor-green", ["flow.cells=16", "flow.fluid=compressible", "flow.sound_speed=10",
+                                        "initial.kind=own_flow:jet"])
+    fluid = dns.build_fluid(scene, comm)
+    state = dns.initial_state(scene, fluid)
+    assert state.shape == (4, *fluid.grid.spectral_shape) and np.abs(state[3]).max() < 1e-16  # a jet has no pressure
 
 
 class SilentComm:

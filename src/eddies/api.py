@@ -1,0 +1,86 @@
+"""What the commands do, for programs: every function takes a scene, or its name or path, and returns when all is done.
+
+This is the other place, beside the command line, where the communicator of the job enters. All ranks call.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import sys
+import traceback
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from importlib import import_module
+from pathlib import Path
+
+from eddies.logs import configure_logging
+from eddies.scene import Scene, load_scene
+
+CHECKPOINT_SECONDS = 600.0
+
+
+def check(scene: Scene | str | Path, *, comm=None) -> None:
+    """Log what a scene amounts to: resolution, memory, ranks and time. Writes nothing."""
+    with _job(comm) as comm:
+        import_module("eddies.workflows.check").run(_scene(scene), comm)
+
+
+def run(scene: Scene | str | Path, *, output: str | Path | None = None, resume: bool = False, comm=None) -> Path:
+    """Run every stage of a scene, in order, and its report; returns the run directory, `output` or runs/NAME.
+
+    With `resume`, stages whose product is complete and was made with the same settings are skipped.
+
+    Raises as `stages.run_stages`.
+    """
+    return _run(_scene(scene), None, output, resume, comm)
+
+
+def train(scene: Scene | str | Path, *, output: str | Path | None = None, resume: bool = False, comm=None) -> Path:
+    """Train the model of a scene, on the ground truth and with the kernel of the run directory, which it returns."""
+    return _run(_scene(scene), ("train",), output, resume, comm)
+
+
+def simulate(scene: Scene | str | Path, *, output: str | Path | None = None, resume: bool = False, comm=None) -> Path:
+    """Let the particles of a scene go, from its ground truth, with its trained model if its method needs one; returns
+    the run directory, with the new rollout.h5."""
+    return _run(_scene(scene), ("simulate",), output, resume, comm)
+
+
+def _scene(scene: Scene | str | Path) -> Scene:
+    return scene if isinstance(scene, Scene) else load_scene(scene)
+
+
+def _run(scene: Scene, stages: Sequence[str] | None, output: str | Path | None, resume: bool, comm) -> Path:
+    directory = Path(output) if output is not None else Path("runs") / scene.name
+    with _job(comm) as comm:
+        from eddies.parallel.stop import StopRequest
+        from eddies.stages import run_stages
+        stop = StopRequest(comm, (), directory / "STOP", math.inf, CHECKPOINT_SECONDS)
+        run_stages(stages or scene.stages, scene, comm, directory, resume, stop)
+    return directory
+
+
+@contextmanager
+def _job(comm) -> Iterator:
+    """The communicator of a job, all ranks if None; log lines go to standard output unless the program sends them
+    elsewhere, and an error that not all ranks meet ends the job, as the others may wait for ever."""
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported: a thread for every core, in every rank
+    from mpi4py import MPI
+
+    from eddies.parallel.rendezvous import all_arrive
+    comm = MPI.COMM_WORLD if comm is None else comm
+    if not logging.getLogger("eddies").hasHandlers():
+        configure_logging(comm.rank)
+    errors = comm.Dup()
+    try:
+        yield comm
+    except Exception:
+        if comm.size > 1 and not all_arrive(errors):
+            traceback.print_exc()
+            sys.stderr.flush()
+            comm.Abort(1)
+        raise
+    else:
+        errors.Free()

@@ -1,0 +1,82 @@
+"""The Python face: what `import eddies` brings, and a rollout set going from a program."""
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import pytest
+
+import eddies
+
+TEN_LINES = """
+import eddies
+
+scene = eddies.load_scene("tiny", ["tracers.turnovers=0.4", "simulation.turnovers=0.1", "kernel.steps=5"])
+model = eddies.Model(terms=("pressure", "relaxation", "pairs"), settings={"pairs": {"hidden": (4,)}})
+scene = dataclasses.replace(scene, name="mine", model=model)
+eddies.check(scene)
+directory = eddies.run(scene)
+longer = dataclasses.replace(scene, simulation=dataclasses.replace(scene.simulation, step=0.01))
+eddies.simulate(longer, output=directory)
+"""
+
+
+def test_importing_is_cheap_and_names_are_loaded_when_asked_for():
+    code = ("import sys, eddies; eddies.load_scene; eddies.TermSettings; eddies.number; eddies.Flow; eddies.run;"
+            "sys.exit(bool({'torch', 'mpi4py', 'numpy', 'h5py'} & set(sys.modules)))")
+    assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
+
+
+def test_names():
+    assert {"load_scene", "Scene", "check", "run", "train", "simulate", "Term", "PairTerm", "TermSettings", "Rates",
+            "LagrangianModel", "number", "boolean", "__version__"} <= set(dir(eddies))
+    with pytest.raises(AttributeError, match="module 'eddies' has no attribute 'simulte'"):
+        eddies.simulte
+
+
+@pytest.mark.parametrize("name", eddies.__all__)
+def test_every_name_is_there_and_explained(name):
+    assert getattr(eddies, name).__doc__
+
+
+@pytest.mark.mpi(1, 2)
+def test_a_flow_from_a_program(comm, tmp_path):
+    scene = eddies.load_scene("abc", ["time.duration=0.1"])
+    assert eddies.run(scene, output=tmp_path, comm=comm) == tmp_path
+    assert (tmp_path / "ground_truth.h5").exists() and (tmp_path / "report/index.html").exists()
+    before = (tmp_path / "ground_truth.h5").stat().st_mtime_ns
+    comm.Barrier()
+    eddies.run(replace(scene, title="another"), output=tmp_path, resume=True, comm=comm)
+    assert (tmp_path / "ground_truth.h5").stat().st_mtime_ns == before
+
+
+@pytest.mark.mpi(1)
+def test_a_mistake_is_raised(comm, tmp_path):
+    with pytest.raises(eddies.SceneError, match=r"has no \[model\], which `eddies train` is about"):
+        eddies.train("abc", output=tmp_path, comm=comm)
+
+
+@pytest.mark.mpi(1)
+def test_a_scene_that_a_program_makes_and_names_a_run_directory(comm, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    scene = eddies.Scene(name="made", flow=eddies.Flow(fluid="incompressible", cells=8, viscosity=0.1),
+                         initial=eddies.Initial(kind="abc"), time=eddies.Time(duration=0.1))
+    assert str(eddies.run(scene)) == "runs/made" and (tmp_path / "runs/made/scene.toml").exists()
+
+
+def test_ten_lines_set_a_rollout_going(tmp_path):
+    program = "import dataclasses" + TEN_LINES
+    ended = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    assert ended.returncode == 0, ended.stderr
+    assert (tmp_path / "runs/mine/report/index.html").exists() and "rollout: complete" in ended.stdout
+
+
+def test_an_error_that_one_rank_meets_ends_the_job(tmp_path):
+    from test_cli import start
+    program = tmp_path / "program.py"
+    program.write_text("import eddies, eddies.api\nfrom mpi4py import MPI\n"
+                       "def fail(scene, comm):\n    if comm.rank == 1:\n        raise RuntimeError('lost')\n"
+                       "    comm.Barrier()\n"
+                       "import eddies.workflows.check\neddies.workflows.check.run = fail\neddies.check('abc')\n")
+    code, _, errors = start(2, program)
+    assert code != 0 and "RuntimeError: lost" in errors
