@@ -29,7 +29,7 @@ name = "longer-steps"
 set = ["simulation.step=0.05"]
 [[variant]]
 name = "no-force"
-set = ["simulation.force=none"]
+set = ["simulation.method=none"]
 group = "baseline"
 [[variant]]
 name = "stops"

@@ -22,7 +22,8 @@ def comparison(tmp_path, *variants):
 
 @pytest.mark.parametrize("change", ["kernel.neighbors=40", "kernel.steps=60"])
 def test_what_a_kernel_of_its_own_shows_is_left_out(tmp_path, monkeypatch, change):
-    read = comparison(tmp_path, variant("smaller", "model.hidden=[8]", "simulation.step=0.05"), variant("own", change))
+    read = comparison(tmp_path, variant("smaller", "model.pairs.hidden=[8]", "simulation.step=0.05"),
+                      variant("own", change))
     runs = [VariantRun(scene, tmp_path / name, tmp_path) for name, scene in read.scenes.items()]
     monkeypatch.setattr(comparison_rows, "measured",
                         lambda *_: {"status": "complete", **dict.fromkeys(MEASURES, 0.5)})
@@ -35,13 +36,13 @@ def test_what_a_kernel_of_its_own_shows_is_left_out(tmp_path, monkeypatch, chang
 
 
 def test_nothing_is_said_where_all_compares(tmp_path):
-    assert notes(comparison(tmp_path, variant("none", "simulation.force=none"))) == []
+    assert notes(comparison(tmp_path, variant("none", "simulation.method=none"))) == []
 
 
 def test_wavenumbers_that_grids_keep_are_told(tmp_path):
-    force = "simulation.force=eulerian"
-    read = comparison(tmp_path, variant("grid-18", force, "eulerian.cells=18"),
-                      variant("grid-16", force, "eulerian.cells=16"), variant("grid", force))
+    grid = "simulation.method=eulerian"
+    read = comparison(tmp_path, variant("grid-18", grid, "eulerian.cells=18"),
+                      variant("grid-16", grid, "eulerian.cells=16"), variant("grid", grid))
     # Of 18 cells the mode 18/3 = 6 is not kept; by default there are 8, the fewest.
     assert notes(read) == ["Of a grid the 2/3 rule leaves the wavenumbers |k_i| < cells/3, at most: 5 in grid-18, "
                            "5 in grid-16, 2 in grid; k_d = 3."]

@@ -18,7 +18,7 @@ from tests.workflows.stopping import StopAtStep
 # of each horizon.
 SHORT = ["flow.cells=12", "tracers.particles_per_side=6", "tracers.field_cells=8", "spin_up.turnovers=0.01",
          "tracers.turnovers=0.14", "tracers.frame_interval=0.02", "tracers.field_every=3", "kernel.neighbors=20",
-         "kernel.steps=2", "kernel.points=20", "model.hidden=[4]", "training.window=1", "training.frames=2",
+         "kernel.steps=2", "kernel.points=20", "model.pairs.hidden=[4]", "training.window=1", "training.frames=2",
          "training.batch=50", "training.steps=6", "training.combined_steps=2", "training.horizon_steps=2",
          "training.horizons=[1,2]", "training.noise=0.1", "simulation.start=0"]
 

@@ -23,7 +23,7 @@ def write(comm, directory, stage, scene):
 @pytest.fixture
 def variants(comm, tmp_path):
     """Two variants with the same model and one with another, beside a base run with ground truth, kernel and model."""
-    changes = {"first": [], "second": ["simulation.integrator=rk2"], "other": ["model.hidden=[4]"]}
+    changes = {"first": [], "second": ["simulation.integrator=rk2"], "other": ["model.pairs.hidden=[4]"]}
     scenes = {name: load_scene("tiny", [*change, f"name={name}"]) for name, change in changes.items()}
     for stage in ("dns", "train-kernel", "train"):
         write(comm, tmp_path / "base", stage, scenes["first"])
@@ -160,7 +160,7 @@ def test_an_error_in_the_program_is_no_failure_of_a_variant(comm, variants):
 @pytest.mark.mpi(2)
 @pytest.mark.parametrize("step, frames", [(0.02, 2), (0.05, 3), (0.1, 6)])
 def test_a_block_has_enough_steps_beyond_the_warm_up(comm, tmp_path, step, frames):
-    scene = load_scene("tiny", [f"simulation.step={step}", "simulation.force=none"])
+    scene = load_scene("tiny", [f"simulation.step={step}", "simulation.method=none"])
     variant = VariantRun(scene, tmp_path / "variant", tmp_path)
     write(comm, variant.directory, "simulate", scene)
     blocks = []
