@@ -63,6 +63,21 @@ def test_stage_without_its_input_writes_nothing(comm, tmp_path, capfd, stage):
 
 
 @pytest.mark.mpi(1, 2)
+def test_input_of_another_version_is_one_line(comm, tmp_path, capfd):
+    from eddies.io.hdf5 import create_product
+    from eddies.scene import load_scene
+
+    with create_product(comm, tmp_path / "ground_truth.h5", "ground_truth",
+                        {"fingerprint": load_scene("tiny").fingerprint("dns"), "eddies": "0.1.0"}) as file:
+        del file.attrs["format"]
+    assert run_cli("train-kernel", "tiny", "--output", tmp_path) == 2
+    if comm.rank == 0:
+        assert capfd.readouterr().err == (
+            f"eddies: error: {tmp_path / 'ground_truth.h5'}: written by eddies 0.1.0, whose ground truth this version "
+            "does not read; run `eddies dns` again\n")
+
+
+@pytest.mark.mpi(1, 2)
 def test_stage_that_the_scene_lacks(comm, tmp_path, capfd):
     assert run_cli("train", "abc", "--output", tmp_path) == 2
     assert comm.rank > 0 or "has no [model], which `eddies train` is about" in capfd.readouterr().err

@@ -13,9 +13,9 @@ from typing import Any
 
 from eddies.composition import origins, search_in
 from eddies.scene_checks import first_inconsistency
+from eddies.scene_model import Model
 from eddies.scene_reader import (apply_overrides, find_document, parse_document, read_section, read_text,
                                  write_section)
-from eddies.scene_model import Model
 from eddies.scene_sections import (BOX_LENGTH, DEFAULT_WINDOW, Eulerian, Flow, Forcing, Initial, Kernel, Simulation,
                                    SpinUp, Time, Tracers, Training, Wcsph)
 from eddies.scene_values import Document, SceneError, choice, import_paths, integer, section, text

@@ -23,12 +23,12 @@ from statistics import median
 import numpy as np
 from mpi4py import MPI
 
-from eddies.spectral.fourier_passes import PlanePass
 from eddies.flow.initial_fields import balanced_density, random_velocity
 from eddies.flow.navier_stokes import CompressibleFluid
-from eddies.spectral.spectral_grid import Collector, SpectralGrid
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.transpose import TransposeBuffers
+from eddies.spectral.fourier_passes import PlanePass
+from eddies.spectral.spectral_grid import Collector, SpectralGrid
 from eddies.time_stepping import ETDRK4
 
 EVALUATIONS = 4              # of the nonlinear term in a step

@@ -15,8 +15,8 @@ import numpy as np
 from mpi4py import MPI
 from mpi4py_fft import PFFT, newDistArray
 
-from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.parallel.slab import SlabDecomposition
+from eddies.spectral.spectral_grid import SpectralGrid
 
 REPEATS = 15
 

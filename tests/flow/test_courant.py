@@ -4,9 +4,9 @@ from eddies.clock import Clock
 from eddies.flow.courant import CourantLimit
 from eddies.flow.initial_fields import taylor_green
 from eddies.flow.navier_stokes import CompressibleFluid, advective_speed
-from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.flow.stability import FlowDiverged, step_limits
 from eddies.parallel.slab import SlabDecomposition
+from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.time_stepping import RungeKutta4
 
 

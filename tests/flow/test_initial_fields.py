@@ -3,9 +3,9 @@ import pytest
 
 from eddies.flow import initial_fields
 from eddies.flow.operators import divergence, pressure
-from eddies.spectral.spectral_grid import SpectralGrid, restrict
 from eddies.flow.statistics import energy_spectrum, gradient_moments
 from eddies.parallel.slab import SlabDecomposition
+from eddies.spectral.spectral_grid import SpectralGrid, restrict
 
 
 def make_grid(comm, cells):

@@ -1,16 +1,16 @@
 import numpy as np
 import pytest
 
+from eddies.clock import Clock
 from eddies.flow import initial_fields
 from eddies.flow.forcing import ForcingError, LinearForcing
 from eddies.flow.history import FlowHistory
 from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid
 from eddies.flow.operators import divergence, gradient
-from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.flow.statistics import compressible_budget, gradient_moments
-from eddies.clock import Clock
 from eddies.parallel.migration import Redistribution
 from eddies.parallel.slab import SlabDecomposition
+from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.time_stepping import ETDRK4
 
 

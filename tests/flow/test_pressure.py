@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 
-from eddies.spectral.interpolation import SplineInterpolation
 from eddies.flow.pressure import PressureSolver
-from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
+from eddies.spectral.interpolation import SplineInterpolation
+from eddies.spectral.spectral_grid import SpectralGrid
 
 LENGTH, CELLS = 2 * np.pi, 12
 

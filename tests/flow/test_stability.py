@@ -6,11 +6,11 @@ from eddies.flow.forcing import LinearForcing
 from eddies.flow.history import FlowHistory
 from eddies.flow.initial_fields import balanced_density, random_velocity
 from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid
-from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.flow.stability import (
     GROWTH, IMAGINARY_REACH, REAL_REACH, FlowDiverged, StabilityWatch, advice, quadratic_energy, step_limits,
 )
 from eddies.parallel.slab import SlabDecomposition
+from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.time_stepping import ETDRK4, RungeKutta4
 
 

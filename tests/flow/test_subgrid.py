@@ -4,9 +4,9 @@ import pytest
 from eddies.flow import initial_fields
 from eddies.flow.navier_stokes import CompressibleFluid
 from eddies.flow.operators import gradient
-from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.flow.subgrid import Smagorinsky
 from eddies.parallel.slab import SlabDecomposition
+from eddies.spectral.spectral_grid import SpectralGrid
 
 CONSTANT, WIDTH = 0.2, 0.7
 

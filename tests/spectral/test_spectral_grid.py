@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from eddies.spectral.spectral_grid import SpectralGrid, restrict
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.transpose import TransposeBuffers
+from eddies.spectral.spectral_grid import SpectralGrid, restrict
 
 # Round-off of a transform of this size; float32 has 2^29 times coarser numbers.
 TOLERANCE = {"float64": 1e-14, "float32": 2e-6}

@@ -7,7 +7,8 @@ import pytest
 from eddies.io.fields import FieldSeries
 from eddies.io.hdf5 import open_product, read_attributes, read_provenance, read_table
 from eddies.io.trajectories import Trajectory
-from eddies.scene import SceneError, load_scene
+from eddies.parallel.slab import SlabDecomposition
+from eddies.scene import BOX_LENGTH, SceneError, load_scene
 from eddies.workflows import dns
 
 SMALL = ["flow.cells=16", "tracers.particles_per_side=6", "tracers.turnovers=0.05", "tracers.field_cells=8"]
@@ -16,7 +17,8 @@ LEFT_OUT = """
 import sys
 from mpi4py import MPI
 from eddies.parallel import halo
-from eddies.scene import load_scene
+from eddies.parallel.slab import SlabDecomposition
+from eddies.scene import BOX_LENGTH, SceneError, load_scene
 from eddies.workflows import dns
 calls = []
 halo.HaloExchange.__init__ = lambda *a: calls.append("halo")
@@ -117,6 +119,8 @@ def test_statistics_are_sampled_every_few_steps_at_the_release_and_at_the_end(co
 @pytest.mark.mpi(1, 2)
 @pytest.mark.parametrize("name", ["tiny", "tracers-only"])
 def test_scales_are_those_of_the_release_however_long_the_flow_is_followed(comm, tmp_path, name):
+    from eddies.workflows.truth import GroundTruth
+
     overrides = ["flow.cells=16", "tracers.particles_per_side=6", "tracers.field_cells=8"]
     if name == "tiny":
         overrides += ["spin_up.turnovers=0.05", "spin_up.stationary=0.03", "kernel.neighbors=20", "training.batch=9"]
@@ -134,6 +138,10 @@ def test_scales_are_those_of_the_release_however_long_the_flow_is_followed(comm,
             columns = {column: np.stack([trajectory.read(frame, column) for frame in (0, 1)])
                        for column in trajectory.columns if column != "position"}
             interval = trajectory.times[1] - trajectory.times[0]
+            truth = GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, 16))
+            release, later = truth.scales, truth.scales_at(1)
+    assert (later.acceleration, later.density_rate) == (release.acceleration, release.density_rate)
+    assert truth.has_density == (name == "tiny") == (release.sound_speed is not None)
     assert len(trajectory.times) > 2 and scales[0.02] == scales[0.2]
     rates = {"velocity": ("acceleration", 0.0), "density": ("density_rate", 1.0)}
     for column, values in columns.items():

@@ -6,9 +6,9 @@ import numpy as np
 
 from eddies.clock import Clock, ladder_step
 from eddies.flow.navier_stokes import advective_speed
-from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.flow.stability import FlowDiverged
 from eddies.parallel.reduction import global_max
+from eddies.spectral.spectral_grid import SpectralGrid
 
 
 class CourantLimit:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.parallel.reduction import global_sum
+from eddies.spectral.spectral_grid import SpectralGrid
 
 
 # Share of the kinetic energy at the forced modes that round-off alone may leave there.

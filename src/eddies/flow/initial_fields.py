@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from eddies.flow.operators import pressure, project
-from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.parallel.reduction import global_sum
+from eddies.spectral.spectral_grid import SpectralGrid
 
 
 def random_velocity(grid: SpectralGrid, seed: int, amplitude: float, peak_wavenumber: float) -> np.ndarray:

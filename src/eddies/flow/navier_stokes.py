@@ -10,8 +10,8 @@ import numpy as np
 from eddies.flow.forcing import LinearForcing
 from eddies.flow.linear_operators import AcousticBlock, Decay, sum_of_acoustic_blocks, sum_of_decays
 from eddies.flow.operators import divergence, dot_wavevector, project
-from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.flow.subgrid import Smagorinsky
+from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.time_stepping import ScalarFunction, divided_difference
 
 

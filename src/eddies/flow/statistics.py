@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from eddies.flow.operators import dot_wavevector, inverse_wavenumber_squared
-from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.parallel.reduction import global_sum
+from eddies.spectral.spectral_grid import SpectralGrid
 
 
 def energy_spectrum(grid: SpectralGrid, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

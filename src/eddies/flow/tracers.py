@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from eddies.flow.filtering import gaussian_transfer
-from eddies.spectral.interpolation import SplineInterpolation
-from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.parallel.migration import id_block, migrate, wrap
 from eddies.parallel.slab import SlabDecomposition
+from eddies.spectral.interpolation import SplineInterpolation
+from eddies.spectral.spectral_grid import SpectralGrid
 
 
 def random_positions(seed: int, total: int, start: int, stop: int, length: float) -> np.ndarray:

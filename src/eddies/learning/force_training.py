@@ -15,8 +15,8 @@ from eddies.learning.optimization import Descent, shared_values
 from eddies.parallel.reduction import global_sum
 from eddies.particles.cloud import grid_points
 from eddies.particles.dynamics import ParticleDynamics
-from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.model import LagrangianModel
+from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.reconstruction import reconstruct, volumes
 from eddies.particles.smoothing_kernels import SmoothingKernel

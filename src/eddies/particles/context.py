@@ -107,6 +107,10 @@ class Context:
             self.sum_pairs([term], self.rows)
         return self._sums[term]
 
+    def forget_sums(self, term: Summand) -> None:
+        """Take a term's sums anew where they are asked for next, since its parameters are others."""
+        self._sums.pop(term, None)
+
     @cached_property
     def moments(self) -> Moments:
         """Moments of the neighbourhoods, regularised so that they can be inverted without neighbours."""

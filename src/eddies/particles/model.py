@@ -138,6 +138,7 @@ class LagrangianModel(nn.Module):
         def at(values: Tensor) -> Rates:
             split = values.split([parameter.numel() for parameter in parameters.values()])
             named = {name: part.reshape(parameter.shape) for part, (name, parameter) in zip(split, parameters.items())}
+            context.forget_sums(term)
             return self._at_particles(functional_call(term, named, (context,)), context)
 
         count = sum(parameter.numel() for parameter in parameters.values())

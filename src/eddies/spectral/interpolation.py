@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.parallel.halo import HaloError
 from eddies.parallel.plane_halo import PlaneHalo
+from eddies.spectral.spectral_grid import SpectralGrid
 
 ORDERS = {"cubic": 3, "quintic": 5}
 

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from eddies.spectral.fourier_passes import ColumnPass, PlanePass
 from eddies.parallel.migration import Redistribution
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.transpose import Transpose, TransposeBuffers
+from eddies.spectral.fourier_passes import ColumnPass, PlanePass
 
 REAL = {"float64": np.float64, "float32": np.float32}
 COMPLEX = {"float64": np.complex128, "float32": np.complex64}

@@ -18,9 +18,9 @@ from statistics import median
 import numpy as np
 
 from eddies.clock import Clock
+from eddies.scene import Initial, Scene
 from eddies.spectral.fourier_passes import BLOCK_BYTES
 from eddies.spectral.spectral_grid import SpectralGrid
-from eddies.scene import Initial, Scene
 from eddies.time_stepping import STEPPERS
 from eddies.workflows.dns import build_fluid, build_step_limit, initial_state
 from eddies.workflows.estimates import expected_turbulence, largest_wavenumber

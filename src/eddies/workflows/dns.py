@@ -16,7 +16,6 @@ from eddies.flow.history import FlowHistory
 from eddies.flow.initial_fields import INITIAL_FLOWS, balanced_density, sound_wave_density
 from eddies.flow.navier_stokes import FLUIDS, Fluid
 from eddies.flow.operators import project
-from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.io.checkpoint import DIRECTORIES, Checkpoint
 from eddies.io.fields import FieldSeries, FieldWriter
 from eddies.io.hdf5 import create_product, open_product, write_attributes, write_table
@@ -24,6 +23,7 @@ from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import StopRequest
 from eddies.scene import BOX_LENGTH, Scene, SceneError
 from eddies.scene_sections import SpinUp
+from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.time_stepping import STEPPERS
 from eddies.workflows.flow_run import FlowRun, Guard
 from eddies.workflows.frame_segments import FrameSegments

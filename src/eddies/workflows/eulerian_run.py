@@ -15,7 +15,6 @@ from eddies.flow.forcing import LinearForcing
 from eddies.flow.initial_fields import balanced_density
 from eddies.flow.navier_stokes import CompressibleFluid
 from eddies.flow.operators import gradient
-from eddies.spectral.spectral_grid import SpectralGrid, restrict
 from eddies.flow.stability import quadratic_energy
 from eddies.flow.subgrid import Smagorinsky
 from eddies.flow.tracers import FilteredField, TracerParticles
@@ -23,6 +22,7 @@ from eddies.parallel.migration import migrate
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.particle_set import ParticleSet
 from eddies.scene import Eulerian, Scene
+from eddies.spectral.spectral_grid import SpectralGrid, restrict
 from eddies.time_stepping import ETDRK4
 from eddies.workflows.particle_run import forced_below, injection_rate
 from eddies.workflows.truth import GroundTruth

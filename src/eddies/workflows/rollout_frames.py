@@ -27,7 +27,7 @@ class RolloutFrames:
     """
 
     def __init__(self, file, truth: GroundTruth, kernel: SmoothingKernel, start_time: float,
-                 density: bool = True) -> None:
+                 density: bool) -> None:
         self.truth, self.kernel, self.start_time = truth, kernel, start_time
         self.times: list[float] = []
         comm, length = truth.decomposition.comm, truth.decomposition.length

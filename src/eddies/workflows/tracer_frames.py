@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from eddies.clock import Clock
-from eddies.spectral.spectral_grid import SpectralGrid, restrict
 from eddies.flow.statistics import energy_spectrum
 from eddies.flow.tracers import TracerParticles
 from eddies.io.checkpoint import Checkpoint
@@ -13,6 +12,7 @@ from eddies.io.hdf5 import write_table
 from eddies.parallel.migration import IdOrder
 from eddies.parallel.slab import SlabDecomposition
 from eddies.scene import Tracers
+from eddies.spectral.spectral_grid import SpectralGrid, restrict
 from eddies.workflows.frame_segments import FrameSegments
 
 

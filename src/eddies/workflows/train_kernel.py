@@ -10,7 +10,6 @@ import torch
 
 from eddies.clock import ProgressLine
 from eddies.flow.operators import gradient
-from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.io.hdf5 import open_product
 from eddies.io.weights import save_weights
 from eddies.learning.kernel_training import KernelLossWeights, KernelSample, KernelTrainer
@@ -22,6 +21,7 @@ from eddies.parallel.stop import StopRequest
 from eddies.particles.cloud import ParticleCloud
 from eddies.particles.smoothing_kernels import CubicSpline, KernelNetwork, SmoothingKernel, WendlandC2, integral
 from eddies.scene import BOX_LENGTH, Scene
+from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.workflows.devices import prepare_torch
 from eddies.workflows.truth import GroundTruth
 
