@@ -104,7 +104,7 @@ BAD_OVERRIDES = [
     ("simulation.frame_interval=0.05", "must be a whole multiple of"),
     ("simulation.force=none", "[simulation] force: no such key; valid here: method, "),
     ("simulation.method=magnetic", 'must be one of "learned", "none", "wcsph", "eulerian", or the import path'),
-    ("simulation.method=nowhere:Run", '[simulation] method: "nowhere:Run": it is not found; put it beside the scene'),
+    ("simulation.method=nowhere:Run", '[simulation] method: "nowhere:Run": there is no module "nowhere"; put it'),
     ("flow.fluid=eddies.flow.navier_stokes:Honey", 'eddies.flow.navier_stokes has no Honey'),
     ("initial.kind=eddies.logs:log", '[initial] kind: "eddies.logs:log": eddies.logs has no log'),
     ("simulation.method=wcsph", "[simulation] step = 0.02: method = \"wcsph\" must resolve sound, with a step of"),

@@ -1,24 +1,17 @@
 """The Python face: what `import eddies` brings, and a rollout set going from a program."""
 
+import logging
+import re
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
 import eddies
 
-TEN_LINES = """
-import eddies
-
-scene = eddies.load_scene("tiny", ["tracers.turnovers=0.4", "simulation.turnovers=0.1", "kernel.steps=5"])
-model = eddies.Model(terms=("pressure", "relaxation", "pairs"), settings={"pairs": {"hidden": (4,)}})
-scene = dataclasses.replace(scene, name="mine", model=model)
-eddies.check(scene)
-directory = eddies.run(scene)
-longer = dataclasses.replace(scene, simulation=dataclasses.replace(scene.simulation, step=0.01))
-eddies.simulate(longer, output=directory)
-"""
+README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
 
 
 def test_importing_is_cheap_and_names_are_loaded_when_asked_for():
@@ -50,6 +43,18 @@ def test_a_flow_from_a_program(comm, tmp_path):
     assert (tmp_path / "ground_truth.h5").stat().st_mtime_ns == before
 
 
+@pytest.mark.mpi(1, 2)
+def test_classes_of_the_users_are_told_once(comm, tmp_path, own, caplog, monkeypatch):
+    own("own_start", "from eddies.flow.initial_fields import abc\n"
+        "def twice(grid, initial, seed):\n    return abc(grid, 2 * initial.amplitude, 1)\n")
+    scene = eddies.load_scene("abc", ["time.duration=0.1", "initial.kind=own_start:twice"])
+    monkeypatch.setattr(logging.getLogger("eddies"), "propagate", True)
+    with caplog.at_level(logging.INFO, logger="eddies"):
+        eddies.run(scene, output=tmp_path, comm=comm)
+    told = [record.getMessage() for record in caplog.records if "own_start" in record.getMessage()]
+    assert told == ["abc: uses classes that are not of this package: own_start:twice"]
+
+
 @pytest.mark.mpi(1)
 def test_a_mistake_is_raised(comm, tmp_path):
     with pytest.raises(eddies.SceneError, match=r"has no \[model\], which `eddies train` is about"):
@@ -65,7 +70,7 @@ def test_a_scene_that_a_program_makes_and_names_a_run_directory(comm, tmp_path, 
 
 
 def test_ten_lines_set_a_rollout_going(tmp_path):
-    program = "import dataclasses" + TEN_LINES
+    program = re.search(r"^```python\n(import dataclasses\n.*?)^```", README, re.MULTILINE | re.DOTALL)[1]
     ended = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert ended.returncode == 0, ended.stderr
     assert (tmp_path / "runs/mine/report/index.html").exists() and "rollout: complete" in ended.stdout

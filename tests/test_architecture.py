@@ -34,8 +34,9 @@ ONLY_IN = {
     "matplotlib*": ("analysis.figures*", "workflows.report", "workflows.compare"),
     "eddies.analysis.figures*": ("analysis.figures*", "workflows.report", "workflows.compare", "workflows.train"),
     **dict.fromkeys(("eddies.scene", "eddies.scene.*", "eddies.scene_[!v]*"),
-                    ("scene*", "comparison", "workflows*", "cli", "api", "stages", "logs")),
-    "eddies.scene_v*": ("scene*", "comparison", "composition", "particles.terms.*", "workflows*"),
+                    ("scene*", "comparison", "methods", "workflows*", "cli", "api", "stages", "logs")),
+    "eddies.scene_v*": ("scene*", "comparison", "composition", "methods", "particles.model", "particles.terms.*",
+                        "workflows*"),
     "eddies.comparison*": ("workflows*", "cli"),
     "pickle*": (),
 }

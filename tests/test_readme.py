@@ -11,9 +11,12 @@ import pytest
 
 from eddies.cli import build_parser
 from eddies.comparison import Comparison, Variant, load_comparison
+from eddies.methods import METHODS
+from eddies.particles.terms.presets import DEFAULT_PRESET, PRESETS, TERMS
 from eddies.scene import BOX_LENGTH, Scene, builtin_scenes, load_scene
-from eddies.scene_sections import Model, Simulation
-from eddies.scene_values import Bounds, Choice, Integer, Integers, Number, Texts, quoted
+from eddies.scene_model import Model, settings_class
+from eddies.scene_rules import Boolean, Bounds, Choice, Integer, Integers, Number, Texts, quoted
+from eddies.scene_sections import Simulation
 
 CHECKOUT = Path(__file__).parents[1]
 README = (CHECKOUT / "README.md").read_text(encoding="utf-8")
@@ -36,7 +39,8 @@ def marked(name):
 BASH = blocks("bash") + blocks("bash", VALIDATION.read_text(encoding="utf-8"))
 COMMANDS = [line.strip() for block in BASH for line in block.replace("\\\n", " ").splitlines()
             if line.strip() and not line.strip().startswith("#")]
-EXAMPLE_NAME, EXAMPLE = re.fullmatch(r"# (\S+\.toml).*?\n(.*)", blocks("toml")[0], re.DOTALL).groups()
+EXAMPLE_NAME, EXAMPLE = next(match.groups() for block in blocks("toml")
+                             if (match := re.fullmatch(r"# (\S+\.toml).*?\n(.*)", block, re.DOTALL)))
 
 
 @pytest.fixture
@@ -128,8 +132,13 @@ def test_table_of_scenes():
 def allowed(rule):
     """The values that a key may have, in few words."""
     words = [f"`{quoted(word)}`" for word in getattr(rule, "words", ())]
+    path = " or an import path" if getattr(rule, "paths", False) else ""
     if isinstance(rule, Choice):
-        return ", ".join(words)
+        return ", ".join(words) + path
+    if isinstance(rule, Boolean):
+        return "`true`, `false`"
+    if isinstance(rule, Texts) and words:
+        return f"list of {', '.join(words)}{path}"
     nouns = {Number: "number", Integer: "integer", Integers: "list of integers", Texts: "list of texts"}
     noun = nouns.get(type(rule), "text")
     symbols = {"above": ">", "at_least": "≥", "below": "<", "at_most": "≤"}
@@ -150,6 +159,16 @@ def key_row(field):
     return f"| `{field.name}` | {default} | {allowed(rule)} | {rule.about} |".replace("|k|", r"\|k\|")
 
 
+def term_rows():
+    """The rows of the keys of each term, by its word."""
+    lines = []
+    for word in TERMS:
+        settings = settings_class(word)
+        lines.append(f"| **`[model.{word}]`** | | | *{settings.__doc__.splitlines()[0]}* |")
+        lines += [key_row(key) for key in dataclasses.fields(settings)]
+    return lines
+
+
 def scene_reference():
     """The scene reference of README, from the declarations of the keys."""
     lines = ["| key | default | values | meaning |", "|---|---|---|---|"]
@@ -160,7 +179,9 @@ def scene_reference():
             kind, default = field.metadata["section"], field.default
             need = ", required" if default is dataclasses.MISSING else ", optional" if default is None else ""
             lines.append(f"| **`[{field.name}]`**{need} | | | *{kind.__doc__.splitlines()[0]}* |")
-            lines += [key_row(key) for key in dataclasses.fields(kind)]
+            lines += [key_row(key) for key in dataclasses.fields(kind) if "rule" in key.metadata]
+            if kind is Model:
+                lines += term_rows()
     return "\n".join(lines)
 
 
@@ -168,15 +189,27 @@ def test_scene_reference():
     assert marked("scene reference") == scene_reference()
 
 
-@pytest.mark.parametrize("section, key, heading", [
-    (Model, "closure", "| closure | density | acceleration besides the pair sum |"),
-    (Simulation, "force", "| `force` | what moves the particles |"),
+@pytest.mark.parametrize("words, default, heading", [
+    (PRESETS, DEFAULT_PRESET, "| preset | terms | density |"),
+    (METHODS, Simulation.__dataclass_fields__["method"].default, "| `method` | what moves the particles |"),
 ])
-def test_a_table_explains_every_choice(section, key, heading):
+def test_a_table_explains_every_choice(words, default, heading):
     table = README.split(heading)[1].split("\n\n")[0]
-    field = section.__dataclass_fields__[key]
-    assert re.findall(r"^\| `([a-z-]+)`", table, re.MULTILINE) == list(field.metadata["rule"].words)
-    assert re.findall(r"^\| `([a-z-]+)` \(default\)", table, re.MULTILINE) == [field.default]
+    assert re.findall(r"^\| `([a-z-]+)`", table, re.MULTILINE) == list(words)
+    assert re.findall(r"^\| `([a-z-]+)` \(default\)", table, re.MULTILINE) == [default]
+
+
+def test_table_of_presets_lists_their_terms():
+    table = README.split("| preset | terms |")[1].split("\n\n")[0]
+    for preset, terms in PRESETS.items():
+        (listed,) = re.findall(rf"^\| `{preset}`[^|]*\|([^|]*)\|", table, re.MULTILINE)
+        assert re.findall(r"`([a-z-]+)`", listed) == list(terms)
+
+
+def test_every_term_is_in_the_table():
+    table = README.split("| term | what it gives | learned |")[1].split("\n\n")[0]
+    named = [word for row in table.splitlines()[2:] for word in re.findall(r"`([^`]+)`", row.split("|")[1])]
+    assert set(named) == {*TERMS, '"module:name"'}
 
 
 def comparison_reference():
@@ -189,7 +222,8 @@ def comparison_reference():
 
 def test_comparison_reference(tmp_path):
     assert marked("comparison reference") == comparison_reference()
-    (tmp_path / "example.toml").write_text(blocks("toml")[1], encoding="utf-8")
+    example = next(block for block in blocks("toml") if "[[variant]]" in block)
+    (tmp_path / "example.toml").write_text(example, encoding="utf-8")
     assert list(load_comparison(tmp_path / "example.toml").scenes) == ["learned", "small", "no-force"]
 
 
@@ -213,7 +247,7 @@ def test_links_and_files_of_a_page_exist(page):
 
 
 @pytest.mark.mpi(1)
-@pytest.mark.parametrize("program", blocks("python"), ids=lambda _: "program")
+@pytest.mark.parametrize("program", [code for code in blocks("python") if "h5py" in code], ids=["of README"])
 def test_python_runs_on_the_files_of_a_run(comm, tmp_path, monkeypatch, capsys, program):
     from tests.workflows.synthetic_run import write_run
     write_run(comm, tmp_path / "runs/hit-small")

@@ -45,8 +45,8 @@ def load(path: str) -> Any:
     try:
         module = import_module(module_name)
     except ModuleNotFoundError as error:
-        missing = "it" if error.name == module_name else f'the module "{error.name}" that it imports'
-        raise SceneError(f'"{path}": {missing} is not found; put it beside the scene, into the working directory, or '
+        missing = f'there is no module "{error.name}"' + ("" if error.name == module_name else ", which it imports")
+        raise SceneError(f'"{path}": {missing}; put it beside the scene, into the working directory, or '
                          "into a folder of PYTHONPATH") from None
     except Exception as error:
         raise SceneError(f'"{path}": importing {module_name} fails: {type(error).__name__}: {error}') from error

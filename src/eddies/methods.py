@@ -1,6 +1,10 @@
 """What can move the particles of a rollout: the words of [simulation] method."""
 
 from eddies.composition import is_path, load
+from eddies.scene_rules import quoted
+from eddies.scene_values import SceneError
+
+NEEDS = ("model", "density", "pairs")
 
 #: Of each word the class behind it, and what it needs: a trained "model"; the "density" of the ground truth; "pairs",
 #: neighbours within the support of the kernel. A class of the user's says so in its attribute `needs`.
@@ -18,5 +22,11 @@ def method_class(method: str) -> type:
 
 
 def needs_of(method: str) -> tuple[str, ...]:
-    """What a method needs; its class is loaded only where it is the user's."""
-    return tuple(getattr(load(method), "needs", ())) if is_path(method) else METHODS[method][1]
+    """What a method needs; its class is loaded only where it is the user's. SceneError where that is none of NEEDS."""
+    if not is_path(method):
+        return METHODS[method][1]
+    needs = getattr(load(method), "needs", ())
+    if isinstance(needs, str) or not set(needs) <= set(NEEDS):
+        raise SceneError(f"[simulation] method: {quoted(method)}: needs = {quoted(needs)}: must be a tuple of any of "
+                         f"{', '.join(map(quoted, NEEDS))}")
+    return tuple(needs)

@@ -169,8 +169,8 @@ def test_what_no_term_reads_limits_no_ranks():
     told = {preset: [line for line in warnings(load_scene("tiny", [f"model.preset={preset}"]), 1) if "horizons" in line]
             for preset in limits}
     assert told == {"poisson-stress": [], "resolved": [], "learned-density": [
-        '[model] terms: "density-transport" is trained through horizons alone, and stays as it starts without them: set '
-        "[training] horizon_steps"]}
+        '[model] terms: "density-transport" is trained through horizons alone, and stays as it starts without them: '
+        "set [training] horizon_steps"]}
 
 
 def test_memory_of_pairs_is_that_of_the_widest_network():
@@ -183,8 +183,8 @@ def test_memory_of_pairs_is_that_of_the_widest_network():
 @pytest.mark.mpi(1)
 def test_check_of_a_start_of_the_users(comm, own, caplog, recorded):
     own("own_start", "def swirl(grid, initial, seed): pass\n")
-    text = lines_of(load_scene("taylor-green", ["initial.kind=own_start:swirl"]), comm, caplog)
-    assert "not foreseen: the speed of the initial flow is not known" in text
+    scene = replace(load_scene("taylor-green", ["initial.kind=own_start:swirl"]), time=Time(duration=1))
+    assert "not foreseen: the speed of the initial flow is not known" in lines_of(scene, comm, caplog)
 
 
 def test_ghost_planes_limit_the_ranks():

@@ -199,8 +199,8 @@ def flat(grid, initial, seed):
 def nothing(grid, initial, seed):
     return None
 """
-OWN = ["flow.cells=16", "time.duration=0.5", "time.step=0.05", "flow.fluid=own_flow:Sticky", "initial.kind=own_flow:jet",
-       "initial.wavenumber=2"]
+OWN = ["flow.cells=16", "time.duration=0.5", "time.step=0.05", "flow.fluid=own_flow:Sticky",
+       "initial.kind=own_flow:jet", "initial.wavenumber=2"]
 
 
 @pytest.mark.mpi(1, 2)
@@ -218,8 +218,9 @@ def test_a_fluid_and_a_start_of_the_users(comm, tmp_path, own):
 
 
 @pytest.mark.mpi(1)
-@pytest.mark.parametrize("name, message", [("flat", "returned an array \\(3, 4, 4, 3\\); must be the modes"),
-                                           ("nothing", "returned a NoneType; must be the modes \\(3, kz, ky, kx\\) = ")])
+@pytest.mark.parametrize("name, message", [
+    ("flat", "returned an array \\(3, 4, 4, 3\\); must be the modes"),
+    ("nothing", "returned a NoneType; must be the modes \\(3, kz, ky, kx\\) = ")])
 def test_a_start_that_is_no_velocity(comm, own, name, message):
     own("own_flow", OWN_FLOW)
     scene = load_scene("taylor-green", [*OWN, f"initial.kind=own_flow:{name}"])

@@ -63,7 +63,8 @@ class Descent:
         """Go on after `taken` steps, with the parameters and the memory of then."""
         self.taken = taken
         for number, parameter in enumerate(self.parameters) if taken else ():
-            moments = {moment: torch.from_numpy(memory[f"{moment}_{number}"]).to(parameter) for moment in MOMENTS}
+            moments = {moment: torch.from_numpy(memory[f"{moment}_{number}"]).to(parameter).reshape(parameter.shape)
+                       for moment in MOMENTS}
             self._adam.state[parameter] = {"step": torch.tensor(float(taken)), **moments}
 
 

@@ -153,8 +153,11 @@ class Training:
         return {name: tensor.detach().cpu().numpy().copy() for name, tensor in self.model.state_dict().items()}
 
     def _load(self, weights: Mapping[str, np.ndarray]) -> None:
-        self.model.load_state_dict({name: torch.from_numpy(np.asarray(array)) for name, array in weights.items()})
+        shapes = {name: tensor.shape for name, tensor in self.model.state_dict().items()}
+        self.model.load_state_dict({name: torch.from_numpy(np.asarray(array)).reshape(shapes[name])
+                                    for name, array in weights.items()})
 
 
 def _named(prefix: str, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    return {f"{prefix} {name}": array for name, array in arrays.items()}
+    """Arrays as a checkpoint takes them: single numbers as rows of one."""
+    return {f"{prefix} {name}": np.atleast_1d(array) for name, array in arrays.items()}
