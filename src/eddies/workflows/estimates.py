@@ -134,7 +134,7 @@ def most_training_ranks(scene: Scene) -> dict[str, int]:
     support, simulation = scene.kernel.support(scene.tracers.particles), scene.simulation
     if "resolved" in scene.model.reads:
         skin, step = (simulation.skin * support, simulation.step) if simulation else (0.0, 0.0)
-        limits["ghost planes of the resolved velocity"] = closure_ranks(scene, step, skin)
+        limits["ghost planes of the resolved velocity"] = ranks_of_resolved_grid(scene, step, skin)
     time = horizon_time(scene)
     if time > 0:
         if learns_pairs(scene):
@@ -142,7 +142,7 @@ def most_training_ranks(scene: Scene) -> dict[str, int]:
             limits[f"slabs no thinner than the particles' reach {reach:.3g} in the training through horizons"] = (
                 thick_slabs(scene.tracers.particles_per_side, reach))
         if scene.training.energy_weight > 0 or "resolved" in scene.model.reads:
-            limits["ghost planes of the grid in the training through horizons"] = closure_ranks(scene, time)
+            limits["ghost planes of the grid in the training through horizons"] = ranks_of_resolved_grid(scene, time)
     return limits
 
 
@@ -182,7 +182,7 @@ def horizon_time(scene: Scene) -> float:
     return max(settings.horizons) * scene.tracers.frame_interval
 
 
-def closure_ranks(scene: Scene, time: float, skin: float = 0.0) -> int:
+def ranks_of_resolved_grid(scene: Scene, time: float, skin: float = 0.0) -> int:
     """The largest number of ranks for the cubic splines on a grid of one cell a particle, which have one more ghost
     plane for each plane that a particle may be outside its slab after a time."""
     outside = (skin / 2 + particle_drift(scene, time, ALLOWED_VELOCITY)) / scene.tracers.spacing
