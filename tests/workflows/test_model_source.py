@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,8 @@ import pytest
 from eddies.io.hdf5 import ProductError
 from eddies.io.weights import save_weights
 from eddies.particles.reference_scales import ReferenceScales
-from eddies.scene import SceneError, load_scene
+from eddies.scene import Model, SceneError, load_scene
+from eddies.scene_rules import quoted
 from eddies.stages import check_inputs
 from eddies.workflows.model_source import read_source
 from eddies.workflows.trained_model import describe
@@ -26,6 +28,10 @@ class Drag(eddies.Term):
     def forward(self, context):
         return eddies.Rates(acceleration=-context.particles.velocity)
 """
+
+
+def scene_with(path, *terms):
+    return replace(load_scene("tiny"), model=Model(terms=terms, path=str(path)))
 
 
 def scene(*overrides):
@@ -63,7 +69,7 @@ def test_a_run_directory_or_its_file_gives_description_weights_and_tables(comm, 
     ("tracers.filter_width=0.9", "[tracers] filter_width = 0.9, but {} was trained with 1.04719755"),
 ])
 def test_another_form_is_refused_with_both_values(comm, tmp_path, own, override, message):
-    own("own_networks", "class Net: pass\n")
+    own("own_networks", "class Net:\n    def forward(self, features): pass\n")
     write_source(comm, tmp_path)
     with pytest.raises(SceneError) as error:
         read_source(scene(f"model.path={tmp_path}", override), comm)
@@ -71,14 +77,14 @@ def test_another_form_is_refused_with_both_values(comm, tmp_path, own, override,
 
 
 @pytest.mark.mpi(1)
-@pytest.mark.parametrize("terms", ['["pressure", "pairs"]', '["pairs", "pressure", "stress", "damping", "relaxation"]'])
+@pytest.mark.parametrize("terms", [("pressure", "pairs"), ("pairs", "pressure", "stress", "damping", "relaxation")])
 def test_other_terms_are_refused_with_both_lists(comm, tmp_path, terms):
     """Also in another order, in which sums are rounded otherwise."""
     write_source(comm, tmp_path)
     with pytest.raises(SceneError) as error:
-        read_source(scene(f"model.terms={terms}", f"model.path={tmp_path}"), comm)
+        read_source(scene_with(tmp_path, *terms), comm)
     trained = '["pressure", "stress", "damping", "relaxation", "pairs"]'
-    assert f"tiny: [model] terms = {terms}, but {tmp_path}/model.h5 was trained with {trained}" in str(error.value)
+    assert f"tiny: [model] terms = {quoted(terms)}, but {tmp_path}/model.h5 was trained with {trained}" in str(error.value)
 
 
 @pytest.mark.mpi(1, 2)
@@ -95,15 +101,14 @@ def test_a_file_never_has_a_class_imported(comm, tmp_path, own):
     if comm.rank == 0:
         own("own_source", OWN_TERM)
     comm.Barrier()
-    named = 'model.terms=["pressure", "own_source:Drag"]'
     terms = {"pressure": {"force": True}, "own_source:Drag": {}}
     write_source(comm, tmp_path, {"terms": terms, "scales": SCALES.to_dict(), "neighbors": 56.0})
     with pytest.raises(SceneError) as error:
-        read_source(load_scene("tiny", ['model.terms=["pressure"]', f"model.path={tmp_path}"]), comm)
+        read_source(scene_with(tmp_path, "pressure"), comm)
     assert (f'tiny: [model] terms = ["pressure"], but {tmp_path}/model.h5 was trained with ["pressure", '
             '"own_source:Drag"]; set it to that') in str(error.value)
     assert "own_source" not in sys.modules and not (tmp_path / "imported").exists()
     comm.Barrier()
     if comm.rank == 0:  # whose path leads to the module
-        assert load_scene("tiny", [named, f"model.path={tmp_path}"]).model.foreign == ("own_source:Drag",)
+        assert scene_with(tmp_path, "pressure", "own_source:Drag").model.foreign == ("own_source:Drag",)
         assert (tmp_path / "imported").exists()

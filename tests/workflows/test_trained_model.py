@@ -9,13 +9,17 @@ import torch
 from eddies.io.hdf5 import ProductError
 from eddies.io.weights import load_weights, save_weights
 from eddies.particles.reference_scales import ReferenceScales
-from eddies.scene import SceneError, load_scene
+from eddies.scene import Model, SceneError, load_scene
 from eddies.workflows.trained_model import describe, differences, load_model, scene_model
 
 # Of the scene tiny: the filter is two spacings wide.
 SCALES = ReferenceScales(length=1.0471975511965976, spacing=0.5235987755982988, velocity=0.9, density_mean=1.0,
                          density=0.02, acceleration=1.7, density_rate=0.05, sound_speed=20.0, viscosity=0.01)
 SMALL = "model.pairs.hidden=[4]"
+
+
+def with_terms(*terms):
+    return replace(load_scene("tiny"), model=Model(terms=terms))
 
 
 def saved(comm, directory, scene=None, change=lambda weights: weights):
@@ -51,7 +55,7 @@ def test_it_is_made_for_the_scales_that_are_asked_for(comm, tmp_path):
 
 @pytest.mark.mpi(1)
 def test_a_model_without_parameters_is_read_too(comm, tmp_path):
-    scene, model, path = saved(comm, tmp_path, load_scene("tiny", ['model.terms=["pressure"]']))
+    scene, model, path = saved(comm, tmp_path, with_terms("pressure"))
     assert not model.state_dict() and list(load_model(scene, comm, path, SCALES).terms) == ["pressure"]
 
 
@@ -99,16 +103,15 @@ def test_no_key_of_a_term_s_settings_goes_unnoticed():
 ])
 def test_a_class_that_is_no_term_has_one_error(own, body, message):
     own("own_terms", f"import torch\nfrom torch import nn\nfrom eddies import Term\n{body}")
-    scene = load_scene("tiny", ['model.terms=["pressure", "own_terms:Mine"]'])
+    scene = with_terms("pressure", "own_terms:Mine")
     with pytest.raises(SceneError) as error:
         scene_model(scene, SCALES)
     assert str(error.value).startswith('[model] terms: term "own_terms:Mine": ') and message in str(error.value)
 
 
 @pytest.mark.parametrize("body, message", [
-    ("def mine(*numbers): pass\n", "must be a class derived from torch.nn.Module"),
-    ("class mine: pass\n", "must be a class derived from torch.nn.Module"),
-    ("class mine(nn.Module):\n    def __init__(self, inputs): pass\n",
+    ("class mine:\n    def forward(self, features): pass\n", "must be a class derived from torch.nn.Module"),
+    ("class mine(nn.Module):\n    def __init__(self, inputs): pass\n    def forward(self, features): pass\n",
      "cannot be made with (inputs, hidden, outputs, seed): "),
 ])
 def test_a_class_that_is_no_network_has_one_error(own, body, message):
