@@ -4,36 +4,30 @@ import numpy as np
 import pytest
 import torch
 
-from eddies.flow.pressure import PressureSolver
 from eddies.flow.tracers import release
 from eddies.learning.optimization import Descent, shared_values
 from eddies.learning.rollout_training import RolloutTrainer, TrainingWindow, mean_losses
 from eddies.parallel.migration import migrate
-from eddies.parallel.reduction import global_max, global_sum
+from eddies.parallel.reduction import global_max
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.integrators import INTEGRATORS
-from eddies.particles.pair_forces import PairModel
 from eddies.particles.particle_set import ParticleSet
-from eddies.particles.poisson_closure import PoissonClosure
-from eddies.particles.reference_scales import ReferenceScales
-from eddies.particles.smoothing_kernels import WendlandC2
+from eddies.particles.resolved_velocity import ResolvedVelocity
 
-LENGTH, PER_SIDE, FRAMES, INTERVAL = 2 * np.pi, 12, 4, 0.06
-SPACING = LENGTH / PER_SIDE
+from tests.learning.models import LENGTH, PER_SIDE, SPACING, Recorder, model_of, slope
+
+FRAMES, INTERVAL = 4, 0.06
 SUPPORT = 1.6 * SPACING
-SCALES = ReferenceScales(length=2 * SPACING, spacing=SPACING, velocity=1.0, density_mean=1.0, density=0.01,
-                         acceleration=1.0, density_rate=0.02, sound_speed=10.0, viscosity=0.01)
-every_closure = pytest.mark.parametrize("closure", ["poisson", "poisson-stress", "learned-density"])
+every_preset = pytest.mark.parametrize("preset", ["poisson", "poisson-stress", "learned-density"])
 
 
-def grid_closure(slab, factors=None):
+def resolution(slab):
     """Within four intervals particles move farther than a grid plane out of their slab."""
-    return PoissonClosure(PressureSolver(slab, 5, margin=2), WendlandC2(1.6 * SPACING), 10.0, passes=2,
-                          dtype=torch.float64, factors=factors)
+    return ResolvedVelocity.on_slabs(slab, torch.float64, drift=2 * SPACING)
 
 
-def window_of(slab):
+def window_of(slab, with_density):
     """Particles in a smooth flow, and what it makes of them if it turns slowly."""
     columns = release(slab, 3, PER_SIDE, "random")
     x, y, z = columns["position"].T
@@ -49,38 +43,23 @@ def window_of(slab):
              "density_later": np.stack([density(time) for time in times], axis=1)}
     columns = migrate(slab, {**columns, "velocity": velocity(0.0), "density": density(0.0), **later})
     columns = {name: torch.from_numpy(column) for name, column in columns.items()}
-    true = [columns.pop(f"{name}_later").movedim(1, 0).contiguous() for name in ("velocity", "density")]
+    true = {name: columns.pop(f"{name}_later").movedim(1, 0).contiguous() for name in ("velocity", "density")}
+    if not with_density:
+        del columns["density"], true["density"]
     particles = ParticleSet(**columns)
-    start = grid_closure(slab).band_energies(particles)
+    start = resolution(slab).band_energies(particles)
     energies = torch.stack([start * 0.9**frame for frame in range(FRAMES + 1)])
-    return TrainingWindow(particles, *true, energies)
+    return TrainingWindow(particles, true["velocity"], true.get("density"), energies)
 
 
-def trainer_of(comm, closure="poisson-stress", integrator="verlet", steps=1, noise=0.0):
+def trainer_of(comm, preset="poisson-stress", integrator="verlet", steps=1, noise=0.0):
     slab = SlabDecomposition(comm, LENGTH, PER_SIDE)
-    model = PairModel(SCALES, SUPPORT, 17, (6, 5), closure=closure, seed=2)
-    given = None
-    if not model.learns_density:
-        given = grid_closure(slab, model.resolved_factors if closure == "poisson-stress" else None)
-    dynamics = ParticleDynamics(slab, LENGTH, [model], 0.0, given, torch.float64, fixed_ranks=True)
-    energies = grid_closure(slab).band_energies
-    trainer = RolloutTrainer(comm, INTEGRATORS[integrator](dynamics), [window_of(slab)], INTERVAL, steps, 0.5, energies,
-                             noise, 5)
+    model = model_of(preset, SUPPORT, 17, (6, 5))
+    dynamics = ParticleDynamics(slab, model, 0.0, torch.float64, 2 * SPACING, fixed_ranks=True)
+    window = window_of(slab, model.integrates_density)
+    trainer = RolloutTrainer(comm, INTEGRATORS[integrator](dynamics), [window], INTERVAL, steps, 0.5,
+                             resolution(slab).band_energies, noise, 5)
     return trainer, model
-
-
-class Recorder:
-    """Takes no step but keeps the gradient, summed over ranks."""
-
-    def __init__(self, comm, model):
-        self.comm, self.model = comm, model
-
-    def step(self, share):
-        self.model.zero_grad()
-        share.backward()
-        parts = [torch.zeros_like(p) if p.grad is None else p.grad for p in self.model.parameters()]
-        self.gradient = global_sum(self.comm, torch.cat([part.flatten() for part in parts]).numpy())
-        return 0.0
 
 
 def gradient_of(comm, horizon, **choices):
@@ -90,36 +69,32 @@ def gradient_of(comm, horizon, **choices):
     return loss, recorder.gradient
 
 
-@every_closure
+@every_preset
 @pytest.mark.mpi(2, 3)
 @pytest.mark.parametrize("horizon", [1, 4])
-def test_gradient_is_the_same_on_any_number_of_ranks(comm, horizon, closure):
+def test_gradient_is_the_same_on_any_number_of_ranks(comm, horizon, preset):
     from mpi4py import MPI
 
-    loss, gradient = gradient_of(comm, horizon, closure=closure)
-    alone, expected = gradient_of(MPI.COMM_SELF, horizon, closure=closure)
+    loss, gradient = gradient_of(comm, horizon, preset=preset)
+    alone, expected = gradient_of(MPI.COMM_SELF, horizon, preset=preset)
     assert loss == pytest.approx(alone, rel=1e-11)
     assert np.linalg.norm(gradient - expected) < 1e-10 * np.linalg.norm(expected)
 
 
-@every_closure
+@every_preset
 @pytest.mark.mpi(2)
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-def test_gradient_through_several_steps_against_finite_differences(comm, integrator, closure):
-    trainer, model = trainer_of(comm, closure, integrator, steps=2)
+def test_gradient_through_several_steps_against_finite_differences(comm, integrator, preset):
+    trainer, model = trainer_of(comm, preset, integrator, steps=2)
     recorder = Recorder(comm, model)
     trainer.step(recorder, 0, 2)
-    random = np.random.default_rng(1)
-    direction = [torch.from_numpy(random.standard_normal(p.shape)) for p in model.parameters()]
-    expected = recorder.gradient @ torch.cat([part.flatten() for part in direction]).numpy()
-    epsilon, losses = 1e-5, []
-    with torch.no_grad():
-        for sign in (1, -2):
-            for parameter, part in zip(model.parameters(), direction):
-                parameter += sign * epsilon * part
-            losses.append(sum(shared_values(comm, trainer.loss_shares(trainer.windows[0], 2)).values()))
+
+    def loss():
+        return sum(shared_values(comm, trainer.loss_shares(trainer.windows[0], 2)).values())
+
+    found, expected = slope(model, loss, recorder.gradient, 1e-5)
     # Errors: epsilon^2 of the difference, and kinks of second order where pairs enter or leave the support.
-    assert (losses[0] - losses[1]) / (2 * epsilon) == pytest.approx(expected, rel=1e-5)
+    assert found == pytest.approx(expected, rel=1e-5)
 
 
 @pytest.mark.mpi(2, 3)
@@ -128,7 +103,7 @@ def test_particles_leave_their_slabs_within_a_window(comm):
     trainer, _ = trainer_of(comm)
     with torch.no_grad():
         *_, (_, particles) = trainer._frames(trainer.windows[0].particles, FRAMES)
-    slab = trainer.integrator.dynamics.surroundings.decomposition
+    slab = trainer.integrator.dynamics.decomposition
     assert global_max(comm, float(particles.position[:, 2].max()) - slab.upper) > SPACING
 
 
@@ -196,7 +171,7 @@ def test_a_steady_band_counts_like_a_slow_one(comm):
 
 @pytest.mark.mpi(1)
 def test_no_acceleration_has_an_error_of_one(comm):
-    trainer, model = trainer_of(comm, closure="poisson")
+    trainer, model = trainer_of(comm, preset="poisson")
     trainer.energy_weight = 0.0
     with torch.no_grad():
         for parameter in model.parameters():

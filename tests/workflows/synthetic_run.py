@@ -127,7 +127,7 @@ def write_kernel(comm, directory, cells=32):
                  provenance(), tables)
 
 
-def write_model(comm, directory, closure="poisson", source=None):
+def write_model(comm, directory, terms=("pressure", "pairs"), source=None):
     """With weights of another run, where `source` says which and at which Mach number."""
     rng = np.random.default_rng(3)
     step, delay = np.arange(0, 300, 10), np.linspace(-0.6, 0.6, 13)
@@ -144,14 +144,14 @@ def write_model(comm, directory, closure="poisson", source=None):
     predicted = 0.95 * truth + 0.2 * rng.normal(size=truth.shape)
     tables = {"history": history, "a_priori": a_priori,
               "acceleration_sample": {"truth": truth, "predicted": predicted}}
-    if closure != "poisson":
+    if "density-flux" in terms:
         tables["a_priori"]["density_rate_error"] = 0.6 + 0.05 * delay
         tables["density_rate_sample"] = {"truth": truth[:, 0], "predicted": 0.8 * truth[:, 0]}
     origin = provenance()
     if source:
         tables["source_a_priori"] = {name: 0.9 * errors for name, errors in tables["a_priori"].items()}
         origin |= {"mach_turbulent": 0.16, "source": source}
-    save_weights(comm, directory / "model.h5", "model", {"basis": "corrected", "closure": closure},
+    save_weights(comm, directory / "model.h5", "model", {"terms": {term: {} for term in terms}},
                  {"weight": np.ones(3)}, origin, tables)
 
 
@@ -181,7 +181,7 @@ def write_rollout(comm, directory, status="complete", total=600, cells=16, frame
     shapes |= {"density": ()} if density else {}
     times = 0.1 * np.arange(frames)
     attributes = {"status": status, "start_time": 0.6, "time_step": 0.02, "integrator": "verlet",
-                  "force": "learned", "closure": "poisson", "turnovers": times[-1] / TURNOVER,
+                  "method": "learned", "terms": "pressure, pairs", "turnovers": times[-1] / TURNOVER,
                   "seconds_per_step": 0.031, "particles": total, "ranks": 1, "eddy_turnover_time": TURNOVER,
                   "injection_rate": injection_rate}
     with create_product(comm, directory / "rollout.h5", "rollout", provenance()) as file:

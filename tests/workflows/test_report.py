@@ -68,7 +68,8 @@ def test_a_complete_run_shows_everything(comm, tmp_path):
         assert all(math.isfinite(value) for value in numbers(metrics[section].values()))
         missing = {key for key in keys if metrics[section][key] is None}
         assert missing == ({"density_rate_error"} if section == "model" else set())
-    assert "closure poisson has none" in page
+    assert "the trained model, terms pressure, pairs" in page
+    assert "terms pressure, pairs have none" in page
     check_stationary(metrics["stationary"], page)
 
 
@@ -183,7 +184,7 @@ def test_a_rollout_that_breaks_at_once_is_not_compared(comm, tmp_path):
 
 @pytest.mark.mpi(1)
 def test_a_model_that_integrates_density(comm, tmp_path):
-    write_model(comm, tmp_path, closure="learned-density")
+    write_model(comm, tmp_path, terms=("pairs", "density-flux"))
     report.run(tmp_path, comm)
     metrics, _ = written(tmp_path)
     assert metrics["model"]["density_rate_error"] == pytest.approx(0.63)

@@ -4,7 +4,7 @@ import torch
 from eddies.io.hdf5 import ProductError
 from eddies.io.weights import save_weights
 from eddies.particles.smoothing_kernels import KernelNetwork
-from eddies.workflows.closures import load_kernel
+from eddies.workflows.trained_kernel import load_kernel
 
 NETWORK = KernelNetwork(0.7, [4], seed=3).float()
 

@@ -1,0 +1,56 @@
+"""Models, scales and a recorder of gradients that the tests of this folder share."""
+
+import numpy as np
+import torch
+
+from eddies.parallel.reduction import global_sum
+from eddies.particles.flow_units import FlowUnits
+from eddies.particles.model import build_model
+from eddies.particles.reference_scales import ReferenceScales
+from eddies.scene_model import Model
+
+LENGTH, PER_SIDE = 2 * np.pi, 12
+SPACING = LENGTH / PER_SIDE
+SCALES = ReferenceScales(length=2 * SPACING, spacing=SPACING, velocity=1.0, density_mean=1.0, density=0.01,
+                         acceleration=1.0, density_rate=0.02, sound_speed=10.0, viscosity=0.01)
+
+
+def model_of(preset, support, neighbors, hidden, **settings):
+    """The model of a preset or of a list of terms, with initial weights in double precision; `settings` by term, over
+    the widths of all networks."""
+    listed = {"preset": preset} if isinstance(preset, str) else {"terms": tuple(preset)}
+    bare = Model(**listed)
+    widths = {name: {"hidden": hidden} for name, declared in bare.settings.items() if hasattr(declared, "hidden")}
+    wanted = Model(**listed, settings={name: {**widths.get(name, {}), **settings.get(name, {})}
+                                       for name in widths.keys() | settings.keys()})
+    return build_model(wanted.settings, wanted.terms, FlowUnits(SCALES, support, neighbors, seed=2))
+
+
+class Recorder:
+    """In place of a descent: takes no step but keeps the gradient, summed over ranks, and this rank's share."""
+
+    def __init__(self, comm, model):
+        self.comm, self.model = comm, model
+
+    def step(self, share):
+        self.model.zero_grad()
+        share.backward()
+        parts = [torch.zeros_like(p) if p.grad is None else p.grad for p in self.model.parameters()]
+        self.share, self.gradient = share, global_sum(self.comm, torch.cat([part.flatten() for part in parts]).numpy())
+        return 0.0
+
+
+def slope(model, loss, gradient, epsilon):
+    """The derivative of a loss in a random direction of all parameters: by central differences, and as the gradient
+    has it."""
+    random = np.random.default_rng(1)
+    direction = [torch.from_numpy(np.asarray(random.standard_normal(p.shape))) for p in model.parameters()]
+    values = []
+    with torch.no_grad():
+        for sign in (1, -2):
+            for parameter, part in zip(model.parameters(), direction):
+                parameter += sign * epsilon * part
+            values.append(loss())
+        for parameter, part in zip(model.parameters(), direction):
+            parameter += epsilon * part
+    return (values[0] - values[1]) / (2 * epsilon), gradient @ torch.cat([part.flatten() for part in direction]).numpy()
