@@ -33,11 +33,15 @@ class Known:
 
 
 @torch.no_grad()
-def acceleration(lagrangian, field, position, velocity):
-    """At particles on the points of the grid, where splines are exact."""
+def evaluated(lagrangian, field, position, velocity):
+    """Rates of particles on the points of the grid, where splines are exact."""
     dynamics = dynamics_of(SlabDecomposition(MPI.COMM_SELF, LENGTH, CELLS), lagrangian, 0.1)
     dynamics.resolution = Known(field)
-    return dynamics.rates(ParticleSet(torch.arange(len(position)), position, velocity)).acceleration
+    return dynamics.rates(ParticleSet(torch.arange(len(position)), position, velocity))
+
+
+def acceleration(lagrangian, field, position, velocity):
+    return evaluated(lagrangian, field, position, velocity).acceleration
 
 
 def lattice():
