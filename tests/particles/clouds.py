@@ -48,7 +48,8 @@ CLOUDS = {
 }
 #: Models of pairs.
 PAIR_MODELS = {
-    "paper": {"pairs": dict(basis="paper"), "density-flux": {}, "eddy-viscosity": dict(form="two-sided", basis="paper")},
+    "paper": {"pairs": dict(basis="paper"), "density-flux": {},
+              "eddy-viscosity": dict(form="two-sided", basis="paper")},
     "corrected": {**PRESETS["learned-density"], "eddy-viscosity": dict(form="monaghan")},
     "pairs": {"pairs": {}},
     "antisymmetric": {"pairs": dict(basis="paper", symmetry="antisymmetric"), "density-transport": {},
@@ -84,7 +85,8 @@ def model(terms=None, flow=FLOW, **more):
 
 
 def _settings(kind, chosen):
-    return kind(**chosen, **({"hidden": (6, 5)} if issubclass(kind, NetworkSettings) and "hidden" not in chosen else {}))
+    small = {"hidden": (6, 5)} if issubclass(kind, NetworkSettings) else {}
+    return kind(**{**small, **chosen})
 
 
 @dataclass(frozen=True, kw_only=True)

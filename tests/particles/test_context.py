@@ -82,7 +82,8 @@ class ReadsPairs(TermSettings):
 
 @pytest.mark.mpi(1)
 @pytest.mark.parametrize("name, settings, wanted", [
-    ("pairs", None, '"pairs" or "resolved"'), ("velocity", None, '"pairs" or "resolved"'), ("resolved", None, '"resolved"'),
+    ("pairs", None, '"pairs" or "resolved"'), ("velocity", None, '"pairs" or "resolved"'),
+    ("resolved", None, '"resolved"'),
     ("density", ReadsPairs(), '"density"'), ("resolved", ReadsPairs(), '"resolved"')])
 def test_what_a_term_does_not_declare_it_is_told_to(comm, name, settings, wanted):
     slab, particles = alone(*state()[:2])

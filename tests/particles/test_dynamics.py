@@ -45,7 +45,8 @@ def test_rates_loss_and_gradients_do_not_depend_on_the_ranks(comm, terms):
 
 def assert_same_on_all_ranks(comm, force, columns):
     (slab, particles), (whole, everything) = distributed(comm, *columns), alone(*columns)
-    rates, expected = given(dynamics_of(slab, force).rates(particles)), given(dynamics_of(whole, force).rates(everything))
+    rates, expected = (given(dynamics_of(slabs, force).rates(which))
+                       for slabs, which in ((slab, particles), (whole, everything)))
     assert rates.keys() == expected.keys()
     for name in expected:
         reference = expected[name][torch.argsort(everything.id)].detach()

@@ -1,4 +1,4 @@
-"""The linear steps between particles, grid and modes have the adjoints that they say; the formulas are those of numpy."""
+"""The linear steps between particles, grid and modes have the adjoints that they say; formulas are those of numpy."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,6 @@ LENGTH, CELLS, RESOLVED = 5.0, 13, 5  # slabs of unequal thickness on two and th
 
 def grid_on(comm, cells=CELLS, resolved=RESOLVED):
     return FourierGrid(SlabDecomposition(comm, LENGTH, cells), resolved)
-
 
 
 def real(comm, *shape, seed=0):
@@ -93,7 +92,8 @@ def test_adjoints_of_interpolation_and_spreading(comm):
 def test_slopes_of_interpolation_and_spreading_in_the_positions(comm):
     grid = grid_on(comm)
     position = points(comm, grid)
-    values, modes, change = real(comm, len(position), 2), modes_like(comm, grid, 2), real(comm, len(position), 3, seed=1)
+    values, modes = real(comm, len(position), 2), modes_like(comm, grid, 2)
+    change = real(comm, len(position), 3, seed=1)
     for function, weights in ((lambda x: grid.at(modes, x), values), (lambda x: grid.spread(values, x), modes)):
         expected = inner(comm, pulled_back(function, position, weights), change)
         # The error of a central difference: step^2 of the third derivative, which jumps at grid planes.
@@ -216,8 +216,8 @@ def test_values_of_a_wave_at_positions_to_the_accuracy_of_splines(comm):
     grid = grid_on(comm)
     x, y, z = grid.spectral.coordinates()
     k = 2 * 2 * np.pi / LENGTH
-    wave = torch.from_numpy(np.broadcast_to(np.sin(k * x) * np.cos(k * z / 2), grid.spectral.physical_shape)[None].copy())
+    wave = np.broadcast_to(np.sin(k * x) * np.cos(k * z / 2), grid.spectral.physical_shape)
     position = points(comm, grid)
-    found = grid.at(grid.to_modes(wave), position)[:, 0]
+    found = grid.at(grid.to_modes(torch.from_numpy(wave[None].copy())), position)[:, 0]
     expected = torch.sin(k * position[:, 0]) * torch.cos(k * position[:, 2] / 2)
     assert (found - expected).abs().max() < 4e-3

@@ -57,8 +57,8 @@ def test_order_with_a_force_that_depends_on_velocity(comm, name, order):
 @pytest.mark.mpi(1)
 @pytest.mark.parametrize("name, order", [("verlet", 1.9), ("rk2", 1.9), ("rk4", 2.8)])
 def test_order_with_the_pair_model_and_its_density(comm, name, order):
-    """The second derivative of a pair's weight jumps at the cutoff, which limits the order to three; where particles have
-    hardly a neighbour each one that enters shows, and the order is not seen at steps like these."""
+    """The second derivative of a pair's weight jumps at the cutoff, which limits the order to three; where particles
+    have hardly a neighbour each one that enters shows, and the order is not seen at steps like these."""
     slab, particles = distributed(comm, *state(250))
     force = model(PRESETS["learned-density"])
     with torch.no_grad():

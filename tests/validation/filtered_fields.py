@@ -48,8 +48,8 @@ class Filtered:
         self.hidden_pressure = self._pressure_of(modes_of(self.stress))
 
     def force(self, viscosity=0.0, hidden=True):
-        """Modes of -grad p_bar - div tau + nu laplacian u_bar: what accelerates a particle that moves with u_bar; or not
-        `hidden`, what tau has no part in."""
+        """Modes of -grad p_bar - div tau + nu laplacian u_bar: what accelerates a particle that moves with u_bar; if
+        not `hidden`, without what tau has a part in."""
         pressure = self.pressure if hidden else self.pressure - self.hidden_pressure
         force = -1j * WAVE * pressure - viscosity * SQUARED * self.velocity
         return force - self.stress_divergence() if hidden else force

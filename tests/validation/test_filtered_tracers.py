@@ -30,8 +30,8 @@ def moments_of_tracers(grid):
     state = initial_fields.random_velocity(grid, 5, 1.0, 1.5)
     for _ in range(30):
         state = advance(state, STEP)
-    tracers = TracerParticles(FilteredField(grid, WIDTH, "quintic"), release(grid.decomposition, 3, PER_SIDE, "lattice"),
-                              state)
+    columns = release(grid.decomposition, 3, PER_SIDE, "lattice")
+    tracers = TracerParticles(FilteredField(grid, WIDTH, "quintic"), columns, state)
     found = []
     for _ in range(3):
         order = np.argsort(tracers.columns["id"])
@@ -55,8 +55,6 @@ def modelled(now, *words):
     if not hasattr(scales, "viscosity"):  # to be removed with the viscosity's place in the scales
         acceleration += flow.at_particles(-VISCOSITY * flow.grid.wavenumber_squared * flow.velocity)
     return acceleration.numpy(), flow
-
-
 
 
 @pytest.mark.mpi(1)
