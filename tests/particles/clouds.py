@@ -1,7 +1,7 @@
 """Particle clouds and models that the tests of particles share."""
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -25,17 +25,8 @@ from eddies.particles.terms.settings import NetworkSettings, TermSettings
 from eddies.particles.terms.term import Term
 
 LENGTH = 2 * math.pi
-
-
-def scales_of(**given):
-    """Reference scales; those that they do not have are left out."""
-    # The viscosity is about to become one of them: then this can be a plain call.
-    known = {field.name for field in fields(ReferenceScales)}
-    return ReferenceScales(**{name: value for name, value in given.items() if name in known})
-
-
-SCALES = scales_of(length=1.2, spacing=0.6, velocity=0.9, density_mean=1.0, density=0.02, acceleration=1.7,
-                   density_rate=0.05, sound_speed=11.0, viscosity=0.03)
+SCALES = ReferenceScales(length=1.2, spacing=0.6, velocity=0.9, density_mean=1.0, density=0.02, acceleration=1.7,
+                         density_rate=0.05, sound_speed=11.0, viscosity=0.03)
 CUTOFF, NEIGHBORS = 1.5, 12.0
 FLOW = FlowUnits(SCALES, CUTOFF, NEIGHBORS)
 CLOUDS = {

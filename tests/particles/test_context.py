@@ -11,7 +11,7 @@ from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.rates import Rates
 from eddies.particles.resolved_velocity import ResolvedVelocity
 from eddies.particles.terms.settings import TermSettings
-from eddies.particles.terms.term import Term
+from eddies.particles.terms.term import PairTerm, Term
 from tests.particles.clouds import (
     CUTOFF, MODELS, NEIGHBORS, SCALES, ReadsNothing, alone, distributed, dynamics_of, model, of_terms, state,
 )
@@ -125,3 +125,37 @@ def test_pairs_are_taken_in_blocks_that_fit_the_cache(comm, monkeypatch):
     sizes = [len(pairs.distance) for pairs in context.scaled_pairs(8)]
     assert len(sizes) > 10 and max(sizes) <= 400 / 8 + 60  # at least a particle's neighbours
     assert sum(sizes) == sum(len(pairs.distance) for pairs in context.scaled_pairs(1))
+
+
+@dataclass(frozen=True, kw_only=True)
+class GivesDensity(TermSettings):
+    """Settings of a sum over pairs that gives a part of the density."""
+
+    reads = ("pairs",)
+    gives = ("density",)
+
+
+class WeightedMean(PairTerm):
+    """A density, of all particles, made with the moments of their neighbourhoods."""
+
+    Settings = GivesDensity
+    needs_moments = True
+
+    def pair_values(self, pairs):
+        return (pairs.weight * pairs.distance).unsqueeze(0)
+
+    def rates_of(self, sums, context):
+        return Rates(density=(sums / context.moments.weight)[0])
+
+
+@pytest.mark.mpi(1, 2)
+def test_a_density_is_summed_for_all_particles_whichever_are_asked_for(comm):
+    """Also where it needs moments, and a pair sum for the few needs them too."""
+    slab, particles = distributed(comm, *state())
+    given = WeightedMean(GivesDensity(), of_terms().flow).double()
+    lagrangian = of_terms(given, *model(pairs={}, eddy_viscosity={}).terms.values())
+    rows = torch.arange(0, len(particles), 3)
+    whole = dynamics_of(slab, lagrangian).rates(particles)
+    some = dynamics_of(slab, lagrangian).rates(particles, rows)
+    assert torch.allclose(some.density, whole.density, atol=1e-14)
+    assert torch.allclose(some.acceleration, whole.acceleration[rows], rtol=1e-12, atol=1e-14)

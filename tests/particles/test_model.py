@@ -16,7 +16,7 @@ from eddies.particles.terms.settings import TermSettings
 from eddies.particles.terms.term import PairTerm, Term
 from eddies.scene_values import SceneError
 from tests.particles.clouds import (
-    FLOW, MODELS, SCALES, DensityReader, Field, ReadsNothing, distributed, dynamics_of, given, model, of_terms, state,
+    FLOW, MODELS, DensityReader, Field, ReadsNothing, distributed, dynamics_of, given, model, of_terms, state,
 )
 
 
@@ -29,8 +29,7 @@ def randomised(lagrangian, seed=3):
     return lagrangian
 
 
-LINEAR = ["pressure", "stress", "damping", "relaxation", "forcing",
-          *(["viscosity"] if hasattr(SCALES, "viscosity") else [])]
+LINEAR = ["pressure", "stress", "damping", "relaxation", "forcing", "viscosity"]
 SETTINGS = {"forcing": dict(injection_rate=0.3)}
 
 

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from clouds import DensityReader, along, assert_close, by_id, distributed, dynamics_of, model, of_terms, scales_of
+from clouds import DensityReader, along, assert_close, by_id, distributed, dynamics_of, model, of_terms
 from mpi4py import MPI
 
 from eddies.flow import initial_fields
@@ -16,6 +16,7 @@ from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.fourier_grid import FourierGrid
 from eddies.particles.particle_set import ParticleSet, as_numpy
+from eddies.particles.reference_scales import ReferenceScales
 from eddies.particles.resolved_velocity import ResolvedVelocity
 from eddies.particles.smoothing_kernels import WendlandC2
 from eddies.particles.surroundings import Surroundings
@@ -24,8 +25,9 @@ from eddies.spectral.spectral_grid import SpectralGrid
 
 LENGTH, PER_SIDE, SOUND_SPEED = 2 * np.pi, 16, 10.0
 SUPPORT = 1.8 * LENGTH / PER_SIDE
-FLOW = FlowUnits(scales_of(length=0.5, spacing=0.4, velocity=1.0, density_mean=1.0, density=0.01, acceleration=2.0,
-                           density_rate=0.05, sound_speed=SOUND_SPEED, viscosity=0.02), 0.8, 20.0)
+SCALES = ReferenceScales(length=0.5, spacing=0.4, velocity=1.0, density_mean=1.0, density=0.01, acceleration=2.0,
+                         density_rate=0.05, sound_speed=SOUND_SPEED, viscosity=0.02)
+FLOW = FlowUnits(SCALES, 0.8, 20.0)
 
 
 def particles_in_turbulence(comm):

@@ -22,7 +22,7 @@ import eddies.parallel.reduction
 
 # What of eddies breaks, and in which call of it. In each of these the other ranks wait for this one, or soon will.
 PLACES = {
-    "transform": (eddies.spectral.fourier_passes.PlanePass, "to_physical", 50),  # between the two transposes of a product
+    "transform": (eddies.spectral.fourier_passes.PlanePass, "to_physical", 50),  # between two transposes
     "halo": (eddies.parallel.plane_halo.PlaneHalo, "_exchange", 4),
     "reduction": (eddies.parallel.reduction, "_reduce", 60),
     "product": (eddies.io.hdf5, "_collective", 15),  # the last preparation of a collective write: the second frame

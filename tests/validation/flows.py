@@ -5,8 +5,8 @@ import numpy as np
 from eddies.flow import initial_fields
 from eddies.flow.forcing import LinearForcing
 from eddies.flow.navier_stokes import CompressibleFluid
-from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.parallel.slab import SlabDecomposition
+from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.time_stepping import STEPPERS
 
 

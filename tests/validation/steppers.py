@@ -22,11 +22,11 @@ from eddies.clock import ProgressLine
 from eddies.flow import initial_fields
 from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid, advective_speed
 from eddies.flow.operators import project
-from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.flow.statistics import compressible_budget, energy_spectrum, gradient_moments, turbulence_scales
 from eddies.logs import configure_logging
 from eddies.parallel.reduction import global_max
 from eddies.parallel.slab import SlabDecomposition
+from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.time_stepping import ETDRK4, STEPPERS
 
 MACH_NUMBERS = (0.04, 0.08, 0.16)

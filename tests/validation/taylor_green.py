@@ -19,10 +19,10 @@ from eddies.clock import Clock, ProgressLine
 from eddies.flow import initial_fields
 from eddies.flow.courant import CourantLimit
 from eddies.flow.navier_stokes import IncompressibleFluid
-from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.flow.statistics import incompressible_budget
 from eddies.logs import configure_logging
 from eddies.parallel.slab import SlabDecomposition
+from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.time_stepping import ETDRK4
 
 VISCOSITY = 1 / 1600

@@ -18,8 +18,9 @@ from eddies.particles.faults import Limits, find_fault
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.model import LagrangianModel
+from eddies.particles.reference_scales import ReferenceScales
 from eddies.particles.terms.presets import PRESETS
-from tests.particles.clouds import LENGTH, Field, by_id, distributed, of_terms, scales_of
+from tests.particles.clouds import LENGTH, Field, by_id, distributed, of_terms
 from tests.particles.clouds import model as model_of
 
 TOTAL, PLANES, SKIN = 343, 7, 0.1  # one cell of the grid a particle
@@ -45,7 +46,7 @@ NEIGHBORS = [30, 60, 120, 200]
 def scales(total, mach=0.1):
     """Of turbulence with v_rms = 1 and the largest eddies of the box; density fluctuations go with M_t^2."""
     spacing = LENGTH / round(total ** (1 / 3))
-    return scales_of(
+    return ReferenceScales(
         length=2 * spacing, spacing=spacing, velocity=1.0, density_mean=1.0, density=0.3 * mach**2, acceleration=3.0,
         density_rate=0.5 * mach**2, sound_speed=math.sqrt(3) / mach,
         viscosity=0.02)

@@ -16,9 +16,10 @@ from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.particle_set import ParticleSet
+from eddies.particles.reference_scales import ReferenceScales
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.time_stepping import ETDRK4
-from tests.particles.clouds import LENGTH, model, scales_of
+from tests.particles.clouds import LENGTH, model
 
 CELLS, PER_SIDE, VISCOSITY, STEP = 32, 24, 0.03, 0.02
 WIDTH = 2 * LENGTH / PER_SIDE
@@ -44,16 +45,13 @@ def moments_of_tracers(grid):
 @torch.no_grad()
 def modelled(now, *words):
     """Accelerations by these terms, and the resolved flow."""
-    scales = scales_of(length=WIDTH, spacing=LENGTH / PER_SIDE, velocity=0.6, density_mean=1.0, density=0.01,
-                       acceleration=1.0, density_rate=0.05, sound_speed=10.0, viscosity=VISCOSITY)
-    terms = {word: {} for word in words if word != "viscosity" or hasattr(scales, "viscosity")}
+    scales = ReferenceScales(length=WIDTH, spacing=LENGTH / PER_SIDE, velocity=0.6, density_mean=1.0, density=0.01,
+                             acceleration=1.0, density_rate=0.05, sound_speed=10.0, viscosity=VISCOSITY)
     dynamics = ParticleDynamics(SlabDecomposition(MPI.COMM_SELF, LENGTH, PER_SIDE),
-                                model(terms, FlowUnits(scales, 2 * WIDTH, 30.0)), 0.1)
+                                model({word: {} for word in words}, FlowUnits(scales, 2 * WIDTH, 30.0)), 0.1)
     particles = ParticleSet.from_numpy(now)
     context = dynamics.context(particles)
     acceleration, flow = dynamics.model.rates(context).acceleration, context.resolved
-    if not hasattr(scales, "viscosity"):  # to be removed with the viscosity's place in the scales
-        acceleration += flow.at_particles(-VISCOSITY * flow.grid.wavenumber_squared * flow.velocity)
     return acceleration.numpy(), flow
 
 

@@ -9,7 +9,6 @@ import torch
 from eddies.flow import initial_fields
 from eddies.flow.forcing import LinearForcing
 from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid
-from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.learning import force_training
 from eddies.learning.force_training import ForceTrainer, LossWeights, TrainingFrame
 from eddies.learning.optimization import Descent
@@ -21,16 +20,18 @@ from eddies.particles.fourier_grid import FourierGrid
 from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.particle_set import ParticleSet
+from eddies.particles.reference_scales import ReferenceScales
 from eddies.particles.resolved_velocity import ResolvedVelocity
 from eddies.particles.smoothing_kernels import WendlandC2
 from eddies.particles.terms.eddy_viscosity import EddyViscosity
 from eddies.particles.terms.presets import PRESETS
-from tests.particles.clouds import model, scales_of
+from eddies.spectral.spectral_grid import SpectralGrid
+from tests.particles.clouds import model
 
 LENGTH, PER_SIDE, STEP = 2 * np.pi, 9, 0.001
 SPACING = LENGTH / PER_SIDE
-SCALES = scales_of(length=2 * SPACING, spacing=SPACING, velocity=1.0, density_mean=1.0, density=0.01,
-                   acceleration=1.0, density_rate=0.02, sound_speed=10.0, viscosity=0.01)
+SCALES = ReferenceScales(length=2 * SPACING, spacing=SPACING, velocity=1.0, density_mean=1.0, density=0.01,
+                         acceleration=1.0, density_rate=0.02, sound_speed=10.0, viscosity=0.01)
 FORCING = {"forcing": dict(injection_rate=0.5)}
 NO_DENSITY = {"pairs": dict(inputs=("distance", "speed", "approach"))}
 

@@ -5,10 +5,10 @@ import pytest
 
 from eddies.analysis.tracer_statistics import tracer_statistics
 from eddies.flow import initial_fields
-from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.flow.statistics import energy_spectrum
 from eddies.flow.tracers import FilteredField, TracerParticles, release
 from eddies.parallel.slab import SlabDecomposition
+from eddies.spectral.spectral_grid import SpectralGrid
 
 LENGTH, PER_SIDE, STEP, FRAMES = 2 * np.pi, 14, 0.02, 21
 

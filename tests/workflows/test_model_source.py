@@ -84,7 +84,8 @@ def test_other_terms_are_refused_with_both_lists(comm, tmp_path, terms):
     with pytest.raises(SceneError) as error:
         read_source(scene_with(tmp_path, *terms), comm)
     trained = '["pressure", "stress", "damping", "relaxation", "pairs"]'
-    assert f"tiny: [model] terms = {quoted(terms)}, but {tmp_path}/model.h5 was trained with {trained}" in str(error.value)
+    expected = f"tiny: [model] terms = {quoted(terms)}, but {tmp_path}/model.h5 was trained with {trained}"
+    assert expected in str(error.value)
 
 
 @pytest.mark.mpi(1, 2)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Protocol
@@ -80,6 +81,16 @@ class Context:
             raise LookupError(UNSEEN)
         return self._surroundings.local(self.particles)
 
+    @cached_property
+    def everywhere(self) -> Context:
+        """The same where all owned particles are asked for."""
+        if self.rows is None:
+            return self
+        whole = copy(self)
+        whole.rows, whole._sums = None, {}
+        vars(whole).pop("moments", None)
+        return whole
+
     def column(self, name: str) -> Tensor:
         """"velocity" (s, 3) or "density" (s,) of the particles that this rank sees, owned first; collective."""
         if self._surroundings is None:
@@ -87,7 +98,8 @@ class Context:
         if name not in self._columns:
             owned = self.density if name == "density" else getattr(self.particles, name)
             if owned is None:
-                raise LookupError(f'no term of this model reads "{name}": add it to the `reads` of the settings')
+                raise LookupError(f'no term of this model reads "{name}": add it to the `reads` of the settings; or '
+                                  "the particles have none")
             self._columns[name] = self._surroundings.column(owned)
         return self._columns[name]
 
@@ -107,7 +119,7 @@ class Context:
     def pair_sums(self, term: Summand) -> Tensor:
         """Sums (components, k) of a term's pair values over each particle's neighbours."""
         if term not in self._sums:
-            self.sum_pairs([term], self.rows)
+            self.sum_pairs([term])
         return self._sums[term]
 
     def forget_sums(self, term: object) -> None:
@@ -123,18 +135,17 @@ class Context:
         return Moments(moments.invert_symmetric(sums[1:] + REGULARISATION * expected * diagonal),
                        sums[:1] + REGULARISATION * moments.expected_weight(flow.neighbors))
 
-    def sum_pairs(self, terms: Sequence[Summand], rows: Tensor | None) -> None:
-        """Take the sums of terms together, with the moments that some of them need, for rows (k,) of the particles or
-        for all; collective."""
+    def sum_pairs(self, terms: Sequence[Summand]) -> None:
+        """Take the sums of terms together, with the moments that some of them need; collective."""
         summands = [*terms, *([_MOMENTS] if any(getattr(term, "needs_moments", False) for term in terms) else [])]
         if summands:
-            mutual = rows is None and all(summand.mutual for summand in summands)
-            found = self._mutual_sums(summands) if mutual else self._sums_of(summands, rows)
+            mutual = self.rows is None and all(summand.mutual for summand in summands)
+            found = self._mutual_sums(summands) if mutual else self._sums_of(summands)
             self._sums |= dict(zip(summands, found))
 
-    def _sums_of(self, summands: Sequence[Summand], rows: Tensor | None) -> Sequence[Tensor]:
+    def _sums_of(self, summands: Sequence[Summand]) -> Sequence[Tensor]:
         blocks = []
-        for block in self._blocks(summands, rows):
+        for block in self._blocks(summands):
             pairs = self._pairs(block)
             values = [summand.pair_values(pairs) for summand in summands]
             blocks.append(pairs.pairs.sum(torch.cat(values).T).T)
@@ -144,7 +155,7 @@ class Context:
         """Each pair of owned particles evaluated once; those with ghosts on both sides."""
         totals = [self.local.position.new_zeros((len(summand.parity), len(self.particles)), dtype=self.dtype)
                   for summand in summands]
-        for block in self._blocks(summands, None):
+        for block in self._blocks(summands):
             pairs = self._pairs(block, once=True)
             for summand, total in zip(summands, totals):
                 pairs.pairs.add_to_both(summand.pair_values(pairs), summand.parity.to(total), total)
@@ -155,16 +166,16 @@ class Context:
         pairs = self.local.neighbors.pairs(position[: len(self.particles)], position, block, self.dtype, once)
         return ScaledPairs(pairs, self.column, self.flow)
 
-    def _blocks(self, summands: Sequence[Summand], rows: Tensor | None) -> Iterator[Tensor | slice | None]:
+    def _blocks(self, summands: Sequence[Summand]) -> Iterator[Tensor | slice | None]:
         """Receivers to take together: few enough for the cache, or all where a gradient is recorded."""
-        if rows is not None or torch.is_grad_enabled():
-            yield rows
+        if self.rows is not None or torch.is_grad_enabled():
+            yield self.rows
             return
         yield from self.blocks(max(summand.width for summand in summands))
 
     def blocks(self, width: int) -> Iterator[slice]:
-        """Consecutive particles whose pairs hold about as many numbers as fit the cache, `width` for each pair; at least
-        one block."""
+        """Consecutive particles whose pairs hold about as many numbers as fit the cache, `width` for each pair; at
+        least one block."""
         together = max(PAIR_VALUES_TOGETHER[self.particles.position.device.type] // width, 1)
         yield from self.local.neighbors.blocks(together)
 

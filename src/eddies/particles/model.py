@@ -83,7 +83,8 @@ class LagrangianModel(nn.Module):
         """
         kept, sums = kept or {}, []
         for stage in self._stages:
-            self._sum_pairs([term for name, term in stage if name not in kept], context)
+            anew = [term for name, term in stage if name not in kept]
+            context.sum_pairs([term for term in anew if isinstance(term, PairTerm) and not _everywhere(term)])
             found = [kept[name].at(context.rows) if name in kept else _evaluated(term, context) for name, term in stage]
             sums.append(self._at_particles(total(found), context))
             if context.density is None and self.density_is_given:
@@ -106,14 +107,6 @@ class LagrangianModel(nn.Module):
         named = list(self.terms.items())
         stages = [[item for item in named if ("density" in item[1].reads) == reading] for reading in (False, True)]
         return stages if stages[1] else stages[:1]
-
-    def _sum_pairs(self, terms: Iterable[Term], context: Context) -> None:
-        """Take the sums over pairs together that are for all particles, and those that are for the ones asked for."""
-        pair_terms = [term for term in terms if isinstance(term, PairTerm)]
-        for everywhere in (True, False):
-            together = [term for term in pair_terms if ("density" in term.gives) == everywhere]
-            if together:
-                context.sum_pairs(together, None if everywhere else context.rows)
 
     def _at_particles(self, rates: Rates, context: Context) -> Rates:
         """With what was given as modes taken to the particles: the force less its mean over them, as it keeps their
@@ -180,9 +173,14 @@ class LinearRates:
         return Rates(**values)
 
 
+def _everywhere(term: Term) -> bool:
+    """Whether a sum over pairs is for all particles, whichever are asked for: others see the density that it gives."""
+    return isinstance(term, PairTerm) and "density" in term.gives
+
+
 def _evaluated(term: Term, context: Context) -> Rates:
     """A term's rates, those of the particles that are asked for."""
-    rates = term(context)
+    rates = term(context.everywhere if _everywhere(term) else context)
     if not isinstance(rates, Rates):
         raise SceneError(f"{type(term).__name__}: forward returns a {type(rates).__name__}; it must return Rates")
     return rates if isinstance(term, PairTerm) else rates.at(context.rows)

@@ -1,5 +1,7 @@
 """Spectral damping, viscosity and relaxation of a resolved velocity of few modes."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from mpi4py import MPI
@@ -10,7 +12,7 @@ from eddies.particles.fourier_grid import FourierGrid
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.resolved_velocity import ResolvedFlow
 from eddies.particles.terms.damping import RATES
-from tests.particles.clouds import CUTOFF, LENGTH, NEIGHBORS, SCALES, dynamics_of, model, scales_of
+from tests.particles.clouds import CUTOFF, LENGTH, NEIGHBORS, SCALES, dynamics_of, model
 
 pytestmark = pytest.mark.mpi(1)
 RESOLVED, CELLS = 6, 18
@@ -79,10 +81,9 @@ def test_between_the_wavenumbers_of_two_rates_damping_is_linear():
     assert torch.allclose(force[:, 2], -rate * wave(*position.T)[2], atol=1e-12)
 
 
-@pytest.mark.skipif(not hasattr(SCALES, "viscosity"), reason="the viscosity is no reference scale yet")
 def test_viscosity_damps_with_the_square_of_the_wavenumber():
     nu = 0.07
-    flow = FlowUnits(scales_of(**{**SCALES.to_dict(), "viscosity": nu}), CUTOFF, NEIGHBORS)
+    flow = FlowUnits(replace(SCALES, viscosity=nu), CUTOFF, NEIGHBORS)
     position = lattice()
     force = acceleration(model(viscosity={}, flow=flow), waves, position, torch.zeros_like(position))
     for component, (wave, squared) in enumerate(zip(waves(*position.T), (4, 25, 1))):

@@ -1,5 +1,7 @@
 """What holds for every model of pairs, and the learned force of Eqs. 3 and 4."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -7,7 +9,7 @@ from eddies.particles import moments
 from eddies.particles.flow_units import FlowUnits
 from eddies.scene_values import SceneError
 from tests.particles.clouds import (
-    CUTOFF, FLOW, LENGTH, NEIGHBORS, PAIR_MODELS, SCALES, along, cloud, given, model, rates, scaled_pairs, scales_of,
+    CUTOFF, FLOW, LENGTH, NEIGHBORS, PAIR_MODELS, SCALES, along, cloud, given, model, rates, scaled_pairs,
     state,
 )
 
@@ -180,8 +182,8 @@ def test_forces_scale_with_the_units_of_the_flow():
     """The same network in a flow twice as large, three times as fast: accelerations in units of a_rms."""
     position, velocity, density = state()
     small = position / 2 + 1.0  # far from the faces
-    half = FlowUnits(scales_of(**{**SCALES.to_dict(), "length": SCALES.length / 2, "velocity": 3 * SCALES.velocity,
-                                  "acceleration": 5.0, "viscosity": 0.01}), CUTOFF / 2, NEIGHBORS)
+    scales = replace(SCALES, length=SCALES.length / 2, velocity=3 * SCALES.velocity, acceleration=5.0)
+    half = FlowUnits(scales, CUTOFF / 2, NEIGHBORS)
     inside = ((position > CUTOFF) & (position < LENGTH - CUTOFF)).all(1)
     first = rates(model(pairs={}), position, velocity, density).acceleration[inside] / SCALES.acceleration
     second = rates(model(pairs={}, flow=half), small, 3 * velocity, density).acceleration[inside] / 5.0

@@ -3,6 +3,8 @@
 What is expected is made of the unfiltered velocity by plain transforms, never of the terms' own formulas.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -16,20 +18,17 @@ from eddies.particles.fourier_grid import FourierGrid
 from eddies.particles.model import LagrangianModel
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.resolved_velocity import ResolvedFlow
-from tests.particles.clouds import CUTOFF, LENGTH, NEIGHBORS, SCALES, DensityReader, model, scales_of
+from tests.particles.clouds import CUTOFF, LENGTH, NEIGHBORS, SCALES, DensityReader, model
 from tests.validation.filtered_fields import CELLS, WAVE, Filtered, at, fields_of, modes_of, random_velocity
 
 pytestmark = pytest.mark.mpi(1)
-MODES, PLANES, COUNT, VISCOSITY = random_velocity(4), 48, 400, 0.05
-# Until it is one of the reference scales: then it is just so.
-VISCOUS = hasattr(SCALES, "viscosity")
-NU = VISCOSITY if VISCOUS else 0.0
+MODES, PLANES, COUNT, NU = random_velocity(4), 48, 400, 0.05
 
 
 def lagrangian(width, *words):
     """A model of these terms, and of one that reads a density."""
-    flow = FlowUnits(scales_of(**{**SCALES.to_dict(), "length": width, "viscosity": VISCOSITY}), CUTOFF, NEIGHBORS)
-    terms = model({word: {} for word in words if word != "viscosity" or VISCOUS}, flow).terms
+    flow = FlowUnits(replace(SCALES, length=width, viscosity=NU), CUTOFF, NEIGHBORS)
+    terms = model({word: {} for word in words}, flow).terms
     return LagrangianModel({**terms, "reader": DensityReader()}, flow)
 
 

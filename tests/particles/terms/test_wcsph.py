@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -6,7 +8,7 @@ from eddies.particles.flow_units import FlowUnits
 from eddies.particles.integrators import VelocityVerlet
 from eddies.particles.smoothing_kernels import CubicSpline, WendlandC2
 from tests.particles.clouds import (
-    LENGTH, SCALES, alone, by_id, distributed, dynamics_of, model, rates, scales_of, state,
+    LENGTH, SCALES, alone, by_id, distributed, dynamics_of, model, rates, state,
 )
 
 SUPPORT, COUNT = 1.5, 200
@@ -17,8 +19,7 @@ both_kernels = pytest.mark.parametrize("kernel", KERNELS)
 
 def sph(kernel, spacing=LENGTH / COUNT ** (1 / 3), support=SUPPORT, sound_speed=TRUE["sound_speed"], **values):
     """Summation density and forces; a particle has the mass of a cube of the spacing."""
-    flow = FlowUnits(scales_of(**{**SCALES.to_dict(), "spacing": spacing, "sound_speed": sound_speed,
-                                  "viscosity": 0.01}), support, 20.0)
+    flow = FlowUnits(replace(SCALES, spacing=spacing, sound_speed=sound_speed), support, 20.0)
     forces = {name: TRUE[name] for name in ("alpha", "beta", "exponent")} | values
     return model({"summation-density": dict(kernel=kernel), "wcsph": dict(kernel=kernel, **forces)}, flow)
 
