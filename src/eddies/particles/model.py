@@ -25,7 +25,7 @@ class LagrangianModel(nn.Module):
     Parameters
     ----------
     terms : by name, in the order in which they are evaluated.
-    flow : what they were made for.
+    flow : what they were made for, and the units that they have unless a `ParticleDynamics` is given others.
 
     Terms that do not read the density come first; what they give of it is the density that the others see. What no term
     reads is not built, and the density is not computed where nobody reads it. Raises SceneError where a term both reads
@@ -88,7 +88,7 @@ class LagrangianModel(nn.Module):
             found = [kept[name].at(context.rows) if name in kept else _evaluated(term, context) for name, term in stage]
             sums.append(self._at_particles(total(found), context))
             if context.density is None and self.density_is_given:
-                context.density = self.flow.scales.density_mean + sums[0].density
+                context.density = context.flow.scales.density_mean + sums[0].density
         result = total(sums)
         if result.acceleration is None:
             at_rest = torch.zeros_like(context.particles.velocity)
@@ -121,7 +121,7 @@ class LagrangianModel(nn.Module):
         if rates.force_modes is not None:
             parts.append(Rates(acceleration=context.without_mean(values[:, :3])).at(context.rows))
         if pressure is not None:
-            scales = self.flow.scales
+            scales = context.flow.scales
             parts.append(Rates(density=values[:, -1] * (scales.density_mean / scales.sound_speed**2)))
         return total(parts)
 

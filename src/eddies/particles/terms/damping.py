@@ -32,7 +32,7 @@ class Damping(Term):
 
     def forward(self, context: Context) -> Rates:
         """Modes of the force."""
-        flow, scales = context.resolved, self.flow.scales
+        flow, scales = context.resolved, context.flow.scales
         return Rates(force_modes=-scales.velocity / scales.length * self._damping(flow.grid) * flow.velocity)
 
     def _damping(self, grid: FourierGrid) -> Tensor:

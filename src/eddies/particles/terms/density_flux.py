@@ -42,5 +42,5 @@ class DensityFlux(PairTerm):
 
     def rates_of(self, sums: Tensor, context: Context) -> Rates:
         """The rate of density."""
-        rate = self.flow.scales.density_rate / self.flow.neighbors * sums[0]
+        rate = context.flow.scales.density_rate / context.flow.neighbors * sums[0]
         return Rates(density_rate=rate.to(context.particles.velocity.dtype))

@@ -41,10 +41,10 @@ class DensityTransport(PairTerm):
 
     def rates_of(self, sums: Tensor, context: Context) -> Rates:
         """The rate of density."""
-        scales, around = self.flow.scales, context.moments
+        scales, around = context.flow.scales, context.moments
         divergence = moments.contract_symmetric(around.inverse, sums[:6])
         contrast = (sums[6:] / around.weight)[0]
         compression, relaxation = self.factors
         rate = (-compression * scales.density_mean * scales.velocity / scales.length * divergence
-                + relaxation * scales.sound_speed / self.flow.cutoff * scales.density * contrast)
+                + relaxation * scales.sound_speed / context.flow.cutoff * scales.density * contrast)
         return Rates(density_rate=rate.to(context.particles.velocity.dtype))

@@ -25,7 +25,7 @@ class Relaxation(Term):
 
     def forward(self, context: Context) -> Rates:
         """The acceleration."""
-        scales = self.flow.scales
+        scales = context.flow.scales
         missing = context.resolved.missing()
         rate = 2 * scales.velocity / scales.length * self.factor.to(missing)
         return Rates(acceleration=-rate * context.without_mean(missing))

@@ -31,5 +31,5 @@ class Stress(Term):
         """Modes of the force and of p_tau."""
         grid = context.resolved.grid
         slopes = grid.slopes(context.resolved.velocity)
-        factor = self.amplitude.double().cpu() * self.flow.scales.length**2 / 12
+        factor = self.amplitude.double().cpu() * context.flow.scales.length**2 / 12
         return grid.hidden_stress(factor * grid.products(slopes, slopes))

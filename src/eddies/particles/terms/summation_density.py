@@ -40,4 +40,4 @@ class SummationDensity(PairTerm):
         """The density's deviation from the mean."""
         itself = self.kernel.value(sums.new_zeros(()))
         density = (self.mass * (sums[0] + itself)).to(context.particles.velocity.dtype)
-        return Rates(density=density - self.flow.scales.density_mean)
+        return Rates(density=density - context.flow.scales.density_mean)

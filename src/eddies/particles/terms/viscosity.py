@@ -16,5 +16,5 @@ class Viscosity(Term):
 
     def forward(self, context: Context) -> Rates:
         """Modes of the force."""
-        flow = context.resolved
-        return Rates(force_modes=-self.flow.scales.viscosity * flow.grid.wavenumber_squared * flow.velocity)
+        grid, velocity = context.resolved.grid, context.resolved.velocity
+        return Rates(force_modes=-context.flow.scales.viscosity * grid.wavenumber_squared * velocity)
