@@ -270,3 +270,16 @@ def test_a_scene_with_a_model_loads_no_torch():
             "eddies.Model(preset='wcsph'); dir(eddies);"
             "sys.exit(bool({'torch', 'mpi4py', 'numpy', 'h5py', 'pyfftw'} & set(sys.modules)))")
     assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
+
+
+def test_another_list_on_the_command_line_takes_the_place_of_the_file_s(tmp_path):
+    """Of a preset, of terms, and of a written scene, which has settings of all its terms."""
+    written = load_scene("hit-small", ["model.pairs.hidden=[8, 8]"]).to_toml()
+    assert load_scene("hit-small", ['model.terms=["pressure", "pairs"]']).model.terms == ("pressure", "pairs")
+    found = read(tmp_path, written, "model.preset=resolved").model
+    assert found.terms == tuple(PRESETS["resolved"]) == tuple(found.settings)
+    kept = read(tmp_path, written, 'model.terms=["pressure", "pairs"]').model
+    assert kept.settings["pairs"].hidden == (8, 8)
+    refused("[model.pairs]: no such term",
+            lambda: read(tmp_path, written, "model.preset=resolved", "model.pairs.hidden=[4]"))
+    refused("with terms = ", lambda: read(tmp_path, written, "model.preset=resolved", 'model.terms=["pressure"]'))

@@ -13,7 +13,7 @@ from typing import Any
 
 from eddies.composition import origins, search_in
 from eddies.scene_checks import first_inconsistency
-from eddies.scene_model import Model
+from eddies.scene_model import Model, replace_terms
 from eddies.scene_reader import (apply_overrides, find_document, parse_document, read_section, read_text,
                                  write_section)
 from eddies.scene_sections import (BOX_LENGTH, DEFAULT_WINDOW, Eulerian, Flow, Forcing, Initial, Kernel, Simulation,
@@ -135,6 +135,8 @@ def load_scene(name_or_path: str | Path, overrides: list[str] | tuple[str, ...] 
     try:
         document = {"name": path.stem, **parse_document(read_text(path))}
         keys = apply_overrides(document, list(overrides))
+        if isinstance(document.get("model"), dict):
+            replace_terms(document["model"], keys)
         return read_section(Scene, document)
     except SceneError as error:
         origin = f"{path}, --set" if error.key in keys else path

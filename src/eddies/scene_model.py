@@ -75,6 +75,21 @@ class Model(Section):
         return tuple(dict.fromkeys(path for part, _ in parts for _, path in import_paths(part)))
 
 
+def replace_terms(table: dict[str, Any], keys: set[str]) -> None:
+    """Where one of preset and terms was written over a [model] of a file, let the other go, and with it the file's
+    settings of terms that there are no more. `keys` are those written over the file, "section.key"."""
+    if ("model.preset" in keys) == ("model.terms" in keys):
+        return
+    written, other = ("preset", "terms") if "model.preset" in keys else ("terms", "preset")
+    table.pop(other, None)
+    listed = PRESETS.get(table[written], ()) if written == "preset" else table[written]
+    if not isinstance(listed, str):
+        names = {short_name(str(term)) for term in listed}
+        for name in [name for name, part in table.items() if isinstance(part, dict) and name not in names]:
+            if f"model.{name}" not in keys:
+                del table[name]
+
+
 def settings_class(term: str) -> type[TermSettings]:
     """The class of a term's settings: of a word of ours, or `Settings` of the class that an import path names.
 
