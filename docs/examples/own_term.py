@@ -3,7 +3,7 @@
     python docs/examples/own_term.py                # or: mpirun -n 2 python docs/examples/own_term.py
 
 runs the scene `tiny` with it: ground truth, training of its coefficient, rollout, report. A scene names it by its
-import path, in a TOML file beside this one or on the command line:
+import path, in a TOML file beside this one:
 
     [model]
     terms = ["pressure", "own_term:SmagorinskyStress", "relaxation", "pairs"]
@@ -12,7 +12,7 @@ import path, in a TOML file beside this one or on the command line:
     constant = 0.1
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -51,6 +51,5 @@ class SmagorinskyStress(eddies.Term):
 
 
 if __name__ == "__main__":
-    scene = eddies.load_scene("tiny", ['name="own-term"',
-                                       'model.terms=["pressure", "own_term:SmagorinskyStress", "relaxation", "pairs"]'])
-    eddies.run(scene)
+    model = eddies.Model(terms=("pressure", "own_term:SmagorinskyStress", "relaxation", "pairs"))
+    eddies.run(replace(eddies.load_scene("tiny", ['name="own-term"']), model=model))

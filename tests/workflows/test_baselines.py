@@ -26,14 +26,14 @@ field_every = 1
 neighbors = 30
 steps = 1
 [simulation]
-force = "none"
+method = "none"
 step = 0.02
 turnovers = 0.2
 frame_interval = 0.04
 start = 0
 """
-COARSE = ["simulation.force=eulerian", "eulerian.cells=12"]
-SOUND = ["simulation.force=wcsph", "simulation.step=0.004", "simulation.precision=float64"]
+COARSE = ["simulation.method=eulerian", "eulerian.cells=12"]
+SOUND = ["simulation.method=wcsph", "simulation.step=0.004", "simulation.precision=float64"]
 
 
 @pytest.fixture
@@ -67,8 +67,7 @@ def read(folder):
     with open_product(MPI.COMM_SELF, folder / "rollout.h5", "rollout") as file:
         runs = {name: Trajectory(file, name) for name in ("model", "truth")}
         columns = {name: {column: np.array([run.read(frame, column) for frame in range(len(run.times))])
-                          for column in ("position", "velocity", "density", "acceleration", "velocity_gradient")}
-                   for name, run in runs.items()}
+                          for column in run.columns} for name, run in runs.items()}
         assert len(FieldSeries(file, "model").times) == len(runs["model"].times)
         assert "outside_training" not in file  # a matter of networks
         return read_attributes(file, "rollout"), runs["model"].times, columns
@@ -76,7 +75,7 @@ def read(folder):
 
 def said_in_the_report(attributes):
     from eddies.analysis.figures_comparison import Rollout
-    return Rollout(attributes, None, None, {}, BOX_LENGTH, None, None).force
+    return Rollout(attributes, None, None, {}, BOX_LENGTH, None, None).method
 
 
 def energy(columns):
@@ -91,7 +90,7 @@ def test_particles_without_a_force_keep_their_velocity(comm, folder):
         model, truth = columns["model"], columns["truth"]
         assert attributes["status"] == "complete" and said_in_the_report(attributes).startswith("no force")
         assert np.array_equal(model["velocity"], np.broadcast_to(truth["velocity"][0], model["velocity"].shape))
-        assert not model["acceleration"].any()
+        assert not model["acceleration"].any() and "density" not in model
         path = truth["position"][0] + times[-1] * truth["velocity"][0] - model["position"][-1]
         # Positions are stored in single precision.
         assert np.abs(path - BOX_LENGTH * np.rint(path / BOX_LENGTH)).max() < 2e-6
@@ -100,15 +99,14 @@ def test_particles_without_a_force_keep_their_velocity(comm, folder):
 
 @pytest.mark.mpi(1)
 def test_without_a_force_there_is_no_list_and_no_halo(comm, folder):
-    from eddies.workflows.particle_run import ParticleRun
+    from eddies.workflows.particle_run import BallisticRun
     from eddies.workflows.truth import GroundTruth
 
     with open_product(comm, folder / "ground_truth.h5", "ground_truth") as file:
         truth = GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, 8))
-        run = ParticleRun(load_scene(folder / "baseline.toml"), truth, 1, folder, "cpu")
+        run = BallisticRun(load_scene(folder / "baseline.toml"), truth, 1, folder, "cpu")
     dynamics = run.dynamics
-    assert dynamics.surroundings is None and not dynamics.pair_terms and not dynamics.body_terms
-    assert dynamics.closure is None
+    assert dynamics.surroundings is None and dynamics.resolution is None and not dynamics.model.terms
 
 
 @pytest.mark.mpi(1, 2)
@@ -185,12 +183,12 @@ def test_seconds_of_a_step_leave_out_the_warm_up():
 
 
 @pytest.mark.parametrize("overrides, limit", [
-    (["simulation.force=none"], None),
-    (["simulation.force=wcsph", "simulation.step=0.0025"], "slabs no thinner than the particles' reach"),
-    (["simulation.force=eulerian"], "ghost planes of the coarse grid"),
+    (["simulation.method=none"], None),
+    (["simulation.method=wcsph", "simulation.step=0.0025"], "slabs no thinner than the particles' reach"),
+    (["simulation.method=eulerian"], "ghost planes of the coarse grid"),
 ])
-def test_ranks_are_limited_by_what_the_force_needs_alone(overrides, limit):
+def test_ranks_are_limited_by_what_the_method_needs_alone(overrides, limit):
     from eddies.workflows.estimates import most_ranks
-    alone = ("particles' reach", "filtered fields", "Poisson closure", "coarse grid")
+    alone = ("particles' reach", "filtered fields", "resolved velocity", "coarse grid")
     found = [reason for reason in most_ranks(load_scene("tiny", overrides)) if any(part in reason for part in alone)]
     assert len(found) == (limit is not None) and all(reason.startswith(limit) for reason in found)

@@ -77,7 +77,8 @@ def test_another_form_is_refused_with_both_values(comm, tmp_path, own, override,
 
 
 @pytest.mark.mpi(1)
-@pytest.mark.parametrize("terms", [("pressure", "pairs"), ("pairs", "pressure", "stress", "damping", "relaxation")])
+@pytest.mark.parametrize("terms", [("pressure", "pairs"),
+                                   ("pairs", "pressure", "stress", "damping", "relaxation")])
 def test_other_terms_are_refused_with_both_lists(comm, tmp_path, terms):
     """Also in another order, in which sums are rounded otherwise."""
     write_source(comm, tmp_path)

@@ -4,7 +4,6 @@ import dataclasses
 import json
 import math
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -69,7 +68,8 @@ def test_pairs_outside_the_training_data_are_counted(run_directory):
     with h5py.File(run_directory / "model.h5") as file:
         low, high = (file[f"feature_range/{bound}"][()] for bound in ("low", "high"))
         description = json.loads(file.attrs["description"])
-    support = description["support"] / description["scales"]["length"]
+    scene, length = load_scene("tiny"), description["scales"]["length"]
+    support = scene.kernel.support(scene.tracers.particles) / length
     # rho'_i, rho'_j, |x|, |v|, x.v
     assert low.shape == high.shape == (5,) and np.all(low < high)
     assert low[0] == low[1] and high[0] == high[1] and 0 < low[2] < 0.1 * support < 0.99 * support < high[2] <= support
@@ -80,21 +80,6 @@ def test_pairs_outside_the_training_data_are_counted(run_directory):
     assert np.all((0 <= share) & (share < 0.01))
     shown = json.loads((run_directory / "report" / "metrics.json").read_text())
     assert shown["rollout"]["outside_training"] == share.max()
-
-
-def test_a_model_from_before_the_range_was_stored_runs_without_it(run_directory, tmp_path):
-    for name in ("ground_truth.h5", "kernel.h5"):
-        (tmp_path / name).symlink_to(run_directory / name)
-    shutil.copy(run_directory / "model.h5", tmp_path)
-    with h5py.File(tmp_path / "model.h5", "r+") as file:
-        del file["feature_range"]
-    result = eddies(2, "simulate", "tiny", "--output", str(tmp_path), "--set", "simulation.turnovers=0.1")
-    assert result.returncode == 0, result.stdout + result.stderr
-    assert result.stdout.count("pairs outside the training range are not counted") == 1
-    with h5py.File(tmp_path / "rollout.h5") as file:
-        assert "outside_training" not in file and file["rollout"].attrs["status"] == "complete"
-    assert eddies(1, "report", str(tmp_path)).returncode == 0
-    assert "outside_training" not in json.loads((tmp_path / "report" / "metrics.json").read_text())["rollout"]
 
 
 def test_resume_skips_what_is_done_and_redoes_what_changed(run_directory):
@@ -167,18 +152,26 @@ def test_a_trained_model_runs_on_another_flow(run_directory, tmp_path):
     assert shown["mach_turbulent"] == pytest.approx(2 * shown["source_mach_turbulent"], rel=0.2)
 
 
-@pytest.mark.parametrize("form, weights", [("closure=learned-density", 1 + 6), ("closure=paper-density", 6),
-                                           ("basis=none", 1)])
-def test_the_other_forms_run(run_directory, tmp_path, form, weights):
+@pytest.mark.parametrize("model, weights, rate", [
+    ('preset = "learned-density"', 6 + 6 + 1, True),
+    ('preset = "paper-density"\n[model.pairs]\nhidden = [4]\n[model.density-flux]\nhidden = [4]', 4 + 4, True),
+    ('preset = "resolved"', 3, False),
+])
+def test_other_models_run(run_directory, tmp_path, model, weights, rate):
+    """Of networks, or of forces of the resolved velocity alone, where nothing reads a density."""
     for name in ("ground_truth.h5", "kernel.h5"):
         (tmp_path / name).symlink_to(run_directory / name)
-    change = ("--output", str(tmp_path), "--set", f"model.{form}")
+    text = load_scene("tiny", ["training.steps=10", "training.combined_steps=2", "simulation.turnovers=0.1"]).to_toml()
+    head, rest = text.split("[model]")
+    (tmp_path / "other.toml").write_text(f"{head}[model]\n{model}\n[training]{rest.split('[training]')[1]}")
     for stage in ("train", "simulate"):
-        result = eddies(2, stage, "tiny", *change)
+        result = eddies(2, stage, str(tmp_path / "other.toml"), "--output", str(tmp_path))
         assert result.returncode == 0, result.stdout + result.stderr
     assert eddies(1, "report", str(tmp_path)).returncode == 0
     metrics = json.loads((tmp_path / "report" / "metrics.json").read_text())
-    assert metrics["model"]["density_rate_error"] is not None
-    assert form.replace("=", " ") in metrics["rollout"]["force"]
+    assert (metrics["model"]["density_rate_error"] is not None) == rate
+    terms = load_scene(tmp_path / "other.toml").model.terms
+    assert metrics["rollout"]["method"] == f"the trained model, terms {', '.join(terms)}"
     with h5py.File(tmp_path / "model.h5") as file:
-        assert len(file["weights"]) == weights and ("feature_range" in file) == (form != "basis=none")
+        assert len(file["weights"]) == weights and ("feature_range" in file) == ("pairs" in terms)
+        assert list(json.loads(file.attrs["description"])["terms"]) == list(terms)

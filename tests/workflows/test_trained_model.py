@@ -45,7 +45,7 @@ def test_a_model_is_read_as_it_was_saved_in_its_precision(comm, tmp_path):
 
 @pytest.mark.mpi(1)
 def test_it_is_made_for_the_scales_that_are_asked_for(comm, tmp_path):
-    """Those of the start of a rollout; the stored ones tell where weights come from, and how wide the filter was."""
+    """Those of the start of a rollout; the stored ones tell how wide the filter was in training."""
     scene, _, path = saved(comm, tmp_path)
     other = replace(SCALES, velocity=3.0, sound_speed=5.0)
     found = load_model(scene, comm, path, other)

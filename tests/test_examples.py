@@ -1,0 +1,166 @@
+"""The examples of the documentation: each trains, runs and reports, as a program, from any directory."""
+
+import json
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+import eddies
+from mpi_tools.launch import mpi_environment, mpirun_command
+
+EXAMPLES = Path(__file__).parents[1] / "docs" / "examples"
+SMALL = ["flow.cells=16", "spin_up.turnovers=0.1", "tracers.particles_per_side=8", "tracers.field_cells=12",
+         "tracers.turnovers=0.3", "tracers.field_every=2", "kernel.neighbors=30", "kernel.steps=4", "kernel.points=50",
+         "training.steps=8", "training.combined_steps=2", "training.frames=3", "training.batch=64",
+         "simulation.turnovers=0.05", "simulation.frame_interval=0.04"]
+# Imported by Python itself when it starts: the scenes are smaller, and stages already done are skipped.
+SMALLER = f"""
+import eddies
+load, run = eddies.load_scene, eddies.run
+eddies.load_scene = lambda name, overrides: load(name, [*overrides, *{SMALL!r}])
+eddies.run = lambda scene: run(scene, resume=True)
+"""
+
+
+def started(folder, ranks, program):
+    """What a program says that is started in a folder, with smaller scenes."""
+    (folder / "sitecustomize.py").write_text(SMALLER)
+    line = mpirun_command(ranks, [sys.executable, str(program)]) if ranks > 1 else [sys.executable, str(program)]
+    environment = mpi_environment(ranks) if ranks > 1 else {**os.environ, "OMP_NUM_THREADS": "1"}
+    environment["PYTHONPATH"] = os.pathsep.join([str(folder), *filter(None, [environment.get("PYTHONPATH")])])
+    ended = subprocess.run(line, cwd=folder, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True,
+                           timeout=110)
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    return ended.stdout
+
+
+def results(directory):
+    """Metrics of the report, and what the products say of their model."""
+    metrics = json.loads((directory / "report" / "metrics.json").read_text())
+    assert metrics["rollout"]["status"] == "complete" and math.isfinite(metrics["model"]["acceleration_error"])
+    with h5py.File(directory / "model.h5") as file:
+        weights = {name: values[()] for name, values in file["weights"].items()}
+        return metrics, json.loads(file.attrs["description"])["terms"], weights
+
+
+@pytest.fixture(scope="module")
+def ground_truth(tmp_path_factory):
+    """A run directory with what does not depend on the model."""
+    folder = tmp_path_factory.mktemp("shared")
+    (folder / "program.py").write_text(
+        "import eddies, math, pathlib\nfrom mpi4py import MPI\nfrom eddies.parallel.stop import StopRequest\n"
+        "from eddies.stages import run_stages\n"
+        "stop = StopRequest(MPI.COMM_WORLD, (), pathlib.Path('STOP'), math.inf, 600.0)\n"
+        "run_stages(('dns', 'train-kernel'), eddies.load_scene('tiny', []), MPI.COMM_WORLD, pathlib.Path('run'), False,"
+        " stop)\n")
+    started(folder, 1, folder / "program.py")
+    return folder / "run"
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+@pytest.mark.parametrize("name", ["own_term", "own_network"])
+def test_a_model_of_the_users(tmp_path, ground_truth, name, ranks):
+    run = tmp_path / "runs" / name.replace("_", "-")
+    run.mkdir(parents=True)
+    for product in ("ground_truth.h5", "kernel.h5"):
+        (run / product).symlink_to(ground_truth / product)
+    said = started(tmp_path, ranks, EXAMPLES / f"{name}.py")
+    assert said.count("skipped") == 2
+    metrics, terms, weights = results(run)
+    if name == "own_term":
+        assert list(terms) == ["pressure", "own_term:SmagorinskyStress", "relaxation", "pairs"]
+        assert metrics["rollout"]["method"].endswith("pressure, SmagorinskyStress, relaxation, pairs")
+        learned = weights["terms.SmagorinskyStress.squared_constant"]
+        assert learned.shape == () and learned > 0 and learned != np.float32(0.17**2)
+    else:
+        assert terms["pairs"]["network"] == "own_network:Waves"
+        assert weights["terms.pairs.network.wavevectors"].shape == (32, 5)
+    assert "own_" in (run / "scene.toml").read_text()  # a run says whose classes it uses
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_a_flow_of_the_users(tmp_path, ranks):
+    started(tmp_path, ranks, EXAMPLES / "own_initial_flow.py")
+    run = tmp_path / "runs" / "own-initial-flow"
+    metrics, *_ = results(run)
+    # Spun up for a tenth of a turnover it is still what it began as: rms 1 a component, all three alike.
+    assert metrics["ground_truth"]["energy_budget_error"] < 1e-2
+    with h5py.File(run / "ground_truth.h5") as file:
+        energies = [file[f"statistics/energy_{axis}"][0] for axis in "xyz"]
+    assert energies == pytest.approx([energies[0]] * 3, rel=1e-6) and sum(energies) == pytest.approx(1.5, rel=1e-3)
+
+
+@pytest.fixture
+def examples(monkeypatch):
+    """Where a scene beside the examples would find them."""
+    monkeypatch.setattr(sys, "path", [*sys.path, str(EXAMPLES)])
+
+
+@pytest.mark.mpi(1, 2)
+@pytest.mark.parametrize("constant", [0.0, 0.17, 0.3])
+def test_the_stress_of_the_example_is_linear_as_it_says(comm, examples, constant):
+    """What is kept of it is what it gives, and so is the gradient."""
+    import torch
+
+    from eddies.flow.tracers import release
+    from eddies.parallel.reduction import global_sum
+    from eddies.parallel.slab import SlabDecomposition
+    from eddies.particles.dynamics import ParticleDynamics
+    from eddies.particles.particle_set import ParticleSet
+    from tests.learning.models import LENGTH, SPACING, model_of
+
+    terms = ("pressure", "own_term:SmagorinskyStress", "pairs")
+    model = model_of(terms, 1.6 * SPACING, 17, (4,))
+    slab = SlabDecomposition(comm, LENGTH, 12)
+    columns = release(slab, 3, 12, "random")
+    x, y, z = columns["position"].T
+    velocity = np.stack([np.sin(y) + np.cos(2 * z), np.sin(z), np.sin(2 * x)], axis=1)
+    particles = ParticleSet.from_numpy({**columns, "velocity": velocity})
+    dynamics = ParticleDynamics(slab, model, 0.0, torch.float64)
+    kept = model.linear_rates(dynamics.context(particles))
+    assert set(kept) == {"pressure", "SmagorinskyStress"}
+    parameter = model.terms["SmagorinskyStress"].squared_constant
+    with torch.no_grad():
+        parameter.fill_(constant**2)
+    found = []
+    for given in (kept, None):
+        rates = dynamics.rates(particles, kept=given)
+        rates.acceleration.square().sum().backward()
+        found.append((rates.acceleration.detach(), rates.density.detach(),
+                      torch.tensor(global_sum(comm, float(parameter.grad)))))
+        parameter.grad = None
+    for linear, direct in zip(*found):
+        assert torch.allclose(linear, direct, rtol=1e-10, atol=1e-12 * float(direct.abs().max()))
+    assert constant == 0 or float(found[0][0].square().mean()) > 0
+
+
+@pytest.mark.mpi(1, 2)
+def test_a_term_that_gives_nothing_has_one_error(comm, own):
+    """What is no term or no network at all is refused where the model is made: see test_trained_model."""
+    from eddies.parallel.slab import SlabDecomposition
+    from eddies.particles.dynamics import ParticleDynamics
+    from eddies.particles.particle_set import ParticleSet
+    from tests.learning.models import LENGTH, model_of
+
+    own("wrong", "import eddies\n\nclass Mine(eddies.Term):\n    def forward(self, context): pass\n")
+    dynamics = ParticleDynamics(SlabDecomposition(comm, LENGTH, 6), model_of(("wrong:Mine",), 1.5, 20, (4,)), 0.0)
+    at_rest = ParticleSet.from_numpy({"id": np.array([comm.rank]), "position": np.ones((1, 3)),
+                                      "velocity": np.zeros((1, 3))})
+    with pytest.raises(eddies.SceneError, match="Mine: forward returns a NoneType; it must return Rates"):
+        dynamics.rates(at_rest)
+
+
+@pytest.mark.mpi(1, 2)
+def test_a_wrong_initial_flow_has_one_error(comm, tmp_path, own):
+    if comm.rank == 0:
+        own("wrong", "import numpy\n\ndef flow(grid, initial, seed):\n    return numpy.zeros((3, 4, 4, 4))\n")
+    comm.Barrier()
+    scene = eddies.load_scene("tiny", [*SMALL, "initial.kind=wrong:flow", "initial.peak_wavenumber=3"])
+    with pytest.raises(eddies.SceneError, match=r'\[initial\] kind = "wrong:flow": returned .*must be the modes'):
+        eddies.run(scene, output=tmp_path / "run", comm=comm)

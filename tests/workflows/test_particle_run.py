@@ -1,0 +1,218 @@
+"""What moves the particles of a rollout: models in the units of its start frame, with and without a density, and a
+class of the user's."""
+
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+import torch
+
+from eddies.io.hdf5 import open_product, read_attributes, read_table
+from eddies.io.trajectories import Trajectory
+from eddies.io.weights import save_weights
+from eddies.methods import METHODS, method_class
+from eddies.parallel.slab import SlabDecomposition
+from eddies.particles.smoothing_kernels import KernelNetwork
+from eddies.scene import BOX_LENGTH, Model, SceneError, load_scene
+from eddies.workflows import dns, report, simulate, train
+from eddies.workflows.trained_model import describe, scene_model
+from eddies.workflows.truth import GroundTruth
+
+SCENE = """
+[flow]
+fluid = "{fluid}"
+cells = 12
+viscosity = 0.1
+{sound}
+[tracers]
+particles_per_side = 6
+turnovers = {turnovers}
+frame_interval = 0.02
+field_every = 1
+field_cells = 8
+[kernel]
+neighbors = 20
+steps = 1
+{model}
+[training]
+window = 1
+frames = 2
+batch = 60
+steps = 4
+combined_steps = 2
+field_weight = 0.1
+horizon_steps = 1
+horizons = [1]
+[simulation]
+step = 0.02
+turnovers = 0.05
+frame_interval = 0.04
+start = {start}
+"""
+WITHOUT_DENSITY = {
+    "resolved": '[model]\nterms = ["pressure", "stress", "damping", "relaxation"]',
+    "pairs": '[model]\nterms = ["pressure", "pairs"]\n[model.pairs]\nhidden = [4]\ninputs = ["distance", "approach"]',
+}
+OWN_METHOD = """
+import torch
+
+from eddies.particles.particle_set import ParticleSet
+
+
+class Swept:
+    '''All particles drift with the same wind.'''
+
+    needs = ()
+    has_density = False
+
+    def __init__(self, scene, truth, start, directory, device):
+        self.length, self.wind = truth.decomposition.length, torch.tensor([0.5, 0.0, -1.0], dtype=torch.float64)
+        columns = truth.particles(start)
+        columns.pop("density", None)
+        self.particles = ParticleSet.from_numpy(columns)
+
+    def steps(self, interval):
+        return 2
+
+    def advance(self, step, number):
+        moved = (self.particles.position + step * self.wind) % self.length
+        velocity = self.wind.expand_as(moved).contiguous()
+        self.particles = ParticleSet(self.particles.id, moved, velocity)
+
+    def frame(self):
+        return self.particles, torch.zeros_like(self.particles.velocity)
+
+    def series(self):
+        return {"wind": {"strength": []}}
+
+    def description(self):
+        return {"integrator": "exact", "terms": "wind"}
+"""
+
+
+def prepared(comm, directory, fluid="compressible", model="[model]", start=0.3, turnovers=0.14):
+    """The scene, with its ground truth in a directory, and a kernel with the weights that training starts from."""
+    path = directory / "own.toml"
+    if comm.rank == 0:
+        directory.mkdir(parents=True, exist_ok=True)
+        sound = "sound_speed = 15.0" if fluid == "compressible" else ""
+        path.write_text(SCENE.format(fluid=fluid, sound=sound, model=model, start=start, turnovers=turnovers))
+    comm.Barrier()
+    scene = load_scene(path)
+    dns.run(scene, comm, directory)
+    network = KernelNetwork(scene.kernel.support(scene.tracers.particles), [4])
+    description = {"form": network.FORM, "support": network.support, "hidden": [4], "cutoff": "smooth"}
+    weights = {name: tensor.numpy() for name, tensor in network.state_dict().items()}
+    save_weights(comm, directory / "kernel.h5", "kernel", description, weights, scene.provenance("train-kernel"), {
+        "history": {"step": np.zeros(1)}})
+    return scene
+
+
+def write_model(comm, directory, scene, scales):
+    weights = {name: tensor.float().numpy() for name, tensor in scene_model(scene, scales).state_dict().items()}
+    ranges = {"low": np.full(5, -1e3), "high": np.full(5, 1e3)}
+    save_weights(comm, directory / "model.h5", "model", describe(scene, scales), weights, {}, {"feature_range": ranges})
+
+
+def mover_of(comm, directory, scene, start):
+    with open_product(comm, directory / "ground_truth.h5", "ground_truth") as file:
+        truth = GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, scene.tracers.particles_per_side))
+        mover = method_class(scene.simulation.method)(scene, truth, start, directory, torch.device("cpu"))
+        with torch.no_grad():
+            return truth.scales_at(start), truth.scales, mover, *mover.frame()
+
+
+@pytest.mark.mpi(1, 2)
+def test_units_are_those_of_the_start_frame_whatever_follows(comm, tmp_path):
+    """A flow that is followed twice as long gives the same rollout, bit for bit."""
+    found = []
+    for name, turnovers in (("short", 0.1), ("long", 0.2)):
+        folder, start = tmp_path / name, 3
+        scene = prepared(comm, folder, turnovers=turnovers)
+        at_start, release, *_ = mover_of(comm, folder, with_method(scene, "none"), start)
+        write_model(comm, folder, scene, release)
+        at_start, release, mover, particles, acceleration = mover_of(comm, folder, scene, start)
+        assert mover.flow.scales == mover.model.flow.scales == at_start != release
+        found.append((at_start, release, particles, acceleration))
+    (scales, release, particles, acceleration), (other, release_too, more, again) = found
+    assert scales == other and release == release_too and acceleration.abs().max() > 0
+    assert torch.equal(particles.id, more.id) and torch.equal(particles.density, more.density)
+    assert torch.equal(acceleration, again)
+
+
+def with_method(scene, method, **keys):
+    return replace(scene, simulation=replace(scene.simulation, method=method, **keys))
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_has_the_units_of_its_start_and_runs(comm, tmp_path, method):
+    keys = {"step": 0.004, "frame_interval": 0.02, "turnovers": 0.01} if method == "wcsph" else {}
+    scene = with_method(prepared(comm, tmp_path), method, **keys)
+    with open_product(comm, tmp_path / "ground_truth.h5", "ground_truth") as file:
+        release = GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, 6)).scales
+    write_model(comm, tmp_path, scene, release)
+    scales, _, mover, particles, acceleration = mover_of(comm, tmp_path, scene, 3)
+    assert getattr(mover, "scales", scales) == scales
+    assert (particles.density is not None) == mover.has_density == (method != "none")
+    assert len(acceleration) == 6**3 and bool(torch.isfinite(acceleration).all())
+    assert bool(acceleration.any()) == (method != "none")
+    simulate.run(scene, comm, tmp_path)
+    with open_product(comm, tmp_path / "rollout.h5", "rollout") as file:
+        attributes = read_attributes(file, "rollout")
+        assert attributes["status"] == "complete" and attributes["method"] == method
+        assert ("density" in Trajectory(file, "model").columns) == (method != "none")
+    terms = {"learned": ", ".join(scene.model.terms), "none": "none", "wcsph": "summation-density, wcsph"}
+    assert attributes.get("terms") == terms.get(method)
+
+
+@pytest.mark.mpi(1, 2)
+@pytest.mark.parametrize("kind", WITHOUT_DENSITY)
+def test_where_no_term_reads_the_density_an_incompressible_truth_will_do(comm, tmp_path, kind):
+    scene = prepared(comm, tmp_path, "incompressible", WITHOUT_DENSITY[kind])
+    assert "density" not in scene.model.reads
+    train.run(scene, comm, tmp_path)
+    simulate.run(scene, comm, tmp_path)
+    with open_product(comm, tmp_path / "model.h5", "model") as file:
+        errors = read_table(file, "a_priori")
+        assert set(errors) == {"delay", "acceleration_error"} and np.isfinite(errors["acceleration_error"]).all()
+        assert ("feature_range" in file) == (kind == "pairs") and "density_rate_sample" not in file
+    with open_product(comm, tmp_path / "rollout.h5", "rollout") as file:
+        assert read_attributes(file, "rollout")["status"] == "complete"
+        both = {"position", "velocity", "acceleration", "velocity_gradient"}
+        assert set(Trajectory(file, "model").columns) == set(Trajectory(file, "truth").columns) == both
+        assert ("outside_training" in file) == (kind == "pairs")
+    comm.Barrier()
+    if comm.rank == 0:
+        (tmp_path / "kernel.h5").unlink()  # untrained, there is nothing to show of it
+    comm.Barrier()
+    report.run(tmp_path, comm)
+    assert f"terms {', '.join(scene.model.terms)}" in (tmp_path / "report" / "index.html").read_text(encoding="utf-8")
+
+
+def test_terms_that_read_the_density_are_refused_there(tmp_path):
+    path = tmp_path / "own.toml"
+    path.write_text(SCENE.format(fluid="incompressible", sound="", turnovers=0.1, start=0,
+                                 model='[model]\nterms = ["pressure", "pairs"]'))
+    with pytest.raises(SceneError, match=r"\[model.pairs\]: reads the density, which an incompressible flow does"):
+        load_scene(path)
+
+
+@pytest.mark.mpi(1, 2)
+@pytest.mark.parametrize("fluid", ["compressible", "incompressible"])
+def test_a_method_of_the_users(comm, tmp_path, own, fluid):
+    if comm.rank == 0:
+        own("own_method", OWN_METHOD)
+    comm.Barrier()
+    scene = replace(prepared(comm, tmp_path, fluid, WITHOUT_DENSITY["resolved"]), model=Model(preset="resolved"))
+    simulate.run(with_method(scene, "own_method:Swept"), comm, tmp_path)
+    if comm.rank == 0:
+        with h5py.File(tmp_path / "rollout.h5") as file:
+            attributes = dict(file["rollout"].attrs)
+            assert attributes["method"] == "own_method:Swept" and attributes["terms"] == "wind"
+            velocity = file["particles/model/velocity/value"]
+            assert attributes["status"] == "complete" and len(velocity) > 1 and "wind" in file
+            assert np.array_equal(velocity[-1], np.broadcast_to(np.float32([0.5, 0, -1]), velocity[-1].shape))
+            assert "density" not in file["particles/model"] and "density" not in file["particles/truth"]
+    comm.Barrier()
