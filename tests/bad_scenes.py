@@ -66,8 +66,6 @@ BAD_OVERRIDES = [
     ("model.preset=wide", '[model] preset = "wide": must be one of "poisson-stress", "resolved", "poisson-force", '
      '"poisson", "learned-density", "paper-density", "wcsph" ('),
     ("model.preset=resolve", "did you mean resolved?"),
-    ('model.terms=["pressure", "pairs"]', '[model] preset = "poisson-stress": with terms = ["pressure", "pairs"] the '
-     "list is given twice; remove one of the two"),
     ("model.pairs=3", "[model] pairs: no such key"),
     ("model.pair.hidden=[8]", "[model.pair]: no such term; did you mean pairs? the terms are pressure, stress, "
      "damping, relaxation, pairs; remove the section, or add the term to the list"),

@@ -74,8 +74,8 @@ def test_a_model_of_the_users(tmp_path, ground_truth, name, ranks):
     assert said.count("skipped") == 2
     metrics, terms, weights = results(run)
     if name == "own_term":
-        assert list(terms) == ["pressure", "own_term:SmagorinskyStress", "relaxation", "pairs"]
-        assert metrics["rollout"]["method"].endswith("pressure, SmagorinskyStress, relaxation, pairs")
+        assert list(terms) == ["pressure", "own_term:SmagorinskyStress", "viscosity", "relaxation", "pairs"]
+        assert metrics["rollout"]["method"].endswith("pressure, SmagorinskyStress, viscosity, relaxation, pairs")
         learned = weights["terms.SmagorinskyStress.squared_constant"]
         assert learned.shape == () and learned > 0 and learned != np.float32(0.17**2)
     else:

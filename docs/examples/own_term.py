@@ -3,16 +3,16 @@
     python docs/examples/own_term.py                # or: mpirun -n 2 python docs/examples/own_term.py
 
 runs the scene `tiny` with it: ground truth, training of its coefficient, rollout, report. A scene names it by its
-import path, in a TOML file beside this one:
+import path, in a TOML file beside this one or on the command line:
 
     [model]
-    terms = ["pressure", "own_term:SmagorinskyStress", "relaxation", "pairs"]
+    terms = ["pressure", "own_term:SmagorinskyStress", "viscosity", "relaxation", "pairs"]
 
     [model.SmagorinskyStress]
     constant = 0.1
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 
@@ -51,5 +51,5 @@ class SmagorinskyStress(eddies.Term):
 
 
 if __name__ == "__main__":
-    model = eddies.Model(terms=("pressure", "own_term:SmagorinskyStress", "relaxation", "pairs"))
-    eddies.run(replace(eddies.load_scene("tiny", ['name="own-term"']), model=model))
+    terms = '["pressure", "own_term:SmagorinskyStress", "viscosity", "relaxation", "pairs"]'
+    eddies.run(eddies.load_scene("tiny", ['name="own-term"', f"model.terms={terms}"]))

@@ -84,7 +84,7 @@ def test_other_terms_are_refused_with_both_lists(comm, tmp_path, terms):
     write_source(comm, tmp_path)
     with pytest.raises(SceneError) as error:
         read_source(scene_with(tmp_path, *terms), comm)
-    trained = '["pressure", "stress", "damping", "relaxation", "pairs"]'
+    trained = '["pressure", "stress", "viscosity", "damping", "relaxation", "pairs"]'
     expected = f"tiny: [model] terms = {quoted(terms)}, but {tmp_path}/model.h5 was trained with {trained}"
     assert expected in str(error.value)
 

@@ -24,7 +24,7 @@ TERMS = {
     )
 }
 
-RESOLVED = ("pressure", "stress", "damping", "relaxation")
+RESOLVED = ("pressure", "stress", "viscosity", "damping", "relaxation")
 
 #: Of each preset the settings that differ from the terms' own, by term, in the order of the terms.
 PRESETS: dict[str, dict[str, Mapping[str, Any]]] = {
