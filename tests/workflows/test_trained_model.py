@@ -9,6 +9,7 @@ import torch
 from eddies.io.hdf5 import ProductError
 from eddies.io.weights import load_weights, save_weights
 from eddies.particles.reference_scales import ReferenceScales
+from eddies.particles.terms.presets import PRESETS
 from eddies.scene import Model, SceneError, load_scene
 from eddies.workflows.trained_model import describe, differences, load_model, scene_model
 
@@ -38,7 +39,7 @@ def saved(comm, directory, scene=None, change=lambda weights: weights):
 def test_a_model_is_read_as_it_was_saved_in_its_precision(comm, tmp_path):
     scene, model, path = saved(comm, tmp_path)
     found = load_model(scene, comm, path, SCALES)
-    assert list(found.terms) == list(model.terms) == ["pressure", "stress", "viscosity", "damping", "relaxation", "pairs"]
+    assert list(found.terms) == list(model.terms) == list(PRESETS["poisson-stress"])
     assert all(torch.equal(tensor, found.state_dict()[name]) and tensor.dtype == torch.float32
                for name, tensor in model.state_dict().items())
 
