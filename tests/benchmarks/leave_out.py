@@ -20,12 +20,14 @@ sys.path[:0] = [str(HERE.parent / "validation"), str(HERE.parents[1])]
 
 from test_leave_out import CountingComm, combined_step, fluid_of, particle_step  # noqa: E402
 
+from eddies.particles.terms.presets import PRESETS  # noqa: E402
+
 Call = tuple[Callable[[], object], list]  # what is measured, and the list that notes its messages
 
 
-def step_of(comm, **choices) -> Call:
+def step_of(comm, terms) -> Call:
     counting = CountingComm(comm)
-    return particle_step(counting, **choices), counting.sent
+    return particle_step(counting, terms), counting.sent
 
 
 def evaluation_of(comm, compressible: bool, forced: bool) -> Call:
@@ -38,16 +40,17 @@ def pairs_of_calls(comm) -> dict[str, tuple[Call, Call]]:
     """By part: the call with it, and without."""
     everything = {"field": 1.0, "velocity_kl": 0.1, "acceleration_kl": 0.1}
     without = {name: {key: weight for key, weight in everything.items() if key != name} for name in everything}
+    pressure, resolved, learned = PRESETS["poisson-force"], PRESETS["resolved"], PRESETS["learned-density"]
+    stress = PRESETS["poisson-stress"]
     steps = {
-        "pair force": ({"closure": "learned-density"}, {"pairs": False}),
-        "Poisson closure": ({}, {"closure": "learned-density"}),
-        "force of the Poisson closure": ({"closure": "poisson-force"}, {}),
-        "resolved stress, damping and friction": ({"closure": "poisson-stress"}, {"closure": "poisson-force"}),
-        "pair sum beside them": ({"closure": "poisson-stress"}, {"closure": "poisson-stress", "basis": "none"}),
-        "eddy viscosity": ({"viscosity": "two-sided"}, {}),
-        "forcing of the particles": ({"forced": True}, {}),
+        "pair force": (learned, {}),
+        "pressure and its force": (pressure, learned),
+        "stress, viscosity, damping and relaxation": (stress, pressure),
+        "pair sum beside them": (stress, resolved),
+        "eddy viscosity": (pressure | {"eddy-viscosity": {}}, pressure),
+        "forcing of the particles": (pressure | {"forcing": {"injection_rate": 0.5}}, pressure),
     }
-    found = {f"step: {name}": tuple(step_of(comm, **choices) for choices in pair) for name, pair in steps.items()}
+    found = {f"step: {name}": tuple(step_of(comm, terms) for terms in pair) for name, pair in steps.items()}
     for name, others in without.items():
         found[f"training: {name.replace('_', ' ')} loss"] = combined_step(comm, **everything), combined_step(
             comm, **others)
