@@ -132,7 +132,7 @@ class LagrangianModel(nn.Module):
             split = values.split([parameter.numel() for parameter in parameters.values()])
             named = {name: part.reshape(parameter.shape) for part, (name, parameter) in zip(split, parameters.items())}
             context.forget_sums(term)
-            return self._at_particles(functional_call(term, named, (context,)), context)
+            return self._at_particles(_required(functional_call(term, named, (context,)), term), context)
 
         count = sum(parameter.numel() for parameter in parameters.values())
         like = next(iter(parameters.values()), context.particles.position)
@@ -180,10 +180,15 @@ def _everywhere(term: Term) -> bool:
 
 def _evaluated(term: Term, context: Context) -> Rates:
     """A term's rates, those of the particles that are asked for."""
-    rates = term(context.everywhere if _everywhere(term) else context)
-    if not isinstance(rates, Rates):
-        raise SceneError(f"{type(term).__name__}: forward returns a {type(rates).__name__}; it must return Rates")
+    rates = _required(term(context.everywhere if _everywhere(term) else context), term)
     return rates if isinstance(term, PairTerm) else rates.at(context.rows)
+
+
+def _required(found: object, term: Term) -> Rates:
+    """What a term's forward returned; SceneError unless these are Rates."""
+    if not isinstance(found, Rates):
+        raise SceneError(f"{type(term).__name__}: forward returns a {type(found).__name__}; it must return Rates")
+    return found
 
 
 def build_model(settings: Mapping[str, TermSettings], paths: Iterable[str], flow: FlowUnits) -> LagrangianModel:
