@@ -112,8 +112,7 @@ def load_frame(truth: GroundTruth, index: int, model: LagrangianModel, dtype: to
     columns = truth.particles_with_rates(int(index))
     rates = {name: torch.from_numpy(columns[name]).to(device, dtype)
              for name in ("acceleration", "density_rate") if name in columns}
-    flow = replace(model.flow, scales=truth.scales_at(int(index)))
-    dynamics = ParticleDynamics(truth.decomposition, model, skin=0.0, dtype=dtype, flow=flow)
+    dynamics = ParticleDynamics(truth.decomposition, model, skin=0.0, dtype=dtype)
     return TrainingFrame(dynamics, particles_for(model, columns, device), rates["acceleration"],
                          rates.get("density_rate"))
 
