@@ -137,7 +137,8 @@ class Context:
 
     def sum_pairs(self, terms: Sequence[Summand]) -> None:
         """Take the sums of terms together, with the moments that some of them need; collective."""
-        summands = [*terms, *([_MOMENTS] if any(getattr(term, "needs_moments", False) for term in terms) else [])]
+        moments_too = any(getattr(term, "needs_moments", False) for term in terms)
+        summands = [summand for summand in (*terms, *([_MOMENTS] if moments_too else [])) if summand not in self._sums]
         if summands:
             mutual = self.rows is None and all(summand.mutual for summand in summands)
             found = self._mutual_sums(summands) if mutual else self._sums_of(summands)

@@ -73,7 +73,7 @@ class LagrangianModel(nn.Module):
     @property
     def networks(self) -> list[PairTerm]:
         """The terms with a network of pairs, which can tell what it is given by `features`."""
-        return [term for term in self.terms.values() if hasattr(term, "features")]
+        return [term for term in self.terms.values() if isinstance(term, PairTerm) and hasattr(term, "features")]
 
     def rates(self, context: Context, kept: Mapping[str, LinearRates] | None = None) -> Rates:
         """The sum of the terms: `acceleration` (k, 3), `density_rate` (k,) if some term gives one, and the `density`
@@ -82,7 +82,7 @@ class LagrangianModel(nn.Module):
         `kept` stands for terms at these very particles: see `linear_rates`.
         """
         kept, sums = kept or {}, []
-        for stage in self._stages:
+        for stage in self._stages if self.density_is_given and context.density is None else [list(self.terms.items())]:
             anew = [term for name, term in stage if name not in kept]
             context.sum_pairs([term for term in anew if isinstance(term, PairTerm) and not _everywhere(term)])
             found = [kept[name].at(context.rows) if name in kept else _evaluated(term, context) for name, term in stage]
@@ -105,8 +105,7 @@ class LagrangianModel(nn.Module):
     def _stages(self) -> list[list[tuple[str, Term]]]:
         """The terms that do not read the density, then those that do."""
         named = list(self.terms.items())
-        stages = [[item for item in named if ("density" in item[1].reads) == reading] for reading in (False, True)]
-        return stages if stages[1] else stages[:1]
+        return [[item for item in named if ("density" in item[1].reads) == reading] for reading in (False, True)]
 
     def _at_particles(self, rates: Rates, context: Context) -> Rates:
         """With what was given as modes taken to the particles: the force less its mean over them, as it keeps their

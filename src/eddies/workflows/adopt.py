@@ -15,8 +15,9 @@ from eddies.parallel.slab import SlabDecomposition
 from eddies.scene import BOX_LENGTH, Scene
 from eddies.workflows.a_priori import evaluate, evaluation_frames
 from eddies.workflows.devices import prepare_torch
+from eddies.workflows.model_description import describe
 from eddies.workflows.model_source import ModelSource, read_source
-from eddies.workflows.trained_model import describe, with_weights
+from eddies.workflows.trained_model import with_weights
 from eddies.workflows.truth import GroundTruth
 
 log = logging.getLogger("eddies")

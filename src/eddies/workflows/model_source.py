@@ -12,7 +12,7 @@ from eddies.io.hdf5 import ProductError, open_product, read_provenance
 from eddies.io.weights import load_tables, load_weights
 from eddies.scene import Scene, SceneError
 from eddies.scene_rules import quoted
-from eddies.workflows.trained_model import differences
+from eddies.workflows.model_description import differences
 
 
 @dataclass(frozen=True)

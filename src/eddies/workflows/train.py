@@ -18,8 +18,8 @@ from eddies.scene import BOX_LENGTH, Scene, SceneError
 from eddies.workflows import adopt
 from eddies.workflows.a_priori import evaluate, evaluation_frames
 from eddies.workflows.devices import prepare_torch
+from eddies.workflows.model_description import describe
 from eddies.workflows.trained_kernel import load_kernel
-from eddies.workflows.trained_model import describe
 from eddies.workflows.training_data import TrainingData
 from eddies.workflows.truth import GroundTruth
 

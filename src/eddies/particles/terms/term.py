@@ -64,7 +64,7 @@ class PairTerm(Term):
     Attributes
     ----------
     width : most numbers that are held for a pair at once, for choosing how many pairs to take together.
-    needs_moments : whether `rates_of` asks for `context.moments()`.
+    needs_moments : whether `rates_of` asks for `context.moments`.
     mutual : whether what j gets from i is what i gets from j times `parity`, so that a pair is evaluated once.
     parity : (components,), 1 or -1.
     """
