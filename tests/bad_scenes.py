@@ -68,7 +68,7 @@ BAD_OVERRIDES = [
     ("model.preset=resolve", "did you mean resolved?"),
     ("model.pairs=3", "[model] pairs: no such key"),
     ("model.pair.hidden=[8]", "[model.pair]: no such term; did you mean pairs? the terms are pressure, stress, "
-     "damping, relaxation, pairs; remove the section, or add the term to the list"),
+     "viscosity, damping, relaxation, pairs; remove the section, or add the term to the list"),
     ("model.pairs.hiden=[8]", "[model.pairs] hiden: no such key; did you mean hidden? valid here: hidden, inputs, "),
     ("model.pairs.hidden=[16, 0]", "[model.pairs] hidden = [16, 0]: must be a list such as [16, 16] of whole numbers, "
      "each at least 1"),

@@ -35,8 +35,8 @@ ONLY_IN = {
     "eddies.analysis.figures*": ("analysis.figures*", "workflows.report", "workflows.compare", "workflows.train"),
     **dict.fromkeys(("eddies.scene", "eddies.scene.*", "eddies.scene_[!v]*"),
                     ("scene*", "comparison", "methods", "workflows*", "cli", "api", "stages", "logs")),
-    "eddies.scene_v*": ("scene*", "comparison", "composition", "methods", "particles.model", "particles.terms.*",
-                        "workflows*"),
+    "eddies.scene_v*": ("scene*", "comparison", "composition", "methods", "particles.model", "particles.context",
+                        "particles.terms.*", "workflows*"),
     "eddies.comparison*": ("workflows*", "cli"),
     "pickle*": (),
 }

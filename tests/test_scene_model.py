@@ -29,10 +29,10 @@ INCOMPRESSIBLE = '[flow]\nfluid = "incompressible"\ncells = 16\nviscosity = 0.1\
 
 SETTINGS = """
 from dataclasses import dataclass
-from eddies import TermSettings
+from eddies import Term, TermSettings
 """
 OWN_TERM = SETTINGS + """
-class Drag:
+class Drag(Term):
     @dataclass(frozen=True)
     class Settings(TermSettings):
         constant: float = 0.1
@@ -112,7 +112,7 @@ def test_what_terms_read_and_give():
     (dict(settings={"pairs": Pressure()}), "[model.pairs]: must be settings of the class PairNetwork, or a dict"),
     (dict(settings={"pairs": 3}), "model.pairs = 3: must be a section"),
     (dict(terms=("own_nowhere:Term",)), '[model] terms: "own_nowhere:Term": there is no module "own_nowhere"'),
-    (dict(terms=("eddies.scene:load_scene",)), "must be the class of a term, with a method forward"),
+    (dict(terms=("eddies.scene:load_scene",)), "must be a class derived from eddies.Term"),
 ])
 def test_bad_model(changes, message):
     refused(message, lambda: Model(**changes))
@@ -161,15 +161,15 @@ def test_an_own_term_has_keys_of_its_own(tmp_path, own):
 
 
 @pytest.mark.parametrize("body, message", [
-    ("class Bad:\n    def forward(self): pass\n    class Settings: pass\n", "its Settings must be a class of"),
-    ("class Bad:\n    def forward(self): pass\n    class Settings(TermSettings):\n        a: float = 1\n",
+    ("class Bad(Term):\n    def forward(self): pass\n    class Settings: pass\n", "its Settings must be a class of"),
+    ("class Bad(Term):\n    def forward(self): pass\n    class Settings(TermSettings):\n        a: float = 1\n",
      "write @dataclass(frozen=True) and below it class Settings(eddies.TermSettings)"),
-    ("class Bad:\n    def forward(self): pass\n    @dataclass(frozen=True)\n    class Settings(TermSettings):\n"
+    ("class Bad(Term):\n    def forward(self): pass\n    @dataclass(frozen=True)\n    class Settings(TermSettings):\n"
      "        a: complex = 1j\n", "Bad.Settings.a: complex: a key is declared by number, integer"),
-    ("class Bad:\n    def forward(self): pass\n    @dataclass(frozen=True)\n    class Settings(TermSettings):\n"
+    ("class Bad(Term):\n    def forward(self): pass\n    @dataclass(frozen=True)\n    class Settings(TermSettings):\n"
      "        reads = ('vorticity',)\n", 'reads = ["vorticity"]: must be a tuple of any of "pairs", "resolved", '),
-    ("class Bad: pass\n", "must be the class of a term, with a method forward; derive it from eddies.Term"),
-    ("Bad = 3\n", "must be the class of a term"),
+    ("class Bad: pass\n", "must be a class derived from eddies.Term"),
+    ("Bad = 3\n", "must be a class derived from eddies.Term"),
 ])
 def test_bad_own_term(own, body, message):
     own("own_bad", SETTINGS + body)
@@ -180,7 +180,7 @@ def test_classes_beside_the_scene_are_found(tmp_path, own):
     own("unused", "")  # restores where modules are looked for
     folder = tmp_path / "apart"
     folder.mkdir()
-    (folder / "own_neighbour.py").write_text("class Quiet:\n    def forward(self, context):\n        return None\n")
+    (folder / "own_neighbour.py").write_text("from eddies import Term\n\nclass Quiet(Term):\n    def forward(self, context):\n        return None\n")
     (folder / "case.toml").write_text(COMPRESSIBLE + '[model]\nterms = ["own_neighbour:Quiet"]\n')
     scene = load_scene(folder / "case.toml")
     assert scene.model.settings["Quiet"].reads == () and not scene.model.gives & {"density"}
@@ -200,7 +200,7 @@ def swirl(grid, initial, seed): pass
 class Run:
     needs = ("model",)
     def steps(self): pass
-    advance = frame = series = description = steps
+    advance = frame = series = description = has_density = steps
 """)
     text = load_scene("tiny").to_toml().partition("[model]")
     bare = text[0] + "[model]\n[training]" + text[2].partition("[training]")[2]
@@ -228,7 +228,7 @@ def test_who_reads_no_density_needs_none(tmp_path):
     refused('[model.pairs]: reads the density, which an incompressible flow does not have; leave "density" out of '
             '[model.pairs] inputs, or set [flow] fluid = "compressible"', lambda: read(tmp_path, free.replace(
                 '["distance", "speed"]', '["distance", "density"]')))
-    refused('"density-flux" gives a rate of density, which an incompressible flow does not have', lambda: read(
+    refused('"density-flux" gives the density alone, which no term reads; remove it', lambda: read(
         tmp_path, free, 'model.terms=["pairs", "density-flux"]', 'model.density-flux.inputs=["speed"]'))
 
 

@@ -34,27 +34,29 @@ def run(scene: Scene | str | Path, *, output: str | Path | None = None, resume: 
 
     Raises as `stages.run_stages`.
     """
-    return _run(_scene(scene), None, output, resume, comm)
+    return _run(scene, None, output, resume, comm)
 
 
 def train(scene: Scene | str | Path, *, output: str | Path | None = None, resume: bool = False, comm=None) -> Path:
     """Train the model of a scene, on the ground truth and with the kernel of the run directory, which it returns."""
-    return _run(_scene(scene), ("train",), output, resume, comm)
+    return _run(scene, ("train",), output, resume, comm)
 
 
 def simulate(scene: Scene | str | Path, *, output: str | Path | None = None, resume: bool = False, comm=None) -> Path:
     """Let the particles of a scene go, from its ground truth, with its trained model if its method needs one; returns
     the run directory, with the new rollout.h5."""
-    return _run(_scene(scene), ("simulate",), output, resume, comm)
+    return _run(scene, ("simulate",), output, resume, comm)
 
 
 def _scene(scene: Scene | str | Path) -> Scene:
     return scene if isinstance(scene, Scene) else load_scene(scene)
 
 
-def _run(scene: Scene, stages: Sequence[str] | None, output: str | Path | None, resume: bool, comm) -> Path:
-    directory = Path(output) if output is not None else Path("runs") / scene.name
+def _run(scene: Scene | str | Path, stages: Sequence[str] | None, output: str | Path | None, resume: bool,
+         comm) -> Path:
     with _job(comm) as comm:
+        scene = _scene(scene)
+        directory = Path(output) if output is not None else Path("runs") / scene.name
         from eddies.parallel.stop import StopRequest
         from eddies.stages import run_stages
         stop = StopRequest(comm, (), directory / "STOP", math.inf, CHECKPOINT_SECONDS)
@@ -66,7 +68,7 @@ def _run(scene: Scene, stages: Sequence[str] | None, output: str | Path | None, 
 def _job(comm) -> Iterator:
     """The communicator of a job, all ranks if None; log lines go to standard output unless the program sends them
     elsewhere, and an error that not all ranks meet ends the job, as the others may wait for ever."""
-    os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported: a thread for every core, in every rank
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # else torch takes a thread for every core, in every rank
     from mpi4py import MPI
 
     from eddies.parallel.rendezvous import all_arrive
@@ -81,6 +83,7 @@ def _job(comm) -> Iterator:
             traceback.print_exc()
             sys.stderr.flush()
             comm.Abort(1)
+        errors.Free()
         raise
     else:
         errors.Free()

@@ -126,7 +126,7 @@ def build_parser() -> argparse.ArgumentParser:
     stages = {"run": "every stage of the scene, in order",
               "dns": "ground truth: direct simulation, filter, tracers",
               "train-kernel": "the smoothing kernel",
-              "train": "the pair-force model",
+              "train": "the model of the particles",
               "simulate": "the trained model, without the direct simulation"}
     for name, about in stages.items():
         command = commands.add_parser(name, help=about, description=about)

@@ -25,7 +25,7 @@ INITIAL_KEYS = {
     "peak_wavenumber": ("random",), "wavenumber": ("abc", "shear-wave", "sound-wave"), "path": ("file",)}
 # What a class of the user's must have, by the key that names it.
 REQUIRED = {"fluid": ("nonlinear", "linear", "linear_function", "combine", "compressible"), "kind": ("__call__",),
-            "method": ("steps", "advance", "frame", "series", "description"), "network": ("forward",)}
+            "method": ("steps", "advance", "frame", "series", "description", "has_density"), "network": ("forward",)}
 
 
 def first_inconsistency(scene: Scene) -> str | None:
@@ -49,8 +49,15 @@ def foreign_problems(scene: Scene) -> Iterator[str]:
                 yield f"[{section}] {key}: {error}"
                 continue
             lacking = [name for name in REQUIRED.get(key, ()) if not hasattr(found, name)]
+            if not lacking and key == "network" and not _is_class_of(found, "torch.nn:Module"):
+                yield f"[{section}] {key}: {quoted(path)}: must be a class derived from torch.nn.Module"
             if lacking:
                 yield f"[{section}] {key}: {quoted(path)}: cannot be used here, it has no {', '.join(lacking)}"
+
+
+def _is_class_of(found: object, path: str) -> bool:
+    """Whether this is a class derived from the one that a path names."""
+    return isinstance(found, type) and issubclass(found, load(path))
 
 
 def flow_problems(scene: Scene) -> Iterator[str]:
@@ -138,6 +145,13 @@ def model_problems(scene: Scene) -> Iterator[str]:
                          for what in ("density", "density_rate"))
         yield (f'[model] terms = {quoted(scene.model.terms)}: "{first}" gives the density and "{second}" its rate, '
                "which are two densities; remove one of the two")
+    reads = scene.model.reads
+    for name, one in settings.items():
+        if "density" in one.reads and "density" in one.gives:
+            yield f"[model] terms: {quoted(name)}: reads the density and gives a part of it; it can do one of both"
+        if "density" not in reads and set(one.gives) <= {"density", "density_rate"}:
+            yield (f"[model] terms = {quoted(scene.model.terms)}: {quoted(name)} gives the density alone, which no "
+                   "term reads; remove it, or add a term that does")
     if not gives & {"density", "density_rate"}:
         for name, one in settings.items():
             if "density" in one.reads:

@@ -82,8 +82,8 @@ def replace_terms(table: dict[str, Any], keys: set[str]) -> None:
         return
     written, other = ("preset", "terms") if "model.preset" in keys else ("terms", "preset")
     table.pop(other, None)
-    listed = PRESETS.get(table[written], ()) if written == "preset" else table[written]
-    if not isinstance(listed, str):
+    listed = PRESETS.get(str(table[written]), ()) if written == "preset" else table[written]
+    if isinstance(listed, (list, dict)):
         names = {short_name(str(term)) for term in listed}
         for name in [name for name, part in table.items() if isinstance(part, dict) and name not in names]:
             if f"model.{name}" not in keys:
@@ -98,8 +98,8 @@ def settings_class(term: str) -> type[TermSettings]:
     if not is_path(term):
         return load(TERMS[term][1])
     kind = load(term)
-    if not isinstance(kind, type) or not (hasattr(kind, "forward") or "__call__" in vars(kind)):
-        raise SceneError(f'"{term}": must be the class of a term, with a method forward; derive it from eddies.Term')
+    if not isinstance(kind, type) or not issubclass(kind, load("eddies.particles.terms.term:Term")):
+        raise SceneError(f'"{term}": must be a class derived from eddies.Term')
     settings = getattr(kind, "Settings", TermSettings)
     if not (isinstance(settings, type) and issubclass(settings, TermSettings)
             and "__dataclass_fields__" in vars(settings)):

@@ -86,10 +86,11 @@ def _pdf_panel(axis: Axes, sample: Mapping[str, np.ndarray], title: str, symbol:
 
 def section(description: Mapping[str, object], table: Mapping[str, np.ndarray],
             acceleration: Mapping[str, np.ndarray], density_rate: Mapping[str, np.ndarray] | None,
-            history: Mapping[str, np.ndarray], source: str | None = None) -> Section:
+            history: Mapping[str, np.ndarray] | None, source: str | None = None) -> Section:
     """The model: a-priori figures and the errors at the last frame, from the tables.
 
-    `source` names the run that the weights come from, if it is another; the history is that run's.
+    `source` names the run that the weights come from, if it is another; the history is that run's, and None where
+    there was nothing to learn.
     """
     last = int(np.argmax(table["delay"]))
     at = {name: float(values[last]) for name, values in table.items()}
@@ -113,6 +114,7 @@ def section(description: Mapping[str, object], table: Mapping[str, np.ndarray],
         png(a_priori(table, acceleration, density_rate)),
         f"At the last frame the acceleration error is {at['acceleration_error']:.3f}{beside}. KL "
         f"divergence of the acceleration PDF {divergence:.2g}. Grey: frames of the training window.")
-    shown.add_figure("model-training", "Training of the model", png(figures_learning.curves(history)),
-                     f"{int(history['step'][-1]) + 1} steps" + (f", in {source}." if source else "."))
+    if history is not None:
+        shown.add_figure("model-training", "Training of the model", png(figures_learning.curves(history)),
+                         f"{int(history['step'][-1]) + 1} steps" + (f", in {source}." if source else "."))
     return shown

@@ -35,7 +35,8 @@ class Descent:
     def step(self, share: Tensor) -> float:
         """One step down the gradient of the sum of all shares; returns the norm of that gradient."""
         self._adam.zero_grad(set_to_none=False)
-        share.backward()
+        if share.requires_grad:  # not where all that is left to learn shows through several steps alone
+            share.backward()
         # A rank whose share does not depend on a parameter still takes part in the sum.
         gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in self.parameters]
         for parameter, gradient in zip(self.parameters, gradients):

@@ -18,6 +18,7 @@ from eddies.particles.particle_set import ParticleSet
 from eddies.particles.rank_sums import mean_over_ranks
 from eddies.particles.scaled_pairs import ScaledPairs
 from eddies.particles.surroundings import LocalParticles, Surroundings
+from eddies.scene_values import SceneError
 
 if TYPE_CHECKING:
     from eddies.particles.resolved_velocity import ResolvedFlow, ResolvedVelocity
@@ -78,7 +79,7 @@ class Context:
     def local(self) -> LocalParticles:
         """The particles that this rank sees, ghosts included, without columns."""
         if self._surroundings is None:
-            raise LookupError(UNSEEN)
+            raise SceneError(UNSEEN)
         return self._surroundings.local(self.particles)
 
     @cached_property
@@ -94,12 +95,12 @@ class Context:
     def column(self, name: str) -> Tensor:
         """"velocity" (s, 3) or "density" (s,) of the particles that this rank sees, owned first; collective."""
         if self._surroundings is None:
-            raise LookupError(UNSEEN)
+            raise SceneError(UNSEEN)
         if name not in self._columns:
             owned = self.density if name == "density" else getattr(self.particles, name)
             if owned is None:
-                raise LookupError(f'no term of this model reads "{name}": add it to the `reads` of the settings; or '
-                                  "the particles have none")
+                raise SceneError(f'no term of this model reads "{name}": add it to the `reads` of the settings; or the '
+                                 "particles have none")
             self._columns[name] = self._surroundings.column(owned)
         return self._columns[name]
 
@@ -107,7 +108,7 @@ class Context:
     def resolved(self) -> ResolvedFlow:
         """The velocity that a grid resolves of the particles'; collective."""
         if self._resolution is None:
-            raise LookupError('no term of this model reads "resolved": add it to the `reads` of the settings')
+            raise SceneError('no term of this model reads "resolved": add it to the `reads` of the settings')
         return self._resolution.of(self.particles, self.local)
 
     def without_mean(self, rows: Tensor) -> Tensor:

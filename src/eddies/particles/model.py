@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from eddies.composition import is_path, load, short_name
+from eddies.parallel.reduction import any_rank
 from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.rates import Rates, total
@@ -101,6 +102,23 @@ class LagrangianModel(nn.Module):
         parameters do at given particles: what a training that looks at them again and again keeps; collective."""
         return {name: self._linear_rates(term, context) for name, term in self._stages[0] if term.linear}
 
+    @torch.no_grad()
+    def require_linear(self, context: Context) -> None:
+        """Check terms that declare themselves linear in their parameters at other parameters than what is kept was
+        made with; raises SceneError where one is not. Collective."""
+        for name, kept in self.linear_rates(context).items():
+            term, sizes = self.terms[name], [parameter.shape for parameter in kept.parameters]
+            others = [torch.linspace(0.3, 1.9, shape.numel()).reshape(shape).to(parameter)
+                      for shape, parameter in zip(sizes, kept.parameters)]
+            named = dict(zip(dict(term.named_parameters()), others))
+            direct = self._at_particles(_required(functional_call(term, named, (context,)), term), context)
+            context.forget_sums(term)
+            wrong = [what for what in _GIVEN if getattr(direct, what) is not None and not torch.allclose(
+                getattr(replace(kept, parameters=others).at(None), what), getattr(direct, what), rtol=1e-3, atol=1e-6)]
+            if any_rank(context.comm, bool(wrong)):
+                raise SceneError(f'term "{name}": declares itself linear in its parameters, and is not; remove its '
+                                 "linear = True")
+
     @property
     def _stages(self) -> list[list[tuple[str, Term]]]:
         """The terms that do not read the density, then those that do."""
@@ -187,6 +205,9 @@ def _required(found: object, term: Term) -> Rates:
     """What a term's forward returned; SceneError unless these are Rates."""
     if not isinstance(found, Rates):
         raise SceneError(f"{type(term).__name__}: forward returns a {type(found).__name__}; it must return Rates")
+    if "density" in term.gives and found.density is None and found.pressure_modes is None:
+        raise SceneError(f'{type(term).__name__}: declares that it gives "density", and returns none; take it out of '
+                         "`gives` of its settings, or return density or pressure_modes")
     return found
 
 
@@ -213,5 +234,7 @@ def _build_term(path: str, settings: TermSettings, flow: FlowUnits) -> Term:
         raise SceneError(f'term "{path}": its Settings must be a frozen dataclass derived from eddies.TermSettings')
     try:
         return kind(settings, flow).double()
-    except (TypeError, AttributeError) as error:
-        raise SceneError(f'term "{path}": cannot be made: {error}') from error
+    except SceneError:
+        raise
+    except Exception as error:  # of a class of the user's, anything
+        raise SceneError(f'term "{path}": cannot be made: {type(error).__name__}: {error}') from error

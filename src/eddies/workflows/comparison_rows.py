@@ -81,7 +81,8 @@ def measured(run: VariantRun, alone, ranks: int) -> dict[str, Any]:
     row |= step_costs([StepSeconds.of_rollout(rollout), *run.blocks], rollout["time_step"], stored.turnover, ranks)
     if "train" in run.stages:
         with open_product(alone, run.directory / "model.h5", "model") as file:
-            row["training_seconds"] = float(read_table(file, "history")["seconds"][-1])
+            if "history" in file:
+                row["training_seconds"] = float(read_table(file, "history")["seconds"][-1])
     return row
 
 

@@ -9,6 +9,7 @@ from eddies.scene import BOX_LENGTH, Eulerian, Scene
 DISSIPATION_CONSTANT = 0.5   # C_eps = eps L / u'^3 of developed turbulence
 PEAK_VELOCITY = 4.0          # largest component of the velocity of a particle over u'
 ALLOWED_VELOCITY = 6.0       # the same, for which a resolved velocity has ghost planes: too few of them end a run
+AVERAGING_REACH = 1.57       # of the averages that make the resolved velocity, in mean spacings
 PEAK_SPEED = 7.0             # max(|u| + |v| + |w|) over u' in turbulence: four rms in each component at worst
 EXACT_PEAK_SPEED = {"taylor-green": 1.0, "abc": 3 * math.sqrt(2), "shear-wave": 1.0}  # over the amplitude
 GHOST_PLANES = {"cubic": 3, "quintic": 4}
@@ -137,8 +138,9 @@ def most_training_ranks(scene: Scene) -> dict[str, int]:
         limits["ghost planes of the resolved velocity"] = ranks_of_resolved_grid(scene, step, skin)
     time = horizon_time(scene)
     if time > 0:
-        if learns_pairs(scene):
-            reach = support + 2 * particle_drift(scene, time)
+        sees = support if learns_pairs(scene) else AVERAGING_REACH * scene.tracers.spacing
+        if learns_pairs(scene) or "resolved" in scene.model.reads:
+            reach = sees + 2 * particle_drift(scene, time)
             limits[f"slabs no thinner than the particles' reach {reach:.3g} in the training through horizons"] = (
                 thick_slabs(scene.tracers.particles_per_side, reach))
         if scene.training.energy_weight > 0 or "resolved" in scene.model.reads:

@@ -138,8 +138,9 @@ def _read_model(file, record: Run) -> list[Section]:
     density_rate = read_table(file, "density_rate_sample") if "density_rate_sample" in file else None
     provenance, errors = record.provenance["model"], read_table(file, "a_priori")
     source = provenance.get("source")
+    history = read_table(file, "history") if "history" in file else None
     shown = figures_model.section(json.loads(file.attrs["description"]), errors,
-                                  read_table(file, "acceleration_sample"), density_rate, read_table(file, "history"),
+                                  read_table(file, "acceleration_sample"), density_rate, history,
                                   source and source["path"])
     if source:
         own = figures_mach.FlowErrors("this flow", provenance["mach_turbulent"], errors)

@@ -45,17 +45,22 @@ def run(scene: Scene, comm, directory: str | Path, stop: StopRequest | None = No
         model, last, tests = data.model, data.last, evaluation_frames(truth)
         log.info("train: frames up to %d of the times up to %.3g of %.3g, %d held out; %d weights", data.learned,
                  truth.times[last], truth.times[-1], last - data.learned, sum(p.numel() for p in model.parameters()))
-        phases = [*data.one_step_phases(), *data.horizon_phases()]
-        training = Training(comm, model, phases, scene.training.patience)
         checkpoints = CheckpointDirectory(comm, directory / DIRECTORIES["train"], scene.fingerprint("train"))
-        take_all_steps(training, checkpoints, stop, LearningCurves(comm, directory / "learning.png"))
-        tables = evaluate(truth, model, tests, last, data.dtype, device)
+        history = {}
+        if next(model.parameters(), None) is None:
+            log.info("train: the terms have no parameters, nothing is learned")
+        else:
+            phases = [*data.one_step_phases(), *data.horizon_phases()]
+            training = Training(comm, model, phases, scene.training.patience)
+            take_all_steps(training, checkpoints, stop, LearningCurves(comm, directory / "learning.png"))
+            history = {"history": training.columns()}
+        tables = history | evaluate(truth, model, tests, last, data.dtype, device)
         if model.networks:
             tables["feature_range"] = vars(data.feature_range())
         mach, description = truth.reference.get("mach_turbulent"), describe(scene, truth.scales)
     weights = {name: tensor.cpu().numpy() for name, tensor in model.state_dict().items()}
     save_weights(comm, directory / "model.h5", "model", description, weights,
-                 {**scene.provenance("train"), "mach_turbulent": mach}, {"history": training.columns(), **tables})
+                 {**scene.provenance("train"), "mach_turbulent": mach}, tables)
     checkpoints.remove()
     errors = tables["a_priori"]
     beside = (f" (exact filtered pressure gradient {errors['pressure_gradient_error'][-1]:.3f})"

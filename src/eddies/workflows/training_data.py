@@ -72,6 +72,9 @@ class TrainingData:
     def one_step_phases(self) -> list[Phase]:
         """Steps on the rates of single frames: on trajectories, then on all losses, as far as the scene has them."""
         settings = self.settings
+        if self.scene.model.foreign:
+            first = self.frames[0]
+            self.model.require_linear(first.dynamics.context(first.particles))
         validation = self._frame(self.last - 1)
         weights = LossWeights(settings.trajectory_weight, settings.field_weight, settings.velocity_kl_weight,
                               settings.acceleration_kl_weight)

@@ -84,6 +84,7 @@ class EddyViscosity(TermSettings):
                        default="two-sided")
     basis: str = choice("of the sum over pairs, as of the pair network", *BASES, default="corrected")
 
+    numbers_per_pair = 8
     reads = ("pairs",)
 
 
@@ -100,6 +101,7 @@ class DensityFlux(NetworkSettings):
 class DensityTransport(TermSettings):
     """A rate of density from the divergence of the velocity and from relaxation to the neighbours' density."""
 
+    numbers_per_pair = 8
     reads = ("pairs", "density")
     gives = ("density_rate",)
     learns_through_horizons = True
@@ -162,6 +164,7 @@ class SummationDensity(TermSettings):
 
     kernel: str = choice("smoothing kernel", "cubic-spline", "wendland", default="cubic-spline")
 
+    numbers_per_pair = 8
     reads = ("pairs",)
     gives = ("density",)
 
@@ -176,4 +179,5 @@ class WCSPH(TermSettings):
     exponent: float = number("gamma of the pressure c^2 rho_0 / gamma ((rho / rho_0)^gamma - 1)", default=1.0,
                              at_least=1)
 
+    numbers_per_pair = 8
     reads = ("pairs", "density")

@@ -58,8 +58,8 @@ class Term(nn.Module):
 class PairTerm(Term):
     """A term that is a sum over neighbours within the radius of interaction, of `pair_values`.
 
-    Sums of all such terms of a model are taken together, pairs being gathered once. Its rates are those of the
-    particles that are asked for, which in training are some of the owned ones.
+    Sums of such terms are taken together, pairs being gathered once; or twice where terms give a density that others
+    read. Its rates are those of the particles that are asked for, which in training are some of the owned ones.
 
     Attributes
     ----------
