@@ -180,7 +180,8 @@ def test_classes_beside_the_scene_are_found(tmp_path, own):
     own("unused", "")  # restores where modules are looked for
     folder = tmp_path / "apart"
     folder.mkdir()
-    (folder / "own_neighbour.py").write_text("from eddies import Term\n\nclass Quiet(Term):\n    def forward(self, context):\n        return None\n")
+    (folder / "own_neighbour.py").write_text(
+        "from eddies import Term\n\nclass Quiet(Term):\n    def forward(self, context):\n        return None\n")
     (folder / "case.toml").write_text(COMPRESSIBLE + '[model]\nterms = ["own_neighbour:Quiet"]\n')
     scene = load_scene(folder / "case.toml")
     assert scene.model.settings["Quiet"].reads == () and not scene.model.gives & {"density"}

@@ -13,8 +13,9 @@ from eddies.particles.particle_set import ParticleSet
 from eddies.particles.reference_scales import ReferenceScales
 from eddies.scene import BOX_LENGTH, load_scene
 from eddies.workflows.adopt import trained_on
+from eddies.workflows.model_description import describe
 from eddies.workflows.model_source import ModelSource
-from eddies.workflows.trained_model import describe, scene_model, with_weights
+from eddies.workflows.trained_model import scene_model, with_weights
 
 # Of the scene tiny: filter width two spacings, whatever their number.
 SCALES = ReferenceScales(length=BOX_LENGTH / 6, spacing=BOX_LENGTH / 12, velocity=0.9, density_mean=1.0, density=0.02,

@@ -13,8 +13,8 @@ from eddies.particles.reference_scales import ReferenceScales
 from eddies.scene import Model, SceneError, load_scene
 from eddies.scene_rules import quoted
 from eddies.stages import check_inputs
+from eddies.workflows.model_description import describe
 from eddies.workflows.model_source import read_source
-from eddies.workflows.trained_model import describe
 
 # Of the scene tiny: filter width two spacings, whatever their number.
 SCALES = ReferenceScales(length=0.5, spacing=0.25, velocity=1.0, acceleration=2.0, density_mean=1.0, viscosity=0.01)

@@ -16,7 +16,8 @@ from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.smoothing_kernels import KernelNetwork
 from eddies.scene import BOX_LENGTH, Model, SceneError, load_scene
 from eddies.workflows import dns, report, simulate, train
-from eddies.workflows.trained_model import describe, scene_model
+from eddies.workflows.model_description import describe
+from eddies.workflows.trained_model import scene_model
 from eddies.workflows.truth import GroundTruth
 
 SCENE = """

@@ -11,7 +11,8 @@ from eddies.io.weights import load_weights, save_weights
 from eddies.particles.reference_scales import ReferenceScales
 from eddies.particles.terms.presets import PRESETS
 from eddies.scene import Model, SceneError, load_scene
-from eddies.workflows.trained_model import describe, differences, load_model, scene_model
+from eddies.workflows.model_description import describe, differences
+from eddies.workflows.trained_model import load_model, scene_model
 
 # Of the scene tiny: the filter is two spacings wide.
 SCALES = ReferenceScales(length=1.0471975511965976, spacing=0.5235987755982988, velocity=0.9, density_mean=1.0,
