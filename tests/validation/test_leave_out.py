@@ -150,7 +150,7 @@ def fluid_of(comm, compressible, forced):
     state = initial_fields.random_velocity(grid, 3, 1.0, 2.0)
     forcing = LinearForcing(grid, 0.5, 2.0) if forced else None
     if not compressible:
-        return grid, IncompressibleFluid(grid, 0.1, forcing), state
+        return grid, IncompressibleFluid(grid, 0.1, forcing=forcing), state
     density = initial_fields.balanced_density(grid, state, 10.0)
     return grid, CompressibleFluid(grid, 0.1, 10.0, forcing), np.concatenate([state, density[None]])
 

@@ -29,7 +29,8 @@ def test_the_same_flow_in_other_units_gets_the_same_force_in_those_units(comm, p
     scene = load_scene("tiny", [f"model.preset={preset}"])
     model = scene_model(scene, SCALES).float()
     weights = {name: tensor.numpy() for name, tensor in model.state_dict().items()}
-    other = replace(SCALES, velocity=1.8, density=0.08, acceleration=6.8, density_rate=0.4)
+    other = replace(SCALES, velocity=1.8, density=0.08, acceleration=6.8, density_rate=0.4,
+                    viscosity=2 * SCALES.viscosity)
     adopted = with_weights(scene, json.loads(json.dumps(describe(scene, SCALES))), weights, "model.h5", other)
     assert adopted.flow.scales == other and adopted.flow.cutoff == model.flow.cutoff
     assert all(parameter.dtype == torch.float32 for parameter in adopted.parameters())

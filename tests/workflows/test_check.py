@@ -172,9 +172,10 @@ def test_what_no_term_reads_limits_no_ranks():
 
 def test_memory_of_pairs_is_that_of_the_widest_network():
     from eddies.workflows.cost_model import pair_bytes
-    sizes = [pair_bytes(load_scene("tiny", ["model.preset=paper-density", f"model.{term}.hidden=[{width}]"]), 1)
-             for term, width in (("pairs", 4), ("density-flux", 4), ("pairs", 200), ("density-flux", 200))]
-    assert sizes[0] == sizes[1] < sizes[2] == sizes[3]
+    sizes = [pair_bytes(load_scene("tiny", ["model.preset=paper-density", f"model.pairs.hidden=[{first}]",
+                                            f"model.density-flux.hidden=[{second}]"]), 1)
+             for first, second in ((4, 4), (4, 200), (200, 4))]
+    assert sizes[0] < sizes[1] == sizes[2]
 
 
 @pytest.mark.mpi(1)

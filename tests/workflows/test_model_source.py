@@ -69,7 +69,7 @@ def test_a_run_directory_or_its_file_gives_description_weights_and_tables(comm, 
     ("tracers.filter_width=0.9", "[tracers] filter_width = 0.9, but {} was trained with 1.04719755"),
 ])
 def test_another_form_is_refused_with_both_values(comm, tmp_path, own, override, message):
-    own("own_networks", "class Net:\n    def forward(self, features): pass\n")
+    own("own_networks", "from torch import nn\nclass Net(nn.Module):\n    def forward(self, features): pass\n")
     write_source(comm, tmp_path)
     with pytest.raises(SceneError) as error:
         read_source(scene(f"model.path={tmp_path}", override), comm)

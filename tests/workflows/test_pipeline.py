@@ -156,9 +156,10 @@ def test_a_trained_model_runs_on_another_flow(run_directory, tmp_path):
     ('preset = "learned-density"', 6 + 6 + 1, True),
     ('preset = "paper-density"\n[model.pairs]\nhidden = [4]\n[model.density-flux]\nhidden = [4]', 4 + 4, True),
     ('preset = "resolved"', 3, False),
+    ('terms = ["pressure", "viscosity"]', 0, False),
 ])
 def test_other_models_run(run_directory, tmp_path, model, weights, rate):
-    """Of networks, or of forces of the resolved velocity alone, where nothing reads a density."""
+    """Of networks, of forces of the resolved velocity alone, where nothing reads a density, with nothing to learn."""
     for name in ("ground_truth.h5", "kernel.h5"):
         (tmp_path / name).symlink_to(run_directory / name)
     text = load_scene("tiny", ["training.steps=10", "training.combined_steps=2", "simulation.turnovers=0.1"]).to_toml()

@@ -57,8 +57,8 @@ def _errors_panel(axis: Axes, table: Mapping[str, np.ndarray]) -> None:
                   textcoords="offset points", ha="right", fontsize=9, color="#5a5a5a")
     if delay.min() < 0:
         axis.axvspan(delay.min() - 0.03 * np.ptp(delay), 0, color="#eeeeee", zorder=0)
-        axis.annotate("training", (delay.min(), 0.01), xycoords=("data", "axes fraction"), fontsize=9,
-                      color="#5a5a5a", va="bottom")
+        axis.annotate("training", (delay.min(), 0.86), xycoords=("data", "axes fraction"), fontsize=9,
+                      color="#5a5a5a", va="top")
     for column, label, colour, style, marker in ERRORS:
         if column in table:
             axis.plot(delay, table[column], color=colour, linestyle=style, marker=marker, markersize=4,
