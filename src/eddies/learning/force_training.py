@@ -80,7 +80,7 @@ class TrainingFrame:
         collective."""
         if self.dynamics.surroundings is not None and self.dynamics.surroundings.neighbors is not None:
             return self.dynamics.surroundings
-        slab, reach = self.decomposition, self.dynamics.flow.cutoff
+        slab, reach = self.decomposition, self.model.flow.cutoff
         found = Surroundings(slab, slab.length, reach, reach, 0.0)
         found.update(self.particles)
         return found
@@ -215,7 +215,7 @@ class ForceTrainer:
         """Eq. 14, components together, for the acceleration, and for the velocity that the error of the acceleration
         leads to after a time v_rms / a_rms."""
         shares = {}
-        scales, truth = frame.dynamics.flow.scales, frame.acceleration[rows]
+        scales, truth = self.model.flow.scales, frame.acceleration[rows]
         if self.weights.acceleration_kl > 0:
             shares["acceleration_kl"] = self._divergence(truth / frame.acceleration_rms, error / frame.acceleration_rms)
         if self.weights.velocity_kl > 0:

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.context import Context
-from eddies.particles.flow_units import FlowUnits
 from eddies.particles.model import LagrangianModel, LinearRates
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.periodic_box import PeriodicBox
@@ -31,19 +30,16 @@ class ParticleDynamics:
         and pair displacements are converted after the nearest image is taken.
     drift : how far particles may move beyond half the skin before they change rank: the reach of the grid of the
         resolved velocity.
-    flow : units of the flow of these particles; those that the model was made for unless given.
     fixed_ranks : particles never change rank, nor rows; for a few steps of which gradients are taken. The halo
         is as much wider as they stray from their slab.
     """
 
     def __init__(self, decomposition: SlabDecomposition, model: LagrangianModel, skin: float,
-                 dtype: torch.dtype | None = None, drift: float = 0.0, flow: FlowUnits | None = None,
-                 fixed_ranks: bool = False) -> None:
+                 dtype: torch.dtype | None = None, drift: float = 0.0, fixed_ranks: bool = False) -> None:
         self.decomposition, self.model, self.dtype, self.fixed_ranks = decomposition, model, dtype, fixed_ranks
-        self.flow = flow or model.flow
         self.box = PeriodicBox(decomposition.length)
         reads = model.reads
-        list_cutoff = self.flow.cutoff if "pairs" in reads else 0.0
+        list_cutoff = model.flow.cutoff if "pairs" in reads else 0.0
         self.resolution = None
         if "resolved" in reads:
             from eddies.particles.resolved_velocity import ResolvedVelocity  # pyfftw, where a transform is needed
@@ -100,5 +96,5 @@ class ParticleDynamics:
             self.surroundings.update(particles)
         if density is None and not self.model.density_is_given:
             density = particles.density
-        return Context(self.decomposition, particles, self.flow, self.surroundings, self.resolution, rows,
+        return Context(self.decomposition, particles, self.model.flow, self.surroundings, self.resolution, rows,
                        self.dtype, density)

@@ -26,7 +26,7 @@ class LagrangianModel(nn.Module):
     Parameters
     ----------
     terms : by name, in the order in which they are evaluated.
-    flow : what they were made for, and the units that they have unless a `ParticleDynamics` is given others.
+    flow : what they were made for, and the units of their rates.
 
     Terms that do not read the density come first; what they give of it is the density that the others see. What no term
     reads is not built, and the density is not computed where nobody reads it. Raises SceneError where a term both reads

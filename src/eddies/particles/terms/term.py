@@ -20,8 +20,7 @@ if TYPE_CHECKING:
 class Term(nn.Module):
     """One term of dv_i/dt or d rho_i/dt: a module with named parameters, made for a flow with its settings.
 
-    Rates are in the units of `context.flow`, which may be those of another flow, or of the same one at another time,
-    than it was made for.
+    Rates are in the units of `context.flow`.
 
     A term of one's own subclasses it, declares what it reads and gives on its class of `Settings`, and computes its
     contribution in `forward`. All ranks evaluate a term together, also those without particles.

@@ -27,7 +27,7 @@ class WCSPH(PairTerm):
     Pi only for approaching pairs, x.v < 0. The smoothing length h is half the support of W, which is the radius of
     interaction. Forces of a pair are opposite and central, so momentum and angular momentum are kept. In three
     dimensions Pi acts like a viscosity of about alpha c h / 10. The sound speed c, at first that of the flow, alpha,
-    beta and gamma are parameters in double precision.
+    beta and gamma are parameters.
     """
 
     Settings = declared.WCSPH
