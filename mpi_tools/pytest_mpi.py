@@ -24,7 +24,7 @@ from pathlib import Path
 
 import pytest
 
-from mpi_tools.launch import mpi_environment, mpirun_command
+from mpi_tools.launch import local_cores, mpi_environment, mpirun_command
 
 TIMEOUT = 120.0  # seconds for one test on all its ranks
 STALL = 60.0     # seconds without a result, beyond the time limit, after which mpirun itself is given up
@@ -100,6 +100,14 @@ class OuterRun:
         for item in items:
             if isinstance(item, MpiItem):
                 self.waiting.setdefault(item.ranks, []).append(item)
+
+    @pytest.hookimpl(tryfirst=True)
+    def pytest_runtestloop(self, session):
+        """The tests on one rank run beside those that need none: two cores are busy."""
+        group = self.waiting.get(1)
+        if group and len(session.items) > sum(map(len, self.waiting.values())) and local_cores() > 1 \
+                and not session.config.option.collectonly and session.config.option.capture != "no":
+            self.run = RankRun(self.config, 1, group)
 
     def records(self, item) -> list[dict]:
         """Records of all ranks for a test; where no mpirun reaches it, one starts with it."""

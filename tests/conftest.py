@@ -2,11 +2,16 @@
 
 import importlib
 import logging
+import os
+import runpy
 import sys
+from pathlib import Path
 
 import pytest
 
 pytest_plugins = ["mpi_tools.pytest_mpi"]
+
+UNDRAWN = Path(__file__).parent / "undrawn"
 
 
 @pytest.fixture(autouse=True)
@@ -17,6 +22,15 @@ def logger_as_before():
     yield
     logger.handlers, logger.propagate = handlers, propagate
     logger.setLevel(level)
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Figures are made but not drawn, here and in programs that are started: that is most of a report's time."""
+    from eddies.analysis import figures
+    monkeypatch.setattr(figures, "png", figures.png)  # what is set in the next line ends with the test
+    runpy.run_path(str(UNDRAWN / "sitecustomize.py"))
+    monkeypatch.setenv("PYTHONPATH", str(UNDRAWN), prepend=os.pathsep)
 
 
 @pytest.fixture

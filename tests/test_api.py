@@ -1,17 +1,13 @@
-"""The Python face: what `import eddies` brings, and a rollout set going from a program."""
+"""The Python face: what `import eddies` brings, and runs from a program."""
 
 import logging
-import re
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
 import eddies
-
-README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
 
 
 def test_importing_is_cheap_and_names_are_loaded_when_asked_for():
@@ -67,13 +63,6 @@ def test_a_scene_that_a_program_makes_and_names_a_run_directory(comm, tmp_path, 
     scene = eddies.Scene(name="made", flow=eddies.Flow(fluid="incompressible", cells=8, viscosity=0.1),
                          initial=eddies.Initial(kind="abc"), time=eddies.Time(duration=0.1))
     assert str(eddies.run(scene)) == "runs/made" and (tmp_path / "runs/made/scene.toml").exists()
-
-
-def test_ten_lines_set_a_rollout_going(tmp_path):
-    program = re.search(r"^```python\n(import dataclasses\n.*?)^```", README, re.MULTILINE | re.DOTALL)[1]
-    ended = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, timeout=300)
-    assert ended.returncode == 0, ended.stderr
-    assert (tmp_path / "runs/mine/report/index.html").exists() and "rollout: complete" in ended.stdout
 
 
 def test_an_error_that_one_rank_meets_ends_the_job(tmp_path):

@@ -1,8 +1,10 @@
-"""The examples of the documentation: each trains, runs and reports, as a program, from any directory."""
+"""The examples of the documentation, and of the README: each trains, runs and reports, as a program, from any
+directory."""
 
 import json
 import math
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -19,9 +21,11 @@ SMALL = ["flow.cells=16", "spin_up.turnovers=0.1", "tracers.particles_per_side=8
          "tracers.turnovers=0.3", "tracers.field_every=2", "kernel.neighbors=30", "kernel.steps=4", "kernel.points=50",
          "training.steps=8", "training.combined_steps=2", "training.frames=3", "training.batch=64",
          "simulation.turnovers=0.05", "simulation.frame_interval=0.04"]
-# Imported by Python itself when it starts: the scenes are smaller, and stages already done are skipped.
+UNDRAWN = Path(__file__).parent / "undrawn" / "sitecustomize.py"
+# What Python runs as it starts: the scenes are smaller, stages already done are skipped, figures are not drawn.
 SMALLER = f"""
-import eddies
+import eddies, runpy
+runpy.run_path({str(UNDRAWN)!r})
 load, run = eddies.load_scene, eddies.run
 eddies.load_scene = lambda name, overrides: load(name, [*overrides, *{SMALL!r}])
 eddies.run = lambda scene: run(scene, resume=True)
@@ -63,12 +67,26 @@ def ground_truth(tmp_path_factory):
     return folder / "run"
 
 
-@pytest.mark.parametrize("name, ranks", [("own_term", 1), ("own_term", 2), ("own_network", 2)])
-def test_a_model_of_the_users(tmp_path, ground_truth, name, ranks):
-    run = tmp_path / "runs" / name.replace("_", "-")
+def linked(ground_truth, run):
+    """The run directory with those products."""
     run.mkdir(parents=True)
     for product in ("ground_truth.h5", "kernel.h5"):
         (run / product).symlink_to(ground_truth / product)
+    return run
+
+
+def test_ten_lines_set_a_rollout_going(tmp_path, ground_truth):
+    readme = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+    program, run = tmp_path / "program.py", linked(ground_truth, tmp_path / "runs" / "mine")
+    program.write_text(re.search(r"^```python\n(import dataclasses\n.*?)^```", readme, re.MULTILINE | re.DOTALL)[1])
+    said = started(tmp_path, 1, program)
+    assert said.count("rollout: complete") == 2 and said.count("skipped") == 2
+    assert list(results(run)[1]) == ["pressure", "relaxation", "pairs"]
+
+
+@pytest.mark.parametrize("name, ranks", [("own_term", 1), ("own_network", 2)])
+def test_a_model_of_the_users(tmp_path, ground_truth, name, ranks):
+    run = linked(ground_truth, tmp_path / "runs" / name.replace("_", "-"))
     said = started(tmp_path, ranks, EXAMPLES / f"{name}.py")
     assert said.count("skipped") == 2
     metrics, terms, weights = results(run)

@@ -168,6 +168,7 @@ def test_every_method_has_the_units_of_its_start_and_runs(comm, tmp_path, method
     assert attributes.get("terms") == terms.get(method)
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.mpi(1, 2)
 @pytest.mark.parametrize("kind", WITHOUT_DENSITY)
 def test_where_no_term_reads_the_density_an_incompressible_truth_will_do(comm, tmp_path, kind):

@@ -7,8 +7,11 @@ from collections.abc import Callable, Sequence
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
+
+from eddies.analysis.page import Section
 
 # Colour-blind safe (Okabe and Ito), the same quantity in the same colour in every figure.
 DNS, FILTERED, TRUTH, MODEL = "#000000", "#7f7f7f", "#0072B2", "#D55E00"
@@ -55,8 +58,18 @@ def letter(axes: Sequence[Axes]) -> None:
 def png(figure: Figure) -> bytes:
     """The figure as a PNG image."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", facecolor="white", metadata={"Software": None})
+    # Not `savefig`, which draws every figure twice: the first time for its layout alone.
+    FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": None})
     return buffer.getvalue()
+
+
+def draw(comm, sections: Sequence[Section]) -> None:
+    """Turn the figures of rank 0's sections into PNG images; all ranks call it, and each draws its share."""
+    illustrations = [illustration for section in sections for illustration in section.illustrations]
+    shares = [[illustration.image for illustration in illustrations[rank::comm.size]] for rank in range(comm.size)]
+    images = comm.gather([png(figure) for figure in comm.scatter(shares)])
+    for index, illustration in enumerate(illustrations):
+        illustration.image = images[index % comm.size][index // comm.size]
 
 
 def largest(*arrays: np.ndarray, quantile: float = 0.998) -> float:

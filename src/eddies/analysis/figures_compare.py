@@ -12,7 +12,7 @@ from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
 from eddies.analysis.accuracy import MEASURES
 from eddies.analysis.figures import (
-    DNS, FILTERED, FOURTH, GUIDE, MODEL, SECOND, THIRD, TRUTH, letter, panels, png, styled,
+    DNS, FILTERED, FOURTH, GUIDE, MODEL, SECOND, THIRD, TRUTH, letter, panels, styled,
 )
 from eddies.analysis.figures_labels import fix_layout, place_labels
 from eddies.analysis.page import Metric, RunRecord, Section
@@ -77,9 +77,9 @@ def sections(table: ErrorAgainstTime, turnovers: float) -> list[Section]:
             "in both. Crosses at the top: became unstable, at the time given. ")
     for measure in DRAWN:
         first.add_figure(measure.replace("_", "-"), f"Run time and {MEASURES[measure]}",
-                         png(scatter(table, [measure])), note + _caption(table, measure))
+                         scatter(table, [measure]), note + _caption(table, measure))
     overview = Section("overview", "All four measures")
-    overview.add_figure("error-against-run-time", "Error against run time", png(scatter(table, DRAWN)), note)
+    overview.add_figure("error-against-run-time", "Error against run time", scatter(table, DRAWN), note)
     errors = {**MEASURES, "end": "time of the end (T)", "stopped_at": "unstable at (T)"}
     return [first, overview, _table("errors", "Errors", table.rows, errors,
                                     "Spectrum, energy and KL divergences (nats) are those at the end, of the stable "

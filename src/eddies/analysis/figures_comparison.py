@@ -8,7 +8,6 @@ import numpy as np
 from eddies.analysis import figures_disorder, figures_rollout, figures_statistics
 from eddies.analysis import rollout_comparison as comparison
 from eddies.analysis.errors import normalized_l2
-from eddies.analysis.figures import png
 from eddies.analysis.page import Metric, Section
 from eddies.analysis.rollout_comparison import CommonFrames, Frames, Pair, ParticleFrames
 from eddies.analysis.spectra import spectrum_error, vorticity
@@ -130,7 +129,7 @@ def _add_planes(shown: Section, run: Rollout, last: float) -> None:
     planes = [_plane_of_first_component(model, truth, common, index) for index in common.spread(4)]
     shown.add_figure(
         "figure-4-velocity", "Velocity over time (the paper's Fig. 4)",
-        png(figures_rollout.velocity_planes(planes, run.turnover, TRUTH_NAMES[name])),
+        figures_rollout.velocity_planes(planes, run.turnover, TRUTH_NAMES[name]),
         f"u_x in the plane z = π: {TRUTH_NAMES[name]} above, the model through the learned kernel below. "
         f"Relative difference in the last plane: {normalized_l2(planes[-1].model, planes[-1].truth):.3f}.")
     fields = comparison.particle_pair(model, truth, common, common.times.size - 1, "velocity")
@@ -139,7 +138,7 @@ def _add_planes(shown: Section, run: Rollout, last: float) -> None:
     ratios = [pair.model.mean() / pair.truth.mean() for pair in (rotation, energy)]
     shown.add_figure(
         "figure-5-vorticity-energy", "Vorticity and kinetic energy (the paper's Fig. 5)",
-        png(figures_rollout.vorticity_and_energy(rotation, energy, TRUTH_NAMES[name])),
+        figures_rollout.vorticity_and_energy(rotation, energy, TRUTH_NAMES[name]),
         f"Plane z = π at t = {fields.time / run.turnover:.2f} T. Mean over the plane, model / truth: "
         f"vorticity {ratios[0]:.2f}, energy {ratios[1]:.2f}.")
 
@@ -160,18 +159,18 @@ def _add_particles(shown: Section, run: Rollout, common: CommonFrames) -> None:
                       for index in common.spread(3)] for column in comparison.EDGES}
     shown.add_figure(
         "figure-6-pdfs", "PDFs of velocity and acceleration (the paper's Fig. 6)",
-        png(figures_statistics.particle_pdfs(pairs, run.turnover)),
+        figures_statistics.particle_pdfs(pairs, run.turnover),
         "All components, centred and divided by the truth's standard deviation at the time; values beyond "
         f"the axis count in its last bins. Last time: KL {final['velocity_kl']:.2g} (velocity), "
         f"{final['acceleration_kl']:.2g} (acceleration).")
     shown.add_figure(
         "figure-9-errors", "Rollout over time",
-        png(figures_rollout.errors_over_time(model, truth, errors, run.turnover)),
+        figures_rollout.errors_over_time(model, truth, errors, run.turnover),
         f"At the last common time the model has {ratio:.3f} of the truth's energy and a velocity error of "
         f"{final['velocity_error']:.3f} (dotted: 1, as large as the velocity itself).")
     shown.add_figure(
         "lagrangian", "Lagrangian statistics",
-        png(figures_rollout.lagrangian({"truth": truth, "model": model}, run.turnover)),
+        figures_rollout.lagrangian({"truth": truth, "model": model}, run.turnover),
         "Correlation of the velocity with that at the start, and spreading of nearest neighbours in units of "
         "their mean-square separation. Correlation at the last common time: "
         f"{truth['correlation'][-1]:.3f} (truth), {model['correlation'][common.model[-1]]:.3f} (model).")
@@ -182,7 +181,7 @@ def _add_invariants(shown: Section, run: Rollout, common: CommonFrames) -> None:
     shown.metrics.append(Metric("qr_kl", "KL divergence of the Q–R joint PDF", statistics.divergence))
     shown.add_figure(
         "figure-7-invariants", "Invariants Q and R of the velocity gradient (the paper's Fig. 7)",
-        png(figures_statistics.invariant_plane(statistics)),
+        figures_statistics.invariant_plane(statistics),
         f"Joint PDF at t = {common.times[-1] / run.turnover:.2f} T (isolines half a decade apart, smoothed "
         f"over one bin for drawing; KL {statistics.divergence:.2g} from raw bins) and mean motion over all "
         "frames until then. Orange: Vieillefosse line. Both are in units of the truth's ⟨Q_w⟩ = ⟨W:W⟩/2.")
@@ -209,7 +208,7 @@ def _add_spectra(shown: Section, run: Rollout, last: float) -> None:
     start = float(run.attributes["start_time"])
     figure = figures_rollout.energy_spectra(series, run.eulerian, start, run.turnover, cutoff)
     title = "Energy spectra over time (the paper's Fig. 8)"
-    shown.add_figure("figure-8-spectra", title, png(figure), caption)
+    shown.add_figure("figure-8-spectra", title, figure, caption)
 
 
 def _plane_of_first_component(model: Frames, truth: Frames, common: CommonFrames, index: int) -> Pair:

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from eddies.analysis import disorder
-from eddies.analysis.figures import GUIDE, letter, panels, png, styled
+from eddies.analysis.figures import GUIDE, letter, panels, styled
 from eddies.analysis.figures_rollout import LINES
 from eddies.analysis.page import Metric, Section
 from eddies.analysis.pdfs import kl_divergence
@@ -67,7 +67,7 @@ def add(shown: Section, found: Disorder, turnover: float) -> None:
                "the filter width is in ground_truth.h5, which is not here"),
     ]
     shown.add_figure(
-        "particle-disorder", "Disorder of the particles", png(draw(found, turnover)),
+        "particle-disorder", "Disorder of the particles", draw(found, turnover),
         f"A: distance to the nearest neighbour at t = {found.time / turnover:.2f} T; KL {found.divergence:.2g}. "
         f"B: variance of the particles' number in cells of {disorder.CELL:g} mean spacings, 1 for random points; "
         f"at that time {variance['truth']:.2f} (true tracers), {variance['model']:.2f} (model): above the truth's the "

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from eddies.analysis.figures import (
     DNS, FILTERED, FOURTH, GUIDE, MODEL, POSITIVE, SECOND, SIGNED, TRUTH, colour_bar, guide_power_law,
-    largest, legend_below, letter, mark_time, number_wavenumbers, panels, png, show_plane, styled,
+    largest, legend_below, letter, mark_time, number_wavenumbers, panels, show_plane, styled,
 )
 from eddies.analysis.page import Metric, Section
 
@@ -193,11 +193,11 @@ def section(flow: GroundTruth) -> Section:
                     main=("reynolds_lambda", "kmax_eta", "mach_turbulent"))
     first, last = flow.statistics["time"][[0, -1]]
     shown.add_figure(
-        "statistics", "History of the simulation", png(statistics_history(flow.statistics, flow.released_at)),
+        "statistics", "History of the simulation", statistics_history(flow.statistics, flow.released_at),
         f"From t = {first:.3g} to {last:.3g}. {when.capitalize()} the energy is {at['energy']:.3g} and the "
         f"dissipation rate {at['dissipation_rate']:.3g}.")
     _add_spectra(shown, flow)
-    shown.add_figure("fields", "Velocity and vorticity", png(field_planes(**flow.planes)),
+    shown.add_figure("fields", "Velocity and vorticity", field_planes(**flow.planes),
                      f"Plane z = π of the last stored {flow.field_name} field.")
     return shown
 
@@ -213,4 +213,4 @@ def _add_spectra(shown: Section, flow: GroundTruth) -> None:
         kept = filtered.sum() / energy.sum()
         caption += f" The filter of width d = {scales['length']:.3g} keeps {kept:.1%} of the energy."
     figure = spectra(flow.spectra["wavenumber"], energy, filtered, scales)
-    shown.add_figure("spectra", "Energy spectrum of the ground truth", png(figure), caption)
+    shown.add_figure("spectra", "Energy spectrum of the ground truth", figure, caption)

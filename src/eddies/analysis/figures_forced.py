@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from eddies.analysis.figures import GUIDE, MODEL, TRUTH, letter, number_wavenumbers, panels, png, styled
+from eddies.analysis.figures import GUIDE, MODEL, TRUTH, letter, number_wavenumbers, panels, styled
 from eddies.analysis.figures_comparison import Rollout
 from eddies.analysis.isotropic_turbulence import StationarySpan
 from eddies.analysis.page import Metric, Section
@@ -139,7 +139,7 @@ def section(run: Rollout, span: StationarySpan) -> Section:
             Metric("qr_kl", "KL divergence of the Q–R joint PDF, standardised", found.qr_kl),
         ])
     shown.add_figure(
-        "forced", "Forced rollout", png(forced_rollout(found, turnover, run.filter_wavenumber)),
+        "forced", "Forced rollout", forced_rollout(found, turnover, run.filter_wavenumber),
         f"Energy of the model {energy:.3g} ± {deviation:.2g}, of the stationary flow {flow_energy:.3g} ± "
         f"{flow_deviation:.2g} (band; ± is the standard deviation in time). Mean spectra through the kernel differ by "
         f"{error:.3f} up to k_d/2 (dotted: k_d). KL of the acceleration PDF {found.divergence('acceleration'):.2g}.")

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from eddies.analysis.figures import (
-    DNS, FOURTH, MODEL, SECOND, SIGNED, THIRD, TRUTH, colour_bar, largest, letter, panels, png, show_plane,
+    DNS, FOURTH, MODEL, SECOND, SIGNED, THIRD, TRUTH, colour_bar, largest, letter, panels, show_plane,
     styled,
 )
 from eddies.analysis.page import Metric, Section
@@ -100,13 +100,13 @@ def section(support: float, kernels: Mapping[str, np.ndarray], slices: Mapping[s
                     metrics=metrics, main=("velocity_error", "gradient_error"))
     value = shown.value
     shown.add_figure(
-        "figure-1-kernels", "Kernels and their derivatives (the paper's Fig. 1)", png(shapes(kernels)),
+        "figure-1-kernels", "Kernels and their derivatives (the paper's Fig. 1)", shapes(kernels),
         f"Support h = {support:.3g}; the learned kernel integrates to {value('integral'):.6f}.")
     shown.add_figure(
         "figure-2-reconstruction", "Fields reconstructed from particles (the paper's Fig. 2)",
-        png(reconstructed_planes(slices, errors)),
+        reconstructed_planes(slices, errors),
         "Plane z = π of an unseen frame. Numbers in titles: normalised error over the whole field; "
         f"velocity {value('velocity_error'):.3f}, gradient {value('gradient_error'):.3f} when learned.")
-    shown.add_figure("kernel-training", "Training of the kernels", png(training_history(history)),
+    shown.add_figure("kernel-training", "Training of the kernels", training_history(history),
                      f"{int(history['step'][-1])} steps.")
     return shown

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullLocator, StrMethodFormatter
 
-from eddies.analysis.figures import DNS, GUIDE, MODEL, legend_below, panels, png, styled
+from eddies.analysis.figures import DNS, GUIDE, MODEL, legend_below, panels, styled
 from eddies.analysis.page import Metric, Section
 
 CURVES = (  # column of the table, label, colour, marker, factor that sets the bars apart
@@ -71,6 +71,6 @@ def add(shown: Section, this: FlowErrors, source: FlowErrors) -> None:
                float(source.unseen("acceleration_error").mean())),
         Metric("unseen_acceleration_error", "the same of this flow", float(this.unseen("acceleration_error").mean()))]
     shown.add_figure(
-        "figure-3b-mach", "A-priori error over the Mach number (the paper's Fig. 3)", png(over_mach([this, source])),
+        "figure-3b-mach", "A-priori error over the Mach number (the paper's Fig. 3)", over_mach([this, source]),
         f"Trained in {source.name} at M_t = {source.mach:.3f}; of this flow, at M_t = {this.mach:.3f}, the model has "
         "nothing but the scales. Points: mean over the unseen times of a flow; bars: smallest and largest.")

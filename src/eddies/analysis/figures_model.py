@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from eddies.analysis import figures_learning
 from eddies.analysis.figures import (
-    DNS, FOURTH, GUIDE, MODEL, SECOND, TRUTH, legend_below, letter, panels, png, styled,
+    DNS, FOURTH, GUIDE, MODEL, SECOND, TRUTH, legend_below, letter, panels, styled,
 )
 from eddies.analysis.page import Metric, Section
 from eddies.analysis.pdfs import bin_edges, bin_probabilities, gaussian, kl_divergence, pdf, standardized
@@ -111,10 +111,10 @@ def section(description: Mapping[str, object], table: Mapping[str, np.ndarray],
         beside = f"; that of the exact filtered pressure gradient alone is {at['pressure_gradient_error']:.3f}{beside}"
     shown.add_figure(
         "figure-3-a-priori", "A-priori errors and PDFs (the paper's Fig. 3)",
-        png(a_priori(table, acceleration, density_rate)),
+        a_priori(table, acceleration, density_rate),
         f"At the last frame the acceleration error is {at['acceleration_error']:.3f}{beside}. KL "
         f"divergence of the acceleration PDF {divergence:.2g}. Grey: frames of the training window.")
     if history is not None:
-        shown.add_figure("model-training", "Training of the model", png(figures_learning.curves(history)),
+        shown.add_figure("model-training", "Training of the model", figures_learning.curves(history),
                          f"{int(history['step'][-1]) + 1} steps" + (f", in {source}." if source else "."))
     return shown

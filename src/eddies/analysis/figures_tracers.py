@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from eddies.analysis.figures import (
-    DNS, FOURTH, GUIDE, MODEL, SECOND, TRUTH, letter, number_wavenumbers, panels, png, styled,
+    DNS, FOURTH, GUIDE, MODEL, SECOND, TRUTH, letter, number_wavenumbers, panels, styled,
 )
 from eddies.analysis.isotropic_turbulence import acceleration_constant
 from eddies.analysis.page import Metric, Section
@@ -86,7 +86,7 @@ def section(found: TracerStatistics, scales: Mapping[str, float]) -> Section:
             "filter leaves, and fall below the literature's of the whole flow.")
     shown = Section("tracers", "Tracers", text, metrics=metrics)
     shown.add_figure(
-        "tracers", "Statistics of the tracers", png(tracers(found, scales)),
+        "tracers", "Statistics of the tracers", tracers(found, scales),
         f"A: grey, two standard deviations of as many points put at random. B: differences of frames, in units of "
         f"their rms at the time; kurtosis {kurtosis:.3g}. C: of a velocity component. D: pairs by their first distance "
         f"r₀; dashed, the ballistic law S₂(r₀) t² from their first velocities.")

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from eddies.analysis.figures import (
-    DNS, FOURTH, GUIDE, MODEL, SECOND, TRUTH, legend_below, letter, number_wavenumbers, panels, png, styled,
+    DNS, FOURTH, GUIDE, MODEL, SECOND, TRUTH, legend_below, letter, number_wavenumbers, panels, styled,
 )
 from eddies.analysis.isotropic_turbulence import (
     COMPONENTS, INERTIAL, KOLMOGOROV_CONSTANT, Row, StationarySpan, comparison,
@@ -67,7 +67,7 @@ def section(statistics: Mapping[str, np.ndarray], span: StationarySpan) -> Secti
         "with the standard deviation in time, and the literature's values at this Re_λ.",
         metrics=[Metric(row.key, row.label, columns_of(row)) for row in comparison(span)])
     shown.add_figure(
-        "stationary", "The stationary state", png(stationary_state(statistics, span)),
+        "stationary", "The stationary state", stationary_state(statistics, span),
         f"Shaded: the span of the averages. Its energy balance closes to {abs(span.energy_imbalance):.1e} of the "
         "dissipation. C: mean spectrum, each shell with the mean energy of its modes; band: Kolmogorov's constant.")
     return shown

@@ -6,6 +6,8 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 Number = float | int | bool | str | dict | None
 
@@ -54,13 +56,14 @@ class Metric:
             object.__setattr__(self, "reason", "not measured in this run")
 
 
-@dataclass(frozen=True)
+@dataclass
 class Illustration:
-    """A figure as it stands on the page: file name without ending, PNG bytes, caption with its numbers."""
+    """A figure as it stands on the page: file name without ending, caption with its numbers, image: a matplotlib
+    Figure until it is drawn, then the bytes of a PNG."""
 
     name: str
     title: str
-    image: bytes
+    image: Any
     caption: str
 
 
@@ -76,9 +79,9 @@ class Section:
     metrics: list[Metric] = field(default_factory=list)
     main: Sequence[str] = ()  # keys of the metrics shown at the top of the page
 
-    def add_figure(self, name: str, title: str, image: bytes, caption: str) -> None:
-        """Put a figure (PNG) after those that are there."""
-        self.illustrations.append(Illustration(name, title, image, caption))
+    def add_figure(self, name: str, title: str, figure: Any, caption: str) -> None:
+        """Put a matplotlib Figure after those that are there."""
+        self.illustrations.append(Illustration(name, title, figure, caption))
 
     def value(self, key: str) -> Number:
         """The value of one metric."""
@@ -110,6 +113,15 @@ def shown(value: Number) -> str:
     if isinstance(value, dict):
         return ", ".join(f"{name} {shown(part)}" for name, part in value.items())
     return str(value)
+
+
+def write_page(output: Path, run: RunRecord, sections: Sequence[Section]) -> None:
+    """Write index.html and figures/NAME.png of sections whose figures are drawn."""
+    (output / "figures").mkdir(parents=True, exist_ok=True)
+    for section in sections:
+        for illustration in section.illustrations:
+            (output / "figures" / f"{illustration.name}.png").write_bytes(illustration.image)
+    (output / "index.html").write_text(render_page(run, sections), encoding="utf-8")
 
 
 def render_page(run: RunRecord, sections: Sequence[Section]) -> str:

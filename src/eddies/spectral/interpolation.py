@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -47,7 +47,7 @@ class SplineInterpolation:
         """Values (n, c) at positions (n, 3), x and y anywhere, z within the slab and the margin (periodically)."""
         flat = coefficients.reshape(-1, coefficients.shape[-1])
         values = np.zeros((len(positions), flat.shape[1]))
-        for rows, weight in self._stencil(positions, len(coefficients)):
+        for rows, (weight,) in self._stencil(positions, len(coefficients)):
             values += weight[:, None] * flat[rows]
         return values
 
@@ -55,9 +55,10 @@ class SplineInterpolation:
         """Gradient (n, 3) with respect to the positions of sum_c factors_c f_c, the factors (n, c) held fixed."""
         flat = coefficients.reshape(-1, coefficients.shape[-1])
         slope = np.zeros((len(positions), 3))
-        for axis in range(3):
-            for rows, weight in self._stencil(positions, len(coefficients), axis):
-                slope[:, axis] += weight * np.einsum("nc,nc->n", factors, flat[rows])
+        for rows, weights in self._stencil(positions, len(coefficients), derivatives=(0, 1, 2)):
+            product = np.einsum("nc,nc->n", factors, flat[rows])
+            for axis, weight in enumerate(weights):
+                slope[:, axis] += weight * product
         return slope
 
     def spread(self, values: np.ndarray, positions: np.ndarray) -> np.ndarray:
@@ -67,31 +68,35 @@ class SplineInterpolation:
         """
         n, planes = self.grid.cells, self.grid.physical_shape[0] + self._halo.below + self._halo.above
         flat = np.zeros((values.shape[1], planes * n * n))
-        for rows, weight in self._stencil(positions, planes):
+        for rows, (weight,) in self._stencil(positions, planes):
             for component, column in zip(flat, values.T):
                 component += np.bincount(rows, weight * column, planes * n * n)
         return np.moveaxis(self._halo.adjoint(np.moveaxis(flat.reshape(-1, planes, n, n), 0, -1)), -1, 0)
 
     def _stencil(self, positions: np.ndarray, planes: int,
-                 derivative: int | None = None) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+                 derivatives: Sequence[int | None] = (None,)) -> Iterator[tuple[np.ndarray, list[np.ndarray]]]:
         """For each of the (degree + 1)^3 splines around the points: rows (n,) in the flattened padded planes, and
-        weights (n,); or the weights' derivative along one axis."""
+        weights (n,), for each of the `derivatives` along an axis; None asks for the spline itself."""
         n, width, spacing = self.grid.cells, self.degree + 1, self.grid.decomposition.spacing
         scaled = np.asarray(positions) / spacing
         base = np.floor(scaled)
-        weights = [_spline_weights(self.degree, fraction) for fraction in (scaled - base).T]
-        if derivative is not None:
-            slope = _spline_slopes(self.degree, (scaled - base)[:, derivative])
-            weights[derivative] = slope / spacing
+        fractions = (scaled - base).T
+        values = [_spline_weights(self.degree, fraction) for fraction in fractions]
+        choices = []  # of weights along x, y, z
+        for axis in derivatives:
+            choice = list(values)
+            if axis is not None:
+                choice[axis] = _spline_slopes(self.degree, fractions[axis]) / spacing
+            choices.append(choice)
         first = base.astype(np.int64) - (self.degree - 1) // 2
         columns = [(first[:, axis, None] + np.arange(width)) % n for axis in (0, 1)]
         lowest = self._rows(first[:, 2], planes)
         for k in range(width):
             for j in range(width):
                 line = ((lowest + k) * n + columns[1][:, j]) * n
-                weight = weights[2][:, k] * weights[1][:, j]
+                lines = [(z[:, k] * y[:, j], x) for x, y, z in choices]
                 for i in range(width):
-                    yield line + columns[0][:, i], weight * weights[0][:, i]
+                    yield line + columns[0][:, i], [weight * x[:, i] for weight, x in lines]
 
     def _rows(self, first: np.ndarray, planes: int) -> np.ndarray:
         """Index in the padded planes of the first of the planes that each point needs."""

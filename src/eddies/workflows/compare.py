@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from eddies.analysis import figures_compare
-from eddies.analysis.page import render_page
+from eddies.analysis.figures import draw
+from eddies.analysis.page import write_page
 from eddies.comparison import BASELINE, Comparison
 from eddies.io.hdf5 import ProductError, open_product, read_attributes, read_provenance
 from eddies.scene import SceneError
@@ -50,9 +51,9 @@ def run(comparison: Comparison, comm, output: Path, resume: bool, run_stages: Ru
                 variant.attempt(errors, lambda: variant.time_block(comm, run_stages))
     errors.Free()
     alone = comm.Split(comm.rank)
-    if comm.rank == 0:
-        write(comparison, rows(comparison, runs, alone, comm.size), comm.size, output)
+    table = rows(comparison, runs, alone, comm.size) if comm.rank == 0 else []
     alone.Free()
+    write(comparison, table, comm, output)
     comm.Barrier()
 
 
@@ -80,23 +81,23 @@ def check_ground_truth(comparison: Comparison, variant: VariantRun, comm) -> Non
                          f"t_eta = {kolmogorov_time:.3g}, at which errors are compared; lower it")
 
 
-def write(comparison: Comparison, table: list[dict[str, Any]], ranks: int, output: Path) -> None:
-    """Write the rows and what is drawn of them; one rank calls it."""
-    computer = machine(comparison.base_scene.device, ranks)
+def write(comparison: Comparison, table: list[dict[str, Any]], comm, output: Path) -> None:
+    """Write rank 0's rows and what is drawn of them; all ranks call it."""
+    sections = []
+    if comm.rank == 0:
+        sections = figures_compare.sections(
+            figures_compare.ErrorAgainstTime(table, comparison.subject, BASELINE), comparison.turnovers)
+    draw(comm, sections)
+    if comm.rank > 0:
+        return
+    computer = machine(comparison.base_scene.device, comm.size)
     with open(output / "comparison.csv", "w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, COLUMNS)
         writer.writeheader()
         writer.writerows(table)
     record = {"name": comparison.name, "title": comparison.title, "machine": computer, "rows": table}
     (output / "comparison.json").write_text(json.dumps(record, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    sections = figures_compare.sections(
-        figures_compare.ErrorAgainstTime(table, comparison.subject, BASELINE), comparison.turnovers)
     sections[0].notices += notes(comparison)
     page = figures_compare.run_record(comparison.name, comparison.title, comparison.base_scene.to_toml(), computer)
-    figures = output / "figures"
-    figures.mkdir(exist_ok=True)
-    for section in sections:
-        for illustration in section.illustrations:
-            (figures / f"{illustration.name}.png").write_bytes(illustration.image)
-    (output / "index.html").write_text(render_page(page, sections), encoding="utf-8")
+    write_page(output, page, sections)
     log.info("compare: %s", output / "index.html")

@@ -1,6 +1,6 @@
 """The report of a run: the paper's figures from the run's own products, one page, and the numbers as JSON.
 
-Every product is optional; a section appears for what there is. Rank 0 does the work, the others wait.
+Every product is optional; a section appears for what there is. Rank 0 reads and computes, all ranks draw.
 """
 
 import json
@@ -17,8 +17,9 @@ from eddies.analysis import (
     figures_comparison, figures_flow, figures_forced, figures_kernel, figures_mach, figures_model, figures_tracers,
     figures_turbulence,
 )
+from eddies.analysis.figures import draw
 from eddies.analysis.isotropic_turbulence import StationarySpan
-from eddies.analysis.page import Metric, RunRecord, Section, metrics_json, render_page, shown
+from eddies.analysis.page import Metric, RunRecord, Section, metrics_json, shown, write_page
 from eddies.analysis.spectra import energy_spectrum, vorticity
 from eddies.analysis.tracer_statistics import tracer_statistics
 from eddies.io.fields import FieldSeries
@@ -50,14 +51,19 @@ def run(directory: str | Path, comm) -> None:
 
     Raises ProductError if the directory holds no product, or a damaged one.
     """
+    directory, record, sections = Path(directory), None, []
     alone = comm.Split(comm.rank)
     if comm.rank == 0:
-        _write_report(Path(directory), alone)
+        record, sections = _read(directory, alone)
     alone.Free()
+    draw(comm, sections)
+    if comm.rank == 0:
+        _write_files(directory / "report", record, sections)
+        _log_main_numbers(sections)
     comm.Barrier()
 
 
-def _write_report(directory: Path, alone) -> None:
+def _read(directory: Path, alone) -> tuple[RunRecord, list[Section]]:
     record, sections = Run(seconds=_stage_seconds(directory)), []
     readers = {"ground_truth": _read_ground_truth, "kernel": _read_kernel, "model": _read_model,
                "rollout": _read_rollout}
@@ -74,8 +80,7 @@ def _write_report(directory: Path, alone) -> None:
         raise ProductError(f"{directory}: holds none of {', '.join(f'{kind}.h5' for kind in readers)}; "
                            "run `eddies dns SCENE` first")
     sections.append(_cost_section(record))
-    _write_files(directory / "report", _run_record(directory, record), sections)
-    _log_main_numbers(sections)
+    return _run_record(directory, record), sections
 
 
 def read_stationary_span(file) -> StationarySpan:
@@ -194,14 +199,10 @@ def _run_record(directory: Path, record: Run) -> RunRecord:
 
 
 def _write_files(output: Path, record: RunRecord, sections: Sequence[Section]) -> None:
-    (output / "figures").mkdir(parents=True, exist_ok=True)
     for stale in (output / "figures").glob("*.png"):
         stale.unlink()
-    for section in sections:
-        for illustration in section.illustrations:
-            (output / "figures" / f"{illustration.name}.png").write_bytes(illustration.image)
+    write_page(output, record, sections)
     (output / "metrics.json").write_text(metrics_json(sections), encoding="utf-8")
-    (output / "index.html").write_text(render_page(record, sections), encoding="utf-8")
     log.info("report: %s", output / "index.html")
 
 
