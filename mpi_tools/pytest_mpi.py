@@ -107,6 +107,8 @@ class OuterRun:
         group = self.waiting.get(1)
         if group and len(session.items) > sum(map(len, self.waiting.values())) and local_cores() > 1 \
                 and not session.config.option.collectonly and session.config.option.capture != "no":
+            # A rank that waits for another leaves its core to them.
+            os.environ.setdefault("OMPI_MCA_mpi_yield_when_idle", "1")
             self.run = RankRun(self.config, 1, group)
 
     def records(self, item) -> list[dict]:

@@ -102,7 +102,7 @@ def test_a_model_of_the_users(tmp_path, ground_truth, name, ranks):
 
 
 def test_a_flow_of_the_users(tmp_path):
-    started(tmp_path, 2, EXAMPLES / "own_initial_flow.py")
+    started(tmp_path, 1, EXAMPLES / "own_initial_flow.py")
     run = tmp_path / "runs" / "own-initial-flow"
     metrics, *_ = results(run)
     # Spun up for a tenth of a turnover it is still what it began as: rms 1 a component, all three alike.

@@ -19,7 +19,7 @@ from tests.learning.models import LENGTH, PER_SIDE, SPACING, Recorder, model_of,
 
 FRAMES, INTERVAL = 4, 0.06
 SUPPORT = 1.6 * SPACING
-every_preset = pytest.mark.parametrize("preset", ["poisson", "poisson-stress", "learned-density"])
+every_preset = pytest.mark.parametrize("preset", ["poisson-stress", "learned-density"])
 
 
 def resolution(slab):

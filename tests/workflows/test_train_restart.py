@@ -43,6 +43,7 @@ def trained(comm, directory):
     return numbers
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.mpi(1, 2)
 def test_a_stopped_training_is_the_one_never_stopped(comm, tmp_path):
     scene = prepared(comm, tmp_path)
@@ -67,6 +68,7 @@ def test_a_stopped_training_is_the_one_never_stopped(comm, tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"ground_truth.h5", "kernel.h5", "model.h5", "learning.png"}
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.mpi(2)
 def test_a_training_goes_on_from_products_that_are_still_those_it_began_with(comm, tmp_path):
     scene = prepared(comm, tmp_path)

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from eddies.analysis.figures import (
-    DNS, FOURTH, GUIDE, MODEL, SECOND, THIRD, TRUTH, letter, panels, png, styled,
+    DNS, FOURTH, GUIDE, MODEL, SECOND, THIRD, TRUTH, letter, panels, styled,
 )
 from eddies.clock import duration
 
@@ -47,11 +47,6 @@ def curves(history: Mapping[str, np.ndarray]) -> Figure:
     figure.legend(*losses.get_legend_handles_labels(), loc="outside lower center", ncols=4)
     letter(axes.flat)
     return figure
-
-
-def picture(history: Mapping[str, np.ndarray]) -> bytes:
-    """The same as a PNG image."""
-    return png(curves(history))
 
 
 def _places(phase: np.ndarray) -> np.ndarray:

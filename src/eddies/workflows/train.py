@@ -118,6 +118,6 @@ class LearningCurves:
     def draw(self, training: Training) -> None:
         """Draw now."""
         if self.comm.rank == 0:
-            from eddies.analysis import figures_learning  # matplotlib takes a while to start
-            self.path.write_bytes(figures_learning.picture(training.columns()))
+            from eddies.analysis import figures, figures_learning  # matplotlib takes a while to start
+            self.path.write_bytes(figures.png(figures_learning.curves(training.columns())))
         self._drawn = time.monotonic()
