@@ -99,7 +99,7 @@ def test_the_rollout_is_the_same_on_any_number_of_ranks(run_directory, tmp_path)
         for name in ("ground_truth.h5", "kernel.h5", "model.h5"):
             (directory / name).symlink_to(run_directory / name)
         result = eddies(ranks, "simulate", "tiny", "--output", str(directory), "--set", "simulation.precision=float64",
-                        "--set", "simulation.turnovers=0.15")
+                        "--set", "simulation.turnovers=0.1")
         assert result.returncode == 0, result.stdout + result.stderr
         with h5py.File(directory / "rollout.h5") as file:
             positions.append(file["particles/model/position/value"][-1])

@@ -55,6 +55,7 @@ def numbers(values):
     return [value for value in values if isinstance(value, float)]
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.mpi(1)
 def test_a_complete_run_shows_everything(comm, tmp_path):
     write_run(comm, tmp_path, {"frames": 17, "stationary": True})
@@ -150,6 +151,7 @@ def test_numbers_of_a_known_rollout(comm, tmp_path):
     assert rollout["count_variance_ratio"] == pytest.approx(1, abs=0.3)
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.mpi(1)
 def test_a_forced_rollout_is_compared_with_the_stationary_state_if_there_is_one(comm, tmp_path):
     write_rollout(comm, tmp_path, injection_rate=0.5)
@@ -266,11 +268,11 @@ def test_an_empty_directory_is_refused(comm, tmp_path):
 def test_ranks_share_the_drawing(comm, tmp_path):
     alone = comm.Split(comm.rank)
     if comm.rank == 0:
-        write_kernel(alone, tmp_path)
+        write_ground_truth(alone, tmp_path, stationary=True)
     comm.Barrier()
     report.run(tmp_path, comm)
     if comm.rank == 0:
         page = written(tmp_path)[1]
         report.run(tmp_path, alone)
-        assert len(figures(tmp_path)) == 3 and written(tmp_path)[1] == page
+        assert len(figures(tmp_path)) == 4 and written(tmp_path)[1] == page
     alone.Free()

@@ -7,10 +7,9 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.optim.adam import adam  # not the class around it: making one loads torch's compiler, two seconds for nothing
 
 from eddies.parallel.reduction import global_sum, sum_flat
-
-MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
 class Descent:
@@ -25,7 +24,9 @@ class Descent:
         self.comm, self.parameters = comm, list(parameters)
         self.steps, self.first_rate, self.last_rate = steps, first_rate, last_rate
         self.taken = 0
-        self._adam = torch.optim.Adam(self.parameters, lr=first_rate)
+        # Adam's running means of the gradient and of its square, by name.
+        self._moments = {name: [torch.zeros_like(p, requires_grad=False) for p in self.parameters]
+                         for name in ("exp_avg", "exp_avg_sq")}
 
     @property
     def learning_rate(self) -> float:
@@ -34,21 +35,20 @@ class Descent:
 
     def step(self, share: Tensor) -> float:
         """One step down the gradient of the sum of all shares; returns the norm of that gradient."""
-        self._adam.zero_grad(set_to_none=False)
+        for parameter in self.parameters:
+            parameter.grad = None
         if share.requires_grad:  # not where all that is left to learn shows through several steps alone
             share.backward()
         # A rank whose share does not depend on a parameter still takes part in the sum.
         gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in self.parameters]
-        for parameter, gradient in zip(self.parameters, gradients):
-            parameter.grad = gradient
         on_host = [gradient.cpu() for gradient in gradients]
         sum_flat(self.comm, [gradient.numpy() for gradient in on_host])
         for gradient, summed in zip(gradients, on_host):
             gradient.copy_(summed)
         norm = float(sum(gradient.double().square().sum() for gradient in on_host) ** 0.5)
-        for group in self._adam.param_groups:
-            group["lr"] = self.learning_rate
-        self._adam.step()
+        with torch.no_grad():
+            adam(self.parameters, gradients, *self._moments.values(), [], self._steps(), amsgrad=False, beta1=0.9,
+                 beta2=0.999, lr=self.learning_rate, weight_decay=0.0, eps=1e-8, maximize=False)
         self.taken += 1
         return norm
 
@@ -56,17 +56,19 @@ class Descent:
         """What `restore` needs besides the parameters: Adam's running means, by name; the same on all ranks."""
         if self.taken == 0:
             return {}
-        states = [self._adam.state[parameter] for parameter in self.parameters]
-        return {f"{moment}_{number}": state[moment].cpu().numpy() for number, state in enumerate(states)
-                for moment in MOMENTS}
+        return {f"{name}_{number}": mean.cpu().numpy() for name, means in self._moments.items()
+                for number, mean in enumerate(means)}
 
     def restore(self, taken: int, memory: Mapping[str, np.ndarray]) -> None:
         """Go on after `taken` steps, with the parameters and the memory of then."""
         self.taken = taken
-        for number, parameter in enumerate(self.parameters) if taken else ():
-            moments = {moment: torch.from_numpy(memory[f"{moment}_{number}"]).to(parameter).reshape(parameter.shape)
-                       for moment in MOMENTS}
-            self._adam.state[parameter] = {"step": torch.tensor(float(taken)), **moments}
+        for name, means in self._moments.items() if taken else ():
+            for number, mean in enumerate(means):
+                mean.copy_(torch.from_numpy(memory[f"{name}_{number}"]).reshape(mean.shape))
+
+    def _steps(self) -> list[Tensor]:
+        """The number of steps taken, as `adam` wants it: by parameter, and to be counted up there."""
+        return [torch.tensor(float(self.taken)) for _ in self.parameters]
 
 
 def shared_values(comm, shares: Mapping[str, Tensor]) -> dict[str, float]:
