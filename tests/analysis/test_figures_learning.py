@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from eddies.analysis import figures_learning
+from eddies.analysis.figures import png
 
 
 def history(phases, **columns):
@@ -40,4 +41,4 @@ def test_a_phase_that_did_only_harm_has_its_start_circled():
 @pytest.mark.filterwarnings("error")
 def test_a_history_of_one_step_without_anything_positive_is_drawn():
     nothing = history([1], loss=np.zeros(1), gradient_norm=np.zeros(1), energy_loss=np.full(1, np.nan))
-    assert figures_learning.picture(nothing).startswith(b"\x89PNG\r\n\x1a\n")
+    assert png(figures_learning.curves(nothing)).startswith(b"\x89PNG\r\n\x1a\n")

@@ -1,6 +1,7 @@
 """What moves the particles of a rollout: models in the units of its start frame, with and without a density, and a
 class of the user's."""
 
+import json
 from dataclasses import replace
 
 import h5py
@@ -27,7 +28,7 @@ cells = 12
 viscosity = 0.1
 {sound}
 [tracers]
-particles_per_side = 6
+particles_per_side = {side}
 turnovers = {turnovers}
 frame_interval = 0.02
 field_every = 1
@@ -92,13 +93,14 @@ class Swept:
 """
 
 
-def prepared(comm, directory, fluid="compressible", model="[model]", start=0.3, turnovers=0.14):
+def prepared(comm, directory, fluid="compressible", model="[model]", start=0.3, turnovers=0.14, side=6):
     """The scene, with its ground truth in a directory, and a kernel with the weights that training starts from."""
     path = directory / "own.toml"
     if comm.rank == 0:
         directory.mkdir(parents=True, exist_ok=True)
         sound = "sound_speed = 15.0" if fluid == "compressible" else ""
-        path.write_text(SCENE.format(fluid=fluid, sound=sound, model=model, start=start, turnovers=turnovers))
+        path.write_text(SCENE.format(fluid=fluid, sound=sound, model=model, start=start, turnovers=turnovers,
+                                     side=side))
     comm.Barrier()
     scene = load_scene(path)
     dns.run(scene, comm, directory)
@@ -110,9 +112,10 @@ def prepared(comm, directory, fluid="compressible", model="[model]", start=0.3, 
     return scene
 
 
-def write_model(comm, directory, scene, scales):
+def write_model(comm, directory, scene, scales, bound=1e3):
+    """The model as training begins with it, all of whose inputs were seen up to a bound."""
     weights = {name: tensor.float().numpy() for name, tensor in scene_model(scene, scales).state_dict().items()}
-    ranges = {"low": np.full(5, -1e3), "high": np.full(5, 1e3)}
+    ranges = {"low": np.full(5, -bound), "high": np.full(5, bound)}
     save_weights(comm, directory / "model.h5", "model", describe(scene, scales), weights, {}, {"feature_range": ranges})
 
 
@@ -168,6 +171,77 @@ def test_every_method_has_the_units_of_its_start_and_runs(comm, tmp_path, method
     assert attributes.get("terms") == terms.get(method)
 
 
+def untrained(comm, directory, side=6):
+    """A scene with all products that a rollout needs, and half of the model's inputs outside of what it has seen."""
+    scene = prepared(comm, directory, side=side)
+    with open_product(comm, directory / "ground_truth.h5", "ground_truth") as file:
+        scales = GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, side)).scales
+    write_model(comm, directory, scene, scales, 0.5)
+    return scene
+
+
+def reported(comm, directory, untrained=("kernel.h5",)):
+    """The numbers and the page of the report; of what is untrained there is nothing to show."""
+    comm.Barrier()
+    if comm.rank == 0:
+        for name in untrained:
+            (directory / name).unlink()
+    comm.Barrier()
+    report.run(directory, comm)
+    comm.Barrier()
+    page = (directory / "report" / "index.html").read_text(encoding="utf-8")
+    return json.loads((directory / "report" / "metrics.json").read_text()), page
+
+
+@pytest.mark.mpi(2, 3)
+def test_the_rollout_is_the_same_on_any_number_of_ranks(comm, tmp_path):
+    from mpi4py import MPI
+
+    scene = with_method(untrained(comm, tmp_path, side=9), "learned", precision="float64", turnovers=0.1)
+    found = []
+    for communicator in (comm, MPI.COMM_SELF):
+        if communicator is comm or comm.rank == 0:
+            simulate.run(scene, communicator, tmp_path)
+            with open_product(communicator, tmp_path / "rollout.h5", "rollout") as file:
+                found.append((Trajectory(file, "model").read(-1, "position"), read_table(file, "outside_training")))
+        comm.Barrier()
+    if comm.rank == 0:
+        (positions, shares), (alone, shares_alone) = found
+        assert np.abs(positions - alone).max() < 2e-6  # stored in single precision
+        assert np.array_equal(shares["share"], shares_alone["share"]) and shares["share"].max() > 0
+
+
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.mpi(1, 2)
+def test_a_rollout_that_goes_wrong_ends_there_and_keeps_its_frames(comm, tmp_path):
+    simulate.run(with_method(untrained(comm, tmp_path), "learned", injection=1e6), comm, tmp_path)
+    with open_product(comm, tmp_path / "rollout.h5", "rollout") as file:
+        status = read_attributes(file, "rollout")["status"]
+        assert status.startswith("stopped: step") and "nearest particle" in status
+        assert len(Trajectory(file, "model").times) >= 1
+    assert "stopped: step" in reported(comm, tmp_path, ("kernel.h5", "model.h5"))[1]
+
+
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.mpi(2)
+@pytest.mark.parametrize("model, weights, rate", [
+    ('preset = "paper-density"\n[model.pairs]\nhidden = [4]\n[model.density-flux]\nhidden = [4]', 4 + 4, True),
+    ('terms = ["pressure", "viscosity"]', 0, False),
+])
+def test_other_models_run(comm, tmp_path, model, weights, rate):
+    """Of two networks; of the resolved velocity alone, where nothing reads a density and there is nothing to learn."""
+    scene = prepared(comm, tmp_path, model=f"[model]\n{model}")
+    train.run(scene, comm, tmp_path)
+    simulate.run(scene, comm, tmp_path)
+    metrics, _ = reported(comm, tmp_path)
+    assert (metrics["model"]["density_rate_error"] is not None) == rate
+    terms = scene.model.terms
+    assert metrics["rollout"]["method"] == f"the trained model, terms {', '.join(terms)}"
+    with open_product(comm, tmp_path / "model.h5", "model") as file:
+        assert len(file["weights"]) == weights and ("feature_range" in file) == ("pairs" in terms)
+        assert list(json.loads(file.attrs["description"])["terms"]) == list(terms)
+
+
 @pytest.mark.usefixtures("undrawn")
 @pytest.mark.mpi(1, 2)
 @pytest.mark.parametrize("kind", WITHOUT_DENSITY)
@@ -185,17 +259,12 @@ def test_where_no_term_reads_the_density_an_incompressible_truth_will_do(comm, t
         both = {"position", "velocity", "acceleration", "velocity_gradient"}
         assert set(Trajectory(file, "model").columns) == set(Trajectory(file, "truth").columns) == both
         assert ("outside_training" in file) == (kind == "pairs")
-    comm.Barrier()
-    if comm.rank == 0:
-        (tmp_path / "kernel.h5").unlink()  # untrained, there is nothing to show of it
-    comm.Barrier()
-    report.run(tmp_path, comm)
-    assert f"terms {', '.join(scene.model.terms)}" in (tmp_path / "report" / "index.html").read_text(encoding="utf-8")
+    assert f"terms {', '.join(scene.model.terms)}" in reported(comm, tmp_path)[1]
 
 
 def test_terms_that_read_the_density_are_refused_there(tmp_path):
     path = tmp_path / "own.toml"
-    path.write_text(SCENE.format(fluid="incompressible", sound="", turnovers=0.1, start=0,
+    path.write_text(SCENE.format(fluid="incompressible", sound="", turnovers=0.1, start=0, side=6,
                                  model='[model]\nterms = ["pressure", "pairs"]'))
     with pytest.raises(SceneError, match=r"\[model.pairs\]: reads the density, which an incompressible flow does"):
         load_scene(path)

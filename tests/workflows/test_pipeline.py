@@ -91,38 +91,6 @@ def test_resume_skips_what_is_done_and_redoes_what_changed(run_directory):
     assert [path.name for path, time in before.items() if path.stat().st_mtime_ns != time] == ["rollout.h5"]
 
 
-def test_the_rollout_is_the_same_on_any_number_of_ranks(run_directory, tmp_path):
-    positions, shares = [], []
-    for ranks in (1, 3):
-        directory = tmp_path / str(ranks)
-        directory.mkdir()
-        for name in ("ground_truth.h5", "kernel.h5", "model.h5"):
-            (directory / name).symlink_to(run_directory / name)
-        result = eddies(ranks, "simulate", "tiny", "--output", str(directory), "--set", "simulation.precision=float64",
-                        "--set", "simulation.turnovers=0.1")
-        assert result.returncode == 0, result.stdout + result.stderr
-        with h5py.File(directory / "rollout.h5") as file:
-            positions.append(file["particles/model/position/value"][-1])
-            shares.append(file["outside_training/share"][()])
-    # Stored in single precision.
-    assert max(np.abs(positions[0] - other).max() for other in positions[1:]) < 2e-6
-    assert np.array_equal(*shares) and shares[0].max() > 0
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_a_rollout_that_goes_wrong_ends_there_and_keeps_its_frames(run_directory, tmp_path):
-    for name in ("ground_truth.h5", "kernel.h5", "model.h5"):
-        (tmp_path / name).symlink_to(run_directory / name)
-    result = eddies(1, "simulate", "tiny", "--output", str(tmp_path), "--set", "simulation.injection=1e5")
-    assert result.returncode == 0, result.stdout + result.stderr
-    with h5py.File(tmp_path / "rollout.h5") as file:
-        status = file["rollout"].attrs["status"]
-        assert status.startswith("stopped: step") and "faster than" in status and "nearest particle" in status
-        assert len(file["particles/model/velocity/value"]) >= 1
-    assert eddies(1, "report", str(tmp_path)).returncode == 0
-    assert "stopped: step" in (tmp_path / "report" / "index.html").read_text()
-
-
 def test_a_step_that_outruns_the_slabs_is_refused(run_directory, tmp_path):
     for name in ("ground_truth.h5", "kernel.h5", "model.h5"):
         (tmp_path / name).symlink_to(run_directory / name)
@@ -154,27 +122,3 @@ def test_a_trained_model_runs_on_another_flow(run_directory, tmp_path):
     shown = json.loads((tmp_path / "run" / "report" / "metrics.json").read_text())["model"]
     assert shown["acceleration_error"] < 0.95 and shown["source_acceleration_error"] < 0.9
     assert shown["mach_turbulent"] == pytest.approx(2 * shown["source_mach_turbulent"], rel=0.2)
-
-
-@pytest.mark.usefixtures("undrawn")
-@pytest.mark.parametrize("model, weights, rate", [
-    ('preset = "paper-density"\n[model.pairs]\nhidden = [4]\n[model.density-flux]\nhidden = [4]', 4 + 4, True),
-    ('terms = ["pressure", "viscosity"]', 0, False),
-])
-def test_other_models_run(run_directory, tmp_path, model, weights, rate):
-    """Of two networks; of the resolved velocity alone, where nothing reads a density and there is nothing to learn."""
-    for name in ("ground_truth.h5", "kernel.h5"):
-        (tmp_path / name).symlink_to(run_directory / name)
-    text = load_scene("tiny", ["training.steps=10", "training.combined_steps=2", "simulation.turnovers=0.1"]).to_toml()
-    head, rest = text.split("[model]")
-    (tmp_path / "other.toml").write_text(f"{head}[model]\n{model}\n[training]{rest.split('[training]')[1]}")
-    result = eddies(2, "run", str(tmp_path / "other.toml"), "--output", str(tmp_path), "--resume")
-    log = result.stdout + result.stderr
-    assert result.returncode == 0 and log.count("skipped") == 2, log
-    metrics = json.loads((tmp_path / "report" / "metrics.json").read_text())
-    assert (metrics["model"]["density_rate_error"] is not None) == rate
-    terms = load_scene(tmp_path / "other.toml").model.terms
-    assert metrics["rollout"]["method"] == f"the trained model, terms {', '.join(terms)}"
-    with h5py.File(tmp_path / "model.h5") as file:
-        assert len(file["weights"]) == weights and ("feature_range" in file) == ("pairs" in terms)
-        assert list(json.loads(file.attrs["description"])["terms"]) == list(terms)
