@@ -5,6 +5,8 @@ Everything made of them is a formula that differentiates itself.
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -50,14 +52,23 @@ class FourierGrid:
         """Fields of modes; of those with kx = 0 the part that belongs to a real field."""
         return _ToFields.apply(modes, self)
 
-    def at(self, modes: Tensor, position: Tensor) -> Tensor:
-        """Values (n, c) of modes at positions, by cubic splines; differentiable in both."""
-        return _Interpolated.apply(self.to_fields(modes * self._prefilter), position, self)
+    def points(self, position: Tensor) -> Points:
+        """Positions at which fields are asked for more than once."""
+        return Points(self.spline, position)
 
-    def spread(self, values: Tensor, position: Tensor) -> Tensor:
+    def at(self, modes: Tensor, position: Tensor | Points) -> Tensor:
+        """Values (n, c) of modes at positions, by cubic splines; differentiable in both."""
+        points = self._as_points(position)
+        return _Interpolated.apply(self.to_fields(modes * self._prefilter), points.position, points)
+
+    def spread(self, values: Tensor, position: Tensor | Points) -> Tensor:
         """Modes (c, kz, ky, kx) of a sum of splines around positions with weights `values` (n, c); differentiable in
         both. Up to the number of points and the multiplicity of modes the adjoint of `at`."""
-        return self.to_modes(_Spread.apply(values, position, self)) * self._prefilter
+        points = self._as_points(position)
+        return self.to_modes(_Spread.apply(values, points.position, points)) * self._prefilter
+
+    def _as_points(self, position: Tensor | Points) -> Points:
+        return position if isinstance(position, Points) else self.points(position)
 
     # ---- formulas on modes
 
@@ -112,6 +123,49 @@ class FourierGrid:
         return kx * vector[0] + ky * vector[1] + kz * vector[2]
 
 
+class Points:
+    """Positions (n, 3) among the planes of a grid, and the splines around them as sparse matrices (n, rows of the
+    padded planes): they cost more to make than to use, and are used at every pass of a deconvolution."""
+
+    def __init__(self, spline: SplineInterpolation, position: Tensor) -> None:
+        self.spline, self.position = spline, position
+        self._matrices: dict[int | None, Tensor] = {}
+
+    def at(self, padded: np.ndarray) -> Tensor:
+        """Values (n, c) of padded planes (z, y, x, c)."""
+        return (self._matrix() @ _flat(padded)).to(self.position.device)
+
+    def slope_along(self, padded: np.ndarray, factors: Tensor) -> Tensor:
+        """Gradient (n, 3) with respect to the positions of sum_c factors_c f_c, the factors (n, c) held fixed."""
+        fields, factors = _flat(padded), factors.detach().cpu().double()
+        return torch.stack([(factors * (self._matrix(axis) @ fields)).sum(1) for axis in range(3)], 1).to(self.position)
+
+    def spread(self, values: Tensor) -> Tensor:
+        """Transpose of `at` on planes with ghosts: values (n, c) added to planes (c, z_local, y, x)."""
+        matrix, n, planes = self._matrix(), self.spline.grid.cells, self.spline.padded_planes()
+        rows, weights = matrix.col_indices().numpy(), matrix.values().view(len(values), -1)
+        padded = np.stack([np.bincount(rows, (weights * column[:, None]).numpy().ravel(), planes * n * n)
+                           for column in values.detach().cpu().double().T], axis=-1)
+        return torch.from_numpy(self.spline.without_ghosts(padded.reshape(planes, n, n, -1)))
+
+    def _matrix(self, derivative: int | None = None) -> Tensor:
+        if derivative not in self._matrices:
+            planes = self.spline.padded_planes()
+            rows, weights = self.spline.stencil(as_numpy(self.position), planes, derivative)
+            n, width = rows.shape
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", "Sparse CSR tensor support is in beta")
+                self._matrices[derivative] = torch.sparse_csr_tensor(
+                    torch.arange(0, n * width + 1, width), torch.from_numpy(rows.ravel()),
+                    torch.from_numpy(weights.ravel()), (n, planes * self.spline.grid.cells**2),
+                    check_invariants=False)
+        return self._matrices[derivative]
+
+
+def _flat(padded: np.ndarray) -> Tensor:
+    return torch.from_numpy(padded.reshape(-1, padded.shape[-1]))
+
+
 # Modes with kx > 0 stand for two, so the transform back is the adjoint of the transform forth but for `multiplicity`
 # and the number of points.
 
@@ -146,19 +200,14 @@ class _Interpolated(torch.autograd.Function):
     """Spline coefficients (c, z_local, y, x) at positions (n, 3): (n, c)."""
 
     @staticmethod
-    def forward(ctx, planes: Tensor, position: Tensor, grid: FourierGrid) -> Tensor:
-        ctx.grid, ctx.padded = grid, grid.spline.with_ghosts(as_numpy(planes))
-        ctx.save_for_backward(position)
-        return torch.from_numpy(grid.spline.at(ctx.padded, as_numpy(position))).to(position.device)
+    def forward(ctx, planes: Tensor, position: Tensor, points: Points) -> Tensor:
+        ctx.points, ctx.padded = points, points.spline.with_ghosts(as_numpy(planes))
+        return points.at(ctx.padded)
 
     @staticmethod
     def backward(ctx, gradient: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
-        spline, (position,) = ctx.grid.spline, ctx.saved_tensors
-        weights, by_planes, by_position = as_numpy(gradient), None, None
-        if ctx.needs_input_grad[0]:
-            by_planes = torch.from_numpy(np.ascontiguousarray(spline.spread(weights, as_numpy(position))))
-        if ctx.needs_input_grad[1]:
-            by_position = torch.from_numpy(spline.slope_along(ctx.padded, as_numpy(position), weights)).to(position)
+        by_planes = ctx.points.spread(gradient) if ctx.needs_input_grad[0] else None
+        by_position = ctx.points.slope_along(ctx.padded, gradient) if ctx.needs_input_grad[1] else None
         return by_planes, by_position, None
 
 
@@ -166,14 +215,13 @@ class _Spread(torch.autograd.Function):
     """Transpose of `_Interpolated`: values (n, c) added to planes (c, z_local, y, x)."""
 
     @staticmethod
-    def forward(ctx, values: Tensor, position: Tensor, grid: FourierGrid) -> Tensor:
-        ctx.grid = grid
-        ctx.save_for_backward(values, position)
-        return torch.from_numpy(np.ascontiguousarray(grid.spline.spread(as_numpy(values), as_numpy(position))))
+    def forward(ctx, values: Tensor, position: Tensor, points: Points) -> Tensor:
+        ctx.points = points
+        ctx.save_for_backward(values)
+        return points.spread(values)
 
     @staticmethod
     def backward(ctx, gradient: Tensor) -> tuple[Tensor, Tensor, None]:
-        spline, (values, position) = ctx.grid.spline, ctx.saved_tensors
-        padded, points = spline.with_ghosts(as_numpy(gradient)), as_numpy(position)
-        by_values = torch.from_numpy(spline.at(padded, points)).to(values)
-        return by_values, torch.from_numpy(spline.slope_along(padded, points, as_numpy(values))).to(position), None
+        points, (values,) = ctx.points, ctx.saved_tensors
+        padded = points.spline.with_ghosts(as_numpy(gradient))
+        return points.at(padded).to(values), points.slope_along(padded, values), None

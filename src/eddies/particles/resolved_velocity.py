@@ -13,7 +13,7 @@ from eddies.parallel.halo import HaloError, HaloExchange
 from eddies.parallel.reduction import any_rank
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.cloud import grid_points
-from eddies.particles.fourier_grid import FourierGrid
+from eddies.particles.fourier_grid import FourierGrid, Points
 from eddies.particles.ghosts import exchange_ghosts
 from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.pairs import Pairs
@@ -39,18 +39,18 @@ class ResolvedFlow:
     ----------
     grid : of its modes.
     velocity : modes (3, kz, ky, kx), solenoidal, |k| <= `grid.resolved`.
-    position : (n, 3) of the owned particles.
+    points : of the owned particles on the grid.
     relative_velocity : (n, 3), theirs less its mean over all particles.
     """
 
     grid: FourierGrid
     velocity: Tensor
-    position: Tensor
+    points: Points
     relative_velocity: Tensor
 
     def at_particles(self, modes: Tensor) -> Tensor:
         """Values (n, c) of modes (c, kz, ky, kx) at the particles; collective, differentiable."""
-        return self.grid.at(modes, self.position)
+        return self.grid.at(modes, self.points)
 
     def missing(self) -> Tensor:
         """What the grid does not resolve of the particles' velocities relative to their mean: (n, 3); collective."""
@@ -109,14 +109,15 @@ class ResolvedVelocity:
         pairs = self._pairs_around_points(local)
         weight = self.kernel.value(pairs.distance)
         weight = weight / pairs.sum(weight).clamp_min(torch.finfo(weight.dtype).tiny).index_select(0, pairs.segment)
+        points = self.grid.points(particles.position)
         missing, modes = self._with_ghosts(relative, local), 0
         for remaining in reversed(range(self.passes)):
             average = pairs.sum((weight * pairs.at_senders(missing.to(weight.dtype)).T).T)
             modes = modes + self._resolved_modes(average)
             if remaining:
-                found = self.grid.at(modes, particles.position)
+                found = self.grid.at(modes, points)
                 missing = self._with_ghosts(relative - found.to(relative), local)
-        return ResolvedFlow(self.grid, modes, particles.position, relative)
+        return ResolvedFlow(self.grid, modes, points, relative)
 
     def alone(self, particles: ParticleSet) -> ResolvedFlow:
         """The same of particles whose surroundings are not known."""

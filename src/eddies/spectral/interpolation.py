@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-
 import numpy as np
 
 from eddies.parallel.halo import HaloError
 from eddies.parallel.plane_halo import PlaneHalo
 from eddies.spectral.spectral_grid import SpectralGrid
 
+TOGETHER = 512  # points whose splines are held at once: a few MB
 ORDERS = {"cubic": 3, "quintic": 5}
 
 
@@ -47,56 +46,36 @@ class SplineInterpolation:
         """Values (n, c) at positions (n, 3), x and y anywhere, z within the slab and the margin (periodically)."""
         flat = coefficients.reshape(-1, coefficients.shape[-1])
         values = np.zeros((len(positions), flat.shape[1]))
-        for rows, (weight,) in self._stencil(positions, len(coefficients)):
-            values += weight[:, None] * flat[rows]
+        for first in range(0, len(positions), TOGETHER):
+            block = slice(first, first + TOGETHER)
+            rows, weights = self.stencil(positions[block], len(coefficients))
+            values[block] = np.matmul(weights[:, None], flat[rows])[:, 0]
         return values
 
-    def slope_along(self, coefficients: np.ndarray, positions: np.ndarray, factors: np.ndarray) -> np.ndarray:
-        """Gradient (n, 3) with respect to the positions of sum_c factors_c f_c, the factors (n, c) held fixed."""
-        flat = coefficients.reshape(-1, coefficients.shape[-1])
-        slope = np.zeros((len(positions), 3))
-        for rows, weights in self._stencil(positions, len(coefficients), derivatives=(0, 1, 2)):
-            product = np.einsum("nc,nc->n", factors, flat[rows])
-            for axis, weight in enumerate(weights):
-                slope[:, axis] += weight * product
-        return slope
-
-    def spread(self, values: np.ndarray, positions: np.ndarray) -> np.ndarray:
-        """Transpose of `at` on `with_ghosts`: values (n, c) added to planes (c, z_local, y, x).
-
-        For all planes f and values g, the sum over ranks of at(with_ghosts(f)).g equals that of f.spread(g).
-        """
-        n, planes = self.grid.cells, self.grid.physical_shape[0] + self._halo.below + self._halo.above
-        flat = np.zeros((values.shape[1], planes * n * n))
-        for rows, (weight,) in self._stencil(positions, planes):
-            for component, column in zip(flat, values.T):
-                component += np.bincount(rows, weight * column, planes * n * n)
-        return np.moveaxis(self._halo.adjoint(np.moveaxis(flat.reshape(-1, planes, n, n), 0, -1)), -1, 0)
-
-    def _stencil(self, positions: np.ndarray, planes: int,
-                 derivatives: Sequence[int | None] = (None,)) -> Iterator[tuple[np.ndarray, list[np.ndarray]]]:
-        """For each of the (degree + 1)^3 splines around the points: rows (n,) in the flattened padded planes, and
-        weights (n,), for each of the `derivatives` along an axis; None asks for the spline itself."""
+    def stencil(self, positions: np.ndarray, planes: int,
+                derivative: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """The s = (degree + 1)^3 splines around points (n, 3): their rows (n, s) in the flattened padded planes, as
+        many as there are, and their values (n, s) at the points; or the derivatives of these along one axis."""
         n, width, spacing = self.grid.cells, self.degree + 1, self.grid.decomposition.spacing
         scaled = np.asarray(positions) / spacing
         base = np.floor(scaled)
-        fractions = (scaled - base).T
-        values = [_spline_weights(self.degree, fraction) for fraction in fractions]
-        choices = []  # of weights along x, y, z
-        for axis in derivatives:
-            choice = list(values)
-            if axis is not None:
-                choice[axis] = _spline_slopes(self.degree, fractions[axis]) / spacing
-            choices.append(choice)
+        along = [_spline_weights(self.degree, fraction) for fraction in (scaled - base).T]
+        if derivative is not None:
+            along[derivative] = _spline_slopes(self.degree, (scaled - base)[:, derivative]) / spacing
         first = base.astype(np.int64) - (self.degree - 1) // 2
         columns = [(first[:, axis, None] + np.arange(width)) % n for axis in (0, 1)]
-        lowest = self._rows(first[:, 2], planes)
-        for k in range(width):
-            for j in range(width):
-                line = ((lowest + k) * n + columns[1][:, j]) * n
-                lines = [(z[:, k] * y[:, j], x) for x, y, z in choices]
-                for i in range(width):
-                    yield line + columns[0][:, i], [weight * x[:, i] for weight, x in lines]
+        columns.append(self._rows(first[:, 2], planes)[:, None] + np.arange(width))
+        rows = (columns[2][:, :, None, None] * n + columns[1][:, None, :, None]) * n + columns[0][:, None, None, :]
+        weights = (along[2][:, :, None, None] * along[1][:, None, :, None]) * along[0][:, None, None, :]
+        return rows.reshape(len(rows), -1), weights.reshape(len(rows), -1)
+
+    def padded_planes(self) -> int:
+        """Planes of coefficients, with those of the neighbours."""
+        return self.grid.physical_shape[0] + self._halo.below + self._halo.above
+
+    def without_ghosts(self, padded: np.ndarray) -> np.ndarray:
+        """The transpose of `with_ghosts`: what stands on planes of the neighbours is added to theirs."""
+        return np.ascontiguousarray(np.moveaxis(self._halo.adjoint(padded), -1, 0))
 
     def _rows(self, first: np.ndarray, planes: int) -> np.ndarray:
         """Index in the padded planes of the first of the planes that each point needs."""

@@ -31,7 +31,7 @@ class Known:
         self.modes = self.grid.to_modes(torch.stack([each.expand(shape) for each in fields[0](x, y, z)]))
 
     def of(self, particles, local):
-        return ResolvedFlow(self.grid, self.modes, particles.position, particles.velocity)
+        return ResolvedFlow(self.grid, self.modes, self.grid.points(particles.position), particles.velocity)
 
 
 @torch.no_grad()

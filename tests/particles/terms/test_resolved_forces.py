@@ -43,7 +43,7 @@ class Known:
         self.modes = coarse.to_modes(torch.from_numpy(fields_of(field.velocity)))
 
     def of(self, particles, local):
-        return ResolvedFlow(self.grid, self.modes, particles.position, particles.velocity)
+        return ResolvedFlow(self.grid, self.modes, self.grid.points(particles.position), particles.velocity)
 
 
 def particles_in(field, position):
