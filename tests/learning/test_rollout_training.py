@@ -107,7 +107,7 @@ def test_particles_leave_their_slabs_within_a_window(comm):
     assert global_max(comm, float(particles.position[:, 2].max()) - slab.upper) > SPACING
 
 
-@pytest.mark.mpi(2, 3)
+@pytest.mark.mpi(3)
 def test_training_has_the_same_losses_on_any_number_of_ranks(comm):
     from mpi4py import MPI
 

@@ -44,7 +44,7 @@ def trained(comm, directory):
 
 
 @pytest.mark.usefixtures("undrawn")
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_a_stopped_training_is_the_one_never_stopped(comm, tmp_path):
     scene = prepared(comm, tmp_path)
     train.run(scene, comm, tmp_path)

@@ -67,7 +67,7 @@ class SplineInterpolation:
         columns.append(self._rows(first[:, 2], planes)[:, None] + np.arange(width))
         rows = (columns[2][:, :, None, None] * n + columns[1][:, None, :, None]) * n + columns[0][:, None, None, :]
         weights = (along[2][:, :, None, None] * along[1][:, None, :, None]) * along[0][:, None, None, :]
-        return rows.reshape(len(rows), -1), weights.reshape(len(rows), -1)
+        return rows.reshape(-1, width**3), weights.reshape(-1, width**3)
 
     def padded_planes(self) -> int:
         """Planes of coefficients, with those of the neighbours."""
