@@ -144,8 +144,9 @@ class Points:
         """Transpose of `at` on planes with ghosts: values (n, c) added to planes (c, z_local, y, x)."""
         matrix, n, planes = self._matrix(), self.spline.grid.cells, self.spline.padded_planes()
         rows, weights = matrix.col_indices().numpy(), matrix.values().view(-1, (self.spline.degree + 1) ** 3)
+        # Of no points at all `bincount` makes integers.
         padded = np.stack([np.bincount(rows, (weights * column[:, None]).numpy().ravel(), planes * n * n)
-                           for column in values.detach().cpu().double().T], axis=-1)
+                           for column in values.detach().cpu().double().T], axis=-1, dtype=np.float64)
         return torch.from_numpy(self.spline.without_ghosts(padded.reshape(planes, n, n, -1)))
 
     def _matrix(self, derivative: int | None = None) -> Tensor:
