@@ -25,7 +25,7 @@ class Descent:
         self.steps, self.first_rate, self.last_rate = steps, first_rate, last_rate
         self.taken = 0
         # Adam's running means of the gradient and of its square, by name.
-        self._moments = {name: [torch.zeros_like(p, requires_grad=False) for p in self.parameters]
+        self._moments = {name: [torch.zeros_like(p) for p in self.parameters]
                          for name in ("exp_avg", "exp_avg_sq")}
 
     @property
