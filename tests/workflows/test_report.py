@@ -275,4 +275,6 @@ def test_ranks_share_the_drawing(comm, tmp_path):
         page = written(tmp_path)[1]
         report.run(tmp_path, alone)
         assert len(figures(tmp_path)) == 4 and written(tmp_path)[1] == page
+        images = {path.read_bytes() for path in (tmp_path / "report" / "figures").glob("*.png")}
+        assert len(images) == 4, "each has its own"
     alone.Free()
