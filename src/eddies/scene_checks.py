@@ -224,14 +224,14 @@ def training_problems(scene: Scene) -> Iterator[str]:
 
 
 def simulation_problems(scene: Scene) -> Iterator[str]:
-    """Frames that fall on steps and on the frames of the ground truth."""
+    """Frames that fall on the frames of the ground truth, and on steps or between those that tell what is there."""
     simulation = scene.simulation
     if simulation is None or scene.tracers is None:
         return
     frame = simulation.frame_interval
-    if not _is_multiple(frame, simulation.step):
+    if simulation.integrator == "verlet" and not _is_multiple(frame, simulation.step):
         yield (f"[simulation] frame_interval = {frame:g}: must be a whole multiple of step = "
-               f"{simulation.step:g}; change either")
+               f'{simulation.step:g} with integrator = "verlet", which does not tell what is between steps; change any')
     if not _is_multiple(frame, scene.tracers.frame_interval):
         yield (f"[simulation] frame_interval = {frame:g}: must be a whole multiple of [tracers] "
                f"frame_interval = {scene.tracers.frame_interval:g}, so that truth and model are stored at "

@@ -104,8 +104,14 @@ class Tracers(Section):
 
     @property
     def cells(self) -> int:
-        """Cells along each side of the stored fields: as given, or 1.5 particles_per_side rounded to even."""
-        return 2 * round(0.75 * self.particles_per_side) if self.field_cells is None else self.field_cells
+        """Cells along each side of the stored fields: as given, or `planes`."""
+        return self.planes if self.field_cells is None else self.field_cells
+
+    @property
+    def planes(self) -> int:
+        """Layers at which the particles' slabs are cut: 1.5 particles_per_side rounded to even, the cells of the grid
+        on which their velocity is resolved."""
+        return 2 * round(0.75 * self.particles_per_side)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,7 +156,7 @@ class Training(Section):
     horizon_steps: int = integer("optimiser steps of each horizon, after all others", default=0, at_least=0)
     horizon_step: float | None = number("time step of the horizons; absent: the interval of frames", default=None,
                                         above=0)
-    horizon_integrator: str = choice("time stepping of the horizons", "verlet", "rk2", "rk4", default="verlet")
+    horizon_integrator: str = choice("time stepping of the horizons", "verlet", "rk2", "rk3", "rk4", default="verlet")
     horizon_learning_rate: float = number("of the optimiser, at the start of each horizon", default=1e-3, above=0)
     energy_weight: float = number("weight of the energies by bands of wavenumbers in the loss of the horizons",
                                   default=0.1, at_least=0)
@@ -164,7 +170,7 @@ class Simulation(Section):
     """The run of the particles, without the direct simulation."""
 
     method: str = named("what moves the particles; see Baselines", *METHODS, default="learned")
-    integrator: str = choice("time stepping of the particles", "verlet", "rk2", "rk4", default="verlet")
+    integrator: str = choice("time stepping of the particles", "verlet", "rk2", "rk3", "rk4", default="verlet")
     step: float = number("time step; eulerian: the longest", above=0)
     turnovers: float = number("large-eddy turnovers to simulate", above=0)
     start: float | None = number("as a fraction of the ground truth; absent: where the training window ends",

@@ -78,10 +78,10 @@ class TrainingFrame:
     def surroundings(self) -> Surroundings:
         """Halo and list of the pairs that the field loss looks at: the model's, if it has a list; the first use is
         collective."""
-        if self.dynamics.surroundings is not None and self.dynamics.surroundings.neighbors is not None:
+        if self.dynamics.surroundings is not None:
             return self.dynamics.surroundings
         slab, reach = self.decomposition, self.model.flow.cutoff
-        found = Surroundings(slab, slab.length, reach, reach, 0.0)
+        found = Surroundings(slab, slab.length, reach, 0.0)
         found.update(self.particles)
         return found
 
@@ -125,7 +125,7 @@ class ForceTrainer:
     Parameters
     ----------
     model, frames : the frames all on the same slabs.
-    kernel : of the field loss, which compares on a grid of one cell for each plane of the slabs.
+    kernel : of the field loss, which compares on a grid of about as many points as there are particles.
     weights : of the losses. batch : particles of a step without the field loss.
     """
 
@@ -135,7 +135,7 @@ class ForceTrainer:
         self.comm, self.length = self.decomposition.comm, self.decomposition.length
         self.model, self.frames = model, frames
         self.kernel, self.weights, self.batch, self.seed = kernel, weights, min(batch, self.total), seed
-        self._points = grid_points(self.decomposition).to(frames[0].particles.position.device)
+        self._points = grid_points(self.decomposition, round(self.total ** (1 / 3))).to(frames[0].particles.position.device)
 
     def trajectory_step(self, descent: Descent, step: int) -> dict[str, float]:
         """One step on the trajectory loss of a random batch of particles (Eq. 12); returns the losses."""

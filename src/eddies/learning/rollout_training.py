@@ -114,6 +114,7 @@ class RolloutTrainer:
     def _frames(self, particles: ParticleSet, horizon: int) -> Iterator[tuple[int, ParticleSet]]:
         """Number and particles of each frame reached."""
         memory: dict[str, Tensor] = {}
+        self.integrator.dynamics.begin()
         for reached in range(horizon):
             for _ in range(self.steps_per_frame):
                 particles, memory = self._advanced(particles, memory)
@@ -122,11 +123,13 @@ class RolloutTrainer:
     def _advanced(self, particles: ParticleSet, memory: dict[str, Tensor]) -> tuple[ParticleSet, dict[str, Tensor]]:
         """One time step; where gradients are recorded, without keeping what happens within it."""
         given, carried, after = particles.columns(), list(memory), ([], [])
+        state = self.integrator.dynamics.state_dict()
         del given["id"]
 
         def advance(*columns: Tensor) -> tuple[Tensor, ...]:
-            # Lists built anew, so that the way back does the very same.
+            # Lists built anew and the same foreseen, so that the way back does the very same.
             self.integrator.dynamics.forget()
+            self.integrator.dynamics.load_state_dict(state)
             start = ParticleSet(particles.id, **dict(zip(given, columns)))
             self.integrator.restore(start, dict(zip(carried, columns[len(given):])))
             end = self.integrator.step(start, self.time_step).columns()

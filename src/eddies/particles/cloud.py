@@ -39,7 +39,7 @@ class ParticleCloud:
         self.halo = HaloExchange(decomposition, as_numpy(position), support)
         self._position = torch.cat([position, exchange_ghost_positions(self.halo, position)])
         self._velocity = torch.cat([velocity, exchange_ghosts(self.halo, velocity)]).to(dtype)
-        self._points, self._support = grid_points(decomposition).to(position.device), support
+        self._points, self._support = grid_points(decomposition, decomposition.planes).to(position.device), support
 
     def volumes(self, kernel: SmoothingKernel) -> Tensor:
         """Volumes 1 / sum_j W(x_i - x_j), i itself counted, of all local particles (s,); collective, differentiable."""
@@ -87,10 +87,11 @@ class ParticleCloud:
         return found
 
 
-def grid_points(slab: SlabDecomposition) -> Tensor:
-    """This slab's points (m, 3) of the grid that has as many cells as the slabs have planes, z slowest."""
-    axis = torch.arange(slab.planes, dtype=torch.float64) * slab.spacing
-    z, y, x = torch.meshgrid(axis[slab.start : slab.stop], axis, axis, indexing="ij")
+def grid_points(slab: SlabDecomposition, cells: int) -> Tensor:
+    """The points (m, 3) of a grid of `cells`^3 that lie in this slab, z slowest."""
+    axis = torch.arange(cells, dtype=torch.float64) * (slab.length / cells)
+    own = axis[torch.from_numpy(slab.owner_of(axis.numpy()) == slab.rank)]
+    z, y, x = torch.meshgrid(own, axis, axis, indexing="ij")
     return torch.stack([x.flatten(), y.flatten(), z.flatten()], dim=1)
 
 

@@ -29,7 +29,7 @@ PAIR_VALUES_TOGETHER = {"cpu": 1 << 19, "cuda": 1 << 26}
 # Added to moment matrices and sums of weights, as a fraction of their values for evenly spread neighbours:
 # they stay invertible without neighbours or with coplanar ones, at a bias of a tenth of a percent elsewhere.
 REGULARISATION = 1e-3
-UNSEEN = 'no term of this model reads "pairs" or "resolved": add it to the `reads` of the settings'
+UNSEEN = 'no term of this model reads "pairs": add it to the `reads` of the settings'
 
 
 class Summand(Protocol):
@@ -63,15 +63,16 @@ class Context:
     rows : (k,), the particles whose acceleration and density rate are asked for; None: all.
     dtype : of the pair arithmetic; None: that of the positions.
     density : (n,), the particles' density unless terms give it.
+    time : of the evaluation, where others before it tell what to expect; None: it stands alone.
     """
 
     def __init__(self, decomposition: SlabDecomposition, particles: ParticleSet, flow: FlowUnits,
                  surroundings: Surroundings | None, resolution: ResolvedVelocity | None, rows: Tensor | None = None,
-                 dtype: torch.dtype | None = None, density: Tensor | None = None) -> None:
+                 dtype: torch.dtype | None = None, density: Tensor | None = None, time: float | None = None) -> None:
         self.decomposition, self.comm = decomposition, decomposition.comm
         self.particles, self.flow, self.rows, self.density = particles, flow, rows, density
         self.dtype = dtype or particles.position.dtype
-        self._surroundings, self._resolution = surroundings, resolution
+        self._surroundings, self._resolution, self._time = surroundings, resolution, time
         self._columns: dict[str, Tensor] = {}
         self._sums: dict[Summand, Tensor] = {}
 
@@ -106,10 +107,10 @@ class Context:
 
     @cached_property
     def resolved(self) -> ResolvedFlow:
-        """The velocity that a grid resolves of the particles'; collective."""
+        """The velocity that the particles resolve; collective."""
         if self._resolution is None:
             raise SceneError('no term of this model reads "resolved": add it to the `reads` of the settings')
-        return self._resolution.of(self.particles, self.local)
+        return self._resolution.of(self.particles, self._time)
 
     def without_mean(self, rows: Tensor) -> Tensor:
         """Rows (n, c) of the owned particles less their mean over all particles of all ranks; collective."""

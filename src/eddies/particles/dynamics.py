@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -14,7 +15,10 @@ from eddies.particles.model import LagrangianModel, LinearRates
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.periodic_box import PeriodicBox
 from eddies.particles.rates import Rates
-from eddies.particles.surroundings import Surroundings
+from eddies.particles.surroundings import Surroundings, at_home, farthest_outside
+
+if TYPE_CHECKING:
+    from eddies.particles.resolved_velocity import ResolvedVelocity
 
 
 class ParticleDynamics:
@@ -28,26 +32,24 @@ class ParticleDynamics:
     skin : extra radius of list and halo; they are built anew when some particle has moved by half of it.
     dtype : precision of pair arithmetic; that of positions unless given. Positions stay in double precision,
         and pair displacements are converted after the nearest image is taken.
-    drift : how far particles may move beyond half the skin before they change rank: the reach of the grid of the
-        resolved velocity.
     fixed_ranks : particles never change rank, nor rows; for a few steps of which gradients are taken. The halo
         is as much wider as they stray from their slab.
+    drift : how far they may stray then, where the resolved velocity is asked for.
+
+    `time` is that at the beginning of the step that is being taken; integrators move it on.
     """
 
     def __init__(self, decomposition: SlabDecomposition, model: LagrangianModel, skin: float,
-                 dtype: torch.dtype | None = None, drift: float = 0.0, fixed_ranks: bool = False) -> None:
+                 dtype: torch.dtype | None = None, fixed_ranks: bool = False, drift: float = 0.0) -> None:
         self.decomposition, self.model, self.dtype, self.fixed_ranks = decomposition, model, dtype, fixed_ranks
-        self.box = PeriodicBox(decomposition.length)
-        reads = model.reads
-        list_cutoff = model.flow.cutoff if "pairs" in reads else 0.0
-        self.resolution = None
-        if "resolved" in reads:
-            from eddies.particles.resolved_velocity import ResolvedVelocity  # pyfftw, where a transform is needed
-            self.resolution = ResolvedVelocity.on_slabs(decomposition, dtype or torch.float64, skin, drift)
-        reach = max(list_cutoff, self.resolution.reach if self.resolution else 0.0)
+        self.box, self.time, self.evaluations = PeriodicBox(decomposition.length), 0.0, 0
+        self.resolution: ResolvedVelocity | None = None
         self.surroundings: Surroundings | None = None
-        if reach > 0:
-            self.surroundings = Surroundings(decomposition, decomposition.length, list_cutoff, reach, skin)
+        if "resolved" in model.reads:
+            from eddies.particles.resolved_velocity import ResolvedVelocity  # pyfftw, where a transform is needed
+            self.resolution = ResolvedVelocity.on_slabs(decomposition, model.flow, skin / 2 + drift)
+        if "pairs" in model.reads:
+            self.surroundings = Surroundings(decomposition, decomposition.length, model.flow.cutoff, skin)
 
     def forget(self) -> None:
         """Build halo and list anew at the next occasion.
@@ -57,44 +59,81 @@ class ParticleDynamics:
         if self.surroundings is not None:
             self.surroundings.forget()
 
+    def begin(self) -> None:
+        """Time 0 of a run of which nothing is known yet."""
+        self.time, self.evaluations = 0.0, 0
+        if self.resolution is not None:
+            self.resolution.forget()
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """What evaluations to come depend on beside the particles: the time, and what the closure foresees."""
+        resolved = {} if self.resolution is None else self.resolution.state_dict()
+        return {"time": torch.tensor(self.time, dtype=torch.float64), **resolved}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Inverse of `state_dict`, on the same number of ranks."""
+        self.time = float(state["time"])
+        if self.resolution is not None:
+            self.resolution.load_state_dict(state)
+
     def settle(
         self, particles: ParticleSet, companions: dict[str, Tensor] | None = None
     ) -> tuple[ParticleSet, dict[str, Tensor]]:
         """Bring particles to the ranks of their slabs, where halo and list must be built anew.
 
-        To be called at the beginning of a step. `companions` are further columns (n, ...) that move with the
+        To be called before rates are asked for. `companions` are further columns (n, ...) that move with the
         particles. Where a gradient is being recorded nothing changes rank, since that would cut it off.
         Collective.
         """
         companions = companions or {}
         if self.fixed_ranks:
             return particles, companions
-        if self.surroundings is None:
+        if self.surroundings is None and (self.resolution is None or self.decomposition.size == 1):
+            if self.resolution is not None:
+                farthest_outside(self.decomposition, particles)
             return replace(particles, position=self.box.wrap(particles.position)), companions
         columns = particles.columns()
         recorded = torch.is_grad_enabled() and any(column.requires_grad for column in columns.values())
-        if not recorded and self.surroundings.due(particles):
+        if not recorded and self._away(particles):
             prefix = "companion "
             named = {prefix + name: column for name, column in companions.items()}
-            moved = self.surroundings.settle({**columns, **named})
+            reach = self.model.flow.cutoff if self.surroundings else self.decomposition.spacing
+            moved = at_home(self.decomposition, {**columns, **named}, reach)
             particles = ParticleSet(**{name: moved[name] for name in columns})
             companions = {name: moved[prefix + name] for name in companions}
-            self.surroundings.forget()
         return particles, companions
 
+    def _away(self, particles: ParticleSet) -> bool:
+        """Whether halo and list no longer fit the particles, or, where there are none, one is out of its slab."""
+        if self.surroundings is not None:
+            return self.surroundings.outdated(particles)
+        return farthest_outside(self.decomposition, particles) > 0
+
     def rates(self, particles: ParticleSet, rows: Tensor | None = None,
-              kept: Mapping[str, LinearRates] | None = None, density: Tensor | None = None) -> Rates:
+              kept: Mapping[str, LinearRates] | None = None, density: Tensor | None = None,
+              time: float | None = None) -> Rates:
         """Rates of change of the owned particles, or of `rows` (k,) of them: see LagrangianModel.rates.
 
-        `kept` stands for terms at these very particles; `density` (n,) for that which terms would give.
+        `kept` stands for terms at these very particles; `density` (n,) for that which terms would give. At a `time` of
+        a run its evaluations before tell what to expect; without one the moment stands alone.
         """
-        return self.model.rates(self.context(particles, rows, density), kept)
+        return self.model.rates(self.context(particles, rows, density, time), kept)
 
-    def context(self, particles: ParticleSet, rows: Tensor | None = None, density: Tensor | None = None) -> Context:
+    def rates_after(self, delay: float, particles: ParticleSet) -> Rates:
+        """The same within a step, a time after its beginning; later evaluations expect what follows from it."""
+        context = self.context(particles, time=self.time + delay)
+        rates = self.model.rates(context)
+        if self.resolution is not None:
+            self.resolution.remember(self.time + delay, context.resolved, rates.force_modes)
+        self.evaluations += 1
+        return rates
+
+    def context(self, particles: ParticleSet, rows: Tensor | None = None, density: Tensor | None = None,
+                time: float | None = None) -> Context:
         """What terms are evaluated in at these particles; collective."""
         if self.surroundings is not None:
             self.surroundings.update(particles)
         if density is None and not self.model.density_is_given:
             density = particles.density
         return Context(self.decomposition, particles, self.model.flow, self.surroundings, self.resolution, rows,
-                       self.dtype, density)
+                       self.dtype, density, time)

@@ -70,6 +70,10 @@ class FourierGrid:
     def _as_points(self, position: Tensor | Points) -> Points:
         return position if isinstance(position, Points) else self.points(position)
 
+    def zeros(self, *leading: int) -> Tensor:
+        """Modes (*leading, kz, ky, kx) of nothing."""
+        return torch.zeros(*leading, *self.spectral.spectral_shape, dtype=torch.complex128)
+
     # ---- formulas on modes
 
     def gradient(self, scalar: Tensor) -> Tensor:
@@ -113,6 +117,11 @@ class FourierGrid:
         pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
         fields = [first[i] * second[j] for i, j in pairs]
         return self.to_modes(torch.stack([field.sum(0) if field.dim() > 3 else field for field in fields]))
+
+    def squares(self, vector: Tensor) -> Tensor:
+        """Modes (6, kz, ky, kx), |k| <= `resolved`, of u_i u_j of a vector's modes."""
+        fields = self.to_fields(vector)
+        return self.within(self.products(fields, fields))
 
     def within(self, vector: Tensor) -> Tensor:
         """The modes with |k| <= `resolved` of a vector."""

@@ -1,8 +1,10 @@
-"""Time steps of particles: velocity Verlet, and Runge-Kutta of second and fourth order."""
+"""Time steps of particles: velocity Verlet, and Runge-Kutta of second, third and fourth order."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 from torch import Tensor
 
@@ -12,14 +14,23 @@ from eddies.particles.rates import Rates
 
 
 class Integrator:
-    """A time stepping scheme; `memory` is what it carries from one step to the next besides the particles."""
+    """A time stepping scheme; `memory` is what it carries from one step to the next besides the particles and the
+    state of the dynamics, with rows as in the particles last returned: a checkpoint must keep it, and `restore` gives
+    it back. `dense`: whether `rates` are those at the ends of steps, so that what is between can be told from them."""
+
+    dense = False
 
     def __init__(self, dynamics: ParticleDynamics) -> None:
         self.dynamics = dynamics
-        self.memory: dict[str, Tensor] = {}
+        self.restore(None, {})
 
-    def restore(self, particles: ParticleSet, memory: dict[str, Tensor]) -> None:
+    def restore(self, particles: ParticleSet | None, memory: dict[str, Tensor]) -> None:
         """Go on from a checkpoint: `memory` belongs to these very particles."""
+        self._last, self.memory = particles, memory
+
+    def rates(self, particles: ParticleSet) -> tuple[ParticleSet, Rates]:
+        """Particles between two steps, on the ranks of their slabs, and their rates; collective."""
+        raise NotImplementedError
 
     def step(self, particles: ParticleSet, time_step: float) -> ParticleSet:
         """The particles one time step later; collective."""
@@ -34,56 +45,96 @@ class VelocityVerlet(Integrator):
     step's first half kick as well. A density with a rate is integrated by the trapezoidal rule; one that terms give
     is left as last evaluated.
 
-    `memory` holds those rates, rows as in the particles last returned: a checkpoint must keep it, and
-    `restore` gives it back. For any other particles than those last returned the rates are evaluated anew.
+    `memory` holds those rates. For any other particles than those last returned they are evaluated anew.
     """
 
-    def __init__(self, dynamics: ParticleDynamics) -> None:
-        super().__init__(dynamics)
-        self._last: ParticleSet | None = None
-
-    def restore(self, particles: ParticleSet, memory: dict[str, Tensor]) -> None:
-        self._last, self.memory = particles, memory
+    def rates(self, particles: ParticleSet) -> tuple[ParticleSet, Rates]:
+        # Those of the memory belong to the predicted velocity, so they are not these.
+        particles, _ = self.dynamics.settle(particles)
+        return particles, self.dynamics.rates(particles)
 
     def step(self, particles: ParticleSet, time_step: float) -> ParticleSet:
-        memory = self.memory if particles is self._last else {}
-        particles, memory = self.dynamics.settle(particles, memory)
-        start = Rates(**memory) if memory else self.dynamics.rates(particles)
+        if particles is self._last and self.memory:
+            particles, memory = self.dynamics.settle(particles, self.memory)
+            start = Rates(**memory)
+        else:
+            particles, _ = self.dynamics.settle(particles)
+            start = self.dynamics.rates_after(0.0, particles)
         position = particles.position + time_step * (particles.velocity + 0.5 * time_step * start.acceleration)
-        end = self.dynamics.rates(replace(_kicked(particles, start, time_step), position=position))
-        kicked = _kicked(_kicked(particles, start, 0.5 * time_step), end, 0.5 * time_step)
-        result = replace(kicked, position=position)
-        remembered = {name: getattr(end, name) for name in REMEMBERED}
-        self.restore(result, {name: rate for name, rate in remembered.items() if rate is not None})
+        predicted = replace(_kicked(particles, start, time_step), position=position)
+        kicked = _kicked(particles, start, 0.5 * time_step)
+        columns = {name: column for name, column in kicked.columns().items() if name not in ("id", "position")}
+        predicted, columns = self.dynamics.settle(predicted, columns)
+        end = self.dynamics.rates_after(time_step, predicted)
+        result = _kicked(replace(predicted, **columns), end, 0.5 * time_step)
+        self.dynamics.time += time_step
+        self.restore(result, _remembered(end))
         return result
 
 
-class Midpoint(Integrator):
-    """Runge-Kutta of second order, two evaluations of the rates a step."""
+class RungeKutta(Integrator):
+    """An explicit Runge-Kutta scheme in which each stage goes from the step's start along the rates of the one before:
+
+        k_s = f(y + c_s dt k_(s-1)),    y + dt sum_s b_s k_s.
+
+    Parameters
+    ----------
+    nodes, weights : c and b.
+
+    Particles change rank between stages. `memory` holds the rates at the particles last returned where `rates` was
+    asked for them: the next step does not evaluate them again.
+    """
+
+    dense = True
+
+    def __init__(self, dynamics: ParticleDynamics, nodes: Sequence[float], weights: Sequence[float]) -> None:
+        super().__init__(dynamics)
+        self.nodes, self.weights = nodes, weights
+
+    def rates(self, particles: ParticleSet) -> tuple[ParticleSet, Rates]:
+        if particles is not self._last or not self.memory:
+            particles, _ = self.dynamics.settle(particles)
+            rates = self.dynamics.rates_after(0.0, particles)
+            self.restore(particles, _remembered(rates))
+        return particles, Rates(**self.memory)
 
     def step(self, particles: ParticleSet, time_step: float) -> ParticleSet:
-        start, _ = self.dynamics.settle(particles)
-        middle = _advanced(start, start, self.dynamics.rates(start), 0.5 * time_step)
-        return _advanced(start, middle, self.dynamics.rates(middle), time_step)
+        stage, rates = self.rates(particles)
+        start = end = stage
+        for number, (node, weight) in enumerate(zip(self.nodes, self.weights)):
+            if number:
+                stage = _advanced(start, stage, rates, node * time_step)
+                stage, start, end = self._settled(stage, start, end)
+                rates = self.dynamics.rates_after(node * time_step, stage)
+            end = _advanced(end, stage, rates, weight * time_step)
+        self.dynamics.time += time_step
+        self.restore(end, {})
+        return end
+
+    def _settled(self, stage: ParticleSet, *others: ParticleSet) -> list[ParticleSet]:
+        """A stage on the ranks of its slabs, and other columns of its particles beside it."""
+        names = [name for name in stage.columns() if name != "id"]
+        companions = {f"{number} {name}": getattr(other, name) for number, other in enumerate(others) for name in names}
+        stage, moved = self.dynamics.settle(stage, companions)
+        return [stage, *(ParticleSet(stage.id, **{name: moved[f"{number} {name}"] for name in names})
+                         for number in range(len(others)))]
 
 
-class RungeKutta4(Integrator):
-    """The classical Runge-Kutta scheme of fourth order, four evaluations of the rates a step."""
-
-    def step(self, particles: ParticleSet, time_step: float) -> ParticleSet:
-        start, _ = self.dynamics.settle(particles)
-        stages = [(start, self.dynamics.rates(start))]
-        for fraction in (0.5, 0.5, 1.0):
-            stage = _advanced(start, *stages[-1], fraction * time_step)
-            stages.append((stage, self.dynamics.rates(stage)))
-        result = start
-        for weight, stage in zip((1, 2, 2, 1), stages):
-            result = _advanced(result, *stage, weight * time_step / 6)
-        return result
+REMEMBERED = ("acceleration", "density_rate", "density")
+INTEGRATORS = {
+    "verlet": VelocityVerlet,
+    "rk2": partial(RungeKutta, nodes=(0, 1 / 2), weights=(0, 1)),
+    # Heun's scheme of third order: its stages are a third of a step apart, which suits a solve that starts from what
+    # the stages before foresee.
+    "rk3": partial(RungeKutta, nodes=(0, 1 / 3, 2 / 3), weights=(1 / 4, 0, 3 / 4)),
+    "rk4": partial(RungeKutta, nodes=(0, 1 / 2, 1 / 2, 1), weights=(1 / 6, 1 / 3, 1 / 3, 1 / 6)),
+}
 
 
-INTEGRATORS = {"verlet": VelocityVerlet, "rk2": Midpoint, "rk4": RungeKutta4}
-REMEMBERED = ("acceleration", "density_rate")
+def _remembered(rates: Rates) -> dict[str, Tensor]:
+    """Those that a later step may want, by name."""
+    found = {name: getattr(rates, name) for name in REMEMBERED}
+    return {name: rate for name, rate in found.items() if rate is not None}
 
 
 def _kicked(particles: ParticleSet, rates: Rates, time_step: float) -> ParticleSet:

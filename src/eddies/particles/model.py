@@ -78,7 +78,8 @@ class LagrangianModel(nn.Module):
 
     def rates(self, context: Context, kept: Mapping[str, LinearRates] | None = None) -> Rates:
         """The sum of the terms: `acceleration` (k, 3), `density_rate` (k,) if some term gives one, and the `density`
-        (n,) itself, not its deviation, if terms give it. Differentiable; collective.
+        (n,) itself, not its deviation, if terms give it; beside the acceleration the `force_modes` that are in it.
+        Differentiable; collective.
 
         `kept` stands for terms at these very particles: see `linear_rates`.
         """
@@ -130,7 +131,7 @@ class LagrangianModel(nn.Module):
         momentum. It would have none in continuous space, and has one where particles sample the grid unevenly."""
         pressure = rates.pressure_modes if self.density_is_given else None
         modes = [part for part in (rates.force_modes, None if pressure is None else pressure[None]) if part is not None]
-        local = Rates(rates.acceleration, rates.density_rate, rates.density)
+        local = Rates(rates.acceleration, rates.density_rate, rates.density, rates.force_modes)
         if not modes:
             return local
         values = context.resolved.at_particles(torch.cat(modes)).to(context.particles.velocity)

@@ -1,32 +1,33 @@
-"""The velocity that a grid resolves of the particles': averages, deconvolved, of which the solenoidal modes are
-kept."""
+"""The velocity that particles resolve: solenoidal modes found from theirs by regularised least squares."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from eddies.parallel.halo import HaloError, HaloExchange
-from eddies.parallel.reduction import any_rank
+from eddies.parallel.halo import HaloError
+from eddies.parallel.reduction import any_rank, global_sum
 from eddies.parallel.slab import SlabDecomposition
-from eddies.particles.cloud import grid_points
+from eddies.particles.flow_units import FlowUnits
 from eddies.particles.fourier_grid import FourierGrid, Points
-from eddies.particles.ghosts import exchange_ghosts
-from eddies.particles.neighbor_list import NeighborList
-from eddies.particles.pairs import Pairs
-from eddies.particles.particle_set import ParticleSet
+from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.rank_sums import mean_over_ranks, sum_over_ranks
-from eddies.particles.smoothing_kernels import SmoothingKernel, WendlandC2
-from eddies.particles.surroundings import LocalParticles, Surroundings
 
-# Particles in an average, and the share of the Nyquist wavenumber up to which modes are resolved: the best of a trial
-# on filtered turbulence (32^3 particles, four passes): error of -grad p at the particles 0.366 in `hit` and 0.343 in
-# `hit-small`, against 0.415 and 0.365 of the exact filtered pressure gradient, and 0.377 and 0.350 with two passes.
-# More passes gain less than 0.002; more neighbours smooth more and cost more.
-NEIGHBORS, RESOLVED_SHARE, PASSES = 16, 7 / 8, 4
+# The highest wavenumber that is resolved, in units of the particles' Nyquist wavenumber; the exponent of the prior's
+# power law, and how many times the energy that it expects beyond is taken for noise. Measured in docs/closure.md.
+RESOLVED_SHARE, EXPONENT, WEIGHT = 1.25, 11 / 3, 40.0
+# Residuals, relative to the velocities, at which a solve ends: one that starts from nothing, and one that starts from
+# what is foreseen. The latter's is spread over all modes, the former's is left in those that are hardest to tell.
+TOLERANCE, TOLERANCE_FORESEEN = 2e-4, 2e-3
+MOST_ITERATIONS = 300
+# No mode is resolved of which the filter leaves less.
+LEAST_TRANSFER = 1e-3
 # Wavenumber shells in a band of the energy.
 BAND = 2
 
@@ -41,12 +42,19 @@ class ResolvedFlow:
     velocity : modes (3, kz, ky, kx), solenoidal, |k| <= `grid.resolved`.
     points : of the owned particles on the grid.
     relative_velocity : (n, 3), theirs less its mean over all particles.
+    filter_width : d of the filter that the particles' velocity has passed.
+    iterations : that the solve took. residual : that it ended with, relative to the velocities. converged : whether
+        that is as little as was asked for.
     """
 
     grid: FourierGrid
     velocity: Tensor
     points: Points
     relative_velocity: Tensor
+    filter_width: float
+    iterations: int = 0
+    residual: float = 0.0
+    converged: bool = True
 
     def at_particles(self, modes: Tensor) -> Tensor:
         """Values (n, c) of modes (c, kz, ky, kx) at the particles; collective, differentiable."""
@@ -56,16 +64,52 @@ class ResolvedFlow:
         """What the grid does not resolve of the particles' velocities relative to their mean: (n, 3); collective."""
         return self.relative_velocity - self.at_particles(self.velocity).to(self.relative_velocity)
 
+    @cached_property
+    def products(self) -> Tensor:
+        """Modes (6, kz, ky, kx) of u_i u_j; collective, differentiable."""
+        return self.grid.squares(self.velocity)
+
+    @cached_property
+    def filter_transfer(self) -> Tensor:
+        """G = exp(-k^2 d^2 / 24) of each mode (kz, ky, kx)."""
+        return torch.exp(-self.grid.wavenumber_squared * (self.filter_width**2 / 24))
+
+    @property
+    def unfiltered(self) -> Tensor:
+        """Modes (3, kz, ky, kx) of u* = u / G."""
+        return self.velocity / self.filter_transfer
+
+    @cached_property
+    def rms(self) -> Tensor:
+        """Root mean square of a component of the resolved velocity; collective, differentiable."""
+        return self._rms_of(self.velocity, 0.0)
+
+    @cached_property
+    def smallest_rms(self) -> Tensor:
+        """The same of the smallest scales, of the modes of u* with |k| > k_c/2."""
+        return self._rms_of(self.unfiltered, self.grid.resolved / 2)
+
+    def _rms_of(self, modes: Tensor, above: float) -> Tensor:
+        square = (modes.real.square() + modes.imag.square()).sum(0) * self.grid.multiplicity
+        square = torch.where(self.grid.shell > above, square, 0.0).sum()
+        # Where nothing moves the slope of the root is taken for zero.
+        return (sum_over_ranks(self.grid.decomposition.comm, square) / 3).clamp_min(1e-300).sqrt()
+
 
 class ResolvedVelocity:
-    """Makes a `ResolvedFlow` of particles.
+    """Makes a `ResolvedFlow` of particles: the solenoidal modes u(k), 0 < |k| <= k_c, that
 
-    The velocity on the grid is a kernel average of the particles', which attenuates the smaller scales. So the average
-    of what the grid still misses at the particles is added to it, `passes` times in all: iterated (van Cittert)
-    deconvolution. Only solenoidal modes count: with a divergence, which scattered particles always leave in a field
-    made of them, the pressure would depend on the mean velocity, and oscillate with it faster than particles can be
-    stepped. Where a point has no particle in reach the average is zero. So all velocities are taken relative to their
-    mean over the particles: a void, too, looks the same from every frame of reference.
+        minimise  sum_i |v_i - u(x_i)|^2  +  sum_k (sigma^2 / P_k) |u(k)|^2
+
+    as is done for measured particle tracks (Gesemann et al. 2016). The velocities v_i are relative to their mean over
+    all particles. P_k ~ k^(-11/3) G^2, G the transfer of the filter, is the energy expected of a mode, and sigma^2
+    `WEIGHT` times what this law has beyond k_c, which is noise to the modes within; both in units of the velocities, so
+    that their ratio is a number. As the filtered velocity is smooth and solenoidal, modes beyond the particles' Nyquist
+    wavenumber can be told.
+
+    Conjugate gradients, preconditioned by 1 / (N + sigma^2/P_k), solve for the modes until the preconditioned residual
+    is `tolerance` of the velocities; or take a given number of `iterations`. Where the time of an evaluation is given
+    they start from what earlier ones foresee: see `foreseen`.
 
     Products of modes above a third of the number of cells alias; for fields known from particles that is far below the
     error of the highest modes themselves.
@@ -73,63 +117,54 @@ class ResolvedVelocity:
     Parameters
     ----------
     grid : where the velocity is resolved.
-    kernel : weight of the average; its support is the `reach` to other particles.
-    skin : extra radius of the list of particles around grid points.
-    dtype : of the pair sums.
+    filter_width : d of the filter.
 
-    Differentiable in the particles' positions and velocities. All ranks call it together. Raises HaloError, on all
-    ranks, where a particle lies farther outside its slab than the grid reaches.
+    Differentiable in the particles' positions and velocities: on the way back the same system is solved. All ranks call
+    it together. Raises HaloError, on all ranks, where a particle lies farther outside its slab than the grid reaches.
     """
 
-    def __init__(self, grid: FourierGrid, kernel: SmoothingKernel, skin: float = 0.0, passes: int = PASSES,
-                 dtype: torch.dtype = torch.float32) -> None:
-        self.grid, self.kernel, self.skin, self.passes, self.dtype = grid, kernel, skin, passes, dtype
-        self.reach = kernel.support
-        self._points = grid_points(grid.decomposition)
-        self._list: NeighborList | None = None
-        self._halo: HaloExchange | None = None
+    tolerance, tolerance_foreseen, most_iterations = TOLERANCE, TOLERANCE_FORESEEN, MOST_ITERATIONS
+    iterations: int | None = None
+    #: iterations and residual of the solves of a run, and whether they converged, one after the other
+    solves: list[tuple[int, float, bool]]
+
+    def __init__(self, grid: FourierGrid, filter_width: float) -> None:
+        self.grid, self.filter_width = grid, filter_width
+        self._inside = (grid.shell > 0) & (grid.shell <= grid.resolved)
+        self._moments: list[_Moment] = []
+        self.solves = []
+        law, tail = _prior(grid, filter_width, self._inside)
+        self._penalty = torch.where(self._inside, WEIGHT * tail / (3 * torch.where(self._inside, law, 1.0)), 0.0)
 
     @classmethod
-    def on_slabs(cls, decomposition: SlabDecomposition, dtype: torch.dtype, skin: float = 0.0,
-                 drift: float = 0.0) -> ResolvedVelocity:
-        """On a grid of one cell for each plane of the slabs, and as many particles.
+    def on_slabs(cls, decomposition: SlabDecomposition, flow: FlowUnits, margin: float = 0.0) -> ResolvedVelocity:
+        """On a grid of one cell for each plane of the slabs, for particles that lie at most `margin` outside them."""
+        nyquist = math.pi / flow.scales.spacing
+        highest = min(RESOLVED_SHARE * nyquist, math.sqrt(-24 * math.log(LEAST_TRANSFER)) / flow.scales.length)
+        shells = int(highest * decomposition.length / (2 * math.pi) + 1e-9)
+        resolved = min(max(shells, 1), (decomposition.planes - 1) // 2)
+        planes = max(math.ceil(margin / decomposition.spacing - 1e-9), 1)
+        return cls(FourierGrid(decomposition, resolved, planes), flow.scales.length)
 
-        `drift` is how far particles may move beyond half the skin before they change rank.
-        """
-        support = decomposition.spacing * (NEIGHBORS / (4 / 3 * math.pi)) ** (1 / 3)
-        margin = max(math.ceil((skin / 2 + drift) / decomposition.spacing), 1)
-        grid = FourierGrid(decomposition, int(RESOLVED_SHARE * decomposition.planes / 2), margin)
-        return cls(grid, WendlandC2(support), skin, dtype=dtype)
-
-    def of(self, particles: ParticleSet, local: LocalParticles) -> ResolvedFlow:
-        """The resolved flow of particles and what this rank sees around them."""
+    def of(self, particles: ParticleSet, time: float | None = None) -> ResolvedFlow:
+        """The resolved flow of particles; `time` tells what is foreseen of it."""
         self._require_reach(particles.position)
-        mean = mean_over_ranks(self.grid.decomposition.comm, particles.velocity)
-        relative = particles.velocity - mean
-        pairs = self._pairs_around_points(local)
-        weight = self.kernel.value(pairs.distance)
-        weight = weight / pairs.sum(weight).clamp_min(torch.finfo(weight.dtype).tiny).index_select(0, pairs.segment)
-        points = self.grid.points(particles.position)
-        missing, modes = self._with_ghosts(relative, local), 0
-        for remaining in reversed(range(self.passes)):
-            average = pairs.sum((weight * pairs.at_senders(missing.to(weight.dtype)).T).T)
-            modes = modes + self._resolved_modes(average)
-            if remaining:
-                found = self.grid.at(modes, points)
-                missing = self._with_ghosts(relative - found.to(relative), local)
-        return ResolvedFlow(self.grid, modes, points, relative)
-
-    def alone(self, particles: ParticleSet) -> ResolvedFlow:
-        """The same of particles whose surroundings are not known."""
-        decomposition = self.grid.decomposition
-        surroundings = Surroundings(decomposition, decomposition.length, 0.0, self.reach, self.skin)
-        surroundings.update(particles)
-        return self.of(particles, surroundings.local(particles))
+        comm = self.grid.decomposition.comm
+        mean = mean_over_ranks(comm, particles.velocity)
+        relative, points = particles.velocity - mean, self.grid.points(particles.position)
+        flow = ResolvedFlow(self.grid, self.grid.zeros(3), points, relative, self.filter_width)
+        with torch.no_grad():
+            start = None if time is None else self.foreseen(time, as_numpy(mean))
+            flow = self._solved(flow, start)
+        if torch.is_grad_enabled():
+            gradient = self._descent(flow)
+            flow = replace(flow, velocity=_Solution.apply(gradient, flow.velocity, self._adjoint(flow)))
+        return flow
 
     def band_energies(self, particles: ParticleSet) -> Tensor:
         """Mean kinetic energy <u.u>/2 of the resolved velocity by bands of `BAND` wavenumber shells, from shell 1 on:
         (bands,), over all ranks; collective, differentiable."""
-        grid, modes = self.grid, self.alone(particles).velocity
+        grid, modes = self.grid, self.of(particles).velocity
         energy = 0.5 * grid.multiplicity * (modes.real.square() + modes.imag.square()).sum(0)
         shell = torch.round(grid.shell).long()
         inside = (shell > 0) & (shell <= grid.resolved)
@@ -137,13 +172,131 @@ class ResolvedVelocity:
         return sum_over_ranks(grid.decomposition.comm,
                               bands.index_add(0, (shell[inside] - 1) // BAND, energy[inside]))
 
-    def _resolved_modes(self, average: Tensor) -> Tensor:
-        """The resolved modes of a velocity (m, 3) at the grid points."""
-        fields = average.double().cpu().T.reshape(3, *self.grid.spectral.physical_shape)
-        return self.grid.solenoidal(self.grid.within(self.grid.to_modes(fields)))
+    # ---- from one evaluation to the next
 
-    def _with_ghosts(self, owned: Tensor, local: LocalParticles) -> Tensor:
-        return torch.cat([owned, exchange_ghosts(local.halo, owned)])
+    @torch.no_grad()
+    def remember(self, time: float, flow: ResolvedFlow, force: Tensor | None) -> None:
+        """Keep a flow and its rate of change for later evaluations to start from. `force` are the modes
+        (3, kz, ky, kx) of the particles' acceleration as a field: du/dt = P[force - div(uu)], P the solenoidal
+        projection, in the frame that moves with the particles' mean velocity."""
+        change = -self.grid.stress_divergence(flow.products)
+        rate = self._solenoidal(change if force is None else force.detach() + change)
+        self._moments = [moment for moment in self._moments if moment.time != time][-1:]
+        self._moments.append(_Moment(time, flow.velocity.detach(), rate))
+        self.solves.append((flow.iterations, flow.residual, flow.converged))
+
+    def foreseen(self, time: float, mean: np.ndarray) -> Tensor | None:
+        """The modes at a time by the rates of the last two evaluations at different times (Adams and Bashforth),
+        carried along by the mean velocity (3,) of the particles; None where nothing is known."""
+        if not self._moments:
+            return None
+        last, step = self._moments[-1], time - self._moments[-1].time
+        rate = last.rate
+        if len(self._moments) > 1:
+            between = last.time - self._moments[0].time
+            before = self._carried(self._moments[0].rate, between, mean)
+            rate = rate + step / (2 * between) * (rate - before)
+        return self._carried(last.velocity + step * rate, step, mean)
+
+    def forget(self) -> None:
+        """Start the next solve from nothing."""
+        self._moments = []
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """What later solves start from: times (m,), and modes (m, 2, 3, kz, ky_local, kx) of velocity and rate."""
+        modes = [torch.stack([moment.velocity, moment.rate]) for moment in self._moments]
+        return {"times": torch.tensor([moment.time for moment in self._moments], dtype=torch.float64),
+                "modes": torch.stack(modes) if modes else self.grid.zeros(0, 2, 3)}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Inverse of `state_dict`."""
+        self._moments = [_Moment(float(time), *modes) for time, modes in zip(state["times"], state["modes"])]
+
+    def _carried(self, modes: Tensor, step: float, mean: np.ndarray) -> Tensor:
+        """Modes of a field that has moved with the mean velocity for a time."""
+        kx, ky, kz = self.grid.wavevector
+        return modes * torch.exp(-1j * step * (kx * mean[0] + ky * mean[1] + kz * mean[2]))
+
+    # ---- the solve
+
+    def _solved(self, flow: ResolvedFlow, start: Tensor | None) -> ResolvedFlow:
+        """The flow with the modes that conjugate gradients find."""
+        comm, size = self.grid.decomposition.comm, flow.relative_velocity.double().square().sum()
+        count, square = global_sum(comm, np.array([len(flow.relative_velocity), float(size)]))
+        if start is not None:
+            flow = replace(flow, velocity=start)
+        right = self._descent(flow)
+        begin, tolerance = self._size(right, count), self.tolerance if start is None else self.tolerance_foreseen
+        if begin > square and start is not None:  # worse than nothing is
+            return self._solved(replace(flow, velocity=torch.zeros_like(start)), None)
+        change, iterations, left = self._conjugate_gradients(flow.points, right, count, tolerance**2 * square)
+        # What is not finite has not converged.
+        return replace(flow, velocity=flow.velocity + change, iterations=iterations,
+                       residual=math.sqrt(left / square) if square > 0 else 0.0,
+                       converged=self.iterations is not None or left <= tolerance**2 * square)
+
+    def _conjugate_gradients(self, points: Points, right: Tensor, count: float,
+                             enough: float) -> tuple[Tensor, int, float]:
+        """Modes y with A y = `right` until the squared residual is `enough`; the iterations, and what is left of it."""
+        inverse = self._preconditioner(count)
+        found, residual = torch.zeros_like(right), right
+        direction = preconditioned = inverse * residual
+        left, iterations = self._product(residual, preconditioned), 0
+        while (left > enough and iterations < self.most_iterations) if self.iterations is None else (
+                iterations < self.iterations and left > 0):
+            image = self._applied(direction, points)
+            length = left / self._product(direction, image)
+            found, residual = found + length * direction, residual - length * image
+            preconditioned = inverse * residual
+            before, left = left, self._product(residual, preconditioned)
+            direction = preconditioned + left / before * direction
+            iterations += 1
+        return found, iterations, left
+
+    def _descent(self, flow: ResolvedFlow) -> Tensor:
+        """Half the steepest descent of what is minimised, P B^T (v - B u) - (sigma^2/P_k) u, zero at its minimum."""
+        missing = flow.relative_velocity.double() - self.grid.at(flow.velocity, flow.points)
+        return self._gathered(missing, flow.points) - self._penalty * flow.velocity
+
+    def _applied(self, modes: Tensor, points: Points) -> Tensor:
+        """A = P B^T B + sigma^2/P_k on solenoidal modes; B gives values at the particles."""
+        return self._gathered(self.grid.at(modes, points), points) + self._penalty * modes
+
+    def _gathered(self, values: Tensor, points: Points) -> Tensor:
+        """P B^T of values (n, 3) at the particles."""
+        return self._solenoidal(self.grid.spread(values, points) * self.grid.spectral.cells**3)
+
+    def _solenoidal(self, modes: Tensor) -> Tensor:
+        return torch.where(self._inside, self.grid.solenoidal(modes), 0.0)
+
+    def _preconditioner(self, count: float) -> Tensor:
+        return torch.where(self._inside, 1 / (count + self._penalty), 0.0)
+
+    def _size(self, residual: Tensor, count: float) -> float:
+        """Square of a residual, such that it is comparable to sum_i |v_i|^2."""
+        return self._product(residual, self._preconditioner(count) * residual)
+
+    def _product(self, first: Tensor, second: Tensor) -> float:
+        """Inner product of two real fields by their modes, over all ranks."""
+        local = self.grid.multiplicity * (first.real * second.real + first.imag * second.imag)
+        return float(global_sum(self.grid.decomposition.comm, float(local.sum())))
+
+    def _adjoint(self, flow: ResolvedFlow) -> Callable[[Tensor], Tensor]:
+        """By the implicit function theorem: the gradient by modes of the minimum -> that by the descent there.
+
+        The descent d(u; x, v) is zero at the minimum and changes with u by -A, so that du = A^-1 dd. A is symmetric in
+        the inner product in which modes count by their multiplicity m, therefore its transpose is m A (1/m).
+        """
+        grid, count = self.grid, float(global_sum(self.grid.decomposition.comm, len(flow.relative_velocity)))
+
+        def solve(gradient: Tensor) -> Tensor:
+            # The part that belongs to a real field; what else there is has no effect on any value.
+            right = self._solenoidal(grid.to_modes(grid.to_fields(gradient.resolve_conj() / grid.multiplicity)))
+            found, _, _ = self._conjugate_gradients(flow.points, right, count,
+                                                    self.tolerance**2 * self._size(right, count))
+            return grid.multiplicity * found
+
+        return solve
 
     def _require_reach(self, position: Tensor) -> None:
         slab = self.grid.decomposition
@@ -154,11 +307,38 @@ class ResolvedVelocity:
             raise HaloError(f"a particle moves more than {reach:.3g} out of its slab before it can change rank, and "
                             "the ghost planes reach no farther: shorten the time step or the skin")
 
-    def _pairs_around_points(self, local: LocalParticles) -> Pairs:
-        # Ghosts, and with them the rows of the list, belong to one halo.
-        if local.halo is not self._halo:
-            self._points = self._points.to(local.position.device)
-            self._list = NeighborList(local.box, self.reach, self.skin)
-            self._list.build(self._points, local.position, exclude_self=False)
-            self._halo = local.halo
-        return self._list.pairs(self._points, local.position, dtype=self.dtype)
+
+@dataclass(frozen=True)
+class _Moment:
+    """Modes of the resolved velocity at a time, and of its rate of change."""
+
+    time: float
+    velocity: Tensor
+    rate: Tensor = field(repr=False)
+
+
+class _Solution(torch.autograd.Function):
+    """The modes that make the descent zero, as a function of the descent at these very modes."""
+
+    @staticmethod
+    def forward(ctx, descent: Tensor, modes: Tensor, adjoint: Callable[[Tensor], Tensor]) -> Tensor:
+        ctx.adjoint = adjoint
+        return modes.clone()
+
+    @staticmethod
+    def backward(ctx, gradient: Tensor) -> tuple[Tensor, None, None]:
+        return ctx.adjoint(gradient), None, None
+
+
+def _prior(grid: FourierGrid, filter_width: float, inside: Tensor) -> tuple[Tensor, float]:
+    """Energy P_k of a component of each mode (kz, ky, kx), and the energy beyond, for <v.v> = 1."""
+    unit = 2 * math.pi / grid.decomposition.length
+
+    def law(k):
+        return k**-EXPONENT * np.exp(-((unit * k * filter_width) ** 2) / 12)
+
+    modes = torch.where(inside, torch.from_numpy(law(grid.shell.clamp_min(1).numpy())), 0.0)
+    total = float(global_sum(grid.decomposition.comm, float(2 * (modes * grid.multiplicity).sum())))
+    shells = np.arange(1, 40 * grid.resolved, dtype=float)
+    energy = shells**2 * law(shells)
+    return modes / total, float(energy[shells > grid.resolved].sum() / energy.sum())

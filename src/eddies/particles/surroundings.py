@@ -28,13 +28,13 @@ class LocalParticles:
     Parameters
     ----------
     position : (s, 3); on several ranks z is not periodic here, and ghosts stand where they are seen from.
-    neighbors : the list of pairs, built from these rows; or None.
+    neighbors : the list of pairs, built from these rows.
     halo : for further columns, with `ghosts.exchange_ghosts`; another one whenever rows of ghosts change.
     box : the box in which differences of these positions are taken.
     """
 
     position: Tensor
-    neighbors: NeighborList | None
+    neighbors: NeighborList
     halo: HaloExchange
     box: PeriodicBox
 
@@ -46,47 +46,27 @@ class Surroundings:
     ----------
     decomposition : slabs.
     length : side of the periodic box.
-    list_cutoff : radius of the neighbour list; zero: there is none.
-    halo_cutoff : how far a rank must see beyond its particles, at least `list_cutoff`.
-    skin : extra radius of both. They hold until some particle of any rank has moved by half of it.
+    cutoff : radius of the neighbour list, and how far a rank sees beyond its particles.
+    skin : extra radius. They hold until some particle of any rank has moved by half of it.
 
     All methods are collective. Raises HaloError, on all ranks, when slabs are thinner than the halo.
     """
 
-    def __init__(
-        self,
-        decomposition: SlabDecomposition,
-        length: float,
-        list_cutoff: float,
-        halo_cutoff: float,
-        skin: float,
-    ) -> None:
-        self.decomposition, self.halo_cutoff, self.skin = decomposition, halo_cutoff, skin
+    def __init__(self, decomposition: SlabDecomposition, length: float, cutoff: float, skin: float) -> None:
+        self.decomposition, self.cutoff, self.skin = decomposition, cutoff, skin
         self.box = PeriodicBox(length, periodic_z=decomposition.size == 1)
-        self.neighbors = NeighborList(self.box, list_cutoff, skin) if list_cutoff > 0 else None
+        self.neighbors = NeighborList(self.box, cutoff, skin)
         self.builds = 0
         self.forget()
 
     def forget(self) -> None:
         """Build anew at the next occasion."""
         self._ids: Tensor | None = None
-        self._moved_before, self._strayed_at_build = 0.0, False
 
     def outdated(self, particles: ParticleSet) -> bool:
         """Whether, on any rank, these are other particles or one has moved by more than half the skin, or to a
         position that is not a number."""
         return any_rank(self.decomposition.comm, not self._moved(particles) <= self.skin / 2)
-
-    def due(self, particles: ParticleSet) -> bool:
-        """Whether to build anew before a step: in the middle of one, particles cannot change rank.
-
-        So it is if the list will be outdated once the particles move as far again as since the last call, or
-        if a particle had left its slab when the list was built.
-        """
-        moved = self._moved(particles)
-        ahead = moved + max(moved - self._moved_before, 0.0)
-        self._moved_before = moved
-        return any_rank(self.decomposition.comm, ahead > self.skin / 2 or self._strayed_at_build)
 
     def _moved(self, particles: ParticleSet) -> float:
         """Largest distance that a particle of this rank has moved since the build; infinite for others."""
@@ -94,18 +74,6 @@ class Surroundings:
             return math.inf
         moved = self.box.displacement(particles.position.detach(), self._built_at)
         return math.sqrt(float((moved * moved).sum(-1).max())) if len(moved) else 0.0
-
-    def settle(self, columns: dict[str, Tensor]) -> dict[str, Tensor]:
-        """All columns after each particle moved to the rank of its slab, ordered by place, then by id.
-
-        The order depends on nothing but ids and positions, and keeps neighbours close in memory.
-        """
-        device = columns["id"].device
-        moved = migrate(self.decomposition, {name: as_numpy(column) for name, column in columns.items()})
-        cells = max(int(self.box.length / self.halo_cutoff), 1)
-        x, y, z = np.minimum((moved["position"].T * (cells / self.box.length)).astype(np.int64), cells - 1)
-        order = np.lexsort((moved["id"], x, y, z))
-        return {name: torch.from_numpy(column[order]).to(device) for name, column in moved.items()}
 
     def update(self, particles: ParticleSet) -> None:
         """Make halo and list fit the particles.
@@ -117,20 +85,15 @@ class Surroundings:
         """
         if not self.outdated(particles):
             return
-        outside = self._outside(particles.position)
-        strayed = float(global_max(self.decomposition.comm, float(outside.max()) if len(outside) else 0.0))
-        if strayed > self.box.length:
-            self._refuse(particles, outside)
-        width = self.halo_cutoff + self.skin + strayed
+        strayed = farthest_outside(self.decomposition, particles)
+        width = self.cutoff + self.skin + strayed
         require_thick_slabs(self.decomposition, width + strayed)
         self.halo = HaloExchange(self.decomposition, as_numpy(particles.position), width)
         self._ids, self._built_at = particles.id, particles.position.detach().clone()
-        self._moved_before, self._strayed_at_build = 0.0, strayed > 0
         self.builds += 1
-        if self.neighbors is not None:
-            with torch.no_grad():
-                position = self._with_ghosts(particles.position, exchange_ghost_positions)
-            self.neighbors.build(position[: len(particles)], position, exclude_self=True)
+        with torch.no_grad():
+            position = self._with_ghosts(particles.position, exchange_ghost_positions)
+        self.neighbors.build(position[: len(particles)], position, exclude_self=True)
 
     def local(self, particles: ParticleSet) -> LocalParticles:
         """Positions with ghosts, as of now."""
@@ -145,17 +108,36 @@ class Surroundings:
     def _with_ghosts(self, owned: Tensor, exchange) -> Tensor:
         return owned if self.decomposition.size == 1 else torch.cat([owned, exchange(self.halo, owned)])
 
-    def _refuse(self, particles: ParticleSet, outside: Tensor) -> None:
-        """Raise HaloError with the first particle, over the ranks, that is nowhere near its slab."""
-        comm = self.decomposition.comm
-        found = find_unplaced(particles, outside, PeriodicBox(self.box.length), comm.rank)
-        raise HaloError(f"within the step, {first_complaint(comm, found)}")
 
-    def _outside(self, position: Tensor) -> Tensor:
-        """How far each particle is outside the slab, (n,); infinite where its position is not finite."""
-        position, slab = position.detach(), self.decomposition
-        z = position[:, 2]
-        distance = torch.maximum(slab.lower - z, z - slab.upper).clamp_min(0)
-        if slab.size == 1:  # which has no outside
-            distance = torch.zeros_like(z)
-        return distance.where(torch.isfinite(position).all(1), torch.inf)
+def farthest_outside(slab: SlabDecomposition, particles: ParticleSet) -> float:
+    """How far the particle farthest from its slab, of all ranks, is outside it; collective.
+
+    Raises HaloError, on all ranks, where that is farther than the box is long, or a position is not finite.
+    """
+    position = particles.position.detach()
+    z = position[:, 2]
+    distance = torch.maximum(slab.lower - z, z - slab.upper).clamp_min(0)
+    if slab.size == 1:  # which has no outside
+        distance = torch.zeros_like(z)
+    # What is just at the upper face belongs to the next slab.
+    distance = torch.where(z == slab.upper, torch.finfo(z.dtype).tiny, distance)
+    distance = distance.where(torch.isfinite(position).all(1), torch.inf)
+    farthest = float(global_max(slab.comm, float(distance.max()) if len(distance) else 0.0))
+    if farthest > slab.length:
+        found = find_unplaced(particles, distance, PeriodicBox(slab.length), slab.comm.rank)
+        raise HaloError(f"within the step, {first_complaint(slab.comm, found)}")
+    return farthest
+
+
+def at_home(decomposition: SlabDecomposition, columns: dict[str, Tensor], reach: float) -> dict[str, Tensor]:
+    """All columns after each particle moved to the rank of its slab, ordered by place in cells of side `reach` and then
+    by id; collective.
+
+    The order depends on nothing but ids and positions, and keeps neighbours close in memory.
+    """
+    device = columns["id"].device
+    moved = migrate(decomposition, {name: as_numpy(column) for name, column in columns.items()})
+    cells = max(int(decomposition.length / reach), 1)
+    x, y, z = np.minimum((moved["position"].T * (cells / decomposition.length)).astype(np.int64), cells - 1)
+    order = np.lexsort((moved["id"], x, y, z))
+    return {name: torch.from_numpy(column[order]).to(device) for name, column in moved.items()}

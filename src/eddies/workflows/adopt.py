@@ -31,7 +31,7 @@ def run(scene: Scene, comm, directory: str | Path) -> None:
     the weights were trained.
     """
     device, source = prepare_torch(scene.device, comm), read_source(scene, comm)
-    slab = SlabDecomposition(comm, BOX_LENGTH, scene.tracers.particles_per_side)
+    slab = SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes)
     with open_product(comm, Path(directory) / "ground_truth.h5", "ground_truth") as file:
         truth = GroundTruth(file, slab)
         model = with_weights(scene, source.description, source.weights, source.path, truth.scales).to(device)

@@ -67,7 +67,7 @@ def particle_lines(scene: Scene) -> Iterator[str]:
     yield f"filtered fields on {tracers.cells}^3 points, every {field_interval:.3g}"
     if scene.kernel:
         yield (f"kernel support {scene.kernel.support(tracers.particles):.4g}, {scene.kernel.neighbors:g} "
-               f"neighbours; reach with skin and drift {particle_reach(scene):.4g}")
+               f"neighbours; reach with skin {particle_reach(scene):.4g}")
 
 
 def step_lines(scene: Scene) -> Iterator[str]:

@@ -8,8 +8,7 @@ from eddies.scene import BOX_LENGTH, Eulerian, Scene
 
 DISSIPATION_CONSTANT = 0.5   # C_eps = eps L / u'^3 of developed turbulence
 PEAK_VELOCITY = 4.0          # largest component of the velocity of a particle over u'
-ALLOWED_VELOCITY = 6.0       # the same, for which a resolved velocity has ghost planes: too few of them end a run
-AVERAGING_REACH = 1.57       # of the averages that make the resolved velocity, in mean spacings
+ALLOWED_VELOCITY = 6.0       # the same, for which a resolved velocity has ghost planes in the training through horizons
 PEAK_SPEED = 7.0             # max(|u| + |v| + |w|) over u' in turbulence: four rms in each component at worst
 EXACT_PEAK_SPEED = {"taylor-green": 1.0, "abc": 3 * math.sqrt(2), "shear-wave": 1.0}  # over the amplitude
 GHOST_PLANES = {"cubic": 3, "quintic": 4}
@@ -118,8 +117,7 @@ def most_ranks(scene: Scene) -> dict[str, int]:
             scene.tracers.cells, support)
     if learns_pairs(scene) or (scene.simulation and "pairs" in scene.simulation.needs):
         reach = particle_reach(scene)
-        limits[f"slabs no thinner than the particles' reach {reach:.3g}"] = thick_slabs(
-            scene.tracers.particles_per_side, reach)
+        limits[f"slabs no thinner than the particles' reach {reach:.3g}"] = thick_slabs(scene.tracers.planes, reach)
     if "train" in scene.stages:
         limits |= most_training_ranks(scene)
     if scene.simulation and scene.simulation.method == "eulerian":
@@ -134,17 +132,17 @@ def most_training_ranks(scene: Scene) -> dict[str, int]:
     limits = {"ghost planes of the filtered fields": max(scene.tracers.cells // GHOST_PLANES["quintic"], 1)}
     support, simulation = scene.kernel.support(scene.tracers.particles), scene.simulation
     if "resolved" in scene.model.reads:
-        skin, step = (simulation.skin * support, simulation.step) if simulation else (0.0, 0.0)
-        limits["ghost planes of the resolved velocity"] = ranks_of_resolved_grid(scene, step, skin)
+        skin = simulation.skin * support if simulation else 0.0
+        limits["ghost planes of the resolved velocity"] = ranks_of_resolved_grid(scene, skin / 2)
     time = horizon_time(scene)
     if time > 0:
-        sees = support if learns_pairs(scene) else AVERAGING_REACH * scene.tracers.spacing
-        if learns_pairs(scene) or "resolved" in scene.model.reads:
-            reach = sees + 2 * particle_drift(scene, time)
+        if learns_pairs(scene):
+            reach = support + 2 * particle_drift(scene, time)
             limits[f"slabs no thinner than the particles' reach {reach:.3g} in the training through horizons"] = (
-                thick_slabs(scene.tracers.particles_per_side, reach))
+                thick_slabs(scene.tracers.planes, reach))
         if scene.training.energy_weight > 0 or "resolved" in scene.model.reads:
-            limits["ghost planes of the grid in the training through horizons"] = ranks_of_resolved_grid(scene, time)
+            limits["ghost planes of the grid in the training through horizons"] = ranks_of_resolved_grid(
+                scene, particle_drift(scene, time, ALLOWED_VELOCITY))
     return limits
 
 
@@ -164,10 +162,8 @@ def thick_slabs(planes: int, width: float) -> int:
 
 
 def particle_reach(scene: Scene) -> float:
-    """How thick slabs must be for the particles: kernel support, skin of the neighbour list, and twice a step's way out
-    of a slab, as two particles that see each other may stray into one from both sides."""
-    step, skin = (scene.simulation.step, scene.simulation.skin) if scene.simulation else (0.0, 0.0)
-    return scene.kernel.support(scene.tracers.particles) * (1 + skin) + 2 * particle_drift(scene, step)
+    """How thick slabs must be for the particles: kernel support, and skin of the neighbour list."""
+    return scene.kernel.support(scene.tracers.particles) * (1 + (scene.simulation.skin if scene.simulation else 0.0))
 
 
 def particle_drift(scene: Scene, time: float, peak: float = PEAK_VELOCITY) -> float:
@@ -184,9 +180,9 @@ def horizon_time(scene: Scene) -> float:
     return max(settings.horizons) * scene.tracers.frame_interval
 
 
-def ranks_of_resolved_grid(scene: Scene, time: float, skin: float = 0.0) -> int:
-    """The largest number of ranks for the cubic splines on a grid of one cell a particle, which have one more ghost
-    plane for each plane that a particle may be outside its slab after a time."""
-    outside = (skin / 2 + particle_drift(scene, time, ALLOWED_VELOCITY)) / scene.tracers.spacing
-    ghosts = GHOST_PLANES["cubic"] - 1 + max(math.ceil(outside), 1)
-    return max(scene.tracers.particles_per_side // ghosts, 1)
+def ranks_of_resolved_grid(scene: Scene, outside: float) -> int:
+    """The largest number of ranks for the cubic splines on the grid of the resolved velocity, which have one more ghost
+    plane for each plane that a particle may be outside its slab."""
+    planes = scene.tracers.planes
+    ghosts = GHOST_PLANES["cubic"] - 1 + max(math.ceil(outside * planes / BOX_LENGTH - 1e-9), 1)
+    return max(planes // ghosts, 1)

@@ -57,13 +57,17 @@ class EulerianRun:
         self.tracers = TracerParticles(FilteredField(grid, 0.0, scene.tracers.interpolation), columns, self.state)
         self.flow_seconds: list[float] = []
 
-    def steps(self, interval: float) -> int:
-        """As many steps as the Courant number of the flow now asks for, and none longer than that of the scene."""
-        longest = min(self.step_limit.bound(self.state, self.clock), self.longest_step)
-        return max(math.ceil(interval / longest - 1e-9), 1)
+    @property
+    def time(self) -> float:
+        """Of the flow, since the start."""
+        return self.clock.time
 
-    def advance(self, step: float, number: int) -> str | None:
-        """Take a step; what is wrong with the state after it, on all ranks, or None."""
+    def advance(self, until: float, number: int) -> str | None:
+        """Take one of the equal steps to a time, as many as the Courant number of the flow now asks for, and none longer
+        than that of the scene; what is wrong with the state after it, on all ranks, or None."""
+        left = until - self.time
+        longest = min(self.step_limit.bound(self.state, self.clock), self.longest_step)
+        step = left / math.ceil(left / longest - 1e-9)
         began = time.perf_counter()
         with np.errstate(over="ignore", invalid="ignore"):  # said in words below
             self.state = self.stepper(self.state, step)
@@ -77,7 +81,7 @@ class EulerianRun:
         self.tracers.advance(self.state, step)
         return None
 
-    def frame(self) -> tuple[ParticleSet, torch.Tensor]:
+    def frame(self, time: float) -> tuple[ParticleSet, torch.Tensor]:
         """The particles with the density of the fluid, and their acceleration."""
         columns = {**self.tracers.columns, "density": self.tracers.density(self.state)}
         return ParticleSet.from_numpy(columns), torch.from_numpy(self._acceleration())
@@ -91,6 +95,10 @@ class EulerianRun:
         values = spline.at(spline.coefficients(np.concatenate([change, *gradients])), self.tracers.columns["position"])
         along = np.einsum("nij,nj->ni", values[:, 3:].reshape(-1, 3, 3), self.tracers.columns["velocity"])
         return values[:, :3] + along
+
+    def status(self) -> str:
+        """Nothing."""
+        return ""
 
     def series(self) -> dict[str, dict[str, list[float]]]:
         """None."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -16,14 +17,16 @@ from eddies.particles.feature_range import FeatureRange, pair_features
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.model import LagrangianModel, build_model
+from eddies.particles.moment import Moment, between
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.terms.forcing import Forcing
 from eddies.particles.terms.presets import PRESETS
 from eddies.particles.terms.settings import SummationDensity, WCSPH
 from eddies.scene import Scene, Wcsph
-from eddies.workflows.estimates import ALLOWED_VELOCITY
 from eddies.workflows.trained_model import load_feature_range, load_model
 from eddies.workflows.truth import GroundTruth, particles_for
+
+log = logging.getLogger("eddies")
 
 # A state is runaway, not turbulence, when a particle is this many times faster, or its density this many times
 # farther from the mean, than the rms of the truth.
@@ -45,13 +48,13 @@ class ParticleRun:
         self.flow = FlowUnits(self.scales, scene.kernel.support(truth.total), scene.kernel.neighbors, scene.seed)
         dtype = getattr(torch, self.settings.precision)
         self.model = self.with_forcing(self.build(scene, directory), scene, truth).to(dtype=dtype, device=device)
-        drift = ALLOWED_VELOCITY * self.scales.velocity * self.settings.step
-        self.dynamics = ParticleDynamics(truth.decomposition, self.model, self.settings.skin * self.flow.cutoff, dtype,
-                                         drift)
+        self.dynamics = ParticleDynamics(truth.decomposition, self.model, self.settings.skin * self.flow.cutoff, dtype)
         self.integrator = INTEGRATORS[self.settings.integrator](self.dynamics)
-        self.particles = particles_for(self.model, truth.particles(start), device)
+        self.particles, self.total = particles_for(self.model, truth.particles(start), device), truth.total
+        self._before: Moment | None = None
         self.limits = Limits(RUNAWAY_SPEED * self.scales.velocity, self.scales.density_mean, self.largest_deviation)
         self._shares_outside: list[float] = []
+        self._solves = {"iterations": [], "most_iterations": [], "residual": [], "not_converged": []}
 
     def build(self, scene: Scene, directory: Path) -> LagrangianModel:
         """The model, without forcing; collective."""
@@ -69,36 +72,79 @@ class ParticleRun:
         """Whether the particles of its frames have a density."""
         return self.model.reads_density
 
-    def steps(self, interval: float) -> int:
-        """As many steps as are no longer than that of the scene."""
-        return max(int(np.ceil(interval / self.settings.step - 1e-9)), 1)
+    @property
+    def time(self) -> float:
+        """Of the particles, since the start."""
+        return self.dynamics.time
 
-    def advance(self, step: float, number: int) -> str | None:
-        """Take a step; what is wrong with the state after it, on all ranks, or None."""
+    def advance(self, until: float, number: int) -> str | None:
+        """Take a step towards a time; what is wrong with the state after it, on all ranks, or None.
+
+        Steps of a scheme that can tell what was between them are all as long as the scene has them, and may go beyond;
+        those of others end there.
+        """
+        step, left = self.settings.step, until - self.time
+        if not self.integrator.dense:
+            step = left / np.ceil(left / step - 1e-9)
         try:
+            self._before = self._now() if step > left * (1 + 1e-9) else None
             self.particles = self.integrator.step(self.particles, step)
         except HaloError as error:  # on all ranks alike: particles outrun the halo
             return f"step {number}: {error}"
         fault = find_fault(self.particles, self.limits, self.dynamics.box, number, self.comm.rank)
         return first_complaint(self.comm, fault)
 
-    def frame(self) -> tuple[ParticleSet, torch.Tensor]:
-        """The particles, with the density that terms give if they do, and their acceleration."""
-        particles, _ = self.dynamics.settle(self.particles)
-        rates = self.dynamics.rates(particles)
+    def frame(self, time: float) -> tuple[ParticleSet, torch.Tensor]:
+        """The particles at a time that the last step reached, with the density that terms give if they do, and their
+        acceleration."""
+        if self._before is None:
+            self.particles, rates = self.integrator.rates(self.particles)
+            particles = self.particles
+        else:
+            found = between(self._before, self._now(), time, self.dynamics.box)
+            particles, _ = self.dynamics.settle(particles_for(self.model, found.to_numpy(), self.particles.id.device))
+            rates = self.dynamics.rates(particles, time=time)
         if rates.density is not None:
             particles = replace(particles, density=rates.density)
         if self.seen is not None:
             self._shares_outside.append(self.seen.share_outside(self.comm, pair_features(self.dynamics, particles)))
+        self._count_solves()
         return particles, rates.acceleration
 
+    def _now(self) -> Moment:
+        """The particles with their acceleration, which the next step does not evaluate again; collective."""
+        self.particles, rates = self.integrator.rates(self.particles)
+        return Moment.of(self.comm, self.total, self.time, self.particles, rates)
+
+    def _count_solves(self) -> None:
+        """Take down what the closure's solves took since the last frame."""
+        if self.dynamics.resolution is None:
+            return
+        solves, self.dynamics.resolution.solves = self.dynamics.resolution.solves, []
+        iterations, residuals, converged = (np.array(column) for column in zip(*solves or [(0, 0.0, True)]))
+        failed = int((~converged).sum())
+        for name, value in (("iterations", iterations.mean()), ("most_iterations", iterations.max()),
+                            ("residual", residuals.max()), ("not_converged", failed)):
+            self._solves[name].append(float(value))
+        if failed and self.comm.rank == 0:
+            log.warning("rollout: %d of %d solves for the resolved velocity did not converge in %d iterations, the "
+                        "worst left a residual of %.1e", failed, len(solves), max(iterations), residuals.max())
+
+    def status(self) -> str:
+        """Iterations of a solve for the resolved velocity, for the progress line."""
+        return f"  iterations {self._solves['iterations'][-1]:.1f}" if self._solves["iterations"] else ""
+
     def series(self) -> dict[str, dict[str, list[float]]]:
-        """`outside_training`: the share of pairs that give the networks inputs outside the range of their training."""
-        return {} if self.seen is None else {"outside_training": {"share": self._shares_outside}}
+        """`outside_training`: the share of pairs that give the networks inputs outside the range of their training;
+        `closure`: mean and most iterations, the largest residual and the failures of the solves for the resolved
+        velocity since the frame before."""
+        found = {} if self.seen is None else {"outside_training": {"share": self._shares_outside}}
+        return found if self.dynamics.resolution is None else {**found, "closure": self._solves}
 
     def description(self) -> dict[str, float | str]:
-        """Integrator and terms."""
-        return {"integrator": self.settings.integrator, "terms": ", ".join(self.model.terms) or "none"}
+        """Integrator, terms, and how often the rates were evaluated for the steps."""
+        return {"integrator": self.settings.integrator, "terms": ", ".join(self.model.terms) or "none",
+                "evaluations": self.dynamics.evaluations}
 
 
 class LearnedRun(ParticleRun):

@@ -37,14 +37,17 @@ class Mover(Protocol):
 
     has_density: bool  # of the particles of its frames
 
-    def steps(self, interval: float) -> int:
-        """Number of equal steps into which the next interval is divided."""
+    time: float  # of its particles, since the start
 
-    def advance(self, step: float, number: int) -> str | None:
-        """Take a step, the `number`-th of the run; what is wrong with the state after it, on all ranks, or None."""
+    def advance(self, until: float, number: int) -> str | None:
+        """Take a step, the `number`-th of the run, that ends at a time or before it, or beyond it where `frame` can look
+        back; what is wrong with the state after it, on all ranks, or None."""
 
-    def frame(self) -> tuple[ParticleSet, torch.Tensor]:
-        """The particles now, in any order, and their acceleration (n, 3)."""
+    def frame(self, time: float) -> tuple[ParticleSet, torch.Tensor]:
+        """The particles at a time that the last step reached, in any order, and their acceleration (n, 3)."""
+
+    def status(self) -> str:
+        """What the progress line shows of it beside time and energy."""
 
     def series(self) -> dict[str, dict[str, list[float]]]:
         """Tables for the product, with a value in each column for each call of `frame`."""
@@ -58,7 +61,7 @@ def run(scene: Scene, comm, directory: str | Path, stop: StopRequest | None = No
     says so in its status."""
     device = prepare_torch(scene.device, comm)
     directory, settings = Path(directory), scene.simulation
-    slab = SlabDecomposition(comm, BOX_LENGTH, scene.tracers.particles_per_side)
+    slab = SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes)
     with (open_product(comm, directory / "ground_truth.h5", "ground_truth") as truth_file,
           create_product(comm, directory / "rollout.h5", "rollout", scene.provenance("simulate")) as file):
         truth = GroundTruth(truth_file, slab)
@@ -85,25 +88,25 @@ def roll_out(mover: Mover, frames: RolloutFrames, count: int, interval: float, t
     """Advance `count` frame intervals, or until the state is at fault; returns status, time, and seconds a step."""
     comm = truth.decomposition.comm
     clock, seconds, complaint = Clock(end=count * interval), [], None
-    progress = ProgressLine("rollout", lambda: f"t {clock.time:.3f}  energy {energy:.4f}")
-    energy = store(frames, mover, clock, truth)
-    while clock.running and complaint is None:
-        steps = mover.steps(interval)
-        for _ in range(steps):
+    progress = ProgressLine("rollout", lambda: f"t {clock.time:.3f}  energy {energy:.4f}{mover.status()}")
+    energy = store(frames, mover, clock, 0.0, truth)
+    for number in range(1, count + 1):
+        until = number * interval
+        while complaint is None and mover.time < until - 1e-9 * interval:
             stop.check()
-            began = time.perf_counter()
-            complaint = mover.advance(interval / steps, clock.steps + 1)
-            if complaint is not None:
-                break
-            clock.tick(interval / steps)
-            seconds.append(time.perf_counter() - began)
-        else:
-            energy = store(frames, mover, clock, truth)
-            progress(clock.time / clock.end, clock.steps)
+            began, before = time.perf_counter(), mover.time
+            complaint = mover.advance(until, clock.steps + 1)
+            if complaint is None:
+                clock.tick(mover.time - before)
+                seconds.append(time.perf_counter() - began)
+        if complaint is not None:
+            break
+        energy = store(frames, mover, clock, until, truth)
+        progress(until / clock.end, clock.steps)
     if complaint is not None and comm.rank == 0:
         log.warning("rollout stopped at time %.4g: %s", clock.time, complaint)
-    return {"status": "complete" if complaint is None else f"stopped: {complaint}", "time": clock.time,
-            "time_step": clock.time / clock.steps if clock.steps else interval / steps, **quartiles(seconds)}
+    return {"status": "complete" if complaint is None else f"stopped: {complaint}", "time": frames.times[-1],
+            "steps": clock.steps, "time_step": clock.time / max(clock.steps, 1), **quartiles(seconds)}
 
 
 def quartiles(seconds: Sequence[float]) -> dict[str, float]:
@@ -112,10 +115,10 @@ def quartiles(seconds: Sequence[float]) -> dict[str, float]:
     return {"seconds_per_step": median, "seconds_per_step_low": low, "seconds_per_step_high": high}
 
 
-def store(frames: RolloutFrames, mover: Mover, clock: Clock, truth: GroundTruth) -> float:
-    """Store a frame; returns the mean kinetic energy <v.v>/2 of its particles."""
-    particles, acceleration = mover.frame()
-    frames.store(clock.steps, clock.time, particles, acceleration)
+def store(frames: RolloutFrames, mover: Mover, clock: Clock, time: float, truth: GroundTruth) -> float:
+    """Store the frame of a time; returns the mean kinetic energy <v.v>/2 of its particles."""
+    particles, acceleration = mover.frame(time)
+    frames.store(clock.steps, time, particles, acceleration)
     energy = 0.5 * float(particles.velocity.double().square().sum())
     return float(global_sum(truth.decomposition.comm, energy)) / truth.total
 

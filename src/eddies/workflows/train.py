@@ -40,7 +40,7 @@ def run(scene: Scene, comm, directory: str | Path, stop: StopRequest | None = No
         return
     device, directory, stop = prepare_torch(scene.device, comm), Path(directory), stop or StopRequest(comm)
     with open_product(comm, directory / "ground_truth.h5", "ground_truth") as file:
-        truth = GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, scene.tracers.particles_per_side))
+        truth = GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes))
         data = TrainingData(scene, truth, load_kernel(comm, directory / "kernel.h5", device), device)
         model, last, tests = data.model, data.last, evaluation_frames(truth)
         log.info("train: frames up to %d of the times up to %.3g of %.3g, %d held out; %d weights", data.learned,

@@ -101,10 +101,10 @@ class TrainingData:
             return []
         interval, slab = scene.tracers.frame_interval, self.truth.decomposition
         drift = ALLOWED_VELOCITY * self.model.flow.scales.velocity * interval * self.longest
-        dynamics = ParticleDynamics(slab, self.model, 0.0, self.dtype, drift, fixed_ranks=True)
+        dynamics = ParticleDynamics(slab, self.model, 0.0, self.dtype, fixed_ranks=True, drift=drift)
         resolution = None
         if settings.energy_weight > 0:
-            resolution = dynamics.resolution or ResolvedVelocity.on_slabs(slab, self.dtype, drift=drift)
+            resolution = dynamics.resolution or ResolvedVelocity.on_slabs(slab, self.model.flow, drift)
         starts = np.unique(np.linspace(0, self.learned - self.longest, settings.frames).astype(int))
         windows = [self._window(start, resolution) for start in starts]
         validation = self._window(self.last - self.longest, resolution)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor, nn
 
@@ -12,15 +14,16 @@ from eddies.particles.rates import Rates
 from eddies.particles.terms import settings as declared
 from eddies.particles.terms.term import Term
 
-# The rates D to begin with: as those of a viscosity, growing as k^2.
-RATES = (torch.arange(1, 7, dtype=torch.float64) / 6) ** 2
+# The rates D to begin with: as those of a small viscosity, growing as k^2.
+RATES = 0.1 * (torch.arange(1, 7, dtype=torch.float64) / 6) ** 2
 
 
 class Damping(Term):
     """-D(k) u of the modes of the resolved velocity u, a spectral eddy viscosity (Kraichnan 1976).
 
-    D is v_rms/d times six learned values at wavenumbers equally spaced up to the highest that is resolved, linear
-    between them and from D(0) = 0.
+    D is k_c u_c times six learned values at wavenumbers equally spaced up to the highest that is resolved, k_c, linear
+    between them and from D(0) = 0. u_c is the rms of a component of the smallest resolved scales as they are now, the
+    modes of the unfiltered velocity above k_c/2: what the scales beyond take depends on how much of them there is.
     """
 
     Settings = declared.Damping
@@ -32,11 +35,12 @@ class Damping(Term):
 
     def forward(self, context: Context) -> Rates:
         """Modes of the force."""
-        flow, scales = context.resolved, context.flow.scales
-        return Rates(force_modes=-scales.velocity / scales.length * self._damping(flow.grid) * flow.velocity)
+        flow = context.resolved
+        highest = 2 * math.pi / context.decomposition.length * flow.grid.resolved
+        return Rates(force_modes=-highest * flow.smallest_rms * self._damping(flow.grid) * flow.velocity)
 
     def _damping(self, grid: FourierGrid) -> Tensor:
-        """D of each mode (kz, ky, kx), in units of v_rms/d."""
+        """D of each mode (kz, ky, kx), in units of k_c u_c."""
         rates = torch.cat([self.rates.new_zeros(1), self.rates]).double().cpu()
         place = grid.shell * (len(self.rates) / grid.resolved)
         below = place.long().clamp_max(len(self.rates) - 1)

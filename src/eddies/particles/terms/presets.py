@@ -28,12 +28,10 @@ RESOLVED = ("pressure", "stress", "viscosity", "damping", "relaxation")
 
 #: Of each preset the settings that differ from the terms' own, by term, in the order of the terms.
 PRESETS: dict[str, dict[str, Mapping[str, Any]]] = {
-    "poisson-stress": dict.fromkeys((*RESOLVED, "pairs"), {}),
     "resolved": dict.fromkeys(RESOLVED, {}),
-    "poisson-force": {"pressure": {}, "pairs": {}},
-    "poisson": {"pressure": {"force": False}, "pairs": {}},
+    "resolved + pairs": dict.fromkeys((*RESOLVED, "pairs"), {}),
     "learned-density": {"pairs": {}, "density-flux": {"zero_at_first": True}, "density-transport": {}},
-    "paper-density": {"pairs": {"basis": "paper", "hidden": (20, 100, 20)}, "density-flux": {"hidden": (20, 100, 20)}},
+    "paper": {"pairs": {"basis": "paper", "hidden": (20, 100, 20)}, "density-flux": {"hidden": (20, 100, 20)}},
     "wcsph": {"summation-density": {}, "wcsph": {}},
 }
-DEFAULT_PRESET = "poisson-stress"
+DEFAULT_PRESET = "resolved + pairs"

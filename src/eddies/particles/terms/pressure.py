@@ -17,8 +17,7 @@ class Pressure(Term):
 
     def forward(self, context: Context) -> Rates:
         """Modes of pressure and force."""
-        grid, velocity = context.resolved.grid, context.resolved.velocity
-        fields = grid.to_fields(velocity)
-        pressure = grid.pressure_of(grid.products(fields, fields))
+        grid = context.resolved.grid
+        pressure = grid.pressure_of(context.resolved.products)
         force = -grid.gradient(pressure) if self.settings.force else None
         return Rates(force_modes=force, pressure_modes=pressure)

@@ -14,7 +14,7 @@ from eddies.particles.terms.term import Term
 
 class Relaxation(Term):
     """-C (v - u) of what the resolved velocity u misses of a particle's v, less its mean over the particles, so that it
-    keeps their momentum. C is 2 v_rms/d times a learned factor."""
+    keeps their momentum. C is 2 u_rms/d times a learned factor, u_rms that of u as it is now."""
 
     Settings = declared.Relaxation
     linear = True
@@ -25,7 +25,7 @@ class Relaxation(Term):
 
     def forward(self, context: Context) -> Rates:
         """The acceleration."""
-        scales = context.flow.scales
-        missing = context.resolved.missing()
-        rate = 2 * scales.velocity / scales.length * self.factor.to(missing)
-        return Rates(acceleration=-rate * context.without_mean(missing))
+        flow = context.resolved
+        missing = context.without_mean(flow.missing())
+        rate = (2 * flow.rms / flow.filter_width).to(missing) * self.factor.to(missing)
+        return Rates(acceleration=-rate * missing)

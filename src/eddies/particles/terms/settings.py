@@ -123,7 +123,10 @@ class Pressure(TermSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class Stress(TermSettings):
-    """The stress that the filter hides, by the gradient model, and its pressure."""
+    """The stress that the filter hides, and its pressure."""
+
+    form: str = choice("of the model; deconvolution: of the velocity with the filter undone; gradient: the leading term "
+                       "of its expansion", "deconvolution", "gradient", default="deconvolution")
 
     reads = ("resolved",)
     gives = ("acceleration", "density")

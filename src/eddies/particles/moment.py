@@ -1,0 +1,58 @@
+"""Particles at a moment by their ids, and between two moments."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from eddies.parallel.migration import IdOrder
+from eddies.particles.particle_set import ParticleSet, as_numpy
+from eddies.particles.periodic_box import PeriodicBox
+from eddies.particles.rates import Rates
+
+
+@dataclass(frozen=True)
+class Moment:
+    """This rank's block of all particles in the order of their ids, wherever they are.
+
+    Parameters
+    ----------
+    time : of the moment.
+    first : the id that the block begins with.
+    position, velocity, acceleration : (n, 3).
+    """
+
+    time: float
+    first: int
+    position: np.ndarray
+    velocity: np.ndarray
+    acceleration: np.ndarray
+
+    @classmethod
+    def of(cls, comm, total: int, time: float, particles: ParticleSet, rates: Rates) -> Moment:
+        """That of particles on any ranks, `total` in all; collective."""
+        order = IdOrder(comm, as_numpy(particles.id), total)
+        columns = particles.position, particles.velocity, rates.acceleration
+        return cls(time, order.start, *(order.apply(as_numpy(column)) for column in columns))
+
+
+def between(before: Moment, after: Moment, time: float, box: PeriodicBox) -> ParticleSet:
+    """The particles at a time between two moments, in blocks by id: polynomials of fifth degree for positions and of
+    third for velocities (Hermite), which the positions, velocities and accelerations at both ends determine. Their
+    errors are of sixth and of fourth order in the time between."""
+    step = after.time - before.time
+    theta = (time - before.time) / step
+    moved = box.displacement(torch.from_numpy(after.position), torch.from_numpy(before.position)).numpy()
+    kick, drift = step * before.acceleration, step * before.velocity
+    # What remains at the end of the expansion about the first moment.
+    jump, turn = step * (after.velocity - before.velocity) - step * kick, step * (step * after.acceleration - kick)
+    miss = moved - drift - step * kick / 2
+    position = before.position + theta * (drift + theta * (step * kick / 2 + theta * (
+        10 * miss - 4 * jump + turn / 2 + theta * (-15 * miss + 7 * jump - turn + theta * (
+            6 * miss - 3 * jump + turn / 2)))))
+    jump, turn = jump / step, turn / step
+    velocity = before.velocity + theta * (kick + theta * (3 * jump - turn + theta * (turn - 2 * jump)))
+    ids = torch.arange(before.first, before.first + len(position))
+    return ParticleSet(ids, box.wrap(torch.from_numpy(position)), torch.from_numpy(velocity))
