@@ -104,14 +104,14 @@ class Tracers(Section):
 
     @property
     def cells(self) -> int:
-        """Cells along each side of the stored fields: as given, or `planes`."""
-        return self.planes if self.field_cells is None else self.field_cells
+        """Cells along each side of the stored fields: as given, or 1.5 particles_per_side rounded to even."""
+        return 2 * round(0.75 * self.particles_per_side) if self.field_cells is None else self.field_cells
 
     @property
     def planes(self) -> int:
-        """Layers at which the particles' slabs are cut: 1.5 particles_per_side rounded to even, the cells of the grid
-        on which their velocity is resolved."""
-        return 2 * round(0.75 * self.particles_per_side)
+        """Layers at which the particles' slabs are cut, cells of the grid on which their velocity is resolved: 1.75
+        particles_per_side rounded to even, so that modes up to 1.5 times their Nyquist wavenumber fit in."""
+        return 2 * round(0.875 * self.particles_per_side)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,7 +170,7 @@ class Simulation(Section):
     """The run of the particles, without the direct simulation."""
 
     method: str = named("what moves the particles; see Baselines", *METHODS, default="learned")
-    integrator: str = choice("time stepping of the particles", "verlet", "rk2", "rk3", "rk4", default="verlet")
+    integrator: str = choice("time stepping of the particles", "verlet", "rk2", "rk3", "rk4", default="rk3")
     step: float = number("time step; eulerian: the longest", above=0)
     turnovers: float = number("large-eddy turnovers to simulate", above=0)
     start: float | None = number("as a fraction of the ground truth; absent: where the training window ends",

@@ -113,11 +113,14 @@ class RungeKutta(Integrator):
 
     def _settled(self, stage: ParticleSet, *others: ParticleSet) -> list[ParticleSet]:
         """A stage on the ranks of its slabs, and other columns of its particles beside it."""
-        names = [name for name in stage.columns() if name != "id"]
-        companions = {f"{number} {name}": getattr(other, name) for number, other in enumerate(others) for name in names}
+        companions = {f"{number} {name}": column for number, other in enumerate(others)
+                      for name, column in other.columns().items() if name != "id"}
         stage, moved = self.dynamics.settle(stage, companions)
-        return [stage, *(ParticleSet(stage.id, **{name: moved[f"{number} {name}"] for name in names})
-                         for number in range(len(others)))]
+        found: list[dict[str, Tensor]] = [{"id": stage.id} for _ in others]
+        for place, column in moved.items():
+            number, name = place.split(" ", 1)
+            found[int(number)][name] = column
+        return [stage, *(ParticleSet(**columns) for columns in found)]
 
 
 REMEMBERED = ("acceleration", "density_rate", "density")

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import asdict, dataclass, fields
 
+MAY_VANISH = ("viscosity", "kolmogorov_length")
+
 
 @dataclass(frozen=True)
 class ReferenceScales:
@@ -21,8 +23,10 @@ class ReferenceScales:
     density : rms of the density fluctuation rho - rho_0.
     density_rate : rms of the rate of change of density along trajectories.
     sound_speed : speed of sound c.
+    kolmogorov_length : eta of the flow that was filtered, beyond whose wavenumber it has next to nothing; 0 without
+        viscosity.
 
-    The last three are None for a ground truth without density, that of an incompressible fluid. A flow at another Mach
+    Those of density and sound are None for a ground truth without density, that of an incompressible fluid. A flow at another Mach
     number supplies its own scales to the same network. Raises ValueError unless all that are given are finite and
     positive.
     """
@@ -36,12 +40,15 @@ class ReferenceScales:
     density: float | None = None
     density_rate: float | None = None
     sound_speed: float | None = None
+    kolmogorov_length: float = 0.0
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.viscosity) and self.viscosity >= 0):
-            raise ValueError(f"reference scale viscosity = {self.viscosity}: must be finite and not negative")
+        for name in MAY_VANISH:
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0):
+                raise ValueError(f"reference scale {name} = {value}: must be finite and not negative")
         for name, value in asdict(self).items():
-            if name != "viscosity" and value is not None and not (math.isfinite(value) and value > 0):
+            if name not in MAY_VANISH and value is not None and not (math.isfinite(value) and value > 0):
                 raise ValueError(f"reference scale {name} = {value}: must be finite and positive")
 
     def to_dict(self) -> dict[str, float | None]:

@@ -19,13 +19,17 @@ from eddies.particles.fourier_grid import FourierGrid, Points
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.rank_sums import mean_over_ranks, sum_over_ranks
 
-# The highest wavenumber that is resolved, in units of the particles' Nyquist wavenumber; the exponent of the prior's
-# power law, and how many times the energy that it expects beyond is taken for noise. Measured in docs/closure.md.
-RESOLVED_SHARE, EXPONENT, WEIGHT = 1.25, 11 / 3, 40.0
+# The highest wavenumber that is resolved, in units of the particles' Nyquist wavenumber, and in units of 1/eta, where
+# turbulence ends; the exponent of the prior's power law, and how many times the energy that it expects beyond is taken
+# for noise. Measured in docs/closure.md.
+BEYOND_NYQUIST, BEYOND_DISSIPATION, EXPONENT, WEIGHT = 1.5, 1.05, 11 / 3, 30.0
 # Residuals, relative to the velocities, at which a solve ends: one that starts from nothing, and one that starts from
 # what is foreseen. The latter's is spread over all modes, the former's is left in those that are hardest to tell.
 TOLERANCE, TOLERANCE_FORESEEN = 2e-4, 2e-3
 MOST_ITERATIONS = 300
+# How many times stronger the preconditioner holds the small scales back: their errors count most, as the filter is
+# undone, and the first iterations would make many of them.
+SMOOTHING = 5.0
 # No mode is resolved of which the filter leaves less.
 LEAST_TRANSFER = 1e-3
 # Wavenumber shells in a band of the energy.
@@ -125,6 +129,7 @@ class ResolvedVelocity:
 
     tolerance, tolerance_foreseen, most_iterations = TOLERANCE, TOLERANCE_FORESEEN, MOST_ITERATIONS
     iterations: int | None = None
+    smoothing = SMOOTHING
     #: iterations and residual of the solves of a run, and whether they converged, one after the other
     solves: list[tuple[int, float, bool]]
 
@@ -139,8 +144,10 @@ class ResolvedVelocity:
     @classmethod
     def on_slabs(cls, decomposition: SlabDecomposition, flow: FlowUnits, margin: float = 0.0) -> ResolvedVelocity:
         """On a grid of one cell for each plane of the slabs, for particles that lie at most `margin` outside them."""
-        nyquist = math.pi / flow.scales.spacing
-        highest = min(RESOLVED_SHARE * nyquist, math.sqrt(-24 * math.log(LEAST_TRANSFER)) / flow.scales.length)
+        scales = flow.scales
+        highest = min(BEYOND_NYQUIST * math.pi / scales.spacing, math.sqrt(-24 * math.log(LEAST_TRANSFER)) / scales.length)
+        if scales.kolmogorov_length > 0:
+            highest = min(highest, BEYOND_DISSIPATION / scales.kolmogorov_length)
         shells = int(highest * decomposition.length / (2 * math.pi) + 1e-9)
         resolved = min(max(shells, 1), (decomposition.planes - 1) // 2)
         planes = max(math.ceil(margin / decomposition.spacing - 1e-9), 1)
@@ -229,13 +236,13 @@ class ResolvedVelocity:
         begin, tolerance = self._size(right, count), self.tolerance if start is None else self.tolerance_foreseen
         if begin > square and start is not None:  # worse than nothing is
             return self._solved(replace(flow, velocity=torch.zeros_like(start)), None)
-        change, iterations, left = self._conjugate_gradients(flow.points, right, count, tolerance**2 * square)
+        change, iterations, left = self._conjugate_gradients(flow, right, count, tolerance**2 * square)
         # What is not finite has not converged.
         return replace(flow, velocity=flow.velocity + change, iterations=iterations,
                        residual=math.sqrt(left / square) if square > 0 else 0.0,
                        converged=self.iterations is not None or left <= tolerance**2 * square)
 
-    def _conjugate_gradients(self, points: Points, right: Tensor, count: float,
+    def _conjugate_gradients(self, flow: ResolvedFlow, right: Tensor, count: float,
                              enough: float) -> tuple[Tensor, int, float]:
         """Modes y with A y = `right` until the squared residual is `enough`; the iterations, and what is left of it."""
         inverse = self._preconditioner(count)
@@ -244,7 +251,7 @@ class ResolvedVelocity:
         left, iterations = self._product(residual, preconditioned), 0
         while (left > enough and iterations < self.most_iterations) if self.iterations is None else (
                 iterations < self.iterations and left > 0):
-            image = self._applied(direction, points)
+            image = self._applied(direction, flow)
             length = left / self._product(direction, image)
             found, residual = found + length * direction, residual - length * image
             preconditioned = inverse * residual
@@ -258,9 +265,9 @@ class ResolvedVelocity:
         missing = flow.relative_velocity.double() - self.grid.at(flow.velocity, flow.points)
         return self._gathered(missing, flow.points) - self._penalty * flow.velocity
 
-    def _applied(self, modes: Tensor, points: Points) -> Tensor:
+    def _applied(self, modes: Tensor, flow: ResolvedFlow) -> Tensor:
         """A = P B^T B + sigma^2/P_k on solenoidal modes; B gives values at the particles."""
-        return self._gathered(self.grid.at(modes, points), points) + self._penalty * modes
+        return self._gathered(self.grid.at(modes, flow.points), flow.points) + self._penalty * modes
 
     def _gathered(self, values: Tensor, points: Points) -> Tensor:
         """P B^T of values (n, 3) at the particles."""
@@ -270,7 +277,7 @@ class ResolvedVelocity:
         return torch.where(self._inside, self.grid.solenoidal(modes), 0.0)
 
     def _preconditioner(self, count: float) -> Tensor:
-        return torch.where(self._inside, 1 / (count + self._penalty), 0.0)
+        return torch.where(self._inside, 1 / (count + self.smoothing * self._penalty), 0.0)
 
     def _size(self, residual: Tensor, count: float) -> float:
         """Square of a residual, such that it is comparable to sum_i |v_i|^2."""
@@ -292,8 +299,7 @@ class ResolvedVelocity:
         def solve(gradient: Tensor) -> Tensor:
             # The part that belongs to a real field; what else there is has no effect on any value.
             right = self._solenoidal(grid.to_modes(grid.to_fields(gradient.resolve_conj() / grid.multiplicity)))
-            found, _, _ = self._conjugate_gradients(flow.points, right, count,
-                                                    self.tolerance**2 * self._size(right, count))
+            found, _, _ = self._conjugate_gradients(flow, right, count, self.tolerance**2 * self._size(right, count))
             return grid.multiplicity * found
 
         return solve

@@ -34,4 +34,4 @@ PRESETS: dict[str, dict[str, Mapping[str, Any]]] = {
     "paper": {"pairs": {"basis": "paper", "hidden": (20, 100, 20)}, "density-flux": {"hidden": (20, 100, 20)}},
     "wcsph": {"summation-density": {}, "wcsph": {}},
 }
-DEFAULT_PRESET = "resolved + pairs"
+DEFAULT_PRESET = "resolved"
