@@ -135,7 +135,8 @@ class ForceTrainer:
         self.comm, self.length = self.decomposition.comm, self.decomposition.length
         self.model, self.frames = model, frames
         self.kernel, self.weights, self.batch, self.seed = kernel, weights, min(batch, self.total), seed
-        self._points = grid_points(self.decomposition, round(self.total ** (1 / 3))).to(frames[0].particles.position.device)
+        points = grid_points(self.decomposition, round(self.total ** (1 / 3)))
+        self._points = points.to(frames[0].particles.position.device)
 
     def trajectory_step(self, descent: Descent, step: int) -> dict[str, float]:
         """One step on the trajectory loss of a random batch of particles (Eq. 12); returns the losses."""

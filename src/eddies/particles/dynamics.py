@@ -46,8 +46,8 @@ class ParticleDynamics:
         self.resolution: ResolvedVelocity | None = None
         self.surroundings: Surroundings | None = None
         if "resolved" in model.reads:
-            from eddies.particles.resolved_velocity import ResolvedVelocity  # pyfftw, where a transform is needed
-            self.resolution = ResolvedVelocity.on_slabs(decomposition, model.flow, skin / 2 + drift)
+            from eddies.particles import resolved_velocity  # pyfftw, where a transform is needed
+            self.resolution = resolved_velocity.ResolvedVelocity.on_slabs(decomposition, model.flow, skin / 2 + drift)
         if "pairs" in model.reads:
             self.surroundings = Surroundings(decomposition, decomposition.length, model.flow.cutoff, skin)
 

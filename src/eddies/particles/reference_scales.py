@@ -5,6 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import asdict, dataclass, fields
 
+# The highest wavenumber that particles resolve: in units of their Nyquist wavenumber; in units of 1/eta, where
+# turbulence ends; and the least that the filter may leave of a mode, as it is undone. Measured in docs/closure.md.
+BEYOND_NYQUIST, BEYOND_DISSIPATION, LEAST_TRANSFER = 1.5, 1.05, 0.02
 MAY_VANISH = ("viscosity", "kolmogorov_length")
 
 
@@ -23,11 +26,11 @@ class ReferenceScales:
     density : rms of the density fluctuation rho - rho_0.
     density_rate : rms of the rate of change of density along trajectories.
     sound_speed : speed of sound c.
-    kolmogorov_length : eta of the flow that was filtered, beyond whose wavenumber it has next to nothing; 0 without
+    kolmogorov_length : eta of the flow that was filtered, beyond whose wavenumber there is next to nothing; 0 without
         viscosity.
 
-    Those of density and sound are None for a ground truth without density, that of an incompressible fluid. A flow at another Mach
-    number supplies its own scales to the same network. Raises ValueError unless all that are given are finite and
+    Those of density and sound are None for a ground truth without density, that of an incompressible fluid. A flow at
+    another Mach number supplies its own scales to the same network. Raises ValueError unless all that are given are finite and
     positive.
     """
 
@@ -62,3 +65,9 @@ class ReferenceScales:
         if set(scales) != expected:
             raise ValueError(f"reference scales {sorted(scales)}: expected {sorted(expected)}")
         return cls(**scales)
+
+
+def resolved_wavenumber(spacing: float, filter_width: float, kolmogorov_length: float) -> float:
+    """k_c, the highest wavenumber of a filtered velocity that particles so far apart resolve."""
+    highest = min(BEYOND_NYQUIST * math.pi / spacing, math.sqrt(-24 * math.log(LEAST_TRANSFER)) / filter_width)
+    return min(highest, BEYOND_DISSIPATION / kolmogorov_length) if kolmogorov_length > 0 else highest

@@ -18,11 +18,11 @@ from eddies.particles.flow_units import FlowUnits
 from eddies.particles.fourier_grid import FourierGrid, Points
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.rank_sums import mean_over_ranks, sum_over_ranks
+from eddies.particles.reference_scales import resolved_wavenumber
 
-# The highest wavenumber that is resolved, in units of the particles' Nyquist wavenumber, and in units of 1/eta, where
-# turbulence ends; the exponent of the prior's power law, and how many times the energy that it expects beyond is taken
-# for noise. Measured in docs/closure.md.
-BEYOND_NYQUIST, BEYOND_DISSIPATION, EXPONENT, WEIGHT = 1.5, 1.05, 11 / 3, 30.0
+# The exponent of the prior's power law, and how many times the energy that it expects beyond the resolved modes is
+# taken for noise. Measured in docs/closure.md.
+EXPONENT, WEIGHT = 11 / 3, 30.0
 # Residuals, relative to the velocities, at which a solve ends: one that starts from nothing, and one that starts from
 # what is foreseen. The latter's is spread over all modes, the former's is left in those that are hardest to tell.
 TOLERANCE, TOLERANCE_FORESEEN = 2e-4, 2e-3
@@ -30,8 +30,6 @@ MOST_ITERATIONS = 300
 # How many times stronger the preconditioner holds the small scales back: their errors count most, as the filter is
 # undone, and the first iterations would make many of them.
 SMOOTHING = 5.0
-# No mode is resolved of which the filter leaves less.
-LEAST_TRANSFER = 1e-3
 # Wavenumber shells in a band of the energy.
 BAND = 2
 
@@ -145,9 +143,7 @@ class ResolvedVelocity:
     def on_slabs(cls, decomposition: SlabDecomposition, flow: FlowUnits, margin: float = 0.0) -> ResolvedVelocity:
         """On a grid of one cell for each plane of the slabs, for particles that lie at most `margin` outside them."""
         scales = flow.scales
-        highest = min(BEYOND_NYQUIST * math.pi / scales.spacing, math.sqrt(-24 * math.log(LEAST_TRANSFER)) / scales.length)
-        if scales.kolmogorov_length > 0:
-            highest = min(highest, BEYOND_DISSIPATION / scales.kolmogorov_length)
+        highest = resolved_wavenumber(scales.spacing, scales.length, scales.kolmogorov_length)
         shells = int(highest * decomposition.length / (2 * math.pi) + 1e-9)
         resolved = min(max(shells, 1), (decomposition.planes - 1) // 2)
         planes = max(math.ceil(margin / decomposition.spacing - 1e-9), 1)

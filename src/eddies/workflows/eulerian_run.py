@@ -63,8 +63,8 @@ class EulerianRun:
         return self.clock.time
 
     def advance(self, until: float, number: int) -> str | None:
-        """Take one of the equal steps to a time, as many as the Courant number of the flow now asks for, and none longer
-        than that of the scene; what is wrong with the state after it, on all ranks, or None."""
+        """Take one of the equal steps to a time, as many as the Courant number of the flow now asks for, and none
+        longer than that of the scene; what is wrong with the state after it, on all ranks, or None."""
         left = until - self.time
         longest = min(self.step_limit.bound(self.state, self.clock), self.longest_step)
         step = left / math.ceil(left / longest - 1e-9)

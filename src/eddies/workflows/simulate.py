@@ -40,8 +40,8 @@ class Mover(Protocol):
     time: float  # of its particles, since the start
 
     def advance(self, until: float, number: int) -> str | None:
-        """Take a step, the `number`-th of the run, that ends at a time or before it, or beyond it where `frame` can look
-        back; what is wrong with the state after it, on all ranks, or None."""
+        """Take a step, the `number`-th of the run, that ends at a time or before it, or beyond it where `frame` can
+        look back; what is wrong with the state after it, on all ranks, or None."""
 
     def frame(self, time: float) -> tuple[ParticleSet, torch.Tensor]:
         """The particles at a time that the last step reached, in any order, and their acceleration (n, 3)."""

@@ -1,4 +1,5 @@
-"""Pressure, hidden stress and viscosity of a filtered velocity of few modes against the exact ones.
+"""Pressure, hidden stress and viscosity of a filtered velocity of few modes against the exact ones, both forms of the
+stress.
 
 What is expected is made of the unfiltered velocity by plain transforms, never of the terms' own formulas.
 """
@@ -25,25 +26,24 @@ pytestmark = pytest.mark.mpi(1)
 MODES, PLANES, COUNT, NU = random_velocity(4), 48, 400, 0.05
 
 
-def lagrangian(width, *words):
+def lagrangian(width, *words, form="gradient", spacing=SCALES.spacing):
     """A model of these terms, and of one that reads a density."""
-    flow = FlowUnits(replace(SCALES, length=width, viscosity=NU), CUTOFF, NEIGHBORS)
-    terms = model({word: {} for word in words}, flow).terms
+    flow = FlowUnits(replace(SCALES, length=width, spacing=spacing, viscosity=NU), CUTOFF, NEIGHBORS)
+    terms = model({word: dict(form=form) if word == "stress" else {} for word in words}, flow).terms
     return LagrangianModel({**terms, "reader": DensityReader()}, flow)
 
 
 class Known:
     """In place of what resolves the particles' velocity: the modes that are there."""
 
-    reach = LENGTH / PLANES
-
-    def __init__(self, field):
+    def __init__(self, field, width):
         self.grid = FourierGrid(SlabDecomposition(MPI.COMM_SELF, LENGTH, PLANES), 10)
         coarse = FourierGrid(SlabDecomposition(MPI.COMM_SELF, LENGTH, CELLS), 10)
-        self.modes = coarse.to_modes(torch.from_numpy(fields_of(field.velocity)))
+        self.modes, self.width = coarse.to_modes(torch.from_numpy(fields_of(field.velocity))), width
 
-    def of(self, particles, local):
-        return ResolvedFlow(self.grid, self.modes, self.grid.points(particles.position), particles.velocity)
+    def of(self, particles, time):
+        points = self.grid.points(particles.position)
+        return ResolvedFlow(self.grid, self.modes, points, particles.velocity, self.width)
 
 
 def particles_in(field, position):
@@ -52,10 +52,11 @@ def particles_in(field, position):
 
 
 @torch.no_grad()
-def found(field, width, position, *words):
+def found(field, width, position, *words, form="gradient"):
     """Acceleration and density by terms where the resolved velocity is exact."""
-    dynamics = ParticleDynamics(SlabDecomposition(MPI.COMM_SELF, LENGTH, PLANES), lagrangian(width, *words), 0.1)
-    dynamics.resolution = Known(field)
+    slab = SlabDecomposition(MPI.COMM_SELF, LENGTH, PLANES)
+    dynamics = ParticleDynamics(slab, lagrangian(width, *words, form=form), 0.1)
+    dynamics.resolution = Known(field, width)
     rates = dynamics.rates(particles_in(field, position))
     return rates.acceleration.numpy(), rates.density.numpy()
 
@@ -89,11 +90,26 @@ def test_the_force_is_that_of_the_filtered_equations_to_the_fourth_power_of_the_
     assert errors[0.4] < 2e-3 and errors[0.2] < 3e-4
 
 
+def test_by_deconvolution_force_and_density_are_exact():
+    """All modes are known, so nothing but the splines' error is left, at any width."""
+    position, c = LENGTH * np.random.default_rng(2).random((COUNT, 3)), SCALES.sound_speed
+    for width in (0.4, 1.6):
+        field = Filtered(MODES, width)
+        force, density = found(field, width, position, *ALL, form="deconvolution")
+        exact = at(field.force(NU), position)
+        assert error(force, exact) < 3e-4
+        pressure = at(field.pressure[None], position)[:, 0]
+        assert np.linalg.norm((density - 1) * c**2 - pressure) < 3e-4 * np.linalg.norm(pressure)
+        # Without the stress's pressure, and without the stress, it is another force.
+        for wrong in (unprojected(field), field.force(NU, hidden=False)):
+            assert error(at(wrong, position), exact) > 0.02
+
+
 def test_the_stress_of_the_terms_without_projection_is_another_force():
     """The terms' own modes of div tau, not projected, differ from the exact force as much as no stress does."""
     width, position = 0.4, LENGTH * np.random.default_rng(2).random((COUNT, 3))
     field = Filtered(MODES, width)
-    known, exact = Known(field), at(field.force(), position)
+    known, exact = Known(field, width), at(field.force(), position)
     grid = known.grid
     slopes = grid.slopes(known.modes)
     divergence = grid.stress_divergence(width**2 / 12 * grid.products(slopes, slopes))
@@ -149,16 +165,17 @@ def test_the_filtered_equations_hold_for_what_is_called_exact():
 
 
 def test_the_force_at_particles_that_resolve_their_velocity():
-    """Through averages and deconvolution: 20^3 particles of wavenumbers up to 3."""
+    """Through the solve: 20^3 particles of wavenumbers up to 3."""
     side, width = 20, 0.8
     position = lattice_positions(3, side, 0, side**3, LENGTH)
     field = Filtered(MODES, width)
-    exact = at(field.force(NU), position)
+    exact, slab = at(field.force(NU), position), SlabDecomposition(MPI.COMM_SELF, LENGTH, 34)
     errors = {}
     with torch.no_grad():
-        for words in (ALL, ("pressure", "viscosity")):
-            dynamics = ParticleDynamics(SlabDecomposition(MPI.COMM_SELF, LENGTH, side), lagrangian(width, *words), 0.1)
-            errors[words] = error(dynamics.rates(particles_in(field, position)).acceleration.numpy(), exact)
-    # The model's next order alone: 0.023 of the force.
-    assert errors[ALL] < 0.03
-    assert min(errors["pressure", "viscosity"], error(at(unprojected(field), position), exact)) > 4 * errors[ALL]
+        for form, words in (("deconvolution", ALL), ("gradient", ALL), ("none", ("pressure", "viscosity"))):
+            terms = lagrangian(width, *words, form=form, spacing=LENGTH / side)
+            rates = ParticleDynamics(slab, terms, 0.0).rates(particles_in(field, position))
+            errors[form] = error(rates.acceleration.numpy(), exact)
+    # The gradient model's next order alone is 0.023 of the force.
+    assert errors["deconvolution"] < 0.01 and errors["gradient"] < 0.03
+    assert min(errors["none"], error(at(unprojected(field), position), exact)) > 4 * errors["gradient"]

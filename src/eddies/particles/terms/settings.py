@@ -125,8 +125,8 @@ class Pressure(TermSettings):
 class Stress(TermSettings):
     """The stress that the filter hides, and its pressure."""
 
-    form: str = choice("of the model; deconvolution: of the velocity with the filter undone; gradient: the leading term "
-                       "of its expansion", "deconvolution", "gradient", default="deconvolution")
+    form: str = choice("deconvolution: of the velocity with the filter undone; gradient: the leading term of its "
+                       "expansion in the filter width", "deconvolution", "gradient", default="deconvolution")
 
     reads = ("resolved",)
     gives = ("acceleration", "density")
