@@ -195,14 +195,14 @@ def test_scene_reference():
 ])
 def test_a_table_explains_every_choice(words, default, heading):
     table = README.split(heading)[1].split("\n\n")[0]
-    assert re.findall(r"^\| `([a-z-]+)`", table, re.MULTILINE) == list(words)
+    assert re.findall(r"^\| `([a-z +-]+)`", table, re.MULTILINE) == list(words)
     assert re.findall(r"^\| `([a-z-]+)` \(default\)", table, re.MULTILINE) == [default]
 
 
 def test_table_of_presets_lists_their_terms():
     table = README.split("| preset | terms |")[1].split("\n\n")[0]
     for preset, terms in PRESETS.items():
-        (listed,) = re.findall(rf"^\| `{preset}`[^|]*\|([^|]*)\|", table, re.MULTILINE)
+        (listed,) = re.findall(rf"^\| `{re.escape(preset)}`[^|]*\|([^|]*)\|", table, re.MULTILINE)
         assert re.findall(r"`([a-z-]+)`", listed) == list(terms)
 
 

@@ -30,8 +30,8 @@ class ReferenceScales:
         viscosity.
 
     Those of density and sound are None for a ground truth without density, that of an incompressible fluid. A flow at
-    another Mach number supplies its own scales to the same network. Raises ValueError unless all that are given are finite and
-    positive.
+    another Mach number supplies its own scales to the same network. Raises ValueError unless all that are given are
+    finite and positive.
     """
 
     length: float

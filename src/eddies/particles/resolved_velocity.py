@@ -105,7 +105,7 @@ class ResolvedVelocity:
 
     as is done for measured particle tracks (Gesemann et al. 2016). The velocities v_i are relative to their mean over
     all particles. P_k ~ k^(-11/3) G^2, G the transfer of the filter, is the energy expected of a mode, and sigma^2
-    `WEIGHT` times what this law has beyond k_c, which is noise to the modes within; both in units of the velocities, so
+    `weight` times what this law has beyond k_c, which is noise to the modes within; both in units of the velocities, so
     that their ratio is a number. As the filtered velocity is smooth and solenoidal, modes beyond the particles' Nyquist
     wavenumber can be told.
 
@@ -120,6 +120,7 @@ class ResolvedVelocity:
     ----------
     grid : where the velocity is resolved.
     filter_width : d of the filter.
+    weight : of what is expected beyond k_c, taken for noise.
 
     Differentiable in the particles' positions and velocities: on the way back the same system is solved. All ranks call
     it together. Raises HaloError, on all ranks, where a particle lies farther outside its slab than the grid reaches.
@@ -131,13 +132,13 @@ class ResolvedVelocity:
     #: iterations and residual of the solves of a run, and whether they converged, one after the other
     solves: list[tuple[int, float, bool]]
 
-    def __init__(self, grid: FourierGrid, filter_width: float) -> None:
+    def __init__(self, grid: FourierGrid, filter_width: float, weight: float = WEIGHT) -> None:
         self.grid, self.filter_width = grid, filter_width
         self._inside = (grid.shell > 0) & (grid.shell <= grid.resolved)
         self._moments: list[_Moment] = []
         self.solves = []
         law, tail = _prior(grid, filter_width, self._inside)
-        self._penalty = torch.where(self._inside, WEIGHT * tail / (3 * torch.where(self._inside, law, 1.0)), 0.0)
+        self._penalty = torch.where(self._inside, weight * tail / (3 * torch.where(self._inside, law, 1.0)), 0.0)
 
     @classmethod
     def on_slabs(cls, decomposition: SlabDecomposition, flow: FlowUnits, margin: float = 0.0) -> ResolvedVelocity:

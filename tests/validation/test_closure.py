@@ -1,0 +1,36 @@
+"""The program that measures the closure, on a small flow."""
+
+import pytest
+from closure import figure, measure
+from matplotlib.figure import Figure
+
+from eddies.scene import load_scene
+from eddies.workflows import dns
+
+SCENE = """
+title = "decaying turbulence with tracers"
+[flow]
+fluid = "incompressible"
+cells = 32
+viscosity = 0.03
+[initial]
+kind = "random"
+amplitude = 1.0
+peak_wavenumber = 2
+[tracers]
+particles_per_side = 16
+turnovers = 0.1
+frame_interval = 0.02
+field_every = 2
+"""
+
+
+@pytest.mark.mpi(1)
+def test_errors_over_wavenumbers_and_iterations(comm, tmp_path):
+    (tmp_path / "scene.toml").write_text(SCENE)
+    dns.run(load_scene(tmp_path / "scene.toml"), comm, tmp_path)
+    found = measure(tmp_path, shares=(0.75, 1.25), iterations=(2, 20))
+    coarse, fine = (error for error, _ in found["by_weight"]["30"])
+    assert fine < 0.5 * coarse < 0.5 and found["by_iterations"][1] < found["by_iterations"][0]
+    assert all(len(rows) == 2 for rows in (found["gradient"], *found["by_weight"].values()))
+    assert isinstance(figure({"a run": found}), Figure)
