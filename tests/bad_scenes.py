@@ -22,8 +22,9 @@ BAD_TEXTS = [
     (FLOW + LEARNING + '[simulation]\nmethod = "wcsph"\nstep = 1\nturnovers = 1\nframe_interval = 1\n',
      '[simulation] method = "wcsph": starts from the density, which an incompressible flow does not have; choose '
      'another, or set [flow] fluid = "compressible" and sound_speed'),
-    (FLOW + LEARNING + MODEL, '[model.pairs]: reads the density, which an incompressible flow does not have; leave '
-     '"density" out of [model.pairs] inputs, or set [flow] fluid = "compressible" and sound_speed'),
+    (FLOW + LEARNING + MODEL + 'preset = "resolved + pairs"\n', '[model.pairs]: reads the density, which an '
+     'incompressible flow does not have; leave "density" out of [model.pairs] inputs, or set [flow] fluid = '
+     '"compressible" and sound_speed'),
     (FLOW + LEARNING + MODEL + 'terms = ["eddy-viscosity", "density-transport"]\n',
      '[model.density-transport]: reads the density, which an incompressible flow does not have; remove '
      '"density-transport", or set [flow] fluid'),
@@ -63,8 +64,8 @@ BAD_OVERRIDES = [
     ("kernel.hidden=16", "must be a list such as [16, 16]"),
     ("model.hidden=[16]", "[model] hidden: no such key; valid here: preset, terms, path"),
     ("model.closure=poisson", "[model] closure: no such key; valid here: preset, terms, path"),
-    ("model.preset=wide", '[model] preset = "wide": must be one of "poisson-stress", "resolved", "poisson-force", '
-     '"poisson", "learned-density", "paper-density", "wcsph" ('),
+    ("model.preset=wide", '[model] preset = "wide": must be one of "resolved", "resolved + pairs", "learned-density", '
+     '"paper", "wcsph" ('),
     ("model.preset=resolve", "did you mean resolved?"),
     ("model.pairs=3", "[model] pairs: no such key"),
     ("model.pair.hidden=[8]", "[model.pair]: no such term; did you mean pairs? the terms are pressure, stress, "
@@ -79,6 +80,7 @@ BAD_OVERRIDES = [
     ("model.pairs.symmetry=odd", '[model.pairs] symmetry = "odd": must be one of "none", "antisymmetric"'),
     ("model.pairs.symmetry=antisymmetric", 'with basis = "corrected" the forces of a pair are not opposite'),
     ("model.pressure.force=yes", '[model.pressure] force = "yes": must be true or false (whether -grad p acts'),
+    ("model.stress.form=exact", '[model.stress] form = "exact": must be one of "deconvolution", "gradient" ('),
     ("model.damping.strength=1", "[model.damping] strength: no such key; valid here: no key"),
     ("model.path=3", "[model] path = 3: must be a text in quotes (run directory or model.h5"),
     ("training.window=1.5", "must be a number above 0 and at most 1"),
@@ -93,19 +95,20 @@ BAD_OVERRIDES = [
     ("training.horizon_steps=-1", "[training] horizon_steps = -1: must be a whole number at least 0"),
     ("training.horizon_step=0", "[training] horizon_step = 0: must be a number above 0"),
     ("training.horizon_step=0.03", "[tracers] frame_interval = 0.02 must be a whole multiple of it; change either"),
-    ("training.horizon_integrator=euler", 'horizon_integrator = "euler": must be one of "verlet", "rk2", "rk4"'),
+    ("training.horizon_integrator=euler", 'horizon_integrator = "euler": must be one of "verlet", "rk2", "rk3", "rk4"'),
     ("training.horizon_learning_rate=0", "[training] horizon_learning_rate = 0: must be a number above 0"),
     ("training.energy_weight=-1", "[training] energy_weight = -1: must be a number at least 0"),
     ("training.noise=-0.1", "[training] noise = -0.1: must be a number at least 0"),
     ("training.patience=0", "[training] patience = 0: must be a whole number at least 1"),
-    ("simulation.step=0.03", "must be a whole multiple of step = 0.03"),
+    ("simulation.integrator=verlet", "[simulation] frame_interval = 0.1: must be a whole multiple of step = 0.08 with "
+     'integrator = "verlet", which does not tell what is between steps'),
     ("simulation.frame_interval=0.05", "must be a whole multiple of"),
     ("simulation.force=none", "[simulation] force: no such key; valid here: method, "),
     ("simulation.method=magnetic", 'must be one of "learned", "none", "wcsph", "eulerian", or the import path'),
     ("simulation.method=nowhere:Run", '[simulation] method: "nowhere:Run": there is no module "nowhere"; put it'),
     ("flow.fluid=eddies.flow.navier_stokes:Honey", 'eddies.flow.navier_stokes has no Honey'),
     ("initial.kind=eddies.logs:log", '[initial] kind: "eddies.logs:log": eddies.logs has no log'),
-    ("simulation.method=wcsph", "[simulation] step = 0.02: method = \"wcsph\" must resolve sound, with a step of"),
+    ("simulation.method=wcsph", "[simulation] step = 0.08: method = \"wcsph\" must resolve sound, with a step of"),
     ("simulation.start=1", "[simulation] start = 1: must be a number at least 0 and below 1"),
     ("simulation.skin=2", "[simulation] skin = 2: must be a number at least 0 and at most 1"),
     ("wcsph.kernel=gaussian", '[wcsph] kernel = "gaussian": must be one of "cubic-spline", "wendland"'),

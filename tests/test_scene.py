@@ -171,6 +171,13 @@ def test_bad_override(override, message):
     assert message in str(error.value)
 
 
+@pytest.mark.parametrize("integrator", ["rk2", "rk3", "rk4"])
+def test_steps_of_a_scheme_that_tells_what_is_between_need_not_fall_on_frames(integrator):
+    scene = load_scene("tiny", [f"simulation.integrator={integrator}", "simulation.step=0.07"])
+    assert (scene.simulation.step, scene.simulation.frame_interval) == (0.07, 0.1)
+    assert load_scene("tiny", ["simulation.integrator=verlet", "simulation.step=0.05"]).simulation.step == 0.05
+
+
 def test_override_is_named_as_the_origin():
     with pytest.raises(SceneError, match=r"tiny.toml, --set: \[flow\] cells = 3: "):
         load_scene("tiny", ["flow.cells=3"])

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from eddies.particles.terms.presets import DEFAULT_PRESET, PRESETS, TERMS
-from eddies.particles.terms.settings import DensityTransport, PairNetwork, Pressure
+from eddies.particles.terms.settings import DensityTransport, PairNetwork, Pressure, Stress
 from eddies.scene import STAGES, Flow, Initial, Model, Scene, SceneError, Simulation, Time, load_scene
 from eddies.scene_model import settings_class
 
@@ -61,7 +61,7 @@ def test_without_anything_the_model_is_the_default_preset(tmp_path):
     model = read(tmp_path, COMPRESSIBLE + "[model]\n").model
     assert model == Model() == Model(preset=DEFAULT_PRESET)
     assert model.terms == tuple(PRESETS[DEFAULT_PRESET]) == tuple(model.settings)
-    assert model.settings["pairs"] == PairNetwork()
+    assert model.settings["stress"] == Stress() and model.settings["stress"].form == "deconvolution"
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -82,12 +82,12 @@ def test_every_term_has_settings_that_are_explained(word):
 
 
 def test_keys_of_a_term_are_written_over_those_of_the_preset(tmp_path):
-    scene = read(tmp_path, COMPRESSIBLE + '[model]\npreset = "paper-density"\n[model.pairs]\nhidden = [4]\n',
+    scene = read(tmp_path, COMPRESSIBLE + '[model]\npreset = "paper"\n[model.pairs]\nhidden = [4]\n',
                  "model.density-flux.hidden=[5, 5]", 'model.pairs.inputs=["distance", "density"]')
     pairs, flux = scene.model.settings["pairs"], scene.model.settings["density-flux"]
     assert (pairs.basis, pairs.hidden, pairs.inputs, flux.hidden) == ("paper", (4,), ("distance", "density"), (5, 5))
-    assert Model(preset="paper-density", settings={"pairs": {"hidden": [4]}}).settings["pairs"].basis == "paper"
-    whole = Model(preset="paper-density", settings={"pairs": PairNetwork(hidden=(4,))}).settings["pairs"]
+    assert Model(preset="paper", settings={"pairs": {"hidden": [4]}}).settings["pairs"].basis == "paper"
+    whole = Model(preset="paper", settings={"pairs": PairNetwork(hidden=(4,))}).settings["pairs"]
     assert whole == PairNetwork(hidden=(4,))
 
 
@@ -109,8 +109,9 @@ def test_what_terms_read_and_give():
     (dict(terms="pressure"), '[model] terms = "pressure": must be a list of any of "pairs", "eddy-viscosity"'),
     (dict(terms=("pressure",), preset="wcsph"), "the list is given twice; remove one of the two"),
     (dict(terms=("pressure",), settings={"pairs": {}}), "[model.pairs]: no such term; the terms are pressure; remove"),
-    (dict(settings={"pairs": Pressure()}), "[model.pairs]: must be settings of the class PairNetwork, or a dict"),
-    (dict(settings={"pairs": 3}), "model.pairs = 3: must be a section"),
+    (dict(terms=("pairs",), settings={"pairs": Pressure()}),
+     "[model.pairs]: must be settings of the class PairNetwork, or a dict"),
+    (dict(terms=("pairs",), settings={"pairs": 3}), "model.pairs = 3: must be a section"),
     (dict(terms=("own_nowhere:Term",)), '[model] terms: "own_nowhere:Term": there is no module "own_nowhere"'),
     (dict(terms=("eddies.scene:load_scene",)), "must be a class derived from eddies.Term"),
 ])
@@ -125,7 +126,7 @@ def test_bad_model(changes, message):
     (lambda: Flow(fluid="incompressible", cells=None, viscosity=1), "[flow] cells = None: must be a whole number"),
     (lambda: PairNetwork(hidden=(0,)), "[PairNetwork] hidden = [0]: must be a list such as [16, 16]"),
     (lambda: PairNetwork(symmetry="antisymmetric"), "the forces of a pair are not opposite"),
-    (lambda: Model(settings={"pairs": {"hidden": 3}}), "[model.pairs] hidden = 3: must be a list"),
+    (lambda: Model(terms=("pairs",), settings={"pairs": {"hidden": 3}}), "[model.pairs] hidden = 3: must be a list"),
     (lambda: Scene(flow=3, time=Time(duration=1)), "flow = 3: must be a Flow"),
     (lambda: Scene(seed=-1, flow=Flow(fluid="incompressible", cells=8, viscosity=1)), "seed = -1: must be a whole"),
     (lambda: replace(load_scene("tiny").flow, viscosity="thin"), '[flow] viscosity = "thin": must be a number'),
@@ -200,8 +201,8 @@ class Honey(Honey0): pass
 def swirl(grid, initial, seed): pass
 class Run:
     needs = ("model",)
-    def steps(self): pass
-    advance = frame = series = description = has_density = steps
+    def advance(self, until, number): pass
+    frame = status = series = description = has_density = advance
 """)
     text = load_scene("tiny").to_toml().partition("[model]")
     bare = text[0] + "[model]\n[training]" + text[2].partition("[training]")[2]
@@ -221,7 +222,8 @@ def test_provenance_names_no_classes_where_there_are_none():
 
 def test_who_reads_no_density_needs_none(tmp_path):
     simulation = "[simulation]\nstep = 0.02\nframe_interval = 0.1\nturnovers = 0.2\n"
-    free = INCOMPRESSIBLE + '[model]\n[model.pairs]\ninputs = ["distance", "speed"]\n' + simulation
+    pairs = '[model]\npreset = "resolved + pairs"\n[model.pairs]\ninputs = ["distance", "speed"]\n'
+    free = INCOMPRESSIBLE + pairs + simulation
     assert read(tmp_path, free).stages == STAGES
     assert "density" not in read(tmp_path, free).model.reads
     bare = INCOMPRESSIBLE.replace("[training]\nframes = 2\nbatch = 9\nsteps = 3\n", "") + simulation
@@ -246,7 +248,8 @@ def test_a_density_is_given_once(tmp_path):
     ("flow.fluid", "eddies.scene:load_scene", '[flow] fluid: "eddies.scene:load_scene": cannot be used here, it has no '
      "nonlinear, linear, linear_function, combine, compressible"),
     ("initial.kind", "eddies.scene:STAGES", "cannot be used here, it has no __call__"),
-    ("simulation.method", "eddies.scene:Scene", "cannot be used here, it has no steps, advance, frame"),
+    ("simulation.method", "eddies.scene:Scene", "cannot be used here, it has no advance, frame, status, "
+     "series, description, has_density"),
     ("model.pairs.network", "eddies.scene:Scene", "[model.pairs] network: \"eddies.scene:Scene\": cannot be used here, "
      "it has no forward"),
 ])
@@ -275,7 +278,7 @@ def test_a_scene_with_a_model_loads_no_torch():
 
 def test_another_list_on_the_command_line_takes_the_place_of_the_file_s(tmp_path):
     """Of a preset, of terms, and of a written scene, which has settings of all its terms."""
-    written = load_scene("hit-small", ["model.pairs.hidden=[8, 8]"]).to_toml()
+    written = load_scene("hit-small", ["model.preset=resolved + pairs", "model.pairs.hidden=[8, 8]"]).to_toml()
     assert load_scene("hit-small", ['model.terms=["pressure", "pairs"]']).model.terms == ("pressure", "pairs")
     found = read(tmp_path, written, "model.preset=resolved").model
     assert found.terms == tuple(PRESETS["resolved"]) == tuple(found.settings)

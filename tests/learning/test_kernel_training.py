@@ -26,7 +26,7 @@ def sample_of(comm, support):
     slab = SlabDecomposition(comm, LENGTH, CELLS)
     position = torch.from_numpy(release(slab, 3, PER_SIDE, "random")["position"])
     cloud = ParticleCloud(slab, support, position, flow(position)[0], torch.float64)
-    return KernelSample(cloud, *flow(grid_points(slab)))
+    return KernelSample(cloud, *flow(grid_points(slab, CELLS)))
 
 
 def fit(comm, support=2.4 * SPACING, steps=4, rates=(1e-3, 1e-3)):

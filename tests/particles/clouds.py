@@ -48,7 +48,11 @@ PAIR_MODELS = {
     "without density": {"pairs": dict(inputs=("distance", "speed", "approach"))},
 }
 #: Models with a resolved velocity.
-RESOLVED_MODELS = {name: PRESETS[name] for name in ("poisson", "poisson-force", "poisson-stress", "resolved")}
+RESOLVED_MODELS = {
+    "pressure for the density": {"pressure": dict(force=False), "pairs": {}},
+    "pressure": {"pressure": {}, "pairs": {}},
+    **{name: PRESETS[name] for name in ("resolved + pairs", "resolved")},
+}
 MODELS = PAIR_MODELS | RESOLVED_MODELS
 
 
@@ -123,8 +127,14 @@ def of_terms(*terms, flow=FLOW):
     return LagrangianModel({f"{type(term).__name__} {number}": term for number, term in enumerate(terms)}, flow)
 
 
-def dynamics_of(slab, lagrangian, skin=0.2, **options):
-    return ParticleDynamics(slab, lagrangian, skin, **options)
+def dynamics_of(slab, lagrangian, skin=0.2, iterations=None, tolerance=None, **options):
+    """Dynamics; a number of iterations of the solves for a resolved velocity, or the residual at which they end."""
+    dynamics = ParticleDynamics(slab, lagrangian, skin, **options)
+    if dynamics.resolution is not None:
+        dynamics.resolution.iterations = iterations
+        if tolerance is not None:
+            dynamics.resolution.tolerance = dynamics.resolution.tolerance_foreseen = tolerance
+    return dynamics
 
 
 def rates(lagrangian, position, velocity, density=None, skin=0.3, dtype=None, planes=13):
@@ -135,8 +145,8 @@ def rates(lagrangian, position, velocity, density=None, skin=0.3, dtype=None, pl
 
 
 def given(rates):
-    """The rates that there are, by name."""
-    return {name: rate for name, rate in vars(rates).items() if rate is not None}
+    """The rates of particles that there are, by name."""
+    return {name: rate for name, rate in vars(rates).items() if rate is not None and not name.endswith("modes")}
 
 
 def scaled_pairs(position, velocity, density=None, once=False, flow=FLOW):

@@ -47,8 +47,24 @@ def test_velocities_spread_on_the_grid_are_those_of_the_neighbours_of_its_points
 def test_a_smooth_field_and_its_gradient_on_any_number_of_ranks(comm):
     cloud = cloud_of(comm, lambda x: torch.stack([torch.sin(x[:, 1]), torch.sin(x[:, 2]), torch.sin(x[:, 0])], dim=1))
     velocity, gradient = cloud.on_whole_grid(WendlandC2(2.5 * LENGTH / 16))
-    points = grid_points(cloud.decomposition)
+    points = grid_points(cloud.decomposition, cloud.decomposition.planes)
     # The kernel attenuates k = 1 by a few percent, and the jittered lattice adds noise of that order.
     assert largest(comm, velocity[:, 0] - torch.sin(points[:, 1])) < 0.12
     assert largest(comm, gradient[:, 1, 2] - torch.cos(points[:, 2])) < 0.4
     assert largest(comm, gradient[:, 1, 0]) < 0.4
+
+
+@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.parametrize("cells", [16, 36])
+def test_the_slabs_share_the_points_of_a_grid(comm, cells):
+    """Each stands on one rank; of a grid with a cell for each plane, on the rank of that plane."""
+    for planes in (cells, 3 * cells // 2):
+        slab = SlabDecomposition(comm, LENGTH, planes)
+        points = grid_points(slab, cells)
+        heights = torch.unique(points[:, 2])
+        axis = torch.arange(cells, dtype=torch.float64) * (LENGTH / cells)
+        assert len(points) == len(heights) * cells**2
+        assert torch.equal(points[: cells**2, :2].flip(1), torch.cartesian_prod(axis, axis))
+        assert torch.equal(torch.cat(comm.allgather(heights)), axis)
+        if planes == cells:
+            assert torch.equal(heights, axis[slab.start : slab.stop])

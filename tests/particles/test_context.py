@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import pytest
 import torch
 
+from eddies.parallel.halo import HaloExchange
 from eddies.particles import context as context_module
 from eddies.particles import moments
 from eddies.particles.neighbor_list import NeighborList
@@ -37,26 +38,28 @@ class Counted:
 @pytest.mark.mpi(1, 2)
 def test_terms_share_pairs_columns_and_the_resolved_velocity(comm, monkeypatch):
     slab, particles = distributed(comm, *state())
-    terms = {**MODELS["poisson-stress"], "eddy-viscosity": {}, "density-flux": {}}
+    terms = {**MODELS["resolved + pairs"], "eddy-viscosity": {}, "density-flux": {}}
     dynamics = dynamics_of(slab, model(terms))
     dynamics.rates(particles)
     pairs = Counted(monkeypatch, NeighborList, "pairs")
     resolved = Counted(monkeypatch, ResolvedVelocity, "of")
     with torch.no_grad():
         dynamics.rates(particles, torch.arange(3))
-    # Particles around grid points; pairs before the density is known, and after.
-    assert resolved.calls["of"] == 1 and pairs.calls["pairs"] == 3
+    # Pairs before the density is known, and after.
+    assert resolved.calls["of"] == 1 and pairs.calls["pairs"] == 2
 
 
 @pytest.mark.mpi(1, 2)
-def test_a_model_without_pairs_lists_none_and_sees_as_far_as_its_averages(comm):
+def test_a_model_without_pairs_sees_none_but_its_own_particles(comm, monkeypatch):
     slab, particles = distributed(comm, *state())
     dynamics = dynamics_of(slab, model(MODELS["resolved"]))
-    dynamics.rates(particles)
-    assert dynamics.surroundings.neighbors is None
-    assert dynamics.surroundings.halo_cutoff == dynamics.resolution.reach < CUTOFF
-    both = dynamics_of(slab, model(MODELS["poisson-stress"]))
-    assert both.surroundings.halo_cutoff == CUTOFF
+    halo, lists = Counted(monkeypatch, HaloExchange, "__init__"), Counted(monkeypatch, NeighborList, "__init__")
+    dynamics.rates(dynamics.settle(particles)[0])
+    assert dynamics.surroundings is None and halo.calls == lists.calls == {"__init__": 0}
+    both = dynamics_of(slab, model(MODELS["resolved + pairs"]))
+    both.rates(particles)
+    assert both.surroundings.cutoff == both.surroundings.neighbors.cutoff == CUTOFF
+    assert halo.calls == lists.calls == {"__init__": 1}
 
 
 class Asking(Term):
@@ -83,8 +86,7 @@ class ReadsPairs(TermSettings):
 
 @pytest.mark.mpi(1)
 @pytest.mark.parametrize("name, settings, wanted", [
-    ("pairs", None, '"pairs" or "resolved"'), ("velocity", None, '"pairs" or "resolved"'),
-    ("resolved", None, '"resolved"'),
+    ("pairs", None, '"pairs"'), ("velocity", None, '"pairs"'), ("resolved", None, '"resolved"'),
     ("density", ReadsPairs(), '"density"'), ("resolved", ReadsPairs(), '"resolved"')])
 def test_what_a_term_does_not_declare_it_is_told_to(comm, name, settings, wanted):
     slab, particles = alone(*state()[:2])

@@ -8,7 +8,7 @@ from clouds import (
     of_terms, state,
 )
 
-from eddies.parallel.halo import HaloExchange
+from eddies.parallel.halo import HaloError, HaloExchange
 from eddies.parallel.reduction import global_sum, sum_flat
 from eddies.particles import context, surroundings
 from eddies.particles.dense_network import DenseNetwork
@@ -19,12 +19,14 @@ from eddies.particles.terms.settings import TermSettings
 from eddies.particles.terms.term import Term
 
 SKIN = 0.2
+# Of each solve for the resolved velocity: on any number of ranks the same ones.
+ITERATIONS = 8
 every_model = pytest.mark.parametrize("terms", MODELS.values(), ids=MODELS)
 
 
 def loss_of(slab, particles, force, total):
     """A loss over all particles, summed over ranks, and its gradients, summed over ranks."""
-    dynamics = dynamics_of(slab, force)
+    dynamics = dynamics_of(slab, force, iterations=ITERATIONS)
     rates = dynamics.rates(dynamics.settle(particles)[0])
     share = sum((rate**2).sum() for rate in given(rates).values()) / total
     gradients = torch.autograd.grad(share, list(force.parameters()))
@@ -45,23 +47,24 @@ def test_rates_loss_and_gradients_do_not_depend_on_the_ranks(comm, terms):
 
 def assert_same_on_all_ranks(comm, force, columns):
     (slab, particles), (whole, everything) = distributed(comm, *columns), alone(*columns)
-    rates, expected = (given(dynamics_of(slabs, force).rates(which))
+    rates, expected = (given(dynamics_of(slabs, force, iterations=ITERATIONS).rates(which))
                        for slabs, which in ((slab, particles), (whole, everything)))
     assert rates.keys() == expected.keys()
     for name in expected:
         reference = expected[name][torch.argsort(everything.id)].detach()
-        assert_close(by_id(comm, particles, rates[name], 200), reference)
+        actual = by_id(comm, particles, rates[name], 200)
+        # Of particles at one point nothing is resolved: what acts on it is round-off, as are its derivatives below.
+        assert (actual - reference).abs().max() <= 1e-12 * max(float(reference.abs().max()), 0.1)
     if not list(force.parameters()):
         return
     sums, expected = loss_of(slab, particles, force, 200), loss_of(whole, everything, force, 200)
     for actual, reference in zip(sums, expected):
-        # Where all particles are at one point the derivative by the stress is round-off.
-        assert np.abs(actual - reference).max() <= 1e-12 * max(np.abs(reference).max(), 1e-12 * expected[0])
+        assert np.abs(actual - reference).max() <= 1e-12 * max(np.abs(reference).max(), 1e-10)
 
 
 @pytest.mark.mpi(1, 2, 3)
 @pytest.mark.parametrize("integrator, name", [("verlet", "paper"), ("rk4", "corrected"), ("rk4", "antisymmetric"),
-                                              ("verlet", "poisson-stress")])
+                                              ("verlet", "resolved + pairs")])
 def test_gradients_through_several_steps_do_not_depend_on_the_ranks(comm, integrator, name):
     """Steps long enough for particles to leave their slabs and for lists to be built anew on the way."""
     columns = state(120)
@@ -70,7 +73,7 @@ def test_gradients_through_several_steps_do_not_depend_on_the_ranks(comm, integr
     def gradients(slab, particles):
         columns = {name: column.clone() for name, column in particles.columns().items()}
         inputs = [columns[name].requires_grad_() for name in ("position", "velocity", "density")]
-        dynamics = dynamics_of(slab, force, SKIN / 2, drift=0.5)
+        dynamics = dynamics_of(slab, force, SKIN / 2, ITERATIONS, drift=0.5)
         stepper, end = INTEGRATORS[integrator](dynamics), ParticleSet(**columns)
         for _ in range(3):
             end = stepper.step(end, 0.04)
@@ -93,18 +96,19 @@ def test_gradients_through_several_steps_do_not_depend_on_the_ranks(comm, integr
 
 
 @pytest.mark.mpi(1, 2, 3)
-@pytest.mark.parametrize("terms", [{"pairs": {}}, MODELS["poisson-stress"]], ids=["pairs", "poisson-stress"])
-def test_particles_that_cross_slabs_go_on_as_on_one_rank(comm, terms):
+@pytest.mark.parametrize("name, integrator, steps", [("pairs", "verlet", 25), ("resolved + pairs", "verlet", 25),
+                                                     ("resolved", "rk3", 8)])
+def test_particles_that_cross_slabs_go_on_as_on_one_rank(comm, name, integrator, steps):
     position, velocity, density = state(150)
     columns = position, velocity + torch.tensor([0.0, 0.0, 2.0]), density
     ends = []
     for slab, particles in (distributed(comm, *columns), alone(*columns)):
-        dynamics, start = dynamics_of(slab, model(terms)), particles
-        stepper = INTEGRATORS["verlet"](dynamics)
+        dynamics, start = dynamics_of(slab, model(MODELS[name]), iterations=ITERATIONS), particles
+        stepper = INTEGRATORS[integrator](dynamics)
         with torch.no_grad():
-            for _ in range(25):
-                particles = stepper.step(particles, 0.008)
-        assert 2 < dynamics.surroundings.builds < 20
+            for _ in range(steps):
+                particles = stepper.step(particles, 0.2 / steps)
+        assert dynamics.surroundings is None if name == "resolved" else 2 < dynamics.surroundings.builds < 20
         assert slab.size == 1 or set(start.id.tolist()) != set(particles.id.tolist())
         ends.append(by_id(slab.comm, particles, particles.velocity, 150))
     assert_close(*ends, 1e-10)
@@ -202,14 +206,13 @@ def test_without_terms_that_look_at_others_there_is_no_list_no_halo_and_no_migra
         raise AssertionError("nothing of this is needed")
 
     slab, particles = distributed(comm, *state())
-    for name in ("HaloExchange", "NeighborList", "migrate", "any_rank"):
+    for name in ("HaloExchange", "NeighborList", "migrate", "any_rank", "global_max"):
         monkeypatch.setattr(surroundings, name, forbidden)
     dynamics = dynamics_of(slab, model(terms))
     moved = INTEGRATORS["verlet"](dynamics).step(particles, 0.5)
-    assert torch.equal(moved.position, particles.position + 0.5 * particles.velocity)
+    assert torch.equal(moved.position, dynamics.box.wrap(particles.position + 0.5 * particles.velocity))
     assert dynamics.surroundings is None and dynamics.resolution is None
-    settled, _ = dynamics.settle(moved)
-    assert torch.all((settled.position >= 0) & (settled.position < LENGTH))
+    assert torch.all((moved.position >= 0) & (moved.position < LENGTH))
 
 
 @pytest.mark.mpi(1, 2)
@@ -223,7 +226,7 @@ def test_a_force_of_zero_amplitude_changes_nothing(comm):
 @pytest.mark.mpi(1, 2)
 def test_terms_are_added(comm):
     slab, particles = distributed(comm, *state())
-    terms = {**MODELS["poisson-force"], "forcing": dict(injection_rate=0.4)}
+    terms = {**MODELS["pressure"], "forcing": dict(injection_rate=0.4)}
     together = dynamics_of(slab, model(terms)).rates(particles)
     apart = [dynamics_of(slab, model({word: terms[word]})).rates(replace(particles, density=together.density))
              for word in terms]
@@ -281,7 +284,7 @@ def test_terms_read_the_density_that_others_give(comm, stored):
 def test_a_density_that_is_at_hand_stands_for_the_one_that_terms_would_give(comm):
     position, velocity, density = state()
     slab, particles = distributed(comm, position, velocity)
-    dynamics = dynamics_of(slab, model(MODELS["poisson"]))
+    dynamics = dynamics_of(slab, model(MODELS["pressure for the density"]))
     own = dynamics.rates(particles)
     again = dynamics.rates(particles, density=own.density.detach())
     assert torch.equal(again.acceleration, own.acceleration) and torch.equal(again.density, own.density)
@@ -293,14 +296,17 @@ def test_a_density_that_is_at_hand_stands_for_the_one_that_terms_would_give(comm
 
 
 @pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("name", ["pairs", "corrected", "poisson-stress"])
+@pytest.mark.parametrize("name", ["pairs", "corrected", "resolved + pairs"])
 def test_pair_arithmetic_in_single_precision(comm, name):
     slab, particles = distributed(comm, *state())
     double = dynamics_of(slab, model(MODELS[name])).rates(particles)
     single = dynamics_of(slab, model(MODELS[name]).float(), dtype=torch.float32).rates(particles)
-    for found, expected in zip(given(single).values(), given(double).values()):
-        assert found.dtype == torch.float64
-        assert 0 < (found - expected).norm() < 1e-5 * expected.norm()
+    assert (single.density is None) == (name != "resolved + pairs")
+    if single.density is not None:  # nothing of it is made of pairs
+        assert torch.equal(single.density, double.density)
+    for found, expected in ((single.acceleration, double.acceleration), (single.density_rate, double.density_rate)):
+        if expected is not None:
+            assert found.dtype == torch.float64 and 0 < (found - expected).norm() < 1e-5 * expected.norm()
 
 
 @pytest.mark.mpi(1, 2)
@@ -315,3 +321,59 @@ def test_settled_particles_stay_until_one_moves_too_far(comm):
         assert dynamics.settle(near)[0] is near
         far = replace(settled, position=settled.position + torch.tensor([0.0, 0.0, 0.51 * SKIN]))
         assert dynamics.settle(far)[0] is not far
+
+
+@pytest.mark.mpi(1, 2)
+def test_without_a_list_particles_come_home_as_soon_as_one_is_out_of_its_slab(comm):
+    slab, particles = distributed(comm, *state())
+    dynamics = dynamics_of(slab, model(MODELS["resolved"]))
+    with torch.no_grad():
+        settled, _ = dynamics.settle(particles)
+        assert torch.equal(settled.id, particles.id) and torch.equal(settled.position, particles.position)
+        position = particles.position.clone()
+        position[particles.id == 7, 2] = slab.upper
+        moved, along = dynamics.settle(replace(particles, position=position), {"velocity": particles.velocity})
+    assert torch.all((moved.position[:, 2] >= slab.lower) & (moved.position[:, 2] < slab.upper))
+    assert torch.equal(along["velocity"], moved.velocity)
+    before, after = set(particles.id.tolist()), set(moved.id.tolist())
+    assert comm.allreduce(sorted(before - after)) == comm.allreduce(sorted(after - before)) == [7] * (comm.size > 1)
+
+
+@pytest.mark.mpi(1, 2)
+@pytest.mark.parametrize("name", ["resolved", "pairs"])
+def test_a_position_that_is_not_a_number_is_told_by_all_ranks(comm, name):
+    slab, particles = distributed(comm, *state())
+    position = particles.position.clone()
+    position[particles.id == 7, 1] = torch.nan
+    dynamics = dynamics_of(slab, model(MODELS[name]))
+    with torch.no_grad(), pytest.raises(HaloError, match="particle 7: .*not finite"):
+        settled, _ = dynamics.settle(replace(particles, position=position))
+        dynamics.rates(settled)
+
+
+@pytest.mark.mpi(1, 2)
+def test_evaluations_of_a_run_tell_later_ones_what_to_expect(comm):
+    """From one to the next the solve needs less; a moment that stands alone does not know of them, nor a run begun
+    anew; one that goes on from what is kept of the first does the very same."""
+    slab, particles = distributed(comm, *state())
+    dynamics = dynamics_of(slab, model(MODELS["resolved"]), tolerance=1e-3)
+
+    def iterations(which, time=None):
+        return which.context(particles, time=time).resolved.iterations
+
+    with torch.no_grad():
+        first = dynamics.rates_after(0.0, particles)
+        assert iterations(dynamics) > 5 and iterations(dynamics, 0.0) <= 1
+        alone = dynamics.rates(particles)
+        assert torch.equal(alone.acceleration, first.acceleration)
+        dynamics.time = 0.25
+        dynamics.rates_after(0.01, particles)
+        assert dynamics.evaluations == 2 and len(dynamics.resolution.solves) == 2
+        again = dynamics_of(slab, dynamics.model, tolerance=1e-3)
+        assert iterations(again, 0.3) == iterations(again)
+        again.load_state_dict({name: column.clone() for name, column in dynamics.state_dict().items()})
+        assert again.time == 0.25
+        found, expected = (each.rates(particles, time=0.3).acceleration for each in (again, dynamics))
+        assert torch.equal(found, expected) and not torch.equal(found, alone.acceleration)
+        dynamics.begin()
+        assert dynamics.time == dynamics.evaluations == 0 and iterations(dynamics, 0.3) == iterations(dynamics)

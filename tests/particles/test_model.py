@@ -63,7 +63,7 @@ def test_what_is_kept_of_a_linear_term_is_what_it_gives(comm, word):
 
 
 @pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("name", ["poisson-stress", "poisson", "resolved"])
+@pytest.mark.parametrize("name", ["resolved + pairs", "pressure for the density", "resolved"])
 def test_rates_and_gradients_with_what_is_kept_are_those_without(comm, name):
     slab, particles = distributed(comm, *state())
     lagrangian = model({**MODELS[name], **SETTINGS})
@@ -135,18 +135,37 @@ def test_a_linear_sum_over_pairs_is_kept_too(comm):
         assert_same_rates(dynamics.rates(particles, rows, kept), expected)
 
 
+@pytest.mark.mpi(1, 2)
+def test_the_modes_of_a_force_stand_beside_the_acceleration_that_they_make(comm):
+    """Less the mean over particles; also beside terms that read the density, and where some rows alone are asked."""
+    slab, particles = distributed(comm, *state())
+    forces = model(MODELS["resolved"]).terms
+    lagrangian = LagrangianModel({name: forces[name] for name in forces if name != "relaxation"}, FLOW)
+    dynamics = dynamics_of(slab, lagrangian, iterations=5)
+    context = dynamics.context(particles)
+    rates = lagrangian.rates(context)
+    expected = context.without_mean(context.resolved.at_particles(rates.force_modes))
+    assert rates.acceleration.abs().max() > 0.1 and torch.allclose(rates.acceleration, expected, atol=1e-13)
+    pairs = model(pairs={}).terms
+    both = dynamics_of(slab, LagrangianModel({**pairs, **lagrangian.terms}, FLOW), iterations=5).rates(particles)
+    assert torch.allclose(both.force_modes, rates.force_modes, atol=1e-13)
+    some = dynamics.rates(particles, torch.tensor([3, 1]))
+    assert len(some.acceleration) == 2 and torch.equal(some.force_modes, rates.force_modes)
+    assert dynamics_of(slab, model(pairs={})).rates(particles).force_modes is None
+
+
 # ---- the list
 
 
 def test_what_a_model_reads_and_gives_is_what_its_terms_do():
     assert model().reads == model().gives == set() and not model().reads_density
-    poisson, force, learned, resolved = (model(MODELS[name]) for name in (
-        "poisson", "poisson-force", "corrected", "resolved"))
-    assert poisson.reads == force.reads == {"pairs", "resolved", "density"}
-    assert poisson.density_is_given and force.density_is_given and not learned.density_is_given
+    density, force, learned, resolved = (model(MODELS[name]) for name in (
+        "pressure for the density", "pressure", "corrected", "resolved"))
+    assert density.reads == force.reads == {"pairs", "resolved", "density"}
+    assert density.density_is_given and force.density_is_given and not learned.density_is_given
     # The pressure gives a density, but nobody reads it.
     assert "density" in resolved.gives and not resolved.reads_density and not resolved.density_is_given
-    assert [len(each.networks) for each in (poisson, learned, resolved)] == [1, 2, 0]
+    assert [len(each.networks) for each in (density, learned, resolved)] == [1, 2, 0]
 
 
 @pytest.mark.mpi(1)
@@ -160,9 +179,8 @@ def test_settings_and_weights_make_the_same_model(comm):
 
 
 def test_absent_terms_have_no_parameters():
-    assert list(model(PRESETS["resolved"]).state_dict()) == ["terms.stress.amplitude", "terms.damping.rates",
-                                                             "terms.relaxation.factor"]
-    assert list(model(pressure={}).parameters()) == []
+    assert list(model(PRESETS["resolved"]).state_dict()) == ["terms.damping.rates", "terms.relaxation.factor"]
+    assert list(model(pressure={}, stress={}).parameters()) == []
 
 
 @pytest.mark.mpi(1)

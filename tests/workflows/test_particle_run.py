@@ -14,6 +14,7 @@ from eddies.io.trajectories import Trajectory
 from eddies.io.weights import save_weights
 from eddies.methods import METHODS, method_class
 from eddies.parallel.slab import SlabDecomposition
+from eddies.particles.resolved_velocity import ResolvedVelocity
 from eddies.particles.smoothing_kernels import KernelNetwork
 from eddies.scene import BOX_LENGTH, Model, SceneError, load_scene
 from eddies.workflows import dns, report, simulate, train
@@ -52,6 +53,7 @@ turnovers = 0.05
 frame_interval = 0.04
 start = {start}
 """
+MODEL = '[model]\npreset = "resolved + pairs"'
 WITHOUT_DENSITY = {
     "resolved": '[model]\nterms = ["pressure", "stress", "damping", "relaxation"]',
     "pairs": '[model]\nterms = ["pressure", "pairs"]\n[model.pairs]\nhidden = [4]\ninputs = ["distance", "approach"]',
@@ -69,21 +71,25 @@ class Swept:
     has_density = False
 
     def __init__(self, scene, truth, start, directory, device):
+        self.time = 0.0
         self.length, self.wind = truth.decomposition.length, torch.tensor([0.5, 0.0, -1.0], dtype=torch.float64)
         columns = truth.particles(start)
         columns.pop("density", None)
         self.particles = ParticleSet.from_numpy(columns)
 
-    def steps(self, interval):
-        return 2
-
-    def advance(self, step, number):
+    def advance(self, until, number):
+        step = min(until - self.time, 0.03)
         moved = (self.particles.position + step * self.wind) % self.length
         velocity = self.wind.expand_as(moved).contiguous()
         self.particles = ParticleSet(self.particles.id, moved, velocity)
+        self.time += step
 
-    def frame(self):
+    def frame(self, time):
+        assert abs(time - self.time) < 1e-12
         return self.particles, torch.zeros_like(self.particles.velocity)
+
+    def status(self):
+        return "  the wind blows"
 
     def series(self):
         return {"wind": {"strength": []}}
@@ -93,7 +99,7 @@ class Swept:
 """
 
 
-def prepared(comm, directory, fluid="compressible", model="[model]", start=0.3, turnovers=0.14, side=6):
+def prepared(comm, directory, fluid="compressible", model=MODEL, start=0.3, turnovers=0.14, side=6):
     """The scene, with its ground truth in a directory, and a kernel with the weights that training starts from."""
     path = directory / "own.toml"
     if comm.rank == 0:
@@ -121,10 +127,10 @@ def write_model(comm, directory, scene, scales, bound=1e3):
 
 def mover_of(comm, directory, scene, start):
     with open_product(comm, directory / "ground_truth.h5", "ground_truth") as file:
-        truth = GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, scene.tracers.particles_per_side))
+        truth = GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes))
         mover = method_class(scene.simulation.method)(scene, truth, start, directory, torch.device("cpu"))
         with torch.no_grad():
-            return truth.scales_at(start), truth.scales, mover, *mover.frame()
+            return truth.scales_at(start), truth.scales, mover, *mover.frame(0.0)
 
 
 @pytest.mark.mpi(1, 2)
@@ -195,9 +201,10 @@ def reported(comm, directory, untrained=("kernel.h5",)):
 
 @pytest.mark.mpi(2, 3)
 def test_the_rollout_is_the_same_on_any_number_of_ranks(comm, tmp_path):
+    """With frames between steps and on them."""
     from mpi4py import MPI
 
-    scene = with_method(untrained(comm, tmp_path, side=9), "learned", precision="float64", turnovers=0.1)
+    scene = with_method(untrained(comm, tmp_path, side=9), "learned", precision="float64", turnovers=0.1, step=0.03)
     found = []
     for communicator in (comm, MPI.COMM_SELF):
         if communicator is comm or comm.rank == 0:
@@ -209,6 +216,51 @@ def test_the_rollout_is_the_same_on_any_number_of_ranks(comm, tmp_path):
         (positions, shares), (alone, shares_alone) = found
         assert np.abs(positions - alone).max() < 2e-6  # stored in single precision
         assert np.array_equal(shares["share"], shares_alone["share"]) and shares["share"].max() > 0
+
+
+def rolled_out(comm, directory, scene, **keys):
+    """Attributes of a rollout, what the closure's solves took, and the columns of its frames by name."""
+    simulate.run(with_method(scene, **{"method": "learned", "turnovers": 0.14, **keys}), comm, directory)
+    with open_product(comm, directory / "rollout.h5", "rollout") as file:
+        run = Trajectory(file, "model")
+        columns = {name: np.array([run.read(frame, name) for frame in range(len(run.times))])
+                   for name in ("position", "velocity", "acceleration")}
+        closure = read_table(file, "closure") if "closure" in file else None
+        return read_attributes(file, "rollout"), closure, {"time": run.times, **columns}
+
+
+@pytest.mark.mpi(1, 2)
+@pytest.mark.parametrize("step", [0.03, 0.1])
+def test_frames_between_steps_lie_on_the_way(comm, tmp_path, step):
+    """That of particles which keep their velocity is known."""
+    attributes, closure, columns = rolled_out(comm, tmp_path, untrained(comm, tmp_path), method="none", step=step)
+    count = len(columns["time"]) - 1
+    assert closure is None and np.allclose(columns["time"], 0.04 * np.arange(count + 1)) and count == 3
+    assert attributes["steps"] == -(-0.12 // step) and attributes["time_step"] == pytest.approx(step)
+    straight = columns["position"][0] + columns["time"][:, None, None] * columns["velocity"][0]
+    miss = columns["position"] - straight
+    # Stored in single precision.
+    assert np.abs(miss - BOX_LENGTH * np.rint(miss / BOX_LENGTH)).max() < 2e-6
+    assert np.abs(columns["velocity"] - columns["velocity"][0]).max() < 1e-6 and not columns["acceleration"].any()
+
+
+@pytest.mark.mpi(1)
+def test_frames_of_long_steps_are_those_of_short_ones(comm, tmp_path, monkeypatch):
+    for name in ("tolerance", "tolerance_foreseen"):
+        monkeypatch.setattr(ResolvedVelocity, name, 1e-8)
+    scene, found = untrained(comm, tmp_path), {}
+    for step in (0.01, 0.03, 0.1):
+        attributes, closure, found[step] = rolled_out(comm, tmp_path, scene, step=step, precision="float64")
+        # Three stages, and the end of the last step; frames between are none of its evaluations.
+        assert attributes["evaluations"] == 3 * attributes["steps"] + 1 and attributes["status"] == "complete"
+        ends = np.ceil(np.arange(4) * 0.04 / step - 1e-9)
+        assert ((closure["iterations"] > 0) == [True, *(np.diff(ends) > 0)]).all() and not closure["not_converged"].any()
+        assert (closure["most_iterations"] >= closure["iterations"]).all() and closure["residual"].max() < 1e-8
+    short = found[0.01]
+    for step in (0.03, 0.1):
+        for name in ("velocity", "acceleration"):
+            change = np.linalg.norm(short[name] - short[name][0])
+            print(name, step, np.linalg.norm(found[step][name] - short[name]) / change)
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -225,7 +277,7 @@ def test_a_rollout_that_goes_wrong_ends_there_and_keeps_its_frames(comm, tmp_pat
 @pytest.mark.usefixtures("undrawn")
 @pytest.mark.mpi(2)
 @pytest.mark.parametrize("model, weights, rate", [
-    ('preset = "paper-density"\n[model.pairs]\nhidden = [4]\n[model.density-flux]\nhidden = [4]', 4 + 4, True),
+    ('preset = "paper"\n[model.pairs]\nhidden = [4]\n[model.density-flux]\nhidden = [4]', 4 + 4, True),
     ('terms = ["pressure", "viscosity"]', 0, False),
 ])
 def test_other_models_run(comm, tmp_path, model, weights, rate):

@@ -40,7 +40,7 @@ def saved(comm, directory, scene=None, change=lambda weights: weights):
 def test_a_model_is_read_as_it_was_saved_in_its_precision(comm, tmp_path):
     scene, model, path = saved(comm, tmp_path)
     found = load_model(scene, comm, path, SCALES)
-    assert list(found.terms) == list(model.terms) == list(PRESETS["poisson-stress"])
+    assert list(found.terms) == list(model.terms) == list(PRESETS["resolved + pairs"])
     assert all(torch.equal(tensor, found.state_dict()[name]) and tensor.dtype == torch.float32
                for name, tensor in model.state_dict().items())
 
@@ -64,7 +64,7 @@ def test_a_model_without_parameters_is_read_too(comm, tmp_path):
 @pytest.mark.mpi(1, 2)
 @pytest.mark.parametrize("change", [
     lambda weights: {**weights, "terms.damping.rates": weights["terms.damping.rates"][:3]},
-    lambda weights: {name.replace("amplitude", "strength"): tensor for name, tensor in weights.items()}],
+    lambda weights: {name.replace("factor", "strength"): tensor for name, tensor in weights.items()}],
     ids=["another shape", "another name"])
 def test_weights_of_an_older_form_are_refused(comm, tmp_path, change):
     scene, _, path = saved(comm, tmp_path, change=change)
@@ -80,7 +80,7 @@ def test_weights_of_another_scene_are_refused_with_the_key(comm, tmp_path):
         load_model(load_scene("tiny", ["model.pairs.hidden=[5]"]), comm, path, SCALES)
 
 
-@pytest.mark.parametrize("preset", ["poisson-stress", "learned-density", "paper-density", "wcsph"])
+@pytest.mark.parametrize("preset", ["resolved + pairs", "resolved", "learned-density", "paper", "wcsph"])
 def test_a_description_is_json_and_differs_from_its_own_scene_in_nothing(preset):
     scene = load_scene("tiny", [f"model.preset={preset}"])
     stored = json.loads(json.dumps(describe(scene, SCALES)))

@@ -21,7 +21,8 @@ from eddies.particles.surroundings import LocalParticles, Surroundings
 from eddies.scene_values import SceneError
 
 if TYPE_CHECKING:
-    from eddies.particles.resolved_velocity import ResolvedFlow, ResolvedVelocity
+    from eddies.particles.resolved_flow import ResolvedFlow
+    from eddies.particles.resolved_velocity import ResolvedVelocity
 
 # Numbers held at once while pairs are summed without a gradient: about a core's cache, or a part of a
 # device's memory.

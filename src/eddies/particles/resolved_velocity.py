@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 
 import numpy as np
 import torch
@@ -19,6 +18,7 @@ from eddies.particles.fourier_grid import FourierGrid, Points
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.rank_sums import mean_over_ranks, sum_over_ranks
 from eddies.particles.reference_scales import resolved_wavenumber
+from eddies.particles.resolved_flow import ResolvedFlow
 
 # The exponent of the prior's power law, and how many times the energy that it expects beyond the resolved modes is
 # taken for noise. Measured in docs/closure.md.
@@ -32,70 +32,6 @@ MOST_ITERATIONS = 300
 SMOOTHING = 5.0
 # Wavenumber shells in a band of the energy.
 BAND = 2
-
-
-@dataclass(frozen=True)
-class ResolvedFlow:
-    """The resolved velocity at one moment.
-
-    Parameters
-    ----------
-    grid : of its modes.
-    velocity : modes (3, kz, ky, kx), solenoidal, |k| <= `grid.resolved`.
-    points : of the owned particles on the grid.
-    relative_velocity : (n, 3), theirs less its mean over all particles.
-    filter_width : d of the filter that the particles' velocity has passed.
-    iterations : that the solve took. residual : that it ended with, relative to the velocities. converged : whether
-        that is as little as was asked for.
-    """
-
-    grid: FourierGrid
-    velocity: Tensor
-    points: Points
-    relative_velocity: Tensor
-    filter_width: float
-    iterations: int = 0
-    residual: float = 0.0
-    converged: bool = True
-
-    def at_particles(self, modes: Tensor) -> Tensor:
-        """Values (n, c) of modes (c, kz, ky, kx) at the particles; collective, differentiable."""
-        return self.grid.at(modes, self.points)
-
-    def missing(self) -> Tensor:
-        """What the grid does not resolve of the particles' velocities relative to their mean: (n, 3); collective."""
-        return self.relative_velocity - self.at_particles(self.velocity).to(self.relative_velocity)
-
-    @cached_property
-    def products(self) -> Tensor:
-        """Modes (6, kz, ky, kx) of u_i u_j; collective, differentiable."""
-        return self.grid.squares(self.velocity)
-
-    @cached_property
-    def filter_transfer(self) -> Tensor:
-        """G = exp(-k^2 d^2 / 24) of each mode (kz, ky, kx)."""
-        return torch.exp(-self.grid.wavenumber_squared * (self.filter_width**2 / 24))
-
-    @property
-    def unfiltered(self) -> Tensor:
-        """Modes (3, kz, ky, kx) of u* = u / G."""
-        return self.velocity / self.filter_transfer
-
-    @cached_property
-    def rms(self) -> Tensor:
-        """Root mean square of a component of the resolved velocity; collective, differentiable."""
-        return self._rms_of(self.velocity, 0.0)
-
-    @cached_property
-    def smallest_rms(self) -> Tensor:
-        """The same of the smallest scales, of the modes of u* with |k| > k_c/2."""
-        return self._rms_of(self.unfiltered, self.grid.resolved / 2)
-
-    def _rms_of(self, modes: Tensor, above: float) -> Tensor:
-        square = (modes.real.square() + modes.imag.square()).sum(0) * self.grid.multiplicity
-        square = torch.where(self.grid.shell > above, square, 0.0).sum()
-        # Where nothing moves the slope of the root is taken for zero.
-        return (sum_over_ranks(self.grid.decomposition.comm, square) / 3).clamp_min(1e-300).sqrt()
 
 
 class ResolvedVelocity:

@@ -1,5 +1,6 @@
 """Spectral damping, viscosity and relaxation of a resolved velocity of few modes."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -10,7 +11,7 @@ from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.fourier_grid import FourierGrid
 from eddies.particles.particle_set import ParticleSet
-from eddies.particles.resolved_velocity import ResolvedFlow
+from eddies.particles.resolved_flow import ResolvedFlow
 from eddies.particles.terms.damping import RATES
 from tests.particles.clouds import CUTOFF, LENGTH, NEIGHBORS, SCALES, dynamics_of, model
 
@@ -21,8 +22,6 @@ RESOLVED, CELLS = 6, 18
 class Known:
     """In place of what resolves the particles' velocity: modes that are there."""
 
-    reach = LENGTH / CELLS
-
     def __init__(self, *fields):
         slab = SlabDecomposition(MPI.COMM_SELF, LENGTH, CELLS)
         self.grid = FourierGrid(slab, RESOLVED)
@@ -30,8 +29,9 @@ class Known:
         shape = self.grid.spectral.physical_shape
         self.modes = self.grid.to_modes(torch.stack([each.expand(shape) for each in fields[0](x, y, z)]))
 
-    def of(self, particles, local):
-        return ResolvedFlow(self.grid, self.modes, self.grid.points(particles.position), particles.velocity)
+    def of(self, particles, time=None):
+        relative = particles.velocity - particles.velocity.mean(0)
+        return ResolvedFlow(self.grid, self.modes, self.grid.points(particles.position), relative, SCALES.length)
 
 
 @torch.no_grad()
@@ -56,29 +56,56 @@ def waves(x, y, z):
     return torch.sin(2 * y), torch.cos(3 * x) * torch.cos(4 * z), torch.cos(y)
 
 
+def unit_of_damping(square, wavenumber):
+    """k_c times the rms of a component of the one wave above k_c / 2, with the filter undone; its mean square."""
+    return RESOLVED * math.sqrt(square * math.exp(wavenumber**2 * SCALES.length**2 / 12) / 3)
+
+
 def test_each_mode_is_damped_at_the_rate_of_its_wavenumber():
-    """Of the six rates, one for each wavenumber here."""
+    """Of the six rates, one for each wavenumber here; in units of the wave of the largest."""
     lagrangian = model(damping={})
     with torch.no_grad():
-        lagrangian.terms["damping"].rates.copy_(torch.tensor([0.3, 1.1, 0.0, 0.0, 0.7, 0.0]))
+        lagrangian.terms["damping"].rates.copy_(torch.tensor([0.3, 1.1, 0.0, 0.0, 0.7, 0.0], dtype=torch.float64))
     position = lattice()
     force = acceleration(lagrangian, waves, position, torch.zeros_like(position))
-    unit = SCALES.velocity / SCALES.length
+    unit = unit_of_damping(square=1 / 4, wavenumber=5)
     for component, (wave, rate) in enumerate(zip(waves(*position.T), (1.1, 0.7, 0.3))):
-        assert torch.allclose(force[:, component], -unit * rate * wave, atol=1e-12)
+        assert torch.allclose(force[:, component], -unit * rate * wave, rtol=1e-12, atol=1e-11)
 
 
 def test_between_the_wavenumbers_of_two_rates_damping_is_linear():
     lagrangian = model(damping={})
     position = lattice()
 
-    def wave(x, y, z):  # |k| = sqrt(5)
-        return torch.zeros_like(x), torch.zeros_like(x), torch.cos(x) * torch.sin(2 * y)
+    def wave(x, y, z):  # |k| = sqrt(10)
+        return torch.zeros_like(x), torch.zeros_like(x), torch.cos(x) * torch.sin(3 * y)
 
     force = acceleration(lagrangian, wave, position, torch.zeros_like(position))
-    share = 5**0.5 - 2
-    rate = float((1 - share) * RATES[1] + share * RATES[2]) * SCALES.velocity / SCALES.length
-    assert torch.allclose(force[:, 2], -rate * wave(*position.T)[2], atol=1e-12)
+    share = 10**0.5 - 3
+    rate = float((1 - share) * RATES[2] + share * RATES[3]) * unit_of_damping(square=1 / 4, wavenumber=10**0.5)
+    assert torch.allclose(force[:, 2], -rate * wave(*position.T)[2], rtol=1e-12, atol=1e-12)
+
+
+def test_what_has_no_small_scales_is_not_damped():
+    """Wavenumbers up to half the highest alone."""
+    position = lattice()
+
+    def wave(x, y, z):
+        return torch.sin(3 * y), torch.cos(2 * z), torch.cos(x) * torch.sin(2 * y)
+
+    assert acceleration(model(damping={}), wave, position, torch.zeros_like(position)).abs().max() < 1e-12
+
+
+def test_damping_grows_with_the_small_scales_and_not_with_the_large():
+    position = lattice()
+
+    def force(large, small):
+        def wave(x, y, z):
+            return large * torch.sin(y), small * torch.sin(5 * z), torch.cos(2 * x)
+
+        return acceleration(model(damping={}), wave, position, torch.zeros_like(position))[:, 2]
+
+    assert torch.allclose(force(1.0, 0.3), 3 * force(7.0, 0.1), atol=1e-12) and force(1.0, 0.3).abs().max() > 0.01
 
 
 def test_viscosity_damps_with_the_square_of_the_wavenumber():
@@ -98,6 +125,7 @@ def test_relaxation_takes_what_is_not_resolved_and_keeps_the_momentum():
     with torch.no_grad():
         lagrangian.terms["relaxation"].factor.fill_(1.5)
     force = acceleration(lagrangian, waves, position, resolved + missing)
-    rate = 1.5 * 2 * SCALES.velocity / SCALES.length
+    rms = math.sqrt((1 / 2 + 1 / 4 + 1 / 2) / 3)
+    rate = 1.5 * 2 * rms / SCALES.length
     assert torch.allclose(force, -rate * (missing - missing.mean(0)), atol=1e-12)
     assert force.sum(0).abs().max() < 1e-12 * force.abs().sum()

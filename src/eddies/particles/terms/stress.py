@@ -6,7 +6,7 @@ from torch import Tensor
 
 from eddies.particles.context import Context
 from eddies.particles.rates import Rates
-from eddies.particles.resolved_velocity import ResolvedFlow
+from eddies.particles.resolved_flow import ResolvedFlow
 from eddies.particles.terms import settings as declared
 from eddies.particles.terms.term import Term
 
