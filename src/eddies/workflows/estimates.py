@@ -10,7 +10,7 @@ from eddies.scene import BOX_LENGTH, Eulerian, Scene
 DISSIPATION_CONSTANT = 0.5   # C_eps = eps L / u'^3 of developed turbulence
 PEAK_VELOCITY = 4.0          # largest component of the velocity of a particle over u'
 ALLOWED_VELOCITY = 6.0       # the same, for which there are ghost planes in the training through horizons
-ADVISED_ANGLE = 3.0          # k_c u' times a step of "rk3": beyond it errors grow, at 4.5 steps are hardly stable
+ADVISED_ANGLE = 3.0          # k_c u' times a step of "rk3", u' of the forced flow: docs/closure.md
 PEAK_SPEED = 7.0             # max(|u| + |v| + |w|) over u' in turbulence: four rms in each component at worst
 EXACT_PEAK_SPEED = {"taylor-green": 1.0, "abc": 3 * math.sqrt(2), "shear-wave": 1.0}  # over the amplitude
 GHOST_PLANES = {"cubic": 3, "quintic": 4}
