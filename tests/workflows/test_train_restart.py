@@ -9,6 +9,7 @@ from eddies import stages
 from eddies.io.hdf5 import open_product, read_table
 from eddies.io.weights import load_weights
 from eddies.parallel.stop import Stopped, StopRequest
+from eddies.particles.resolved_velocity import ResolvedVelocity
 from eddies.scene import SceneError, load_scene
 from eddies.workflows import dns, train, train_kernel
 
@@ -21,6 +22,12 @@ SHORT = ["flow.cells=12", "tracers.particles_per_side=6", "tracers.field_cells=8
          "kernel.steps=2", "kernel.points=20", "model.pairs.hidden=[4]", "training.window=1", "training.frames=2",
          "training.batch=50", "training.steps=6", "training.combined_steps=2", "training.horizon_steps=2",
          "training.horizons=[1,2]", "training.noise=0.1", "simulation.start=0"]
+
+
+@pytest.fixture(autouse=True)
+def quick_solves(monkeypatch):
+    """What is learned does not matter here, but that it is the same."""
+    monkeypatch.setattr(ResolvedVelocity, "iterations", 3)
 
 
 def prepared(comm, directory):
