@@ -55,8 +55,7 @@ class VelocityVerlet(Integrator):
 
     def step(self, particles: ParticleSet, time_step: float) -> ParticleSet:
         if particles is self._last and self.memory:
-            particles, memory = self.dynamics.settle(particles, self.memory)
-            start = Rates(**memory)
+            start = Rates(**self.memory)
         else:
             particles, _ = self.dynamics.settle(particles)
             start = self.dynamics.rates_after(0.0, particles)
