@@ -40,8 +40,8 @@ def pairs_of_calls(comm) -> dict[str, tuple[Call, Call]]:
     """By part: the call with it, and without."""
     everything = {"field": 1.0, "velocity_kl": 0.1, "acceleration_kl": 0.1}
     without = {name: {key: weight for key, weight in everything.items() if key != name} for name in everything}
-    pressure, resolved, learned = PRESETS["poisson-force"], PRESETS["resolved"], PRESETS["learned-density"]
-    stress = PRESETS["poisson-stress"]
+    pressure, resolved, learned = {"pressure": {}, "pairs": {}}, PRESETS["resolved"], PRESETS["learned-density"]
+    stress = PRESETS["resolved + pairs"]
     steps = {
         "pair force": (learned, {}),
         "pressure and its force": (pressure, learned),

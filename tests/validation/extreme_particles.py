@@ -69,10 +69,10 @@ def states(comm) -> Iterator[Row]:
     for step in (1e-5, 1e-4, 1e-2):
         yield (f"two steps of {step:g} at 1000 c, {comm.size} rank(s)", "as at rest, or refused by all ranks",
                shown(translated_run(comm, "learned-density", fast, step)))
-    for kind, factors in (("poisson", (0.2,)), ("learned-density", (0.1, 20.0))):
+    for kind, factors in (("pressure for the density", (0.2,)), ("learned-density", (0.1, 20.0))):
         for mach in MACH_NUMBERS:
             for factor in factors:
-                step = 0.02 if kind.startswith("poisson") else factor * mach
+                step = 0.02 if kind.startswith("pressure") else factor * mach
                 complaint, velocity = at_mach_number(comm, kind, mach, step)
                 yield (f"M_t {mach:g}, 20 steps of {step:g}; {kind}",
                        "says what failed" if factor > 1 else "finite",
@@ -83,7 +83,7 @@ def states(comm) -> Iterator[Row]:
     for rate in (1.0, 10.0):
         yield (f"injection {rate:g}", "that much energy", f"{overdriven(comm, rate):.9f} of it")
     for value in (math.nan, 1e200):
-        told = broken_step(comm, "poisson-force", "rk4", value, 2)
+        told = broken_step(comm, "pressure", "rk4", value, 2)
         yield (f"a force of {value:g} in a stage of rk4", "all ranks say where",
                told[0] if len(set(told)) == 1 else f"ranks differ: {told}")
 

@@ -196,8 +196,8 @@ def test_a_model_pays_with_transposes_for_the_terms_that_it_has_alone(comm):
         ("pairs",), ("pressure",), ("stress",), ("damping",), ("relaxation",), ("pressure", "stress"),
         ("pressure", "stress", "damping", "relaxation"), ("pressure", "stress", "damping", "relaxation", "pairs"))}
     transposes = {words: messages.count("Alltoallv") for words, messages in sent.items()}
-    # Of the resolved velocity: a solve that starts from what is foreseen, here well enough that it ends at once: what is
-    # missed at the particles and back; then the products, which tell how it changes.
+    # Of the resolved velocity: a solve that starts from what is foreseen, here well enough that it ends at once: what
+    # is missed at the particles and back; then the products, which tell how it changes.
     resolved = 2 + 2
     # The products of the velocity with the filter undone: to the grid, they back. What all terms give as modes goes to
     # the particles once, and what is missed there with it.

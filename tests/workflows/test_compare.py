@@ -14,7 +14,7 @@ from tests.workflows.synthetic_run import write_ground_truth
 SMALLER = ["flow.cells=16", "flow.viscosity=0.1", "spin_up.turnovers=0.3", "tracers.particles_per_side=8",
            "tracers.field_cells=12", "tracers.frame_interval=0.1", "tracers.field_every=1", "kernel.neighbors=30",
            "kernel.steps=4", "training.steps=6", "training.combined_steps=2", "training.batch=64",
-           "simulation.frame_interval=0.2"]
+           "simulation.step=0.02", "simulation.frame_interval=0.2"]
 FILE = """
 title = "small"
 base = "base.toml"
