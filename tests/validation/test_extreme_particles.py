@@ -24,6 +24,7 @@ from tests.particles.clouds import LENGTH, Field, by_id, distributed, of_terms
 from tests.particles.clouds import model as model_of
 
 TOTAL, SIDE, PLANES, SKIN = 343, 7, 12, 0.1  # of the grid 1.75 cells a particle and direction
+ITERATIONS = 10
 PAPER = {"pairs": dict(basis="paper", hidden=(8, 8)), "density-flux": dict(hidden=(8, 8)),
          "eddy-viscosity": dict(form="two-sided", basis="paper")}
 CLOSURES = {
@@ -94,7 +95,12 @@ def set_up(comm, model, position, velocity=None, density=None, dtype=torch.float
     velocity = flow_velocity(position) if velocity is None else velocity
     density = torch.ones(len(position), dtype=torch.float64) if density is None else density
     slab, particles = distributed(comm, position, velocity, density, planes=PLANES)
-    return ParticleDynamics(slab, model.to(dtype), skin, dtype), particles
+    dynamics = ParticleDynamics(slab, model.to(dtype), skin, dtype)
+    if dynamics.resolution is not None:
+        # So many that different ranks, frames and precisions do the same, and no more of what ill-posed arrangements do
+        # to rounding.
+        dynamics.resolution.iterations = ITERATIONS
+    return dynamics, particles
 
 
 @torch.no_grad()
@@ -282,10 +288,9 @@ def spring(frequency=0.0, drag=0.0):
 
 def amplification(integrator, system, z):
     """Spectral radius of one step: "oscillator" x'' = -x, "drag" v' = -v, "sound" y' = iy, at the step z."""
-    if integrator == "rk2" or integrator == "rk4":
+    if integrator.startswith("rk"):
         z = -z if system == "drag" else 1j * z
-        terms = (1, 1, 2) if integrator == "rk2" else (1, 1, 2, 6, 24)
-        return abs(sum(z**n / factorial for n, factorial in enumerate(terms)))
+        return abs(sum(z**n / math.factorial(n) for n in range(int(integrator[2:]) + 1)))
     if system == "oscillator":  # positions and forces leapfrog
         return max(abs(np.linalg.eigvals([[1 - z**2 / 2, z], [-z + z**3 / 4, 1 - z**2 / 2]])))
     # The rate at the velocity (or density) predicted by Euler's rule, averaged with the last one so obtained: that is
@@ -410,12 +415,11 @@ def test_opposite_forces_keep_the_momentum_with_every_model(comm, kind):
 
 
 @pytest.mark.mpi(1, 2)
-def test_particles_that_outrun_their_slab_are_refused_by_all_ranks(comm):
+def test_particles_may_cross_slabs_and_the_box_within_a_step(comm):
+    """At 1000 c, by 0.2, 1.7 and 170; they change rank before each evaluation."""
     speed = 1000 * scales(TOTAL).sound_speed
-    assert translated_run(comm, "learned-density", speed, 1e-5) < 1e-9
-    assert comm.size == 1 or "thinner than the halo" in translated_run(comm, "learned-density", speed, 1e-4)
-    told = translated_run(comm, "learned-density", speed, 1e-2)
-    assert told < 1e-9 if comm.size == 1 else "farther outside its slab" in told
+    for step in (1e-5, 1e-4, 1e-2):
+        assert translated_run(comm, "learned-density", speed, step) < 1e-9
 
 
 class Breaking(Field):
@@ -484,7 +488,9 @@ def test_a_density_contrast_of_a_thousand_leaves_forces_bounded(comm, kind):
 @every_closure
 def test_single_precision_follows_double_precision(comm, kind):
     # Round-off of single precision, 6e-8, a few times.
-    assert 1e-9 < precision_error(comm, kind, 8) < 1e-6
+    # What is made on the grid is in double precision whatever that of the particles is.
+    least = 1e-9 if "pairs" in network_model(kind, TOTAL).reads else 1e-11
+    assert least < precision_error(comm, kind, 8) < 1e-6
 
 
 @pytest.mark.mpi(1)

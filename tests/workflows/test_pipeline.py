@@ -91,11 +91,10 @@ def test_resume_skips_what_is_done_and_redoes_what_changed(run_directory):
     assert [path.name for path, time in before.items() if path.stat().st_mtime_ns != time] == ["rollout.h5"]
 
 
-def test_a_step_that_outruns_the_slabs_is_refused(run_directory, tmp_path):
+def test_a_skin_that_reaches_beyond_the_slabs_is_refused(run_directory, tmp_path):
     for name in ("ground_truth.h5", "kernel.h5", "model.h5"):
         (tmp_path / name).symlink_to(run_directory / name)
-    longer = ("--set", "simulation.step=0.5", "--set", "simulation.frame_interval=0.5")
-    result = eddies(2, "simulate", "tiny", "--output", str(tmp_path), *longer)
+    result = eddies(3, "simulate", "tiny", "--output", str(tmp_path), "--set", "simulation.skin=1")
     assert result.returncode == 2 and "slabs no thinner than the particles' reach" in result.stderr
     assert not (tmp_path / "rollout.h5").exists()
 
