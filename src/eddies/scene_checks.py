@@ -25,7 +25,7 @@ INITIAL_KEYS = {
     "peak_wavenumber": ("random",), "wavenumber": ("abc", "shear-wave", "sound-wave"), "path": ("file",)}
 # What a class of the user's must have, by the key that names it.
 REQUIRED = {"fluid": ("nonlinear", "linear", "linear_function", "combine", "compressible"), "kind": ("__call__",),
-            "method": ("steps", "advance", "frame", "series", "description", "has_density"), "network": ("forward",)}
+            "method": ("advance", "frame", "status", "series", "description", "has_density"), "network": ("forward",)}
 
 
 def first_inconsistency(scene: Scene) -> str | None:
