@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from eddies.analysis.pdfs import (
-    bin_edges, bin_probabilities, gaussian, joint_probabilities, kl_divergence, pdf, standardized,
+    bin_edges, bin_probabilities, gaussian, joint_probabilities, kl_divergence, pdf, sampling_divergence, standardized,
 )
 
 
@@ -54,6 +54,14 @@ def test_divergence_is_forward_and_finite():
     truth, prediction = np.array([0.5, 0.5, 0.0]), np.array([1.0, 0.0, 0.0])
     missed, invented = kl_divergence(truth, prediction), kl_divergence(prediction, truth)
     assert np.isfinite(missed) and missed > 5 * invented > 0
+
+
+def test_divergence_of_samples_of_one_distribution():
+    """It is (K - 1) / n for K bins and n independent values in each: the mean of chi-square, in the mean of 30 draws
+    good to 6 %."""
+    draws = np.random.default_rng(7).uniform(size=(30, 5000))
+    found = [sampling_divergence(values, np.linspace(0, 1, 21)) for values in draws]
+    assert np.mean(found) == pytest.approx(19 / 5000, rel=0.2)
 
 
 def test_unusable_samples_are_refused():

@@ -32,7 +32,7 @@ METRICS = {
               "true_density_acceleration_error", "delay"},
     "rollout": {"turnovers", "stable", "energy_ratio", "velocity_error", "spectrum_error", "velocity_kl",
                 "acceleration_kl", "qr_kl", "outside_training", "nearest_distance_kl", "count_variance_ratio",
-                "high_wavenumber_energy_ratio"},
+                "high_wavenumber_energy_ratio", "acceleration_rms_ratio", "velocity_kl_floor", "acceleration_kl_floor"},
     "cost": {"seconds_per_step", "particles", "ranks", "stage_seconds"},
 }
 
@@ -138,13 +138,16 @@ def test_numbers_of_a_known_rollout(comm, tmp_path):
     """The model is the truth plus an error of 0.4 t times an independent flow of the same energy."""
     write_run(comm, tmp_path, total=3000)
     report.run(tmp_path, comm)
-    rollout = written(tmp_path)[0]["rollout"]
+    metrics, page = written(tmp_path)
+    rollout = metrics["rollout"]
     assert rollout["stable"] is True
     assert rollout["last_common_time"] == pytest.approx(0.5 / 1.2)
     assert rollout["velocity_error"] == pytest.approx(0.2, rel=0.15)
     assert rollout["energy_ratio"] == pytest.approx(1.04, abs=0.05)
     assert rollout["filter_wavenumber"] == pytest.approx(4)
     assert rollout["outside_training"] == pytest.approx(0.2e-3)  # at t = 0.4 or 0.5
+    assert (rollout["closure_iterations"], rollout["closure_most_iterations"]) == (2.5, 40)
+    assert "Solves for the resolved velocity that did not converge: 1; the worst left 1.0e-03" in page
     assert 0 < rollout["velocity_kl"] < 0.1 and 0 < rollout["qr_kl"] < 0.5
     # Both start at the same random points. The field of the model is made without its error, and k <= 4.
     assert 0 < rollout["nearest_distance_kl"] < 0.1

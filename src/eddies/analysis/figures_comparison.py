@@ -31,7 +31,8 @@ class Rollout:
 
     attributes: of the group `rollout`; model, truth: trajectories; fields: the series "model", "truth" and
     "filtered"; length: box edge; filter_width and eulerian (table `spectra`): of the ground truth, or None;
-    outside_training: share of the pairs outside the training range, (frames,), where it was counted.
+    outside_training: share of the pairs outside the training range, (frames,), where it was counted;
+    closure: columns over the frames on the solves for the resolved velocity, where there were any.
     """
 
     attributes: Mapping[str, float | str]
@@ -42,6 +43,7 @@ class Rollout:
     filter_width: float | None
     eulerian: Mapping[str, np.ndarray] | None
     outside_training: np.ndarray | None = None
+    closure: Mapping[str, np.ndarray] | None = None
 
     @property
     def turnover(self) -> float:
@@ -84,6 +86,8 @@ def section(run: Rollout) -> Section:
     if run.outside_training is not None:
         shown.metrics.append(Metric("outside_training", "pairs outside the training range, largest share over time",
                                     float(run.outside_training.max())))
+    if run.closure is not None:
+        _add_closure(shown, run.closure)
     try:
         common = CommonFrames.of(run.model, run.truth, broken)
     except ValueError as error:
@@ -103,6 +107,23 @@ def section(run: Rollout) -> Section:
     figures_disorder.add(shown, found, run.turnover)
     shown.illustrations.sort(key=lambda illustration: illustration.name)
     return shown
+
+
+def _add_closure(shown: Section, solves: Mapping[str, np.ndarray]) -> None:
+    """What the solves for the resolved velocity took; that of the first frame, from nothing, does not count."""
+    later = slice(1, None) if len(solves["iterations"]) > 1 else slice(None)
+    failed = int(solves["not_converged"].sum())
+    shown.metrics += [
+        Metric("closure_iterations", "iterations of a solve for the resolved velocity, mean",
+               float(solves["iterations"][later].mean())),
+        Metric("closure_most_iterations", "iterations of a solve, most", int(solves["most_iterations"].max())),
+        Metric("closure_residual", "largest residual of a solve, in the rms of the velocity",
+               float(solves["residual"].max())),
+        Metric("closure_not_converged", "solves that did not converge", failed),
+    ]
+    if failed:
+        shown.notices.append(f"Solves for the resolved velocity that did not converge: {failed}; the worst left "
+                             f"{solves['residual'].max():.1e} of the velocities' rms.")
 
 
 def _notices(run: Rollout, last: float, broken: float) -> list[str]:
@@ -157,12 +178,22 @@ def _add_particles(shown: Section, run: Rollout, common: CommonFrames) -> None:
     ]
     pairs = {column: [comparison.particle_pair(run.model, run.truth, common, index, column)
                       for index in common.spread(3)] for column in comparison.EDGES}
+    floors = {column: comparison.sampling_floor(pairs[column][-1], edges)
+              for column, edges in comparison.EDGES.items()}
+    accelerations = pairs["acceleration"][-1]
+    shown.metrics += [
+        *(Metric(f"{column}_kl_floor", f"the same of two samples of the true {column}, as large as this", floor)
+          for column, floor in floors.items()),
+        Metric("acceleration_rms_ratio", "rms of the acceleration, model / truth",
+               float(np.std(accelerations.model) / np.std(accelerations.truth))),
+    ]
     shown.add_figure(
         "figure-6-pdfs", "PDFs of velocity and acceleration (the paper's Fig. 6)",
         figures_statistics.particle_pdfs(pairs, run.turnover),
         "All components, centred and divided by the truth's standard deviation at the time; values beyond "
         f"the axis count in its last bins. Last time: KL {final['velocity_kl']:.2g} (velocity), "
-        f"{final['acceleration_kl']:.2g} (acceleration).")
+        f"{final['acceleration_kl']:.2g} (acceleration); between samples of the truth {floors['velocity']:.2g} and "
+        f"{floors['acceleration']:.2g}.")
     shown.add_figure(
         "figure-9-errors", "Rollout over time",
         figures_rollout.errors_over_time(model, truth, errors, run.turnover),

@@ -52,6 +52,17 @@ def kl_divergence(truth: np.ndarray, prediction: np.ndarray, floor: float = FLOO
     return float(np.sum(p * np.log(p / q)))
 
 
+def sampling_divergence(values: np.ndarray, edges: np.ndarray) -> float:
+    """The divergence to expect of two samples of one distribution, each of as many rows as `values` (n, ...) has: what
+    a perfect model is found to have whose particles are others than those of the truth.
+
+    Half of what two halves, drawn from a fixed seed, have: it falls as one over the number of rows.
+    """
+    rows = np.random.default_rng(0).permutation(len(values))
+    halves = (bin_probabilities(values[half], edges) for half in np.array_split(rows, 2))
+    return kl_divergence(*halves) / 2
+
+
 def standardized(values: np.ndarray, reference: np.ndarray | None = None) -> np.ndarray:
     """(values - mean) / standard deviation, both taken from `reference` (default: the values themselves)."""
     reference = values if reference is None else reference

@@ -12,7 +12,7 @@ import numpy as np
 
 from eddies.analysis.errors import normalized_l2
 from eddies.analysis.lagrangian import neighbor_dispersion, velocity_correlation
-from eddies.analysis.pdfs import bin_edges, bin_probabilities, kl_divergence, standardized
+from eddies.analysis.pdfs import bin_edges, bin_probabilities, kl_divergence, sampling_divergence, standardized
 from eddies.analysis.spectra import energy_spectrum
 from eddies.analysis.velocity_gradients import ConditionalVelocity, InvariantBins, enstrophy_scale, invariants
 
@@ -119,6 +119,12 @@ def pdf_divergence(pair: Pair, edges: np.ndarray) -> float:
     """Forward KL divergence of the PDFs of all components, both standardised by the truth."""
     return kl_divergence(bin_probabilities(standardized(pair.truth), edges),
                          bin_probabilities(standardized(pair.model, pair.truth), edges))
+
+
+def sampling_floor(pair: Pair, edges: np.ndarray) -> float:
+    """The divergence of that PDF between two independent samples of the truth; that of a model whose particles are
+    still where those of the truth are can be smaller."""
+    return sampling_divergence(standardized(pair.truth), edges)
 
 
 @dataclass(frozen=True)

@@ -157,11 +157,15 @@ def _read_model(file, record: Run) -> list[Section]:
 def _read_rollout(file, record: Run) -> list[Section]:
     attributes = read_attributes(file, "rollout")
     record.cost += [Metric(key, label, attributes[key]) for key, label in ROLLOUT_COST.items()]
+    if "evaluations" in attributes:
+        record.cost.append(Metric("evaluations_per_turnover", "evaluations of the forces a turnover",
+                                  attributes["evaluations"] / attributes["turnovers"]))
     model, truth = Trajectory(file, "model"), Trajectory(file, "truth")
     fields = {name: FieldSeries(file, name) for name in ("model", "truth", "filtered")}
     outside = read_table(file, "outside_training")["share"] if "outside_training" in file else None
+    closure = read_table(file, "closure") if "closure" in file else None
     rollout = figures_comparison.Rollout(attributes, model, truth, fields, model.length, record.filter_width,
-                                         record.eulerian, outside)
+                                         record.eulerian, outside, closure)
     sections = [figures_comparison.section(rollout)]
     if rollout.forced and record.stationary is not None and record.filter_width is not None:
         sections.append(figures_forced.section(rollout, record.stationary))
