@@ -232,15 +232,19 @@ def slug(heading):
     return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
 
 
-@pytest.mark.parametrize("page", [CHECKOUT / "README.md", VALIDATION], ids=lambda page: page.name)
+PAGES = [CHECKOUT / "README.md", *sorted((CHECKOUT / "docs").glob("*.md"))]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_links_and_files_of_a_page_exist(page):
     text = page.read_text(encoding="utf-8")
-    anchors = {slug(heading) for heading in re.findall(r"^#+ (.+)$", text, re.MULTILINE)}
     for link in re.findall(r"\]\(([^)\s]+)\)", text):
-        if link.startswith("#"):
-            assert link[1:] in anchors, link
-        elif not link.startswith("https://"):
-            assert (page.parent / link).exists(), link
+        if not link.startswith("https://"):
+            path, _, anchor = link.partition("#")
+            target = page.parent / path if path else page
+            assert target.exists(), link
+            headings = re.findall(r"^#+ (.+)$", target.read_text("utf-8"), re.MULTILINE) if anchor else []
+            assert not anchor or anchor in map(slug, headings), link
     for path in re.findall(r"`((?:mpi_tools|jobs|tests|src|docs)/[\w./-]*)`", text):
         assert (CHECKOUT / path).exists(), path
     assert not re.search(r"^[A-Z]+(_[A-Z]+)*$|<[A-Z]+>", text, re.MULTILINE)  # nothing left to fill in

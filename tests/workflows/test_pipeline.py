@@ -48,8 +48,9 @@ def test_metrics_are_finite_and_within_bounds(run_directory):
     # Sixty steps teach little, but more than nothing: without a model the error is 1.
     assert model["acceleration_error"] < 0.9
     assert rollout["stable"] and 0.5 < rollout["energy_ratio"] < 1.5
-    assert rollout["closure_not_converged"] == 0 and 1 < rollout["closure_iterations"] < 30
-    assert 20 < metrics["cost"]["evaluations_per_turnover"] < 80
+    assert rollout["closure_not_converged"] == 0 and 0.3 < rollout["closure_iterations"] < 10
+    # 3 in each of 9 steps, and the first.
+    assert metrics["cost"]["evaluations_per_turnover"] == pytest.approx(28 / rollout["turnovers"])
     assert rollout["velocity_error"] < 0.95 * error_of_frozen_velocities(run_directory)
 
 

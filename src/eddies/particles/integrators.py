@@ -50,7 +50,8 @@ class VelocityVerlet(Integrator):
 
     def rates(self, particles: ParticleSet) -> tuple[ParticleSet, Rates]:
         # Those of the memory belong to the predicted velocity, so they are not these.
-        particles, _ = self.dynamics.settle(particles)
+        if particles is not self._last:  # else they are where they belong, and the memory is theirs
+            particles, _ = self.dynamics.settle(particles)
         return particles, self.dynamics.rates(particles)
 
     def step(self, particles: ParticleSet, time_step: float) -> ParticleSet:

@@ -157,7 +157,7 @@ def _read_model(file, record: Run) -> list[Section]:
 def _read_rollout(file, record: Run) -> list[Section]:
     attributes = read_attributes(file, "rollout")
     record.cost += [Metric(key, label, attributes[key]) for key, label in ROLLOUT_COST.items()]
-    if "evaluations" in attributes:
+    if "evaluations" in attributes and attributes["turnovers"] > 0:
         record.cost.append(Metric("evaluations_per_turnover", "evaluations of the forces a turnover",
                                   attributes["evaluations"] / attributes["turnovers"]))
     model, truth = Trajectory(file, "model"), Trajectory(file, "truth")

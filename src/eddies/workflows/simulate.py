@@ -105,8 +105,9 @@ def roll_out(mover: Mover, frames: RolloutFrames, count: int, interval: float, t
         progress(until / clock.end, clock.steps)
     if complaint is not None and comm.rank == 0:
         log.warning("rollout stopped at time %.4g: %s", clock.time, complaint)
+    step = clock.time / clock.steps if clock.steps else np.nan
     return {"status": "complete" if complaint is None else f"stopped: {complaint}", "time": frames.times[-1],
-            "steps": clock.steps, "time_step": clock.time / max(clock.steps, 1), **quartiles(seconds)}
+            "steps": clock.steps, "time_step": step, **quartiles(seconds)}
 
 
 def quartiles(seconds: Sequence[float]) -> dict[str, float]:
