@@ -368,7 +368,7 @@ def test_evaluations_of_a_run_tell_later_ones_what_to_expect(comm):
         assert torch.equal(alone.acceleration, first.acceleration)
         dynamics.time = 0.25
         dynamics.rates_after(0.01, particles)
-        assert dynamics.evaluations == 2 and len(dynamics.resolution.solves) == 2
+        assert dynamics.evaluations == 2 and len(dynamics.resolution.solves) == 5
         again = dynamics_of(slab, dynamics.model, tolerance=1e-3)
         assert iterations(again, 0.3) == iterations(again)
         again.load_state_dict({name: column.clone() for name, column in dynamics.state_dict().items()})

@@ -30,6 +30,20 @@ def test_motion_of_fifth_degree_is_met_exactly_across_the_faces_of_the_box():
     assert np.allclose(found.velocity, rows(1)(0.23), rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("speed", [0.0, 40.0, 1e4])
+def test_uniform_motion_at_any_speed_and_a_density_of_third_degree(speed):
+    """Also many times through the box within a step."""
+    position, velocity = np.array([[1.0, 2.0, 6.0]]), np.array([[speed, -0.7 * speed, 0.3 * speed]])
+    density = np.polynomial.Polynomial([1.0, 0.2, -0.4, 3.0])
+    before, after = (Moment(time, 0, (position + time * velocity) % LENGTH, velocity, 0 * velocity,
+                            *(np.array([density.deriv(order)(time)]) for order in (0, 1))) for time in (0.2, 0.33))
+    found = between(before, after, 0.3, PeriodicBox(LENGTH))
+    miss = found.position.numpy() - position - 0.3 * velocity
+    assert np.abs(miss - LENGTH * np.rint(miss / LENGTH)).max() < 1e-14 * max(speed, 100)
+    assert np.abs(found.velocity.numpy() - velocity).max() <= 1e-15 * speed
+    assert found.density.numpy() == pytest.approx(density(0.3), rel=1e-14)
+
+
 def test_errors_between_steps_are_of_fourth_order():
     def errors(step):
         waves = [lambda time, order=order: np.sin(3 * time + order * np.pi / 2) * 3.0**order * np.ones((1, 3))

@@ -103,8 +103,8 @@ def test_no_arrangement_of_particles_disturbs_a_solve(comm, kind):
     flow = found.of(particles)
     penalty = (found._penalty * flow.grid.multiplicity * flow.velocity.abs().square().sum(0)).sum()
     assert flow.missing().square().sum() + penalty <= flow.relative_velocity.square().sum()
-    assert flow.converged or kind in ("cluster across a corner", "void", "uneven", "coincident")
-    assert flow.converged == (flow.residual <= found.tolerance)
+    # Where most particles are in a few places a solve takes hundreds of iterations, and says that it did not converge.
+    assert flow.converged == (kind not in ("cluster across a corner", "void", "uneven"))
 
 
 @pytest.mark.mpi(1)
@@ -295,7 +295,7 @@ def test_what_is_foreseen_of_a_rate_that_changes_linearly_is_exact(comm):
     slab, particles, _ = in_known_flow(comm)
     found = resolution_on(slab)
     flow, zero = found.of(particles), np.zeros(3)
-    assert found.foreseen(0.3, zero) is None
+    assert found.foreseen(0.3, zero, 0.0) is None
 
     def at(time):  # u(t) with du/dt = (1 + 2t) w, w = u(0)
         return (1 + time + time**2) * flow.velocity
@@ -306,9 +306,43 @@ def test_what_is_foreseen_of_a_rate_that_changes_linearly_is_exact(comm):
 
     for time in (0.1, 0.25):
         found.remember(time, *force(time))
-    assert_close(found.foreseen(0.4, zero), at(0.4), 1e-12)
-    assert_close(found.foreseen(0.2, zero), at(0.2), 1e-12)
-    assert [iterations for iterations, _, _ in found.solves] == 2 * [flow.iterations]
+    assert_close(found.foreseen(0.4, zero, 0.0), at(0.4), 1e-12)
+    assert_close(found.foreseen(0.2, zero, 0.0), at(0.2), 1e-12)
+
+
+@pytest.mark.mpi(1, 2)
+def test_a_forecast_is_as_large_as_it_deserves(comm):
+    """Modes that a velocity U carries along, u exp(-ik.Ut), normally distributed with 0.8 a component: in the mean over
+    many U no forecast of a shell is worse than none, one of slow modes is good, and without their worth those of fast
+    ones are worse than none."""
+    slab, particles, _ = in_known_flow(comm)
+    flow, zero, random = resolution_on(slab).of(particles), np.zeros(3), np.random.default_rng(4)
+    shell = torch.round(flow.grid.shell).long()
+    missed, size = {speed: torch.zeros(10, dtype=torch.float64) for speed in (0.0, 0.8)}, torch.zeros(10)
+    for _ in range(12):
+        turn = sum(k * float(u) for k, u in zip(flow.grid.wavevector, 0.8 * random.normal(size=3)))
+
+        def at(time):
+            return flow.velocity * torch.exp(-1j * turn * time)
+
+        found = resolution_on(slab)
+        for time in (-0.2, 0.0):
+            now = replace(flow, velocity=at(time))
+            found.remember(time, now, -1j * turn * at(time) + flow.grid.stress_divergence(now.products))
+        for speed, shells in missed.items():
+            shells += by_shells(flow.grid, shell, found.foreseen(0.2, zero, speed) - at(0.2))
+        size = size + by_shells(flow.grid, shell, at(0.2))
+    raw, worth = ((missed[speed] / size)[1:] for speed in (0.0, 0.8))
+    assert worth.max() < 1 < raw[-1] and worth[1] < 0.05
+    assert (worth[5:] < raw[5:]).all()
+
+
+def by_shells(grid, shell, modes):
+    """Energy of modes by shells 0 to 9, over all ranks."""
+    energy = grid.multiplicity * modes.abs().square().sum(0)
+    inside = shell < 10
+    sums = torch.zeros(10, dtype=torch.float64).index_add(0, shell[inside], energy[inside])
+    return torch.from_numpy(global_sum(grid.decomposition.comm, sums.numpy()))
 
 
 @pytest.mark.mpi(1, 2)
@@ -322,7 +356,7 @@ def test_what_is_foreseen_moves_along_with_the_mean(comm):
     velocity = torch.from_numpy(filtered_fields.at(modes, cloud(count=SIDE**3).numpy()))
     slab, later = distributed(comm, moved % LENGTH, velocity + mean, planes=PLANES)
     expected = resolution_on(slab).of(later)
-    foreseen = found.foreseen(time, (velocity + mean).mean(0).numpy())
+    foreseen = found.foreseen(time, (velocity + mean).mean(0).numpy(), 0.0)
     foreseen = foreseen * torch.exp(1j * time * sum(k * float(v) for k, v in zip(
         flow.grid.wavevector, velocity.mean(0))))  # the modes themselves do not move with the wave's own mean
     # To the splines' error, which depends on where particles are in their cells.

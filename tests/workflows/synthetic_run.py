@@ -188,7 +188,7 @@ def write_rollout(comm, directory, status="complete", total=600, cells=16, frame
         write_attributes(file.create_group("rollout"), attributes)
         write_table(file, "outside_training", {"time": times, "share": 1e-3 * times * (0.9 - times)})
         late = times > 0
-        write_table(file, "closure", {"time": times, "iterations": np.where(late, 2.5, 40.0),
+        write_table(file, "closure", {"time": times, "solves": 4.0 * late, "iterations": np.where(late, 10.0, 40.0),
                                       "most_iterations": np.where(late, 4.0, 40.0),
                                       "residual": np.full(len(times), 1e-3), "not_converged": 1.0 * ~late})
         runs = (("truth", times[:-3], PerturbedFlow(0.0)), ("model", times, PerturbedFlow(0.4)))

@@ -110,12 +110,11 @@ def section(run: Rollout) -> Section:
 
 
 def _add_closure(shown: Section, solves: Mapping[str, np.ndarray]) -> None:
-    """What the solves for the resolved velocity took; that of the first frame, from nothing, does not count."""
-    later = slice(1, None) if len(solves["iterations"]) > 1 else slice(None)
-    failed = int(solves["not_converged"].sum())
+    """What the solves for the resolved velocity took; those of the first frame, from nothing, are not in the mean."""
+    count, failed = solves["solves"][1:].sum(), int(solves["not_converged"].sum())
     shown.metrics += [
         Metric("closure_iterations", "iterations of a solve for the resolved velocity, mean",
-               float(solves["iterations"][later].mean())),
+               float(solves["iterations"][1:].sum() / count) if count else None, "no step was taken"),
         Metric("closure_most_iterations", "iterations of a solve, most", int(solves["most_iterations"].max())),
         Metric("closure_residual", "largest residual of a solve, in the rms of the velocity",
                float(solves["residual"].max())),

@@ -134,7 +134,7 @@ class FourierGrid:
 
 class Points:
     """Positions (n, 3) among the planes of a grid, and the splines around them as sparse matrices (n, rows of the
-    padded planes): they cost more to make than to use, and are used at every pass of a deconvolution."""
+    padded planes): they cost more to make than to use, and are used in every iteration of a solve."""
 
     def __init__(self, spline: SplineInterpolation, position: Tensor) -> None:
         self.spline, self.position = spline, position

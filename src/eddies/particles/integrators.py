@@ -52,7 +52,7 @@ class VelocityVerlet(Integrator):
         # Those of the memory belong to the predicted velocity, so they are not these.
         if particles is not self._last:  # else they are where they belong, and the memory is theirs
             particles, _ = self.dynamics.settle(particles)
-        return particles, self.dynamics.rates(particles)
+        return particles, self.dynamics.rates(particles, time=self.dynamics.time)
 
     def step(self, particles: ParticleSet, time_step: float) -> ParticleSet:
         if particles is self._last and self.memory:

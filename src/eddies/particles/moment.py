@@ -22,6 +22,7 @@ class Moment:
     time : of the moment.
     first : the id that the block begins with.
     position, velocity, acceleration : (n, 3).
+    density, density_rate : (n,), of particles that have a density, else None.
     """
 
     time: float
@@ -29,30 +30,44 @@ class Moment:
     position: np.ndarray
     velocity: np.ndarray
     acceleration: np.ndarray
+    density: np.ndarray | None = None
+    density_rate: np.ndarray | None = None
 
     @classmethod
     def of(cls, comm, total: int, time: float, particles: ParticleSet, rates: Rates) -> Moment:
         """That of particles on any ranks, `total` in all; collective."""
         order = IdOrder(comm, as_numpy(particles.id), total)
-        columns = particles.position, particles.velocity, rates.acceleration
+        columns = [particles.position, particles.velocity, rates.acceleration]
+        if particles.density is not None:
+            still = torch.zeros_like(particles.density)
+            columns += [particles.density, still if rates.density_rate is None else rates.density_rate]
         return cls(time, order.start, *(order.apply(as_numpy(column)) for column in columns))
 
 
 def between(before: Moment, after: Moment, time: float, box: PeriodicBox) -> ParticleSet:
     """The particles at a time between two moments, in blocks by id: polynomials of fifth degree for positions and of
-    third for velocities (Hermite), which the positions, velocities and accelerations at both ends determine. Their
-    errors are of sixth and of fourth order in the time between."""
+    third for velocities and densities (Hermite), which these and their rates at both ends determine. Their errors are
+    of sixth and of fourth order in the time between."""
     step = after.time - before.time
     theta = (time - before.time) / step
-    moved = box.displacement(torch.from_numpy(after.position), torch.from_numpy(before.position)).numpy()
     kick, drift = step * before.acceleration, step * before.velocity
+    # The nearest image is told of what the velocities leave open: particles may cross the box within a step.
+    way = step * (before.velocity + after.velocity) / 2
+    moved = way + box.displacement(torch.from_numpy(after.position - way), torch.from_numpy(before.position)).numpy()
     # What remains at the end of the expansion about the first moment.
     jump, turn = step * (after.velocity - before.velocity) - step * kick, step * (step * after.acceleration - kick)
     miss = moved - drift - step * kick / 2
     position = before.position + theta * (drift + theta * (step * kick / 2 + theta * (
         10 * miss - 4 * jump + turn / 2 + theta * (-15 * miss + 7 * jump - turn + theta * (
             6 * miss - 3 * jump + turn / 2)))))
-    jump, turn = jump / step, turn / step
-    velocity = before.velocity + theta * (kick + theta * (3 * jump - turn + theta * (turn - 2 * jump)))
+    velocity = _cubic(before.velocity, after.velocity, kick, step * after.acceleration, theta)
+    density = None if before.density is None else torch.from_numpy(_cubic(
+        before.density, after.density, step * before.density_rate, step * after.density_rate, theta))
     ids = torch.arange(before.first, before.first + len(position))
-    return ParticleSet(ids, box.wrap(torch.from_numpy(position)), torch.from_numpy(velocity))
+    return ParticleSet(ids, box.wrap(torch.from_numpy(position)), torch.from_numpy(velocity), density)
+
+
+def _cubic(first: np.ndarray, last: np.ndarray, rise: np.ndarray, fall: np.ndarray, theta: float) -> np.ndarray:
+    """Hermite's polynomial of third degree at 0 <= theta <= 1, of values and slopes at both ends."""
+    jump, turn = last - first - rise, fall - rise
+    return first + theta * (rise + theta * (3 * jump - turn + theta * (turn - 2 * jump)))

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from eddies.clock import duration
 from eddies.scene import BOX_LENGTH, Scene
 from eddies.workflows.cost_model import LATENCY, NODE_BANDWIDTH, NODE_RANKS, Speed, cost, costs, pair_bytes, probe
-from eddies.workflows.estimates import (advised_step, expected_step, expected_turbulence, ground_truth_alone,
+from eddies.workflows.estimates import (expected_step, expected_turbulence, foreseen_advised_step, ground_truth_alone,
                                         largest_wavenumber, learns_pairs, most_ranks, particle_reach, run_time)
 
 log = logging.getLogger("eddies")
@@ -143,8 +143,8 @@ def warnings(scene: Scene, ranks: int) -> Iterator[str]:
             if settings.learns_through_horizons:
                 yield (f'[model] terms: "{name}" is trained through horizons alone, and stays as it starts without '
                        "them: set [training] horizon_steps")
-    if scene.simulation and scene.model and "resolved" in scene.model.reads:
-        advised = advised_step(scene)
+    if scene.simulation and "model" in scene.simulation.needs and "resolved" in scene.model.reads:
+        advised = foreseen_advised_step(scene)
         if advised and scene.simulation.step > advised * (1 + 1e-9):
             yield (f"[simulation] step = {scene.simulation.step:g}: is longer than {advised:.2g}, up to which the "
                    "resolved velocity follows the flow; lower it")

@@ -4,13 +4,12 @@ import math
 from dataclasses import dataclass, replace
 
 from eddies.clock import ladder_step
-from eddies.particles.reference_scales import resolved_wavenumber
+from eddies.particles.reference_scales import advised_step, resolved_wavenumber
 from eddies.scene import BOX_LENGTH, Eulerian, Scene
 
 DISSIPATION_CONSTANT = 0.5   # C_eps = eps L / u'^3 of developed turbulence
 PEAK_VELOCITY = 4.0          # largest component of the velocity of a particle over u'
 ALLOWED_VELOCITY = 6.0       # the same, for which there are ghost planes in the training through horizons
-ADVISED_ANGLE = 3.0          # k_c u' times a step of "rk3", u' of the forced flow: docs/closure.md
 PEAK_SPEED = 7.0             # max(|u| + |v| + |w|) over u' in turbulence: four rms in each component at worst
 EXACT_PEAK_SPEED = {"taylor-green": 1.0, "abc": 3 * math.sqrt(2), "shear-wave": 1.0}  # over the amplitude
 GHOST_PLANES = {"cubic": 3, "quintic": 4}
@@ -174,14 +173,14 @@ def particle_drift(scene: Scene, time: float, peak: float = PEAK_VELOCITY) -> fl
     return peak * turbulence.velocity_rms * time if turbulence else 0.0
 
 
-def advised_step(scene: Scene) -> float | None:
-    """The longest time step that is advised where the velocity of the particles is resolved: in it u' carries them by
-    `ADVISED_ANGLE` radians of the highest resolved wave; None where the turbulence is not foreseen."""
+def foreseen_advised_step(scene: Scene) -> float | None:
+    """The longest time step that is advised for the particles of a forced or freely decaying flow, where their velocity
+    is resolved; None where the turbulence is not foreseen."""
     turbulence = expected_turbulence(scene)
     if turbulence is None:
         return None
     highest = resolved_wavenumber(scene.tracers.spacing, scene.tracers.width, turbulence.kolmogorov_length)
-    return ADVISED_ANGLE / (highest * turbulence.velocity_rms)
+    return advised_step(scene.simulation.integrator, highest, turbulence.velocity_rms)
 
 
 def horizon_time(scene: Scene) -> float:

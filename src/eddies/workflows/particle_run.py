@@ -19,6 +19,7 @@ from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.model import LagrangianModel, build_model
 from eddies.particles.moment import Moment, between
 from eddies.particles.particle_set import ParticleSet
+from eddies.particles.reference_scales import advised_step
 from eddies.particles.terms.forcing import Forcing
 from eddies.particles.terms.presets import PRESETS
 from eddies.particles.terms.settings import SummationDensity, WCSPH
@@ -31,6 +32,8 @@ log = logging.getLogger("eddies")
 # A state is runaway, not turbulence, when a particle is this many times faster, or its density this many times
 # farther from the mean, than the rms of the truth.
 RUNAWAY_SPEED, RUNAWAY_DENSITY = 30.0, 300.0
+# What is stored of the solves for the resolved velocity.
+SOLVES = "solves", "iterations", "most_iterations", "residual", "not_converged"
 
 
 class ParticleRun:
@@ -54,7 +57,8 @@ class ParticleRun:
         self._before: Moment | None = None
         self.limits = Limits(RUNAWAY_SPEED * self.scales.velocity, self.scales.density_mean, self.largest_deviation)
         self._shares_outside: list[float] = []
-        self._solves = {"iterations": [], "most_iterations": [], "residual": [], "not_converged": []}
+        self._solves: dict[str, list[float]] = {name: [] for name in SOLVES}
+        self._warn_of_long_steps()
 
     def build(self, scene: Scene, directory: Path) -> LagrangianModel:
         """The model, without forcing; collective."""
@@ -89,10 +93,20 @@ class ParticleRun:
         try:
             self._before = self._now() if step > left * (1 + 1e-9) else None
             self.particles = self.integrator.step(self.particles, step)
+            fault = find_fault(self.particles, self.limits, self.dynamics.box, number, self.comm.rank)
+            complaint = first_complaint(self.comm, fault)
+            if complaint is None and self.integrator.dense:
+                complaint = self._complaint_of_rates(number)
         except HaloError as error:  # on all ranks alike: particles outrun the halo
             return f"step {number}: {error}"
-        fault = find_fault(self.particles, self.limits, self.dynamics.box, number, self.comm.rank)
-        return first_complaint(self.comm, fault)
+        return complaint
+
+    def _complaint_of_rates(self, number: int) -> str | None:
+        """What is wrong with the rates at the end of a step, which a frame asks for and the next step begins with."""
+        self.particles, rates = self.integrator.rates(self.particles)
+        wrong = self.particles.id[~torch.isfinite(rates.acceleration).all(1)].tolist()
+        return first_complaint(self.comm, f"step {number}, rank {self.comm.rank}, particle {wrong[0]}: its "
+                                          "acceleration is not finite" if wrong else None)
 
     def frame(self, time: float) -> tuple[ParticleSet, torch.Tensor]:
         """The particles at a time that the last step reached, with the density that terms give if they do, and their
@@ -123,21 +137,33 @@ class ParticleRun:
         solves, self.dynamics.resolution.solves = self.dynamics.resolution.solves, []
         iterations, residuals, converged = (np.array(column) for column in zip(*solves or [(0, 0.0, True)]))
         failed = int((~converged).sum())
-        for name, value in (("iterations", iterations.mean()), ("most_iterations", iterations.max()),
-                            ("residual", residuals.max()), ("not_converged", failed)):
+        found = len(solves), iterations.sum(), iterations.max(), residuals.max(), failed
+        for name, value in zip(SOLVES, found):
             self._solves[name].append(float(value))
         if failed and self.comm.rank == 0:
             log.warning("rollout: %d of %d solves for the resolved velocity did not converge in %d iterations, the "
                         "worst left a residual of %.1e", failed, len(solves), max(iterations), residuals.max())
 
+    def _warn_of_long_steps(self) -> None:
+        """Say so where the flow carries particles farther in a step than their resolved velocity can follow."""
+        if self.dynamics.resolution is None or self.comm.rank:
+            return
+        highest = self.dynamics.resolution.grid.resolved * 2 * np.pi / self.dynamics.box.length
+        advised = advised_step(self.settings.integrator, highest, self.scales.velocity)
+        if self.settings.step > advised * (1 + 1e-9):
+            log.warning("[simulation] step = %g: is longer than %.2g, up to which the resolved velocity follows this "
+                        "flow; lower it", self.settings.step, advised)
+
     def status(self) -> str:
-        """Iterations of a solve for the resolved velocity, for the progress line."""
-        return f"  iterations {self._solves['iterations'][-1]:.1f}" if self._solves["iterations"] else ""
+        """Iterations of a solve for the resolved velocity, for the progress line: the last mean between two frames."""
+        means = [iterations / count for count, iterations in zip(self._solves["solves"], self._solves["iterations"])
+                 if count]
+        return f"  iterations {means[-1]:.1f}" if means else ""
 
     def series(self) -> dict[str, dict[str, list[float]]]:
         """`outside_training`: the share of pairs that give the networks inputs outside the range of their training;
-        `closure`: mean and most iterations, the largest residual and the failures of the solves for the resolved
-        velocity since the frame before."""
+        `closure`: the solves for the resolved velocity since the frame before, all and most of their iterations, the
+        largest residual, and how many did not converge."""
         found = {} if self.seen is None else {"outside_training": {"share": self._shares_outside}}
         return found if self.dynamics.resolution is None else {**found, "closure": self._solves}
 

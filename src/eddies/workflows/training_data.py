@@ -102,6 +102,9 @@ class TrainingData:
         interval, slab = scene.tracers.frame_interval, self.truth.decomposition
         drift = ALLOWED_VELOCITY * self.model.flow.scales.velocity * interval * self.longest
         dynamics = ParticleDynamics(slab, self.model, 0.0, self.dtype, fixed_ranks=True, drift=drift)
+        if dynamics.resolution is not None:
+            # Whose gradient is that of the particles alone: what is foreseen may not be part of the result.
+            dynamics.resolution.tolerance_foreseen = dynamics.resolution.tolerance
         resolution = None
         if settings.energy_weight > 0:
             resolution = dynamics.resolution or ResolvedVelocity.on_slabs(slab, self.model.flow, drift)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -19,6 +20,8 @@ from eddies.particles.model import LagrangianModel
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.reference_scales import ReferenceScales
 from eddies.workflows.measured_scales import RATES, measured_scales
+
+log = logging.getLogger("eddies")
 
 
 class GroundTruth:
@@ -114,8 +117,14 @@ def load_frame(truth: GroundTruth, index: int, model: LagrangianModel, dtype: to
     rates = {name: torch.from_numpy(columns[name]).to(device, dtype)
              for name in ("acceleration", "density_rate") if name in columns}
     dynamics = ParticleDynamics(truth.decomposition, model, skin=0.0, dtype=dtype)
-    return TrainingFrame(dynamics, particles_for(model, columns, device), rates["acceleration"],
-                         rates.get("density_rate"))
+    frame = TrainingFrame(dynamics, particles_for(model, columns, device), rates["acceleration"],
+                          rates.get("density_rate"))
+    solves = [] if dynamics.resolution is None else dynamics.resolution.solves
+    for iterations, residual, converged in solves:
+        if not converged and truth.decomposition.comm.rank == 0:
+            log.warning("frame %d: the solve for the resolved velocity did not converge in %d iterations and left %.1e",
+                        index, iterations, residual)
+    return frame
 
 
 def particles_for(model: LagrangianModel, columns: dict[str, np.ndarray], device: torch.device) -> ParticleSet:
