@@ -171,7 +171,7 @@ class Simulation(Section):
 
     method: str = named("what moves the particles; see Baselines", *METHODS, default="learned")
     integrator: str = choice("time stepping of the particles", "verlet", "rk2", "rk3", "rk4", default="rk3")
-    step: float = number("time step; eulerian: the longest", above=0)
+    step: float = number("longest time step; see docs/closure.md", above=0)
     turnovers: float = number("large-eddy turnovers to simulate", above=0)
     start: float | None = number("as a fraction of the ground truth; absent: where the training window ends",
                                  default=None, at_least=0, below=1)

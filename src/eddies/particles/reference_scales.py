@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, fields
 # turbulence ends; and the least that the filter may leave of a mode, as it is undone. Measured in docs/closure.md.
 BEYOND_NYQUIST, BEYOND_DISSIPATION, LEAST_TRANSFER = 1.5, 1.05, 0.02
 # k_c u' times a step, by integrator, up to which the resolved velocity follows the flow: docs/closure.md.
-ADVISED_ANGLES = {"verlet": 0.5, "rk2": 1.2, "rk3": 2.4, "rk4": 2.4}
+ALLOWED_ANGLES = {"verlet": 0.5, "rk2": 1.2, "rk3": 2.0, "rk4": 2.4}
 MAY_VANISH = ("viscosity", "kolmogorov_length")
 
 
@@ -75,7 +75,7 @@ def resolved_wavenumber(spacing: float, filter_width: float, kolmogorov_length: 
     return min(highest, BEYOND_DISSIPATION / kolmogorov_length) if kolmogorov_length > 0 else highest
 
 
-def advised_step(integrator: str, highest: float, speed: float) -> float:
-    """The longest time step that is advised where velocities are resolved up to a wavenumber k_c = `highest`: in it
-    the rms `speed` u' of a component carries particles by `ADVISED_ANGLES` radians of that wave. Infinite at rest."""
-    return ADVISED_ANGLES[integrator] / (highest * speed) if speed > 0 else math.inf
+def allowed_step(integrator: str, highest: float, speed: float) -> float:
+    """The longest time step where velocities are resolved up to a wavenumber k_c = `highest`: in it the rms `speed` u'
+    of a component carries particles by `ALLOWED_ANGLES` radians of that wave. Infinite at rest."""
+    return ALLOWED_ANGLES[integrator] / (highest * speed) if speed > 0 else math.inf

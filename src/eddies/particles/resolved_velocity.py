@@ -72,6 +72,8 @@ class ResolvedVelocity:
         self._inside = (grid.shell > 0) & (grid.shell <= grid.resolved)
         self._moments: list[_Moment] = []
         self.solves = []
+        #: rms u' of a component of the resolved velocity last remembered; 0 before
+        self.speed = 0.0
         law, tail = _prior(grid, filter_width, self._inside)
         self._penalty = torch.where(self._inside, weight * tail / (3 * torch.where(self._inside, law, 1.0)), 0.0)
 
@@ -125,6 +127,7 @@ class ResolvedVelocity:
         rate = self._solenoidal(change if force is None else force.detach() + change)
         self._moments = [moment for moment in self._moments if moment.time != time][-1:]
         self._moments.append(_Moment(time, flow.velocity.detach(), rate))
+        self.speed = float(flow.rms)
 
     def foreseen(self, time: float, mean: np.ndarray, speed: float) -> Tensor | None:
         """The modes at a time by the rates of the last two evaluations at different times (Adams and Bashforth),
@@ -149,17 +152,20 @@ class ResolvedVelocity:
 
     def forget(self) -> None:
         """Start the next solve from nothing."""
-        self._moments, self.solves = [], []
+        self._moments, self.solves, self.speed = [], [], 0.0
 
     def state_dict(self) -> dict[str, Tensor]:
-        """What later solves start from: times (m,), and modes (m, 2, 3, kz, ky_local, kx) of velocity and rate."""
+        """What later solves start from: times (m,), and modes (m, 2, 3, kz, ky_local, kx) of velocity and rate; and the
+        speed."""
         modes = [torch.stack([moment.velocity, moment.rate]) for moment in self._moments]
         return {"times": torch.tensor([moment.time for moment in self._moments], dtype=torch.float64),
-                "modes": torch.stack(modes) if modes else self.grid.zeros(0, 2, 3)}
+                "modes": torch.stack(modes) if modes else self.grid.zeros(0, 2, 3),
+                "speed": torch.tensor(self.speed, dtype=torch.float64)}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Inverse of `state_dict`."""
         self._moments = [_Moment(float(time), *modes) for time, modes in zip(state["times"], state["modes"])]
+        self.speed = float(state["speed"])
 
     def _carried(self, modes: Tensor, step: float, mean: np.ndarray) -> Tensor:
         """Modes of a field that has moved with the mean velocity for a time."""

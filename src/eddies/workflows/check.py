@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from eddies.clock import duration
 from eddies.scene import BOX_LENGTH, Scene
 from eddies.workflows.cost_model import LATENCY, NODE_BANDWIDTH, NODE_RANKS, Speed, cost, costs, pair_bytes, probe
-from eddies.workflows.estimates import (expected_step, expected_turbulence, foreseen_advised_step, ground_truth_alone,
+from eddies.workflows.estimates import (expected_step, expected_turbulence, foreseen_allowed_step, ground_truth_alone,
                                         largest_wavenumber, learns_pairs, most_ranks, particle_reach, run_time)
 
 log = logging.getLogger("eddies")
@@ -144,10 +144,10 @@ def warnings(scene: Scene, ranks: int) -> Iterator[str]:
                 yield (f'[model] terms: "{name}" is trained through horizons alone, and stays as it starts without '
                        "them: set [training] horizon_steps")
     if scene.simulation and "model" in scene.simulation.needs and "resolved" in scene.model.reads:
-        advised = foreseen_advised_step(scene)
-        if advised and scene.simulation.step > advised * (1 + 1e-9):
-            yield (f"[simulation] step = {scene.simulation.step:g}: is longer than {advised:.2g}, up to which the "
-                   "resolved velocity follows the flow; lower it")
+        allowed = foreseen_allowed_step(scene)
+        if allowed and scene.simulation.injection != "none" and scene.simulation.step > allowed * (1 + 1e-9):
+            yield (f"[simulation] step = {scene.simulation.step:g}: the particles will take shorter steps, of about "
+                   f"{allowed:.2g}, in which their resolved velocity can follow the flow")
     if scene.tracers and scene.tracers.width < BOX_LENGTH / scene.flow.cells:
         yield "the filter is narrower than a cell of the grid: it filters nothing"
     if ranks > most:

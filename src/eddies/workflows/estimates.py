@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, replace
 
 from eddies.clock import ladder_step
-from eddies.particles.reference_scales import advised_step, resolved_wavenumber
+from eddies.particles.reference_scales import allowed_step, resolved_wavenumber
 from eddies.scene import BOX_LENGTH, Eulerian, Scene
 
 DISSIPATION_CONSTANT = 0.5   # C_eps = eps L / u'^3 of developed turbulence
@@ -173,14 +173,14 @@ def particle_drift(scene: Scene, time: float, peak: float = PEAK_VELOCITY) -> fl
     return peak * turbulence.velocity_rms * time if turbulence else 0.0
 
 
-def foreseen_advised_step(scene: Scene) -> float | None:
-    """The longest time step that is advised for the particles of a forced or freely decaying flow, where their velocity
-    is resolved; None where the turbulence is not foreseen."""
+def foreseen_allowed_step(scene: Scene) -> float | None:
+    """The longest time step that particles with a resolved velocity can take in the turbulence that is expected, which
+    may decay before they start; None where it is not foreseen."""
     turbulence = expected_turbulence(scene)
     if turbulence is None:
         return None
     highest = resolved_wavenumber(scene.tracers.spacing, scene.tracers.width, turbulence.kolmogorov_length)
-    return advised_step(scene.simulation.integrator, highest, turbulence.velocity_rms)
+    return allowed_step(scene.simulation.integrator, highest, turbulence.velocity_rms)
 
 
 def horizon_time(scene: Scene) -> float:

@@ -19,7 +19,7 @@ from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.model import LagrangianModel, build_model
 from eddies.particles.moment import Moment, between
 from eddies.particles.particle_set import ParticleSet
-from eddies.particles.reference_scales import advised_step
+from eddies.particles.reference_scales import allowed_step
 from eddies.particles.terms.forcing import Forcing
 from eddies.particles.terms.presets import PRESETS
 from eddies.particles.terms.settings import SummationDensity, WCSPH
@@ -58,7 +58,6 @@ class ParticleRun:
         self.limits = Limits(RUNAWAY_SPEED * self.scales.velocity, self.scales.density_mean, self.largest_deviation)
         self._shares_outside: list[float] = []
         self._solves: dict[str, list[float]] = {name: [] for name in SOLVES}
-        self._warn_of_long_steps()
 
     def build(self, scene: Scene, directory: Path) -> LagrangianModel:
         """The model, without forcing; collective."""
@@ -84,10 +83,10 @@ class ParticleRun:
     def advance(self, until: float, number: int) -> str | None:
         """Take a step towards a time; what is wrong with the state after it, on all ranks, or None.
 
-        Steps of a scheme that can tell what was between them are all as long as the scene has them, and may go beyond;
-        those of others end there.
+        Steps are as long as the scene has them, or as the flow allows where that is less. Those of a scheme that can
+        tell what was between them may go beyond that time; those of others end there.
         """
-        step, left = self.settings.step, until - self.time
+        step, left = min(self.settings.step, self._allowed_step()), until - self.time
         if not self.integrator.dense:
             step = left / np.ceil(left / step - 1e-9)
         try:
@@ -100,6 +99,14 @@ class ParticleRun:
         except HaloError as error:  # on all ranks alike: particles outrun the halo
             return f"step {number}: {error}"
         return complaint
+
+    def _allowed_step(self) -> float:
+        """The longest step in which the resolved velocity, if there is one, can follow the flow as it is now."""
+        resolution = self.dynamics.resolution
+        if resolution is None:
+            return np.inf
+        highest = resolution.grid.resolved * 2 * np.pi / self.dynamics.box.length
+        return allowed_step(self.settings.integrator, highest, resolution.speed)
 
     def _complaint_of_rates(self, number: int) -> str | None:
         """What is wrong with the rates at the end of a step, which a frame asks for and the next step begins with."""
@@ -143,16 +150,6 @@ class ParticleRun:
         if failed and self.comm.rank == 0:
             log.warning("rollout: %d of %d solves for the resolved velocity did not converge in %d iterations, the "
                         "worst left a residual of %.1e", failed, len(solves), max(iterations), residuals.max())
-
-    def _warn_of_long_steps(self) -> None:
-        """Say so where the flow carries particles farther in a step than their resolved velocity can follow."""
-        if self.dynamics.resolution is None or self.comm.rank:
-            return
-        highest = self.dynamics.resolution.grid.resolved * 2 * np.pi / self.dynamics.box.length
-        advised = advised_step(self.settings.integrator, highest, self.scales.velocity)
-        if self.settings.step > advised * (1 + 1e-9):
-            log.warning("[simulation] step = %g: is longer than %.2g, up to which the resolved velocity follows this "
-                        "flow; lower it", self.settings.step, advised)
 
     def status(self) -> str:
         """Iterations of a solve for the resolved velocity, for the progress line: the last mean between two frames."""
