@@ -374,6 +374,7 @@ def test_a_solve_starts_from_what_is_foreseen_and_goes_on_bit_for_bit(comm):
     found.rates_after(0.05, replace(particles, velocity=particles.velocity + 0.05 * first.acceleration))
     other = dynamics_of(slab, lagrangian(), tolerance=1e-5)
     other.load_state_dict(found.state_dict())
+    assert other.resolution.speed == found.resolution.speed > 0
     one, two = (which.rates_after(0.1, particles).acceleration for which in (found, other))
     assert torch.equal(one, two) and other.resolution.solves[-1] == found.resolution.solves[-1]
 

@@ -14,6 +14,7 @@ from eddies.io.trajectories import Trajectory
 from eddies.io.weights import save_weights
 from eddies.methods import METHODS, method_class
 from eddies.parallel.slab import SlabDecomposition
+from eddies.particles.reference_scales import ALLOWED_ANGLES, resolved_wavenumber
 from eddies.particles.resolved_velocity import ResolvedVelocity
 from eddies.particles.smoothing_kernels import KernelNetwork
 from eddies.scene import BOX_LENGTH, Model, SceneError, load_scene
@@ -264,6 +265,19 @@ def test_frames_of_long_steps_are_those_of_short_ones(comm, tmp_path, monkeypatc
             change = np.linalg.norm(short[name] - short[name][0])
             # Of third order, as the scheme is.
             assert np.linalg.norm(found[step][name] - short[name]) < 2e-3 * (step / 0.1) ** 3 * change
+
+
+@pytest.mark.mpi(1, 2)
+def test_steps_are_as_short_as_the_resolved_velocity_needs(comm, tmp_path, monkeypatch):
+    """Of 0.05 radians of the highest wave by the rms velocity, which changes little."""
+    monkeypatch.setitem(ALLOWED_ANGLES, "rk3", 0.05)
+    scene = untrained(comm, tmp_path)
+    attributes, closure, columns = rolled_out(comm, tmp_path, scene, step=0.5)
+    with open_product(comm, tmp_path / "ground_truth.h5", "ground_truth") as file:
+        scales = GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes)).scales
+    highest = int(resolved_wavenumber(scales.spacing, scales.length, scales.kolmogorov_length))
+    assert attributes["status"] == "complete" and attributes["steps"] > 2
+    assert attributes["time_step"] * highest * columns["velocity"][0].std() == pytest.approx(0.05, rel=0.2)
 
 
 @pytest.mark.usefixtures("undrawn")
