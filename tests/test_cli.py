@@ -44,6 +44,13 @@ def test_bad_override_ends_with_2_and_writes_nothing(comm, tmp_path, capfd, over
         assert errors.startswith("eddies: error: ") and message in errors and errors.count("\n") == 1
 
 
+@pytest.mark.mpi(3)
+def test_a_skin_that_reaches_beyond_the_slabs_is_refused(comm, tmp_path, capfd):
+    assert run_cli("simulate", "tiny", "--set", "simulation.skin=1", "--output", tmp_path / "run") == 2
+    assert comm.rank > 0 or "slabs no thinner than the particles' reach" in capfd.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
 @pytest.mark.mpi(1)
 @pytest.mark.parametrize("text, message", BAD_TEXTS, ids=range(len(BAD_TEXTS)))
 def test_bad_scene_file_ends_with_2(comm, tmp_path, capfd, text, message):

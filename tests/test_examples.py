@@ -1,10 +1,10 @@
-"""The examples of the documentation, and of the README: each trains, runs and reports, as a program, from any
-directory."""
+"""The examples of the documentation, and of the README: each trains, runs and reports, from any directory."""
 
 import json
 import math
 import os
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -14,34 +14,20 @@ import numpy as np
 import pytest
 
 import eddies
-from mpi_tools.launch import mpi_environment, mpirun_command
 
 EXAMPLES = Path(__file__).parents[1] / "docs" / "examples"
 SMALL = ["flow.cells=16", "spin_up.turnovers=0.1", "tracers.particles_per_side=8", "tracers.field_cells=12",
-         "tracers.turnovers=0.3", "tracers.field_every=2", "kernel.neighbors=30", "kernel.steps=4", "kernel.points=50",
-         "training.steps=8", "training.combined_steps=2", "training.frames=3", "training.batch=64",
-         "simulation.turnovers=0.05", "simulation.frame_interval=0.04"]
+         "tracers.turnovers=0.3", "tracers.field_every=4", "kernel.neighbors=30", "kernel.steps=4", "kernel.points=50",
+         "training.steps=8", "training.combined_steps=2", "training.frames=2", "training.batch=64",
+         "simulation.turnovers=0.05", "simulation.frame_interval=0.08"]
 UNDRAWN = Path(__file__).parent / "undrawn" / "sitecustomize.py"
-# What Python runs as it starts: the scenes are smaller, stages already done are skipped, figures are not drawn.
+# What Python runs as it starts: the scenes are smaller, figures are not drawn.
 SMALLER = f"""
 import eddies, runpy
 runpy.run_path({str(UNDRAWN)!r})
-load, run = eddies.load_scene, eddies.run
+load = eddies.load_scene
 eddies.load_scene = lambda name, overrides: load(name, [*overrides, *{SMALL!r}])
-eddies.run = lambda scene: run(scene, resume=True)
 """
-
-
-def started(folder, ranks, program):
-    """What a program says that is started in a folder, with smaller scenes."""
-    (folder / "sitecustomize.py").write_text(SMALLER)
-    line = mpirun_command(ranks, [sys.executable, str(program)]) if ranks > 1 else [sys.executable, str(program)]
-    environment = mpi_environment(ranks) if ranks > 1 else {**os.environ, "OMP_NUM_THREADS": "1"}
-    environment["PYTHONPATH"] = os.pathsep.join([str(folder), *filter(None, [environment.get("PYTHONPATH")])])
-    ended = subprocess.run(line, cwd=folder, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True,
-                           timeout=110)
-    assert ended.returncode == 0, ended.stdout + ended.stderr
-    return ended.stdout
 
 
 def results(directory):
@@ -53,57 +39,56 @@ def results(directory):
         return metrics, json.loads(file.attrs["description"])["terms"], weights
 
 
-@pytest.fixture(scope="module")
-def ground_truth(tmp_path_factory):
-    """A run directory with what does not depend on the model."""
-    folder = tmp_path_factory.mktemp("shared")
-    (folder / "program.py").write_text(
-        "import eddies, math, pathlib\nfrom mpi4py import MPI\nfrom eddies.parallel.stop import StopRequest\n"
-        "from eddies.stages import run_stages\n"
-        "stop = StopRequest(MPI.COMM_WORLD, (), pathlib.Path('STOP'), math.inf, 600.0)\n"
-        "run_stages(('dns', 'train-kernel'), eddies.load_scene('tiny', []), MPI.COMM_WORLD, pathlib.Path('run'), False,"
-        " stop)\n")
-    started(folder, 1, folder / "program.py")
-    return folder / "run"
+def test_ten_lines_set_a_rollout_going(tmp_path):
+    """As a program of its own."""
+    readme = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+    program = tmp_path / "program.py"
+    program.write_text(re.search(r"^```python\n(import dataclasses\n.*?)^```", readme, re.MULTILINE | re.DOTALL)[1])
+    (tmp_path / "sitecustomize.py").write_text(SMALLER)
+    path = os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])])
+    ended = subprocess.run([sys.executable, str(program)], cwd=tmp_path, stdin=subprocess.DEVNULL, timeout=110,
+                           env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": path}, capture_output=True, text=True)
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    assert ended.stdout.count("rollout: complete") == 2
+    assert list(results(tmp_path / "runs" / "mine")[1]) == ["pressure", "relaxation", "pairs"]
 
 
-def linked(ground_truth, run):
-    """The run directory with those products."""
-    run.mkdir(parents=True)
-    for product in ("ground_truth.h5", "kernel.h5"):
-        (run / product).symlink_to(ground_truth / product)
+@pytest.fixture
+def example(comm, tmp_path, monkeypatch, undrawn, examples):
+    """A function that runs an example as on the command line, with smaller scenes; gives its run directory."""
+    load = eddies.load_scene
+    monkeypatch.setattr(eddies, "load_scene", lambda name, overrides: load(name, [*overrides, *SMALL]))
+    monkeypatch.chdir(tmp_path)
+
+    def run(name):
+        runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
+        comm.Barrier()
+        return tmp_path / "runs" / name.replace("_", "-")
+
     return run
 
 
-def test_ten_lines_set_a_rollout_going(tmp_path, ground_truth):
-    readme = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
-    program, run = tmp_path / "program.py", linked(ground_truth, tmp_path / "runs" / "mine")
-    program.write_text(re.search(r"^```python\n(import dataclasses\n.*?)^```", readme, re.MULTILINE | re.DOTALL)[1])
-    said = started(tmp_path, 1, program)
-    assert said.count("rollout: complete") == 2 and said.count("skipped") == 2
-    assert list(results(run)[1]) == ["pressure", "relaxation", "pairs"]
-
-
-@pytest.mark.parametrize("name, ranks", [("own_term", 1), ("own_network", 2)])
-def test_a_model_of_the_users(tmp_path, ground_truth, name, ranks):
-    run = linked(ground_truth, tmp_path / "runs" / name.replace("_", "-"))
-    said = started(tmp_path, ranks, EXAMPLES / f"{name}.py")
-    assert said.count("skipped") == 2
+@pytest.mark.mpi(1)
+def test_a_term_of_the_users(example):
+    run = example("own_term")
     metrics, terms, weights = results(run)
-    if name == "own_term":
-        assert list(terms) == ["pressure", "own_term:SmagorinskyStress", "viscosity", "relaxation", "pairs"]
-        assert metrics["rollout"]["method"].endswith("pressure, SmagorinskyStress, viscosity, relaxation, pairs")
-        learned = weights["terms.SmagorinskyStress.squared_constant"]
-        assert learned.shape == () and learned > 0 and learned != np.float32(0.17**2)
-    else:
-        assert terms["pairs"]["network"] == "own_network:Waves"
-        assert weights["terms.pairs.network.wavevectors"].shape == (16, 5)
-    assert "own_" in (run / "scene.toml").read_text()  # a run says whose classes it uses
+    assert list(terms) == ["pressure", "own_term:SmagorinskyStress", "viscosity", "relaxation", "pairs"]
+    assert metrics["rollout"]["method"].endswith("pressure, SmagorinskyStress, viscosity, relaxation, pairs")
+    learned = weights["terms.SmagorinskyStress.squared_constant"]
+    assert learned.shape == () and learned > 0 and learned != np.float32(0.17**2)
+    assert "own_term:" in (run / "scene.toml").read_text()  # a run says whose classes it uses
 
 
-def test_a_flow_of_the_users(tmp_path):
-    started(tmp_path, 1, EXAMPLES / "own_initial_flow.py")
-    run = tmp_path / "runs" / "own-initial-flow"
+@pytest.mark.mpi(2)
+def test_a_network_of_the_users(example):
+    _, terms, weights = results(example("own_network"))
+    assert terms["pairs"]["network"] == "own_network:Waves"
+    assert weights["terms.pairs.network.wavevectors"].shape == (16, 5)
+
+
+@pytest.mark.mpi(1)
+def test_a_flow_of_the_users(example):
+    run = example("own_initial_flow")
     metrics, *_ = results(run)
     # Spun up for a tenth of a turnover it is still what it began as: rms 1 a component, all three alike.
     assert metrics["ground_truth"]["energy_budget_error"] < 1e-2

@@ -82,12 +82,11 @@ def gradient_of(comm, horizon, **choices):
 
 @every_preset
 @pytest.mark.mpi(2, 3)
-@pytest.mark.parametrize("horizon", [1, 4])
-def test_gradient_is_the_same_on_any_number_of_ranks(comm, horizon, preset):
+def test_gradient_is_the_same_on_any_number_of_ranks(comm, preset):
     from mpi4py import MPI
 
-    loss, gradient = gradient_of(comm, horizon, preset=preset)
-    alone, expected = gradient_of(MPI.COMM_SELF, horizon, preset=preset)
+    loss, gradient = gradient_of(comm, FRAMES, preset=preset)
+    alone, expected = gradient_of(MPI.COMM_SELF, FRAMES, preset=preset)
     assert loss == pytest.approx(alone, rel=1e-11)
     assert np.linalg.norm(gradient - expected) < 1e-10 * np.linalg.norm(expected)
 
@@ -125,13 +124,13 @@ def test_training_has_the_same_losses_on_any_number_of_ranks(comm):
 
     def losses(communicator):
         trainer, model = trainer_of(communicator, noise=0.05)
-        descent = Descent(communicator, model.parameters(), 8, 3e-2, 1e-3)
-        return [trainer.step(descent, step, 1 + step // 6) for step in range(8)]
+        descent = Descent(communicator, model.parameters(), 5, 3e-2, 1e-3)
+        return [trainer.step(descent, step, 1 + step // 4) for step in range(5)]
 
     found, alone = losses(comm), losses(MPI.COMM_SELF)
     for row, other in zip(found, alone):
         assert row == pytest.approx(other, rel=1e-8)
-    assert found[5]["loss"] < found[0]["loss"]
+    assert found[3]["loss"] < found[0]["loss"]
 
 
 @pytest.mark.mpi(1)

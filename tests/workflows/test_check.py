@@ -21,7 +21,7 @@ def recorded(monkeypatch):
     monkeypatch.setattr(logging.getLogger("eddies"), "propagate", True)
 
 
-@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.mpi(1)
 @pytest.mark.parametrize("name", [name for name, _ in builtin_scenes()])
 def test_check_of_any_scene_writes_nothing(comm, tmp_path, monkeypatch, caplog, recorded, name):
     monkeypatch.chdir(tmp_path)
@@ -29,6 +29,12 @@ def test_check_of_any_scene_writes_nothing(comm, tmp_path, monkeypatch, caplog, 
     for subject in ("grid", "turbulence", "time step", "ranks", "memory", "time"):
         assert subject in text
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.mpi(2, 3)
+def test_check_on_more_ranks(comm, caplog, recorded):
+    text = lines_of(load_scene("hit-small"), comm, caplog)
+    assert comm.rank > 0 or "at most 12" in text
 
 
 @pytest.mark.mpi(1)

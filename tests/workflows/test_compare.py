@@ -63,6 +63,7 @@ def rows_of(output):
 
 
 @pytest.mark.mpi(2, timeout=240)
+@pytest.mark.usefixtures("undrawn")
 def test_variants_are_run_measured_and_kept(comm, folder, capfd):
     assert run_cli("dns", "base.toml", "--output", "base") == 0
     if comm.rank == 0:
