@@ -47,7 +47,8 @@ def test_ten_lines_set_a_rollout_going(tmp_path):
     (tmp_path / "sitecustomize.py").write_text(SMALLER)
     path = os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])])
     ended = subprocess.run([sys.executable, str(program)], cwd=tmp_path, stdin=subprocess.DEVNULL, timeout=110,
-                           env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": path}, capture_output=True, text=True)
+                           env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": path}, capture_output=True,
+                           text=True)
     assert ended.returncode == 0, ended.stdout + ended.stderr
     assert ended.stdout.count("rollout: complete") == 2
     assert list(results(tmp_path / "runs" / "mine")[1]) == ["pressure", "relaxation", "pairs"]
