@@ -27,7 +27,7 @@ def logger_as_before():
 @pytest.fixture
 def undrawn(monkeypatch):
     """Figures are made but not drawn, here and in programs that are started: that is most of a report's time."""
-    from eddies.analysis import figures
+    from eddies.report import figures
     monkeypatch.setattr(figures, "png", figures.png)  # what is set in the next line ends with the test
     runpy.run_path(str(UNDRAWN / "sitecustomize.py"))
     monkeypatch.setenv("PYTHONPATH", str(UNDRAWN), prepend=os.pathsep)

@@ -7,7 +7,7 @@ from pathlib import Path
 import eddies.cli
 import eddies.workflows.dns
 from eddies.io.hdf5 import create_product
-from eddies.scene import SceneError
+from eddies.scene.scene import SceneError
 
 FAILURES = {"one rank refuses": lambda rank: SceneError("no such reactor") if rank == 1 else None,
             "all ranks refuse": lambda rank: SceneError("no such reactor")}

@@ -10,9 +10,9 @@ import time
 from pathlib import Path
 
 import pytest
-from bad_scenes import BAD_OVERRIDES, BAD_TEXTS
 
 from mpi_tools.launch import mpi_environment, mpirun_command
+from tests.bad_scenes import BAD_OVERRIDES, BAD_TEXTS
 
 ABC = ["abc", "--set", "time.duration=0.1"]
 FAILING = Path(__file__).with_name("failing_stage.py")
@@ -72,7 +72,7 @@ def test_stage_without_its_input_writes_nothing(comm, tmp_path, capfd, stage):
 @pytest.mark.mpi(1, 2)
 def test_input_of_another_version_is_one_line(comm, tmp_path, capfd):
     from eddies.io.hdf5 import create_product
-    from eddies.scene import load_scene
+    from eddies.scene.scene import load_scene
 
     with create_product(comm, tmp_path / "ground_truth.h5", "ground_truth",
                         {"fingerprint": load_scene("tiny").fingerprint("dns"), "eddies": "0.1.0"}) as file:
@@ -160,7 +160,7 @@ def test_report_of_no_directory(comm, tmp_path, capfd):
 @pytest.mark.mpi(1, 2)
 def test_input_of_other_settings_is_refused(comm, tmp_path, capfd):
     from eddies.io.hdf5 import create_product
-    from eddies.scene import load_scene
+    from eddies.scene.scene import load_scene
     from eddies.stages import check_inputs
     scene = load_scene("tiny")
     with create_product(comm, tmp_path / "ground_truth.h5", "ground_truth", {"fingerprint": scene.fingerprint("dns")}):
@@ -185,7 +185,7 @@ def test_more_ranks_than_slabs_are_refused_before_any_work(comm, tmp_path, capfd
 def test_limit_of_ranks_is_that_of_the_stages(comm):
     from types import SimpleNamespace
 
-    from eddies.scene import SceneError, load_scene
+    from eddies.scene.scene import SceneError, load_scene
     from eddies.stages import check_ranks
     check_ranks(["dns"], load_scene("tiny"), SimpleNamespace(size=8))
     check_ranks(load_scene("hit-small").stages, load_scene("hit-small"), SimpleNamespace(size=8))

@@ -10,13 +10,13 @@ from pathlib import Path
 import pytest
 
 from eddies.cli import build_parser
-from eddies.comparison import Comparison, Variant, load_comparison
-from eddies.methods import METHODS
 from eddies.particles.terms.presets import DEFAULT_PRESET, PRESETS, TERMS
-from eddies.scene import BOX_LENGTH, Scene, builtin_scenes, load_scene
-from eddies.scene_model import Model, settings_class
-from eddies.scene_rules import Boolean, Bounds, Choice, Integer, Integers, Number, Texts, quoted
-from eddies.scene_sections import Simulation
+from eddies.scene.comparison import Comparison, Variant, load_comparison
+from eddies.scene.methods import METHODS
+from eddies.scene.model import Model, settings_class
+from eddies.scene.rules import Boolean, Bounds, Choice, Integer, Integers, Number, Texts, quoted
+from eddies.scene.scene import BOX_LENGTH, Scene, builtin_scenes, load_scene
+from eddies.scene.sections import Simulation
 
 CHECKOUT = Path(__file__).parents[1]
 README = (CHECKOUT / "README.md").read_text(encoding="utf-8")

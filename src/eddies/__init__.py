@@ -9,9 +9,10 @@ __version__ = "0.2.0"
 # reads a scene starts neither MPI nor torch.
 _HOMES = {
     "eddies.api": ("check", "run", "simulate", "train"),
-    "eddies.scene": ("Scene", "SceneError", "load_scene", "Eulerian", "Flow", "Forcing", "Initial", "Kernel", "Model",
-                     "Simulation", "SpinUp", "Time", "Tracers", "Training", "Wcsph"),
-    "eddies.scene_values": ("boolean", "choice", "integer", "integers", "named", "number", "text", "texts"),
+    "eddies.errors": ("UserError",),
+    "eddies.scene.scene": ("Scene", "SceneError", "load_scene", "Eulerian", "Flow", "Forcing", "Initial", "Kernel",
+                           "Model", "Simulation", "SpinUp", "Time", "Tracers", "Training", "Wcsph"),
+    "eddies.scene.values": ("boolean", "choice", "integer", "integers", "named", "number", "text", "texts"),
     "eddies.particles.terms.settings": ("TermSettings",),
     "eddies.particles.terms.term": ("PairTerm", "Term"),
     "eddies.particles.rates": ("Rates",),

@@ -16,7 +16,7 @@ from importlib import import_module
 from pathlib import Path
 
 from eddies.logs import configure_logging
-from eddies.scene import Scene, load_scene
+from eddies.scene.scene import Scene, load_scene
 
 CHECKPOINT_SECONDS = 600.0
 

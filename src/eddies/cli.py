@@ -14,8 +14,10 @@ from importlib import import_module
 from pathlib import Path
 
 import eddies
+from eddies.errors import UserError
 from eddies.logs import configure_logging
-from eddies.scene import SceneError, builtin_scenes, load_scene
+from eddies.pipeline import STAGES
+from eddies.scene.scene import SceneError, builtin_scenes, load_scene
 
 BAD_INPUT = 2
 STOPPED = 75  # EX_TEMPFAIL: the same command with --resume goes on
@@ -84,7 +86,7 @@ def end_with_error(error: Exception, comm) -> int:
     ever.
     """
     from eddies.parallel.rendezvous import all_arrive
-    mistake = is_users_mistake(error)
+    mistake = isinstance(error, UserError)
     text = f"eddies: error: {error}\n" if mistake else "".join(traceback.format_exception(error))
     together = (mistake or comm.size == 1) and all_arrive(comm)
     if not together or comm.rank == 0:
@@ -96,15 +98,6 @@ def end_with_error(error: Exception, comm) -> int:
     if not together:
         comm.Abort(code)
     return code
-
-
-def is_users_mistake(error: Exception) -> bool:
-    """Whether the text of an error tells the user what to do, so that no traceback is wanted."""
-    from eddies.flow.stability import FlowDiverged
-    from eddies.flow.forcing import ForcingError
-    from eddies.io.hdf5 import ProductError
-    from eddies.parallel.halo import HaloError
-    return isinstance(error, (SceneError, ProductError, HaloError, FlowDiverged, ForcingError))
 
 
 def parse_arguments(arguments: list[str] | None, rank: int) -> argparse.Namespace:
@@ -123,11 +116,8 @@ def build_parser() -> argparse.ArgumentParser:
                                      epilog="EDDIES_LOG = debug, info or warning sets what is logged.")
     parser.add_argument("--version", action="version", version=f"eddies {eddies.__version__}")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
-    stages = {"run": "every stage of the scene, in order",
-              "dns": "ground truth: direct simulation, filter, tracers",
-              "train-kernel": "the smoothing kernel",
-              "train": "the model of the particles",
-              "simulate": "the trained model, without the direct simulation"}
+    stages = {"run": "every stage of the scene, in order"}
+    stages |= {stage.name: stage.about for stage in STAGES.values() if stage.product is not None}
     for name, about in stages.items():
         command = commands.add_parser(name, help=about, description=about)
         add_scene_options(command)
@@ -135,7 +125,7 @@ def build_parser() -> argparse.ArgumentParser:
                         "skip stages whose product is complete and was made with the same settings, and go on from the "
                         "newest checkpoint of the direct simulation or of the training")
         command.set_defaults(command=run_command, stage=name)
-    report = commands.add_parser("report", help="figures, one page and metrics.json of a run directory")
+    report = commands.add_parser("report", help=STAGES["report"].about)
     report.add_argument("run", type=Path, metavar="RUN", help="a run directory, such as runs/tiny")
     report.set_defaults(command=report_command)
     compare = commands.add_parser("compare", help="error against run time of variants of a scene")
@@ -207,8 +197,8 @@ def report_command(options: argparse.Namespace, comm) -> None:
 
 def compare_command(options: argparse.Namespace, comm, signals: list[int]) -> None:
     """Variants of a scene, one after the other, until a signal, a file STOP or the limit of wall time ends it."""
-    from eddies.comparison import load_comparison
     from eddies.parallel.stop import StopRequest
+    from eddies.scene.comparison import load_comparison
     from eddies.stages import check_ranks, check_stop_file, run_stages
     comparison = load_comparison(options.comparison, options.run)
     for scene in comparison.scenes.values():

@@ -4,7 +4,7 @@ import logging
 import os
 import sys
 
-from eddies.scene import SceneError
+from eddies.scene.scene import SceneError
 
 LEVELS = {"debug": logging.DEBUG, "info": logging.INFO, "warning": logging.WARNING}
 

@@ -8,21 +8,17 @@ from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 
-import numpy as np
-
 from eddies.clock import duration
-from eddies.io.checkpoint import DIRECTORIES, CheckpointDirectory
+from eddies.io.checkpoint import CheckpointDirectory
 from eddies.io.hdf5 import open_product, product_fingerprint
+from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.stop import StopRequest
-from eddies.scene import Scene, SceneError
-from eddies.workflows.estimates import ground_truth_alone, most_ranks
-from eddies.workflows.model_source import read_source
+from eddies.pipeline import STAGES, Stage, after
+from eddies.scene.scene import Scene, SceneError
+from eddies.workflows.foreseen.estimates import ground_truth_alone, most_ranks
+from eddies.workflows.learned.source import read_source
 
 log = logging.getLogger("eddies")
-
-# The product of each stage, in order: kind, then file name. A stage reads the products before its own.
-PRODUCTS = {"dns": ("ground_truth", "ground_truth.h5"), "train-kernel": ("kernel", "kernel.h5"),
-            "train": ("model", "model.h5"), "simulate": ("rollout", "rollout.h5")}
 
 
 def run_stages(stages: Sequence[str], scene: Scene, comm, directory: Path, resume: bool,
@@ -45,33 +41,29 @@ def run_stages(stages: Sequence[str], scene: Scene, comm, directory: Path, resum
     prepare_directory(scene, comm, directory)
     if scene.foreign:
         log.info("%s: uses classes that are not of this package: %s", scene.name, ", ".join(scene.foreign))
-    for stage in stages:
-        goes_on, resume = resume, resume and is_done(stage, scene, comm, directory)
-        # Left by another run, or by one killed in its last moment.
-        if stage in DIRECTORIES and (resume or not goes_on):
-            CheckpointDirectory(comm, directory / DIRECTORIES[stage], "").remove()
+    for stage in [STAGES[name] for name in stages]:
+        goes_on, resume = resume, resume and is_done(stage.name, scene, comm, directory)
+        if resume or not goes_on:  # left by another run, or by one killed in its last moment
+            remove_checkpoints(stage, comm, directory)
         if resume:
-            log.info("%s: skipped, %s is complete and made with the same settings", stage, PRODUCTS[stage][1])
+            log.info("%s: skipped, %s is complete and made with the same settings", stage.name, stage.file)
             continue
-        remove_later_checkpoints(stage, comm, directory)
-        log.info("%s: starts on %d %s", stage, comm.size, "rank" if comm.size == 1 else "ranks")
+        for later in after(stage.name):  # they start from the product that is about to be replaced
+            remove_checkpoints(later, comm, directory)
+        log.info("%s: starts on %d %s", stage.name, comm.size, "rank" if comm.size == 1 else "ranks")
         start = time.perf_counter()
-        workflow = import_module(f"eddies.workflows.{stage.replace('-', '_')}")
+        module, _, function = stage.run.partition(":")
+        run = getattr(import_module(module), function)
         stop.check()
-        if stage == "report":
-            workflow.run(directory, comm)
-        else:
-            workflow.run(scene, comm, directory, stop)
+        run(scene, comm, directory, stop)
         comm.Barrier()
-        record_seconds(stage, time.perf_counter() - start, comm, directory)
+        record_seconds(stage.name, time.perf_counter() - start, comm, directory)
 
 
-def remove_later_checkpoints(stage: str, comm, directory: Path) -> None:
-    """Remove the checkpoints of the stages that start from the product which a stage is about to replace."""
-    order = list(PRODUCTS)
-    for later in order[order.index(stage) + 1:] if stage in order else ():
-        if later in DIRECTORIES:
-            CheckpointDirectory(comm, directory / DIRECTORIES[later], "").remove()
+def remove_checkpoints(stage: Stage, comm, directory: Path) -> None:
+    """Remove the checkpoints of a stage, if it makes any."""
+    if stage.checkpoints is not None:
+        CheckpointDirectory(comm, directory / stage.checkpoints, "").remove()
 
 
 def check_ranks(stages: Sequence[str], scene: Scene, comm) -> None:
@@ -91,53 +83,42 @@ def check_inputs(stages: Sequence[str], scene: Scene, comm, directory: Path) -> 
             if stage == "train" and scene.model is not None:
                 raise SceneError(f'{scene.name}: [simulation] method = "{scene.simulation.method}" needs no trained '
                                  'model; set method = "learned" to train one')
-            section = {"train-kernel": "kernel", "train": "model", "simulate": "simulation"}[stage]
-            raise SceneError(f"{scene.name}: has no [{section}], which `eddies {stage}` is about; add it")
+            raise SceneError(f"{scene.name}: has no [{STAGES[stage].section}], which `eddies {stage}` is about; add it")
     if "train" in stages and scene.model.path is not None:
         read_source(scene, comm)
-    order = list(PRODUCTS)
-    earlier = order[:order.index(stages[0])] if stages[0] in order else ()
-    for needed in [stage for stage in earlier if stage in scene.stages]:
-        kind, name = PRODUCTS[needed]
-        with open_product(comm, directory / name, kind):
+    first = STAGES[stages[0]]
+    for needed in [STAGES[name] for name in first.depends_on if name in scene.stages and first.product is not None]:
+        with open_product(comm, directory / needed.file, needed.product):
             pass
-        if not is_done(needed, scene, comm, directory):
-            raise SceneError(f"{directory / name}: was made with other settings than this scene's; run "
-                             f"`eddies {needed}` again with these, or give `eddies {stages[0]}` the --set of then")
+        if not is_done(needed.name, scene, comm, directory):
+            raise SceneError(f"{directory / needed.file}: was made with other settings than this scene's; run "
+                             f"`eddies {needed.name}` again with these, or give `eddies {stages[0]}` the --set of then")
 
 
 def check_stop_file(comm, directory: Path) -> None:
     """Refuse to start where a file STOP lies: put there between two jobs, it ends a chain that queues itself again."""
-    if verdict_of_first_rank((directory / "STOP").exists(), comm):
+    if on_first_rank(comm, (directory / "STOP").exists):
         raise SceneError(f"{directory / 'STOP'}: asks the job to stop before it begins; remove the file to go on")
 
 
 def prepare_directory(scene: Scene, comm, directory: Path) -> None:
     """Make the run directory and write the scene as used into it; if rank 0 cannot, all ranks raise."""
-    problem = None
-    if comm.rank == 0:
-        try:
-            directory.mkdir(parents=True, exist_ok=True)
-            (directory / "scene.toml").write_text(scene.to_toml(), encoding="utf-8")
-        except OSError as error:
-            problem = error.strerror
-    if verdict_of_first_rank(problem is not None, comm):
-        raise SceneError(f"{directory}: cannot be written ({problem}); choose another --output")
+    def write() -> None:
+        directory.mkdir(parents=True, exist_ok=True)
+        (directory / "scene.toml").write_text(scene.to_toml(), encoding="utf-8")
+
+    try:
+        on_first_rank(comm, write)
+    except OSError as error:
+        raise SceneError(f"{directory}: cannot be written ({error.strerror}); choose another --output") from None
 
 
 def is_done(stage: str, scene: Scene, comm, directory: Path) -> bool:
     """Whether the product of a stage is complete and was made with the same settings, as rank 0 sees it."""
-    if stage not in PRODUCTS:
+    if STAGES[stage].product is None:
         return False
-    fingerprint = product_fingerprint(directory / PRODUCTS[stage][1])
-    return verdict_of_first_rank(fingerprint == scene.fingerprint(stage), comm)
-
-
-def verdict_of_first_rank(verdict: bool, comm) -> bool:
-    """Rank 0's answer on every rank."""
-    shared = np.array([verdict], np.int8)
-    comm.Bcast(shared)
-    return bool(shared[0])
+    product = directory / STAGES[stage].file
+    return on_first_rank(comm, lambda: product_fingerprint(product) == scene.fingerprint(stage))
 
 
 def record_seconds(stage: str, seconds: float, comm, directory: Path) -> None:

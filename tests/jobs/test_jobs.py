@@ -101,9 +101,9 @@ def asked_of_slurm(script):
 def test_large_job_fits_the_scene():
     # Ranks that all work on planes of their own, ghost planes included, in the memory of a node; those of the stages
     # that follow, of which the comment speaks, are no more than they can use.
-    from eddies.scene import load_scene
-    from eddies.workflows.cost_model import flow_bytes
-    from eddies.workflows.estimates import ground_truth_alone, most_ranks
+    from eddies.scene.scene import load_scene
+    from eddies.workflows.foreseen.cost_model import flow_bytes
+    from eddies.workflows.foreseen.estimates import ground_truth_alone, most_ranks
     scene, asked = load_scene("hit-paper"), asked_of_slurm("hit-paper.slurm.sh")
     on_node = int(asked["ntasks-per-node"])
     ranks = int(asked["nodes"]) * on_node

@@ -7,7 +7,7 @@ from eddies.parallel.reduction import global_sum
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.model import build_model
 from eddies.particles.reference_scales import ReferenceScales
-from eddies.scene_model import Model
+from eddies.scene.model import Model
 
 LENGTH, PER_SIDE = 2 * np.pi, 12
 SPACING = LENGTH / PER_SIDE

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-from eddies.analysis.figures_learning import LOSSES
 from eddies.flow.tracers import release
 from eddies.learning.force_training import ForceTrainer, LossWeights, TrainingFrame
 from eddies.learning.optimization import Descent
@@ -16,7 +15,7 @@ from eddies.particles.particle_set import ParticleSet
 from eddies.particles.rates import Rates
 from eddies.particles.smoothing_kernels import WendlandC2
 from eddies.particles.terms.stress import Stress
-
+from eddies.report.learning import LOSSES
 from tests.learning.models import LENGTH, PER_SIDE, SPACING, Recorder, model_of, slope
 
 SUPPORT = 2.2 * SPACING

@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from eddies.scene import load_scene
+from eddies.scene.scene import load_scene
 from mpi_tools import scaling
 
 
@@ -22,7 +22,7 @@ def test_row_is_against_the_first_number_of_ranks():
 
 
 def test_other_grid_resolves_the_same_flow():
-    from eddies.workflows.estimates import expected_turbulence, largest_wavenumber
+    from eddies.workflows.foreseen.estimates import expected_turbulence, largest_wavenumber
 
     def resolution(overrides):
         scene = load_scene("hit-small", overrides)

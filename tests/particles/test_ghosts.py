@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 import torch
-from clouds import LENGTH, distributed, state
 
 from eddies.parallel.halo import HaloExchange
 from eddies.parallel.reduction import global_sum
 from eddies.particles.ghosts import exchange_ghost_positions, exchange_ghosts
+from tests.particles.clouds import LENGTH, distributed, state
 
 
 @pytest.mark.mpi(1, 2, 3)

@@ -13,10 +13,9 @@ from eddies.particles.rates import Rates, total
 from eddies.particles.terms.presets import PRESETS
 from eddies.particles.terms.settings import TermSettings
 from eddies.particles.terms.term import PairTerm, Term
-from eddies.scene_values import SceneError
-from tests.particles.clouds import (
-    FLOW, MODELS, DensityReader, Field, ReadsNothing, distributed, dynamics_of, given, model, of_terms, state,
-)
+from eddies.scene.values import SceneError
+from tests.particles.clouds import (FLOW, MODELS, DensityReader, Field, ReadsNothing, distributed, dynamics_of, given,
+                                    model, of_terms, state)
 
 
 def randomised(lagrangian, seed=3):

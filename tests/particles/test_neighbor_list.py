@@ -1,12 +1,12 @@
 import numpy as np
 import pytest
 import torch
-from clouds import CLOUDS, LENGTH, cloud
 from scipy.spatial import cKDTree
 
 from eddies.particles import cell_grid
 from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.periodic_box import PeriodicBox
+from tests.particles.clouds import CLOUDS, LENGTH, cloud
 
 
 def listed(receivers, senders, cutoff, skin=0.0, exclude_self=True, periodic_z=True):

@@ -1,11 +1,11 @@
 import pytest
 import torch
-from clouds import LENGTH, cloud
 
 from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.periodic_box import PeriodicBox
 from eddies.particles.reconstruction import reconstruct, reconstruct_gradient, volumes
 from eddies.particles.smoothing_kernels import CubicSpline, KernelNetwork, WendlandC2
+from tests.particles.clouds import LENGTH, cloud
 
 SUPPORT = 1.6
 FAMILIES = {"spline": CubicSpline, "wendland": WendlandC2, "learned": lambda h: KernelNetwork(h).table()}

@@ -1,7 +1,7 @@
 import pytest
-from clouds import SCALES
 
 from eddies.particles.reference_scales import ReferenceScales
+from tests.particles.clouds import SCALES
 
 
 def test_scales_survive_a_dictionary():

@@ -5,9 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from clouds import (
-    CLOUDS, LENGTH, DensityReader, along, assert_close, by_id, cloud, distributed, dynamics_of, model, of_terms,
-)
 from mpi4py import MPI
 
 from eddies.parallel.halo import HaloError
@@ -17,6 +14,8 @@ from eddies.particles.flow_units import FlowUnits
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.reference_scales import ReferenceScales
 from eddies.particles.resolved_velocity import ResolvedVelocity
+from tests.particles.clouds import (CLOUDS, LENGTH, DensityReader, along, assert_close, by_id, cloud, distributed,
+                                    dynamics_of, model, of_terms)
 from tests.validation import filtered_fields
 
 SIDE, PLANES = 12, 22

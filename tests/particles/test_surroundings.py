@@ -2,12 +2,12 @@ import math
 
 import pytest
 import torch
-from clouds import LENGTH
 
 from eddies.parallel.halo import HaloError
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.surroundings import Surroundings
+from tests.particles.clouds import LENGTH
 
 
 def particles_at(comm, heights):

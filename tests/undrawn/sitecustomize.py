@@ -1,5 +1,5 @@
 """Python runs this as it starts, with this folder on its path: figures are made but not drawn."""
 
-from eddies.analysis import figures
+from eddies.report import figures
 
 figures.png = lambda figure: b"\x89PNG\r\n\x1a\n" + bytes(16)

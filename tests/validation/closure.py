@@ -16,7 +16,6 @@ import numpy as np
 import torch
 from mpi4py import MPI
 
-from eddies.analysis.figures import FOURTH, GUIDE, MODEL, SECOND, TRUTH, letter, panels, png, styled
 from eddies.io.hdf5 import open_product
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.dynamics import ParticleDynamics
@@ -27,8 +26,9 @@ from eddies.particles.particle_set import ParticleSet
 from eddies.particles.reference_scales import resolved_wavenumber
 from eddies.particles.resolved_velocity import WEIGHT, ResolvedVelocity
 from eddies.particles.terms.settings import Pressure, Stress, Viscosity
-from eddies.scene import BOX_LENGTH
-from eddies.workflows.truth import GroundTruth
+from eddies.report.figures import FOURTH, GUIDE, MODEL, SECOND, TRUTH, letter, panels, png, styled
+from eddies.scene.scene import BOX_LENGTH
+from eddies.workflows.ground_truth.truth import GroundTruth
 
 SHARES = (0.75, 0.875, 1.0, 1.125, 1.25, 1.375, 1.5, 1.625)
 WEIGHTS = {3.0: FOURTH, WEIGHT: MODEL, 300.0: SECOND}

@@ -13,19 +13,16 @@ import math
 from pathlib import Path
 
 import numpy as np
+from flows import make_grid, march, turbulence
 from mpi4py import MPI
 from PIL import Image
 
-from flows import make_grid, march, turbulence
-
-from eddies.analysis.figures import GUIDE, MODEL, SECOND, THIRD, TRUTH, letter, panels, styled
 from eddies.clock import Clock
 from eddies.flow.history import FlowHistory
 from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid, advective_speed
-from eddies.flow.stability import (
-    IMAGINARY_REACH, REAL_REACH, FlowDiverged, StabilityWatch, step_limits,
-)
+from eddies.flow.stability import IMAGINARY_REACH, REAL_REACH, FlowDiverged, StabilityWatch, step_limits
 from eddies.parallel.reduction import global_max, global_sum
+from eddies.report.figures import GUIDE, MODEL, SECOND, THIRD, TRUTH, letter, panels, styled
 from eddies.time_stepping import STEPPERS, phi
 
 WAVE = 1e-6  # amplitude of a wave: its square, what it does to itself, stays below what is measured

@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 from mpi4py import MPI
 
-from eddies.analysis.figures import MODEL, TRUTH, letter, number_wavenumbers, panels, styled
 from eddies.analysis.spectra import spectrum_error
 from eddies.clock import ProgressLine
 from eddies.flow import initial_fields
@@ -26,6 +25,7 @@ from eddies.flow.statistics import compressible_budget, energy_spectrum, gradien
 from eddies.logs import configure_logging
 from eddies.parallel.reduction import global_max
 from eddies.parallel.slab import SlabDecomposition
+from eddies.report.figures import MODEL, TRUTH, letter, number_wavenumbers, panels, styled
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.time_stepping import ETDRK4, STEPPERS
 

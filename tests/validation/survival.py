@@ -28,7 +28,7 @@ from test_checkpoint import fill, harm  # noqa: E402
 from test_dns_restart import SPLIT, product  # noqa: E402
 
 from eddies.io.checkpoint import CheckpointDirectory  # noqa: E402
-from eddies.scene import load_scene  # noqa: E402
+from eddies.scene.scene import load_scene  # noqa: E402
 
 LONGER = [*SPLIT, "tracers.turnovers=1.5"]
 

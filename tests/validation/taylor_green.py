@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 from mpi4py import MPI
 
-from eddies.analysis.figures import DNS, GUIDE, MODEL, SECOND, TRUTH, legend_below, letter, panels, styled
 from eddies.clock import Clock, ProgressLine
 from eddies.flow import initial_fields
 from eddies.flow.courant import CourantLimit
@@ -22,6 +21,7 @@ from eddies.flow.navier_stokes import IncompressibleFluid
 from eddies.flow.statistics import incompressible_budget
 from eddies.logs import configure_logging
 from eddies.parallel.slab import SlabDecomposition
+from eddies.report.figures import DNS, GUIDE, MODEL, SECOND, TRUTH, legend_below, letter, panels, styled
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.time_stepping import ETDRK4
 

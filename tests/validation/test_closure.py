@@ -4,7 +4,7 @@ import pytest
 from closure import figure, measure
 from matplotlib.figure import Figure
 
-from eddies.scene import load_scene
+from eddies.scene.scene import load_scene
 from eddies.workflows import dns
 
 SCENE = """

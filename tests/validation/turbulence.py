@@ -16,13 +16,11 @@ import numpy as np
 from matplotlib.figure import Figure
 from mpi4py import MPI
 
-from eddies.analysis.figures import (
-    DNS, GUIDE, MODEL, SECOND, THIRD, TRUTH, letter, panels, styled,
-)
-from eddies.analysis.figures_turbulence import columns_of, draw_compensated
 from eddies.analysis.isotropic_turbulence import Row, comparison
-from eddies.analysis.page import shown
 from eddies.io.hdf5 import open_product
+from eddies.report.figures import DNS, GUIDE, MODEL, SECOND, THIRD, TRUTH, letter, panels, styled
+from eddies.report.page import shown
+from eddies.report.stationary import columns_of, draw_compensated
 from eddies.workflows.report import read_stationary_span
 
 NOMINAL = (0.04, 0.08, 0.16)  # turbulent Mach numbers of the paper's Table 1

@@ -9,7 +9,7 @@ from eddies.io.trajectories import Trajectory
 from eddies.io.weights import save_weights
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.smoothing_kernels import KernelNetwork
-from eddies.scene import BOX_LENGTH, load_scene
+from eddies.scene.scene import BOX_LENGTH, load_scene
 
 SCENE = """
 [flow]
@@ -74,7 +74,7 @@ def read(folder):
 
 
 def said_in_the_report(attributes):
-    from eddies.analysis.figures_comparison import Rollout
+    from eddies.report.rollout import Rollout
     return Rollout(attributes, None, None, {}, BOX_LENGTH, None, None).method
 
 
@@ -99,8 +99,8 @@ def test_particles_without_a_force_keep_their_velocity(comm, folder):
 
 @pytest.mark.mpi(1)
 def test_without_a_force_there_is_no_list_and_no_halo(comm, folder):
-    from eddies.workflows.particle_run import BallisticRun
-    from eddies.workflows.truth import GroundTruth
+    from eddies.workflows.ground_truth.truth import GroundTruth
+    from eddies.workflows.rollout.particle_run import BallisticRun
 
     with open_product(comm, folder / "ground_truth.h5", "ground_truth") as file:
         truth = GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, 8))
@@ -188,7 +188,7 @@ def test_seconds_of_a_step_leave_out_the_warm_up():
     (["simulation.method=eulerian"], "ghost planes of the coarse grid"),
 ])
 def test_ranks_are_limited_by_what_the_method_needs_alone(overrides, limit):
-    from eddies.workflows.estimates import most_ranks
+    from eddies.workflows.foreseen.estimates import most_ranks
     alone = ("particles' reach", "filtered fields", "resolved velocity", "coarse grid")
     found = [reason for reason in most_ranks(load_scene("tiny", overrides)) if any(part in reason for part in alone)]
     assert len(found) == (limit is not None) and all(reason.startswith(limit) for reason in found)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from eddies.scene import Time, builtin_scenes, load_scene
+from eddies.scene.scene import Time, builtin_scenes, load_scene
 
 
 def lines_of(scene, comm, caplog):
@@ -46,7 +46,7 @@ def test_numbers_of_the_small_case(comm, caplog, recorded):
 
 
 def test_expected_turbulence_is_consistent():
-    from eddies.workflows.estimates import expected_turbulence
+    from eddies.workflows.foreseen.estimates import expected_turbulence
     turbulence = expected_turbulence(load_scene("hit-small"))
     eta, t_eta, nu = turbulence.kolmogorov_length, turbulence.kolmogorov_time, turbulence.viscosity
     assert eta**2 / t_eta == pytest.approx(nu)
@@ -56,7 +56,7 @@ def test_expected_turbulence_is_consistent():
 
 
 def test_random_start_decays_from_its_own_scales():
-    from eddies.workflows.estimates import expected_turbulence
+    from eddies.workflows.foreseen.estimates import expected_turbulence
     turbulence = expected_turbulence(load_scene("tracers-only"))
     assert turbulence.velocity_rms == 1.0
     assert turbulence.turnover_time == pytest.approx(math.sqrt(2 * math.pi) / 3)
@@ -69,7 +69,7 @@ def test_random_start_decays_from_its_own_scales():
     (["time.step=0.004"], 0.004, "fixed"),
 ])
 def test_what_limits_the_step(overrides, step, limit):
-    from eddies.workflows.estimates import expected_step
+    from eddies.workflows.foreseen.estimates import expected_step
     found, reason = expected_step(load_scene("hit-small", overrides))
     assert found == pytest.approx(step) and limit in reason
 
@@ -78,7 +78,7 @@ def test_what_limits_the_step(overrides, step, limit):
 def test_expected_step_is_the_one_taken_at_the_start(comm):
     from eddies.clock import Clock
     from eddies.workflows.dns import build_fluid, build_step_limit, initial_state
-    from eddies.workflows.estimates import expected_step
+    from eddies.workflows.foreseen.estimates import expected_step
     for name in ("taylor-green", "abc"):
         scene = replace(load_scene(name), time=Time(duration=1e9, max_step=1e3))
         fluid = build_fluid(scene, comm)
@@ -89,12 +89,12 @@ def test_expected_step_is_the_one_taken_at_the_start(comm):
 @pytest.mark.mpi(1, 2, 3)
 @pytest.mark.parametrize("neighbors, most", [(100, 3), (200, 2)])
 def test_most_ranks_is_what_the_parts_accept(comm, neighbors, most):
-    from eddies.spectral.interpolation import SplineInterpolation
-    from eddies.spectral.spectral_grid import SpectralGrid
     from eddies.parallel.halo import HaloError, require_thick_slabs
     from eddies.parallel.slab import SlabDecomposition
-    from eddies.scene import BOX_LENGTH
-    from eddies.workflows.estimates import most_ranks, particle_reach
+    from eddies.scene.scene import BOX_LENGTH
+    from eddies.spectral.interpolation import SplineInterpolation
+    from eddies.spectral.spectral_grid import SpectralGrid
+    from eddies.workflows.foreseen.estimates import most_ranks, particle_reach
     scene = load_scene("tiny", [f"kernel.neighbors={neighbors}"])
     fields, particles = (SlabDecomposition(comm, BOX_LENGTH, planes)
                          for planes in (scene.tracers.cells, scene.tracers.planes))
@@ -121,9 +121,9 @@ def test_ranks_for_horizons_are_those_that_the_grid_and_the_particles_accept(com
     from eddies.particles.particle_set import ParticleSet
     from eddies.particles.resolved_velocity import ResolvedVelocity
     from eddies.particles.surroundings import Surroundings
-    from eddies.scene import BOX_LENGTH
-    from eddies.workflows.estimates import (
-        ALLOWED_VELOCITY, expected_turbulence, horizon_time, most_training_ranks, particle_drift)
+    from eddies.scene.scene import BOX_LENGTH
+    from eddies.workflows.foreseen.estimates import (ALLOWED_VELOCITY, expected_turbulence, horizon_time,
+                                                     most_training_ranks, particle_drift)
     from tests.particles.clouds import FLOW
 
     def accepted(build):
@@ -150,7 +150,7 @@ def test_ranks_for_horizons_are_those_that_the_grid_and_the_particles_accept(com
 
 
 def test_ranks_are_not_limited_by_horizons_that_are_not_trained():
-    from eddies.workflows.estimates import most_ranks
+    from eddies.workflows.foreseen.estimates import most_ranks
     for changes in ([], ["training.horizon_steps=5", "model.path=runs/other"]):
         scene = load_scene("hit-small", changes)
         assert min(most_ranks(scene).values()) == 12 and not any("horizons" in reason for reason in most_ranks(scene))
@@ -158,8 +158,8 @@ def test_ranks_are_not_limited_by_horizons_that_are_not_trained():
 
 def test_what_no_term_reads_limits_no_ranks():
     from eddies.workflows.check import cost_lines, warnings
-    from eddies.workflows.cost_model import Speed
-    from eddies.workflows.estimates import most_ranks
+    from eddies.workflows.foreseen.cost_model import Speed
+    from eddies.workflows.foreseen.estimates import most_ranks
     fast, speed = ["training.horizon_steps=5", "training.horizons=[12]"], Speed(1e-6, 1e9)
     limits = {preset: most_ranks(load_scene("tiny", [*fast, f"model.preset={preset}"]))
               for preset in ("resolved + pairs", "resolved", "learned-density")}
@@ -177,7 +177,7 @@ def test_what_no_term_reads_limits_no_ranks():
 
 
 def test_memory_of_pairs_is_that_of_the_widest_network():
-    from eddies.workflows.cost_model import pair_bytes
+    from eddies.workflows.foreseen.cost_model import pair_bytes
     sizes = [pair_bytes(load_scene("tiny", ["model.preset=paper", f"model.pairs.hidden=[{first}]",
                                             f"model.density-flux.hidden=[{second}]"]), 1)
              for first, second in ((4, 4), (4, 200), (200, 4))]
@@ -192,7 +192,7 @@ def test_check_of_a_start_of_the_users(comm, own, caplog, recorded):
 
 
 def test_ghost_planes_limit_the_ranks():
-    from eddies.workflows.estimates import most_ranks
+    from eddies.workflows.foreseen.estimates import most_ranks
     fields = {planes: most_ranks(load_scene("tiny", [f"tracers.field_cells={planes}"])) for planes in (11, 12)}
     assert [limits["ghost planes of the filtered fields"] for limits in fields.values()] == [2, 3]
     # Of 20 planes: two for the splines, and what half the skin reaches; particles come home at every stage of a step.
@@ -229,13 +229,13 @@ def test_weights_that_are_not_there_yet_are_told(tmp_path):
 @pytest.mark.parametrize("overrides", [["forcing.wavenumber=1.5"], ["flow.cells=72", "forcing.wavenumber=23"]])
 @pytest.mark.filterwarnings("error")
 def test_probe_forces_any_wavenumber(comm, overrides):
-    from eddies.workflows.cost_model import probe
+    from eddies.workflows.foreseen.cost_model import probe
     speed = probe(load_scene("hit-small", overrides), comm, steps=1)
     assert 0 < speed.work < math.inf and 0 < speed.bandwidth < math.inf
 
 
 def test_probe_keeps_the_cells_of_a_rank():
-    from eddies.workflows.cost_model import small_flow
+    from eddies.workflows.foreseen.cost_model import small_flow
     scene = load_scene("hit-paper")
     assert [small_flow(scene, ranks).flow.cells for ranks in (1, 7, 8, 64)] == [64, 64, 128, 256]
     assert small_flow(load_scene("tiny"), 64).flow.cells == 24
@@ -244,12 +244,12 @@ def test_probe_keeps_the_cells_of_a_rank():
 def rows_of(scene):
     """The table of `eddies check` for ranks of a speed that is made up, as words."""
     from eddies.workflows.check import cost_lines
-    from eddies.workflows.cost_model import Speed
+    from eddies.workflows.foreseen.cost_model import Speed
     return [line.split("  ") for line in list(cost_lines(scene, Speed(1e-6, 1e9)))[2:]]
 
 
 def test_table_goes_to_the_most_slabs():
-    from eddies.workflows.cost_model import NODE_RANKS
+    from eddies.workflows.foreseen.cost_model import NODE_RANKS
 
     def words(*overrides):
         return [[word.strip() for word in row if word.strip()] for row in rows_of(load_scene("hit-paper", overrides))]
@@ -267,13 +267,13 @@ def test_table_goes_to_the_most_slabs():
 
 
 def test_memory_and_time_fall_with_the_ranks():
-    from eddies.workflows.cost_model import Speed, costs
+    from eddies.workflows.foreseen.cost_model import Speed, costs
     rows = costs(load_scene("hit-paper"), 512, Speed(1e-6, 1e9))
     for few, many in zip(rows, rows[1:]):
         assert many.memory < few.memory and many.seconds < few.seconds
         assert many.ranks * many.seconds >= few.ranks * few.seconds * (1 - 1e-12)  # no speed-up beyond the ideal
     # An odd plane costs as much as a pair.
-    from eddies.workflows.cost_model import cost
+    from eddies.workflows.foreseen.cost_model import cost
     assert cost(load_scene("hit-paper"), 1024, Speed(1e-6, 1e9)).work == rows[-1].work
 
 
@@ -282,8 +282,8 @@ def test_memory_and_time_fall_with_the_ranks():
 def test_bytes_sent_are_those_of_the_transposes(comm, fluid, monkeypatch):
     from eddies.parallel.reduction import global_sum
     from eddies.parallel.transpose import TransposeBuffers
-    from eddies.workflows.cost_model import sent_bytes
     from eddies.workflows.dns import build_fluid, initial_state
+    from eddies.workflows.foreseen.cost_model import sent_bytes
     changes = ["flow.cells=20", f"flow.fluid={fluid}", "initial.kind=taylor-green"]
     scene = load_scene("taylor-green", changes + (["flow.sound_speed=10"] if fluid == "compressible" else []))
     equation = build_fluid(scene, comm)
@@ -301,7 +301,8 @@ def test_bytes_sent_are_those_of_the_transposes(comm, fluid, monkeypatch):
 
 
 def test_messages_cost_time_beyond_a_node():
-    from eddies.workflows.cost_model import LATENCY, NODE_BANDWIDTH, NODE_RANKS, Speed, exchange_seconds, sent_bytes
+    from eddies.workflows.foreseen.cost_model import (LATENCY, NODE_BANDWIDTH, NODE_RANKS, Speed, exchange_seconds,
+                                                      sent_bytes)
     scene, speed = load_scene("hit-paper"), Speed(1e-6, 1e9)
     assert exchange_seconds(scene, 1, speed) == 0
     # Two nodes: each holds half of all bytes and keeps half of that, in messages from each rank to all others.
@@ -317,10 +318,11 @@ def test_messages_cost_time_beyond_a_node():
 def test_memory_of_a_step_is_as_expected(comm, fluid):
     # Arrays that a state, its operators and buffers hold, counted by the allocator, at a size where they are most.
     import tracemalloc
+
     from eddies.clock import Clock
     from eddies.time_stepping import ETDRK4
-    from eddies.workflows.cost_model import PROCESS_BYTES, flow_bytes
     from eddies.workflows.dns import build_fluid, build_step_limit, initial_state
+    from eddies.workflows.foreseen.cost_model import PROCESS_BYTES, flow_bytes
     changes = ["flow.cells=48", f"flow.fluid={fluid}", "initial.kind=taylor-green"]
     scene = load_scene("taylor-green", changes + (["flow.sound_speed=10"] if fluid == "compressible" else []))
     tracemalloc.start()

@@ -6,9 +6,9 @@ import json
 import pytest
 
 from eddies.io.hdf5 import ProductError
-from eddies.scene import SceneError, load_scene
+from eddies.scene.scene import SceneError, load_scene
 from eddies.workflows.compare import check_ground_truth
-from eddies.workflows.variant_run import VariantRun
+from eddies.workflows.variants.run import VariantRun
 from tests.workflows.synthetic_run import write_ground_truth
 
 SMALLER = ["flow.cells=16", "flow.viscosity=0.1", "spin_up.turnovers=0.3", "tracers.particles_per_side=8",

@@ -8,7 +8,7 @@ from eddies.io.fields import FieldSeries
 from eddies.io.hdf5 import open_product, read_attributes, read_provenance, read_table
 from eddies.io.trajectories import Trajectory
 from eddies.parallel.slab import SlabDecomposition
-from eddies.scene import BOX_LENGTH, SceneError, load_scene
+from eddies.scene.scene import BOX_LENGTH, SceneError, load_scene
 from eddies.workflows import dns
 
 SMALL = ["flow.cells=16", "tracers.particles_per_side=6", "tracers.turnovers=0.05", "tracers.field_cells=8"]
@@ -18,7 +18,7 @@ import sys
 from mpi4py import MPI
 from eddies.parallel import halo
 from eddies.parallel.slab import SlabDecomposition
-from eddies.scene import BOX_LENGTH, SceneError, load_scene
+from eddies.scene.scene import BOX_LENGTH, SceneError, load_scene
 from eddies.workflows import dns
 calls = []
 halo.HaloExchange.__init__ = lambda *a: calls.append("halo")
@@ -119,7 +119,7 @@ def test_statistics_are_sampled_every_few_steps_at_the_release_and_at_the_end(co
 @pytest.mark.mpi(1, 2)
 @pytest.mark.parametrize("name", ["tiny", "tracers-only"])
 def test_scales_are_those_of_the_release_however_long_the_flow_is_followed(comm, tmp_path, name):
-    from eddies.workflows.truth import GroundTruth
+    from eddies.workflows.ground_truth.truth import GroundTruth
 
     overrides = ["flow.cells=16", "tracers.particles_per_side=6", "tracers.field_cells=8"]
     if name == "tiny":

@@ -11,9 +11,8 @@ from eddies.io.checkpoint import Checkpoint
 from eddies.io.hdf5 import open_product, read_attributes, read_table
 from eddies.io.trajectories import Trajectory
 from eddies.parallel.stop import Stopped
-from eddies.scene import load_scene
+from eddies.scene.scene import load_scene
 from eddies.workflows import dns
-
 from tests.workflows.stopping import StopAtStep
 
 # Eight steps of spin-up, twelve with tracers in four frame intervals.

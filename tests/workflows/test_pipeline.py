@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 import pytest
 
-from eddies.scene import load_scene
+from eddies.scene.scene import load_scene
 
 pytestmark = pytest.mark.mpi(2, timeout=240)
 

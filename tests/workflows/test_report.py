@@ -5,15 +5,13 @@ import re
 import h5py
 import pytest
 
-from eddies.analysis.figures_rollout import errors_over_time
 from eddies.analysis.rollout_comparison import CommonFrames, error_series, particle_series
 from eddies.io.hdf5 import ProductError, open_product
 from eddies.io.trajectories import Trajectory
+from eddies.report.rollout_figures import errors_over_time
 from eddies.workflows import report
-
-from tests.workflows.synthetic_run import (
-    LENGTH, write_ground_truth, write_kernel, write_model, write_rollout, write_run,
-)
+from tests.workflows.synthetic_run import (LENGTH, write_ground_truth, write_kernel, write_model, write_rollout,
+                                           write_run)
 
 FIGURES = {
     "statistics", "spectra", "fields", "stationary", "tracers", "figure-1-kernels", "figure-2-reconstruction",

@@ -10,9 +10,8 @@ from eddies.io.hdf5 import open_product, read_table
 from eddies.io.weights import load_weights
 from eddies.parallel.stop import Stopped, StopRequest
 from eddies.particles.resolved_velocity import ResolvedVelocity
-from eddies.scene import SceneError, load_scene
+from eddies.scene.scene import SceneError, load_scene
 from eddies.workflows import dns, train, train_kernel
-
 from tests.workflows.stopping import StopAtStep
 
 # Ten frame intervals, all of them for training: six steps on single frames, two of them with every loss, and then two
@@ -30,9 +29,9 @@ def quick_solves(monkeypatch):
     monkeypatch.setattr(ResolvedVelocity, "iterations", 3)
 
 
-def prepared(comm, directory):
+def prepared(comm, directory, *more):
     """A directory with the ground truth and the kernel of the short scene."""
-    scene = load_scene("tiny", SHORT)
+    scene = load_scene("tiny", [*SHORT, *more])
     if comm.rank == 0:
         directory.mkdir(parents=True, exist_ok=True)
     comm.Barrier()
@@ -78,7 +77,7 @@ def test_a_stopped_training_is_the_one_never_stopped(comm, tmp_path):
 @pytest.mark.usefixtures("undrawn")
 @pytest.mark.mpi(2)
 def test_a_training_goes_on_from_products_that_are_still_those_it_began_with(comm, tmp_path):
-    scene = prepared(comm, tmp_path)
+    scene = prepared(comm, tmp_path, "training.horizon_steps=0")
 
     def stopped(looks, step, resume, names=("train",)):
         with pytest.raises(Stopped, match=f"from step {step} of the training"):

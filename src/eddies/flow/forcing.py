@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
+from eddies.errors import UserError
 from eddies.parallel.reduction import global_sum
 from eddies.spectral.spectral_grid import SpectralGrid
-
 
 # Share of the kinetic energy at the forced modes that round-off alone may leave there.
 SILENT = {"float64": 1e-20, "float32": 1e-10}
 
 
-class ForcingError(ValueError):
+class ForcingError(UserError, ValueError):
     """The flow cannot be forced."""
 
 

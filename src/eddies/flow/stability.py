@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from eddies.clock import Clock
+from eddies.errors import UserError
 from eddies.flow.navier_stokes import Fluid, advective_speed
 from eddies.parallel.reduction import global_max, global_sum
 from eddies.time_stepping import RungeKutta4
@@ -32,7 +33,7 @@ REMEDIES = {"advection": "lower [time] courant or step", "sound": "lower [time] 
             "viscosity": "lower [time] max_step or step" + EXACT}
 
 
-class FlowDiverged(RuntimeError):
+class FlowDiverged(UserError, RuntimeError):
     """The flow is not finite, or it gains energy from nowhere."""
 
     def __init__(self, seen: str, clock: Clock, advice: str) -> None:

@@ -10,7 +10,7 @@ import json
 import logging
 import os
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -23,7 +23,7 @@ from mpi4py import MPI
 from eddies.io.contiguous import Block, lay_out, write_arrays
 from eddies.io.hdf5 import FORMAT, ProductError
 from eddies.io.manifest import find_damage, hash_file, manifest_text, parse_manifest
-from eddies.parallel.broadcast import first_complaint, share_text
+from eddies.parallel.broadcast import first_complaint, on_all_ranks, on_first_rank
 
 log = logging.getLogger("eddies")
 
@@ -54,10 +54,6 @@ class Checkpoint:
             return file[name][(slice(None),) * axis + (slice(start, stop),)]
 
 
-# The directory within a run directory, of each stage that makes checkpoints.
-DIRECTORIES = {"dns": "checkpoints", "train": "checkpoints-train"}
-
-
 class CheckpointDirectory:
     """The checkpoints of a run, made with settings of a `fingerprint`. All methods are collective."""
 
@@ -78,18 +74,18 @@ class CheckpointDirectory:
             return
         arrays = {"description": np.frombuffer(json.dumps(description).encode(), np.uint8), **arrays}
         try:
-            self._by_first_rank(lambda: _make_empty(partial))
-            regions = json.loads(self._by_first_rank(lambda: json.dumps(lay_out(partial / STATE, arrays))))
-            self._by_all(lambda: write_arrays(self.comm.rank, partial / STATE, regions, arrays))
+            on_first_rank(self.comm, lambda: _make_empty(partial))
+            regions = on_first_rank(self.comm, lambda: lay_out(partial / STATE, arrays))
+            on_all_ranks(self.comm, lambda: write_arrays(self.comm.rank, partial / STATE, regions, arrays))
             content = {"step": step, "format": FORMAT, "fingerprint": self.fingerprint,
                        "state": hash_file(self.comm, partial / STATE, regions, (partial / STATE).stat().st_size),
                        "files": {name: self._hash_whole(name) for name in files}}
-            self._by_first_rank(lambda: _finish(partial, final, manifest_text(content)))
+            on_first_rank(self.comm, lambda: _finish(partial, final, manifest_text(content)))
         except OSError as error:
             if self.comm.rank == 0:
                 shutil.rmtree(partial, ignore_errors=True)
-            raise ProductError(f"{final}: cannot be written ({error}); the checkpoints before it are intact: once "
-                               "there is room, go on with --resume") from None
+            raise ProductError(f"{final}: cannot be written ({error.strerror or error}); the checkpoints before it are "
+                               "intact: once there is room, go on with --resume") from None
         for name in self._names()[KEPT:]:
             self._remove(name)
 
@@ -132,17 +128,15 @@ class CheckpointDirectory:
 
     def _names(self) -> list[str]:
         """Checkpoints, the newest first, as rank 0 sees them."""
-        def look() -> str:
-            found = sorted(path.name for path in self.path.glob("step-*") if path.suffix != ".partial")
-            return " ".join(reversed(found))
-        return self._by_first_rank(look).split()
+        return on_first_rank(self.comm, lambda: sorted(
+            (path.name for path in self.path.glob("step-*") if path.suffix != ".partial"), reverse=True))
 
     def _exists(self, path: Path) -> bool:
-        return bool(self._by_first_rank(lambda: "yes" if path.exists() else ""))
+        return on_first_rank(self.comm, path.exists)
 
     def _hash_whole(self, name: str) -> dict[str, Any]:
-        size = int(self._by_first_rank(lambda: str((self.path / name).stat().st_size)))
-        self._by_first_rank(lambda: _sync(self.path / name) or "")
+        size = on_first_rank(self.comm, lambda: (self.path / name).stat().st_size)
+        on_first_rank(self.comm, lambda: _sync(self.path / name))
         return hash_file(self.comm, self.path / name, {"frames": (0, size)}, size)
 
     def _clean(self, kept: set[str]) -> None:
@@ -165,42 +159,18 @@ class CheckpointDirectory:
         else:
             path.unlink()
 
-    def _by_first_rank(self, action: Callable[[], str]) -> str:
-        """What `action` returns on rank 0; if it raises OSError there, all ranks do."""
-        answer, complaint = "", None
-        if self.comm.rank == 0:
-            try:
-                answer = action()
-            except OSError as error:
-                complaint = error.strerror or str(error)
-        return self._agree(complaint) or share_text(self.comm, answer)
-
-    def _by_all(self, action: Callable[[], None]) -> None:
-        complaint = None
-        try:
-            action()
-        except OSError as error:
-            complaint = error.strerror or str(error)
-        self._agree(complaint)
-
-    def _agree(self, complaint: str | None) -> None:
-        complaint = first_complaint(self.comm, complaint)
-        if complaint is not None:
-            raise OSError(complaint)
-
 
 def _name(step: int) -> str:
     return f"step-{step:08d}"
 
 
-def _make_empty(directory: Path) -> str:
+def _make_empty(directory: Path) -> None:
     """Make a directory, in place of any that has its name."""
     shutil.rmtree(directory, ignore_errors=True)
     directory.mkdir(parents=True)
-    return directory.name
 
 
-def _finish(partial: Path, final: Path, manifest: str) -> str:
+def _finish(partial: Path, final: Path, manifest: str) -> None:
     """Write the manifest, wait for the disk, and give the checkpoint its name."""
     with open(partial / MANIFEST, "w", encoding="utf-8") as file:
         file.write(manifest)
@@ -209,7 +179,6 @@ def _finish(partial: Path, final: Path, manifest: str) -> str:
     _sync(partial)
     partial.rename(final)
     _sync(final.parent)
-    return final.name
 
 
 def _sync(path: Path) -> None:

@@ -17,22 +17,23 @@ import h5py
 import numpy as np
 from mpi4py import MPI
 
+from eddies.errors import UserError
 from eddies.io.provenance import environment
 from eddies.parallel.broadcast import share_text
 from eddies.parallel.stop import Stopped
+from eddies.pipeline import MAKER_OF
 
 # Of the products of this version: no other is read. 1 is that of eddies 0.1, whose files do not say so. Since 2 the
 # scales of a ground truth are those of the release, and a model is a list of terms.
 FORMAT = 2
 CHUNK_BYTES = 2**20
-REMEDIES = {"ground_truth": "dns", "kernel": "train-kernel", "model": "train", "rollout": "simulate"}
 
 # Files whose writing was broken off by an exception. Closing one is collective, so it must not happen when
 # Python drops the last reference on one rank alone; they stay open until the process ends.
 _abandoned: list[h5py.File] = []
 
 
-class ProductError(RuntimeError):
+class ProductError(UserError, RuntimeError):
     """A product is missing, unfinished, damaged or of the wrong kind: the text says which and what to do."""
 
 
@@ -201,7 +202,7 @@ def _create(comm: MPI.Comm, path: Path) -> h5py.File:
 
 
 def _open_checked(path: Path, kind: str | None) -> h5py.File:
-    remedy = f"run `eddies {REMEDIES[kind]} SCENE` first" if kind in REMEDIES else "make it first"
+    remedy = f"run `eddies {MAKER_OF[kind].name} SCENE` first" if kind in MAKER_OF else "make it first"
     if not path.is_file():
         raise ProductError(f"{path}: no such file; {remedy}")
     try:
@@ -225,7 +226,7 @@ def _problem(file: h5py.File, kind: str | None, remedy: str) -> str | None:
         return f"unfinished, its writer was stopped: {remedy}"
     if not _has_this_format(file):
         version = json.loads(file.attrs.get("provenance", "{}")).get("eddies", "of unknown version")
-        again = f"run `eddies {REMEDIES[found]}` again" if found in REMEDIES else "make it again"
+        again = f"run `eddies {MAKER_OF[found].name}` again" if found in MAKER_OF else "make it again"
         return f"written by eddies {version}, whose {found.replace('_', ' ')} this version does not read; {again}"
     return None
 

@@ -16,7 +16,7 @@ import numpy as np
 from mpi4py import MPI
 
 from eddies.io.contiguous import Regions
-from eddies.parallel.broadcast import first_complaint
+from eddies.parallel.broadcast import first_complaint, on_all_ranks
 from eddies.parallel.reduction import global_sum
 
 PIECE_BYTES = 4 * 2**20
@@ -30,16 +30,13 @@ def hash_file(comm: MPI.Comm, path: Path, regions: Regions, size: int) -> dict[s
     """
     pieces = list(_pieces(regions, size))
     digests = np.zeros((len(pieces), DIGEST_BYTES), np.uint8)
-    complaint = None
-    try:
+
+    def read() -> None:
         with open(path, "rb") as file:
             for number in range(comm.rank, len(pieces), comm.size):
                 digests[number] = np.frombuffer(_hash(file, pieces[number][1]), np.uint8)
-    except OSError as error:
-        complaint = error.strerror
-    complaint = first_complaint(comm, complaint)
-    if complaint is not None:
-        raise OSError(complaint)
+
+    on_all_ranks(comm, read)
     digests = global_sum(comm, digests)
     hashes: dict[str, list[str]] = {}
     for (name, _), digest in zip(pieces, digests):

@@ -1,11 +1,17 @@
-"""Words from one rank to all."""
+"""Words from one rank to all, and work that only some ranks do: what goes wrong on one is raised by all."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeVar
 
 import numpy as np
 from mpi4py import MPI
 
+from eddies.errors import UserError
 from eddies.parallel.reduction import global_min
+
+Result = TypeVar("Result")
 
 
 def share_text(comm: MPI.Comm, text: str, root: int = 0) -> str:
@@ -24,3 +30,43 @@ def first_complaint(comm: MPI.Comm, complaint: str | None) -> str | None:
     """The complaint of the lowest rank that has one, on every rank; None where no rank has."""
     rank = int(global_min(comm, comm.size if complaint is None else comm.rank))
     return None if rank == comm.size else share_text(comm, complaint or "", rank)
+
+
+def on_first_rank(comm: MPI.Comm, action: Callable[[], Result]) -> Result:
+    """What an action gives on rank 0, the only one that does it, on every rank. Where it raises a UserError or an
+    OSError there, all ranks raise the same. One rank sends nothing."""
+    result, error = None, None
+    if comm.rank == 0:
+        try:
+            result = action()
+        except (UserError, OSError) as raised:
+            error = raised
+    if comm.size > 1:
+        result, kind, arguments = comm.bcast((result, type(error), _arguments(error)))
+        if arguments and comm.rank > 0:
+            error = kind.__new__(kind, *arguments)
+            error.args = arguments
+    if error is not None:
+        raise error
+    return result
+
+
+def on_all_ranks(comm: MPI.Comm, action: Callable[[], Result]) -> Result:
+    """What an action gives on this rank. Where it raises an OSError on some, all ranks raise one, with the words of the
+    lowest."""
+    result, complaint = None, None
+    try:
+        result = action()
+    except OSError as error:
+        complaint = error.strerror or str(error)
+    complaint = first_complaint(comm, complaint)
+    if complaint is not None:
+        raise OSError(complaint)
+    return result
+
+
+def _arguments(error: Exception | None) -> tuple:
+    """What makes an error say the same on another rank; empty for none."""
+    if isinstance(error, OSError) and error.errno is not None:
+        return error.errno, error.strerror, error.filename and str(error.filename)
+    return () if error is None else (str(error),)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 from mpi4py import MPI
 
+from eddies.errors import UserError
 from eddies.parallel.slab import SlabDecomposition
 
 
-class HaloError(ValueError):
+class HaloError(UserError, ValueError):
     """A slab is thinner than the halo."""
 
 

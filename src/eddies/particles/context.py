@@ -18,7 +18,7 @@ from eddies.particles.particle_set import ParticleSet
 from eddies.particles.rank_sums import mean_over_ranks
 from eddies.particles.scaled_pairs import ScaledPairs
 from eddies.particles.surroundings import LocalParticles, Surroundings
-from eddies.scene_values import SceneError
+from eddies.scene.values import SceneError
 
 if TYPE_CHECKING:
     from eddies.particles.resolved_flow import ResolvedFlow

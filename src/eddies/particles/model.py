@@ -9,7 +9,6 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from eddies.composition import is_path, load, short_name
 from eddies.parallel.reduction import any_rank
 from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
@@ -17,7 +16,8 @@ from eddies.particles.rates import Rates, total
 from eddies.particles.terms.presets import TERMS
 from eddies.particles.terms.settings import TermSettings
 from eddies.particles.terms.term import PairTerm, Term
-from eddies.scene_values import SceneError
+from eddies.scene.composition import is_path, load, short_name
+from eddies.scene.values import SceneError
 
 
 class LagrangianModel(nn.Module):

@@ -5,10 +5,12 @@ import math
 from collections.abc import Iterator
 
 from eddies.clock import duration
-from eddies.scene import BOX_LENGTH, Scene
-from eddies.workflows.cost_model import LATENCY, NODE_BANDWIDTH, NODE_RANKS, Speed, cost, costs, pair_bytes, probe
-from eddies.workflows.estimates import (expected_step, expected_turbulence, foreseen_allowed_step, ground_truth_alone,
-                                        largest_wavenumber, learns_pairs, most_ranks, particle_reach, run_time)
+from eddies.scene.scene import BOX_LENGTH, Scene
+from eddies.workflows.foreseen.cost_model import (LATENCY, NODE_BANDWIDTH, NODE_RANKS, Speed, cost, costs, pair_bytes,
+                                                  probe)
+from eddies.workflows.foreseen.estimates import (expected_step, expected_turbulence, foreseen_allowed_step,
+                                                 ground_truth_alone, largest_wavenumber, learns_pairs, most_ranks,
+                                                 particle_reach, run_time)
 
 log = logging.getLogger("eddies")
 

@@ -12,14 +12,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from eddies.analysis import figures_compare
-from eddies.analysis.figures import draw
-from eddies.analysis.page import write_page
-from eddies.comparison import BASELINE, Comparison
 from eddies.io.hdf5 import ProductError, open_product, read_attributes, read_provenance
-from eddies.scene import SceneError
-from eddies.workflows.comparison_rows import COLUMNS, machine, notes, rows
-from eddies.workflows.variant_run import RunStages, VariantRun, on_first_rank
+from eddies.report.comparison import ErrorAgainstTime, run_record, sections
+from eddies.report.figures import draw
+from eddies.report.page import write_page
+from eddies.scene.comparison import BASELINE, Comparison
+from eddies.scene.scene import SceneError
+from eddies.workflows.variants.rows import COLUMNS, machine, notes, rows
+from eddies.workflows.variants.run import RunStages, VariantRun, in_directories
 
 log = logging.getLogger("eddies")
 
@@ -36,13 +36,13 @@ def run(comparison: Comparison, comm, output: Path, resume: bool, run_stages: Ru
     """
     runs = [VariantRun(scene, output / name, comparison.ground_truth_of(name))
             for name, scene in comparison.scenes.items()]
-    on_first_rank(comm, lambda: check_directories(runs))
+    in_directories(comm, lambda: check_directories(runs))
     for variant in runs:
         check_ground_truth(comparison, variant, comm)
     errors = comm.Dup()
     for done, variant in enumerate(runs):
         log.info("compare: %s, %d of %d", variant.name, done + 1, len(runs))
-        on_first_rank(comm, lambda: variant.prepare(runs[:done], comm.size, resume))
+        in_directories(comm, lambda: variant.prepare(runs[:done], comm.size, resume))
         variant.attempt(errors, lambda: variant.roll_out(run_stages))
     for repeat in range(1, comparison.repeats):
         log.info("compare: timing, round %d of %d", repeat + 1, comparison.repeats)
@@ -83,11 +83,10 @@ def check_ground_truth(comparison: Comparison, variant: VariantRun, comm) -> Non
 
 def write(comparison: Comparison, table: list[dict[str, Any]], comm, output: Path) -> None:
     """Write rank 0's rows and what is drawn of them; all ranks call it."""
-    sections = []
+    parts = []
     if comm.rank == 0:
-        sections = figures_compare.sections(
-            figures_compare.ErrorAgainstTime(table, comparison.subject, BASELINE), comparison.turnovers)
-    draw(comm, sections)
+        parts = sections(ErrorAgainstTime(table, comparison.subject, BASELINE), comparison.turnovers)
+    draw(comm, parts)
     if comm.rank > 0:
         return
     computer = machine(comparison.base_scene.device, comm.size)
@@ -97,7 +96,7 @@ def write(comparison: Comparison, table: list[dict[str, Any]], comm, output: Pat
         writer.writerows(table)
     record = {"name": comparison.name, "title": comparison.title, "machine": computer, "rows": table}
     (output / "comparison.json").write_text(json.dumps(record, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    sections[0].notices += notes(comparison)
-    page = figures_compare.run_record(comparison.name, comparison.title, comparison.base_scene.to_toml(), computer)
-    write_page(output, page, sections)
+    parts[0].notices += notes(comparison)
+    page = run_record(comparison.name, comparison.title, comparison.base_scene.to_toml(), computer)
+    write_page(output, page, parts)
     log.info("compare: %s", output / "index.html")

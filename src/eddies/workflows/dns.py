@@ -9,25 +9,26 @@ from pathlib import Path
 import numpy as np
 
 from eddies.clock import Clock, ProgressLine
-from eddies.composition import is_path, load
 from eddies.flow.courant import CourantLimit, FixedStep
 from eddies.flow.forcing import LinearForcing
 from eddies.flow.history import FlowHistory
 from eddies.flow.initial_fields import INITIAL_FLOWS, balanced_density, sound_wave_density
 from eddies.flow.navier_stokes import FLUIDS, Fluid
 from eddies.flow.operators import project
-from eddies.io.checkpoint import DIRECTORIES, Checkpoint
+from eddies.io.checkpoint import Checkpoint
 from eddies.io.fields import FieldSeries, FieldWriter
 from eddies.io.hdf5 import create_product, open_product, write_attributes, write_table
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import StopRequest
-from eddies.scene import BOX_LENGTH, Scene, SceneError
-from eddies.scene_sections import SpinUp
+from eddies.pipeline import STAGES
+from eddies.scene.composition import is_path, load
+from eddies.scene.scene import BOX_LENGTH, Scene, SceneError
+from eddies.scene.sections import SpinUp
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.time_stepping import STEPPERS
-from eddies.workflows.flow_run import FlowRun, Guard
-from eddies.workflows.frame_segments import FrameSegments
-from eddies.workflows.tracer_run import TracerRun
+from eddies.workflows.ground_truth.flow_run import FlowRun, Guard
+from eddies.workflows.ground_truth.frame_segments import FrameSegments
+from eddies.workflows.ground_truth.tracer_run import TracerRun
 
 log = logging.getLogger("eddies")
 
@@ -41,7 +42,7 @@ def run(scene: Scene, comm, directory: str | Path, stop: StopRequest | None = No
     Raises Stopped, after a checkpoint, when `stop` asks for it.
     """
     directory, fingerprint = Path(directory), scene.fingerprint("dns")
-    guard = Guard(comm, directory / DIRECTORIES["dns"], fingerprint, stop or StopRequest(comm))
+    guard = Guard(comm, directory / STAGES["dns"].checkpoints, fingerprint, stop or StopRequest(comm))
     saved = guard.checkpoints.newest()
     flow = build_run(scene, comm, guard, saved)
     with create_product(comm, directory / "ground_truth.h5", "ground_truth", scene.provenance("dns")) as file:

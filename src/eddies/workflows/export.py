@@ -7,8 +7,8 @@ from eddies.io.fields import FieldSeries
 from eddies.io.hdf5 import ProductError, open_product, read_provenance
 from eddies.io.trajectories import Trajectory
 from eddies.io.vtkhdf import write_images, write_points
-from eddies.parallel.broadcast import first_complaint
-from eddies.scene_sections import BOX_LENGTH
+from eddies.parallel.broadcast import on_first_rank
+from eddies.scene.sections import BOX_LENGTH
 
 log = logging.getLogger("eddies")
 
@@ -23,16 +23,10 @@ def run(run_directory: Path, output: Path, comm) -> None:
         ProductError: on all ranks, if there is no such series, a product is damaged, or a file cannot be written.
     """
     alone = comm.Split(comm.rank)
-    complaint = None
-    if comm.rank == 0:
-        try:
-            _export(run_directory, output, alone)
-        except ProductError as error:
-            complaint = str(error)
-    alone.Free()
-    complaint = first_complaint(comm, complaint)
-    if complaint is not None:
-        raise ProductError(complaint)
+    try:
+        on_first_rank(comm, lambda: _export(run_directory, output, alone))
+    finally:
+        alone.Free()
 
 
 def _export(run_directory: Path, output: Path, alone) -> None:

@@ -13,22 +13,24 @@ from typing import Any
 
 import numpy as np
 
-from eddies.analysis import (
-    figures_comparison, figures_flow, figures_forced, figures_kernel, figures_mach, figures_model, figures_tracers,
-    figures_turbulence,
-)
-from eddies.analysis.figures import draw
 from eddies.analysis.isotropic_turbulence import StationarySpan
-from eddies.analysis.page import Metric, RunRecord, Section, metrics_json, shown, write_page
 from eddies.analysis.spectra import energy_spectrum, vorticity
 from eddies.analysis.tracer_statistics import tracer_statistics
 from eddies.io.fields import FieldSeries
 from eddies.io.hdf5 import ProductError, open_product, read_attributes, read_provenance, read_table
 from eddies.io.trajectories import Trajectory
+from eddies.parallel.stop import StopRequest
+from eddies.pipeline import MAKER_OF
+from eddies.report import forced, ground_truth, kernel, mach, stationary, tracers
+from eddies.report.figures import draw
+from eddies.report.model import section as model_section
+from eddies.report.page import Metric, RunRecord, Section, metrics_json, shown, write_page
+from eddies.report.rollout import Rollout
+from eddies.report.rollout import section as rollout_section
+from eddies.scene.scene import Scene
 
 log = logging.getLogger("eddies")
 
-STAGES = {"ground_truth": "dns", "kernel": "train-kernel", "model": "train", "rollout": "simulate"}
 ROLLOUT_COST = {"seconds_per_step": "rollout, seconds per step", "particles": "particles of the rollout",
                 "ranks": "ranks of the rollout"}
 
@@ -43,6 +45,11 @@ class Run:
     filter_width: float | None = None
     eulerian: dict[str, np.ndarray] | None = None
     stationary: StationarySpan | None = None
+
+
+def run_stage(scene: Scene, comm, directory: str | Path, stop: StopRequest | None = None) -> None:
+    """The report as a stage of a scene."""
+    run(directory, comm)
 
 
 def run(directory: str | Path, comm) -> None:
@@ -104,14 +111,14 @@ def _read_ground_truth(file, record: Run) -> list[Section]:
         sections.append(_read_stationary(file, record, statistics))
     if "particles/tracers" in file:
         found = tracer_statistics(Trajectory(file, "tracers"), record.eulerian, reference["spacing"])
-        sections.append(figures_tracers.section(found, reference))
+        sections.append(tracers.section(found, reference))
     return sections
 
 
 def _read_stationary(file, record: Run, statistics: dict[str, np.ndarray]) -> Section:
     try:
         record.stationary = read_stationary_span(file)
-        return figures_turbulence.section(statistics, record.stationary)
+        return stationary.section(statistics, record.stationary)
     except ProductError as error:
         return Section("stationary", "Stationary turbulence", notices=[str(error)])
 
@@ -131,12 +138,12 @@ def _read_flow(file, record: Run, reference: dict[str, Any], statistics: dict[st
     record.cost.append(Metric("dns_seconds_per_step", "DNS, seconds per step (median)",
                               float(np.median(statistics["seconds_per_step"]))))
     planes = {"velocity": velocity[0, middle], "vorticity": vorticity_magnitude[middle]}
-    return figures_flow.section(figures_flow.GroundTruth(statistics, spectra, reference, planes, name))
+    return ground_truth.section(ground_truth.GroundTruth(statistics, spectra, reference, planes, name))
 
 
 def _read_kernel(file, record: Run) -> list[Section]:
     tables = {name: read_table(file, name) for name in ("kernels", "slices", "errors", "history")}
-    return [figures_kernel.section(json.loads(file.attrs["description"])["support"], **tables)]
+    return [kernel.section(json.loads(file.attrs["description"])["support"], **tables)]
 
 
 def _read_model(file, record: Run) -> list[Section]:
@@ -144,13 +151,12 @@ def _read_model(file, record: Run) -> list[Section]:
     provenance, errors = record.provenance["model"], read_table(file, "a_priori")
     source = provenance.get("source")
     history = read_table(file, "history") if "history" in file else None
-    shown = figures_model.section(json.loads(file.attrs["description"]), errors,
-                                  read_table(file, "acceleration_sample"), density_rate, history,
-                                  source and source["path"])
+    shown = model_section(json.loads(file.attrs["description"]), errors,
+                          read_table(file, "acceleration_sample"), density_rate, history, source and source["path"])
     if source:
-        own = figures_mach.FlowErrors("this flow", provenance["mach_turbulent"], errors)
-        figures_mach.add(shown, own, figures_mach.FlowErrors(source["path"], source["mach_turbulent"],
-                                                             read_table(file, "source_a_priori")))
+        own = mach.FlowErrors("this flow", provenance["mach_turbulent"], errors)
+        mach.add(shown, own, mach.FlowErrors(source["path"], source["mach_turbulent"],
+                                             read_table(file, "source_a_priori")))
     return [shown]
 
 
@@ -164,11 +170,11 @@ def _read_rollout(file, record: Run) -> list[Section]:
     fields = {name: FieldSeries(file, name) for name in ("model", "truth", "filtered")}
     outside = read_table(file, "outside_training")["share"] if "outside_training" in file else None
     closure = read_table(file, "closure") if "closure" in file else None
-    rollout = figures_comparison.Rollout(attributes, model, truth, fields, model.length, record.filter_width,
-                                         record.eulerian, outside, closure)
-    sections = [figures_comparison.section(rollout)]
+    rollout = Rollout(attributes, model, truth, fields, model.length, record.filter_width,
+                      record.eulerian, outside, closure)
+    sections = [rollout_section(rollout)]
     if rollout.forced and record.stationary is not None and record.filter_width is not None:
-        sections.append(figures_forced.section(rollout, record.stationary))
+        sections.append(forced.section(rollout, record.stationary))
     return sections
 
 
@@ -191,13 +197,13 @@ def _stage_seconds(directory: Path) -> dict[str, float]:
 def _run_record(directory: Path, record: Run) -> RunRecord:
     rows = [("stage", "ranks", "wall time (s)", "date", "eddies", "commit", "libraries")]
     for kind, origin in record.provenance.items():
-        seconds = shown(record.seconds[STAGES[kind]]) if STAGES[kind] in record.seconds else "not stored"
+        seconds = shown(record.seconds[MAKER_OF[kind].name]) if MAKER_OF[kind].name in record.seconds else "not stored"
         commit = (origin["commit"] or "not a checkout")[:12]
         libraries = ", ".join(f"{name} {version}" for name, version in origin["libraries"].items())
         ranks = str(origin["ranks"])
-        rows.append((STAGES[kind], ranks, seconds, origin["date"], origin["eddies"], commit, libraries))
+        rows.append((MAKER_OF[kind].name, ranks, seconds, origin["date"], origin["eddies"], commit, libraries))
     newest = list(record.provenance.values())[-1]
-    stages = ", ".join(STAGES[kind] for kind in record.provenance)
+    stages = ", ".join(MAKER_OF[kind].name for kind in record.provenance)
     summary = f"Lagrangian large-eddy simulation; stages: {stages}; {newest['date']}"
     return RunRecord(directory.resolve().name, summary, newest["scene"], rows)
 

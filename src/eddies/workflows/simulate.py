@@ -13,17 +13,17 @@ import torch
 
 from eddies.clock import Clock, ProgressLine
 from eddies.io.hdf5 import create_product, open_product, write_attributes, write_table
-from eddies.methods import method_class
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import StopRequest
+from eddies.particles.devices import prepare_torch
 from eddies.particles.particle_set import ParticleSet
-from eddies.scene import BOX_LENGTH, Scene, SceneError
-from eddies.workflows.devices import prepare_torch
-from eddies.workflows.particle_run import injection_rate
-from eddies.workflows.rollout_frames import RolloutFrames
-from eddies.workflows.trained_kernel import load_kernel
-from eddies.workflows.truth import GroundTruth
+from eddies.scene.methods import method_class
+from eddies.scene.scene import BOX_LENGTH, Scene, SceneError
+from eddies.workflows.ground_truth.truth import GroundTruth
+from eddies.workflows.learned.kernel import load_kernel
+from eddies.workflows.rollout.frames import RolloutFrames
+from eddies.workflows.rollout.particle_run import injection_rate
 
 log = logging.getLogger("eddies")
 

@@ -7,21 +7,22 @@ import time
 from pathlib import Path
 
 from eddies.clock import ProgressLine
-from eddies.io.checkpoint import DIRECTORIES, CheckpointDirectory
+from eddies.io.checkpoint import CheckpointDirectory
 from eddies.io.hdf5 import open_product
 from eddies.io.weights import save_weights
 from eddies.learning.training import Training, TrainingDiverged
 from eddies.parallel.halo import HaloError
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import Stopped, StopRequest
-from eddies.scene import BOX_LENGTH, Scene, SceneError
-from eddies.workflows import adopt
-from eddies.workflows.a_priori import evaluate, evaluation_frames
-from eddies.workflows.devices import prepare_torch
-from eddies.workflows.model_description import describe
-from eddies.workflows.trained_kernel import load_kernel
-from eddies.workflows.training_data import TrainingData
-from eddies.workflows.truth import GroundTruth
+from eddies.particles.devices import prepare_torch
+from eddies.pipeline import STAGES
+from eddies.scene.scene import BOX_LENGTH, Scene, SceneError
+from eddies.workflows.ground_truth.truth import GroundTruth
+from eddies.workflows.learned import adopt
+from eddies.workflows.learned.a_priori import evaluate, evaluation_frames
+from eddies.workflows.learned.description import describe
+from eddies.workflows.learned.kernel import load_kernel
+from eddies.workflows.learned.training_data import TrainingData
 
 log = logging.getLogger("eddies")
 
@@ -45,7 +46,7 @@ def run(scene: Scene, comm, directory: str | Path, stop: StopRequest | None = No
         model, last, tests = data.model, data.last, evaluation_frames(truth)
         log.info("train: frames up to %d of the times up to %.3g of %.3g, %d held out; %d weights", data.learned,
                  truth.times[last], truth.times[-1], last - data.learned, sum(p.numel() for p in model.parameters()))
-        checkpoints = CheckpointDirectory(comm, directory / DIRECTORIES["train"], scene.fingerprint("train"))
+        checkpoints = CheckpointDirectory(comm, directory / STAGES["train"].checkpoints, scene.fingerprint("train"))
         history = {}
         if next(model.parameters(), None) is None:
             log.info("train: the terms have no parameters, nothing is learned")
@@ -118,6 +119,7 @@ class LearningCurves:
     def draw(self, training: Training) -> None:
         """Draw now."""
         if self.comm.rank == 0:
-            from eddies.analysis import figures, figures_learning  # matplotlib takes a while to start
-            self.path.write_bytes(figures.png(figures_learning.curves(training.columns())))
+            from eddies.report import figures  # matplotlib takes a while to start
+            from eddies.report.learning import curves
+            self.path.write_bytes(figures.png(curves(training.columns())))
         self._drawn = time.monotonic()

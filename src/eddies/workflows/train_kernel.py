@@ -19,11 +19,11 @@ from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import StopRequest
 from eddies.particles.cloud import ParticleCloud
+from eddies.particles.devices import prepare_torch
 from eddies.particles.smoothing_kernels import CubicSpline, KernelNetwork, SmoothingKernel, WendlandC2, integral
-from eddies.scene import BOX_LENGTH, Scene
+from eddies.scene.scene import BOX_LENGTH, Scene
 from eddies.spectral.spectral_grid import SpectralGrid
-from eddies.workflows.devices import prepare_torch
-from eddies.workflows.truth import GroundTruth
+from eddies.workflows.ground_truth.truth import GroundTruth
 
 log = logging.getLogger("eddies")
 

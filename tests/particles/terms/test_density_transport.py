@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from eddies.particles.flow_units import FlowUnits
-from eddies.scene_values import SceneError
+from eddies.scene.values import SceneError
 from tests.particles.clouds import CUTOFF, FLOW, LENGTH, NEIGHBORS, PAIR_MODELS, SCALES, cloud, model, rates, state
 
 pytestmark = pytest.mark.mpi(1)

@@ -3,8 +3,8 @@ import pytest
 import torch
 
 from eddies.parallel.reduction import global_sum
-from eddies.scene_values import SceneError
-from tests.particles.clouds import LENGTH, along, alone, distributed, dynamics_of, model, state
+from eddies.scene.values import SceneError
+from tests.particles.clouds import LENGTH, alone, along, distributed, dynamics_of, model, state
 
 
 def force_on(slab, particles, rate, wavenumber=2.0):

@@ -7,11 +7,9 @@ import torch
 
 from eddies.particles import moments
 from eddies.particles.flow_units import FlowUnits
-from eddies.scene_values import SceneError
-from tests.particles.clouds import (
-    CUTOFF, FLOW, LENGTH, NEIGHBORS, PAIR_MODELS, SCALES, along, cloud, given, model, rates, scaled_pairs,
-    state,
-)
+from eddies.scene.values import SceneError
+from tests.particles.clouds import (CUTOFF, FLOW, LENGTH, NEIGHBORS, PAIR_MODELS, SCALES, along, cloud, given, model,
+                                    rates, scaled_pairs, state)
 
 pytestmark = pytest.mark.mpi(1)
 SPH = {"summation": {"summation-density": {}, "wcsph": dict(exponent=7.0)}}

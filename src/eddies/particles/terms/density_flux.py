@@ -12,7 +12,7 @@ from eddies.particles.scaled_pairs import ScaledPairs
 from eddies.particles.terms import settings as declared
 from eddies.particles.terms.pair_basis import build_network
 from eddies.particles.terms.term import PairTerm
-from eddies.scene_values import SceneError
+from eddies.scene.values import SceneError
 
 
 class DensityFlux(PairTerm):

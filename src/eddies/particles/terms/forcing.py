@@ -14,7 +14,7 @@ from eddies.particles.rank_sums import sum_over_ranks
 from eddies.particles.rates import Rates
 from eddies.particles.terms import settings as declared
 from eddies.particles.terms.term import Term
-from eddies.scene_values import SceneError
+from eddies.scene.values import SceneError
 
 
 class Forcing(Term):

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from torch import Tensor, nn
 
-from eddies.composition import is_path, load
 from eddies.particles import moments
 from eddies.particles.context import Context
 from eddies.particles.dense_network import DenseNetwork
 from eddies.particles.terms.settings import NetworkSettings
-from eddies.scene_values import SceneError
+from eddies.scene.composition import is_path, load
+from eddies.scene.values import SceneError
 
 
 def along_separation(sums: Tensor, basis: str, context: Context) -> Tensor:

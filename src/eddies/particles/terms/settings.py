@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from eddies.scene_values import KeyProblem, Section, boolean, choice, integers, named, number, texts
+from eddies.scene.values import KeyProblem, Section, boolean, choice, integers, named, number, texts
 
 READS = ("pairs", "resolved", "density")
 GIVES = ("acceleration", "density", "density_rate")

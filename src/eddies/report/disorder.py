@@ -1,0 +1,104 @@
+"""Disorder of the particles of a rollout beside that of the true tracers: one figure and its numbers."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from eddies.analysis import disorder
+from eddies.analysis.pdfs import kl_divergence
+from eddies.analysis.rollout_comparison import CommonFrames, Frames
+from eddies.report.figures import GUIDE, letter, panels, styled
+from eddies.report.page import Metric, Section
+from eddies.report.rollout_figures import LINES
+
+Series = Mapping[str, Mapping[str, np.ndarray]]  # columns over time of "truth" and "model"
+
+
+@dataclass(frozen=True)
+class Disorder:
+    """Shares of nearest-neighbour distances at one time, and series over time, of "truth" and "model".
+
+    distances: (bins,) each, on disorder.DISTANCE_EDGES; counts: columns time, count_variance; energies: columns time,
+    energy (of the reconstructed velocity beyond the filter wavenumber), or None where that is not known.
+    """
+
+    time: float
+    distances: Mapping[str, np.ndarray]
+    counts: Series
+    energies: Series | None
+
+    @property
+    def divergence(self) -> float:
+        """Forward KL divergence of the PDFs of nearest-neighbour distances."""
+        return kl_divergence(self.distances["truth"], self.distances["model"])
+
+
+def measure(trajectories: Mapping[str, Frames], fields: Mapping[str, Frames], common: CommonFrames, length: float,
+            broken: float, wavenumber: float | None) -> Disorder:
+    """Measure model and truth, named so in both mappings: distances at the last common frame, series over all frames
+    before `broken`."""
+    last = {"model": int(common.model[-1]), "truth": int(common.truth[-1])}
+    before = {name: np.flatnonzero(run.times < broken) for name, run in trajectories.items()}
+    distances = {name: disorder.distance_probabilities(run.read(last[name], "position"), length)
+                 for name, run in trajectories.items()}
+    counts = {name: disorder.count_variance_series(run, before[name], length) for name, run in trajectories.items()}
+    energies = None
+    if wavenumber is not None:
+        energies = {name: disorder.energy_above(fields[name], np.flatnonzero(fields[name].times < broken), wavenumber)
+                    for name in trajectories}
+    return Disorder(float(common.times[-1]), distances, counts, energies)
+
+
+def add(shown: Section, found: Disorder, turnover: float) -> None:
+    """Put the figure and its three numbers, all at the last common time, into the section of the rollout."""
+    variance = {name: _at(series, found.time)["count_variance"] for name, series in found.counts.items()}
+    ratio, caption = None, ""
+    if found.energies is not None:
+        energy = {name: _at(series, found.time)["energy"] for name, series in found.energies.items()}
+        ratio = energy["model"] / energy["truth"]
+        caption = (f" C: energy of the reconstructed velocity at k > k_d; model / truth at the end: {ratio:.3g}.")
+    shown.metrics += [
+        Metric("nearest_distance_kl", "KL divergence of the nearest-neighbour distance PDF", found.divergence),
+        Metric("count_variance_ratio", "variance of particle counts, model / truth",
+               variance["model"] / variance["truth"], "too few particles to be counted in cells"),
+        Metric("high_wavenumber_energy_ratio", "energy at k > k_d, model / truth", ratio,
+               "the filter width is in ground_truth.h5, which is not here"),
+    ]
+    shown.add_figure(
+        "particle-disorder", "Disorder of the particles", draw(found, turnover),
+        f"A: distance to the nearest neighbour at t = {found.time / turnover:.2f} T; KL {found.divergence:.2g}. "
+        f"B: variance of the particles' number in cells of {disorder.CELL:g} mean spacings, 1 for random points; "
+        f"at that time {variance['truth']:.2f} (true tracers), {variance['model']:.2f} (model): above the truth's the "
+        f"model's particles cluster.{caption}")
+
+
+@styled
+def draw(found: Disorder, turnover: float) -> Figure:
+    """PDF of nearest-neighbour distances beside that of random points, variance of counts and energy beyond the
+    filter wavenumber over time."""
+    figure, axes = panels(1, 2 if found.energies is None else 3, (4.0, 3.1))
+    edges = disorder.DISTANCE_EDGES
+    fine, centres = np.linspace(edges[0], edges[-1], 300), (edges[1:] + edges[:-1]) / 2
+    nearest, counts = axes[0, :2]
+    nearest.plot(fine, disorder.random_distance_density(fine), color=GUIDE, linestyle=":", label="random points")
+    for name, line in LINES.items():
+        nearest.plot(centres, found.distances[name] / np.diff(edges), **line)
+        counts.plot(found.counts[name]["time"] / turnover, found.counts[name]["count_variance"], **line)
+        if found.energies is not None:
+            series = found.energies[name]
+            axes[0, 2].semilogy(series["time"] / turnover, series["energy"], **line)
+            axes[0, 2].set(title="Energy beyond the filter", ylabel="$E(k > k_d)$", xlabel="time $t/T$")
+    nearest.set(title="Nearest neighbour", xlabel="distance / mean spacing", ylabel="PDF", ylim=(0, None))
+    nearest.legend()
+    counts.axhline(1, color=GUIDE, linestyle=":")
+    counts.set(title="Variance of counts", ylabel="over that of random points", xlabel="time $t/T$", ylim=(0, None))
+    letter(axes.flat)
+    return figure
+
+
+def _at(series: Mapping[str, np.ndarray], time: float) -> dict[str, float]:
+    """The columns at the moment nearest to `time`."""
+    nearest = int(np.argmin(np.abs(series["time"] - time)))
+    return {name: float(values[nearest]) for name, values in series.items()}

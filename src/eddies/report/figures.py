@@ -1,0 +1,130 @@
+"""What all figures share: colours, fonts, panels, slices with one colour scale, guide lines."""
+
+import functools
+import io
+from collections.abc import Callable, Sequence
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
+
+from eddies.report.page import Section
+
+# Colour-blind safe (Okabe and Ito), the same quantity in the same colour in every figure.
+DNS, FILTERED, TRUTH, MODEL = "#000000", "#7f7f7f", "#0072B2", "#D55E00"
+SECOND, THIRD, FOURTH = "#009E73", "#CC79A7", "#E69F00"
+GUIDE = "#9a9a9a"
+SIGNED, POSITIVE = "RdBu_r", "viridis"
+
+STYLE = {
+    "font.size": 10.5, "axes.titlesize": 10.5, "axes.labelsize": 10.5, "legend.fontsize": 9,
+    "xtick.labelsize": 9, "ytick.labelsize": 9, "font.family": "DejaVu Sans",
+    "mathtext.fontset": "dejavusans",
+    "axes.spines.top": False, "axes.spines.right": False, "axes.linewidth": 0.8, "lines.linewidth": 1.7,
+    "legend.frameon": False, "figure.dpi": 150, "savefig.dpi": 150, "axes.prop_cycle": matplotlib.cycler(
+        color=[TRUTH, MODEL, SECOND, THIRD, FOURTH, DNS]),
+}
+
+
+def styled(draw: Callable[..., Figure]) -> Callable[..., Figure]:
+    """Run a drawing function under the common style, whatever the user's matplotlib settings are."""
+    @functools.wraps(draw)
+    def drawn(*arguments, **named):
+        with matplotlib.rc_context({**matplotlib.rcParamsDefault, **STYLE, "backend": "agg"}):
+            return draw(*arguments, **named)
+    return drawn
+
+
+def panels(rows: int, columns: int, size: tuple[float, float], **sharing) -> tuple[Figure, np.ndarray]:
+    """A figure of rows x columns axes, always a two-dimensional array; `size` is of one panel in inches."""
+    figure = Figure(figsize=(size[0] * columns, size[1] * rows), layout="constrained")
+    figure.get_layout_engine().set(w_pad=0.06, h_pad=0.06)
+    return figure, figure.subplots(rows, columns, squeeze=False, **sharing)
+
+
+def letter(axes: Sequence[Axes]) -> None:
+    """Name the panels A, B, C... before their titles."""
+    if len(axes) > 1:
+        for name, panel in zip("ABCDEFGHIJKLMNOP", axes):
+            title = panel.get_title()
+            panel.set_title(f"{name}   {title}" if title else name, loc="left")
+            panel.set_title("", loc="center")
+
+
+@styled
+def png(figure: Figure) -> bytes:
+    """The figure as a PNG image."""
+    buffer = io.BytesIO()
+    # Not `savefig`, which draws every figure twice: the first time for its layout alone.
+    FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": None})
+    return buffer.getvalue()
+
+
+def draw(comm, sections: Sequence[Section]) -> None:
+    """Turn the figures of rank 0's sections into PNG images; all ranks call it, and each draws its share."""
+    illustrations = [illustration for section in sections for illustration in section.illustrations]
+    shares = [[illustration.image for illustration in illustrations[rank::comm.size]] for rank in range(comm.size)]
+    images = comm.gather([png(figure) for figure in comm.scatter(shares)])
+    for index, illustration in enumerate(illustrations):
+        illustration.image = images[index % comm.size][index // comm.size]
+
+
+def largest(*arrays: np.ndarray, quantile: float = 0.998) -> float:
+    """A colour limit for all these arrays: a high quantile of their magnitude, and never zero."""
+    values = np.abs(np.concatenate([np.ravel(array) for array in arrays]))
+    return float(np.quantile(values, quantile)) or 1.0
+
+
+def show_plane(axis: Axes, plane: np.ndarray, limits: tuple[float, float], colours: str):
+    """Draw a [y, x] plane of the box with given colour limits; returns the image for a colour bar."""
+    length = 2 * np.pi
+    image = axis.imshow(plane, origin="lower", extent=(0, length, 0, length), cmap=colours, vmin=limits[0],
+                        vmax=limits[1], interpolation="bilinear", aspect="equal")
+    ticks = [0, length / 2, length]
+    axis.set_xticks(ticks, ["0", r"$\pi$", r"$2\pi$"])
+    axis.set_yticks(ticks, ["0", r"$\pi$", r"$2\pi$"])
+    for side in ("top", "right"):
+        axis.spines[side].set_visible(True)
+    return image
+
+
+def colour_bar(figure: Figure, image, axes: Sequence[Axes], label: str, extend: str = "both"):
+    """One colour bar for all panels of `axes`; returns it."""
+    bar = figure.colorbar(image, ax=list(axes), shrink=0.9, aspect=22, pad=0.015, extend=extend, label=label)
+    bar.outline.set_linewidth(0.6)
+    return bar
+
+
+def guide_power_law(
+    axis: Axes, wavenumber: Sequence[float], level: float, exponent: float, label: str
+) -> None:
+    """A thin dashed power law from (wavenumber[0], level) on, with its label at the upper end."""
+    wavenumber = np.asarray(wavenumber, dtype=float)
+    values = level * (wavenumber / wavenumber[0]) ** exponent
+    axis.plot(wavenumber, values, color=GUIDE, linestyle="--", linewidth=1.1)
+    middle = np.sqrt(wavenumber[0] * wavenumber[-1]), np.sqrt(values[0] * values[-1])
+    axis.annotate(label, middle, xytext=(4, 3), textcoords="offset points", color="#5a5a5a", fontsize=9)
+
+
+def number_wavenumbers(axis: Axes) -> None:
+    """Ticks 1, 2, 5, 10, 20... on a logarithmic axis of wavenumbers, however short it is."""
+    axis.set_xscale("log")
+    axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axis.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axis.xaxis.set_minor_locator(NullLocator())
+
+
+def legend_below(axis: Axes, columns: int) -> None:
+    """The legend under the panel, where it can hide no line."""
+    axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.21), ncol=columns, columnspacing=1.2,
+                handlelength=1.8)
+
+
+def mark_time(axis: Axes, time: float, label: str) -> None:
+    """A thin vertical line at a moment, named along its top."""
+    axis.axvline(time, color=GUIDE, linewidth=1, linestyle=":")
+    axis.annotate(label, (time, 1), xycoords=("data", "axes fraction"), xytext=(3, -2),
+                  textcoords="offset points", va="top", fontsize=8.5, color="#5a5a5a")

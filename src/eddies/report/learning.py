@@ -1,0 +1,105 @@
+"""Learning curves: losses, validation error, learning rate and gradient over the course of a training."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from eddies.clock import duration
+from eddies.report.figures import DNS, FOURTH, GUIDE, MODEL, SECOND, THIRD, TRUTH, letter, panels, styled
+
+LOSSES = (
+    ("loss", "total", DNS), ("trajectory_loss", "trajectory $L_t$", MODEL),
+    ("field_loss", "field $L_f$", TRUTH), ("velocity_kl_loss", "velocity KL", SECOND),
+    ("acceleration_kl_loss", "acceleration KL", FOURTH), ("rollout_loss", "velocity over the horizon", THIRD),
+    ("energy_loss", "energy over the horizon", "#56B4E9"),
+)
+# Single steps see a small batch: their mean over this share of a phase's steps is drawn over them.
+SMOOTHED = 0.04
+
+
+@styled
+def curves(history: Mapping[str, np.ndarray]) -> Figure:
+    """The four curves over the steps of a training, each phase as wide as any other, also one that is not at its end;
+    dotted lines part them.
+
+    history: columns (steps,); a loss that was not in use at a step is NaN there, one never used is absent.
+    """
+    history = {**history, "place": _places(history["phase"])}
+    figure, axes = panels(2, 2, (4.6, 3.0), sharex=True)
+    (losses, errors), (rates, gradients) = axes
+    for name, label, colour in LOSSES:
+        if name in history and np.any(history[name] > 0):
+            _noisy(losses, history, name, colour, label)
+    losses.set(title="Losses", ylabel="loss", yscale="log")
+    _validation(errors, history)
+    for number in np.unique(history["phase"]):
+        chosen = history["phase"] == number
+        rates.plot(history["place"][chosen], history["learning_rate"][chosen], color=MODEL, marker=_marker(chosen))
+    rates.set(title="Learning rate", ylabel="learning rate", yscale="log")
+    _noisy(gradients, history, "gradient_norm", MODEL, None)
+    gradients.set(title="Norm of the gradient", ylabel="norm", yscale="log")
+    for axis in axes.flat:
+        _mark_phases(axis, history)
+    figure.legend(*losses.get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    letter(axes.flat)
+    return figure
+
+
+def _places(phase: np.ndarray) -> np.ndarray:
+    """Where the steps are drawn: those of the first phase in (0, 1], those of the second in (1, 2], and so on."""
+    _, index, count = np.unique(phase, return_inverse=True, return_counts=True)
+    before = np.cumsum(count) - count
+    return index + (np.arange(len(phase)) - before[index] + 1) / count[index]
+
+
+def _marker(steps: np.ndarray) -> str | None:
+    """A single step makes no line."""
+    return "." if np.count_nonzero(steps) == 1 else None
+
+
+def _mark_phases(axis: Axes, history: Mapping[str, np.ndarray]) -> None:
+    """Lines between the phases, and ticks that give steps and wall time."""
+    phases = round(history["place"][-1])
+    for end in range(1, phases):
+        axis.axvline(end, color=GUIDE, linestyle=":", linewidth=1.0)
+    wanted = np.linspace(0, phases, 4 + 1)[1:]
+    shown = np.unique(np.searchsorted(history["place"], wanted - 1e-9))
+    labels = [f"{int(history['step'][row]) + 1}\n{duration(history['seconds'][row])}" for row in shown]
+    axis.set_xticks([0, *history["place"][shown]], ["0", *labels])
+    axis.set_xlabel("steps and wall time" if axis.get_subplotspec().is_last_row() else "")
+
+
+def _validation(axis: Axes, history: Mapping[str, np.ndarray]) -> None:
+    """Each phase has a measure of its own, so its points, from the one before its first step on, are joined with no
+    others; the least is circled."""
+    axis.set(title="Error on what is held out, its least circled", ylabel="validation error")
+    missing, highest = np.full(len(history["step"]), np.nan), 0.0
+    after, before = (history.get(name, missing) for name in ("validation_error", "start_error"))
+    for index, number in enumerate(np.unique(history["phase"])):
+        chosen = history["phase"] == number
+        place = np.append(index, history["place"][chosen])
+        error = np.append(before[chosen][0], after[chosen])
+        place, error = place[np.isfinite(error)], error[np.isfinite(error)]
+        if len(error):
+            best, highest = np.argmin(error), max(highest, error.max())
+            axis.plot(place, error, color=MODEL, marker="o", markersize=3)
+            axis.plot(place[best], error[best], marker="o", markersize=8, markerfacecolor="none", color=DNS)
+    if highest > 0:
+        axis.set_ylim(0, 1.1 * highest)
+
+
+def _noisy(axis: Axes, history: Mapping[str, np.ndarray], name: str, colour: str, label: str | None) -> None:
+    """A curve of single steps, faint, under its running mean within each phase."""
+    values = history[name]
+    for number in np.unique(history["phase"]):
+        used = (values > 0) & (history["phase"] == number)
+        if not used.any():
+            continue
+        place, chosen = history["place"][used], values[used]
+        axis.plot(place, chosen, color=colour, alpha=0.25, linewidth=0.6)
+        width = max(int(SMOOTHED * len(chosen)), 1)
+        mean = np.convolve(chosen, np.full(width, 1 / width), mode="valid")
+        axis.plot(place[width - 1:], mean, color=colour, label=label, linewidth=1.4, marker=_marker(used))
+        label = None

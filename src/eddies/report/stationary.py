@@ -1,0 +1,77 @@
+"""The report's part on the stationary state of forced turbulence: its averages beside those of the literature."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from eddies.analysis.isotropic_turbulence import (COMPONENTS, INERTIAL, KOLMOGOROV_CONSTANT, Row, StationarySpan,
+                                                  comparison)
+from eddies.report.figures import (DNS, FOURTH, GUIDE, MODEL, SECOND, TRUTH, legend_below, letter, number_wavenumbers,
+                                   panels, styled)
+from eddies.report.page import Metric, Section
+
+HISTORY = (("dissipation_rate", r"dissipation", TRUTH, "-"), ("injection_rate", "injection", FOURTH, "--"))
+
+
+@styled
+def stationary_state(statistics: Mapping[str, np.ndarray], span: StationarySpan) -> Figure:
+    """Energy and its rates over turnovers, components of the energy, and the mean compensated spectrum of a span.
+
+    statistics: columns (samples,) of the whole run.
+    """
+    figure, axes = panels(1, 3, (3.7, 3.2))
+    turnovers, (first, last) = statistics["turnovers"], span.columns["turnovers"][[0, -1]]
+    balance, components, spectrum = axes.flat
+    balance.plot(turnovers, statistics["energy"], color=DNS, label="energy")
+    for column, label, colour, style in HISTORY:
+        balance.plot(turnovers, statistics[column], color=colour, linestyle=style, label=label)
+    balance.set(title="Energy balance", ylabel="energy, energy rates", ylim=(0, None))
+    for name, colour in zip(COMPONENTS, (TRUTH, MODEL, SECOND)):
+        share = statistics[name] / np.mean([statistics[other] for other in COMPONENTS], axis=0)
+        components.plot(turnovers, share, color=colour, label=f"$u_{name[-1]}$")
+    components.axhline(1, color=GUIDE, linestyle="--", linewidth=1.1)
+    components.set(title="Components", ylabel="energy / mean of components")
+    for axis in (balance, components):
+        axis.axvspan(first, last, color=GUIDE, alpha=0.2, linewidth=0)
+        axis.set_xlabel("large-eddy turnovers")
+        axis.margins(x=0.02)
+        legend_below(axis, 3)
+    draw_compensated(spectrum, {None: (span, DNS)})
+    letter(axes.flat)
+    return figure
+
+
+def draw_compensated(axis: Axes, spans: Mapping[str | None, tuple[StationarySpan, str]]) -> None:
+    """Mean compensated spectra of spans, by label and with a colour each, and Kolmogorov's constant as a band."""
+    for label, (span, colour) in spans.items():
+        k_eta, compensated = span.compensated_spectrum()
+        axis.loglog(k_eta, compensated, color=colour, marker="o", markersize=3, label=label)
+    axis.fill_between(INERTIAL, *KOLMOGOROV_CONSTANT, color=GUIDE, alpha=0.6, linewidth=0,
+                      label="{}–{}, high Re".format(*KOLMOGOROV_CONSTANT))
+    axis.legend(loc="lower left")
+    axis.set(title="Compensated spectrum", xlabel=r"$k\,\eta$", ylabel=r"$\varepsilon^{-2/3}k^{5/3}E(k)$",
+             ylim=(0.05, 4))
+    number_wavenumbers(axis)
+
+
+def section(statistics: Mapping[str, np.ndarray], span: StationarySpan) -> Section:
+    """Averages over the stationary state, with the literature's values at the same Re_lambda."""
+    first, last = span.columns["time"][[0, -1]]
+    shown = Section(
+        "stationary", "Stationary turbulence",
+        f"Averages over {span.turnovers:.3g} large-eddy turnovers of the forced flow, t = {first:.3g} to {last:.3g}, "
+        "with the standard deviation in time, and the literature's values at this Re_λ.",
+        metrics=[Metric(row.key, row.label, columns_of(row)) for row in comparison(span)])
+    shown.add_figure(
+        "stationary", "The stationary state", stationary_state(statistics, span),
+        f"Shaded: the span of the averages. Its energy balance closes to {abs(span.energy_imbalance):.1e} of the "
+        "dissipation. C: mean spectrum, each shell with the mean energy of its modes; band: Kolmogorov's constant.")
+    return shown
+
+
+def columns_of(row: Row) -> dict[str, float | str]:
+    """A row by the names of its columns; what it does not have is left out."""
+    columns = {"this run": row.value, "deviation": row.deviation, "literature": row.literature, "source": row.source}
+    return {name: value for name, value in columns.items() if value not in (None, "")}

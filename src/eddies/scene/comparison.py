@@ -1,0 +1,135 @@
+"""A comparison: variants of one scene that are run from the same moment on one machine, as read from one TOML file."""
+
+import re
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from eddies.scene.reader import find_document, parse_document, read_section, read_text
+from eddies.scene.rules import nearest
+from eddies.scene.scene import Scene, SceneError, load_scene
+from eddies.scene.values import Document, Section, integer, number, sections, text, texts
+
+__all__ = ["BASELINE", "Comparison", "Variant", "load_comparison"]
+
+BUILT_IN = Path(__file__).parents[1] / "comparisons"
+BASELINE = "baseline"
+RESERVED = ("figures",)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Variant(Section):
+    """The base scene with some keys changed."""
+
+    name: str = text("its run directory and its label in figures")
+    set: tuple[str, ...] = texts('changes "section.key=value" of the base scene', default=())
+    group: str = text(f'a colour and a marker in figures; "{BASELINE}": what the model is measured against',
+                      default="model")
+    run: str | None = text("run directory of its own ground truth, where it needs another than the base's",
+                           default=None)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison(Document):
+    """A whole comparison; making one loads the scenes of all variants and checks that they can be compared."""
+
+    name: str = text("names the output directory; absent: the file's name", default="comparison")
+    title: str = text("one line for lists and reports", default="untitled comparison")
+    base: str = text("the scene that every variant changes: a built-in name or a path")
+    run: str | None = text("run directory that holds the base's ground truth; absent: runs/BASE", default=None)
+    set: tuple[str, ...] = texts('changes "section.key=value" of the base, for all variants', default=())
+    turnovers: float = number("large-eddy turnovers of every rollout", default=1.0, above=0)
+    repeats: int = integer("how often every variant is timed, in rounds over all of them", default=3, at_least=1)
+    model: str | None = text("the variant that the summary is about; absent: the first", default=None)
+    variant: tuple[Variant, ...] = sections(Variant)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._check_names()
+        if load_scene(self.base).simulation is None:
+            raise SceneError(f'base = "{self.base}": has no [simulation], of which errors are compared; add it, '
+                             "or take another base")
+        for variant in self.variant:
+            problem = self._difference(variant)
+            if problem:
+                raise SceneError(f'variant "{variant.name}": {problem}')
+
+    @property
+    def subject(self) -> str:
+        """Name of the variant that the summary is about."""
+        return self.model or self.variant[0].name
+
+    @cached_property
+    def base_scene(self) -> Scene:
+        """The base with the changes that all variants share."""
+        return load_scene(self.base, self._shared)
+
+    @cached_property
+    def scenes(self) -> dict[str, Scene]:
+        """The scene of every variant, by its name, in order."""
+        return {variant.name: self._scene(variant) for variant in self.variant}
+
+    @property
+    def run_directory(self) -> Path:
+        """Where the ground truth of the base is."""
+        return Path(self.run) if self.run else Path("runs") / load_scene(self.base).name
+
+    def ground_truth_of(self, name: str) -> Path:
+        """The run directory with the ground truth of a variant."""
+        own = next(variant.run for variant in self.variant if variant.name == name)
+        return Path(own) if own else self.run_directory
+
+    @property
+    def _shared(self) -> list[str]:
+        """Changes to the base in all variants."""
+        return [*self.set, f"simulation.turnovers={self.turnovers!r}"]
+
+    def _scene(self, variant: Variant) -> Scene:
+        try:
+            return load_scene(self.base, [*self._shared, *variant.set, f'name="{variant.name}"'])
+        except SceneError as error:
+            raise SceneError(f'variant "{variant.name}": {error}', error.key) from None
+
+    def _check_names(self) -> None:
+        names = [variant.name for variant in self.variant]
+        if not names:
+            raise SceneError("[[variant]]: a comparison needs at least one; each has a name and a list `set`")
+        for name in names:
+            if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name) or name in RESERVED:
+                raise SceneError(f'variant "{name}": its name is that of a directory: letters, digits, ".", "_" and '
+                                 f'"-", and not {" or ".join(RESERVED)}; choose another')
+            if names.count(name) > 1:
+                raise SceneError(f'variant "{name}": {names.count(name)} variants have this name; rename all but one')
+        if self.subject not in names:
+            hint = f"{nearest(self.subject, names)} ".lstrip()
+            raise SceneError(f'model = "{self.subject}": no such variant; {hint}there are: {", ".join(names)}')
+
+    def _difference(self, variant: Variant) -> str | None:
+        """Why a variant cannot be compared with the base: other data, another start, other times of its frames."""
+        base, scene = self.base_scene, self.scenes[variant.name]
+        if variant.run is None and scene.fingerprint("dns") != base.fingerprint("dns"):
+            return ("its changes concern the ground truth, which is the base's; give the variant `run`, the run "
+                    "directory of a ground truth made with these changes, or leave them out")
+        for key in ("turnovers", "start", "frame_interval"):
+            ours, theirs = (getattr(other.simulation, key) for other in (scene, base))
+            if ours != theirs:
+                return (f"[simulation] {key} = {ours} where the base has {theirs}: all variants start at the same "
+                        "moment and are compared at the same times; change it for all of them, or not")
+        if scene.simulation.start is None and scene.window != base.window:
+            return (f"[training] window = {scene.window:g} where the base has {base.window:g}: rollouts start where it "
+                    "ends, and all must start at the same moment; give [simulation] start for all of them")
+        return None
+
+
+def load_comparison(name_or_path: str | Path, run: str | Path | None = None) -> Comparison:
+    """Read a built-in comparison by name, or a TOML file by path; `run` is used instead of the file's, if given.
+
+    Raises:
+        SceneError: names the file, the variant and the key, what is allowed and what to do.
+    """
+    path = find_document(str(name_or_path), BUILT_IN, "comparison")
+    given = {} if run is None else {"run": str(run)}
+    try:
+        return read_section(Comparison, {"name": path.stem, **parse_document(read_text(path)), **given})
+    except SceneError as error:
+        raise SceneError(f"{path}: {error}", error.key) from None

@@ -1,0 +1,130 @@
+"""The section [model] of a scene: a list of terms, each with settings of its own in [model.NAME]."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+from eddies.particles.terms.presets import DEFAULT_PRESET, PRESETS, TERMS
+from eddies.particles.terms.settings import GIVES, READS, TermSettings
+from eddies.scene.composition import is_path, load, short_name
+from eddies.scene.reader import read_section
+from eddies.scene.rules import nearest, quoted
+from eddies.scene.values import KeyProblem, SceneError, Section, choice, import_paths, sub_sections, text, texts
+
+
+@dataclass(frozen=True, kw_only=True)
+class Model(Section):
+    """The terms whose sum moves the particles, each with its settings; a preset is a list of them that has a name.
+
+    Once made it holds all `terms`, their `settings` by NAME, and no preset. In a program settings are given as objects
+    or as dicts; a dict leaves the other keys as they are in the preset.
+    """
+
+    preset: str | None = choice(f"a list of terms that has a name; absent: {DEFAULT_PRESET}, if there are no terms",
+                                *PRESETS, default=None)
+    terms: tuple[str, ...] | None = texts("what accelerates the particles and gives their density, each with the keys "
+                                          "of [model.NAME]", *TERMS, default=None, paths=True)
+    path: str | None = text("run directory or model.h5 whose trained weights are used; absent: they are trained",
+                            default=None)
+    settings: dict[str, TermSettings] = sub_sections()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.preset is not None and self.terms is not None:
+            raise SceneError(f"[model] preset = {quoted(self.preset)}: with terms = {quoted(self.terms)} the list is "
+                             "given twice; remove one of the two", "model.preset")
+        preset = PRESETS[self.preset or DEFAULT_PRESET] if self.terms is None else {}
+        terms = self.terms if self.terms is not None else tuple(preset)
+        named = {short_name(term): term for term in terms}
+        if len(named) < len(terms) or not terms:
+            raise KeyProblem("model", "terms", f" = {quoted(terms)}: must be one or more terms, each once by its name "
+                             "(of an import path what follows the colon)")
+        for name in self.settings:
+            if name not in named:
+                hint = f"{nearest(name, named)} ".lstrip()
+                raise SceneError(f"[model.{name}]: no such term; {hint}the terms are {', '.join(named)}; remove the "
+                                 "section, or add the term to the list", f"model.{name}")
+        settings = {name: _settings(term, name, preset.get(name, {}), self.settings.get(name, {}))
+                    for name, term in named.items()}
+        for key, value in (("preset", None), ("terms", terms), ("settings", settings)):
+            object.__setattr__(self, key, value)
+
+    @property
+    def weights_file(self) -> Path | None:
+        """The file of the weights: `path` where it ends in .h5, model.h5 within it otherwise; None without it."""
+        if self.path is None:
+            return None
+        return Path(self.path) if self.path.endswith(".h5") else Path(self.path) / "model.h5"
+
+    @property
+    def reads(self) -> frozenset[str]:
+        """What the terms read, together."""
+        return frozenset(chain.from_iterable(settings.reads for settings in self.settings.values()))
+
+    @property
+    def gives(self) -> frozenset[str]:
+        """What the terms give, together."""
+        return frozenset(chain.from_iterable(settings.gives for settings in self.settings.values()))
+
+    @property
+    def foreign(self) -> tuple[str, ...]:
+        """The import paths that terms and networks are named by."""
+        parts = [(self, "model"), *((part, name) for name, part in self.settings.items())]
+        return tuple(dict.fromkeys(path for part, _ in parts for _, path in import_paths(part)))
+
+
+def replace_terms(table: dict[str, Any], keys: set[str]) -> None:
+    """Where one of preset and terms was written over a [model] of a file, let the other go, and with it the file's
+    settings of terms that there are no more. `keys` are those written over the file, "section.key"."""
+    if ("model.preset" in keys) == ("model.terms" in keys):
+        return
+    written, other = ("preset", "terms") if "model.preset" in keys else ("terms", "preset")
+    table.pop(other, None)
+    listed = PRESETS.get(str(table[written]), ()) if written == "preset" else table[written]
+    if isinstance(listed, (list, dict)):
+        names = {short_name(str(term)) for term in listed}
+        for name in [name for name, part in table.items() if isinstance(part, dict) and name not in names]:
+            if f"model.{name}" not in keys:
+                del table[name]
+
+
+def settings_class(term: str) -> type[TermSettings]:
+    """The class of a term's settings: of a word of ours, or `Settings` of the class that an import path names.
+
+    Raises SceneError: the path names no class of a term, or its Settings are no settings.
+    """
+    if not is_path(term):
+        return load(TERMS[term][1])
+    kind = load(term)
+    if not isinstance(kind, type) or not issubclass(kind, load("eddies.particles.terms.term:Term")):
+        raise SceneError(f'"{term}": must be a class derived from eddies.Term')
+    settings = getattr(kind, "Settings", TermSettings)
+    if not (isinstance(settings, type) and issubclass(settings, TermSettings)
+            and "__dataclass_fields__" in vars(settings)):
+        raise SceneError(f'"{term}": its Settings must be a class of their own kind: write @dataclass(frozen=True) and '
+                         "below it class Settings(eddies.TermSettings)")
+    return settings
+
+
+def _settings(term: str, name: str, preset: Mapping[str, Any],
+              given: TermSettings | Mapping[str, Any]) -> TermSettings:
+    """The settings of a term: as given, or made of the keys that are given over those of the preset."""
+    try:
+        kind = settings_class(term)
+    except SceneError as error:
+        raise SceneError(f"[model] terms: {error}", "model.terms") from None
+    if isinstance(given, Section):
+        if type(given) is not kind:
+            raise SceneError(f"[model.{name}]: must be settings of the class {kind.__qualname__}, or a dict of its "
+                             f"keys, not of {type(given).__qualname__}", f"model.{name}")
+        made = given
+    else:
+        made = read_section(kind, {**preset, **given} if isinstance(given, Mapping) else given, f"model.{name}")
+    for key, valid in (("reads", READS), ("gives", GIVES)):
+        declared = getattr(made, key)
+        if isinstance(declared, str) or not set(declared) <= set(valid):
+            raise SceneError(f"[model] terms: {quoted(term)}: {key} = {quoted(declared)}: must be a tuple of any of "
+                             f"{', '.join(map(quoted, valid))}", "model.terms")
+    return made

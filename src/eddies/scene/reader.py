@@ -1,0 +1,160 @@
+"""Turns a TOML document and the user's `--set` overrides into sections, and sections into TOML.
+
+Nothing here knows a particular section or key: what is allowed stands beside the fields of the dataclasses
+(`scene_values`), which check their values themselves.
+"""
+
+import dataclasses
+import tomllib
+from dataclasses import MISSING
+from pathlib import Path
+from typing import Any
+
+from eddies.scene.rules import nearest, quoted
+from eddies.scene.values import KeyProblem, SceneError, Section, rule_of
+
+
+def find_document(name_or_path: str, built_in: Path, what: str) -> Path:
+    """The file of a built-in name (a TOML file in the folder `built_in`), or of a path; SceneError lists the names."""
+    names = sorted(path.stem for path in built_in.glob("*.toml"))
+    if name_or_path in names:
+        return built_in / f"{name_or_path}.toml"
+    if Path(name_or_path).is_file():
+        return Path(name_or_path)
+    hint = f"{nearest(name_or_path, names)} ".lstrip()
+    raise SceneError(f"{name_or_path}: no such {what}; {hint}give the path of a TOML file, or one of "
+                     f"{', '.join(names)}")
+
+
+def parse_document(text: str) -> dict[str, Any]:
+    """The tables and keys of a TOML text.
+
+    Raises:
+        SceneError: with the line at which the text stops being TOML.
+    """
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise SceneError(f"not TOML: {error}; keys are written `key = value` under a [section]") from None
+
+
+def read_text(path: Path) -> str:
+    """The text of a scene file; SceneError if it cannot be read."""
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise SceneError(f"cannot be read: {reason}; give the path of a scene, a TOML file") from None
+
+
+def apply_overrides(document: dict[str, Any], overrides: list[str]) -> set[str]:
+    """Write each "section.key=value" (or "key=value", or "section.sub.key=value") over the document; returns the keys
+    written, with the sections that hold them.
+
+    The value is read as TOML; what is not TOML, such as a bare word, is a string. A section that the document
+    lacks is made.
+    """
+    keys = set()
+    for override in overrides:
+        path, equals, value = (part.strip() for part in override.partition("="))
+        *outer, last = names = path.split(".")
+        if not equals or not value or len(names) > 3 or not all(names):
+            raise SceneError(f"--set {override}: must be section.key=value, or key=value outside sections, or "
+                             "section.name.key=value in a section of a section")
+        table = document
+        for name in outer:
+            table = table.setdefault(name, {})
+            if not isinstance(table, dict):
+                raise SceneError(f"--set {override}: {name} is a value, not a section")
+        table[last] = _override_value(value)
+        keys |= {".".join(names[:depth]) for depth in range(1, len(names) + 1)}
+    return keys
+
+
+def read_section(kind: type[Section], table: Any, name: str = "") -> Any:
+    """The dataclass `kind` filled from a TOML table; `name` is the section's, empty for the whole document.
+
+    Raises:
+        SceneError: for an unknown key, a value that its declaration refuses, or a key that is missing.
+    """
+    if not isinstance(table, dict):
+        message = f"{name} = {quoted(table)}: must be a section; write [{name}] and its keys below"
+        raise SceneError(message, name)
+    every = {field.name: field for field in dataclasses.fields(kind)}
+    fields = {key: field for key, field in every.items() if "sub_sections" not in field.metadata}
+    holder = next((key for key in every if key not in fields), None)
+    values, inner = {}, {}
+    for key, value in table.items():
+        if key in fields:
+            values[key] = _read_value(fields[key], value)
+        elif holder and isinstance(value, dict):
+            inner[key] = value
+        else:
+            raise _unknown(key, value, name, fields)
+    for key, field in fields.items():
+        if key not in values and field.default is field.default_factory is MISSING:
+            raise _missing(kind, field, name)
+    try:
+        return kind(**values, **({holder: inner} if inner else {}))
+    except KeyProblem as problem:
+        raise (problem.within(name) if problem.section == kind.section_name() else problem) from None
+
+
+def write_section(section: Section, name: str = "") -> list[str]:
+    """The lines `key = value  # meaning` of a section, and below them those of its own sections [name.NAME] that have
+    keys; keys that are None are left out."""
+    lines, inner = [], []
+    for field in dataclasses.fields(section):
+        value, rule = getattr(section, field.name), rule_of(type(section), field)
+        if "sub_sections" in field.metadata:
+            for key, part in value.items():
+                if written := write_section(part):
+                    inner += ["", f"[{name}.{key}]", *written]
+        elif rule is not None and value is not None:
+            lines.append(f"{field.name} = {quoted(value)}" + (f"  # {rule.about}" if rule.about else ""))
+    return lines + inner
+
+
+def _override_value(value: str) -> Any:
+    try:
+        parsed = tomllib.loads(f"value = {value}")
+    except tomllib.TOMLDecodeError:
+        return value
+    return parsed["value"] if len(parsed) == 1 else value
+
+
+def _read_value(field: dataclasses.Field, value: Any) -> Any:
+    if "section" in field.metadata:
+        return read_section(field.metadata["section"], value, field.name)
+    if "sections" in field.metadata:
+        return _read_sections(field.metadata["sections"], value, field.name)
+    return value
+
+
+def _read_sections(kind: type[Section], tables: Any, name: str) -> tuple:
+    """A dataclass for each [[name]]; an error says which by its number, and by its name if it has one."""
+    if not isinstance(tables, list):
+        raise SceneError(f"{name} = {quoted(tables)}: must be sections; write [[{name}]] before each", name)
+    read = []
+    for number, table in enumerate(tables, 1):
+        try:
+            read.append(read_section(kind, table, name))
+        except SceneError as error:
+            own = f' ("{table["name"]}")' if isinstance(table, dict) and "name" in table else ""
+            raise SceneError(f"[[{name}]] number {number}{own}: {error}", error.key) from None
+    return tuple(read)
+
+
+def _unknown(key: str, value: Any, section: str, fields: dict[str, dataclasses.Field]) -> SceneError:
+    hint = f"{nearest(key, fields, cutoff=0.5)} ".lstrip()
+    is_section = isinstance(value, dict) and not section
+    problem = f": no such {'section' if is_section else 'key'}; {hint}valid here: {', '.join(fields) or 'no key'}"
+    return SceneError(f"[{key}]{problem}", key) if is_section else KeyProblem(section, key, problem)
+
+
+def _missing(kind: type[Section], field: dataclasses.Field, section: str) -> SceneError:
+    rule = rule_of(kind, field)
+    if rule is None:
+        return SceneError(f"[{field.name}]: this section is missing; every scene needs it", field.name)
+    about = f" ({rule.about})" if rule.about else ""
+    return KeyProblem(section, field.name, f": this key is missing{about}; give it {rule.allowed}")

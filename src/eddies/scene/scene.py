@@ -1,0 +1,158 @@
+"""A scene: the description of a flow and of what is to be learned from it, as read from one TOML file.
+
+A section that is optional and absent is None, and then nothing is built for it.
+"""
+
+import hashlib
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, fields
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from eddies.pipeline import STAGES
+from eddies.scene.checks import first_inconsistency
+from eddies.scene.composition import origins, search_in
+from eddies.scene.model import Model, replace_terms
+from eddies.scene.reader import apply_overrides, find_document, parse_document, read_section, read_text, write_section
+from eddies.scene.sections import (BOX_LENGTH, DEFAULT_WINDOW, Eulerian, Flow, Forcing, Initial, Kernel, Simulation,
+                                   SpinUp, Time, Tracers, Training, Wcsph)
+from eddies.scene.values import Document, SceneError, choice, import_paths, integer, section, text
+
+__all__ = ["BOX_LENGTH", "Scene", "SceneError", "builtin_scenes", "load_scene", "Eulerian",
+           "Flow", "Forcing", "Initial", "Kernel", "Model", "Simulation", "SpinUp", "Time", "Tracers", "Training",
+           "Wcsph"]
+
+# Sections that may name classes and functions of the user's.
+FOREIGN_IN = ("flow", "initial", "model", "simulation")
+BUILT_IN = Path(__file__).parents[1] / "scenes"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene(Document):
+    """A whole scene; making one checks its values and that its sections fit together (SceneError)."""
+
+    name: str = text("names the run; absent: the file's name", default="scene")
+    title: str = text("one line for lists and reports", default="untitled scene")
+    seed: int = integer("of every random number", default=1, at_least=0)
+    device: str = choice("where particles are computed", "cpu", "cuda", default="cpu")
+    flow: Flow = section(Flow)
+    initial: Initial = section(Initial, default=Initial())
+    forcing: Forcing | None = section(Forcing, default=None)
+    time: Time = section(Time, default=Time())
+    spin_up: SpinUp | None = section(SpinUp, default=None)
+    tracers: Tracers | None = section(Tracers, default=None)
+    kernel: Kernel | None = section(Kernel, default=None)
+    model: Model | None = section(Model, default=None)
+    training: Training | None = section(Training, default=None)
+    simulation: Simulation | None = section(Simulation, default=None)
+    wcsph: Wcsph | None = section(Wcsph, default=None)
+    eulerian: Eulerian | None = section(Eulerian, default=None)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        problem = first_inconsistency(self)
+        if problem:
+            raise SceneError(problem)
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """The stages that this scene asks for, in the order in which they run."""
+        learned = self.simulation is None or "model" in self.simulation.needs
+        return tuple(stage.name for stage in STAGES.values() if (learned or stage.name != "train")
+                     and (stage.section is None or getattr(self, stage.section) is not None))
+
+    @property
+    def window(self) -> float:
+        """Fraction of the ground truth that kernel and model may see; with a kernel alone the default of [training]."""
+        return self.training.window if self.training else DEFAULT_WINDOW
+
+    @property
+    def seen(self) -> float:
+        """Fraction of the ground truth that the model was trained on; 0 without [training], as with [model] path."""
+        return self.training.window if self.training else 0.0
+
+    @property
+    def foreign(self) -> tuple[str, ...]:
+        """The import paths of classes and functions that the scene names: fluid, initial flow, terms, networks, method
+        of the simulation."""
+        return tuple(dict.fromkeys(path for name in FOREIGN_IN
+                                   for path in self._foreign_in(name)))
+
+    def to_toml(self) -> str:
+        """The scene as a TOML text with a comment on every key; reading it back gives an equal scene."""
+        lines = write_section(self)
+        for field in fields(self):
+            part = getattr(self, field.name)
+            if "section" in field.metadata and part is not None:
+                lines += ["", f"[{field.name}]", *write_section(part, field.name)]
+        return "\n".join(lines) + "\n"
+
+    def fingerprint(self, stage: str) -> str:
+        """SHA-256 over what a stage's product depends on: its own settings and those of the earlier stages that
+        the scene has, and the content of the files that the flow starts from, that trained weights come from, and that
+        hold the source of foreign classes."""
+        settings = asdict(self) | {"window": self.window, "start": _digest(self.initial.path),
+                                   "weights": _digest(self.model and self.model.weights_file)}
+        settings |= {f"own_{name}": origins(self._foreign_in(name)) for name in FOREIGN_IN}
+        of_these = {*STAGES[stage].depends_on, stage} & {*self.stages}
+        keys = [key for each in STAGES.values() if each.name in of_these for key in each.reads]
+        return hashlib.sha256(json.dumps([[key, settings[key]] for key in keys]).encode()).hexdigest()
+
+    def provenance(self, stage: str) -> dict[str, Any]:
+        """What the product of a stage keeps of the scene: its text, the stage's fingerprint and, if the scene names
+        any, where foreign classes come from."""
+        foreign = {"foreign": origins(self.foreign)} if self.foreign else {}
+        return {"scene": self.to_toml(), "fingerprint": self.fingerprint(stage), **foreign}
+
+    def _foreign_in(self, name: str) -> Iterator[str]:
+        part = getattr(self, name)
+        if name == "model":
+            yield from part.foreign if part else ()
+        elif part is not None:
+            yield from (path for _, path in import_paths(part))
+
+
+def load_scene(name_or_path: str | Path, overrides: list[str] | tuple[str, ...] = ()) -> Scene:
+    """Read a built-in scene by name, or a TOML file by path, and write overrides "section.key=value" over it.
+
+    Modules of the classes that it names are looked for where Python looks, then beside the file, then in the working
+    directory.
+
+    Raises:
+        SceneError: names the file (or --set), the section and the key, what is allowed and what to do.
+    """
+    path = find_document(str(name_or_path), BUILT_IN, "scene")
+    search_in(path.parent)
+    search_in(Path())
+    keys: set[str] = set()
+    try:
+        document = {"name": path.stem, **parse_document(read_text(path))}
+        keys = apply_overrides(document, list(overrides))
+        if isinstance(document.get("model"), dict):
+            replace_terms(document["model"], keys)
+        return read_section(Scene, document)
+    except SceneError as error:
+        origin = f"{path}, --set" if error.key in keys else path
+        raise SceneError(f"{origin}: {error}", error.key) from None
+
+
+def builtin_scenes() -> list[tuple[str, str]]:
+    """Name and title of every scene that comes with the package, by name."""
+    return [(path.stem, parse_document(read_text(path))["title"]) for path in sorted(BUILT_IN.glob("*.toml"))]
+
+
+def _digest(path: str | Path | None) -> str | None:
+    """SHA-256 of a file's content; None if there is no such file."""
+    if path is None or not Path(path).is_file():
+        return None
+    state = Path(path).stat()
+    return _digest_of_version(path, state.st_size, state.st_mtime_ns)
+
+
+@lru_cache(maxsize=4)
+def _digest_of_version(path: str | Path, size: int, modified: int) -> str:
+    # The file may be large, and its digest is asked for several times in a run.
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

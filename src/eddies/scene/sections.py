@@ -1,0 +1,215 @@
+"""The sections of a scene, each a frozen dataclass whose fields declare their keys.
+
+A declaration gives what the key means, which values are allowed, and the default. Lengths are in units of the
+cube [0, 2 pi)^3, the mean density is 1, and times are in the unit that follows from lengths and velocities.
+"""
+
+import math
+from dataclasses import dataclass
+
+from eddies.scene.composition import is_path, load
+from eddies.scene.methods import METHODS, needs_of
+from eddies.scene.values import Section, choice, integer, integers, named, number, text
+
+BOX_LENGTH = 2 * math.pi
+DEFAULT_WINDOW = 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Flow(Section):
+    """The fluid and the grid on which the direct numerical simulation resolves it."""
+
+    fluid: str = named("equations of motion", "incompressible", "compressible")
+    cells: int = integer("grid cells along each side of the cube", at_least=8)
+    viscosity: float = number("kinematic viscosity", at_least=0)
+    sound_speed: float | None = number("speed of sound, compressible fluid only", default=None, above=0)
+    precision: str = choice("of the grid arrays", "float64", "float32", default="float64")
+
+    @property
+    def compressible(self) -> bool:
+        """Whether the fluid has a density, and sound."""
+        return load(self.fluid).compressible if is_path(self.fluid) else self.fluid == "compressible"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Initial(Section):
+    """The velocity, and with a compressible fluid the density, at time 0."""
+
+    kind: str = named("initial flow", "random", "taylor-green", "abc", "shear-wave", "sound-wave", "file",
+                      default="random")
+    amplitude: float = number("of velocity, random: rms of a component; sound-wave: of ln density",
+                              default=1.0, above=0)
+    peak_wavenumber: float = number("wavenumber of the spectrum's peak, random only", default=3.0, above=0)
+    wavenumber: int = integer("waves in the cube; abc, shear-wave, sound-wave only", default=1, at_least=1)
+    path: str | None = text("HDF5 file to start from, kind file only", default=None)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Forcing(Section):
+    """Linear solenoidal forcing of the largest scales at a prescribed power."""
+
+    injection_rate: float = number("power injected per unit mass", at_least=0)
+    wavenumber: float = number("modes with 0 < |k| < this are forced", default=2.0, above=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Time(Section):
+    """The time step and, without tracers, the run time."""
+
+    stepper: str = choice("time stepping method", "etdrk4", "rk4", default="etdrk4")
+    courant: float = number("Courant number of the step (advective; rk4 also acoustic)", default=0.8, above=0)
+    max_step: float = number("largest step; smaller ones are this over a power of two", default=0.05, above=0)
+    step: float | None = number("fixed step instead", default=None, above=0)
+    duration: float | None = number("run time after spin-up, without tracers only", default=None, above=0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpinUp(Section):
+    """The time before tracers are released, in which forced turbulence becomes stationary."""
+
+    turnovers: float = number("large-eddy turnovers", above=0)
+    stationary: float | None = number("of them, the last: averages of the stationary state are taken over these",
+                                      default=None, above=0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tracers(Section):
+    """Particles that follow the filtered flow: the ground truth of learning."""
+
+    particles_per_side: int = integer("the number of particles is the cube of this", at_least=2)
+    placement: str = choice("where the particles start", "random", "lattice", default="random")
+    filter_width: float | None = number("of the Gaussian filter; absent: twice the mean spacing",
+                                        default=None, above=0, below=BOX_LENGTH)
+    interpolation: str = choice("splines from grid to particles", "cubic", "quintic", default="cubic")
+    turnovers: float = number("large-eddy turnovers to follow the particles", above=0)
+    frame_interval: float = number("time between stored frames", above=0)
+    field_cells: int | None = integer("grid of the stored fields; absent: 1.5 x particles_per_side, even",
+                                      default=None, at_least=4)
+    field_every: int = integer("frames per stored field", default=5, at_least=1)
+
+    @property
+    def particles(self) -> int:
+        """Number of particles N."""
+        return self.particles_per_side**3
+
+    @property
+    def spacing(self) -> float:
+        """Mean spacing L / N^(1/3) of the particles."""
+        return BOX_LENGTH / self.particles_per_side
+
+    @property
+    def width(self) -> float:
+        """Filter width d in use: as given, or twice the mean particle spacing."""
+        return 2 * self.spacing if self.filter_width is None else self.filter_width
+
+    @property
+    def cells(self) -> int:
+        """Cells along each side of the stored fields: as given, or 1.5 particles_per_side rounded to even."""
+        return 2 * round(0.75 * self.particles_per_side) if self.field_cells is None else self.field_cells
+
+    @property
+    def planes(self) -> int:
+        """Layers at which the particles' slabs are cut, cells of the grid on which their velocity is resolved: 1.75
+        particles_per_side rounded to even, so that modes up to 1.5 times their Nyquist wavenumber fit in."""
+        return 2 * round(0.875 * self.particles_per_side)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Kernel(Section):
+    """The smoothing kernel W, learned by reconstructing the filtered field from the particles."""
+
+    neighbors: float = number("mean number of particles within the support", default=60.0, at_least=8)
+    hidden: tuple[int, ...] = integers("widths of the network's tanh layers", default=(20, 20, 20, 20),
+                                       at_least=1)
+    cutoff: str = choice("factor that ends the kernel at its support", "smooth", "sigmoid", default="smooth")
+    gradient_weight: float = number("weight of the velocity gradient in the loss", default=1.0, at_least=0)
+    normalization_weight: float = number("weight of (integral - 1)^2 of the kernel before it is normalised",
+                                         default=0.0, at_least=0)
+    steps: int = integer("optimiser steps", at_least=1)
+    points: int = integer("grid points drawn per step", default=2048, at_least=1)
+    learning_rate: float = number("of the optimiser", default=2e-3, above=0)
+
+    def support(self, particles: int) -> float:
+        """Radius h of the ball that holds `neighbors` of `particles` on average: n = N (4/3) pi h^3 / L^3."""
+        return BOX_LENGTH * (self.neighbors / particles / (4 / 3 * math.pi)) ** (1 / 3)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Training(Section):
+    """How the force is fitted to the tracers: to trajectories, to all losses together, to what the simulation does."""
+
+    window: float = number("fraction of the ground truth that is used, the rest stays unseen",
+                           default=DEFAULT_WINDOW, above=0, at_most=1)
+    frames: int = integer("frames of the window to draw from", at_least=2)
+    batch: int = integer("particles per step", at_least=1)
+    steps: int = integer("optimiser steps", at_least=1)
+    learning_rate: float = number("of the optimiser, at the start", default=5e-3, above=0)
+    final_learning_rate: float = number("of the optimiser, at the end", default=1e-4, above=0)
+    precision: str = choice("of the training", "float32", "float64", default="float32")
+    trajectory_weight: float = number("weight of the trajectory loss", default=1.0, at_least=0)
+    field_weight: float = number("weight of the field loss", default=0.0, at_least=0)
+    velocity_kl_weight: float = number("weight of the divergence of velocity PDFs", default=0.0, at_least=0)
+    acceleration_kl_weight: float = number("the same for acceleration PDFs", default=0.0, at_least=0)
+    combined_steps: int = integer("steps at the end that use every loss", default=0, at_least=0)
+    horizons: tuple[int, ...] = integers("frames through which the simulation is differentiated, one after the other",
+                                         default=(1, 2, 4, 8), at_least=1)
+    horizon_steps: int = integer("optimiser steps of each horizon, after all others", default=0, at_least=0)
+    horizon_step: float | None = number("time step of the horizons; absent: the interval of frames", default=None,
+                                        above=0)
+    horizon_integrator: str = choice("time stepping of the horizons", "verlet", "rk2", "rk3", "rk4", default="verlet")
+    horizon_learning_rate: float = number("of the optimiser, at the start of each horizon", default=1e-3, above=0)
+    energy_weight: float = number("weight of the energies by bands of wavenumbers in the loss of the horizons",
+                                  default=0.1, at_least=0)
+    noise: float = number("added to initial velocities of the horizons, in units of their rms", default=0.0, at_least=0)
+    patience: int | None = integer("validations without a new best that end a phase early; absent: none",
+                                   default=None, at_least=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Simulation(Section):
+    """The run of the particles, without the direct simulation."""
+
+    method: str = named("what moves the particles; see Baselines", *METHODS, default="learned")
+    integrator: str = choice("time stepping of the particles", "verlet", "rk2", "rk3", "rk4", default="rk3")
+    step: float = number("longest time step; see docs/closure.md", above=0)
+    turnovers: float = number("large-eddy turnovers to simulate", above=0)
+    start: float | None = number("as a fraction of the ground truth; absent: where the training window ends",
+                                 default=None, at_least=0, below=1)
+    frame_interval: float = number("time between stored frames", above=0)
+    skin: float = number("extra reach of the neighbour list, in supports", default=0.1, at_least=0, at_most=1)
+    precision: str = choice("of the forces", "float32", "float64", default="float32")
+    injection: float | str = number("large-scale forcing power per mass; dissipation: as the flow loses",
+                                    default="none", words=("none", "dissipation"), above=0)
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """What the method needs, of "model", "density" and "pairs"."""
+        return needs_of(self.method)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wcsph(Section):
+    """Weakly compressible smoothed particle hydrodynamics, with method = "wcsph"; absent: the defaults."""
+
+    kernel: str = choice("smoothing kernel, of the support of [kernel]", "cubic-spline", "wendland",
+                         default="cubic-spline")
+    alpha: float = number("linear coefficient of the artificial viscosity", default=1.0, at_least=0)
+    beta: float = number("quadratic coefficient of the artificial viscosity", default=2.0, at_least=0)
+    exponent: float = number("gamma of the pressure c^2 rho_0 / gamma ((rho / rho_0)^gamma - 1)", default=1.0,
+                             at_least=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Eulerian(Section):
+    """Large-eddy simulation on a coarse grid, with method = "eulerian"; absent: the defaults."""
+
+    cells: int | None = integer("of the coarse grid; absent: its Nyquist wavenumber is pi / filter width, at least 8",
+                                default=None, at_least=8)
+    smagorinsky: float = number("C_s of the eddy viscosity (C_s d)^2 (2 S:S)^(1/2), d the filter width; 0: no model",
+                                default=0.17, at_least=0)
+
+    def cells_for(self, filter_width: float) -> int:
+        """Cells along each side: as given, or the fewest whose Nyquist wavenumber reaches pi / d."""
+        if self.cells is not None:
+            return self.cells
+        return max(math.ceil(BOX_LENGTH / filter_width - 1e-9), 8)

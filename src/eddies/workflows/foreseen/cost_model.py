@@ -1,0 +1,184 @@
+"""Memory and wall time of a scene on any number of ranks, from the step of a small grid on the ranks at hand.
+
+A step of the direct simulation on P ranks takes
+
+    T = work(n) p n^2 + 4 (bytes / bandwidth + 2 (P - 1) latency)
+
+with n the cells along a side, p the planes of the busiest rank, rounded up to pairs because planes are transformed in
+pairs, and work(n) seconds a cell. The nonlinear term is evaluated 4 times, and each time all modes go from columns to
+planes and products back, as messages from each rank to every other. What stays on a node moves at the bandwidth of its
+memory, what leaves it shares the node's network.
+"""
+
+import math
+import time
+from dataclasses import dataclass, replace
+from statistics import median
+
+import numpy as np
+
+from eddies.clock import Clock
+from eddies.scene.scene import Initial, Scene
+from eddies.spectral.fourier_passes import BLOCK_BYTES
+from eddies.spectral.spectral_grid import SpectralGrid
+from eddies.time_stepping import STEPPERS
+from eddies.workflows.dns import build_fluid, build_step_limit, initial_state
+from eddies.workflows.foreseen.estimates import expected_turbulence, largest_wavenumber
+
+PROBE_CELLS = 64
+EVALUATIONS = 4              # of the nonlinear term in a step, of either stepper
+# Of a compressible fluid (True) and of an incompressible one (False): what is sent to planes, and back to columns.
+SENT_COMPONENTS = {True: (8, 4), False: (5, 3)}
+# Work of a cell over that at 64^3. It outgrows the transforms' log n because planes and their blocks outgrow the
+# caches. From tests/benchmarks/step.py, from 256^3 on for the slab of one of many ranks (--share-of).
+WORK_GROWTH = {64: 1.0, 128: 1.0, 256: 1.35, 512: 1.7, 1024: 2.75, 2048: 4.8}
+# Memory of a rank, from runs at 64^3 to 128^3 on 1 and 2 ranks, and from thin slabs of 1024^3: of a cell in float64; of
+# the block of planes that is worked on, in real arrays of a pair of planes; and what there is before any field.
+FLOW_BYTES = {True: 320, False: 220}
+BLOCK_ARRAYS = {True: 64, False: 32}
+PROCESS_BYTES = 100e6
+# The cluster that a job on more ranks than are at hand is imagined on.
+NODE_RANKS = 64
+NODE_BANDWIDTH = 10e9        # bytes a second into and out of a node while all nodes talk to all: 100 Gbit/s, not quite
+RANK_BANDWIDTH = 2e9         # bytes a second of a rank to others of its node, where one rank at hand cannot tell
+LATENCY = 2e-6               # seconds of a message
+
+
+@dataclass(frozen=True)
+class Speed:
+    """Of the ranks at hand: `work`, seconds of a step for a cell of 64^3, and `bandwidth`, bytes a second to others."""
+
+    work: float
+    bandwidth: float
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a step of the direct simulation needs on so many ranks; times in seconds, memory of a rank in bytes."""
+
+    ranks: int
+    planes: int
+    memory: float
+    work: float
+    exchange: float
+
+    @property
+    def nodes(self) -> int:
+        """Nodes that so many ranks fill."""
+        return math.ceil(self.ranks / NODE_RANKS)
+
+    @property
+    def seconds(self) -> float:
+        """Wall time of a step."""
+        return self.work + self.exchange
+
+
+def cost(scene: Scene, ranks: int, speed: Speed) -> Cost:
+    """The cost of a step of a scene's direct simulation on `ranks` ranks, at most as many as it has planes."""
+    cells, planes = scene.flow.cells, busiest_planes(scene.flow.cells, ranks)
+    work = speed.work * work_growth(cells) * cells**2 * planes
+    return Cost(ranks, math.ceil(cells / ranks), flow_bytes(scene, ranks), work, exchange_seconds(scene, ranks, speed))
+
+
+def costs(scene: Scene, most: int, speed: Speed) -> list[Cost]:
+    """Costs on 1, 2, 4, ... ranks up to `most`; the last twelve of these."""
+    return [cost(scene, 2**m, speed) for m in range(most.bit_length())][-12:]
+
+
+def busiest_planes(cells: int, ranks: int) -> int:
+    """Planes that the busiest rank works for: an odd one costs as much as a pair."""
+    return min(2 * math.ceil(math.ceil(cells / ranks) / 2), cells)
+
+
+def work_growth(cells: int) -> float:
+    """Work of a cell over that at 64^3."""
+    return float(np.interp(math.log(cells), np.log(list(WORK_GROWTH)), list(WORK_GROWTH.values())))
+
+
+def sent_bytes(scene: Scene) -> float:
+    """Bytes of all modes that change between columns and planes for one nonlinear term, over all ranks."""
+    K = largest_wavenumber(scene)
+    components = sum(SENT_COMPONENTS[scene.flow.compressible])
+    return components * scene.flow.cells * (2 * K + 1) * (K + 1) * 2 * real_bytes(scene)
+
+
+def exchange_seconds(scene: Scene, ranks: int, speed: Speed) -> float:
+    """Seconds of the messages of a step."""
+    if ranks == 1:
+        return 0.0
+    on_node = min(ranks, NODE_RANKS)
+    own = sent_bytes(scene) / ranks
+    within, beyond = own * (on_node - 1) / ranks, own * (ranks - on_node) / ranks
+    return EVALUATIONS * (within / speed.bandwidth + beyond * on_node / NODE_BANDWIDTH + 2 * (ranks - 1) * LATENCY)
+
+
+def real_bytes(scene: Scene) -> int:
+    """Bytes of a real number of the grid arrays."""
+    return 4 if scene.flow.precision == "float32" else 8
+
+
+def flow_bytes(scene: Scene, ranks: int) -> float:
+    """Memory of a rank in the direct simulation."""
+    fluid, cells, real = scene.flow.compressible, scene.flow.cells, real_bytes(scene)
+    block = BLOCK_ARRAYS[fluid] * max(BLOCK_BYTES, 2 * cells**2 * real)
+    return PROCESS_BYTES + FLOW_BYTES[fluid] * real / 8 * cells**2 * math.ceil(cells / ranks) + block
+
+
+def pair_bytes(scene: Scene, ranks: int) -> float:
+    """Memory of a rank in the learned pair force: list, displacements, three copies of what the term that keeps most
+    of a pair keeps."""
+    pairs = scene.tracers.particles * scene.kernel.neighbors * (1 + scene.simulation.skin) ** 3
+    item = 4 if scene.simulation.precision == "float32" else 8
+    kept = max(settings.numbers_per_pair for settings in scene.model.settings.values())
+    return PROCESS_BYTES + pairs / ranks * (16 + 4 * item + 3 * item * kept)
+
+
+def probe(scene: Scene, comm, steps: int = 5) -> Speed:
+    """The speed of the ranks at hand, from a few steps of the scene's fluid; all ranks call it.
+
+    The grid has no more cells a rank than PROBE_CELLS^3.
+    """
+    small = small_flow(scene, comm.size)
+    fluid = build_fluid(small, comm)
+    grid, stepper, state = fluid.grid, STEPPERS[scene.time.stepper](fluid), initial_state(small, fluid)
+    step = build_step_limit(small, grid)(state, Clock(end=small.time.duration))
+    state = stepper(state, step)  # the first step also plans transforms and makes tables
+    times = []
+    for _ in range(steps):
+        comm.Barrier()
+        start = time.perf_counter()
+        state = stepper(state, step)
+        comm.Barrier()
+        times.append(time.perf_counter() - start)
+    seconds, bandwidth = median(times), RANK_BANDWIDTH
+    if comm.size > 1:
+        exchange = min(exchange_once(grid, small, comm) for _ in range(EVALUATIONS * steps))
+        # Ranks of a node may pass messages faster than LATENCY.
+        moving = max(exchange - 2 * (comm.size - 1) * LATENCY, exchange / 2)
+        bandwidth = sent_bytes(small) * (comm.size - 1) / comm.size**2 / moving
+        seconds -= EVALUATIONS * exchange
+    cells = small.flow.cells
+    return Speed(seconds / (cells**2 * busiest_planes(cells, comm.size) * work_growth(cells)), bandwidth)
+
+
+def exchange_once(grid: SpectralGrid, scene: Scene, comm) -> float:
+    """Seconds in which the messages of one nonlinear term are sent."""
+    to_planes, to_columns = (grid.buffers(direction, components) for direction, components
+                             in zip(("backward", "forward"), SENT_COMPONENTS[scene.flow.compressible]))
+    comm.Barrier()
+    start = time.perf_counter()
+    to_planes.to_planes()
+    to_columns.to_columns()
+    return time.perf_counter() - start
+
+
+def small_flow(scene: Scene, ranks: int) -> Scene:
+    """The flow of a scene with at most PROBE_CELLS^3 cells a rank: random turbulence, forced where the scene is."""
+    cells = min(scene.flow.cells, PROBE_CELLS * 2 ** int(math.log(ranks, 8) + 1e-9))
+    turbulence, forcing = expected_turbulence(scene), scene.forcing
+    initial = Initial(amplitude=turbulence.velocity_rms if turbulence else 1.0, peak_wavenumber=min(3.0, cells / 3))
+    if forcing:
+        forcing = replace(forcing, wavenumber=min(forcing.wavenumber, cells / 3))
+    return replace(scene, flow=replace(scene.flow, cells=cells), initial=initial, forcing=forcing,
+                   time=replace(scene.time, duration=1.0), spin_up=None, tracers=None, kernel=None, model=None,
+                   training=None, simulation=None, wcsph=None, eulerian=None)

@@ -1,0 +1,199 @@
+"""What to expect of a scene before it is run: turbulence, time steps, and the ranks that it can use."""
+
+import math
+from dataclasses import dataclass, replace
+
+from eddies.clock import ladder_step
+from eddies.particles.reference_scales import allowed_step, resolved_wavenumber
+from eddies.scene.scene import BOX_LENGTH, Eulerian, Scene
+
+DISSIPATION_CONSTANT = 0.5   # C_eps = eps L / u'^3 of developed turbulence
+PEAK_VELOCITY = 4.0          # largest component of the velocity of a particle over u'
+ALLOWED_VELOCITY = 6.0       # the same, for which there are ghost planes in the training through horizons
+PEAK_SPEED = 7.0             # max(|u| + |v| + |w|) over u' in turbulence: four rms in each component at worst
+EXACT_PEAK_SPEED = {"taylor-green": 1.0, "abc": 3 * math.sqrt(2), "shear-wave": 1.0}  # over the amplitude
+GHOST_PLANES = {"cubic": 3, "quintic": 4}
+
+
+@dataclass(frozen=True)
+class ExpectedTurbulence:
+    """Turbulence that a scene is expected to develop, from u' and eps; L from eps = C_eps u'^3 / L."""
+
+    velocity_rms: float
+    dissipation_rate: float
+    viscosity: float
+
+    @property
+    def turnover_time(self) -> float:
+        """T = L / u'."""
+        return DISSIPATION_CONSTANT * self.velocity_rms**2 / self.dissipation_rate
+
+    @property
+    def kolmogorov_length(self) -> float:
+        """eta = (nu^3 / eps)^(1/4)."""
+        return (self.viscosity**3 / self.dissipation_rate) ** 0.25
+
+    @property
+    def kolmogorov_time(self) -> float:
+        """t_eta = (nu / eps)^(1/2)."""
+        return math.sqrt(self.viscosity / self.dissipation_rate)
+
+    @property
+    def reynolds_lambda(self) -> float:
+        """Re_lambda = u' lambda / nu with lambda = (15 nu u'^2 / eps)^(1/2)."""
+        return self.velocity_rms**2 * math.sqrt(15 / (self.viscosity * self.dissipation_rate))
+
+
+def largest_wavenumber(scene: Scene) -> int:
+    """k_max kept by the 2/3 rule: the largest integer below cells / 3."""
+    return (scene.flow.cells - 1) // 3
+
+
+def expected_turbulence(scene: Scene) -> ExpectedTurbulence | None:
+    """Turbulence kept up by the forcing, or decaying from a random start; None if not to be foreseen.
+
+    The integral scale is taken as sqrt(2 pi) / k with k of the forcing or of the initial peak, which is
+    exact for the initial spectrum and holds within some 10 % for forced turbulence.
+    """
+    if scene.flow.viscosity == 0:
+        return None
+    if scene.forcing and scene.forcing.injection_rate > 0:
+        integral_scale = math.sqrt(2 * math.pi) / scene.forcing.wavenumber
+        dissipation_rate = scene.forcing.injection_rate
+        velocity_rms = (dissipation_rate * integral_scale / DISSIPATION_CONSTANT) ** (1 / 3)
+        return ExpectedTurbulence(velocity_rms, dissipation_rate, scene.flow.viscosity)
+    if scene.initial.kind == "random":
+        integral_scale = math.sqrt(2 * math.pi) / scene.initial.peak_wavenumber
+        dissipation_rate = DISSIPATION_CONSTANT * scene.initial.amplitude**3 / integral_scale
+        return ExpectedTurbulence(scene.initial.amplitude, dissipation_rate, scene.flow.viscosity)
+    return None
+
+
+def peak_speed(scene: Scene) -> float | None:
+    """Expected largest |u| + |v| + |w|; None without forcing for a flow from a file or of the user's."""
+    initial, turbulence = scene.initial, expected_turbulence(scene)
+    if turbulence:
+        return PEAK_SPEED * turbulence.velocity_rms
+    if initial.kind == "random":
+        return PEAK_SPEED * initial.amplitude
+    if initial.kind == "sound-wave":
+        return initial.amplitude * scene.flow.sound_speed
+    return EXACT_PEAK_SPEED[initial.kind] * initial.amplitude if initial.kind in EXACT_PEAK_SPEED else None
+
+
+def expected_step(scene: Scene) -> tuple[float, str] | None:
+    """The time step of the direct simulation and what limits it; None if the speed cannot be foreseen."""
+    settings, speed = scene.time, peak_speed(scene)
+    if settings.step is not None:
+        return settings.step, "fixed by [time] step"
+    if speed is None:
+        return None
+    sound = math.sqrt(3) * scene.flow.sound_speed if settings.stepper == "rk4" and scene.flow.sound_speed else 0.0
+    bound = settings.courant * BOX_LENGTH / scene.flow.cells / (speed + sound)
+    if bound >= settings.max_step:
+        return settings.max_step, "limited by [time] max_step"
+    limit = "sound, which rk4 must resolve" if sound > speed else "advection"
+    return ladder_step(settings.max_step, bound), f"limited by {limit}: at most {bound:.3g}"
+
+
+def run_time(scene: Scene) -> float | None:
+    """Physical time that the direct simulation covers; None where the turnover time cannot be foreseen."""
+    turnovers = sum(part.turnovers for part in (scene.spin_up, scene.tracers) if part)
+    turbulence = expected_turbulence(scene)
+    if turnovers and turbulence is None:
+        return None
+    return (turnovers * turbulence.turnover_time if turnovers else 0.0) + (scene.time.duration or 0.0)
+
+
+def most_ranks(scene: Scene) -> dict[str, int]:
+    """The largest number of ranks that each part of a run can use, by what limits it."""
+    limits = {"a grid plane each": scene.flow.cells}
+    if scene.tracers:
+        splines = scene.tracers.interpolation
+        ghosts = GHOST_PLANES[splines]
+        limits[f"{ghosts} ghost planes of the {splines} splines"] = scene.flow.cells // ghosts
+    if scene.tracers and scene.kernel:
+        support = scene.kernel.support(scene.tracers.particles)
+        limits[f"slabs of the fields no thinner than the kernel's support {support:.3g}"] = thick_slabs(
+            scene.tracers.cells, support)
+    if learns_pairs(scene) or (scene.simulation and "pairs" in scene.simulation.needs):
+        reach = particle_reach(scene)
+        limits[f"slabs no thinner than the particles' reach {reach:.3g}"] = thick_slabs(scene.tracers.planes, reach)
+    if "train" in scene.stages:
+        limits |= most_training_ranks(scene)
+    if scene.simulation and scene.simulation.method == "eulerian":
+        cells = (scene.eulerian or Eulerian()).cells_for(scene.tracers.width)
+        limits["ghost planes of the coarse grid"] = max(cells // GHOST_PLANES[scene.tracers.interpolation], 1)
+    return limits
+
+
+def most_training_ranks(scene: Scene) -> dict[str, int]:
+    """The same for what a model is trained on and by."""
+    # The a-priori test interpolates filtered fields to the particles, terms what they make of the resolved velocity.
+    limits = {"ghost planes of the filtered fields": max(scene.tracers.cells // GHOST_PLANES["quintic"], 1)}
+    support, simulation = scene.kernel.support(scene.tracers.particles), scene.simulation
+    if "resolved" in scene.model.reads:
+        skin = simulation.skin * support if simulation else 0.0
+        limits["ghost planes of the resolved velocity"] = ranks_of_resolved_grid(scene, skin / 2)
+    time = horizon_time(scene)
+    if time > 0:
+        if learns_pairs(scene):
+            reach = support + 2 * particle_drift(scene, time)
+            limits[f"slabs no thinner than the particles' reach {reach:.3g} in the training through horizons"] = (
+                thick_slabs(scene.tracers.planes, reach))
+        if scene.training.energy_weight > 0 or "resolved" in scene.model.reads:
+            limits["ghost planes of the grid in the training through horizons"] = ranks_of_resolved_grid(
+                scene, particle_drift(scene, time, ALLOWED_VELOCITY))
+    return limits
+
+
+def learns_pairs(scene: Scene) -> bool:
+    """Whether a model is trained or adopted that looks at pairs of particles."""
+    return "train" in scene.stages and "pairs" in scene.model.reads
+
+
+def ground_truth_alone(scene: Scene) -> Scene:
+    """The scene without what learns of its ground truth, which may use more ranks."""
+    return replace(scene, kernel=None, model=None, training=None, simulation=None, wcsph=None, eulerian=None)
+
+
+def thick_slabs(planes: int, width: float) -> int:
+    """The largest number of slabs of that many planes in all that are no thinner than `width`."""
+    return max(planes // math.ceil(width / (BOX_LENGTH / planes) - 1e-9), 1)
+
+
+def particle_reach(scene: Scene) -> float:
+    """How thick slabs must be for the particles: kernel support, and skin of the neighbour list."""
+    return scene.kernel.support(scene.tracers.particles) * (1 + (scene.simulation.skin if scene.simulation else 0.0))
+
+
+def particle_drift(scene: Scene, time: float, peak: float = PEAK_VELOCITY) -> float:
+    """How far a particle may move along z in a time if it has `peak` times u'; 0 where that is not foreseen."""
+    turbulence = expected_turbulence(scene)
+    return peak * turbulence.velocity_rms * time if turbulence else 0.0
+
+
+def foreseen_allowed_step(scene: Scene) -> float | None:
+    """The longest time step that particles with a resolved velocity can take in the turbulence that is expected, which
+    may decay before they start; None where it is not foreseen."""
+    turbulence = expected_turbulence(scene)
+    if turbulence is None:
+        return None
+    highest = resolved_wavenumber(scene.tracers.spacing, scene.tracers.width, turbulence.kolmogorov_length)
+    return allowed_step(scene.simulation.integrator, highest, turbulence.velocity_rms)
+
+
+def horizon_time(scene: Scene) -> float:
+    """The longest time through which a model is trained and particles keep their rank; 0 without such training."""
+    settings = scene.training
+    if settings is None or settings.horizon_steps == 0 or scene.model.path is not None:
+        return 0.0
+    return max(settings.horizons) * scene.tracers.frame_interval
+
+
+def ranks_of_resolved_grid(scene: Scene, outside: float) -> int:
+    """The largest number of ranks for the cubic splines on the grid of the resolved velocity, which have one more ghost
+    plane for each plane that a particle may be outside its slab."""
+    planes = scene.tracers.planes
+    ghosts = GHOST_PLANES["cubic"] - 1 + max(math.ceil(outside * planes / BOX_LENGTH - 1e-9), 1)
+    return max(planes // ghosts, 1)

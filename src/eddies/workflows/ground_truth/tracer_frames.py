@@ -1,0 +1,74 @@
+"""What the ground truth stores of tracers: id-ordered frames, filtered fields and spectra."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from eddies.clock import Clock
+from eddies.flow.statistics import energy_spectrum
+from eddies.flow.tracers import TracerParticles
+from eddies.io.checkpoint import Checkpoint
+from eddies.io.hdf5 import write_table
+from eddies.parallel.migration import IdOrder
+from eddies.parallel.slab import SlabDecomposition
+from eddies.scene.scene import Tracers
+from eddies.spectral.spectral_grid import SpectralGrid, restrict
+from eddies.workflows.ground_truth.frame_segments import FrameSegments
+
+
+class TracerFrames:
+    """Stores frames of tracers in segments, and collects the spectra.
+
+    Times are counted from the release. Of a `compressible` flow the density is stored as well.
+    """
+
+    def __init__(self, segments: FrameSegments, tracers: TracerParticles, settings: Tracers, released_at: float,
+                 compressible: bool) -> None:
+        self.segments, self.tracers, self.settings, self.released_at = segments, tracers, settings, released_at
+        fine = tracers.field.grid
+        slab = SlabDecomposition(fine.decomposition.comm, fine.decomposition.length, settings.cells)
+        self.coarse = SpectralGrid(slab, fine.precision, min(fine.cutoff, (settings.cells - 1) // 2))
+        self._compressible = compressible
+        self._frames = 0
+        self._spectra: dict[str, list] = {"time": [], "energy": [], "filtered": []}
+
+    def store(self, state: np.ndarray, clock: Clock) -> None:
+        """Store a frame, and every few frames the filtered fields and spectra."""
+        time = clock.time - self.released_at
+        order = IdOrder(self.coarse.decomposition.comm, self.tracers.columns["id"], self.settings.particles)
+        frame = {"position": order.apply(self.tracers.columns["position"]),
+                 "velocity": order.apply(self.tracers.columns["velocity"])}
+        if self._compressible:
+            frame["density"] = order.apply(self.tracers.density(state))
+        self.segments.open(clock.steps)
+        self.segments.trajectory.append(clock.steps, time, order.start, frame)
+        if self._frames % self.settings.field_every == 0:
+            self._store_fields(state, time)
+        self._frames += 1
+
+    def memory(self) -> tuple[dict[str, int], dict[str, np.ndarray]]:
+        """What the rest of the run needs to know of the frames so far, for a checkpoint: numbers and arrays."""
+        return {"frames": self._frames}, {f"spectra_{name}": np.array(rows) for name, rows in self._spectra.items()}
+
+    def restore(self, numbers: dict[str, int], saved: Checkpoint) -> None:
+        """Go on from a `memory`, the arrays of which lie in a checkpoint."""
+        self._frames = numbers["frames"]
+        self._spectra = {name: list(saved.read(f"spectra_{name}")) for name in self._spectra}
+
+    def write_spectra(self, file) -> None:
+        """Write the table of DNS and filtered energy spectra."""
+        wavenumber = np.arange(len(self._spectra["energy"][0]))
+        columns = {name: np.array(rows) for name, rows in self._spectra.items()}
+        write_table(file, "spectra", {"wavenumber": wavenumber, **columns})
+
+    def _store_fields(self, state: np.ndarray, time: float) -> None:
+        field = self.tracers.field
+        velocity = field.transfer * state[:3]
+        modes = {"velocity": velocity}
+        if self._compressible:
+            modes["density"] = field.density_modes(state)
+        planes = {name: self.coarse.backward(restrict(field.grid, self.coarse, part)) for name, part in modes.items()}
+        self.segments.fields.append(time, self.coarse.decomposition.start, planes)
+        self._spectra["time"].append(time)
+        self._spectra["energy"].append(energy_spectrum(field.grid, state[:3])[1])
+        self._spectra["filtered"].append(energy_spectrum(field.grid, velocity)[1])

@@ -1,0 +1,100 @@
+"""Tracers in a flow without forcing, one frame interval after the other."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from eddies.clock import ProgressLine
+from eddies.flow.courant import FixedStep
+from eddies.flow.tracers import FilteredField, TracerParticles, release
+from eddies.io.checkpoint import Checkpoint
+from eddies.io.contiguous import Block
+from eddies.parallel.migration import IdOrder, id_block, migrate
+from eddies.scene.scene import Scene
+from eddies.workflows.ground_truth.flow_run import FlowRun
+from eddies.workflows.ground_truth.frame_segments import FrameSegments
+from eddies.workflows.ground_truth.measured_scales import MEAN_DENSITY
+from eddies.workflows.ground_truth.tracer_frames import TracerFrames
+
+
+class TracerRun:
+    """Releases tracers into a flow, forcing off, or takes them from a checkpoint, and follows them.
+
+    `released` is the sample of the flow at the release. Within a frame interval all steps are equal: the longest
+    allowed ones that divide it, so that frames are equally spaced.
+    """
+
+    def __init__(self, scene: Scene, flow: FlowRun, segments: FrameSegments, saved: Checkpoint | None) -> None:
+        self.scene, self.flow, self.segments, self.settings = scene, flow, segments, scene.tracers
+        flow.fluid.forcing = None
+        compressible = flow.fluid.compressible
+        field = FilteredField(flow.fluid.grid, self.settings.width, self.settings.interpolation)
+        self.comm = flow.fluid.grid.decomposition.comm
+        if saved is None:
+            self.released, self.released_at = flow.history.sample(flow.state, flow.clock), flow.clock.time
+            self.interval, self.step, self.first_step = 0, 0.0, flow.clock.steps
+            slab = flow.fluid.grid.decomposition
+            columns = release(slab, scene.seed, self.settings.particles_per_side, self.settings.placement)
+            self.tracers = TracerParticles(field, columns, flow.state)
+            self.frames = TracerFrames(segments, self.tracers, self.settings, self.released_at, compressible)
+            self.frames.store(flow.state, flow.clock)
+        else:
+            known = saved.description["tracers"]
+            self.released, self.released_at = known["released"], known["released_at"]
+            self.interval, self.step, self.first_step = known["interval"], known["step"], known["first_step"]
+            self.tracers = TracerParticles(field, self._saved_columns(saved), flow.state)
+            self.frames = TracerFrames(segments, self.tracers, self.settings, self.released_at, compressible)
+            self.frames.restore(known["frames"], saved)
+
+    @property
+    def intervals(self) -> int:
+        """Number of frame intervals, at least the one that the rates of the release are measured over."""
+        duration = self.settings.turnovers * self.released["eddy_turnover_time"]
+        return max(int(np.ceil(duration / self.settings.frame_interval - 1e-9)), 1)
+
+    def follow(self) -> None:
+        """Follow the tracers to the end of the last interval."""
+        flow, progress = self.flow, ProgressLine("tracers", self.flow.history.describe)
+        if self.interval > 0:
+            self._finish_interval()
+        while self.interval < self.intervals:
+            self.interval += 1
+            self.step = self._longest_step()
+            flow.clock.end = flow.clock.time + self.settings.frame_interval
+            self._finish_interval()
+            progress(self.interval / self.intervals, flow.clock.steps - self.first_step)
+        flow.history.sample(flow.state, flow.clock)
+
+    def scales(self) -> dict[str, float]:
+        """Scales of the filtered flow at the release: what the same flow does later does not change them."""
+        return {"released_at": self.released_at, "sound_speed": self.scene.flow.sound_speed or np.inf,
+                "length": self.settings.width, "spacing": self.settings.spacing, "density_mean": MEAN_DENSITY,
+                **self.segments.release_scales()}
+
+    def memory(self) -> tuple[dict[str, Any], dict[str, np.ndarray | Block], list[str]]:
+        """What a checkpoint keeps: a description, arrays, and the files with the frames so far, which are closed."""
+        self.segments.close()
+        numbers, arrays = self.frames.memory()
+        order = IdOrder(self.comm, self.tracers.columns["id"], self.settings.particles)
+        arrays |= {name: Block(order.apply(self.tracers.columns[name]), order.start, self.settings.particles)
+                   for name in ("position", "velocity")}
+        return {"released": self.released, "released_at": self.released_at, "interval": self.interval,
+                "step": self.step, "first_step": self.first_step, "frames": numbers}, arrays, self.segments.names
+
+    def _longest_step(self) -> float:
+        interval = self.settings.frame_interval
+        longest = min(self.flow.step_limit.bound(self.flow.state, self.flow.clock), self.scene.time.max_step)
+        return interval / int(np.ceil(interval / longest - 1e-9))
+
+    def _finish_interval(self) -> None:
+        flow, step = self.flow, self.step
+        flow.advance([flow.history, lambda state, _: self.tracers.advance(state, step)], FixedStep(step))
+        self.frames.store(flow.state, flow.clock)
+
+    def _saved_columns(self, saved: Checkpoint) -> dict[str, np.ndarray]:
+        """Each saved tracer on the rank whose slab holds it."""
+        start, stop = id_block(self.comm, self.settings.particles)
+        columns = {name: saved.read(name, start, stop) for name in ("position", "velocity")}
+        return migrate(self.flow.fluid.grid.decomposition, {"id": np.arange(start, stop, dtype=np.int64), **columns})

@@ -1,0 +1,133 @@
+"""The ground truth as training and simulation read it: frames of particles on their slabs, fields, scales."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from eddies.io.fields import FieldSeries
+from eddies.io.hdf5 import read_attributes
+from eddies.io.trajectories import Trajectory
+from eddies.learning.force_training import TrainingFrame
+from eddies.parallel.migration import id_block, migrate
+from eddies.parallel.slab import SlabDecomposition
+from eddies.particles.dynamics import ParticleDynamics
+from eddies.particles.model import LagrangianModel
+from eddies.particles.particle_set import ParticleSet
+from eddies.particles.reference_scales import ReferenceScales
+from eddies.workflows.ground_truth.measured_scales import RATES, measured_scales
+
+log = logging.getLogger("eddies")
+
+
+class GroundTruth:
+    """An open ground_truth.h5, read by all ranks; particles arrive on the slabs of `decomposition`.
+
+    Where the fluid is incompressible no density is stored: then `has_density` is false and the columns of the density
+    are left out.
+    """
+
+    def __init__(self, file, decomposition: SlabDecomposition) -> None:
+        self.decomposition = decomposition
+        self.trajectory, self.fields = Trajectory(file, "tracers"), FieldSeries(file, "filtered")
+        self.times, self.total = self.trajectory.times, self.trajectory.total
+        self.reference = read_attributes(file, "reference")
+        self.has_density = "density" in self.trajectory.columns
+        self._evolving = ("velocity", "density") if self.has_density else ("velocity",)
+
+    @property
+    def scales(self) -> ReferenceScales:
+        """Reference scales of the flow when the particles are released; those of the density None without one."""
+        r = self.reference
+        density = ({"density": r["density_rms"], "density_rate": r["density_rate_rms"],
+                    "sound_speed": r["sound_speed"]} if self.has_density else {})
+        return ReferenceScales(
+            length=r["length"], spacing=r["spacing"], velocity=r["velocity_rms"], acceleration=r["acceleration_rms"],
+            density_mean=r["density_mean"], viscosity=r["viscosity"], kolmogorov_length=r["kolmogorov_length"],
+            **density)
+
+    def scales_at(self, frame: int) -> ReferenceScales:
+        """Reference scales of the flow at a frame, not the first, rates from the frame before; collective.
+
+        At frame 1 the rates are those of the release.
+        """
+        if not 0 < frame < len(self.times):
+            raise ValueError(f"frame {frame} of {len(self.times)} has no frame before it")
+        before, now = (self._block(other, self._evolving) for other in (frame - 1, frame))
+        interval = self.times[frame] - self.times[frame - 1]
+        measured = measured_scales(self.decomposition.comm, now, before, now, interval)
+        return replace(self.scales, **{name.removesuffix("_rms"): value for name, value in measured.items()})
+
+    def particles(self, frame: int) -> dict[str, np.ndarray]:
+        """id, position, velocity and, where there is one, density of this rank's particles at a frame."""
+        return migrate(self.decomposition, self._block(frame))
+
+    def particles_with_rates(self, frame: int) -> dict[str, np.ndarray]:
+        """The same with `acceleration` (n, 3) and `density_rate` (n,): centred differences along the trajectories.
+
+        Not for the first and the last frame.
+        """
+        if not 0 < frame < len(self.times) - 1:
+            raise ValueError(f"frame {frame} of {len(self.times)} has no frames on both sides")
+        columns = self._block(frame)
+        before, after = (self._block(other, self._evolving) for other in (frame - 1, frame + 1))
+        span = self.times[frame + 1] - self.times[frame - 1]
+        for name in self._evolving:
+            columns[RATES[name]] = (after[name] - before[name]) / span
+        return migrate(self.decomposition, columns)
+
+    def window(self, frame: int, length: int) -> dict[str, np.ndarray]:
+        """`particles` of a frame, and what is true of them in the frames that follow: `position_later` and
+        `velocity_later` (n, length, 3), `density_later` (n, length)."""
+        columns = self._block(frame)
+        later = [self._block(frame + number) for number in range(1, length + 1)]
+        for name in ("position", *self._evolving):
+            columns[f"{name}_later"] = np.stack([block[name] for block in later], axis=1)
+        return migrate(self.decomposition, columns)
+
+    def field(self, index: int, variable: str) -> np.ndarray:
+        """This rank's planes of a filtered field, (components, z_local, y, x), in double precision."""
+        planes = (self.decomposition.start, self.decomposition.stop)
+        return self.fields.read(index, variable, *planes).astype(np.float64)
+
+    def frame_of_field(self, index: int) -> int:
+        """The frame taken at the time of a field."""
+        return int(np.argmin(np.abs(self.times - self.fields.times[index])))
+
+    def last_frame_seen(self, window: float) -> int:
+        """The last frame of the training window, a fraction of the ground truth."""
+        return max(int(window * (len(self.times) - 1)), 1)
+
+    def _block(self, frame: int, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
+        """Columns of this rank's ids at a frame: those named, or all."""
+        start, stop = id_block(self.decomposition.comm, self.total)
+        names = ("position", *self._evolving) if names is None else names
+        columns = {name: self.trajectory.read(frame, name, start, stop) for name in names}
+        return {"id": np.arange(start, stop, dtype=np.int64), **columns}
+
+
+def load_frame(truth: GroundTruth, index: int, model: LagrangianModel, dtype: torch.dtype,
+               device: torch.device) -> TrainingFrame:
+    """A frame with its true rates; its particles carry the true density where the model integrates it."""
+    columns = truth.particles_with_rates(int(index))
+    rates = {name: torch.from_numpy(columns[name]).to(device, dtype)
+             for name in ("acceleration", "density_rate") if name in columns}
+    dynamics = ParticleDynamics(truth.decomposition, model, skin=0.0, dtype=dtype)
+    frame = TrainingFrame(dynamics, particles_for(model, columns, device), rates["acceleration"],
+                          rates.get("density_rate"))
+    solves = [] if dynamics.resolution is None else dynamics.resolution.solves
+    for iterations, residual, converged in solves:
+        if not converged and truth.decomposition.comm.rank == 0:
+            log.warning("frame %d: the solve for the resolved velocity did not converge in %d iterations and left %.1e",
+                        index, iterations, residual)
+    return frame
+
+
+def particles_for(model: LagrangianModel, columns: dict[str, np.ndarray], device: torch.device) -> ParticleSet:
+    """The true particles as a model sets them going: with their density where it integrates that."""
+    particles = ParticleSet.from_numpy(columns, device)
+    return particles if model.integrates_density else replace(particles, density=None)

@@ -1,0 +1,119 @@
+"""A-priori tests of a trained model: its rates against the truth's at times it was not trained on (Fig. 3)."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from eddies.flow.operators import gradient
+from eddies.learning.force_training import TrainingFrame
+from eddies.learning.losses import relative_error
+from eddies.parallel.migration import IdOrder, migrate
+from eddies.parallel.reduction import global_sum
+from eddies.parallel.slab import SlabDecomposition
+from eddies.particles.dynamics import ParticleDynamics
+from eddies.particles.model import LagrangianModel
+from eddies.particles.particle_set import ParticleSet, as_numpy
+from eddies.scene.scene import SceneError
+from eddies.spectral.interpolation import SplineInterpolation
+from eddies.spectral.spectral_grid import SpectralGrid
+from eddies.workflows.ground_truth.truth import GroundTruth, load_frame, particles_for
+
+EVALUATIONS, SAMPLE = 9, 20000
+
+
+def evaluation_frames(truth: GroundTruth) -> np.ndarray:
+    """Frames at times of filtered fields, evenly spread over the ground truth, with frames on both sides.
+
+    Raises SceneError if there is none.
+    """
+    at_fields = np.array([truth.frame_of_field(index) for index in range(len(truth.fields.times))])
+    usable = at_fields[(at_fields > 0) & (at_fields < len(truth.times) - 1)]
+    if not len(usable):
+        raise SceneError("[tracers] field_every: no filtered field is stored between the first and the last frame; "
+                         "lower it, or raise [tracers] turnovers")
+    return usable[np.unique(np.linspace(0, len(usable) - 1, EVALUATIONS).astype(int))]
+
+
+@torch.no_grad()
+def evaluate(truth: GroundTruth, model: LagrangianModel, frames: np.ndarray, last_seen: int, dtype: torch.dtype,
+             device: torch.device) -> dict[str, dict[str, np.ndarray]]:
+    """Normalised L2 errors over time delay, and samples of true and predicted rates at the last frame; collective.
+
+    `acceleration_error` is that of the model as it runs: with the density that its terms give.
+    `density_rate_error` is that of the learned rate, or of the rate at which a given density changes.
+    `true_density_acceleration_error` is that with the true density, `pressure_gradient_error` that of
+    -c^2 grad ln(rho) of the filtered field, without any model, of a truth that has a density.
+    """
+    rows, comm = [], truth.decomposition.comm
+    for index in frames:
+        frame = load_frame(truth, index, model, dtype, device)
+        errors = frame.errors()
+        row = {"delay": truth.times[index] - truth.times[last_seen],
+               "acceleration_error": relative_error(comm, errors["acceleration"], frame.acceleration)}
+        if truth.has_density:
+            exact = _pressure_force(truth, int(index), frame.particles).to(frame.acceleration)
+            row["pressure_gradient_error"] = relative_error(comm, exact - frame.acceleration, frame.acceleration)
+        if model.density_is_given:
+            true = torch.from_numpy(truth.particles(int(index))["density"]).to(device)
+            given = frame.errors(density=true)["acceleration"]
+            row["true_density_acceleration_error"] = relative_error(comm, given, frame.acceleration)
+            row["density_rate_error"] = _given_rate_error(truth, frame.dynamics, int(index), device)
+        if "density_rate" in errors:
+            row["density_rate_error"] = relative_error(comm, errors["density_rate"], frame.density_rate)
+        rows.append(row)
+    tables = {"a_priori": {name: np.array([row[name] for row in rows]) for name in rows[0]},
+              "acceleration_sample": _sample(truth, frame, frame.acceleration, errors["acceleration"])}
+    if "density_rate" in errors:
+        tables["density_rate_sample"] = _sample(truth, frame, frame.density_rate, errors["density_rate"])
+    return tables
+
+
+def _given_rate_error(truth: GroundTruth, dynamics: ParticleDynamics, index: int, device: torch.device) -> float:
+    """Error of the rate of the density that terms give, along the true trajectories, by centred differences."""
+    comm, total = truth.decomposition.comm, truth.total
+
+    def density(frame: int) -> np.ndarray:
+        particles = particles_for(dynamics.model, truth.particles(frame), device)
+        found = dynamics.rates(particles).density
+        return _by_id(comm, total, {"id": as_numpy(particles.id), "density": as_numpy(found)}, "density")
+
+    rate = (density(index + 1) - density(index - 1)) / (truth.times[index + 1] - truth.times[index - 1])
+    exact = _by_id(comm, total, truth.particles_with_rates(index), "density_rate")
+    return relative_error(comm, torch.from_numpy(rate - exact), torch.from_numpy(exact))
+
+
+def _by_id(comm, total: int, columns: dict[str, np.ndarray], name: str) -> np.ndarray:
+    """This rank's block of a column in the order of particle ids."""
+    return IdOrder(comm, columns["id"], total).apply(columns[name])
+
+
+def _pressure_force(truth: GroundTruth, index: int, particles: ParticleSet) -> torch.Tensor:
+    """-c^2 grad ln(rho) of the filtered field at the particles (n, 3)."""
+    at = int(np.argmin(np.abs(truth.fields.times - truth.times[index])))
+    slab = SlabDecomposition(truth.decomposition.comm, truth.decomposition.length, truth.fields.cells)
+    grid = SpectralGrid(slab, cutoff=(slab.planes - 1) // 2)
+    planes = truth.fields.read(at, "density", slab.start, slab.stop).astype(np.float64)
+    force = -truth.scales.sound_speed**2 * gradient(grid, grid.forward(np.log(planes))[0])
+    spline = SplineInterpolation(grid, "quintic")
+    columns = migrate(slab, {name: as_numpy(getattr(particles, name)) for name in ("id", "position")})
+    values = spline.at(spline.coefficients(force), columns["position"])
+    # The fields' slabs may differ from the particles': values go back to the particles' owners by id.
+    order = IdOrder(slab.comm, columns["id"], truth.total)
+    back = migrate(truth.decomposition, {"id": np.arange(order.start, order.stop), "value": order.apply(values),
+                                         "position": order.apply(columns["position"])})
+    row = np.empty(len(particles), np.int64)
+    row[np.argsort(as_numpy(particles.id))] = np.argsort(back["id"])
+    return torch.from_numpy(back["value"][row])
+
+
+def _sample(truth: GroundTruth, frame: TrainingFrame, exact: torch.Tensor,
+            error: torch.Tensor) -> dict[str, np.ndarray]:
+    """True and predicted rates of the particles with the lowest ids, on every rank."""
+    columns = {"truth": as_numpy(exact), "predicted": as_numpy(exact + error)}
+    ids, sampled = as_numpy(frame.particles.id), min(SAMPLE, truth.total)
+    chosen = ids < sampled
+    whole = {name: np.zeros((sampled, *values.shape[1:])) for name, values in columns.items()}
+    for name, values in columns.items():
+        whole[name][ids[chosen]] = values[chosen]
+    return {name: global_sum(truth.decomposition.comm, values) for name, values in whole.items()}

@@ -1,0 +1,62 @@
+"""The model of a scene: as it is built, and as it is read from a file with what is stored beside its weights."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from eddies.io.hdf5 import ProductError, open_product, read_table
+from eddies.io.weights import load_weights
+from eddies.particles.feature_range import FeatureRange
+from eddies.particles.flow_units import FlowUnits
+from eddies.particles.model import LagrangianModel, build_model
+from eddies.particles.reference_scales import ReferenceScales
+from eddies.scene.scene import Scene, SceneError
+from eddies.workflows.learned.description import differences
+
+
+def scene_model(scene: Scene, scales: ReferenceScales) -> LagrangianModel:
+    """The terms of a scene with initial parameters, for a flow of these scales.
+
+    Raises SceneError where a class of the user's is no term, or cannot be made.
+    """
+    flow = FlowUnits(scales, scene.kernel.support(scene.tracers.particles), scene.kernel.neighbors, scene.seed)
+    try:
+        return build_model(scene.model.settings, scene.model.terms, flow)
+    except SceneError as error:
+        raise SceneError(f"[model] terms: {error}") from None
+
+
+def load_model(scene: Scene, comm, path: str | Path, scales: ReferenceScales) -> LagrangianModel:
+    """The scene's model with the weights of a file, for a flow of these scales; all ranks call it.
+
+    Raises ProductError as `load_weights`, and where the file holds weights of another model.
+    """
+    return with_weights(scene, *load_weights(comm, path, "model"), path, scales)
+
+
+def with_weights(scene: Scene, description: Mapping[str, Any], weights: Mapping[str, np.ndarray], path: str | Path,
+                 scales: ReferenceScales) -> LagrangianModel:
+    """The scene's model with weights that were stored with a description, in their precision."""
+    for key, wanted, trained in differences(scene, description):
+        raise ProductError(f"{path}: was trained with {key} = {trained}, and the scene has {wanted}; run "
+                           "`eddies train` again, or set the key to that")
+    model = scene_model(scene, scales)
+    expected = {name: tuple(tensor.shape) for name, tensor in model.state_dict().items()}
+    if expected != {name: tensor.shape for name, tensor in weights.items()}:
+        raise ProductError(f"{path}: its terms have other parameters now than when this was written; run "
+                           "`eddies train` again")
+    precision = next((tensor.dtype.name for tensor in weights.values()), "float64")
+    model.to(getattr(torch, precision))
+    model.load_state_dict({name: torch.from_numpy(np.asarray(tensor)) for name, tensor in weights.items()})
+    return model
+
+
+def load_feature_range(comm, path: str | Path) -> FeatureRange:
+    """The range of what the networks of a file were given in training."""
+    with open_product(comm, path, "model") as file:
+        return FeatureRange(**read_table(file, "feature_range"))

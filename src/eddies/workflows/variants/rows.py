@@ -1,0 +1,121 @@
+"""The numbers of a comparison: a row for every variant, and the machine that they were measured on."""
+
+from __future__ import annotations
+
+import os
+import platform
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from eddies.analysis.accuracy import MEASURES, StoredRollout, accuracy
+from eddies.io.fields import FieldSeries
+from eddies.io.hdf5 import open_product, read_attributes, read_table
+from eddies.io.provenance import environment
+from eddies.io.trajectories import Trajectory
+from eddies.scene.comparison import Comparison
+from eddies.scene.scene import Eulerian
+from eddies.workflows.variants.run import StepSeconds, VariantRun
+
+COST = ("seconds_per_step", "time_step", "wall_seconds", "wall_seconds_low", "wall_seconds_high", "core_seconds",
+        "training_seconds")
+# Measured on fields and gradients that the kernel makes of the particles, of the model and of the truth.
+THROUGH_KERNEL = ("spectrum_error", "qr_kl")
+COLUMNS = ("name", "group", "status", "stopped_at", *MEASURES, "end", *COST, "settings")
+
+
+def rows(comparison: Comparison, runs: list[VariantRun], alone, ranks: int) -> list[dict[str, Any]]:
+    """The row of every variant, by COLUMNS; None where there is no number. `alone` is a communicator of one rank.
+
+    Times are in turnovers T of the flow, `wall_seconds` and `core_seconds` for one of them.
+    """
+    found = []
+    for variant, run in zip(comparison.variant, runs):
+        row: dict[str, Any] = dict.fromkeys(COLUMNS)
+        row |= {"name": variant.name, "group": variant.group, "settings": " ".join(variant.set)}
+        if run.failure is None:
+            row |= measured(run, alone, ranks)
+            if has_own_kernel(comparison, variant.name):
+                row |= dict.fromkeys(THROUGH_KERNEL)
+        else:
+            row |= {"status": f"failed: {run.failure}"}
+        found.append({key: finite(value) for key, value in row.items()})
+    return found
+
+
+def has_own_kernel(comparison: Comparison, name: str) -> bool:
+    """Whether a variant smooths with another kernel than the base: what is measured through it does not compare."""
+    kernels = (scene.fingerprint("train-kernel") for scene in (comparison.scenes[name], comparison.base_scene))
+    return len(set(kernels)) > 1
+
+
+def notes(comparison: Comparison) -> list[str]:
+    """What a reader of the numbers has to know of single variants."""
+    own = [name for name in comparison.scenes if has_own_kernel(comparison, name)]
+    blank = " and ".join(MEASURES[measure] for measure in THROUGH_KERNEL)
+    found = [f"{', '.join(own)}: no {blank}. These are measured on what the smoothing kernel makes of the particles; "
+             "one of other settings than the base's shows another part of the flow."] if own else []
+    grids = {name: (scene.eulerian or Eulerian()).cells_for(scene.tracers.width)
+             for name, scene in comparison.scenes.items() if scene.simulation.method == "eulerian"}
+    if grids:
+        kept = ", ".join(f"{(cells - 1) // 3} in {name}" for name, cells in grids.items())
+        found.append(f"Of a grid the 2/3 rule leaves the wavenumbers |k_i| < cells/3, at most: {kept}; k_d = "
+                     f"{np.pi / comparison.base_scene.tracers.width:.3g}.")
+    return found
+
+
+def measured(run: VariantRun, alone, ranks: int) -> dict[str, Any]:
+    """What rollout.h5 shows, how long its steps took and, if there is a model, its training."""
+    with (open_product(alone, run.directory / "ground_truth.h5", "ground_truth") as truth_file,
+          open_product(alone, run.directory / "rollout.h5", "rollout") as file):
+        reference, rollout = read_attributes(truth_file, "reference"), read_attributes(file, "rollout")
+        stored = StoredRollout(
+            *(Trajectory(file, name) for name in ("model", "truth")),
+            *(FieldSeries(file, name) for name in ("model", "truth")), turnover=rollout["eddy_turnover_time"],
+            kolmogorov_time=reference["kolmogorov_time"], filter_wavenumber=np.pi / reference["length"])
+        complete = rollout["status"] == "complete"
+        row = {"status": rollout["status"], "stopped_at": None if complete else rollout["turnovers"],
+               **accuracy(stored, complete)}
+    row |= step_costs([StepSeconds.of_rollout(rollout), *run.blocks], rollout["time_step"], stored.turnover, ranks)
+    if "train" in run.stages:
+        with open_product(alone, run.directory / "model.h5", "model") as file:
+            if "history" in file:
+                row["training_seconds"] = float(read_table(file, "history")["seconds"][-1])
+    return row
+
+
+def step_costs(samples: list[StepSeconds], step: float, turnover: float, ranks: int) -> dict[str, float]:
+    """Seconds a step, the median over all samples, and wall and core seconds a turnover with the widest quartiles."""
+    seconds = float(np.median([sample.median for sample in samples]))
+    steps = turnover / step
+    return {"seconds_per_step": seconds, "time_step": step, "wall_seconds": seconds * steps,
+            "wall_seconds_low": min(sample.low for sample in samples) * steps,
+            "wall_seconds_high": max(sample.high for sample in samples) * steps,
+            "core_seconds": seconds * steps * ranks * threads()}
+
+
+def finite(value: Any) -> Any:
+    """The value, or None for a number that is none."""
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def threads() -> int:
+    """Threads of every rank."""
+    return int(os.environ.get("OMP_NUM_THREADS", "1"))
+
+
+def machine(device: str, ranks: int) -> dict[str, Any]:
+    """What the times depend on: processor, cores, ranks, threads, device, and the versions of all libraries."""
+    name = torch.cuda.get_device_name() if device == "cuda" else device
+    return {"processor": processor(), "cores": os.cpu_count(), "threads_per_rank": threads(), "device": name,
+            **environment(ranks)}
+
+
+def processor() -> str:
+    """Name of the processor as Linux gives it, or else its architecture."""
+    information = Path("/proc/cpuinfo")
+    lines = information.read_text().splitlines() if information.exists() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()

@@ -1,0 +1,88 @@
+"""Names beside points do not cover each other; what is unstable is shown as such."""
+
+import numpy as np
+import pytest
+
+from eddies.analysis.accuracy import MEASURES
+from eddies.report.comparison import DRAWN, ErrorAgainstTime, in_symbols, scatter, sections
+from eddies.report.figures import panels, styled
+from eddies.report.labels import fix_layout, place_labels
+
+
+def row(name, seconds, error, group="model", status="complete", stopped_at=None):
+    return {"name": name, "group": group, "status": status, "stopped_at": stopped_at, "end": 1.0,
+            "wall_seconds": seconds, "wall_seconds_low": seconds and 0.9 * seconds,
+            "wall_seconds_high": seconds and 1.2 * seconds, "core_seconds": seconds,
+            "seconds_per_step": 0.1, "time_step": 0.02, "training_seconds": None, **dict.fromkeys(MEASURES, error)}
+
+
+ROWS = [row("learned", 20.0, 0.1), row("none", 1.0, 0.5, "baseline"), row("slow", 90.0, 0.2),
+        row("sph", 50.0, None, "baseline", "stopped: step 9, rank 0", 0.37),
+        row("refused", None, None, "baseline", "failed: too few slabs")]
+TABLE = ErrorAgainstTime(ROWS, "learned", "baseline")
+
+
+@styled
+def boxes_of_labels(points, labels):
+    figure, axes = panels(1, 1, (6.7, 5.0))
+    fix_layout(figure)
+    axis = axes[0, 0]
+    boxes = place_labels(axis, axis.bbox.p0 + points * axis.bbox.size, labels, [False] * len(labels))
+    return boxes, axis.bbox
+
+
+def test_labels_of_a_crowd_cover_neither_each_other_nor_leave_the_panel():
+    rng = np.random.default_rng(8)
+    points = np.concatenate([0.5 + 0.05 * rng.normal(size=(14, 2)), rng.random((6, 2))])
+    boxes, frame = boxes_of_labels(np.clip(points, 0.02, 0.98), [f"variant-{number}" for number in range(20)])
+    for number, box in enumerate(boxes):
+        assert frame.x0 <= box.x0 and box.x1 <= frame.x1 and frame.y0 <= box.y0 and box.y1 <= frame.y1
+        assert not any(box.overlaps(other) for other in boxes[:number])
+
+
+@pytest.mark.parametrize("across, side", [(0.5, 1), (0.99, -1)])
+def test_a_label_alone_stands_beside_its_point_within_the_panel(across, side):
+    (box,), frame = boxes_of_labels(np.array([[across, 0.5]]), ["alone"])
+    point = frame.p0 + np.array([across, 0.5]) * frame.size
+    assert 0 < side * ((box.x0 if side > 0 else box.x1) - point[0]) < 20 and box.y0 < point[1] < box.y1
+
+
+def texts(axis):
+    return {text.get_text() for text in axis.texts}
+
+
+def test_what_became_unstable_is_named_with_its_time():
+    axis = scatter(TABLE, ["velocity_error_early"]).axes[0]
+    assert texts(axis) == {"learned", "none", "slow", "sph 0.37 T"}
+    crosses = [line for line in axis.lines if line.get_marker() == "x"]
+    assert len(crosses) == 1 and crosses[0].get_xdata() == 50.0
+    assert crosses[0].get_ydata() > max(r["velocity_kl"] or 0 for r in ROWS)
+
+
+def test_front_joins_what_nothing_beats():
+    axis = scatter(TABLE, ["velocity_error_early"]).axes[0]
+    (front,) = [line for line in axis.lines if line.get_linestyle() == "--"]
+    assert list(front.get_xdata()) == [1.0, 20.0]
+
+
+def test_a_measure_that_nobody_has_leaves_an_empty_panel():
+    rows = [row("learned", 20.0, None)]
+    assert texts(scatter(ErrorAgainstTime(rows, "learned", "baseline"), DRAWN).axes[0]) == set()
+
+
+def test_page_tells_what_failed_and_what_the_model_is_worth():
+    first, _, errors, cost = sections(TABLE, 1.0)
+    assert first.notices == ["sph (at 0.37 T): stopped: step 9, rank 0", "refused: failed: too few slabs"]
+    assert "learned is worth its cost in velocity error at t_η (0.1, 3 of 3 baselines beaten" in first.text
+    assert [metric.label for metric in errors.metrics] == [r["name"] for r in ROWS]
+    assert cost.metrics[0].value["wall s per T"] == 20.0
+
+
+def test_an_unstable_model_is_worth_nothing():
+    unstable = [{**ROWS[0], "status": "stopped: step 9", "stopped_at": 0.8}, *ROWS[1:]]
+    assert ErrorAgainstTime(unstable, "learned", "baseline").summary[0] == "learned is worth its cost in no measure."
+
+
+@pytest.mark.parametrize("measure", DRAWN)
+def test_symbols_are_drawn_as_formulas(measure):
+    assert "_" not in in_symbols(MEASURES[measure]).replace(r"$t_\eta$", "").replace("$k_d$", "")

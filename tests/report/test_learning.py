@@ -1,0 +1,44 @@
+import numpy as np
+import pytest
+
+from eddies.report.figures import png
+from eddies.report.learning import curves
+
+
+def history(phases, **columns):
+    """Of phases with so many steps each, 2 s a step."""
+    steps = sum(phases)
+    return {"phase": np.repeat(np.arange(len(phases)), phases).astype(float), "step": np.arange(float(steps)),
+            "seconds": 2.0 * np.arange(1, steps + 1), "learning_rate": np.full(steps, 1e-3),
+            "loss": np.linspace(2, 1, steps), "gradient_norm": np.ones(steps), **columns}
+
+
+def circled(axis):
+    return [(line.get_xdata()[0], line.get_ydata()[0]) for line in axis.lines if line.get_markersize() == 8]
+
+
+def test_phases_are_equally_wide_and_ticks_count_steps_and_seconds():
+    figure = curves(history([1000, 4]))
+    axis = figure.axes[2]
+    first, second = (line.get_xdata() for line in axis.lines[:2])
+    assert (first[0], first[-1]) == pytest.approx((1e-3, 1)) and second == pytest.approx([1.25, 1.5, 1.75, 2])
+    labels = [label.get_text() for label in axis.get_xticklabels()]
+    assert labels == ["0", "500\n16 min 40 s", "1000\n33 min 20 s", "1002\n33 min 24 s", "1004\n33 min 28 s"]
+
+
+def test_each_phase_has_its_least_error_circled():
+    errors = np.array([np.nan, 0.5, 0.3, 0.4, 0.9, np.nan, 0.8])
+    axis = curves(history([4, 3], validation_error=errors)).axes[1]
+    assert circled(axis) == [(0.75, 0.3), (2.0, 0.8)]
+
+
+def test_a_phase_that_did_only_harm_has_its_start_circled():
+    errors, starts = np.array([np.nan, 0.5, np.nan, np.inf, 0.9]), np.array([0.7, np.nan, 0.4, np.nan, np.nan])
+    axis = curves(history([2, 3], validation_error=errors, start_error=starts)).axes[1]
+    assert circled(axis) == [(1.0, 0.5), (1.0, 0.4)]
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_history_of_one_step_without_anything_positive_is_drawn():
+    nothing = history([1], loss=np.zeros(1), gradient_norm=np.zeros(1), energy_loss=np.full(1, np.nan))
+    assert png(curves(nothing)).startswith(b"\x89PNG\r\n\x1a\n")

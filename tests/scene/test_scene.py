@@ -1,0 +1,205 @@
+"""Scenes: what is read, what is refused and in which words."""
+
+import dataclasses
+
+import pytest
+
+from eddies.pipeline import STAGES as TABLE
+from eddies.scene.scene import Eulerian, Flow, Scene, SceneError, Time, builtin_scenes, load_scene
+from eddies.scene.values import rule_of
+from tests.bad_scenes import BAD_OVERRIDES, BAD_TEXTS
+
+STAGES = tuple(TABLE)
+
+SMALLEST = '[flow]\nfluid = "incompressible"\ncells = 16\nviscosity = 0.1\n[time]\nduration = 1\n'
+NAMES = [name for name, _ in builtin_scenes()]
+
+
+def scene_file(tmp_path, text, name="case"):
+    path = tmp_path / f"{name}.toml"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_written_scene_reads_back_equal(name, tmp_path):
+    scene = load_scene(name)
+    assert load_scene(scene_file(tmp_path, scene.to_toml(), "other-name")) == scene
+
+
+def test_all_values_survive_writing(tmp_path):
+    scene = load_scene("tiny", ['title="a \\"quoted\\" # title"', "tracers.filter_width=0.1234567890123456",
+                                "simulation.injection=1e-7", "model.pairs.hidden=[1, 2, 3]", "simulation.start=0"])
+    assert load_scene(scene_file(tmp_path, scene.to_toml())) == scene
+    assert scene.simulation.start == 0.0
+    assert scene.model.settings["pairs"].hidden == (1, 2, 3)
+
+
+def test_absent_sections_and_defaults(tmp_path):
+    scene = load_scene(scene_file(tmp_path, SMALLEST))
+    assert scene.name == "case"
+    assert scene.forcing is scene.tracers is scene.kernel is scene.model is scene.simulation is None
+    assert (scene.flow.precision, scene.time.stepper, scene.seed) == ("float64", "etdrk4", 1)
+    assert scene.stages == ("dns", "report")
+
+
+@pytest.mark.parametrize("override, read", [
+    ("seed=7", lambda scene: scene.seed == 7),
+    ("flow.viscosity=1", lambda scene: scene.flow.viscosity == 1.0),
+    ("flow.precision=float32", lambda scene: scene.flow.precision == "float32"),
+    ('flow.precision="float32"', lambda scene: scene.flow.precision == "float32"),
+    (" flow.cells = 32 ", lambda scene: scene.flow.cells == 32),
+    ("forcing.injection_rate=0.5", lambda scene: scene.forcing.injection_rate == 0.5),
+    ("title=a=b", lambda scene: scene.title == "a=b"),
+])
+def test_override(override, read, tmp_path):
+    assert read(load_scene(scene_file(tmp_path, SMALLEST), [override]))
+
+
+def test_all_stages_of_a_whole_scene():
+    assert load_scene("tiny").stages == STAGES
+
+
+def test_without_a_learned_force_nothing_is_trained():
+    scene = load_scene("tiny", ["simulation.method=none"])
+    assert scene.stages == ("dns", "train-kernel", "simulate", "report")
+    other = load_scene("tiny", ["simulation.method=none", "model.pairs.hidden=[4]", "training.steps=50"])
+    assert other.fingerprint("simulate") == scene.fingerprint("simulate")
+    bare = dataclasses.replace(scene, model=None, training=None)
+    assert bare.stages == scene.stages
+
+
+@pytest.mark.parametrize("first, second", [("wcsph.alpha=1", "wcsph.alpha=2"),
+                                           ("eulerian.smagorinsky=0", "eulerian.smagorinsky=0.1")])
+def test_the_form_of_a_baseline_counts_for_its_rollout_alone(first, second):
+    force = first.partition(".")[0]
+    scene, changed = (load_scene("tiny", [f"simulation.method={force}", "simulation.step=0.0025", override])
+                      for override in (first, second))
+    affected = [stage for stage in STAGES if scene.fingerprint(stage) != changed.fingerprint(stage)]
+    assert affected == ["simulate", "report"]
+
+
+def test_coarse_grid_of_the_filter():
+    widths = {name: load_scene(name).tracers.width for name in ("hit", "tiny")}
+    assert Eulerian().cells_for(widths["hit"]) == 16  # Nyquist wavenumber 8 = pi / d
+    assert Eulerian().cells_for(widths["tiny"]) == 8
+    assert Eulerian(cells=24).cells_for(widths["hit"]) == 24
+    with pytest.raises(SceneError, match=r"\[eulerian\] cells = 20: must be at most the 18 of the filtered fields"):
+        load_scene("tiny", ["simulation.method=eulerian", "eulerian.cells=20"])
+
+
+def test_rates_of_the_horizons_fall():
+    flat = ["training.horizon_learning_rate=1e-5", "training.horizon_steps=1"]
+    with pytest.raises(SceneError, match=r"\[training\] final_learning_rate = 0.0001: must be at most "
+                                         "horizon_learning_rate = 1e-05"):
+        load_scene("tiny", flat)
+    assert load_scene("tiny", flat[:1]).training.horizon_steps == 0
+
+
+def test_derived_lengths():
+    tracers, kernel = load_scene("hit-small").tracers, load_scene("hit-small").kernel
+    assert tracers.width == 2 * tracers.spacing == pytest.approx(0.3926990817)
+    assert (tracers.particles, tracers.cells) == (32768, 48)
+    assert load_scene("tiny").tracers.cells == 18
+    assert kernel.support(tracers.particles) / tracers.spacing == pytest.approx(2.4287, rel=1e-4)
+
+
+FINGERPRINTS = {"flow.viscosity=0.061": "dns", "seed=2": "dns", "kernel.steps=99": "train-kernel",
+                "training.window=0.4": "train-kernel", "device=cuda": "train",
+                "model.pairs.hidden=[4]": "train", "training.steps=59": "train", "simulation.skin=0.2": "simulate"}
+
+
+@pytest.mark.parametrize("override, first_changed", FINGERPRINTS.items())
+def test_fingerprint_changes_from_the_stage_that_reads_the_key(override, first_changed):
+    scene, changed = load_scene("tiny"), load_scene("tiny", [override])
+    affected = [stage for stage in STAGES if scene.fingerprint(stage) != changed.fingerprint(stage)]
+    assert affected == list(STAGES[STAGES.index(first_changed):])
+
+
+def test_fingerprint_ignores_names():
+    scene, renamed = load_scene("tiny"), load_scene("tiny", ["name=x", "title=y"])
+    assert scene.fingerprint("report") == renamed.fingerprint("report")
+
+
+def test_fingerprint_changes_with_the_file_that_the_flow_starts_from(tmp_path):
+    start = tmp_path / "start.h5"
+    prints = set()
+    for content in ("one state", "another state", "one state"):
+        start.write_text(content)
+        scene = load_scene("taylor-green", ["initial.kind=file", f"initial.path={start}"])
+        prints.add(scene.fingerprint("dns"))
+    assert len(prints) == 2
+
+
+def test_fingerprint_of_training_changes_with_the_weights_that_it_starts_from(tmp_path):
+    scene = load_scene("tiny", [f"model.path={tmp_path}"])
+    prints = [scene.fingerprint("train")]
+    for content in ("some weights", "others"):
+        (tmp_path / "model.h5").write_text(content)
+        prints.append(scene.fingerprint("train"))
+    assert len(set(prints)) == 3
+    assert scene.fingerprint("train-kernel") == load_scene("tiny").fingerprint("train-kernel")
+
+
+def test_trained_weights_need_no_training_and_have_seen_nothing():
+    scene = load_scene("tiny", ["model.path=runs/other"])
+    alone = dataclasses.replace(scene, training=None)
+    assert (scene.seen, alone.seen, alone.window) == (0.5, 0.0, 0.5)
+    assert alone.stages == STAGES
+    assert str(alone.model.weights_file) == "runs/other/model.h5"
+    assert str(load_scene("tiny", ["model.path=a/b.h5"]).model.weights_file) == "a/b.h5"
+
+
+def test_window_without_training_is_the_default_of_training():
+    scene = load_scene("tiny")
+    alone = dataclasses.replace(scene, model=None, training=None, simulation=None)
+    assert alone.window == scene.window == 0.5
+    assert load_scene("tiny", ["training.window=0.4"]).window == 0.4
+    assert alone.fingerprint("train-kernel") == scene.fingerprint("train-kernel")
+
+
+@pytest.mark.parametrize("text, message", BAD_TEXTS, ids=range(len(BAD_TEXTS)))
+def test_bad_text(text, message, tmp_path):
+    path = scene_file(tmp_path, text)
+    with pytest.raises(SceneError) as error:
+        load_scene(path)
+    assert str(error.value).startswith(f"{path}: ")
+    assert message in str(error.value)
+
+
+@pytest.mark.parametrize("override, message", BAD_OVERRIDES, ids=[override for override, _ in BAD_OVERRIDES])
+def test_bad_override(override, message):
+    with pytest.raises(SceneError) as error:
+        load_scene("tiny", [override])
+    assert message in str(error.value)
+
+
+@pytest.mark.parametrize("integrator", ["rk2", "rk3", "rk4"])
+def test_steps_of_a_scheme_that_tells_what_is_between_need_not_fall_on_frames(integrator):
+    scene = load_scene("tiny", [f"simulation.integrator={integrator}", "simulation.step=0.07"])
+    assert (scene.simulation.step, scene.simulation.frame_interval) == (0.07, 0.1)
+    assert load_scene("tiny", ["simulation.integrator=verlet", "simulation.step=0.05"]).simulation.step == 0.05
+
+
+def test_override_is_named_as_the_origin():
+    with pytest.raises(SceneError, match=r"tiny.toml, --set: \[flow\] cells = 3: "):
+        load_scene("tiny", ["flow.cells=3"])
+
+
+def test_unknown_scene_lists_those_there_are():
+    with pytest.raises(SceneError, match="hit-smal: no such scene; did you mean hit-small.*tiny"):
+        load_scene("hit-smal")
+
+
+def test_sections_are_checked_against_each_other_without_a_file():
+    with pytest.raises(SceneError, match="a compressible fluid needs"):
+        Scene(flow=Flow(fluid="compressible", cells=16, viscosity=0.1), time=Time(duration=1.0))
+
+
+def test_every_key_is_explained():
+    scene = load_scene("tiny")
+    for section in (scene, scene.flow, scene.initial, scene.forcing, scene.time, scene.spin_up, scene.tracers,
+                    scene.kernel, scene.model, scene.training, scene.simulation, *scene.model.settings.values()):
+        for field in dataclasses.fields(section):
+            rule = rule_of(type(section), field)
+            assert rule is None or rule.about

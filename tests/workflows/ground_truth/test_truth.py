@@ -1,0 +1,105 @@
+"""The ground truth as it is read: scales against plain numpy, and no trace of a density that is not stored."""
+
+import math
+
+import numpy as np
+import pytest
+
+from eddies.io.hdf5 import open_product
+from eddies.io.trajectories import Trajectory
+from eddies.parallel.slab import SlabDecomposition
+from eddies.workflows.ground_truth.truth import GroundTruth
+from tests.workflows.synthetic_run import LENGTH, write_ground_truth
+
+FRAMES = 5
+every_fluid = pytest.mark.parametrize("density", [True, False], ids=["density", "no density"])
+
+
+@pytest.fixture
+def path(comm, tmp_path, density):
+    if comm.rank == 0:
+        write_ground_truth(comm.Create_group(comm.group.Incl([0])), tmp_path, frames=FRAMES, density=density)
+    comm.Barrier()
+    return tmp_path / "ground_truth.h5"
+
+
+def read(comm, path, ask):
+    """What a ground truth answers, and its times and columns (frames, particles, ...) as stored."""
+    with open_product(comm, path, "ground_truth") as file:
+        answer = ask(GroundTruth(file, SlabDecomposition(comm, LENGTH, 16)))
+        stored = Trajectory(file, "tracers")
+        columns = {name: np.stack([stored.read(frame, name) for frame in range(FRAMES)]) for name in stored.columns}
+        return answer, stored.times, columns
+
+
+def rms(values):
+    return math.sqrt(np.mean(values**2))
+
+
+@every_fluid
+@pytest.mark.mpi(1, 2)
+def test_scales_are_those_of_the_release_or_of_a_frame(comm, path, density):
+    frames = range(1, FRAMES)
+    (release, later), times, columns = read(comm, path, lambda t: (t.scales, [t.scales_at(frame) for frame in frames]))
+    assert (release.velocity, release.acceleration, release.viscosity) == (1.0, 1.4, 0.014)  # as `reference` says
+    assert release.sound_speed == (20.0 if density else None)
+    for frame, scales in zip(frames, later):
+        interval = times[frame] - times[frame - 1]
+        velocity = columns["velocity"][frame - 1:frame + 1]
+        assert scales.velocity == pytest.approx(rms(velocity[1]), rel=1e-13)
+        assert scales.acceleration == pytest.approx(rms(np.diff(velocity, axis=0) / interval), rel=1e-13)
+        if density:
+            values = columns["density"][frame - 1:frame + 1]
+            assert scales.density == pytest.approx(rms(values[1] - 1), rel=1e-13)
+            assert scales.density_rate == pytest.approx(rms(np.diff(values, axis=0) / interval), rel=1e-13)
+        else:
+            assert scales.density is scales.density_rate is None
+        for name in ("length", "spacing", "density_mean", "viscosity", "sound_speed"):
+            assert getattr(scales, name) == getattr(release, name)
+
+
+@pytest.mark.parametrize("density", [True])
+@pytest.mark.mpi(1, 2)
+def test_a_mean_velocity_counts(comm, path, density, monkeypatch):
+    plain, _, columns = read(comm, path, lambda truth: truth.scales_at(2))
+    wind = np.array([3.0, 0.0, -1.0])
+    original = Trajectory.read
+
+    def windy(self, frame, column, *block):
+        return original(self, frame, column, *block) + (wind if column == "velocity" else 0)
+
+    monkeypatch.setattr(Trajectory, "read", windy)
+    blown, _, moved = read(comm, path, lambda truth: truth.scales_at(2))
+    assert blown.velocity == pytest.approx(rms(moved["velocity"][2])) and blown.velocity > 1.5 * plain.velocity
+    assert blown.acceleration == pytest.approx(plain.acceleration)
+
+
+@every_fluid
+@pytest.mark.parametrize("frame", [0, -1, FRAMES])
+@pytest.mark.mpi(1, 2)
+def test_a_frame_without_one_before_it_has_no_scales(comm, path, density, frame):
+    with pytest.raises(ValueError, match=f"frame {frame} of {FRAMES} has no frame before it"):
+        read(comm, path, lambda truth: truth.scales_at(frame))
+
+
+@every_fluid
+@pytest.mark.mpi(1, 2)
+def test_columns_are_those_that_are_stored(comm, path, density):
+    def ask(truth):
+        return truth.has_density, truth.particles(1), truth.particles_with_rates(1), truth.window(1, 2)
+
+    (has_density, particles, rates, window), times, stored = read(comm, path, ask)
+    assert has_density == density
+    names = {"position", "velocity"} | ({"density"} if density else set())
+    assert stored.keys() == names and particles.keys() == {"id"} | names
+    assert rates.keys() == {"id", "acceleration"} | names | ({"density_rate"} if density else set())
+    assert window.keys() == {"id"} | names | {f"{name}_later" for name in names}
+    ids = particles["id"]
+    assert comm.allreduce(len(ids)) == stored["velocity"].shape[1]
+    for name in names:
+        assert np.array_equal(particles[name], stored[name][1][ids])
+        assert np.array_equal(window[f"{name}_later"], np.stack([stored[name][2][ids], stored[name][3][ids]], axis=1))
+    for name, rate in {"velocity": "acceleration", "density": "density_rate"}.items():
+        if name in names:
+            change = (stored[name][2] - stored[name][0]) / (times[2] - times[0])
+            assert np.allclose(rates[rate], change[ids], rtol=1e-13, atol=0)

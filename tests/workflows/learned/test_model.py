@@ -1,0 +1,120 @@
+"""A model with the weights of a file: what is stored beside them, what is read, and what is refused."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+
+from eddies.io.hdf5 import ProductError
+from eddies.io.weights import load_weights, save_weights
+from eddies.particles.reference_scales import ReferenceScales
+from eddies.particles.terms.presets import PRESETS
+from eddies.scene.scene import Model, SceneError, load_scene
+from eddies.workflows.learned.description import describe, differences
+from eddies.workflows.learned.model import load_model, scene_model
+
+# Of the scene tiny: the filter is two spacings wide.
+SCALES = ReferenceScales(length=1.0471975511965976, spacing=0.5235987755982988, velocity=0.9, density_mean=1.0,
+                         density=0.02, acceleration=1.7, density_rate=0.05, sound_speed=20.0, viscosity=0.01)
+SMALL = "model.pairs.hidden=[4]"
+
+
+def with_terms(*terms):
+    return replace(load_scene("tiny"), model=Model(terms=terms))
+
+
+def saved(comm, directory, scene=None, change=lambda weights: weights):
+    """A model and the file of its weights, changed."""
+    scene = scene or load_scene("tiny", [SMALL])
+    model = scene_model(scene, SCALES).float()
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter += 0.1
+    weights = change({name: tensor.numpy() for name, tensor in model.state_dict().items()})
+    save_weights(comm, directory / "model.h5", "model", describe(scene, SCALES), weights, {})
+    return scene, model, directory / "model.h5"
+
+
+@pytest.mark.mpi(1, 2)
+def test_a_model_is_read_as_it_was_saved_in_its_precision(comm, tmp_path):
+    scene, model, path = saved(comm, tmp_path)
+    found = load_model(scene, comm, path, SCALES)
+    assert list(found.terms) == list(model.terms) == list(PRESETS["resolved + pairs"])
+    assert all(torch.equal(tensor, found.state_dict()[name]) and tensor.dtype == torch.float32
+               for name, tensor in model.state_dict().items())
+
+
+@pytest.mark.mpi(1)
+def test_it_is_made_for_the_scales_that_are_asked_for(comm, tmp_path):
+    """Those of the start of a rollout; the stored ones tell how wide the filter was in training."""
+    scene, _, path = saved(comm, tmp_path)
+    other = replace(SCALES, velocity=3.0, sound_speed=5.0)
+    found = load_model(scene, comm, path, other)
+    assert found.flow.scales == other and all(term.flow is found.flow for term in found.terms.values())
+    assert load_weights(comm, path, "model")[0]["scales"] == SCALES.to_dict()
+
+
+@pytest.mark.mpi(1)
+def test_a_model_without_parameters_is_read_too(comm, tmp_path):
+    scene, model, path = saved(comm, tmp_path, with_terms("pressure"))
+    assert not model.state_dict() and list(load_model(scene, comm, path, SCALES).terms) == ["pressure"]
+
+
+@pytest.mark.mpi(1, 2)
+@pytest.mark.parametrize("change", [
+    lambda weights: {**weights, "terms.damping.rates": weights["terms.damping.rates"][:3]},
+    lambda weights: {name.replace("factor", "strength"): tensor for name, tensor in weights.items()}],
+    ids=["another shape", "another name"])
+def test_weights_of_an_older_form_are_refused(comm, tmp_path, change):
+    scene, _, path = saved(comm, tmp_path, change=change)
+    with pytest.raises(ProductError, match="model.h5: its terms have other parameters now .*run `eddies train` again"):
+        load_model(scene, comm, path, SCALES)
+
+
+@pytest.mark.mpi(1, 2)
+def test_weights_of_another_scene_are_refused_with_the_key(comm, tmp_path):
+    _, _, path = saved(comm, tmp_path)
+    with pytest.raises(ProductError, match=r"model.h5: was trained with \[model.pairs\] hidden = \[4\], and the scene "
+                                           r"has \[5\]; run `eddies train` again, or set the key to that"):
+        load_model(load_scene("tiny", ["model.pairs.hidden=[5]"]), comm, path, SCALES)
+
+
+@pytest.mark.parametrize("preset", ["resolved + pairs", "resolved", "learned-density", "paper", "wcsph"])
+def test_a_description_is_json_and_differs_from_its_own_scene_in_nothing(preset):
+    scene = load_scene("tiny", [f"model.preset={preset}"])
+    stored = json.loads(json.dumps(describe(scene, SCALES)))
+    assert list(differences(scene, stored)) == []
+    assert list(stored["terms"]) == list(scene.model.terms)
+
+
+def test_no_key_of_a_term_s_settings_goes_unnoticed():
+    """A key that has come since, or that has gone, is a difference with its value."""
+    scene = load_scene("tiny", [SMALL])
+    stored = json.loads(json.dumps(describe(scene, SCALES)))
+    stored["terms"]["pairs"]["depth"] = 3
+    del stored["terms"]["pairs"]["symmetry"]
+    assert {key for key, *_ in differences(scene, stored)} == {"[model.pairs] depth", "[model.pairs] symmetry"}
+
+
+@pytest.mark.parametrize("body, message", [
+    ("class Mine(Term):\n    def __init__(self, settings): pass\n", "cannot be made: "),
+    ("class Mine(Term):\n    def __init__(self, settings, flow): self.factor = nn.Parameter(torch.ones(1))\n",
+     "cannot be made: AttributeError: cannot assign parameters before Module.__init__"),
+])
+def test_a_term_that_cannot_be_made_has_one_error(own, body, message):
+    own("own_terms", f"import torch\nfrom torch import nn\nfrom eddies import Term\n{body}")
+    scene = with_terms("pressure", "own_terms:Mine")
+    with pytest.raises(SceneError) as error:
+        scene_model(scene, SCALES)
+    assert str(error.value).startswith('[model] terms: term "own_terms:Mine": ') and message in str(error.value)
+
+
+def test_a_network_that_cannot_be_made_has_one_error(own):
+    own("own_networks", "from torch import nn\nclass mine(nn.Module):\n    def __init__(self, inputs): pass\n"
+                        "    def forward(self, features): pass\n")
+    message = "cannot be made with (inputs, hidden, outputs, seed): "
+    scene = load_scene("tiny", ["model.pairs.network=own_networks:mine"])
+    with pytest.raises(SceneError) as error:
+        scene_model(scene, SCALES)
+    assert 'network = "own_networks:mine"' in str(error.value) and message in str(error.value)

@@ -1,0 +1,116 @@
+"""Trained weights of another run: what is read, and which scenes are refused."""
+
+import json
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from eddies.io.hdf5 import ProductError
+from eddies.io.weights import save_weights
+from eddies.particles.reference_scales import ReferenceScales
+from eddies.scene.rules import quoted
+from eddies.scene.scene import Model, SceneError, load_scene
+from eddies.stages import check_inputs
+from eddies.workflows.learned.description import describe
+from eddies.workflows.learned.source import read_source
+
+# Of the scene tiny: filter width two spacings, whatever their number.
+SCALES = ReferenceScales(length=0.5, spacing=0.25, velocity=1.0, acceleration=2.0, density_mean=1.0, viscosity=0.01)
+OWN_TERM = """
+import eddies
+from pathlib import Path
+
+Path(__file__).with_name("imported").touch()
+
+class Drag(eddies.Term):
+    def forward(self, context):
+        return eddies.Rates(acceleration=-context.particles.velocity)
+"""
+
+
+def scene_with(path, *terms):
+    return replace(load_scene("tiny"), model=Model(terms=terms, path=str(path)))
+
+
+def scene(*overrides):
+    return load_scene("tiny", ["model.pairs.hidden=[8, 8]", *overrides])
+
+
+def described(*overrides):
+    return json.loads(json.dumps(describe(scene(*overrides), SCALES)))
+
+
+def write_source(comm, directory, description=None):
+    comm.Barrier()
+    save_weights(comm, directory / "model.h5", "model", description or described(), {"bias": np.arange(3.0)},
+                 {"mach_turbulent": 0.08}, {"a_priori": {"delay": np.arange(2.0)}})
+
+
+@pytest.mark.mpi(1, 2)
+def test_a_run_directory_or_its_file_gives_description_weights_and_tables(comm, tmp_path):
+    write_source(comm, tmp_path)
+    for path in (tmp_path, tmp_path / "model.h5"):
+        source = read_source(scene(f"model.path={path}"), comm)
+        assert source.path == tmp_path / "model.h5"
+        assert source.description == described() and source.provenance["mach_turbulent"] == 0.08
+        assert np.array_equal(source.weights["bias"], np.arange(3.0)) and set(source.tables) == {"a_priori"}
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("override, message", [
+    ("model.pairs.hidden=[8, 9]", "[model.pairs] hidden = [8, 9], but {} was trained with [8, 8]; set it to that"),
+    ("model.pairs.basis=paper", '[model.pairs] basis = "paper", but {} was trained with "corrected"'),
+    ('model.pairs.inputs=["distance"]', '[model.pairs] inputs = ["distance"], but {} was trained with ["density", '),
+    ("model.pairs.network=own_networks:Net", '[model.pairs] network = "own_networks:Net", but {} was trained with '
+                                             '"dense"'),
+    ("kernel.neighbors=50", "[kernel] neighbors = 50.0, but {} was trained with 56.0"),
+    ("tracers.filter_width=0.9", "[tracers] filter_width = 0.9, but {} was trained with 1.04719755"),
+])
+def test_another_form_is_refused_with_both_values(comm, tmp_path, own, override, message):
+    own("own_networks", "from torch import nn\nclass Net(nn.Module):\n    def forward(self, features): pass\n")
+    write_source(comm, tmp_path)
+    with pytest.raises(SceneError) as error:
+        read_source(scene(f"model.path={tmp_path}", override), comm)
+    assert message.format(tmp_path / "model.h5") in str(error.value)
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("terms", [("pressure", "pairs"),
+                                   ("pairs", "pressure", "stress", "damping", "relaxation")])
+def test_other_terms_are_refused_with_both_lists(comm, tmp_path, terms):
+    """Also in another order, in which sums are rounded otherwise."""
+    write_source(comm, tmp_path)
+    with pytest.raises(SceneError) as error:
+        read_source(scene_with(tmp_path, *terms), comm)
+    trained = '["pressure", "stress", "viscosity", "damping", "relaxation", "pairs"]'
+    expected = f"tiny: [model] terms = {quoted(terms)}, but {tmp_path}/model.h5 was trained with {trained}"
+    assert expected in str(error.value)
+
+
+@pytest.mark.mpi(1, 2)
+def test_missing_weights_are_refused_before_any_work_on_all_ranks(comm, tmp_path):
+    wanted = scene(f"model.path={tmp_path}")
+    with pytest.raises(ProductError, match=r"tiny: \[model\] path = .*model.h5: no such file; run `eddies train"):
+        check_inputs(wanted.stages, wanted, comm, tmp_path)
+    check_inputs(["dns"], wanted, comm, tmp_path)
+
+
+@pytest.mark.mpi(1, 2)
+def test_a_file_never_has_a_class_imported(comm, tmp_path, own):
+    """The scene that is run must name it again, and one error says so."""
+    if comm.rank == 0:
+        own("own_source", OWN_TERM)
+    comm.Barrier()
+    terms = {"pressure": {"force": True}, "own_source:Drag": {}}
+    write_source(comm, tmp_path, {"terms": terms, "scales": SCALES.to_dict(), "neighbors": 56.0})
+    with pytest.raises(SceneError) as error:
+        read_source(scene_with(tmp_path, "pressure"), comm)
+    assert (f'tiny: [model] terms = ["pressure"], but {tmp_path}/model.h5 was trained with ["pressure", '
+            '"own_source:Drag"]; set it to that') in str(error.value)
+    assert "own_source" not in sys.modules and not (tmp_path / "imported").exists()
+    comm.Barrier()
+    if comm.rank == 0:  # whose path leads to the module
+        assert scene_with(tmp_path, "pressure", "own_source:Drag").model.foreign == ("own_source:Drag",)
+        assert (tmp_path / "imported").exists()
