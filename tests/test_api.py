@@ -28,7 +28,7 @@ def test_every_name_is_there_and_explained(name):
     assert getattr(eddies, name).__doc__
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_a_flow_from_a_program(comm, tmp_path):
     scene = eddies.load_scene("abc", ["time.duration=0.1"])
     assert eddies.run(scene, output=tmp_path, comm=comm) == tmp_path

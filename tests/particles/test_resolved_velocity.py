@@ -126,7 +126,7 @@ def lagrangian(*words, side=SIDE):
     return of_terms(*terms, DensityReader(), flow=units(side))
 
 
-@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.mpi(2, 3)
 def test_the_same_on_any_number_of_ranks(comm):
     """At a fixed number of iterations to rounding, otherwise to what the solves leave."""
     for iterations, tolerance, allowed in ((12, None, 1e-12), (None, 1e-5, 1e-4)):
@@ -159,7 +159,7 @@ def test_a_particle_beyond_the_ghost_planes_is_refused_on_all_ranks(comm):
         dynamics_of(slab, lagrangian(), fixed_ranks=True).rates(replace(particles, position=far))
 
 
-@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.mpi(2)
 def test_gradient_of_density_and_force_against_central_differences(comm):
     """Through the solve, transforms and splines, in positions, velocities and parameters."""
     slab, particles, _ = in_known_flow(comm, 6, planes=12)
@@ -194,7 +194,7 @@ def test_gradient_of_density_and_force_against_central_differences(comm):
         assert (values[0] - values[1]) / 2e-3 == pytest.approx(gradient.sum(), rel=1e-5)
 
 
-@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.mpi(2)
 def test_gradient_of_the_band_energies_against_central_differences(comm):
     slab, particles, _ = in_known_flow(comm, 6, planes=12)
     resolution, random = resolution_on(slab, 6, 1e-12), np.random.default_rng(comm.rank)
@@ -255,7 +255,7 @@ def test_a_void_looks_the_same_from_every_frame_of_reference(comm):
     assert np.abs(by_frame).max() < 1e-13 * by_each
 
 
-@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.mpi(2)
 @pytest.mark.parametrize("words", [("pressure",), RESOLVED])
 def test_the_force_keeps_the_momentum_of_the_particles(comm, words):
     """The grid's own has a mean, as the particles do not sample it evenly."""

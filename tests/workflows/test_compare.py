@@ -14,7 +14,7 @@ from tests.workflows.synthetic_run import write_ground_truth
 SMALLER = ["flow.cells=16", "flow.viscosity=0.1", "spin_up.turnovers=0.3", "tracers.particles_per_side=8",
            "tracers.field_cells=12", "tracers.frame_interval=0.1", "tracers.field_every=1", "kernel.neighbors=30",
            "kernel.steps=4", "training.steps=6", "training.combined_steps=2", "training.batch=64",
-           "simulation.step=0.02", "simulation.frame_interval=0.2"]
+           "simulation.step=0.05", "simulation.frame_interval=0.2"]
 FILE = """
 title = "small"
 base = "base.toml"
@@ -26,7 +26,7 @@ set = ["training.frames=3"]
 name = "learned"
 [[variant]]
 name = "longer-steps"
-set = ["simulation.step=0.05"]
+set = ["simulation.step=0.1"]
 [[variant]]
 name = "no-force"
 set = ["simulation.method=none"]
@@ -108,7 +108,7 @@ def check_rows(rows):
         assert row["core_seconds"] == pytest.approx(2 * row["wall_seconds"])
     assert none["acceleration_error"] == 1 and none["training_seconds"] is None
     assert learned["training_seconds"] == longer["training_seconds"] > 0
-    assert (learned["time_step"], longer["time_step"]) == (pytest.approx(0.02), pytest.approx(0.05))
+    assert (learned["time_step"], longer["time_step"]) == (pytest.approx(0.05), pytest.approx(0.1))
 
 
 @pytest.mark.mpi(1, 2)

@@ -61,7 +61,7 @@ def product(comm, path):
     return tables
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_every_split_of_a_run_is_the_whole_run(comm, tmp_path, last, monkeypatch):
     monkeypatch.setattr("eddies.io.checkpoint.KEPT", 100)
     scene, whole = load_scene("tiny", SPLIT), tmp_path / "whole"

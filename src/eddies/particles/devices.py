@@ -7,7 +7,7 @@ import os
 import torch
 
 from eddies.parallel.node import node_rank
-from eddies.scene.scene import SceneError
+from eddies.scene.values import SceneError
 
 
 def prepare_torch(device: str, comm) -> torch.device:

@@ -281,7 +281,7 @@ def test_steps_are_as_short_as_the_resolved_velocity_needs(comm, tmp_path, monke
 
 
 @pytest.mark.usefixtures("undrawn")
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_a_rollout_that_goes_wrong_ends_there_and_keeps_its_frames(comm, tmp_path):
     simulate.run(with_method(untrained(comm, tmp_path), "learned", injection=1e6), comm, tmp_path)
     with open_product(comm, tmp_path / "rollout.h5", "rollout") as file:
