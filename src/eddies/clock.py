@@ -31,12 +31,12 @@ class Clock:
         """End here."""
         self.end = self.time
 
-    def state(self) -> dict[str, float]:
+    def state_dict(self) -> dict[str, float]:
         """All that a clock knows, for a checkpoint."""
         return {"time": self.time, "steps": self.steps, "end": self.end}
 
-    def restore(self, state: dict[str, float]) -> None:
-        """Go on from a `state`."""
+    def load_state_dict(self, state: dict[str, float]) -> None:
+        """Inverse of `state_dict`."""
         self.time, self.steps, self.end = state["time"], int(state["steps"]), state["end"]
 
     def tick(self, step: float) -> None:

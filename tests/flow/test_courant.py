@@ -17,7 +17,7 @@ def test_memory_of_the_step_goes_on_between_two_measurements(comm):
     limit, resumed, fresh = (CourantLimit(grid, 0.5, 1.0, every=8) for _ in range(3))
     step = limit(slow, clock)
     clock.steps = 3  # measured again at step 8 only, though the flow is faster by now
-    resumed.restore(limit.memory())
+    resumed.load_state_dict(limit.state_dict())
     assert resumed(fast, clock) == limit(fast, clock) == step > fresh(fast, clock)
     clock.steps = 8
     assert resumed(fast, clock) == fresh(fast, clock)

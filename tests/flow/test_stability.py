@@ -119,7 +119,7 @@ def test_a_watch_that_goes_on_remembers_the_energy_before(comm):
     fluid, state = compressible(comm)
     watch, resumed, fresh = watched(fluid), watched(fluid), watched(fluid)
     watch(state, 2 * state, 0.01, Clock())  # four times the energy, then four times that
-    resumed.restore(watch.memory())
+    resumed.load_state_dict(watch.state_dict())
     fresh(2 * state, 4 * state, 0.01, Clock())
     with pytest.raises(FlowDiverged, match="came in"):
         resumed(2 * state, 4 * state, 0.01, Clock())

@@ -34,7 +34,7 @@ def arrays(comm, step):
 def fill(comm, path, steps, fingerprint="settings"):
     directory = CheckpointDirectory(comm, path / "checkpoints", fingerprint)
     for step in steps:
-        directory.write(step, {"time": step / 3, "end": np.inf}, arrays(comm, step)[0])
+        directory.write(step, {"time": step / 3, "end": np.inf, **arrays(comm, step)[0]})
     return directory
 
 
@@ -42,7 +42,9 @@ def fill(comm, path, steps, fingerprint="settings"):
 def test_what_is_read_is_what_was_written(comm, tmp_path):
     saved = fill(comm, tmp_path, [200]).newest()
     _, modes, rows = arrays(comm, 200)
-    assert saved.description == {"time": 200 / 3, "end": np.inf} and saved.files == []
+    assert (saved["time"], saved["end"]) == (200 / 3, np.inf) and saved.files == []
+    assert set(saved) == {"time", "end", "modes", "position", "table", "nothing"} and len(saved) == 6
+    assert np.array_equal(saved["table"], arrays(comm, 200)[0]["table"])
     assert np.array_equal(saved.read("modes"), modes) and saved.read("modes").dtype == np.complex128
     assert np.array_equal(saved.read("modes", 2, 5, axis=2), modes[:, :, 2:5])
     assert np.array_equal(saved.read("position", 3, 4), rows[3:4])
@@ -120,12 +122,12 @@ def test_damage_is_found_and_the_checkpoint_before_is_used(comm, tmp_path, caplo
 @pytest.mark.mpi(1, 2)
 def test_damage_of_frames_is_found(comm, tmp_path, caplog):
     directory = CheckpointDirectory(comm, tmp_path / "checkpoints", "settings")
-    directory.write(1, {}, arrays(comm, 1)[0])
+    directory.write(1, arrays(comm, 1)[0])
     frames = directory.path / "frames-00000001.h5"
     if comm.rank == 0:
         frames.write_bytes(b"frames" * 1000)
     comm.Barrier()
-    directory.write(2, {}, arrays(comm, 2)[0], [frames.name])
+    directory.write(2, arrays(comm, 2)[0], [frames.name])
     assert directory.newest().files == [frames.name]
     comm.Barrier()
     if comm.rank == 0:
@@ -146,14 +148,14 @@ def test_a_full_disk_is_told_and_harms_nothing(comm, tmp_path, kilobytes):
         resource.setrlimit(resource.RLIMIT_FSIZE, (kilobytes * 1024, limits[1]))
     try:
         with pytest.raises(ProductError, match="step-00000002: cannot be written .*intact: once there is room"):
-            directory.write(2, {}, arrays(comm, 2)[0])
+            directory.write(2, arrays(comm, 2)[0])
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         signal.signal(signal.SIGXFSZ, before)
     comm.Barrier()
     assert [path.name for path in directory.path.iterdir()] == ["step-00000001"]
     assert directory.newest().content["step"] == 1
-    directory.write(2, {}, arrays(comm, 2)[0])
+    directory.write(2, arrays(comm, 2)[0])
     assert directory.newest().content["step"] == 2
 
 
@@ -167,7 +169,7 @@ directory = CheckpointDirectory(MPI.COMM_SELF, Path(sys.argv[1]), "settings")
 saved = directory.newest()
 first = saved.content["step"] + 1 if saved else 1
 for step in range(first, first + 10**6):
-    directory.write(step, {"step": step}, {"numbers": np.full(20000, float(step))})
+    directory.write(step, {"step": step, "numbers": np.full(20000, float(step))})
     print(step, flush=True)
 """
 

@@ -46,9 +46,9 @@ def test_a_training_restored_at_any_step_is_bitwise_the_one_never_stopped(comm):
         first = training_of(comm)
         for _ in range(split):
             first.step()
-        description, arrays = first.memory()
+        state = first.state_dict()
         second = training_of(comm)
-        second.restore(description, lambda name: arrays[name])
+        second.load_state_dict(state)
         again = numbers(finished(second))
         assert whole.keys() == again.keys()
         for name, values in whole.items():

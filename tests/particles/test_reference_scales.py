@@ -1,19 +1,11 @@
+from dataclasses import replace
+
 import pytest
 
-from eddies.particles.reference_scales import ReferenceScales
 from tests.particles.clouds import SCALES
-
-
-def test_scales_survive_a_dictionary():
-    assert ReferenceScales.from_dict(SCALES.to_dict()) == SCALES
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])
 def test_a_scale_that_cannot_divide_is_refused(value):
     with pytest.raises(ValueError, match="velocity"):
-        ReferenceScales.from_dict({**SCALES.to_dict(), "velocity": value})
-
-
-def test_missing_and_unknown_scales_are_refused():
-    with pytest.raises(ValueError, match="expected"):
-        ReferenceScales.from_dict({**SCALES.to_dict(), "mass": 1.0})
+        replace(SCALES, velocity=value)

@@ -29,13 +29,13 @@ class CourantLimit:
             self._bound = self.bound(state, clock)
         return min(ladder_step(self.largest, self._bound), clock.remaining)
 
-    def memory(self) -> dict[str, float]:
+    def state_dict(self) -> dict[str, float]:
         """What the next step depends on besides the flow, for a checkpoint."""
         return {"bound": self._bound}
 
-    def restore(self, memory: dict[str, float]) -> None:
-        """Go on with a `memory`."""
-        self._bound = memory["bound"]
+    def load_state_dict(self, state: dict[str, float]) -> None:
+        """Inverse of `state_dict`."""
+        self._bound = state["bound"]
 
     def bound(self, state: np.ndarray, clock: Clock) -> float:
         """The longest step that the Courant number allows now; FlowDiverged if the flow is not finite."""
@@ -56,11 +56,11 @@ class FixedStep:
         # A remainder within round-off of the step is the step: another size would need operators of its own.
         return self.step if clock.remaining > self.step * (1 - 1e-6) else clock.remaining
 
-    def memory(self) -> dict[str, float]:
+    def state_dict(self) -> dict[str, float]:
         """Nothing: the step is a setting."""
         return {}
 
-    def restore(self, memory: dict[str, float]) -> None:
+    def load_state_dict(self, state: dict[str, float]) -> None:
         """Nothing to remember."""
 
     def bound(self, state: np.ndarray, clock: Clock) -> float:

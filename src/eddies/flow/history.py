@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -71,15 +73,21 @@ class FlowHistory:
         """All rows as columns."""
         return {name: np.array([row[name] for row in self.rows]) for name in self.rows[0]}
 
-    def memory(self) -> dict[str, float]:
-        """What `rows` do not tell, for a checkpoint."""
-        return {"injected": self._injected, "dissipated": self._dissipated, "steps": self._steps}
+    def state_dict(self) -> dict[str, Any]:
+        """All that goes on, for a checkpoint: columns of `rows`, `spectra`, and the work done since the first."""
+        columns = self.columns()
+        return {"history": {"injected": self._injected, "dissipated": self._dissipated, "steps": self._steps,
+                            "columns": list(columns)},
+                "spectra_of_history": np.array(self.spectra),
+                **{f"history_{name}": values for name, values in columns.items()}}
 
-    def restore(self, columns: dict[str, np.ndarray], spectra: np.ndarray, memory: dict[str, float]) -> None:
-        """Go on from `columns`, `spectra` and `memory`."""
-        self.spectra = list(spectra)
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Inverse of `state_dict`."""
+        known = state["history"]
+        columns = {name: state[f"history_{name}"] for name in known["columns"]}
+        self.spectra = list(state["spectra_of_history"])
         self.rows = [dict(zip(columns, map(float, row))) for row in zip(*columns.values())]
-        self._injected, self._dissipated, self._steps = memory["injected"], memory["dissipated"], int(memory["steps"])
+        self._injected, self._dissipated, self._steps = known["injected"], known["dissipated"], int(known["steps"])
         self._wall = time.perf_counter()
 
     def describe(self) -> str:

@@ -153,10 +153,10 @@ class StabilityWatch:
         kmax_eta = self.history.rows[-1]["kmax_eta"] if self.history.rows else 0.0
         return advice(self.fluid, step_limits(self.fluid, self.stepper, step, speed), kmax_eta)
 
-    def memory(self) -> dict[str, float | None]:
+    def state_dict(self) -> dict[str, float | None]:
         """The most energy that there may be, for a checkpoint; None before the first step."""
         return {"ceiling": self._ceiling if math.isfinite(self._ceiling) else None}
 
-    def restore(self, memory: dict[str, float | None]) -> None:
-        """Go on with a `memory`."""
-        self._ceiling = math.inf if memory["ceiling"] is None else memory["ceiling"]
+    def load_state_dict(self, state: dict[str, float | None]) -> None:
+        """Inverse of `state_dict`."""
+        self._ceiling = math.inf if state["ceiling"] is None else state["ceiling"]

@@ -10,7 +10,7 @@ import json
 import logging
 import os
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -21,7 +21,7 @@ import numpy as np
 from mpi4py import MPI
 
 from eddies.io.contiguous import Block, lay_out, write_arrays
-from eddies.io.hdf5 import FORMAT, ProductError
+from eddies.io.hdf5 import ProductError
 from eddies.io.manifest import find_damage, hash_file, manifest_text, parse_manifest
 from eddies.parallel.broadcast import first_complaint, on_all_ranks, on_first_rank
 
@@ -29,11 +29,15 @@ log = logging.getLogger("eddies")
 
 KEPT = 3
 STATE, MANIFEST = "state.h5", "manifest.json"
+# The dataset of what is no array.
+PLAIN = "plain"
+# Of the layout of a checkpoint: others are not used.
+FORMAT = 3
 
 
 @dataclass(frozen=True)
-class Checkpoint:
-    """A checkpoint whose bytes have been found to be as written."""
+class Checkpoint(Mapping):
+    """A checkpoint whose bytes have been found to be as written: a state by name, as it was given to `write`."""
 
     path: Path
     content: Mapping[str, Any]
@@ -44,9 +48,19 @@ class Checkpoint:
         return list(self.content["files"])
 
     @cached_property
-    def description(self) -> dict[str, Any]:
-        """What was given to `write`."""
-        return json.loads(self.read("description").tobytes())
+    def _plain(self) -> dict[str, Any]:
+        """What is no array."""
+        return json.loads(self.read(PLAIN).tobytes())
+
+    def __getitem__(self, name: str) -> Any:
+        return self._plain[name] if name in self._plain else self.read(name)
+
+    def __iter__(self) -> Iterator[str]:
+        with h5py.File(self.path / STATE, "r") as file:
+            yield from [*self._plain, *(name for name in file if name != PLAIN)]
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
 
     def read(self, name: str, start: int = 0, stop: int | None = None, axis: int = 0) -> np.ndarray:
         """Rows start to stop of an array along an axis; every rank reads what it needs."""
@@ -60,19 +74,20 @@ class CheckpointDirectory:
     def __init__(self, comm: MPI.Comm, path: Path, fingerprint: str) -> None:
         self.comm, self.path, self.fingerprint = comm, path, fingerprint
 
-    def write(self, step: int, description: Mapping[str, Any], arrays: Mapping[str, np.ndarray | Block],
-              files: Sequence[str] = ()) -> None:
-        """Add a checkpoint, and keep the newest few.
+    def write(self, step: int, state: Mapping[str, Any], files: Sequence[str] = ()) -> None:
+        """Add a checkpoint of a state, and keep the newest few.
 
-        `description` (JSON-able) and plain arrays are equal on all ranks. `files` are names of closed files in this
-        directory that belong to the checkpoint.
+        The state holds, by name, arrays, blocks of arrays that are shared by the ranks, and what JSON can hold; all but
+        the blocks are equal on all ranks. `files` are names of closed files in this directory that belong to it.
 
         Raises ProductError if it cannot be written, as on a full disk; those before it are intact.
         """
         final, partial = self.path / _name(step), self.path / f"{_name(step)}.partial"
         if self._exists(final):
             return
-        arrays = {"description": np.frombuffer(json.dumps(description).encode(), np.uint8), **arrays}
+        arrays = {name: part for name, part in state.items() if isinstance(part, np.ndarray | Block)}
+        plain = {name: part for name, part in state.items() if name not in arrays}
+        arrays = {PLAIN: np.frombuffer(json.dumps(plain).encode(), np.uint8), **arrays}
         try:
             on_first_rank(self.comm, lambda: _make_empty(partial))
             regions = on_first_rank(self.comm, lambda: lay_out(partial / STATE, arrays))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from typing import Any
 
 import numpy as np
 import torch
@@ -52,19 +53,18 @@ class Descent:
         self.taken += 1
         return norm
 
-    def memory(self) -> dict[str, np.ndarray]:
-        """What `restore` needs besides the parameters: Adam's running means, by name; the same on all ranks."""
-        if self.taken == 0:
-            return {}
-        return {f"{name}_{number}": mean.cpu().numpy() for name, means in self._moments.items()
-                for number, mean in enumerate(means)}
+    def state_dict(self) -> dict[str, int | np.ndarray]:
+        """What there is besides the parameters: the steps taken, and Adam's running means; the same on all ranks."""
+        means = {f"{name}_{number}": np.atleast_1d(mean.cpu().numpy()) for name, means in self._moments.items()
+                 for number, mean in enumerate(means)}
+        return {"taken": self.taken, **means}
 
-    def restore(self, taken: int, memory: Mapping[str, np.ndarray]) -> None:
-        """Go on after `taken` steps, with the parameters and the memory of then."""
-        self.taken = taken
-        for name, means in self._moments.items() if taken else ():
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Inverse of `state_dict`, with the parameters of then."""
+        self.taken = state["taken"]
+        for name, means in self._moments.items():
             for number, mean in enumerate(means):
-                mean.copy_(torch.from_numpy(memory[f"{name}_{number}"]).reshape(mean.shape))
+                mean.copy_(torch.from_numpy(state[f"{name}_{number}"]).reshape(mean.shape))
 
     def _steps(self) -> list[Tensor]:
         """The number of steps taken, as `adam` wants it: by parameter, and to be counted up there."""

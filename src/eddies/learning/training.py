@@ -116,25 +116,25 @@ class Training:
         names = sorted({name for row in self.history for name in row})
         return {name: np.array([row.get(name, np.nan) for row in self.history]) for name in names}
 
-    def memory(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-        """What `restore` needs: a description and arrays."""
-        columns = self.columns()
-        description = {"number": self.number, "taken": self.descent.taken, "best_error": self.best_error,
-                       "unimproved": self.unimproved, "columns": list(columns), "moments": list(self.descent.memory())}
-        return description, {**_named("model", self._weights()), **_named("best", self.best),
-                             **_named("history", columns), **_named("descent", self.descent.memory())}
+    def state_dict(self) -> dict[str, Any]:
+        """All that goes on, for a checkpoint: numbers and arrays by name."""
+        parts = {"model": self._weights(), "best": self.best, "history": self.columns(),
+                 "descent": self.descent.state_dict()}
+        return {"number": self.number, "best_error": self.best_error, "unimproved": self.unimproved,
+                "names": {part: list(values) for part, values in parts.items()},
+                **{f"{part} {name}": value if isinstance(value, int) else np.atleast_1d(value)
+                   for part, values in parts.items() for name, value in values.items()}}
 
-    def restore(self, known: Mapping[str, Any], read: Callable[[str], np.ndarray]) -> None:
-        """Go on from a memory: its description, and what gives an array of it by name."""
-        names = list(self._weights())
-        self._load({name: read(f"model {name}") for name in names})
-        self._begin(known["number"])
-        self.best = {name: read(f"best {name}") for name in names}
-        self.best_error, self.unimproved = known["best_error"], known["unimproved"]
-        self.descent.restore(known["taken"], {name: read(f"descent {name}") for name in known["moments"]})
-        columns = {name: read(f"history {name}") for name in known["columns"]}
-        rows = zip(*columns.values())
-        self.history = [{name: float(value) for name, value in zip(columns, row) if value == value} for row in rows]
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Inverse of `state_dict`."""
+        parts = {part: {name: state[f"{part} {name}"] for name in names} for part, names in state["names"].items()}
+        self._load(parts["model"])
+        self._begin(state["number"])
+        self.best, self.best_error, self.unimproved = parts["best"], state["best_error"], state["unimproved"]
+        self.descent.load_state_dict(parts["descent"])
+        rows = zip(*parts["history"].values())
+        self.history = [{name: float(value) for name, value in zip(parts["history"], row) if value == value}
+                        for row in rows]
         self._seconds_before = self.history[-1]["seconds"] if self.history else 0.0
 
     def _validate(self) -> float:
@@ -156,8 +156,3 @@ class Training:
         shapes = {name: tensor.shape for name, tensor in self.model.state_dict().items()}
         self.model.load_state_dict({name: torch.from_numpy(np.asarray(array)).reshape(shapes[name])
                                     for name, array in weights.items()})
-
-
-def _named(prefix: str, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Arrays as a checkpoint takes them: single numbers as rows of one."""
-    return {f"{prefix} {name}": np.atleast_1d(array) for name, array in arrays.items()}

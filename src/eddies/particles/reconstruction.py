@@ -72,21 +72,14 @@ def reconstruct_on_grid(
     return (sums[1:] * _reciprocal(sums[0])).T
 
 
-def reconstruct_gradient(
-    kernel: SmoothingKernel, pairs: Pairs, sender_volumes: Tensor, sender_values: Tensor
-) -> Tensor:
-    """Gradient of `reconstruct`: (count, components, 3), the last axis the direction of the derivative.
-
-    It is sum_j V_j (A_j - <A>) grad W(x - x_j) / sum_j V_j W, the asymmetric finite-particle form, and
-    exactly the derivative of the reconstructed field. Arguments as there.
-    """
-    return reconstruct_with_gradient(kernel, pairs, sender_volumes, sender_values)[1]
-
-
 def reconstruct_with_gradient(
     kernel: SmoothingKernel, pairs: Pairs, sender_volumes: Tensor, sender_values: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """`reconstruct` and `reconstruct_gradient` at the cost of the second."""
+    """`reconstruct`, and its gradient (count, components, 3), the last axis the direction of the derivative.
+
+    The gradient is sum_j V_j (A_j - <A>) grad W(x - x_j) / sum_j V_j W, the asymmetric finite-particle form, and
+    exactly the derivative of the reconstructed field. Arguments as there.
+    """
     volume, value, distance = pairs.at_senders(sender_volumes), pairs.at_senders(sender_values).T, pairs.distance
     average, reciprocal = _average(kernel, pairs, volume, value)
     # Both the slope and the direction vanish with the distance.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 
 # The highest wavenumber that particles resolve: in units of their Nyquist wavenumber; in units of 1/eta, where
 # turbulence ends; and the least that the filter may leave of a mode, as it is undone. Measured in docs/closure.md.
@@ -59,14 +59,6 @@ class ReferenceScales:
     def to_dict(self) -> dict[str, float | None]:
         """The scales by name, ready for JSON."""
         return {name: None if value is None else float(value) for name, value in asdict(self).items()}
-
-    @classmethod
-    def from_dict(cls, scales: dict[str, float | None]) -> ReferenceScales:
-        """Inverse of `to_dict`; raises ValueError when a scale is missing or unknown."""
-        expected = {field.name for field in fields(cls)}
-        if set(scales) != expected:
-            raise ValueError(f"reference scales {sorted(scales)}: expected {sorted(expected)}")
-        return cls(**scales)
 
 
 def resolved_wavenumber(spacing: float, filter_width: float, kolmogorov_length: float) -> float:

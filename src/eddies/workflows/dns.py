@@ -48,11 +48,10 @@ def run(scene: Scene, comm, directory: str | Path, stop: StopRequest | None = No
     with create_product(comm, directory / "ground_truth.h5", "ground_truth", scene.provenance("dns")) as file:
         if saved is None:
             flow.history.sample(flow.state, flow.clock)
-        in_tracers = saved is not None and "tracers" in saved.description
-        if scene.spin_up is not None and flow.clock.end == np.inf:
+        if flow.phase == "spin-up":
             spin_up(scene.spin_up.turnovers, flow)
         if scene.tracers is not None:
-            follow_tracers(scene, file, flow, saved if in_tracers else None)
+            follow_tracers(scene, file, flow, saved if flow.phase == "tracers" else None)
         else:
             run_for(scene.time.duration, flow)
             write_final_fields(file, flow)
@@ -71,9 +70,9 @@ def build_run(scene: Scene, comm, guard: Guard, saved: Checkpoint | None) -> Flo
     fluid = build_fluid(scene, comm)
     state = initial_state(scene, fluid) if saved is None else None
     flow = FlowRun(fluid, state, STEPPERS[scene.time.stepper](fluid), build_step_limit(scene, fluid.grid),
-                   FlowHistory(fluid), guard)
+                   FlowHistory(fluid), guard, "start" if scene.spin_up is None else "spin-up")
     if saved is not None:
-        flow.restore(saved)
+        flow.load_state_dict(saved)
         log.info("dns: goes on from step %d, time %.4g", flow.clock.steps, flow.clock.time)
     return flow
 
@@ -81,8 +80,8 @@ def build_run(scene: Scene, comm, guard: Guard, saved: Checkpoint | None) -> Flo
 def run_for(duration: float, flow: FlowRun) -> None:
     """Run the flow for a time after its start or spin-up."""
     clock, progress = flow.clock, ProgressLine("dns", flow.history.describe)
-    if clock.end == np.inf:
-        clock.end = clock.time + duration
+    if flow.phase == "start":
+        clock.end, flow.phase = clock.time + duration, "run"
     start = clock.end - duration
     flow.advance([flow.history, lambda _, clock: progress((clock.time - start) / duration, clock.steps)])
 
@@ -98,7 +97,7 @@ def spin_up(turnovers: float, flow: FlowRun) -> None:
             clock.stop()
 
     flow.advance([history, until_turned_over])
-    flow.clock.end = np.inf  # known in the phases that follow only
+    flow.clock.end, flow.phase = np.inf, "start"  # the end is known in the phases that follow
     history.sample(flow.state, flow.clock)
     log.info("spin-up  done  %s", history.describe())
 
@@ -115,7 +114,7 @@ def follow_tracers(scene: Scene, file, flow: FlowRun, saved: Checkpoint | None) 
     """Release tracers into the flow, forcing off, and store their frames, the filtered fields and the scales."""
     comm, names = flow.fluid.grid.decomposition.comm, saved.files if saved is not None else ()
     with FrameSegments(comm, flow.guard.checkpoints.path, scene.tracers, flow.fluid.compressible, names) as segments:
-        run = flow.guard.tracers = TracerRun(scene, flow, segments, saved)
+        run = TracerRun(scene, flow, segments, saved)
         run.follow()
         segments.assemble(file)
     write_attributes(file.create_group("reference"), {

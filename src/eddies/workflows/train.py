@@ -78,7 +78,7 @@ def take_all_steps(training: Training, checkpoints: CheckpointDirectory, stop: S
     """
     saved = checkpoints.newest()
     if saved is not None:
-        training.restore(saved.description, saved.read)
+        training.load_state_dict(saved)
         log.info("train: goes on from step %d", len(training.history))
 
     def describe() -> str:
@@ -90,7 +90,7 @@ def take_all_steps(training: Training, checkpoints: CheckpointDirectory, stop: S
     while training.running:
         stopping = stop()
         if stop.checkpoint_due:
-            checkpoints.write(len(training.history), *training.memory())
+            checkpoints.write(len(training.history), training.state_dict())
             stop.checkpoint_done()
         if stopping:
             raise Stopped(stop.reason, f"from step {len(training.history)} of the training")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,12 +18,17 @@ from eddies.io.checkpoint import Checkpoint, CheckpointDirectory
 from eddies.io.contiguous import Block
 from eddies.parallel.stop import Stopped, StopRequest
 
+if TYPE_CHECKING:
+    from eddies.workflows.ground_truth.tracer_run import TracerRun
+
 
 @dataclass
 class FlowRun:
     """A fluid with its state, the steps that it takes, its clock and its history.
 
-    `guard` looks on before each step; after it `watch` ends a run that became unstable.
+    `guard` looks on before each step; after it `watch` ends a run that became unstable. `phase` is where it is on its
+    way: in the "spin-up", at the "start" of what follows, in the "run" of a given time, or with "tracers", which then
+    are those that follow it.
     """
 
     fluid: Fluid
@@ -31,7 +36,9 @@ class FlowRun:
     stepper: Callable[[np.ndarray, float], np.ndarray]
     step_limit: CourantLimit | FixedStep
     history: FlowHistory
-    guard: Callable[[FlowRun], None]
+    guard: Guard
+    phase: str = "start"
+    tracers: TracerRun | None = None
     clock: Clock = field(default_factory=Clock)
     watch: StabilityWatch = field(init=False)
 
@@ -54,37 +61,31 @@ class FlowRun:
             for observer in observers:
                 observer(self.state, self.clock)
 
-    def restore(self, saved: Checkpoint) -> None:
-        """Go on from a checkpoint, made on any number of ranks."""
-        grid, known = self.fluid.grid, saved.description
-        starts, rank = grid.column_starts, grid.decomposition.rank
-        self.state = saved.read("modes", starts[rank], starts[rank + 1], axis=2)
-        self.clock.restore(known["clock"])
-        self.step_limit.restore(known["step_limit"])
-        self.watch.restore(known["watch"])
-        columns = {name: saved.read(f"history_{name}") for name in known["history_columns"]}
-        self.history.restore(columns, saved.read("spectra_of_history"), known["history"])
-
-    def memory(self) -> tuple[dict[str, Any], dict[str, np.ndarray | Block]]:
-        """What `restore` needs: a description and arrays."""
+    def state_dict(self) -> dict[str, Any]:
+        """All that goes on, for a checkpoint; with that of the tracers, if there are any."""
         grid = self.fluid.grid
-        columns = self.history.columns()
-        arrays = {"modes": Block(self.state, int(grid.column_starts[grid.decomposition.rank]), grid.modes, axis=2),
-                  "spectra_of_history": np.array(self.history.spectra),
-                  **{f"history_{name}": values for name, values in columns.items()}}
-        return {"clock": self.clock.state(), "step_limit": self.step_limit.memory(), "watch": self.watch.memory(),
-                "history": self.history.memory(), "history_columns": list(columns)}, arrays
+        modes = Block(self.state, int(grid.column_starts[grid.decomposition.rank]), grid.modes, axis=2)
+        return {"phase": self.phase, "modes": modes, "clock": self.clock.state_dict(),
+                "step_limit": self.step_limit.state_dict(), "watch": self.watch.state_dict(),
+                **self.history.state_dict(), **(self.tracers.state_dict() if self.tracers else {})}
+
+    def load_state_dict(self, saved: Checkpoint) -> None:
+        """Go on from a checkpoint, made on any number of ranks; tracers take what is theirs themselves."""
+        grid = self.fluid.grid
+        starts, rank = grid.column_starts, grid.decomposition.rank
+        self.phase, self.state = saved["phase"], saved.read("modes", starts[rank], starts[rank + 1], axis=2)
+        self.clock.load_state_dict(saved["clock"])
+        self.step_limit.load_state_dict(saved["step_limit"])
+        self.watch.load_state_dict(saved["watch"])
+        self.history.load_state_dict(saved)
 
 
 class Guard:
-    """Writes checkpoints of a run when they are due, and ends it when it is asked to.
-
-    `tracers`, as soon as there are any, adds what it knows.
-    """
+    """Writes checkpoints of a run when they are due, and ends it when it is asked to."""
 
     def __init__(self, comm, directory: Path, fingerprint: str, stop: StopRequest) -> None:
         self.checkpoints = CheckpointDirectory(comm, directory, fingerprint)
-        self.stop, self.tracers = stop, None
+        self.stop = stop
 
     def __call__(self, run: FlowRun) -> None:
         """Look whether something is due; raises Stopped once the checkpoint is safe."""
@@ -97,9 +98,8 @@ class Guard:
 
     def save(self, run: FlowRun) -> None:
         """Write a checkpoint of now."""
-        description, arrays = run.memory()
         files: list[str] = []
-        if self.tracers is not None:
-            known, more, files = self.tracers.memory()
-            description, arrays = {**description, "tracers": known}, {**arrays, **more}
-        self.checkpoints.write(run.clock.steps, description, arrays, files)
+        if run.tracers is not None:
+            run.tracers.segments.close()
+            files = run.tracers.segments.names
+        self.checkpoints.write(run.clock.steps, run.state_dict(), files)

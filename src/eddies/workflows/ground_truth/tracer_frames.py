@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 
 from eddies.clock import Clock
 from eddies.flow.statistics import energy_spectrum
 from eddies.flow.tracers import TracerParticles
-from eddies.io.checkpoint import Checkpoint
 from eddies.io.hdf5 import write_table
 from eddies.parallel.migration import IdOrder
 from eddies.parallel.slab import SlabDecomposition
@@ -46,14 +48,14 @@ class TracerFrames:
             self._store_fields(state, time)
         self._frames += 1
 
-    def memory(self) -> tuple[dict[str, int], dict[str, np.ndarray]]:
-        """What the rest of the run needs to know of the frames so far, for a checkpoint: numbers and arrays."""
-        return {"frames": self._frames}, {f"spectra_{name}": np.array(rows) for name, rows in self._spectra.items()}
+    def state_dict(self) -> dict[str, int | np.ndarray]:
+        """What the rest of the run needs to know of the frames so far, for a checkpoint."""
+        return {"frames": self._frames, **{f"spectra_{name}": np.array(rows) for name, rows in self._spectra.items()}}
 
-    def restore(self, numbers: dict[str, int], saved: Checkpoint) -> None:
-        """Go on from a `memory`, the arrays of which lie in a checkpoint."""
-        self._frames = numbers["frames"]
-        self._spectra = {name: list(saved.read(f"spectra_{name}")) for name in self._spectra}
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Inverse of `state_dict`."""
+        self._frames = state["frames"]
+        self._spectra = {name: list(state[f"spectra_{name}"]) for name in self._spectra}
 
     def write_spectra(self, file) -> None:
         """Write the table of DNS and filtered energy spectra."""

@@ -28,7 +28,7 @@ class TracerRun:
 
     def __init__(self, scene: Scene, flow: FlowRun, segments: FrameSegments, saved: Checkpoint | None) -> None:
         self.scene, self.flow, self.segments, self.settings = scene, flow, segments, scene.tracers
-        flow.fluid.forcing = None
+        flow.fluid.forcing, flow.phase, flow.tracers = None, "tracers", self
         compressible = flow.fluid.compressible
         field = FilteredField(flow.fluid.grid, self.settings.width, self.settings.interpolation)
         self.comm = flow.fluid.grid.decomposition.comm
@@ -41,12 +41,11 @@ class TracerRun:
             self.frames = TracerFrames(segments, self.tracers, self.settings, self.released_at, compressible)
             self.frames.store(flow.state, flow.clock)
         else:
-            known = saved.description["tracers"]
-            self.released, self.released_at = known["released"], known["released_at"]
-            self.interval, self.step, self.first_step = known["interval"], known["step"], known["first_step"]
+            self.released, self.released_at = saved["released"], saved["released_at"]
+            self.interval, self.step, self.first_step = saved["interval"], saved["step"], saved["first_step"]
             self.tracers = TracerParticles(field, self._saved_columns(saved), flow.state)
             self.frames = TracerFrames(segments, self.tracers, self.settings, self.released_at, compressible)
-            self.frames.restore(known["frames"], saved)
+            self.frames.load_state_dict(saved)
 
     @property
     def intervals(self) -> int:
@@ -73,15 +72,13 @@ class TracerRun:
                 "length": self.settings.width, "spacing": self.settings.spacing, "density_mean": MEAN_DENSITY,
                 **self.segments.release_scales()}
 
-    def memory(self) -> tuple[dict[str, Any], dict[str, np.ndarray | Block], list[str]]:
-        """What a checkpoint keeps: a description, arrays, and the files with the frames so far, which are closed."""
-        self.segments.close()
-        numbers, arrays = self.frames.memory()
+    def state_dict(self) -> dict[str, Any]:
+        """What a checkpoint keeps beside the flow and the files of `segments`."""
         order = IdOrder(self.comm, self.tracers.columns["id"], self.settings.particles)
-        arrays |= {name: Block(order.apply(self.tracers.columns[name]), order.start, self.settings.particles)
+        columns = {name: Block(order.apply(self.tracers.columns[name]), order.start, self.settings.particles)
                    for name in ("position", "velocity")}
         return {"released": self.released, "released_at": self.released_at, "interval": self.interval,
-                "step": self.step, "first_step": self.first_step, "frames": numbers}, arrays, self.segments.names
+                "step": self.step, "first_step": self.first_step, **self.frames.state_dict(), **columns}
 
     def _longest_step(self) -> float:
         interval = self.settings.frame_interval
