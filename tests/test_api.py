@@ -66,7 +66,7 @@ def test_a_scene_that_a_program_makes_and_names_a_run_directory(comm, tmp_path, 
 
 
 def test_an_error_that_one_rank_meets_ends_the_job(tmp_path):
-    from test_cli import start
+    from tests.test_cli import start
     program = tmp_path / "program.py"
     program.write_text("import eddies, eddies.api\nfrom mpi4py import MPI\n"
                        "def fail(scene, comm):\n    if comm.rank == 1:\n        raise RuntimeError('lost')\n"

@@ -39,7 +39,7 @@ def last(monkeypatch):
 
 def fingerprint(last):
     """SHA-256 of state, clock, history, and tracers by id; of this rank's part."""
-    run, tracers = last.run, last.guard.tracers.tracers.columns
+    run, tracers = last.run, last.run.tracers.tracers.columns
     order = np.argsort(tracers["id"])
     rows = [[value for name, value in sorted(row.items()) if name != "seconds_per_step"] for row in run.history.rows]
     digest = hashlib.sha256(run.state.tobytes())
