@@ -14,20 +14,25 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from eddies.logs import configure_logging
 from eddies.scene.scene import Scene, load_scene
 
+if TYPE_CHECKING:
+    from eddies.parallel.communicator import Comm
+
 CHECKPOINT_SECONDS = 600.0
 
 
-def check(scene: Scene | str | Path, *, comm=None) -> None:
+def check(scene: Scene | str | Path, *, comm: Comm | None = None) -> None:
     """Log what a scene amounts to: resolution, memory, ranks and time. Writes nothing."""
     with _job(comm) as comm:
         import_module("eddies.workflows.check").run(_scene(scene), comm)
 
 
-def run(scene: Scene | str | Path, *, output: str | Path | None = None, resume: bool = False, comm=None) -> Path:
+def run(scene: Scene | str | Path, *, output: str | Path | None = None, resume: bool = False,
+        comm: Comm | None = None) -> Path:
     """Run every stage of a scene, in order, and its report; returns the run directory, `output` or runs/NAME.
 
     With `resume`, stages whose product is complete and was made with the same settings are skipped.
@@ -37,12 +42,14 @@ def run(scene: Scene | str | Path, *, output: str | Path | None = None, resume: 
     return _run(scene, None, output, resume, comm)
 
 
-def train(scene: Scene | str | Path, *, output: str | Path | None = None, resume: bool = False, comm=None) -> Path:
+def train(scene: Scene | str | Path, *, output: str | Path | None = None, resume: bool = False,
+          comm: Comm | None = None) -> Path:
     """Train the model of a scene, on the ground truth and with the kernel of the run directory, which it returns."""
     return _run(scene, ("train",), output, resume, comm)
 
 
-def simulate(scene: Scene | str | Path, *, output: str | Path | None = None, resume: bool = False, comm=None) -> Path:
+def simulate(scene: Scene | str | Path, *, output: str | Path | None = None, resume: bool = False,
+             comm: Comm | None = None) -> Path:
     """Let the particles of a scene go, from its ground truth, with its trained model if its method needs one; returns
     the run directory, with the new rollout.h5."""
     return _run(scene, ("simulate",), output, resume, comm)
@@ -53,7 +60,7 @@ def _scene(scene: Scene | str | Path) -> Scene:
 
 
 def _run(scene: Scene | str | Path, stages: Sequence[str] | None, output: str | Path | None, resume: bool,
-         comm) -> Path:
+         comm: Comm | None) -> Path:
     with _job(comm) as comm:
         scene = _scene(scene)
         directory = Path(output) if output is not None else Path("runs") / scene.name
@@ -65,7 +72,7 @@ def _run(scene: Scene | str | Path, stages: Sequence[str] | None, output: str | 
 
 
 @contextmanager
-def _job(comm) -> Iterator:
+def _job(comm: Comm | None) -> Iterator[Comm]:
     """The communicator of a job, all ranks if None; log lines go to standard output unless the program sends them
     elsewhere, and an error that not all ranks meet ends the job, as the others may wait for ever."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # else torch takes a thread for every core, in every rank

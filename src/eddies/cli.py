@@ -3,6 +3,8 @@
 This is where the communicator of the job enters; everything below gets it as an argument.
 """
 
+from __future__ import annotations
+
 import argparse
 import contextlib
 import math
@@ -12,12 +14,16 @@ import sys
 import traceback
 from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import eddies
 from eddies.errors import UserError
 from eddies.logs import configure_logging
 from eddies.pipeline import STAGES
 from eddies.scene.scene import SceneError, builtin_scenes, load_scene
+
+if TYPE_CHECKING:
+    from eddies.parallel.communicator import Comm
 
 BAD_INPUT = 2
 STOPPED = 75  # EX_TEMPFAIL: the same command with --resume goes on
@@ -78,7 +84,7 @@ def release_signals(received: list[int]) -> None:
         signal.raise_signal(number)
 
 
-def end_with_error(error: Exception, comm) -> int:
+def end_with_error(error: Exception, comm: Comm) -> int:
     """Report an error once and end on all ranks, even those that do not know of it; returns the exit code.
 
     A mistake in the input is met by all ranks: rank 0 says so in a line. An error that stays on some ranks,
@@ -176,7 +182,7 @@ def add_job_options(parser: argparse.ArgumentParser, output: str, resume: str) -
                         help="stop after M minutes of wall time, with exit code 75, to be resumed")
 
 
-def run_command(options: argparse.Namespace, comm, signals: list[int]) -> None:
+def run_command(options: argparse.Namespace, comm: Comm, signals: list[int]) -> None:
     """One stage of a scene, or all that it has, until a signal, a file STOP or the limit of wall time ends it."""
     from eddies.parallel.stop import StopRequest
     from eddies.stages import run_stages
@@ -188,14 +194,14 @@ def run_command(options: argparse.Namespace, comm, signals: list[int]) -> None:
     run_stages(stages, scene, comm, directory, options.resume, stop)
 
 
-def report_command(options: argparse.Namespace, comm) -> None:
+def report_command(options: argparse.Namespace, comm: Comm) -> None:
     """The report of a run directory."""
     if not options.run.is_dir():
         raise SceneError(f"{options.run}: no such directory; give a run directory, such as runs/tiny")
     import_module("eddies.workflows.report").run(options.run, comm)
 
 
-def compare_command(options: argparse.Namespace, comm, signals: list[int]) -> None:
+def compare_command(options: argparse.Namespace, comm: Comm, signals: list[int]) -> None:
     """Variants of a scene, one after the other, until a signal, a file STOP or the limit of wall time ends it."""
     from eddies.parallel.stop import StopRequest
     from eddies.scene.comparison import load_comparison
@@ -211,19 +217,19 @@ def compare_command(options: argparse.Namespace, comm, signals: list[int]) -> No
         lambda stages, scene, where: run_stages(stages, scene, comm, where, True, stop))
 
 
-def export_command(options: argparse.Namespace, comm) -> None:
+def export_command(options: argparse.Namespace, comm: Comm) -> None:
     """The fields and particles of a run directory in another format."""
     output = options.output or options.run / options.format
     import_module("eddies.workflows.export").run(options.run, output, comm)
 
 
-def check_command(options: argparse.Namespace, comm) -> None:
+def check_command(options: argparse.Namespace, comm: Comm) -> None:
     """Derived numbers and estimates of a scene."""
     scene = load_scene(options.scene, options.overrides)
     import_module("eddies.workflows.check").run(scene, comm)
 
 
-def scenes_command(options: argparse.Namespace, comm) -> None:
+def scenes_command(options: argparse.Namespace, comm: Comm) -> None:
     """The built-in scenes, or one scene in full."""
     if options.scene:
         text = load_scene(options.scene).to_toml()

@@ -1,5 +1,7 @@
 """Runs the stages of a scene in a run directory, skips what is done, and keeps how long each took."""
 
+from __future__ import annotations
+
 import json
 import logging
 import os
@@ -12,6 +14,7 @@ from eddies.clock import duration
 from eddies.io.checkpoint import CheckpointDirectory
 from eddies.io.hdf5 import open_product, product_fingerprint
 from eddies.parallel.broadcast import on_first_rank
+from eddies.parallel.communicator import Comm
 from eddies.parallel.stop import StopRequest
 from eddies.pipeline import STAGES, Stage, after
 from eddies.scene.scene import Scene, SceneError
@@ -21,7 +24,7 @@ from eddies.workflows.learned.source import read_source
 log = logging.getLogger("eddies")
 
 
-def run_stages(stages: Sequence[str], scene: Scene, comm, directory: Path, resume: bool,
+def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path, resume: bool,
                stop: StopRequest) -> None:
     """Run stages of a scene, all ranks together, and record the wall time of each in stage_seconds.json.
 
@@ -60,31 +63,31 @@ def run_stages(stages: Sequence[str], scene: Scene, comm, directory: Path, resum
         record_seconds(stage.name, time.perf_counter() - start, comm, directory)
 
 
-def remove_checkpoints(stage: Stage, comm, directory: Path) -> None:
+def remove_checkpoints(stage: Stage, comm: Comm, directory: Path) -> None:
     """Remove the checkpoints of a stage, if it makes any."""
     if stage.checkpoints is not None:
         CheckpointDirectory(comm, directory / stage.checkpoints, "").remove()
 
 
-def check_ranks(stages: Sequence[str], scene: Scene, comm) -> None:
+def check_ranks(stages: Sequence[str], scene: Scene, comm: Comm) -> None:
     """Refuse more ranks than the slabs of a scene allow; its ground truth alone may use more than what learns of it."""
     limits = most_ranks(ground_truth_alone(scene) if set(stages) == {"dns"} else scene)
-    reason = min(limits, key=limits.get)
+    reason = min(limits, key=lambda name: limits[name])
     if comm.size > limits[reason]:
         raise SceneError(f"{scene.name}: {comm.size} ranks are more than the {limits[reason]} that it can use "
                          f"({reason}); start at most {limits[reason]}, `eddies check` gives all limits")
 
 
-def check_inputs(stages: Sequence[str], scene: Scene, comm, directory: Path) -> None:
+def check_inputs(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path) -> None:
     """Refuse stages that the scene lacks, and inputs that are missing or of other settings or another form than the
     scene's."""
     for stage in stages:
         if stage not in scene.stages:
-            if stage == "train" and scene.model is not None:
+            if stage == "train" and scene.model is not None and scene.simulation is not None:
                 raise SceneError(f'{scene.name}: [simulation] method = "{scene.simulation.method}" needs no trained '
                                  'model; set method = "learned" to train one')
             raise SceneError(f"{scene.name}: has no [{STAGES[stage].section}], which `eddies {stage}` is about; add it")
-    if "train" in stages and scene.model.path is not None:
+    if "train" in stages and scene.model is not None and scene.model.path is not None:
         read_source(scene, comm)
     first = STAGES[stages[0]]
     for needed in [STAGES[name] for name in first.depends_on if name in scene.stages and first.product is not None]:
@@ -95,13 +98,13 @@ def check_inputs(stages: Sequence[str], scene: Scene, comm, directory: Path) -> 
                              f"`eddies {needed.name}` again with these, or give `eddies {stages[0]}` the --set of then")
 
 
-def check_stop_file(comm, directory: Path) -> None:
+def check_stop_file(comm: Comm, directory: Path) -> None:
     """Refuse to start where a file STOP lies: put there between two jobs, it ends a chain that queues itself again."""
     if on_first_rank(comm, (directory / "STOP").exists):
         raise SceneError(f"{directory / 'STOP'}: asks the job to stop before it begins; remove the file to go on")
 
 
-def prepare_directory(scene: Scene, comm, directory: Path) -> None:
+def prepare_directory(scene: Scene, comm: Comm, directory: Path) -> None:
     """Make the run directory and write the scene as used into it; if rank 0 cannot, all ranks raise."""
     def write() -> None:
         directory.mkdir(parents=True, exist_ok=True)
@@ -113,7 +116,7 @@ def prepare_directory(scene: Scene, comm, directory: Path) -> None:
         raise SceneError(f"{directory}: cannot be written ({error.strerror}); choose another --output") from None
 
 
-def is_done(stage: str, scene: Scene, comm, directory: Path) -> bool:
+def is_done(stage: str, scene: Scene, comm: Comm, directory: Path) -> bool:
     """Whether the product of a stage is complete and was made with the same settings, as rank 0 sees it."""
     if STAGES[stage].product is None:
         return False
@@ -121,7 +124,7 @@ def is_done(stage: str, scene: Scene, comm, directory: Path) -> bool:
     return on_first_rank(comm, lambda: product_fingerprint(product) == scene.fingerprint(stage))
 
 
-def record_seconds(stage: str, seconds: float, comm, directory: Path) -> None:
+def record_seconds(stage: str, seconds: float, comm: Comm, directory: Path) -> None:
     """Log the wall time of a stage and keep it in stage_seconds.json, which holds the last of each stage."""
     log.info("%s: took %s", stage, duration(seconds))
     if comm.rank == 0:

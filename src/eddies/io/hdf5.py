@@ -27,6 +27,8 @@ from eddies.pipeline import MAKER_OF
 # scales of a ground truth are those of the release, and a model is a list of terms.
 FORMAT = 2
 CHUNK_BYTES = 2**20
+# The type of an open product.
+File = h5py.File
 
 # Files whose writing was broken off by an exception. Closing one is collective, so it must not happen when
 # Python drops the last reference on one rank alone; they stay open until the process ends.

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from eddies.parallel.communicator import Comm
 from eddies.parallel.reduction import global_sum
 from eddies.particles.rank_sums import sum_over_ranks
 
@@ -19,14 +20,14 @@ def mean_square_share(error: Tensor, scale: float, total: int) -> Tensor:
     return (error / scale).square().sum() / (components * total)
 
 
-def relative_error(comm, error: Tensor, exact: Tensor) -> float:
+def relative_error(comm: Comm, error: Tensor, exact: Tensor) -> float:
     """Normalised L2 error |error| / |exact| over the rows of all ranks; collective."""
     squares = [float(part.detach().double().square().sum()) for part in (error, exact)]
     wrong, whole = global_sum(comm, np.array(squares))
     return float(np.sqrt(wrong / whole))
 
 
-def soft_histogram(comm, values: Tensor, bins: int, reach: float) -> Tensor:
+def soft_histogram(comm: Comm, values: Tensor, bins: int, reach: float) -> Tensor:
     """Global histogram of `values` (any shape) over [-reach, reach], mass 1, differentiable: (bins,).
 
     Each value spreads its mass linearly over the two nearest bin centres. Values beyond the ends count at the ends, so

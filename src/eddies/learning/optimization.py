@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.optim.adam import adam  # not the class around it: making one loads torch's compiler, two seconds for nothing
 
+from eddies.parallel.communicator import Comm
 from eddies.parallel.reduction import global_sum, sum_flat
 
 
@@ -20,7 +21,7 @@ class Descent:
     summed over ranks in one message, so all ranks, also those without particles, take the same step.
     """
 
-    def __init__(self, comm, parameters: Iterable[nn.Parameter], steps: int, first_rate: float,
+    def __init__(self, comm: Comm, parameters: Iterable[nn.Parameter], steps: int, first_rate: float,
                  last_rate: float) -> None:
         self.comm, self.parameters = comm, list(parameters)
         self.steps, self.first_rate, self.last_rate = steps, first_rate, last_rate
@@ -71,7 +72,7 @@ class Descent:
         return [torch.tensor(float(self.taken)) for _ in self.parameters]
 
 
-def shared_values(comm, shares: Mapping[str, Tensor]) -> dict[str, float]:
+def shared_values(comm: Comm, shares: Mapping[str, Tensor]) -> dict[str, float]:
     """The global losses by name: sums of the shares of all ranks, in one message."""
     own = torch.stack([share.detach().double() for share in shares.values()])
     return dict(zip(shares, global_sum(comm, own.cpu().numpy()).tolist()))

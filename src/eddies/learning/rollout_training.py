@@ -13,6 +13,7 @@ from torch.utils.checkpoint import checkpoint
 
 from eddies.learning.losses import mean_square_share
 from eddies.learning.optimization import Descent, shared_values
+from eddies.parallel.communicator import Comm
 from eddies.parallel.reduction import global_sum
 from eddies.particles.integrators import Integrator
 from eddies.particles.particle_set import ParticleSet
@@ -63,7 +64,7 @@ class RolloutTrainer:
     noise : standard deviation of what is added to each component of the initial velocities.
     """
 
-    def __init__(self, comm, integrator: Integrator, windows: Sequence[TrainingWindow], frame_interval: float,
+    def __init__(self, comm: Comm, integrator: Integrator, windows: Sequence[TrainingWindow], frame_interval: float,
                  steps_per_frame: int, energy_weight: float, energies: Callable[[ParticleSet], Tensor] | None,
                  noise: float, seed: int) -> None:
         self.comm, self.integrator, self.windows = comm, integrator, windows

@@ -12,6 +12,7 @@ import torch
 from torch import nn
 
 from eddies.learning.optimization import Descent
+from eddies.parallel.communicator import Comm
 from eddies.parallel.halo import HaloError
 
 
@@ -59,7 +60,7 @@ class Training:
     All ranks hold the same state.
     """
 
-    def __init__(self, comm, model: nn.Module, phases: Sequence[Phase], patience: int | None = None) -> None:
+    def __init__(self, comm: Comm, model: nn.Module, phases: Sequence[Phase], patience: int | None = None) -> None:
         self.comm, self.model, self.patience = comm, model, patience
         self.phases = list(phases)
         self.history: list[dict[str, float]] = []

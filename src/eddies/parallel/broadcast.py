@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from mpi4py import MPI
@@ -35,7 +35,8 @@ def first_complaint(comm: MPI.Comm, complaint: str | None) -> str | None:
 def on_first_rank(comm: MPI.Comm, action: Callable[[], Result]) -> Result:
     """What an action gives on rank 0, the only one that does it, on every rank. Where it raises a UserError or an
     OSError there, all ranks raise the same. One rank sends nothing."""
-    result, error = None, None
+    result: Any = None
+    error: Exception | None = None
     if comm.rank == 0:
         try:
             result = action()
@@ -54,7 +55,8 @@ def on_first_rank(comm: MPI.Comm, action: Callable[[], Result]) -> Result:
 def on_all_ranks(comm: MPI.Comm, action: Callable[[], Result]) -> Result:
     """What an action gives on this rank. Where it raises an OSError on some, all ranks raise one, with the words of the
     lowest."""
-    result, complaint = None, None
+    result: Any = None
+    complaint = None
     try:
         result = action()
     except OSError as error:

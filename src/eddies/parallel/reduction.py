@@ -6,26 +6,27 @@ from collections.abc import Sequence
 
 import numpy as np
 from mpi4py import MPI
+from numpy.typing import ArrayLike
 
 
-def _reduce(comm: MPI.Comm, value, operation: MPI.Op) -> np.ndarray:
+def _reduce(comm: MPI.Comm, value: ArrayLike, operation: MPI.Op) -> np.ndarray:
     result = np.array(value, order="C")
     if comm.size > 1:
         comm.Allreduce(MPI.IN_PLACE, result, op=operation)
     return result
 
 
-def global_sum(comm: MPI.Comm, value) -> np.ndarray:
+def global_sum(comm: MPI.Comm, value: ArrayLike) -> np.ndarray:
     """Sum of a scalar or array over ranks; a new array of the same shape and type."""
     return _reduce(comm, value, MPI.SUM)
 
 
-def global_max(comm: MPI.Comm, value) -> np.ndarray:
+def global_max(comm: MPI.Comm, value: ArrayLike) -> np.ndarray:
     """Element-wise largest value over ranks; a new array of the same shape and type."""
     return _reduce(comm, value, MPI.MAX)
 
 
-def global_min(comm: MPI.Comm, value) -> np.ndarray:
+def global_min(comm: MPI.Comm, value: ArrayLike) -> np.ndarray:
     """Element-wise smallest value over ranks; a new array of the same shape and type."""
     return _reduce(comm, value, MPI.MIN)
 

@@ -39,7 +39,7 @@ class TransposeBuffers:
         # Counts are in lines along x of all components: in bytes they would leave the range of MPI's integers.
         self._line = (components * width, dtype)
         self._column_lines, self._plane_lines = z_counts * transpose.y_count, y_counts * transpose.z_count
-        shapes = [(components, int(z), transpose.y_count, width) for z in z_counts]
+        shapes: list[tuple[int, ...]] = [(components, int(z), transpose.y_count, width) for z in z_counts]
         own = np.empty(shapes[rank], dtype)
         self._columns, self.column_blocks = _blocks(shapes, dtype, rank, own)
         shapes = [(components, transpose.z_count, int(y), width) for y in y_counts]

@@ -6,11 +6,12 @@ import os
 
 import torch
 
+from eddies.parallel.communicator import Comm
 from eddies.parallel.node import node_rank
 from eddies.scene.values import SceneError
 
 
-def prepare_torch(device: str, comm) -> torch.device:
+def prepare_torch(device: str, comm: Comm) -> torch.device:
     """The device of this rank; sets the number of threads to OMP_NUM_THREADS (default 1 a rank).
 
     Ranks share the GPUs of a node in turn. Raises SceneError where a GPU is asked for and there is none.

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from eddies.parallel.communicator import Comm
 from eddies.parallel.reduction import global_max, global_min, global_sum
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.particle_set import ParticleSet
@@ -38,12 +39,12 @@ class FeatureRange:
     high: np.ndarray
 
     @classmethod
-    def of(cls, comm, blocks: Iterable[Tensor]) -> FeatureRange:
+    def of(cls, comm: Comm, blocks: Iterable[Tensor]) -> FeatureRange:
         """The range of blocks (features, m) of all ranks, of which each has at least one; collective."""
         low, high = zip(*map(_extrema, blocks))
         return cls(global_min(comm, np.min(low, axis=0)), global_max(comm, np.max(high, axis=0)))
 
-    def share_outside(self, comm, blocks: Iterable[Tensor]) -> float:
+    def share_outside(self, comm: Comm, blocks: Iterable[Tensor]) -> float:
         """The share of the pairs in blocks (features, m) of all ranks of which some feature lies outside the range, or
         is not a number; collective. Zero without pairs."""
         counts = np.zeros(2, np.int64)

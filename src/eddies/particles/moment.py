@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from eddies.parallel.communicator import Comm
 from eddies.parallel.migration import IdOrder
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.periodic_box import PeriodicBox
@@ -34,7 +35,7 @@ class Moment:
     density_rate: np.ndarray | None = None
 
     @classmethod
-    def of(cls, comm, total: int, time: float, particles: ParticleSet, rates: Rates) -> Moment:
+    def of(cls, comm: Comm, total: int, time: float, particles: ParticleSet, rates: Rates) -> Moment:
         """That of particles on any ranks, `total` in all; collective."""
         order = IdOrder(comm, as_numpy(particles.id), total)
         columns = [particles.position, particles.velocity, rates.acceleration]

@@ -1,5 +1,7 @@
 """What all figures share: colours, fonts, panels, slices with one colour scale, guide lines."""
 
+from __future__ import annotations
+
 import functools
 import io
 from collections.abc import Callable, Sequence
@@ -11,6 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
+from eddies.parallel.communicator import Comm
 from eddies.report.page import Section
 
 # Colour-blind safe (Okabe and Ito), the same quantity in the same colour in every figure.
@@ -63,7 +66,7 @@ def png(figure: Figure) -> bytes:
     return buffer.getvalue()
 
 
-def draw(comm, sections: Sequence[Section]) -> None:
+def draw(comm: Comm, sections: Sequence[Section]) -> None:
     """Turn the figures of rank 0's sections into PNG images; all ranks call it, and each draws its share."""
     illustrations = [illustration for section in sections for illustration in section.illustrations]
     shares = [[illustration.image for illustration in illustrations[rank::comm.size]] for rank in range(comm.size)]

@@ -26,7 +26,7 @@ class Bounds:
     below: float = math.inf
     at_most: float = math.inf
 
-    def __contains__(self, number: float) -> bool:
+    def __contains__(self, number: Any) -> bool:
         return self.above < number < self.below and self.at_least <= number <= self.at_most
 
     def __str__(self) -> str:

@@ -94,7 +94,7 @@ class Scene(Document):
         the scene has, and the content of the files that the flow starts from, that trained weights come from, and that
         hold the source of foreign classes."""
         settings = asdict(self) | {"window": self.window, "start": _digest(self.initial.path),
-                                   "weights": _digest(self.model and self.model.weights_file)}
+                                   "weights": _digest(self.model.weights_file if self.model else None)}
         settings |= {f"own_{name}": origins(self._foreign_in(name)) for name in FOREIGN_IN}
         of_these = {*STAGES[stage].depends_on, stage} & {*self.stages}
         keys = [key for each in STAGES.values() if each.name in of_these for key in each.reads]

@@ -47,7 +47,7 @@ class Section:
     """
 
     def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
+        for field in dataclasses.fields(self):  # type: ignore[arg-type]
             value = getattr(self, field.name)
             if not (value is None and field.default is None):
                 object.__setattr__(self, field.name, _accepted(type(self), field, value))
@@ -149,7 +149,7 @@ ANNOTATIONS = {"float": Number(""), "int": Integer(""), "bool": Boolean(""), "st
 
 def import_paths(part: Section) -> Iterator[tuple[str, str]]:
     """Each key of a section that may hold an import path, with the import paths that it holds."""
-    for field in dataclasses.fields(part):
+    for field in dataclasses.fields(part):  # type: ignore[arg-type]
         if getattr(rule_of(type(part), field), "paths", False):
             value = getattr(part, field.name)
             for name in (value,) if isinstance(value, str) else value or ():

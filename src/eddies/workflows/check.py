@@ -1,10 +1,13 @@
 """What a scene amounts to: resolution, steps, ranks, memory, time. Told before a run; writes nothing."""
 
+from __future__ import annotations
+
 import logging
 import math
 from collections.abc import Iterator
 
 from eddies.clock import duration
+from eddies.parallel.communicator import Comm
 from eddies.scene.scene import BOX_LENGTH, Scene
 from eddies.workflows.foreseen.cost_model import (LATENCY, NODE_BANDWIDTH, NODE_RANKS, Speed, cost, costs, pair_bytes,
                                                   probe)
@@ -15,7 +18,7 @@ from eddies.workflows.foreseen.estimates import (expected_step, expected_turbule
 log = logging.getLogger("eddies")
 
 
-def run(scene: Scene, comm) -> None:
+def run(scene: Scene, comm: Comm) -> None:
     """Log every derived number of a scene, estimates of steps and time, and warnings; all ranks call it."""
     speed = probe(scene, comm)
     subjects = {"grid": grid_lines(scene), "turbulence": turbulence_lines(scene),

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from eddies.io.hdf5 import ProductError, open_product, read_attributes, read_provenance
+from eddies.parallel.communicator import Comm
 from eddies.report.comparison import ErrorAgainstTime, run_record, sections
 from eddies.report.figures import draw
 from eddies.report.page import write_page
@@ -24,7 +25,7 @@ from eddies.workflows.variants.run import RunStages, VariantRun, in_directories
 log = logging.getLogger("eddies")
 
 
-def run(comparison: Comparison, comm, output: Path, resume: bool, run_stages: RunStages) -> None:
+def run(comparison: Comparison, comm: Comm, output: Path, resume: bool, run_stages: RunStages) -> None:
     """Run every variant and write comparison.csv, comparison.json, figures and index.html; all ranks call it.
 
     A variant that fails does not end the comparison: its row says when and why. With `resume`, rollouts that are there,
@@ -63,7 +64,7 @@ def check_directories(runs: Sequence[VariantRun]) -> None:
         variant.check_directory([other.ground_truth for other in runs])
 
 
-def check_ground_truth(comparison: Comparison, variant: VariantRun, comm) -> None:
+def check_ground_truth(comparison: Comparison, variant: VariantRun, comm: Comm) -> None:
     """Refuse a ground truth that is missing, of other settings than the variant's, or of too coarse frames."""
     path, interval = variant.ground_truth / "ground_truth.h5", variant.scene.simulation.frame_interval
     remedy = f"make it with `eddies dns {comparison.base} --output {variant.ground_truth}`"
@@ -81,7 +82,7 @@ def check_ground_truth(comparison: Comparison, variant: VariantRun, comm) -> Non
                          f"t_eta = {kolmogorov_time:.3g}, at which errors are compared; lower it")
 
 
-def write(comparison: Comparison, table: list[dict[str, Any]], comm, output: Path) -> None:
+def write(comparison: Comparison, table: list[dict[str, Any]], comm: Comm, output: Path) -> None:
     """Write rank 0's rows and what is drawn of them; all ranks call it."""
     parts = []
     if comm.rank == 0:

@@ -17,7 +17,8 @@ from eddies.flow.navier_stokes import FLUIDS, Fluid
 from eddies.flow.operators import project
 from eddies.io.checkpoint import Checkpoint
 from eddies.io.fields import FieldSeries, FieldWriter
-from eddies.io.hdf5 import create_product, open_product, write_attributes, write_table
+from eddies.io.hdf5 import File, create_product, open_product, write_attributes, write_table
+from eddies.parallel.communicator import Comm
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import StopRequest
 from eddies.pipeline import STAGES
@@ -33,7 +34,7 @@ from eddies.workflows.ground_truth.tracer_run import TracerRun
 log = logging.getLogger("eddies")
 
 
-def run(scene: Scene, comm, directory: str | Path, stop: StopRequest | None = None) -> None:
+def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | None = None) -> None:
     """Simulate the flow of a scene and write ground_truth.h5: statistics, and with tracers their frames and fields.
 
     Forced turbulence is first brought to a stationary state ([spin_up]). Tracers are released with the forcing off.
@@ -65,7 +66,7 @@ def run(scene: Scene, comm, directory: str | Path, stop: StopRequest | None = No
     guard.checkpoints.remove()
 
 
-def build_run(scene: Scene, comm, guard: Guard, saved: Checkpoint | None) -> FlowRun:
+def build_run(scene: Scene, comm: Comm, guard: Guard, saved: Checkpoint | None) -> FlowRun:
     """The flow of a scene at time 0, or as a checkpoint holds it."""
     fluid = build_fluid(scene, comm)
     state = initial_state(scene, fluid) if saved is None else None
@@ -110,7 +111,7 @@ def stationary_span(settings: SpinUp, history: FlowHistory) -> dict[str, float]:
     return {"start": times[first], "end": times[last]}
 
 
-def follow_tracers(scene: Scene, file, flow: FlowRun, saved: Checkpoint | None) -> None:
+def follow_tracers(scene: Scene, file: File, flow: FlowRun, saved: Checkpoint | None) -> None:
     """Release tracers into the flow, forcing off, and store their frames, the filtered fields and the scales."""
     comm, names = flow.fluid.grid.decomposition.comm, saved.files if saved is not None else ()
     with FrameSegments(comm, flow.guard.checkpoints.path, scene.tracers, flow.fluid.compressible, names) as segments:
@@ -123,7 +124,7 @@ def follow_tracers(scene: Scene, file, flow: FlowRun, saved: Checkpoint | None) 
     run.frames.write_spectra(file)
 
 
-def build_fluid(scene: Scene, comm) -> Fluid:
+def build_fluid(scene: Scene, comm: Comm) -> Fluid:
     """The fluid of a scene on its grid, with its forcing if it has one."""
     flow = scene.flow
     grid = SpectralGrid(SlabDecomposition(comm, BOX_LENGTH, flow.cells), flow.precision)
@@ -189,7 +190,7 @@ def _state_from_file(path: str, fluid: Fluid) -> np.ndarray:
     return project(grid, state)
 
 
-def write_final_fields(file, flow: FlowRun) -> None:
+def write_final_fields(file: File, flow: FlowRun) -> None:
     """Store the last velocity, and density of a compressible fluid, on the full grid."""
     grid = flow.fluid.grid
     physical = grid.backward(flow.state)

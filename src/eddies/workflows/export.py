@@ -1,13 +1,16 @@
 """The fields and particles of a run as VTKHDF files, one for each series. Rank 0 does the work, the others wait."""
 
+from __future__ import annotations
+
 import logging
 from pathlib import Path
 
 from eddies.io.fields import FieldSeries
-from eddies.io.hdf5 import ProductError, open_product, read_provenance
+from eddies.io.hdf5 import File, ProductError, open_product, read_provenance
 from eddies.io.trajectories import Trajectory
 from eddies.io.vtkhdf import write_images, write_points
 from eddies.parallel.broadcast import on_first_rank
+from eddies.parallel.communicator import Comm
 from eddies.scene.sections import BOX_LENGTH
 
 log = logging.getLogger("eddies")
@@ -15,7 +18,7 @@ log = logging.getLogger("eddies")
 PRODUCTS = ("ground_truth", "rollout")
 
 
-def run(run_directory: Path, output: Path, comm) -> None:
+def run(run_directory: Path, output: Path, comm: Comm) -> None:
     """Write OUTPUT/PRODUCT-fields-NAME.vtkhdf and OUTPUT/PRODUCT-particles-NAME.vtkhdf for every series of a run
     directory; all ranks call it.
 
@@ -29,7 +32,7 @@ def run(run_directory: Path, output: Path, comm) -> None:
         alone.Free()
 
 
-def _export(run_directory: Path, output: Path, alone) -> None:
+def _export(run_directory: Path, output: Path, alone: Comm) -> None:
     written = 0
     for kind in PRODUCTS:
         path = run_directory / f"{kind}.h5"
@@ -41,7 +44,7 @@ def _export(run_directory: Path, output: Path, alone) -> None:
                            f"{' and '.join(f'{kind}.h5' for kind in PRODUCTS)}; run `eddies dns SCENE` first")
 
 
-def _export_product(file, kind: str, output: Path) -> int:
+def _export_product(file: File, kind: str, output: Path) -> int:
     """Write the series of a product; returns how many have been written."""
     provenance, written = read_provenance(file), 0
     for group, reader in (("fields", FieldSeries), ("particles", Trajectory)):

@@ -3,6 +3,8 @@
 Every product is optional; a section appears for what there is. Rank 0 reads and computes, all ranks draw.
 """
 
+from __future__ import annotations
+
 import json
 import logging
 import tomllib
@@ -17,8 +19,9 @@ from eddies.analysis.isotropic_turbulence import StationarySpan
 from eddies.analysis.spectra import energy_spectrum, vorticity
 from eddies.analysis.tracer_statistics import tracer_statistics
 from eddies.io.fields import FieldSeries
-from eddies.io.hdf5 import ProductError, open_product, read_attributes, read_provenance, read_table
+from eddies.io.hdf5 import File, ProductError, open_product, read_attributes, read_provenance, read_table
 from eddies.io.trajectories import Trajectory
+from eddies.parallel.communicator import Comm
 from eddies.parallel.stop import StopRequest
 from eddies.pipeline import MAKER_OF
 from eddies.report import forced, ground_truth, kernel, mach, stationary, tracers
@@ -47,12 +50,12 @@ class Run:
     stationary: StationarySpan | None = None
 
 
-def run_stage(scene: Scene, comm, directory: str | Path, stop: StopRequest | None = None) -> None:
+def run_stage(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | None = None) -> None:
     """The report as a stage of a scene."""
     run(directory, comm)
 
 
-def run(directory: str | Path, comm) -> None:
+def run(directory: str | Path, comm: Comm) -> None:
     """Write report/index.html, report/figures/*.png and report/metrics.json of a run directory; all ranks
     call it.
 
@@ -70,7 +73,7 @@ def run(directory: str | Path, comm) -> None:
     comm.Barrier()
 
 
-def _read(directory: Path, alone) -> tuple[RunRecord, list[Section]]:
+def _read(directory: Path, alone: Comm) -> tuple[RunRecord, list[Section]]:
     record, sections = Run(seconds=_stage_seconds(directory)), []
     readers = {"ground_truth": _read_ground_truth, "kernel": _read_kernel, "model": _read_model,
                "rollout": _read_rollout}
@@ -90,7 +93,7 @@ def _read(directory: Path, alone) -> tuple[RunRecord, list[Section]]:
     return _run_record(directory, record), sections
 
 
-def read_stationary_span(file) -> StationarySpan:
+def read_stationary_span(file: File) -> StationarySpan:
     """The span of an open ground_truth.h5 over which its stationary state is averaged.
 
     ProductError where the scene has none ([spin_up] stationary), or one of hardly a step.
@@ -104,7 +107,7 @@ def read_stationary_span(file) -> StationarySpan:
         raise ProductError(f"{file.filename}: {error}; raise [spin_up] stationary and run `eddies dns` again") from None
 
 
-def _read_ground_truth(file, record: Run) -> list[Section]:
+def _read_ground_truth(file: File, record: Run) -> list[Section]:
     reference, statistics = read_attributes(file, "reference"), read_table(file, "statistics")
     sections = [_read_flow(file, record, reference, statistics)]
     if "stationary" in file:
@@ -115,7 +118,7 @@ def _read_ground_truth(file, record: Run) -> list[Section]:
     return sections
 
 
-def _read_stationary(file, record: Run, statistics: dict[str, np.ndarray]) -> Section:
+def _read_stationary(file: File, record: Run, statistics: dict[str, np.ndarray]) -> Section:
     try:
         record.stationary = read_stationary_span(file)
         return stationary.section(statistics, record.stationary)
@@ -123,7 +126,7 @@ def _read_stationary(file, record: Run, statistics: dict[str, np.ndarray]) -> Se
         return Section("stationary", "Stationary turbulence", notices=[str(error)])
 
 
-def _read_flow(file, record: Run, reference: dict[str, Any], statistics: dict[str, np.ndarray]) -> Section:
+def _read_flow(file: File, record: Run, reference: dict[str, Any], statistics: dict[str, np.ndarray]) -> Section:
     traced = "released_at" in reference
     name = "filtered" if traced else "final"
     velocity = FieldSeries(file, name).read(-1, "velocity")
@@ -141,12 +144,12 @@ def _read_flow(file, record: Run, reference: dict[str, Any], statistics: dict[st
     return ground_truth.section(ground_truth.GroundTruth(statistics, spectra, reference, planes, name))
 
 
-def _read_kernel(file, record: Run) -> list[Section]:
+def _read_kernel(file: File, record: Run) -> list[Section]:
     tables = {name: read_table(file, name) for name in ("kernels", "slices", "errors", "history")}
     return [kernel.section(json.loads(file.attrs["description"])["support"], **tables)]
 
 
-def _read_model(file, record: Run) -> list[Section]:
+def _read_model(file: File, record: Run) -> list[Section]:
     density_rate = read_table(file, "density_rate_sample") if "density_rate_sample" in file else None
     provenance, errors = record.provenance["model"], read_table(file, "a_priori")
     source = provenance.get("source")
@@ -160,7 +163,7 @@ def _read_model(file, record: Run) -> list[Section]:
     return [shown]
 
 
-def _read_rollout(file, record: Run) -> list[Section]:
+def _read_rollout(file: File, record: Run) -> list[Section]:
     attributes = read_attributes(file, "rollout")
     record.cost += [Metric(key, label, attributes[key]) for key, label in ROLLOUT_COST.items()]
     if "evaluations" in attributes and attributes["turnovers"] > 0:

@@ -13,6 +13,7 @@ import torch
 
 from eddies.clock import Clock, ProgressLine
 from eddies.io.hdf5 import create_product, open_product, write_attributes, write_table
+from eddies.parallel.communicator import Comm
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import StopRequest
@@ -56,7 +57,7 @@ class Mover(Protocol):
         """The settings of what moves the particles, for the attributes of the product."""
 
 
-def run(scene: Scene, comm, directory: str | Path, stop: StopRequest | None = None) -> None:
+def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | None = None) -> None:
     """Simulate what a scene asks for and write rollout.h5. A run that goes wrong ends there, keeps its frames, and
     says so in its status."""
     device = prepare_torch(scene.device, comm)

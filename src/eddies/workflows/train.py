@@ -11,6 +11,7 @@ from eddies.io.checkpoint import CheckpointDirectory
 from eddies.io.hdf5 import open_product
 from eddies.io.weights import save_weights
 from eddies.learning.training import Training, TrainingDiverged
+from eddies.parallel.communicator import Comm
 from eddies.parallel.halo import HaloError
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import Stopped, StopRequest
@@ -30,7 +31,7 @@ log = logging.getLogger("eddies")
 DRAWING_SECONDS = 30.0
 
 
-def run(scene: Scene, comm, directory: str | Path, stop: StopRequest | None = None) -> None:
+def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | None = None) -> None:
     """Train the model of a scene and write model.h5: weights, learning history, a-priori tests, and the range of
     what its networks were given.
 
@@ -108,7 +109,7 @@ def take_all_steps(training: Training, checkpoints: CheckpointDirectory, stop: S
 class LearningCurves:
     """Draws the history of a training to a file now and then, on rank 0."""
 
-    def __init__(self, comm, path: Path) -> None:
+    def __init__(self, comm: Comm, path: Path) -> None:
         self.comm, self.path, self._drawn = comm, path, time.monotonic()
 
     def __call__(self, training: Training) -> None:

@@ -14,6 +14,7 @@ from eddies.io.hdf5 import open_product
 from eddies.io.weights import save_weights
 from eddies.learning.kernel_training import KernelLossWeights, KernelSample, KernelTrainer
 from eddies.learning.optimization import Descent
+from eddies.parallel.communicator import Comm
 from eddies.parallel.migration import id_block, migrate
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
@@ -31,7 +32,7 @@ TRAINING_SAMPLES = 4
 FINAL_RATE_FRACTION = 0.05
 
 
-def run(scene: Scene, comm, directory: str | Path, stop: StopRequest | None = None) -> None:
+def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | None = None) -> None:
     """Train the kernel of a scene on fields of the training window and write kernel.h5.
 
     The kernel without the gradient loss (the paper's Fig. 1) is trained as well. Errors are those at the last field.

@@ -7,6 +7,7 @@ A class of settings is a frozen dataclass whose fields declare their keys as tho
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from eddies.scene.values import KeyProblem, Section, boolean, choice, integers, named, number, texts
 
@@ -29,10 +30,10 @@ class TermSettings(Section):
     numbers_per_pair : how many numbers it keeps of each pair while it is evaluated, for an estimate of the memory.
     """
 
-    reads = ()
-    gives = ("acceleration",)
-    learns_through_horizons = False
-    numbers_per_pair = 0
+    reads: ClassVar[tuple[str, ...]] = ()
+    gives: ClassVar[tuple[str, ...]] = ("acceleration",)
+    learns_through_horizons: ClassVar[bool] = False
+    numbers_per_pair: ClassVar[int] = 0
 
     @classmethod
     def section_name(cls) -> str:
@@ -49,12 +50,12 @@ class NetworkSettings(TermSettings):
     network: str = named("class of the network", "dense", default="dense")
 
     @property
-    def reads(self) -> tuple[str, ...]:
+    def reads(self) -> tuple[str, ...]:  # type: ignore[override]
         """Pairs, and with that input the density."""
         return ("pairs", "density") if "density" in self.inputs else ("pairs",)
 
     @property
-    def numbers_per_pair(self) -> int:
+    def numbers_per_pair(self) -> int:  # type: ignore[override]
         """The inputs, of which the density counts for both particles, what every layer gives, and a vector."""
         return len(self.inputs) + ("density" in self.inputs) + sum(self.hidden) + 3
 
@@ -116,7 +117,7 @@ class Pressure(TermSettings):
     reads = ("resolved",)
 
     @property
-    def gives(self) -> tuple[str, ...]:
+    def gives(self) -> tuple[str, ...]:  # type: ignore[override]
         """The density, and the force unless it is left out."""
         return ("acceleration", "density") if self.force else ("density",)
 

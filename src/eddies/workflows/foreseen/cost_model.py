@@ -10,6 +10,8 @@ planes and products back, as messages from each rank to every other. What stays 
 memory, what leaves it shares the node's network.
 """
 
+from __future__ import annotations
+
 import math
 import time
 from dataclasses import dataclass, replace
@@ -18,6 +20,7 @@ from statistics import median
 import numpy as np
 
 from eddies.clock import Clock
+from eddies.parallel.communicator import Comm
 from eddies.scene.scene import Initial, Scene
 from eddies.spectral.fourier_passes import BLOCK_BYTES
 from eddies.spectral.spectral_grid import SpectralGrid
@@ -133,7 +136,7 @@ def pair_bytes(scene: Scene, ranks: int) -> float:
     return PROCESS_BYTES + pairs / ranks * (16 + 4 * item + 3 * item * kept)
 
 
-def probe(scene: Scene, comm, steps: int = 5) -> Speed:
+def probe(scene: Scene, comm: Comm, steps: int = 5) -> Speed:
     """The speed of the ranks at hand, from a few steps of the scene's fluid; all ranks call it.
 
     The grid has no more cells a rank than PROBE_CELLS^3.
@@ -161,7 +164,7 @@ def probe(scene: Scene, comm, steps: int = 5) -> Speed:
     return Speed(seconds / (cells**2 * busiest_planes(cells, comm.size) * work_growth(cells)), bandwidth)
 
 
-def exchange_once(grid: SpectralGrid, scene: Scene, comm) -> float:
+def exchange_once(grid: SpectralGrid, scene: Scene, comm: Comm) -> float:
     """Seconds in which the messages of one nonlinear term are sent."""
     to_planes, to_columns = (grid.buffers(direction, components) for direction, components
                              in zip(("backward", "forward"), SENT_COMPONENTS[scene.flow.compressible]))

@@ -16,6 +16,7 @@ from eddies.flow.navier_stokes import Fluid
 from eddies.flow.stability import StabilityWatch
 from eddies.io.checkpoint import Checkpoint, CheckpointDirectory
 from eddies.io.contiguous import Block
+from eddies.parallel.communicator import Comm
 from eddies.parallel.stop import Stopped, StopRequest
 
 if TYPE_CHECKING:
@@ -83,7 +84,7 @@ class FlowRun:
 class Guard:
     """Writes checkpoints of a run when they are due, and ends it when it is asked to."""
 
-    def __init__(self, comm, directory: Path, fingerprint: str, stop: StopRequest) -> None:
+    def __init__(self, comm: Comm, directory: Path, fingerprint: str, stop: StopRequest) -> None:
         self.checkpoints = CheckpointDirectory(comm, directory, fingerprint)
         self.stop = stop
 

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from eddies.io.fields import FieldSeries, FieldWriter
-from eddies.io.hdf5 import create_product, open_product
+from eddies.io.hdf5 import File, create_product, open_product
 from eddies.io.trajectories import Trajectory, TrajectoryWriter
+from eddies.parallel.communicator import Comm
 from eddies.parallel.migration import id_block
 from eddies.parallel.slab import SlabDecomposition
 from eddies.scene.scene import BOX_LENGTH, Tracers
@@ -24,7 +25,8 @@ class FrameSegments:
     the same layout as in the ground truth, into which `assemble` copies all frames at the end.
     """
 
-    def __init__(self, comm, directory: Path, settings: Tracers, compressible: bool, names: Sequence[str] = ()) -> None:
+    def __init__(self, comm: Comm, directory: Path, settings: Tracers, compressible: bool,
+                 names: Sequence[str] = ()) -> None:
         self.comm, self.directory, self.settings, self.names = comm, directory, settings, list(names)
         self.scalar = {"density": ()} if compressible else {}
         self._name, self._file = "", ExitStack()
@@ -57,7 +59,7 @@ class FrameSegments:
         (start, first), (end, second) = frames[:2]
         return measured_scales(self.comm, first, first, second, end - start)
 
-    def assemble(self, file) -> None:
+    def assemble(self, file: File) -> None:
         """Copy the frames of all segments into a product."""
         self.close()
         trajectory, fields = self._writers(file)
@@ -83,7 +85,7 @@ class FrameSegments:
         block = id_block(self.comm, self.settings.particles)
         return {column: frames.read(frame, column, *block) for column in frames.columns}
 
-    def _writers(self, file) -> tuple[TrajectoryWriter, FieldWriter]:
+    def _writers(self, file: File) -> tuple[TrajectoryWriter, FieldWriter]:
         settings = self.settings
         trajectory = TrajectoryWriter(file, "tracers", settings.particles, BOX_LENGTH,
                                       {"position": (3,), "velocity": (3,), **self.scalar}, np.float64)

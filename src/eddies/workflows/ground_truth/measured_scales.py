@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from eddies.parallel.communicator import Comm
 from eddies.parallel.reduction import global_sum
 
 MEAN_DENSITY = 1.0
@@ -16,7 +17,7 @@ MEANS = {"velocity": 0.0, "density": MEAN_DENSITY}
 Columns = Mapping[str, np.ndarray]
 
 
-def measured_scales(comm, at: Columns, before: Columns, after: Columns, interval: float) -> dict[str, float]:
+def measured_scales(comm: Comm, at: Columns, before: Columns, after: Columns, interval: float) -> dict[str, float]:
     """Root mean squares over all particles, of one component where there are three; collective.
 
     velocity_rms and acceleration_rms, and with a density density_rms (of its fluctuation) and density_rate_rms: values
@@ -31,6 +32,6 @@ def measured_scales(comm, at: Columns, before: Columns, after: Columns, interval
     return scales
 
 
-def _rms(comm, values: np.ndarray) -> float:
+def _rms(comm: Comm, values: np.ndarray) -> float:
     square, count = global_sum(comm, np.array([np.sum(values**2), values.size]))
     return float(np.sqrt(square / count))

@@ -10,7 +10,7 @@ import numpy as np
 from eddies.clock import Clock
 from eddies.flow.statistics import energy_spectrum
 from eddies.flow.tracers import TracerParticles
-from eddies.io.hdf5 import write_table
+from eddies.io.hdf5 import File, write_table
 from eddies.parallel.migration import IdOrder
 from eddies.parallel.slab import SlabDecomposition
 from eddies.scene.scene import Tracers
@@ -57,7 +57,7 @@ class TracerFrames:
         self._frames = state["frames"]
         self._spectra = {name: list(state[f"spectra_{name}"]) for name in self._spectra}
 
-    def write_spectra(self, file) -> None:
+    def write_spectra(self, file: File) -> None:
         """Write the table of DNS and filtered energy spectra."""
         wavenumber = np.arange(len(self._spectra["energy"][0]))
         columns = {name: np.array(rows) for name, rows in self._spectra.items()}

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from eddies.io.fields import FieldSeries
-from eddies.io.hdf5 import read_attributes
+from eddies.io.hdf5 import File, read_attributes
 from eddies.io.trajectories import Trajectory
 from eddies.learning.force_training import TrainingFrame
 from eddies.parallel.migration import id_block, migrate
@@ -31,7 +31,7 @@ class GroundTruth:
     are left out.
     """
 
-    def __init__(self, file, decomposition: SlabDecomposition) -> None:
+    def __init__(self, file: File, decomposition: SlabDecomposition) -> None:
         self.decomposition = decomposition
         self.trajectory, self.fields = Trajectory(file, "tracers"), FieldSeries(file, "filtered")
         self.times, self.total = self.trajectory.times, self.trajectory.total

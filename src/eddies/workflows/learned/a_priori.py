@@ -8,6 +8,7 @@ import torch
 from eddies.flow.operators import gradient
 from eddies.learning.force_training import TrainingFrame
 from eddies.learning.losses import relative_error
+from eddies.parallel.communicator import Comm
 from eddies.parallel.migration import IdOrder, migrate
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
@@ -83,7 +84,7 @@ def _given_rate_error(truth: GroundTruth, dynamics: ParticleDynamics, index: int
     return relative_error(comm, torch.from_numpy(rate - exact), torch.from_numpy(exact))
 
 
-def _by_id(comm, total: int, columns: dict[str, np.ndarray], name: str) -> np.ndarray:
+def _by_id(comm: Comm, total: int, columns: dict[str, np.ndarray], name: str) -> np.ndarray:
     """This rank's block of a column in the order of particle ids."""
     return IdOrder(comm, columns["id"], total).apply(columns[name])
 

@@ -11,6 +11,7 @@ import torch
 
 from eddies.io.hdf5 import open_product
 from eddies.io.weights import save_weights
+from eddies.parallel.communicator import Comm
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.devices import prepare_torch
 from eddies.scene.scene import BOX_LENGTH, Scene
@@ -23,7 +24,7 @@ from eddies.workflows.learned.source import ModelSource, read_source
 log = logging.getLogger("eddies")
 
 
-def run(scene: Scene, comm, directory: str | Path) -> None:
+def run(scene: Scene, comm: Comm, directory: str | Path) -> None:
     """Write model.h5 with the weights that [model] path names, instead of training; all ranks call it.
 
     Terms work in units of the flow (Eq. 4), so only the scales and the support are this flow's. The tables are

@@ -8,10 +8,11 @@ import torch
 
 from eddies.io.hdf5 import ProductError
 from eddies.io.weights import load_weights
+from eddies.parallel.communicator import Comm
 from eddies.particles.smoothing_kernels import HermiteKernel, KernelNetwork
 
 
-def load_kernel(comm, path: str | Path, device: torch.device | str = "cpu") -> HermiteKernel:
+def load_kernel(comm: Comm, path: str | Path, device: torch.device | str = "cpu") -> HermiteKernel:
     """The trained kernel as the table that is used at run time, in single precision.
 
     ProductError, besides the reasons of `load_weights`, where the weights are those of another form of the kernel.

@@ -11,6 +11,7 @@ import torch
 
 from eddies.io.hdf5 import ProductError, open_product, read_table
 from eddies.io.weights import load_weights
+from eddies.parallel.communicator import Comm
 from eddies.particles.feature_range import FeatureRange
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.model import LagrangianModel, build_model
@@ -31,7 +32,7 @@ def scene_model(scene: Scene, scales: ReferenceScales) -> LagrangianModel:
         raise SceneError(f"[model] terms: {error}") from None
 
 
-def load_model(scene: Scene, comm, path: str | Path, scales: ReferenceScales) -> LagrangianModel:
+def load_model(scene: Scene, comm: Comm, path: str | Path, scales: ReferenceScales) -> LagrangianModel:
     """The scene's model with the weights of a file, for a flow of these scales; all ranks call it.
 
     Raises ProductError as `load_weights`, and where the file holds weights of another model.
@@ -56,7 +57,7 @@ def with_weights(scene: Scene, description: Mapping[str, Any], weights: Mapping[
     return model
 
 
-def load_feature_range(comm, path: str | Path) -> FeatureRange:
+def load_feature_range(comm: Comm, path: str | Path) -> FeatureRange:
     """The range of what the networks of a file were given in training."""
     with open_product(comm, path, "model") as file:
         return FeatureRange(**read_table(file, "feature_range"))

@@ -10,6 +10,7 @@ import numpy as np
 
 from eddies.io.hdf5 import ProductError, open_product, read_provenance
 from eddies.io.weights import load_tables, load_weights
+from eddies.parallel.communicator import Comm
 from eddies.scene.rules import quoted
 from eddies.scene.scene import Scene, SceneError
 from eddies.workflows.learned.description import differences
@@ -26,7 +27,7 @@ class ModelSource:
     provenance: dict[str, Any]
 
 
-def read_source(scene: Scene, comm) -> ModelSource:
+def read_source(scene: Scene, comm: Comm) -> ModelSource:
     """The trained model that [model] path names; all ranks call it.
 
     Raises:

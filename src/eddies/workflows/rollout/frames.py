@@ -6,6 +6,7 @@ import numpy as np
 import torch
 
 from eddies.io.fields import FieldWriter
+from eddies.io.hdf5 import File
 from eddies.io.trajectories import TrajectoryWriter
 from eddies.parallel.migration import IdOrder, migrate
 from eddies.parallel.slab import SlabDecomposition
@@ -26,7 +27,7 @@ class RolloutFrames:
     particles have one; it is stored where the true ones have one too.
     """
 
-    def __init__(self, file, truth: GroundTruth, kernel: SmoothingKernel, start_time: float,
+    def __init__(self, file: File, truth: GroundTruth, kernel: SmoothingKernel, start_time: float,
                  density: bool) -> None:
         self.truth, self.kernel, self.start_time = truth, kernel, start_time
         self.times: list[float] = []

@@ -15,6 +15,7 @@ from eddies.io.fields import FieldSeries
 from eddies.io.hdf5 import open_product, read_attributes, read_table
 from eddies.io.provenance import environment
 from eddies.io.trajectories import Trajectory
+from eddies.parallel.communicator import Comm
 from eddies.scene.comparison import Comparison
 from eddies.scene.scene import Eulerian
 from eddies.workflows.variants.run import StepSeconds, VariantRun
@@ -26,7 +27,7 @@ THROUGH_KERNEL = ("spectrum_error", "qr_kl")
 COLUMNS = ("name", "group", "status", "stopped_at", *MEASURES, "end", *COST, "settings")
 
 
-def rows(comparison: Comparison, runs: list[VariantRun], alone, ranks: int) -> list[dict[str, Any]]:
+def rows(comparison: Comparison, runs: list[VariantRun], alone: Comm, ranks: int) -> list[dict[str, Any]]:
     """The row of every variant, by COLUMNS; None where there is no number. `alone` is a communicator of one rank.
 
     Times are in turnovers T of the flow, `wall_seconds` and `core_seconds` for one of them.
@@ -66,7 +67,7 @@ def notes(comparison: Comparison) -> list[str]:
     return found
 
 
-def measured(run: VariantRun, alone, ranks: int) -> dict[str, Any]:
+def measured(run: VariantRun, alone: Comm, ranks: int) -> dict[str, Any]:
     """What rollout.h5 shows, how long its steps took and, if there is a model, its training."""
     with (open_product(alone, run.directory / "ground_truth.h5", "ground_truth") as truth_file,
           open_product(alone, run.directory / "rollout.h5", "rollout") as file):

@@ -14,6 +14,7 @@ from typing import Any
 from eddies.errors import UserError
 from eddies.io.hdf5 import open_product, product_fingerprint, product_provenance, read_attributes
 from eddies.parallel.broadcast import on_first_rank
+from eddies.parallel.communicator import Comm
 from eddies.parallel.rendezvous import all_arrive
 from eddies.pipeline import STAGES, after
 from eddies.scene.scene import Scene, SceneError
@@ -114,7 +115,7 @@ class VariantRun:
             if same:
                 link(same[0], self.directory)
 
-    def attempt(self, errors, work: Callable[[], None]) -> None:
+    def attempt(self, errors: Comm, work: Callable[[], None]) -> None:
         """Do what may fail: a failure that all ranks meet is noted, another one ends the job.
 
         `errors` is a communicator of its own, as ranks that do not know of a failure may wait for a message on others.
@@ -132,7 +133,7 @@ class VariantRun:
         """Run all stages whose product is not there."""
         run_stages(self.stages, self.scene, self.directory)
 
-    def time_block(self, comm, run_stages: RunStages) -> None:
+    def time_block(self, comm: Comm, run_stages: RunStages) -> None:
         """Run the first steps once more, for their time alone; not if the rollout went wrong."""
         settings, directory = self.scene.simulation, self.directory / "timing"
         with open_product(comm, self.directory / "rollout.h5", "rollout") as file:
@@ -164,7 +165,7 @@ def link(product: Path, directory: Path) -> None:
     path.symlink_to(os.path.relpath(product.resolve(), directory.resolve()))
 
 
-def in_directories(comm, work: Callable[[], None]) -> None:
+def in_directories(comm: Comm, work: Callable[[], None]) -> None:
     """Work in directories that rank 0 does alone; all ranks raise its SceneError, or one where it cannot write."""
     try:
         on_first_rank(comm, work)
