@@ -6,7 +6,7 @@ import torch
 
 from eddies.flow.tracers import release
 from eddies.learning.force_training import ForceTrainer, LossWeights, TrainingFrame
-from eddies.learning.optimization import Descent
+from eddies.learning.optimization import Adam
 from eddies.learning.training import Phase, Training, TrainingDiverged
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
@@ -75,8 +75,8 @@ def test_training_is_the_same_on_any_number_of_ranks(comm, kind, preset):
 
     def losses_and_weights(communicator):
         trainer = trainer_of(communicator, preset)
-        descent = Descent(communicator, trainer.model.parameters(), 5, 1e-2, 1e-3)
-        rows = [getattr(trainer, kind)(descent, step) for step in range(5)]
+        optimizer = Adam(communicator, trainer.model.parameters(), 5, 1e-2, 1e-3)
+        rows = [getattr(trainer, kind)(optimizer, step) for step in range(5)]
         return rows, torch.cat([p.detach().flatten() for p in trainer.model.parameters()])
 
     (rows, weights), (alone, weights_alone) = losses_and_weights(comm), losses_and_weights(MPI.COMM_SELF)
@@ -157,8 +157,8 @@ def test_the_factor_of_a_stress_is_learned_through_the_density_too(comm):
 @pytest.mark.mpi(1)
 def test_training_lowers_the_error_of_a_learnable_force(comm):
     trainer = trainer_of(comm, weights=LossWeights())
-    descent = Descent(comm, trainer.model.parameters(), 150, 1e-2, 1e-3)
-    losses = [trainer.trajectory_step(descent, step)["loss"] for step in range(150)]
+    optimizer = Adam(comm, trainer.model.parameters(), 150, 1e-2, 1e-3)
+    losses = [trainer.trajectory_step(optimizer, step)["loss"] for step in range(150)]
     # The pressure gradient and drag are in the span of the model; what is left is the
     # scatter of differences between randomly placed particles.
     assert np.mean(losses[-20:]) < 0.15 * losses[0]
@@ -167,9 +167,9 @@ def test_training_lowers_the_error_of_a_learnable_force(comm):
 @pytest.mark.mpi(1)
 def test_a_model_without_networks_trains(comm):
     trainer = trainer_of(comm, "resolved", LossWeights(), batch=10**6)
-    assert not trainer.model.networks and trainer.frames[0].dynamics.surroundings is None
-    descent = Descent(comm, trainer.model.parameters(), 150, 1e-1, 1e-2)
-    losses = [trainer.trajectory_step(descent, step)["loss"] for step in range(150)]
+    assert not trainer.model.networks and trainer.frames[0].dynamics.neighborhood is None
+    optimizer = Adam(comm, trainer.model.parameters(), 150, 1e-1, 1e-2)
+    losses = [trainer.trajectory_step(optimizer, step)["loss"] for step in range(150)]
     # Their best is the least-squares fit of its seven factors, in which the loss is quadratic.
     frame = trainer.frames[0]
     slopes = torch.cat([frame.kept[name].slopes["acceleration"] for name in frame.kept if frame.kept[name].slopes])
@@ -229,7 +229,7 @@ def test_a_force_that_is_not_a_number_ends_the_training_on_all_ranks(comm):
 def test_of_learned_rates_of_density_only_the_paper_s_counts_in_single_frames(comm, preset, counts):
     trainer = trainer_of(comm, preset, LossWeights())
     assert trainer.model.regresses_density == counts
-    trainer.trajectory_step(Descent(comm, trainer.model.parameters(), 1, 1e-2, 1e-2), 0)
+    trainer.trajectory_step(Adam(comm, trainer.model.parameters(), 1, 1e-2, 1e-2), 0)
     learned = {name: [p.grad is not None and bool(p.grad.any()) for p in term.parameters()]
                for name, term in trainer.model.terms.items()}
     assert any(learned["pairs"]) and any(learned["density-flux"]) == counts
@@ -239,7 +239,7 @@ def test_of_learned_rates_of_density_only_the_paper_s_counts_in_single_frames(co
 @pytest.mark.mpi(1)
 def test_every_loss_has_a_name_that_the_learning_curves_know(comm):
     trainer = trainer_of(comm)
-    row = trainer.combined_step(Descent(comm, trainer.model.parameters(), 1, 1e-2, 1e-2), 0)
+    row = trainer.combined_step(Adam(comm, trainer.model.parameters(), 1, 1e-2, 1e-2), 0)
     names = {"loss", "trajectory_loss", "field_loss", "velocity_kl_loss", "acceleration_kl_loss"}
     assert set(row) == names | {"gradient_norm"} and names <= {name for name, *_ in LOSSES}
     weighted = sum(weight * row[f"{name}_loss"] for name, weight in vars(trainer.weights).items())
@@ -253,7 +253,7 @@ def test_losses_without_weight_are_not_computed(comm, monkeypatch):
     rows = []
     for kind in ("trajectory_step", "combined_step"):
         trainer = trainer_of(comm, weights=LossWeights())
-        rows.append(getattr(trainer, kind)(Descent(comm, trainer.model.parameters(), 1, 1e-2, 1e-2), 0))
+        rows.append(getattr(trainer, kind)(Adam(comm, trainer.model.parameters(), 1, 1e-2, 1e-2), 0))
     assert set(rows[0]) == {"loss", "trajectory_loss", "gradient_norm"}
     # Without the field loss there is no cube: both draw the same batch.
     assert rows[0] == rows[1]

@@ -4,9 +4,9 @@ import torch
 
 from eddies.flow.tracers import release
 from eddies.learning.kernel_training import KernelLossWeights, KernelSample, KernelTrainer
-from eddies.learning.optimization import Descent
+from eddies.learning.optimization import Adam
 from eddies.parallel.slab import SlabDecomposition
-from eddies.particles.cloud import ParticleCloud, grid_points
+from eddies.particles.particle_field import ParticleField, grid_points
 from eddies.particles.smoothing_kernels import CubicSpline, KernelNetwork, integral
 
 LENGTH, CELLS, PER_SIDE = 2 * np.pi, 12, 10
@@ -25,15 +25,15 @@ def flow(x):
 def sample_of(comm, support):
     slab = SlabDecomposition(comm, LENGTH, CELLS)
     position = torch.from_numpy(release(slab, 3, PER_SIDE, "random")["position"])
-    cloud = ParticleCloud(slab, support, position, flow(position)[0], torch.float64)
-    return KernelSample(cloud, *flow(grid_points(slab, CELLS)))
+    particle_field = ParticleField(slab, support, position, flow(position)[0], torch.float64)
+    return KernelSample(particle_field, *flow(grid_points(slab, CELLS)))
 
 
 def fit(comm, support=2.4 * SPACING, steps=4, rates=(1e-3, 1e-3)):
     sample, network = sample_of(comm, support), KernelNetwork(support, (8, 8), seed=1)
     trainer = KernelTrainer(network, [sample], KernelLossWeights(1.0, 0.5), 200, seed=2)
-    descent = Descent(comm, network.parameters(), steps, *rates)
-    return sample, network, [trainer.step(descent, step) for step in range(steps)]
+    optimizer = Adam(comm, network.parameters(), steps, *rates)
+    return sample, network, [trainer.step(optimizer, step) for step in range(steps)]
 
 
 @pytest.mark.mpi(2, 3)
@@ -56,7 +56,8 @@ def test_the_learned_kernel_beats_a_cubic_spline_of_the_wrong_width_on_the_field
     sample, network, _ = fit(comm, support, 60, (2e-2, 2e-3))
     with torch.no_grad():
         learned = network.table()
-        errors = [sample.errors_of(*sample.cloud.on_whole_grid(kernel)) for kernel in (learned, CubicSpline(support))]
+        errors = [sample.errors_of(*sample.particles.on_whole_grid(kernel))
+                  for kernel in (learned, CubicSpline(support))]
     assert float(integral(learned)) == pytest.approx(1, rel=1e-12)
     fitted, spline = (velocity**2 + gradient**2 for velocity, gradient in errors)
     # A spline of the right width would do as well; to come near it from these the errors must fall by a fifth.

@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from eddies.learning.losses import kullback_leibler, mean_square_share, soft_histogram
-from eddies.learning.optimization import Descent, shared_values
+from eddies.learning.optimization import Adam, shared_values
 from eddies.parallel.reduction import global_sum
 
 
@@ -74,10 +74,10 @@ def test_descent_takes_the_same_steps_on_any_number_of_ranks(comm):
     def fit(rows, communicator):
         parameter = torch.nn.Parameter(torch.zeros(2, dtype=torch.float64))
         unused = torch.nn.Parameter(torch.ones(1, dtype=torch.float64))
-        descent = Descent(communicator, [parameter, unused], 10, 0.1, 0.01)
+        optimizer = Adam(communicator, [parameter, unused], 10, 0.1, 0.01)
         for _ in range(10):
-            norm = descent.step(mean_square_share(parameter - torch.from_numpy(rows), 1.0, 60))
-        assert float(unused) == 1 and descent.learning_rate < 0.011
+            norm = optimizer.step(mean_square_share(parameter - torch.from_numpy(rows), 1.0, 60))
+        assert float(unused) == 1 and optimizer.learning_rate < 0.011
         return parameter.detach().numpy(), norm
 
     from mpi4py import MPI

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from eddies.flow.tracers import release
-from eddies.learning.optimization import Descent, shared_values
+from eddies.learning.optimization import Adam, shared_values
 from eddies.learning.rollout_training import RolloutTrainer, TrainingWindow, mean_losses
 from eddies.parallel.migration import migrate
 from eddies.parallel.reduction import global_max
@@ -15,7 +15,6 @@ from eddies.particles.flow_units import FlowUnits
 from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.resolved_velocity import ResolvedVelocity
-
 from tests.learning.models import LENGTH, PER_SIDE, SCALES, SPACING, Recorder, model_of, slope
 
 FRAMES, INTERVAL = 4, 0.06
@@ -124,8 +123,8 @@ def test_training_has_the_same_losses_on_any_number_of_ranks(comm):
 
     def losses(communicator):
         trainer, model = trainer_of(communicator, noise=0.05)
-        descent = Descent(communicator, model.parameters(), 5, 3e-2, 1e-3)
-        return [trainer.step(descent, step, 1 + step // 4) for step in range(5)]
+        optimizer = Adam(communicator, model.parameters(), 5, 3e-2, 1e-3)
+        return [trainer.step(optimizer, step, 1 + step // 4) for step in range(5)]
 
     found, alone = losses(comm), comm.bcast(losses(MPI.COMM_SELF) if comm.rank == 0 else None)
     for row, other in zip(found, alone):

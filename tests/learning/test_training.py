@@ -14,10 +14,10 @@ def training_of(comm, validate=None, patience=None, steps=(6, 5)):
     torch.manual_seed(3)
     model = nn.Linear(3, 1, bias=False).double()
 
-    def take(descent, step):
+    def take(optimizer, step):
         given = torch.from_numpy(np.random.default_rng([7, step]).standard_normal((4, 3)))
         loss = (model(given) - given @ TARGET.T).square().mean()
-        return {"loss": float(loss), "gradient_norm": descent.step(loss / comm.size)}
+        return {"loss": float(loss), "gradient_norm": optimizer.step(loss / comm.size)}
 
     def error():
         return float((model.weight - TARGET).norm())

@@ -54,10 +54,10 @@ def test_a_model_without_pairs_sees_none_but_its_own_particles(comm, monkeypatch
     dynamics = dynamics_of(slab, model(MODELS["resolved"]))
     halo, lists = Counted(monkeypatch, HaloExchange, "__init__"), Counted(monkeypatch, NeighborList, "__init__")
     dynamics.rates(dynamics.settle(particles)[0])
-    assert dynamics.surroundings is None and halo.calls == lists.calls == {"__init__": 0}
+    assert dynamics.neighborhood is None and halo.calls == lists.calls == {"__init__": 0}
     both = dynamics_of(slab, model(MODELS["resolved + pairs"]))
     both.rates(particles)
-    assert both.surroundings.cutoff == both.surroundings.neighbors.cutoff == CUTOFF
+    assert both.neighborhood.cutoff == both.neighborhood.neighbors.cutoff == CUTOFF
     assert halo.calls == lists.calls == {"__init__": 1}
 
 

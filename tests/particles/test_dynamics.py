@@ -6,7 +6,7 @@ import torch
 
 from eddies.parallel.halo import HaloError, HaloExchange
 from eddies.parallel.reduction import global_sum, sum_flat
-from eddies.particles import context, surroundings
+from eddies.particles import context, neighborhood
 from eddies.particles.dense_network import DenseNetwork
 from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.particle_set import ParticleSet
@@ -77,7 +77,7 @@ def test_gradients_through_several_steps_do_not_depend_on_the_ranks(comm, integr
             end = stepper.step(end, 0.04)
         loss = sum((column**2).sum() for column in (end.position, end.velocity, end.density))
         found = torch.autograd.grad(loss, [*inputs, *force.parameters()], materialize_grads=True)
-        assert dynamics.surroundings.builds > 1
+        assert dynamics.neighborhood.builds > 1
         return found
 
     slab, particles = distributed(comm, *columns)
@@ -106,7 +106,7 @@ def test_particles_that_cross_slabs_go_on_as_on_one_rank(comm, name, integrator,
         with torch.no_grad():
             for _ in range(steps):
                 particles = stepper.step(particles, 0.2 / steps)
-        assert dynamics.surroundings is None if name == "resolved" else 2 < dynamics.surroundings.builds < 20
+        assert dynamics.neighborhood is None if name == "resolved" else 2 < dynamics.neighborhood.builds < 20
         assert slab.size == 1 or set(start.id.tolist()) != set(particles.id.tolist())
         ends.append(by_id(slab.comm, particles, particles.velocity, 150))
     assert_close(*ends, 1e-10)
@@ -205,11 +205,11 @@ def test_without_terms_that_look_at_others_there_is_no_list_no_halo_and_no_migra
 
     slab, particles = distributed(comm, *state())
     for name in ("HaloExchange", "NeighborList", "migrate", "any_rank", "global_max"):
-        monkeypatch.setattr(surroundings, name, forbidden)
+        monkeypatch.setattr(neighborhood, name, forbidden)
     dynamics = dynamics_of(slab, model(terms))
     moved = INTEGRATORS["verlet"](dynamics).step(particles, 0.5)
     assert torch.equal(moved.position, dynamics.box.wrap(particles.position + 0.5 * particles.velocity))
-    assert dynamics.surroundings is None and dynamics.resolution is None
+    assert dynamics.neighborhood is None and dynamics.resolution is None
     assert torch.all((moved.position >= 0) & (moved.position < LENGTH))
 
 

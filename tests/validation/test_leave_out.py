@@ -229,12 +229,12 @@ def test_without_a_pair_sum_no_neighbours_are_searched_and_no_density_travels(co
 def test_a_model_without_pairs_has_neither_list_nor_ghosts(comm):
     resolved, both, pairs = (set_up(comm, PRESETS[name])[0]
                              for name in ("resolved", "resolved + pairs", "learned-density"))
-    assert resolved.surroundings is None and resolved.resolution is not None
-    assert both.surroundings.cutoff == pairs.surroundings.cutoff == pairs.model.flow.cutoff
+    assert resolved.neighborhood is None and resolved.resolution is not None
+    assert both.neighborhood.cutoff == pairs.neighborhood.cutoff == pairs.model.flow.cutoff
     assert pairs.resolution is None
     for terms in ({}, FORCING):
         nothing, _ = set_up(comm, terms)
-        assert nothing.surroundings is None and nothing.resolution is None
+        assert nothing.neighborhood is None and nothing.resolution is None
 
 
 @pytest.mark.mpi(1, 2)

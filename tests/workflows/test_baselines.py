@@ -106,7 +106,7 @@ def test_without_a_force_there_is_no_list_and_no_halo(comm, folder):
         truth = GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, 8))
         run = BallisticRun(load_scene(folder / "baseline.toml"), truth, 1, folder, "cpu")
     dynamics = run.dynamics
-    assert dynamics.surroundings is None and dynamics.resolution is None and not dynamics.model.terms
+    assert dynamics.neighborhood is None and dynamics.resolution is None and not dynamics.model.terms
 
 
 @pytest.mark.mpi(1, 2)

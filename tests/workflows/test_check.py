@@ -118,9 +118,9 @@ def test_ranks_for_horizons_are_those_that_the_grid_and_the_particles_accept(com
 
     from eddies.parallel.halo import HaloError
     from eddies.parallel.slab import SlabDecomposition
+    from eddies.particles.neighborhood import Neighborhood
     from eddies.particles.particle_set import ParticleSet
     from eddies.particles.resolved_velocity import ResolvedVelocity
-    from eddies.particles.surroundings import Surroundings
     from eddies.scene.scene import BOX_LENGTH
     from eddies.workflows.foreseen.estimates import (ALLOWED_VELOCITY, expected_turbulence, horizon_time,
                                                      most_training_ranks, particle_drift)
@@ -145,7 +145,7 @@ def test_ranks_for_horizons_are_those_that_the_grid_and_the_particles_accept(com
     assert accepted(lambda: ResolvedVelocity.on_slabs(slab, FLOW, drift)) == (comm.size <= by_grid)
     far = torch.tensor([[1.0, 1.0, slab.upper + particle_drift(scene, time)]], dtype=torch.float64)
     particles = ParticleSet(torch.tensor([comm.rank]), far, torch.zeros_like(far), torch.ones(1))
-    around = Surroundings(slab, BOX_LENGTH, support, 0.0)
+    around = Neighborhood(slab, BOX_LENGTH, support, 0.0)
     assert accepted(lambda: around.update(particles)) == (comm.size <= by_reach)
 
 

@@ -11,16 +11,16 @@ import torch
 from torch import Tensor
 
 from eddies.learning.losses import kullback_leibler, mean_square_share, soft_histogram
-from eddies.learning.optimization import Descent, shared_values
+from eddies.learning.optimization import Adam, shared_values
 from eddies.parallel.reduction import global_sum
-from eddies.particles.cloud import grid_points
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.model import LagrangianModel
 from eddies.particles.neighbor_list import NeighborList
+from eddies.particles.neighborhood import Neighborhood
+from eddies.particles.particle_field import grid_points
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.reconstruction import reconstruct, volumes
 from eddies.particles.smoothing_kernels import SmoothingKernel
-from eddies.particles.surroundings import Surroundings
 
 # Histograms of the divergence losses: bins over this many standard deviations to each side.
 HISTOGRAM_BINS, HISTOGRAM_REACH = 41, 5.0
@@ -75,28 +75,28 @@ class TrainingFrame:
         return self._row_of_sorted[place[self._sorted_ids[place] == wanted]]
 
     @cached_property
-    def surroundings(self) -> Surroundings:
+    def neighborhood(self) -> Neighborhood:
         """Halo and list of the pairs that the field loss looks at: the model's, if it has a list; the first use is
         collective."""
-        if self.dynamics.surroundings is not None:
-            return self.dynamics.surroundings
+        if self.dynamics.neighborhood is not None:
+            return self.dynamics.neighborhood
         slab, reach = self.decomposition, self.model.flow.cutoff
-        found = Surroundings(slab, slab.length, reach, 0.0)
+        found = Neighborhood(slab, slab.length, reach, 0.0)
         found.update(self.particles)
         return found
 
     @cached_property
     def position(self) -> Tensor:
         """Positions (s, 3) of the particles, then of the ghosts; its first use is collective."""
-        return self.surroundings.local(self.particles).position
+        return self.neighborhood.local(self.particles).position
 
     @torch.no_grad()
     def volumes(self, kernel: SmoothingKernel) -> Tensor:
         """Volumes (s,) of the particles, ghosts included; collective, and kept until another kernel comes."""
         if self._volumes is None or self._volumes[0] is not kernel:
             own = self.position[: len(self.particles)]
-            pairs = self.surroundings.neighbors.pairs(own, self.position, dtype=self.acceleration.dtype)
-            self._volumes = kernel, self.surroundings.column(volumes(kernel, pairs))
+            pairs = self.neighborhood.neighbors.pairs(own, self.position, dtype=self.acceleration.dtype)
+            self._volumes = kernel, self.neighborhood.column(volumes(kernel, pairs))
         return self._volumes[1]
 
     def errors(self, rows: Tensor | None = None, density: Tensor | None = None) -> dict[str, Tensor]:
@@ -138,16 +138,16 @@ class ForceTrainer:
         points = grid_points(self.decomposition, round(self.total ** (1 / 3)))
         self._points = points.to(frames[0].particles.position.device)
 
-    def trajectory_step(self, descent: Descent, step: int) -> dict[str, float]:
+    def trajectory_step(self, optimizer: Adam, step: int) -> dict[str, float]:
         """One step on the trajectory loss of a random batch of particles (Eq. 12); returns the losses."""
         frame, random = self._drawn(step)
         rows = frame.rows(random.choice(self.total, self.batch, replace=False))
-        return self._descend(descent, {"trajectory": self._trajectory_share(frame, frame.errors(rows), self.batch)})
+        return self._step(optimizer, {"trajectory": self._trajectory_share(frame, frame.errors(rows), self.batch)})
 
-    def combined_step(self, descent: Descent, step: int) -> dict[str, float]:
+    def combined_step(self, optimizer: Adam, step: int) -> dict[str, float]:
         """One step on all losses: of the particles in and around a random cube where the field loss is among them, of
         a random batch otherwise; returns the losses."""
-        return self._descend(descent, self._combined_shares(*self._drawn(step)))
+        return self._step(optimizer, self._combined_shares(*self._drawn(step)))
 
     @torch.no_grad()
     def combined_error(self, frame: TrainingFrame, draws: int) -> float:
@@ -179,10 +179,10 @@ class ForceTrainer:
     def _weighted(self, shares: dict[str, Tensor]) -> Tensor:
         return sum(getattr(self.weights, name) * share for name, share in shares.items())
 
-    def _descend(self, descent: Descent, shares: dict[str, Tensor]) -> dict[str, float]:
+    def _step(self, optimizer: Adam, shares: dict[str, Tensor]) -> dict[str, float]:
         """A step down the weighted sum of the losses; returns them."""
         total = self._weighted(shares)
-        norm = descent.step(total)
+        norm = optimizer.step(total)
         named = {f"{name}_loss": share for name, share in shares.items()}
         return {**shared_values(self.comm, {"loss": total, **named}), "gradient_norm": norm}
 
@@ -204,8 +204,8 @@ class ForceTrainer:
         its own error is many times what a step changes, and the force could not make up for it.
         """
         spread = torch.zeros_like(frame.acceleration).index_add(0, rows, error)
-        local = frame.surroundings.column(spread)
-        around = NeighborList(frame.surroundings.box, self.kernel.support, 0.0)
+        local = frame.neighborhood.column(spread)
+        around = NeighborList(frame.neighborhood.box, self.kernel.support, 0.0)
         around.build(points, frame.position, exclude_self=False)
         pairs = around.pairs(points, frame.position, dtype=error.dtype)
         field = reconstruct(self.kernel, pairs, frame.volumes(self.kernel), local)

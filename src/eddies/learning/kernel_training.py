@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from eddies.learning.losses import mean_square_share
-from eddies.learning.optimization import Descent, shared_values
+from eddies.learning.optimization import Adam, shared_values
 from eddies.parallel.reduction import global_sum
-from eddies.particles.cloud import ParticleCloud
+from eddies.particles.particle_field import ParticleField
 from eddies.particles.smoothing_kernels import KernelNetwork
 
 
@@ -28,13 +28,13 @@ class KernelSample:
 
     Parameters
     ----------
-    cloud : the particles.
+    particles : with their velocities.
     field : (m, 3) and gradient (m, 3, 3) [component, direction], the filtered velocity at the m grid points, z slowest.
     """
 
-    def __init__(self, cloud: ParticleCloud, field: Tensor, gradient: Tensor) -> None:
-        self.cloud, self.decomposition = cloud, cloud.decomposition
-        self.field, self.gradient = field.to(cloud.dtype), gradient.to(cloud.dtype)
+    def __init__(self, particles: ParticleField, field: Tensor, gradient: Tensor) -> None:
+        self.particles, self.decomposition = particles, particles.decomposition
+        self.field, self.gradient = field.to(particles.dtype), gradient.to(particles.dtype)
         self.mean_square = self._mean_squares()
 
     def own_rows(self, points: np.ndarray) -> Tensor:
@@ -69,13 +69,13 @@ class KernelTrainer:
         self.comm, self.total = samples[0].decomposition.comm, samples[0].decomposition.planes**3
         self.points, self.seed = min(points, self.total), seed
 
-    def step(self, descent: Descent, step: int) -> dict[str, float]:
+    def step(self, optimizer: Adam, step: int) -> dict[str, float]:
         """One step; returns the global losses."""
         random = np.random.default_rng([self.seed, step])
         sample = self.samples[random.integers(len(self.samples))]
         rows = sample.own_rows(np.sort(random.choice(self.total, self.points, replace=False)))
         kernel = self.network.table()
-        velocity, gradient = sample.cloud.on_grid(kernel, sample.cloud.volumes(kernel), rows)
+        velocity, gradient = sample.particles.on_grid(kernel, sample.particles.volumes(kernel), rows)
         # Each term in units of the mean square of what it reconstructs.
         error = velocity - sample.field[rows]
         shares = {"velocity": mean_square_share(error, sample.mean_square[0] ** 0.5, self.points)}
@@ -87,5 +87,5 @@ class KernelTrainer:
         if self.weights.normalization > 0:
             shares["normalization"] = (self.network.integral() - 1) ** 2 / self.comm.size
             total = total + self.weights.normalization * shares["normalization"]
-        descent.step(total)
+        optimizer.step(total)
         return shared_values(self.comm, {"loss": total, **shares})

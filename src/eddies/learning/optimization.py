@@ -14,7 +14,7 @@ from eddies.parallel.communicator import Comm
 from eddies.parallel.reduction import global_sum, sum_flat
 
 
-class Descent:
+class Adam:
     """Adam (Kingma and Ba 2014) with a learning rate that falls geometrically over `steps` steps.
 
     The loss given to `step` is this rank's share: the shares of all ranks add up to the global loss. Gradients are

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from eddies.learning.losses import mean_square_share
-from eddies.learning.optimization import Descent, shared_values
+from eddies.learning.optimization import Adam, shared_values
 from eddies.parallel.communicator import Comm
 from eddies.parallel.reduction import global_sum
 from eddies.particles.integrators import Integrator
@@ -73,14 +73,14 @@ class RolloutTrainer:
         self.total = int(global_sum(comm, len(windows[0].particles)))
         self.losses = mean_losses(windows) if energy_weight > 0 else None
 
-    def step(self, descent: Descent, step: int, horizon: int) -> dict[str, float]:
+    def step(self, optimizer: Adam, step: int, horizon: int) -> dict[str, float]:
         """One optimiser step on windows of `horizon` frames; returns the losses."""
         random = np.random.default_rng([self.seed, step])
         window = self.windows[random.integers(len(self.windows))]
         window = replace(window, particles=self._disturbed(window.particles, random))
         shares = self.loss_shares(window, horizon)
         total = sum(shares.values())
-        norm = descent.step(total)
+        norm = optimizer.step(total)
         values = shared_values(self.comm, shares)
         return {"loss": sum(values.values()), **values, "gradient_norm": norm}
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from eddies.learning.optimization import Descent
+from eddies.learning.optimization import Adam
 from eddies.parallel.communicator import Comm
 from eddies.parallel.halo import HaloError
 
@@ -33,7 +33,7 @@ class Phase:
     name: str
     work: np.ndarray
     rates: tuple[float, float]
-    take: Callable[[Descent, int], dict[str, float]]
+    take: Callable[[Adam, int], dict[str, float]]
     validate: Callable[[], float]
     validate_every: int
 
@@ -71,7 +71,7 @@ class Training:
         """Be at the start of a phase."""
         self.number, self.best_error, self.best, self.unimproved = number, np.inf, self._weights(), 0
         if self.running:
-            self.descent = Descent(self.comm, self.model.parameters(), self.phase.steps, *self.phase.rates)
+            self.optimizer = Adam(self.comm, self.model.parameters(), self.phase.steps, *self.phase.rates)
 
     @property
     def running(self) -> bool:
@@ -87,21 +87,21 @@ class Training:
     def done(self) -> float:
         """The fraction of all work that is done."""
         before = [phase.work for phase in self.phases[:self.number]]
-        done = sum(work.sum() for work in (*before, self.phase.work[:self.descent.taken]))
+        done = sum(work.sum() for work in (*before, self.phase.work[:self.optimizer.taken]))
         return float(done / sum(phase.work.sum() for phase in self.phases))
 
     def step(self) -> None:
         """One step of the present phase, and the validation that may be due after it."""
-        phase, rate = self.phase, self.descent.learning_rate
-        start = {"start_error": self._validate()} if self.descent.taken == 0 else {}
+        phase, rate = self.phase, self.optimizer.learning_rate
+        start = {"start_error": self._validate()} if self.optimizer.taken == 0 else {}
         row = {"phase": float(self.number), "step": float(len(self.history)), "learning_rate": rate, **start,
-               **phase.take(self.descent, self.descent.taken)}
+               **phase.take(self.optimizer, self.optimizer.taken)}
         place = f"step {len(self.history)} of the training ({phase.name})"
         for name in ("loss", "gradient_norm"):
             if not np.isfinite(row[name]):
                 raise TrainingDiverged(f"{place}: {name} is {row[name]}, at a learning rate of {rate:.3g}")
-        last = self.descent.taken == phase.steps
-        if last or self.descent.taken % phase.validate_every == 0:
+        last = self.optimizer.taken == phase.steps
+        if last or self.optimizer.taken % phase.validate_every == 0:
             row["validation_error"] = self._validate()
         over = last or self.patience is not None and self.unimproved >= self.patience
         if over and self.best_error == np.inf:
@@ -120,7 +120,7 @@ class Training:
     def state_dict(self) -> dict[str, Any]:
         """All that goes on, for a checkpoint: numbers and arrays by name."""
         parts = {"model": self._weights(), "best": self.best, "history": self.columns(),
-                 "descent": self.descent.state_dict()}
+                 "optimizer": self.optimizer.state_dict()}
         return {"number": self.number, "best_error": self.best_error, "unimproved": self.unimproved,
                 "names": {part: list(values) for part, values in parts.items()},
                 **{f"{part} {name}": value if isinstance(value, int) else np.atleast_1d(value)
@@ -132,7 +132,7 @@ class Training:
         self._load(parts["model"])
         self._begin(state["number"])
         self.best, self.best_error, self.unimproved = parts["best"], state["best_error"], state["unimproved"]
-        self.descent.load_state_dict(parts["descent"])
+        self.optimizer.load_state_dict(parts["optimizer"])
         rows = zip(*parts["history"].values())
         self.history = [{name: float(value) for name, value in zip(parts["history"], row) if value == value}
                         for row in rows]

@@ -14,10 +14,10 @@ from torch import Tensor
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles import moments
 from eddies.particles.flow_units import FlowUnits
+from eddies.particles.neighborhood import LocalParticles, Neighborhood
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.rank_sums import mean_over_ranks
 from eddies.particles.scaled_pairs import ScaledPairs
-from eddies.particles.surroundings import LocalParticles, Surroundings
 from eddies.scene.values import SceneError
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ class Context:
     decomposition : slabs, with the communicator.
     particles : the owned ones.
     flow : units of the model.
-    surroundings : halo and neighbour list that fit the particles; None where no term looks at others.
+    neighborhood : halo and neighbour list that fit the particles; None where no term looks at others.
     resolution : what resolves the particles' velocity; None where no term reads it.
     rows : (k,), the particles whose acceleration and density rate are asked for; None: all.
     dtype : of the pair arithmetic; None: that of the positions.
@@ -68,21 +68,21 @@ class Context:
     """
 
     def __init__(self, decomposition: SlabDecomposition, particles: ParticleSet, flow: FlowUnits,
-                 surroundings: Surroundings | None, resolution: ResolvedVelocity | None, rows: Tensor | None = None,
+                 neighborhood: Neighborhood | None, resolution: ResolvedVelocity | None, rows: Tensor | None = None,
                  dtype: torch.dtype | None = None, density: Tensor | None = None, time: float | None = None) -> None:
         self.decomposition, self.comm = decomposition, decomposition.comm
         self.particles, self.flow, self.rows, self.density = particles, flow, rows, density
         self.dtype = dtype or particles.position.dtype
-        self._surroundings, self._resolution, self._time = surroundings, resolution, time
+        self._neighborhood, self._resolution, self._time = neighborhood, resolution, time
         self._columns: dict[str, Tensor] = {}
         self._sums: dict[Summand, Tensor] = {}
 
     @cached_property
     def local(self) -> LocalParticles:
         """The particles that this rank sees, ghosts included, without columns."""
-        if self._surroundings is None:
+        if self._neighborhood is None:
             raise SceneError(UNSEEN)
-        return self._surroundings.local(self.particles)
+        return self._neighborhood.local(self.particles)
 
     @cached_property
     def everywhere(self) -> Context:
@@ -96,14 +96,14 @@ class Context:
 
     def column(self, name: str) -> Tensor:
         """"velocity" (s, 3) or "density" (s,) of the particles that this rank sees, owned first; collective."""
-        if self._surroundings is None:
+        if self._neighborhood is None:
             raise SceneError(UNSEEN)
         if name not in self._columns:
             owned = self.density if name == "density" else getattr(self.particles, name)
             if owned is None:
                 raise SceneError(f'no term of this model reads "{name}": add it to the `reads` of the settings; or the '
                                  "particles have none")
-            self._columns[name] = self._surroundings.column(owned)
+            self._columns[name] = self._neighborhood.column(owned)
         return self._columns[name]
 
     @cached_property

@@ -12,10 +12,10 @@ from torch import Tensor
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.context import Context
 from eddies.particles.model import LagrangianModel, LinearRates
+from eddies.particles.neighborhood import Neighborhood, at_home, farthest_outside
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.periodic_box import PeriodicBox
 from eddies.particles.rates import Rates
-from eddies.particles.surroundings import Surroundings, at_home, farthest_outside
 
 if TYPE_CHECKING:
     from eddies.particles.resolved_velocity import ResolvedVelocity
@@ -44,20 +44,20 @@ class ParticleDynamics:
         self.decomposition, self.model, self.dtype, self.fixed_ranks = decomposition, model, dtype, fixed_ranks
         self.box, self.time, self.evaluations = PeriodicBox(decomposition.length), 0.0, 0
         self.resolution: ResolvedVelocity | None = None
-        self.surroundings: Surroundings | None = None
+        self.neighborhood: Neighborhood | None = None
         if "resolved" in model.reads:
             from eddies.particles import resolved_velocity  # pyfftw, where a transform is needed
             self.resolution = resolved_velocity.ResolvedVelocity.on_slabs(decomposition, model.flow, skin / 2 + drift)
         if "pairs" in model.reads:
-            self.surroundings = Surroundings(decomposition, decomposition.length, model.flow.cutoff, skin)
+            self.neighborhood = Neighborhood(decomposition, decomposition.length, model.flow.cutoff, skin)
 
     def forget(self) -> None:
         """Build halo and list anew at the next occasion.
 
         A run that does so wherever it writes a checkpoint goes on bit for bit as one that starts from it.
         """
-        if self.surroundings is not None:
-            self.surroundings.forget()
+        if self.neighborhood is not None:
+            self.neighborhood.forget()
 
     def begin(self) -> None:
         """Time 0 of a run of which nothing is known yet."""
@@ -88,7 +88,7 @@ class ParticleDynamics:
         companions = companions or {}
         if self.fixed_ranks:
             return particles, companions
-        if self.surroundings is None and (self.resolution is None or self.decomposition.size == 1):
+        if self.neighborhood is None and (self.resolution is None or self.decomposition.size == 1):
             if self.resolution is not None:
                 farthest_outside(self.decomposition, particles)
             return replace(particles, position=self.box.wrap(particles.position)), companions
@@ -97,7 +97,7 @@ class ParticleDynamics:
         if not recorded and self._away(particles):
             prefix = "companion "
             named = {prefix + name: column for name, column in companions.items()}
-            reach = self.model.flow.cutoff if self.surroundings else self.decomposition.spacing
+            reach = self.model.flow.cutoff if self.neighborhood else self.decomposition.spacing
             moved = at_home(self.decomposition, {**columns, **named}, reach)
             particles = ParticleSet(**{name: moved[name] for name in columns})
             companions = {name: moved[prefix + name] for name in companions}
@@ -105,8 +105,8 @@ class ParticleDynamics:
 
     def _away(self, particles: ParticleSet) -> bool:
         """Whether halo and list no longer fit the particles, or, where there are none, one is out of its slab."""
-        if self.surroundings is not None:
-            return self.surroundings.outdated(particles)
+        if self.neighborhood is not None:
+            return self.neighborhood.outdated(particles)
         return farthest_outside(self.decomposition, particles) > 0
 
     def rates(self, particles: ParticleSet, rows: Tensor | None = None,
@@ -131,9 +131,9 @@ class ParticleDynamics:
     def context(self, particles: ParticleSet, rows: Tensor | None = None, density: Tensor | None = None,
                 time: float | None = None) -> Context:
         """What terms are evaluated in at these particles; collective."""
-        if self.surroundings is not None:
-            self.surroundings.update(particles)
+        if self.neighborhood is not None:
+            self.neighborhood.update(particles)
         if density is None and not self.model.density_is_given:
             density = particles.density
-        return Context(self.decomposition, particles, self.model.flow, self.surroundings, self.resolution, rows,
+        return Context(self.decomposition, particles, self.model.flow, self.neighborhood, self.resolution, rows,
                        self.dtype, density, time)

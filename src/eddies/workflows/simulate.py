@@ -32,7 +32,7 @@ log = logging.getLogger("eddies")
 WARM_UP_STEPS = 2
 
 
-class Mover(Protocol):
+class Method(Protocol):
     """What moves the particles of a rollout, made as Class(scene, truth, start, directory, device) where `start` is the
     frame of the ground truth that it starts from. All methods are collective."""
 
@@ -67,42 +67,42 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
           create_product(comm, directory / "rollout.h5", "rollout", scene.provenance("simulate")) as file):
         truth = GroundTruth(truth_file, slab)
         start = start_frame(scene, truth)
-        mover = method_class(settings.method)(scene, truth, start, directory, device)
+        method = method_class(settings.method)(scene, truth, start, directory, device)
         frames = RolloutFrames(file, truth, load_kernel(comm, directory / "kernel.h5"), truth.times[start],
-                               mover.has_density)
+                               method.has_density)
         turnover = truth.reference["eddy_turnover_time"]
         count = int(np.ceil(settings.turnovers * turnover / settings.frame_interval - 1e-9))
         with torch.no_grad():
-            outcome = roll_out(mover, frames, count, settings.frame_interval, truth, stop or StopRequest(comm))
+            outcome = roll_out(method, frames, count, settings.frame_interval, truth, stop or StopRequest(comm))
         write_attributes(file.create_group("rollout"), {
-            **outcome, **mover.description(), "method": settings.method, "turnovers": outcome["time"] / turnover,
+            **outcome, **method.description(), "method": settings.method, "turnovers": outcome["time"] / turnover,
             "injection_rate": injection_rate(scene, truth), "eddy_turnover_time": turnover,
             "start_time": float(truth.times[start]), "particles": truth.total, "ranks": comm.size})
-        for name, columns in mover.series().items():
+        for name, columns in method.series().items():
             write_table(file, name, {"time": frames.times, **columns})
     log.info("rollout: %s after %.2f turnovers, %.3f s/step", outcome["status"], outcome["time"] / turnover,
              outcome["seconds_per_step"])
 
 
-def roll_out(mover: Mover, frames: RolloutFrames, count: int, interval: float, truth: GroundTruth,
+def roll_out(method: Method, frames: RolloutFrames, count: int, interval: float, truth: GroundTruth,
              stop: StopRequest) -> dict[str, float | str]:
     """Advance `count` frame intervals, or until the state is at fault; returns status, time, and seconds a step."""
     comm = truth.decomposition.comm
     clock, seconds, complaint = Clock(end=count * interval), [], None
-    progress = ProgressLine("rollout", lambda: f"t {clock.time:.3f}  energy {energy:.4f}{mover.status()}")
-    energy = store(frames, mover, clock, 0.0, truth)
+    progress = ProgressLine("rollout", lambda: f"t {clock.time:.3f}  energy {energy:.4f}{method.status()}")
+    energy = store(frames, method, clock, 0.0, truth)
     for number in range(1, count + 1):
         until = number * interval
-        while complaint is None and mover.time < until - 1e-9 * interval:
+        while complaint is None and method.time < until - 1e-9 * interval:
             stop.check()
-            began, before = time.perf_counter(), mover.time
-            complaint = mover.advance(until, clock.steps + 1)
+            began, before = time.perf_counter(), method.time
+            complaint = method.advance(until, clock.steps + 1)
             if complaint is None:
-                clock.tick(mover.time - before)
+                clock.tick(method.time - before)
                 seconds.append(time.perf_counter() - began)
         if complaint is not None:
             break
-        energy = store(frames, mover, clock, until, truth)
+        energy = store(frames, method, clock, until, truth)
         progress(until / clock.end, clock.steps)
     if complaint is not None and comm.rank == 0:
         log.warning("rollout stopped at time %.4g: %s", clock.time, complaint)
@@ -117,9 +117,9 @@ def quartiles(seconds: Sequence[float]) -> dict[str, float]:
     return {"seconds_per_step": median, "seconds_per_step_low": low, "seconds_per_step_high": high}
 
 
-def store(frames: RolloutFrames, mover: Mover, clock: Clock, time: float, truth: GroundTruth) -> float:
+def store(frames: RolloutFrames, method: Method, clock: Clock, time: float, truth: GroundTruth) -> float:
     """Store the frame of a time; returns the mean kinetic energy <v.v>/2 of its particles."""
-    particles, acceleration = mover.frame(time)
+    particles, acceleration = method.frame(time)
     frames.store(clock.steps, time, particles, acceleration)
     energy = 0.5 * float(particles.velocity.double().square().sum())
     return float(global_sum(truth.decomposition.comm, energy)) / truth.total

@@ -19,7 +19,7 @@ from eddies.particles.devices import prepare_torch
 from eddies.pipeline import STAGES
 from eddies.scene.scene import BOX_LENGTH, Scene, SceneError
 from eddies.workflows.ground_truth.truth import GroundTruth
-from eddies.workflows.learned import adopt
+from eddies.workflows.learned import transfer
 from eddies.workflows.learned.a_priori import evaluate, evaluation_frames
 from eddies.workflows.learned.description import describe
 from eddies.workflows.learned.kernel import load_kernel
@@ -38,7 +38,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     With [model] path its weights are adopted instead. A training that is stopped goes on from a checkpoint.
     """
     if scene.model.path is not None:
-        adopt.run(scene, comm, directory)
+        transfer.run(scene, comm, directory)
         return
     device, directory, stop = prepare_torch(scene.device, comm), Path(directory), stop or StopRequest(comm)
     with open_product(comm, directory / "ground_truth.h5", "ground_truth") as file:

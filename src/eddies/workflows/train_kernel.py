@@ -13,14 +13,14 @@ from eddies.flow.operators import gradient
 from eddies.io.hdf5 import open_product
 from eddies.io.weights import save_weights
 from eddies.learning.kernel_training import KernelLossWeights, KernelSample, KernelTrainer
-from eddies.learning.optimization import Descent
+from eddies.learning.optimization import Adam
 from eddies.parallel.communicator import Comm
 from eddies.parallel.migration import id_block, migrate
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import StopRequest
-from eddies.particles.cloud import ParticleCloud
 from eddies.particles.devices import prepare_torch
+from eddies.particles.particle_field import ParticleField
 from eddies.particles.smoothing_kernels import CubicSpline, KernelNetwork, SmoothingKernel, WendlandC2, integral
 from eddies.scene.scene import BOX_LENGTH, Scene
 from eddies.spectral.spectral_grid import SpectralGrid
@@ -79,7 +79,7 @@ def load_sample(truth: GroundTruth, index: int, support: float) -> KernelSample:
     by_point = [torch.from_numpy(np.ascontiguousarray(np.moveaxis(values.reshape(*values.shape[:-3], -1), -1, 0)))
                 for values in (velocity, derivatives)]
     position, own_velocity = (torch.from_numpy(columns[name]) for name in ("position", "velocity"))
-    return KernelSample(ParticleCloud(slab, support, position, own_velocity), *by_point)
+    return KernelSample(ParticleField(slab, support, position, own_velocity), *by_point)
 
 
 def train(scene: Scene, samples: list[KernelSample], name: str, gradient_weight: float,
@@ -87,16 +87,16 @@ def train(scene: Scene, samples: list[KernelSample], name: str, gradient_weight:
     """A trained kernel network and the history of its losses."""
     settings = scene.kernel
     support = settings.support(scene.tracers.particles)
-    network = KernelNetwork(support, settings.hidden, settings.cutoff, scene.seed).to(samples[0].cloud.dtype)
+    network = KernelNetwork(support, settings.hidden, settings.cutoff, scene.seed).to(samples[0].particles.dtype)
     weights = KernelLossWeights(gradient_weight, settings.normalization_weight)
     trainer = KernelTrainer(network, samples, weights, settings.points, scene.seed)
-    descent = Descent(trainer.comm, network.parameters(), settings.steps, settings.learning_rate,
-                      FINAL_RATE_FRACTION * settings.learning_rate)
+    optimizer = Adam(trainer.comm, network.parameters(), settings.steps, settings.learning_rate,
+                     FINAL_RATE_FRACTION * settings.learning_rate)
     history: list[dict[str, float]] = []
     progress = ProgressLine(f"kernel {name}", lambda: f"loss {history[-1]['loss']:.5f}")
     for step in range(settings.steps):
         stop.check()
-        history.append({"step": step, **trainer.step(descent, step)})
+        history.append({"step": step, **trainer.step(optimizer, step)})
         progress((step + 1) / settings.steps, step + 1)
     return network, {key: np.array([row[key] for row in history]) for key in history[0]}
 
@@ -118,7 +118,7 @@ def compare(kernels: dict[str, SmoothingKernel], sample: KernelSample) -> dict[s
     slices["truth_velocity"] = _middle_plane(slab, sample.field[:, 0])
     slices["truth_gradient"] = _middle_plane(slab, sample.gradient[:, 0, 0])
     for name, kernel in kernels.items():
-        velocity, derivative = sample.cloud.on_whole_grid(kernel)
+        velocity, derivative = sample.particles.on_whole_grid(kernel)
         errors[f"velocity_error_{name}"], errors[f"gradient_error_{name}"] = sample.errors_of(velocity, derivative)
         errors[f"integral_{name}"] = float(integral(kernel))
         slices[f"velocity_{name}"] = _middle_plane(slab, velocity[:, 0])

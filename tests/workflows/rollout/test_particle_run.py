@@ -126,12 +126,12 @@ def write_model(comm, directory, scene, scales, bound=1e3):
     save_weights(comm, directory / "model.h5", "model", describe(scene, scales), weights, {}, {"feature_range": ranges})
 
 
-def mover_of(comm, directory, scene, start):
+def method_of(comm, directory, scene, start):
     with open_product(comm, directory / "ground_truth.h5", "ground_truth") as file:
         truth = GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes))
-        mover = method_class(scene.simulation.method)(scene, truth, start, directory, torch.device("cpu"))
+        method = method_class(scene.simulation.method)(scene, truth, start, directory, torch.device("cpu"))
         with torch.no_grad():
-            return truth.scales_at(start), truth.scales, mover, *mover.frame(0.0)
+            return truth.scales_at(start), truth.scales, method, *method.frame(0.0)
 
 
 @pytest.mark.mpi(1, 2)
@@ -141,10 +141,10 @@ def test_units_are_those_of_the_start_frame_whatever_follows(comm, tmp_path):
     for name, turnovers in (("short", 0.1), ("long", 0.2)):
         folder, start = tmp_path / name, 3
         scene = prepared(comm, folder, turnovers=turnovers)
-        at_start, release, *_ = mover_of(comm, folder, with_method(scene, "none"), start)
+        at_start, release, *_ = method_of(comm, folder, with_method(scene, "none"), start)
         write_model(comm, folder, scene, release)
-        at_start, release, mover, particles, acceleration = mover_of(comm, folder, scene, start)
-        assert mover.flow.scales == mover.model.flow.scales == at_start != release
+        at_start, release, method, particles, acceleration = method_of(comm, folder, scene, start)
+        assert method.flow.scales == method.model.flow.scales == at_start != release
         found.append((at_start, release, particles, acceleration))
     (scales, release, particles, acceleration), (other, release_too, more, again) = found
     assert scales == other and release == release_too and acceleration.abs().max() > 0
@@ -164,9 +164,9 @@ def test_every_method_has_the_units_of_its_start_and_runs(comm, tmp_path, method
     with open_product(comm, tmp_path / "ground_truth.h5", "ground_truth") as file:
         release = GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, 6)).scales
     write_model(comm, tmp_path, scene, release)
-    scales, _, mover, particles, acceleration = mover_of(comm, tmp_path, scene, 3)
-    assert getattr(mover, "scales", scales) == scales
-    assert (particles.density is not None) == mover.has_density == (method != "none")
+    scales, _, method, particles, acceleration = method_of(comm, tmp_path, scene, 3)
+    assert getattr(method, "scales", scales) == scales
+    assert (particles.density is not None) == method.has_density == (method != "none")
     assert len(acceleration) == 6**3 and bool(torch.isfinite(acceleration).all())
     assert bool(acceleration.any()) == (method != "none")
     simulate.run(scene, comm, tmp_path)

@@ -11,7 +11,7 @@ import torch
 
 from eddies.learning.force_training import ForceTrainer, LossWeights, TrainingFrame
 from eddies.learning.losses import relative_error
-from eddies.learning.optimization import Descent
+from eddies.learning.optimization import Adam
 from eddies.learning.rollout_training import RolloutTrainer, TrainingWindow
 from eddies.learning.training import Phase
 from eddies.particles.dynamics import ParticleDynamics
@@ -119,8 +119,8 @@ class TrainingData:
         every = max(settings.horizon_steps // HORIZON_VALIDATIONS, 1)
 
         def phase(number: int, horizon: int) -> Phase:
-            def take(descent: Descent, step: int) -> dict[str, float]:
-                return trainer.step(descent, number * settings.horizon_steps + step, horizon)
+            def take(optimizer: Adam, step: int) -> dict[str, float]:
+                return trainer.step(optimizer, number * settings.horizon_steps + step, horizon)
 
             # Each step through a window is evaluated, evaluated again on the way back, and differentiated.
             work = np.full(settings.horizon_steps, 3.0 * substeps * horizon * trainer.total)

@@ -10,7 +10,7 @@ from eddies.io.hdf5 import File
 from eddies.io.trajectories import TrajectoryWriter
 from eddies.parallel.migration import IdOrder, migrate
 from eddies.parallel.slab import SlabDecomposition
-from eddies.particles.cloud import ParticleCloud
+from eddies.particles.particle_field import ParticleField
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.smoothing_kernels import SmoothingKernel
 from eddies.workflows.ground_truth.truth import GroundTruth
@@ -58,12 +58,12 @@ class RolloutFrames:
     def _store(self, name: str, step: int, time: float, columns: dict[str, np.ndarray]) -> None:
         columns = migrate(self._slab, {column: columns[column] for column in ("id", *self._columns)})
         position, velocity = (torch.from_numpy(columns[column]) for column in ("position", "velocity"))
-        cloud = ParticleCloud(self._slab, self.kernel.support, position, velocity)
-        columns["velocity_gradient"] = as_numpy(cloud.at_particles(self.kernel)[1])
+        particle_field = ParticleField(self._slab, self.kernel.support, position, velocity)
+        columns["velocity_gradient"] = as_numpy(particle_field.at_particles(self.kernel)[1])
         order = IdOrder(self._slab.comm, columns["id"], self.truth.total)
         by_id = {column: order.apply(columns[column]) for column in (*self._columns, *GRADIENT)}
         self._trajectories[name].append(step, time, order.start, by_id)
-        field = as_numpy(cloud.velocity_on_whole_grid(self.kernel)).T
+        field = as_numpy(particle_field.velocity_on_whole_grid(self.kernel)).T
         n = self._slab.planes
         self._fields[name].append(time, self._slab.start, {"velocity": field.reshape(3, self._slab.count, n, n)})
 

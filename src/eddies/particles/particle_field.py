@@ -21,7 +21,7 @@ from eddies.particles.smoothing_kernels import SmoothingKernel
 PAIRS_TOGETHER = 1 << 16
 
 
-class ParticleCloud:
+class ParticleField:
     """This rank's particles with the ghosts within `support`, and grid points among them.
 
     The grid has one cell for each plane of the slabs; its points on this rank are numbered z slowest.

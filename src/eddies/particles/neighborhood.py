@@ -39,7 +39,7 @@ class LocalParticles:
     box: PeriodicBox
 
 
-class Surroundings:
+class Neighborhood:
     """Halo and neighbour list of the particles of a decomposition.
 
     Parameters

@@ -5,8 +5,8 @@ import torch
 
 from eddies.parallel.halo import HaloError
 from eddies.parallel.slab import SlabDecomposition
+from eddies.particles.neighborhood import Neighborhood
 from eddies.particles.particle_set import ParticleSet
-from eddies.particles.surroundings import Surroundings
 from tests.particles.clouds import LENGTH
 
 
@@ -26,13 +26,13 @@ def test_particles_that_stray_into_one_slab_from_both_sides_are_refused_where_th
     cutoff = LENGTH / comm.size - 0.6
     heights = [slab.upper + strayed] if comm.rank == 0 else []
     heights += [slab.lower - strayed] if comm.rank == 2 % comm.size else []
-    surroundings = Surroundings(slab, LENGTH, cutoff, 0.0)
+    neighborhood = Neighborhood(slab, LENGTH, cutoff, 0.0)
     assert (LENGTH / comm.size - 2 * strayed < cutoff) == refused
     if refused:
         with pytest.raises(HaloError, match="thinner than the halo"):
-            surroundings.update(particles_at(comm, heights))
+            neighborhood.update(particles_at(comm, heights))
     else:
-        surroundings.update(particles_at(comm, heights))
+        neighborhood.update(particles_at(comm, heights))
 
 
 @pytest.mark.mpi(1, 2)
@@ -43,11 +43,11 @@ def test_a_particle_that_is_nowhere_near_its_slab_is_named_by_all_ranks(comm, z,
     slab = SlabDecomposition(comm, LENGTH, 24)
     below = z if comm.size > 1 else z - LENGTH
     heights = [slab.upper - 0.1, below if comm.rank == comm.size - 1 else slab.lower]
-    surroundings, particles = Surroundings(slab, LENGTH, 1.0, 0.0), particles_at(comm, heights)
+    neighborhood, particles = Neighborhood(slab, LENGTH, 1.0, 0.0), particles_at(comm, heights)
     if comm.size == 1 and math.isfinite(z):
-        surroundings.update(particles)
+        neighborhood.update(particles)
         return
     with pytest.raises(HaloError) as told:
-        surroundings.update(particles)
+        neighborhood.update(particles)
     last = comm.size - 1
     assert f"within the step, rank {last}, particle {10 * last + 1}: {complaint}" in str(told.value)

@@ -5,7 +5,7 @@ import torch
 from eddies.flow.tracers import release
 from eddies.parallel.reduction import global_max, global_sum
 from eddies.parallel.slab import SlabDecomposition
-from eddies.particles.cloud import ParticleCloud, grid_points
+from eddies.particles.particle_field import ParticleField, grid_points
 from eddies.particles.smoothing_kernels import WendlandC2
 
 LENGTH = 2 * np.pi
@@ -14,7 +14,7 @@ LENGTH = 2 * np.pi
 def cloud_of(comm, field, per_side=16, cells=12, placement="lattice"):
     slab = SlabDecomposition(comm, LENGTH, cells)
     position = torch.from_numpy(release(slab, 3, per_side, placement)["position"])
-    return ParticleCloud(slab, 2.5 * LENGTH / per_side, position, field(position), torch.float64)
+    return ParticleField(slab, 2.5 * LENGTH / per_side, position, field(position), torch.float64)
 
 
 def largest(comm, error):
