@@ -12,8 +12,9 @@ if [ $# -gt 0 ] && [ "${1#-}" = "$1" ]; then
     shift
 fi
 if [ -z "${EDDIES_RANKS:-}" ]; then
-    most=$("$jobs/../.venv/bin/eddies" check "$EDDIES_SCENE" | sed -n 's/^ranks *at most //p')
-    EDDIES_RANKS=$((${most:-8} < 8 ? ${most:-8} : 8))
+    most=$("$jobs/../.venv/bin/eddies" check "$EDDIES_SCENE" --json |
+        "$jobs/../.venv/bin/python" -c 'import json, sys; print(json.load(sys.stdin)["most_ranks"])')
+    EDDIES_RANKS=$((most < 8 ? most : 8))
 fi
 export EDDIES_RANKS
 launcher=("$jobs/../.venv/bin/python" "$jobs/../mpi_tools/launch.py" --)

@@ -150,6 +150,7 @@ def build_parser() -> argparse.ArgumentParser:
     export.set_defaults(command=export_command)
     check = commands.add_parser("check", help="derived numbers, memory, ranks and time; writes nothing")
     add_scene_options(check)
+    check.add_argument("--json", action="store_true", help="the numbers as JSON, for programs")
     check.set_defaults(command=check_command)
     scenes = commands.add_parser("scenes", help="the built-in scenes, a line each; or one with all settings")
     scenes.add_argument("scene", nargs="?", metavar="SCENE", help="print this scene, defaults included")
@@ -226,7 +227,7 @@ def export_command(options: argparse.Namespace, comm: Comm) -> None:
 def check_command(options: argparse.Namespace, comm: Comm) -> None:
     """Derived numbers and estimates of a scene."""
     scene = load_scene(options.scene, options.overrides)
-    import_module("eddies.workflows.check").run(scene, comm)
+    import_module("eddies.workflows.check").run(scene, comm, options.json)
 
 
 def scenes_command(options: argparse.Namespace, comm: Comm) -> None:

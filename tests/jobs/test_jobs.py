@@ -41,8 +41,8 @@ def checkout(tmp_path):
     shutil.copy(CHECKOUT / "mpi_tools/launch.py", tmp_path / "mpi_tools")
     for name, text in {"mpi_tools/bootstrap.sh": "true", "bin/mpirun": 'echo "mpirun $*"; shift 2; "$@"',
                        "bin/srun": '"$@"', "bin/scontrol": 'echo "scontrol $*"',
-                       ".venv/bin/eddies": 'echo "$SAYS"; echo "eddies $*; threads $OMP_NUM_THREADS"\n'
-                                           'exit ${ENDS_WITH:-0}',
+                       ".venv/bin/eddies": '[ "$1" != check ] || { echo "$CHECKED"; exit; }\n'
+                                           'echo "eddies $*; threads $OMP_NUM_THREADS"\nexit ${ENDS_WITH:-0}',
                        ".venv/bin/python": f'exec {sys.executable} "$@"'}.items():
         path = tmp_path / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -55,7 +55,7 @@ def run(checkout, script, *arguments, **variables):
     ours = {name: value for name, value in os.environ.items() if not re.match("EDDIES_|OMP_|PBS_", name)}
     path = f"{checkout / 'bin'}:{os.environ['PATH']}"
     return subprocess.run(["bash", checkout / "jobs" / script, *arguments], cwd=checkout, text=True,
-                          capture_output=True, timeout=60, env=ours | {"PATH": path} | variables)
+                          capture_output=True, timeout=60, env=ours | {"PATH": path, "CHECKED": '{"most_ranks": 8}'} | variables)
 
 
 @pytest.mark.parametrize("asked, ranks", [("1", 1), ("1000", local_cores()), (None, min(8, local_cores()))])
@@ -67,8 +67,8 @@ def test_local_runs_on_the_cores_or_fewer(checkout, asked, ranks):
 
 
 def test_local_starts_no_more_ranks_than_the_scene_can_use(checkout):
-    result = run(checkout, "local.sh", "tiny", SAYS="ranks       at most 1")
-    assert "mpirun -n 1 " in result.stdout and "eddies check" not in result.stdout
+    result = run(checkout, "local.sh", "tiny", CHECKED='{"most_ranks": 1}')
+    assert "mpirun -n 1 " in result.stdout and "eddies run tiny" in result.stdout
 
 
 def test_local_passes_scene_and_options_on(checkout):

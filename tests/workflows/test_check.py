@@ -1,5 +1,6 @@
 """Numbers told before a run: against closed forms, against what a run does, and nothing is written."""
 
+import json
 import logging
 import math
 from dataclasses import replace
@@ -35,6 +36,29 @@ def test_check_of_any_scene_writes_nothing(comm, tmp_path, monkeypatch, caplog, 
 def test_check_on_more_ranks(comm, caplog, recorded):
     text = lines_of(load_scene("hit-small"), comm, caplog)
     assert comm.rank > 0 or "at most 12" in text
+
+
+@pytest.mark.mpi(1, 2)
+def test_numbers_for_programs(comm, capfd):
+    from eddies.workflows import check
+    check.run(load_scene("hit-small"), comm, as_json=True)
+    shown = capfd.readouterr().out
+    if comm.rank > 0:
+        assert shown == ""
+        return
+    told = json.loads(shown)
+    assert (told["particles"], told["largest_wavenumber"], told["most_ranks"]) == (32768, 21, 12)
+    assert told["most_ranks"] == min(told["limits"].values()) <= told["most_ranks_dns"] and told["ranks"] == comm.size
+    assert told["turbulence"]["reynolds_lambda"] == pytest.approx(50.3, abs=0.05)
+    assert [row["ranks"] for row in told["costs"]][:3] == [1, 2, 4] and told["warnings"] == []
+
+
+@pytest.mark.mpi(1)
+def test_what_is_not_foreseen_is_null(comm, capfd):
+    from eddies.workflows import check
+    check.run(load_scene("abc"), comm, as_json=True)
+    told = json.loads(capfd.readouterr().out)
+    assert told["turbulence"] is told["particles"] is told["kernel_support"] is None
 
 
 @pytest.mark.mpi(1)

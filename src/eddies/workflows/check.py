@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import math
 from collections.abc import Iterator
+from typing import Any
 
 from eddies.clock import duration
 from eddies.parallel.communicator import Comm
@@ -18,9 +20,14 @@ from eddies.workflows.foreseen.estimates import (expected_step, expected_turbule
 log = logging.getLogger("eddies")
 
 
-def run(scene: Scene, comm: Comm) -> None:
-    """Log every derived number of a scene, estimates of steps and time, and warnings; all ranks call it."""
+def run(scene: Scene, comm: Comm, as_json: bool = False) -> None:
+    """Log every derived number of a scene, estimates of steps and time, and warnings; or print them for programs. All
+    ranks call it."""
     speed = probe(scene, comm)
+    if as_json:
+        if comm.rank == 0:
+            print(json.dumps(numbers(scene, comm.size, speed), indent=2, allow_nan=False))
+        return
     subjects = {"grid": grid_lines(scene), "turbulence": turbulence_lines(scene),
                 "particles": particle_lines(scene), "time step": step_lines(scene),
                 "ranks": rank_lines(scene), "time": time_lines(scene, comm.size, speed),
@@ -33,6 +40,30 @@ def run(scene: Scene, comm: Comm) -> None:
     if comm.rank == 0:
         for problem in warnings(scene, comm.size):
             log.warning(problem)
+
+
+def numbers(scene: Scene, ranks: int, speed: Speed) -> dict[str, Any]:
+    """The same for programs: lengths and times in the scene's units, memory in bytes; None where nothing is foreseen.
+
+    `limits` are the largest numbers of ranks by what limits them, `costs` those of the direct simulation.
+    """
+    turbulence, step, limits = expected_turbulence(scene), expected_step(scene), most_ranks(scene)
+    alone = min(most_ranks(ground_truth_alone(scene)).values())
+    return {
+        "scene": scene.name, "stages": list(scene.stages), "cells": scene.flow.cells,
+        "largest_wavenumber": largest_wavenumber(scene),
+        "turbulence": turbulence and {name: getattr(turbulence, name) for name in (
+            "velocity_rms", "dissipation_rate", "reynolds_lambda", "turnover_time", "kolmogorov_length",
+            "kolmogorov_time")},
+        "particles": scene.tracers and scene.tracers.particles,
+        "filter_width": scene.tracers and scene.tracers.width,
+        "kernel_support": scene.kernel and scene.tracers and scene.kernel.support(scene.tracers.particles),
+        "time_step": step and step[0], "steps": expected_steps(scene), "ranks": ranks,
+        "most_ranks": min(limits.values()), "limits": limits, "most_ranks_dns": alone,
+        "costs": [{"ranks": row.ranks, "nodes": row.nodes, "memory": row.memory, "seconds_per_step": row.seconds}
+                  for row in costs(scene, alone, speed)],
+        "warnings": list(warnings(scene, ranks)),
+    }
 
 
 def grid_lines(scene: Scene) -> Iterator[str]:
