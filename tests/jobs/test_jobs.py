@@ -55,7 +55,8 @@ def run(checkout, script, *arguments, **variables):
     ours = {name: value for name, value in os.environ.items() if not re.match("EDDIES_|OMP_|PBS_", name)}
     path = f"{checkout / 'bin'}:{os.environ['PATH']}"
     return subprocess.run(["bash", checkout / "jobs" / script, *arguments], cwd=checkout, text=True,
-                          capture_output=True, timeout=60, env=ours | {"PATH": path, "CHECKED": '{"most_ranks": 8}'} | variables)
+                          capture_output=True, timeout=60,
+                          env=ours | {"PATH": path, "CHECKED": '{"most_ranks": 8}'} | variables)
 
 
 @pytest.mark.parametrize("asked, ranks", [("1", 1), ("1000", local_cores()), (None, min(8, local_cores()))])
