@@ -46,7 +46,7 @@ class SmagorinskyStress(eddies.Term):
         strain = (slopes + slopes.transpose(0, 1)) / 2
         magnitude = (2 * strain.square().sum((0, 1))).clamp_min(1e-30).sqrt()  # whose slope at rest is none
         entries = torch.stack([strain[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))])
-        factor = -2 * self.squared_constant.double().cpu() * context.flow.scales.length**2
+        factor = -2 * self.squared_constant.double().cpu() * context.flow.scales.filter_width**2
         return grid.hidden_stress(factor * grid.to_modes(magnitude * entries))
 
 

@@ -85,7 +85,7 @@ def change_format(comm, path, number):
 
 
 @pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("number", [None, 1, 3])
+@pytest.mark.parametrize("number", [None, 1, 4])
 @pytest.mark.parametrize("kind, remedy", [
     ("ground_truth", "run `eddies dns` again"), ("kernel", "run `eddies train-kernel` again"),
     ("model", "run `eddies train` again"), ("rollout", "run `eddies simulate` again"), ("frames", "make it again")])

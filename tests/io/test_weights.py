@@ -7,7 +7,7 @@ import pytest
 from eddies.io.hdf5 import ProductError
 from eddies.io.weights import load_tables, load_weights, save_weights
 
-DESCRIPTION = {"basis": "corrected", "hidden": [16, 16], "scales": {"length": 0.39}}
+DESCRIPTION = {"basis": "corrected", "hidden": [16, 16], "scales": {"filter_width": 0.39}}
 
 
 def tensors():

@@ -11,7 +11,7 @@ from eddies.scene.model import Model
 
 LENGTH, PER_SIDE = 2 * np.pi, 12
 SPACING = LENGTH / PER_SIDE
-SCALES = ReferenceScales(length=2 * SPACING, spacing=SPACING, velocity=1.0, density_mean=1.0, density=0.01,
+SCALES = ReferenceScales(filter_width=2 * SPACING, spacing=SPACING, velocity=1.0, density_mean=1.0, density=0.01,
                          acceleration=1.0, density_rate=0.02, sound_speed=10.0, viscosity=0.01)
 
 

@@ -25,7 +25,7 @@ from eddies.particles.terms.term import Term
 from eddies.scene.composition import load
 
 LENGTH = 2 * math.pi
-SCALES = ReferenceScales(length=1.2, spacing=0.6, velocity=0.9, density_mean=1.0, density=0.02, acceleration=1.7,
+SCALES = ReferenceScales(filter_width=1.2, spacing=0.6, velocity=0.9, density_mean=1.0, density=0.02, acceleration=1.7,
                          density_rate=0.05, sound_speed=11.0, viscosity=0.03)
 CUTOFF, NEIGHBORS = 1.5, 12.0
 FLOW = FlowUnits(SCALES, CUTOFF, NEIGHBORS)

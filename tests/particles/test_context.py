@@ -114,8 +114,8 @@ def test_moments_of_evenly_spread_neighbours_are_the_expected_ones(comm):
     weight = around.weight - 1e-3 * moments.expected_weight(NEIGHBORS)
     assert torch.allclose(weight, torch.tensor(found * 8 / 35 - 1).double(), rtol=2e-2)
     diagonal = torch.tensor([1.0, 0, 0, 1, 0, 1], dtype=torch.float64)[:, None]
-    expected = moments.expected_moment(found, CUTOFF / SCALES.length)
-    small = 1e-3 * moments.expected_moment(NEIGHBORS, CUTOFF / SCALES.length)
+    expected = moments.expected_moment(found, CUTOFF / SCALES.filter_width)
+    small = 1e-3 * moments.expected_moment(NEIGHBORS, CUTOFF / SCALES.filter_width)
     assert torch.allclose(around.inverse * (expected + small), diagonal.expand_as(around.inverse), atol=2e-2)
 
 

@@ -32,7 +32,7 @@ def test_pairs_of_the_training_data_lie_inside_the_range_and_faster_ones_outside
         assert seen.low[0] < 0 < seen.high[0] and 0 <= seen.low[1] < 0.1 < seen.high[1]
     else:  # the same pairs, seen from both ends
         assert seen.low[0] == seen.low[1] < 0 < seen.high[0] == seen.high[1]
-    assert 0 < seen.low[2] < 0.3 and 0.95 * CUTOFF < SCALES.length * seen.high[2] <= CUTOFF
+    assert 0 < seen.low[2] < 0.3 and 0.95 * CUTOFF < SCALES.filter_width * seen.high[2] <= CUTOFF
     assert seen.share_outside(comm, blocks(comm, choices)) == 0
     assert 0.02 < seen.share_outside(comm, blocks(comm, choices, speed=3.0)) < 0.9
 

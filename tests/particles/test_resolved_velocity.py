@@ -24,7 +24,7 @@ RESOLVED = ("pressure", "stress", "viscosity", "damping", "relaxation")
 
 def units(side, width=2.0):
     """Of a flow with side^3 particles and a filter `width` times as wide as their spacing."""
-    scales = ReferenceScales(length=width * LENGTH / side, spacing=LENGTH / side, velocity=1.0, density_mean=1.0,
+    scales = ReferenceScales(filter_width=width * LENGTH / side, spacing=LENGTH / side, velocity=1.0, density_mean=1.0,
                              density=0.01, acceleration=2.0, density_rate=0.05, sound_speed=10.0, viscosity=0.02)
     return FlowUnits(scales, 0.8, 20.0)
 

@@ -44,15 +44,15 @@ class Known:
         columns = truth.particles_with_rates(frame)
         self.particles, self.exact = ParticleSet.from_numpy(columns), torch.from_numpy(columns["acceleration"])
         self.nyquist = np.pi / self.scales.spacing
-        self.chosen = resolved_wavenumber(self.scales.spacing, self.scales.length, self.scales.kolmogorov_length)
+        self.chosen = resolved_wavenumber(self.scales.spacing, self.scales.filter_width, self.scales.kolmogorov_length)
 
     @torch.no_grad()
     def error(self, highest, weight=WEIGHT, iterations=None, form="deconvolution"):
         """Relative error of the acceleration, and the iterations that the solve took."""
         settings = {"pressure": Pressure(), "stress": Stress(form=form), "viscosity": Viscosity()}
-        model = build_model(settings, settings, FlowUnits(self.scales, self.scales.length, 60.0))
+        model = build_model(settings, settings, FlowUnits(self.scales, self.scales.filter_width, 60.0))
         dynamics = ParticleDynamics(self.slab, model, 0.0)
-        resolution = ResolvedVelocity(FourierGrid(self.slab, int(highest)), self.scales.length, weight)
+        resolution = ResolvedVelocity(FourierGrid(self.slab, int(highest)), self.scales.filter_width, weight)
         resolution.tolerance, resolution.iterations, dynamics.resolution = TIGHT, iterations, resolution
         context = dynamics.context(self.particles)
         missed = model.rates(context).acceleration - self.exact
@@ -68,7 +68,7 @@ def measure(path, shares=SHARES, iterations=ITERATIONS):
         known = Known(truth, len(truth.times) // 2)
     highest = [int(share * known.nyquist) for share in shares]
     return {
-        "particles": side**3, "filter_width_over_eta": known.scales.length / known.scales.kolmogorov_length,
+        "particles": side**3, "filter_width_over_eta": known.scales.filter_width / known.scales.kolmogorov_length,
         "nyquist": known.nyquist, "chosen": int(known.chosen), "highest": highest,
         "by_weight": {f"{weight:g}": [known.error(k, weight) for k in highest] for weight in WEIGHTS},
         "gradient": [known.error(k, form="gradient") for k in highest],

@@ -48,8 +48,8 @@ def scales(total, mach=0.1):
     """Of turbulence with v_rms = 1 and the largest eddies of the box; density fluctuations go with M_t^2."""
     spacing = LENGTH / round(total ** (1 / 3))
     return ReferenceScales(
-        length=2 * spacing, spacing=spacing, velocity=1.0, density_mean=1.0, density=0.3 * mach**2, acceleration=3.0,
-        density_rate=0.5 * mach**2, sound_speed=math.sqrt(3) / mach,
+        filter_width=2 * spacing, spacing=spacing, velocity=1.0, density_mean=1.0, density=0.3 * mach**2,
+        acceleration=3.0, density_rate=0.5 * mach**2, sound_speed=math.sqrt(3) / mach,
         viscosity=0.02)
 
 

@@ -46,8 +46,8 @@ def moments_of_tracers(grid):
 @torch.no_grad()
 def modelled(now, *words, form="deconvolution"):
     """Accelerations by these terms, and the resolved flow."""
-    scales = ReferenceScales(length=WIDTH, spacing=LENGTH / PER_SIDE, velocity=0.6, density_mean=1.0, density=0.01,
-                             acceleration=1.0, density_rate=0.05, sound_speed=10.0, viscosity=VISCOSITY)
+    scales = ReferenceScales(filter_width=WIDTH, spacing=LENGTH / PER_SIDE, velocity=0.6, density_mean=1.0,
+                             density=0.01, acceleration=1.0, density_rate=0.05, sound_speed=10.0, viscosity=VISCOSITY)
     settings = {word: dict(form=form) if word == "stress" else {} for word in words}
     dynamics = ParticleDynamics(SlabDecomposition(MPI.COMM_SELF, LENGTH, PLANES),
                                 model(settings, FlowUnits(scales, 2 * WIDTH, 30.0)), 0.0)

@@ -11,7 +11,7 @@ from eddies.flow.forcing import LinearForcing
 from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid
 from eddies.learning import force_training
 from eddies.learning.force_training import ForceTrainer, LossWeights, TrainingFrame
-from eddies.learning.optimization import Descent
+from eddies.learning.optimization import Adam
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.context import Context
 from eddies.particles.dynamics import ParticleDynamics
@@ -30,7 +30,7 @@ from tests.particles.clouds import model
 
 LENGTH, PER_SIDE, STEP = 2 * np.pi, 9, 0.001
 SPACING = LENGTH / PER_SIDE
-SCALES = ReferenceScales(length=2 * SPACING, spacing=SPACING, velocity=1.0, density_mean=1.0, density=0.01,
+SCALES = ReferenceScales(filter_width=2 * SPACING, spacing=SPACING, velocity=1.0, density_mean=1.0, density=0.01,
                          acceleration=1.0, density_rate=0.02, sound_speed=10.0, viscosity=0.01)
 FORCING = {"forcing": dict(injection_rate=0.5)}
 NO_DENSITY = {"pairs": dict(inputs=("distance", "speed", "approach"))}
@@ -129,10 +129,10 @@ def combined_step(comm, **weights):
     counting = CountingComm(comm)
     learner = trainer(counting, LossWeights(**{"trajectory": 1.0, "field": 0.0, "velocity_kl": 0.0,
                                                "acceleration_kl": 0.0, **weights}))
-    descent = Descent(counting, learner.model.parameters(), 9, 1e-2, 1e-3)
-    learner.combined_step(descent, 0)
+    optimizer = Adam(counting, learner.model.parameters(), 9, 1e-2, 1e-3)
+    learner.combined_step(optimizer, 0)
     counting.sent.clear()
-    return lambda: learner.combined_step(descent, 1), counting.sent
+    return lambda: learner.combined_step(optimizer, 1), counting.sent
 
 
 def losses_called(comm, **weights):

@@ -72,7 +72,7 @@ def write_ground_truth(comm, directory, tracers=True, cells=16, frames=0, statio
         series = FieldWriter(file, "filtered" if tracers else "final", cells, {"velocity": 3})
         series.append(0.0, 0, {"velocity": flow.field(cells, 0.0)})
         if tracers:
-            reference |= {"released_at": 2.0, "length": WIDTH, "spacing": WIDTH / 2, "acceleration_rms": 1.4,
+            reference |= {"released_at": 2.0, "filter_width": WIDTH, "spacing": WIDTH / 2, "acceleration_rms": 1.4,
                           "density_mean": 1.0, "sound_speed": 20.0 if density else np.inf}
             reference |= {"density_rate_rms": 0.01} if density else {}
             write_table(file, "spectra", decaying_spectra())

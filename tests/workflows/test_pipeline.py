@@ -75,7 +75,7 @@ def test_pairs_outside_the_training_data_are_counted(run_directory):
     with h5py.File(run_directory / "model.h5") as file:
         low, high = (file[f"feature_range/{bound}"][()] for bound in ("low", "high"))
         description = json.loads(file.attrs["description"])
-    scene, length = load_scene("tiny"), description["scales"]["length"]
+    scene, length = load_scene("tiny"), description["scales"]["filter_width"]
     support = scene.kernel.support(scene.tracers.particles) / length
     # rho'_i, rho'_j, |x|, |v|, x.v
     assert low.shape == high.shape == (5,) and np.all(low < high)

@@ -24,8 +24,9 @@ from eddies.parallel.stop import Stopped
 from eddies.pipeline import MAKER_OF
 
 # Of the products of this version: no other is read. 1 is that of eddies 0.1, whose files do not say so. Since 2 the
-# scales of a ground truth are those of the release, and a model is a list of terms.
-FORMAT = 2
+# scales of a ground truth are those of the release, and a model is a list of terms, since 3 the filter
+# width has its own name.
+FORMAT = 3
 CHUNK_BYTES = 2**20
 # The type of an open product.
 File = h5py.File

@@ -133,7 +133,7 @@ class Context:
     def moments(self) -> Moments:
         """Moments of the neighbourhoods, regularised so that they can be inverted without neighbours."""
         sums, flow = self.pair_sums(_MOMENTS), self.flow
-        expected = moments.expected_moment(flow.neighbors, flow.cutoff / flow.scales.length)
+        expected = moments.expected_moment(flow.neighbors, flow.cutoff / flow.scales.filter_width)
         diagonal = sums.new_tensor([1, 0, 0, 1, 0, 1]).unsqueeze(1)
         return Moments(moments.invert_symmetric(sums[1:] + REGULARISATION * expected * diagonal),
                        sums[:1] + REGULARISATION * moments.expected_weight(flow.neighbors))

@@ -19,7 +19,7 @@ class ReferenceScales:
 
     Parameters
     ----------
-    length : filter width d, the unit of length in Eq. 4.
+    filter_width : d of the filter, the unit of length in Eq. 4.
     spacing : mean distance of particles, (box volume / particles)^(1/3).
     velocity : rms of one velocity component, its mean not subtracted.
     acceleration : rms of one component of the acceleration along trajectories.
@@ -36,7 +36,7 @@ class ReferenceScales:
     finite and positive.
     """
 
-    length: float
+    filter_width: float
     spacing: float
     velocity: float
     acceleration: float

@@ -81,11 +81,11 @@ class ResolvedVelocity:
     def on_slabs(cls, decomposition: SlabDecomposition, flow: FlowUnits, margin: float = 0.0) -> ResolvedVelocity:
         """On a grid of one cell for each plane of the slabs, for particles that lie at most `margin` outside them."""
         scales = flow.scales
-        highest = resolved_wavenumber(scales.spacing, scales.length, scales.kolmogorov_length)
+        highest = resolved_wavenumber(scales.spacing, scales.filter_width, scales.kolmogorov_length)
         shells = int(highest * decomposition.length / (2 * math.pi) + 1e-9)
         resolved = min(max(shells, 1), (decomposition.planes - 1) // 2)
         planes = max(math.ceil(margin / decomposition.spacing - 1e-9), 1)
-        return cls(FourierGrid(decomposition, resolved, planes), flow.scales.length)
+        return cls(FourierGrid(decomposition, resolved, planes), flow.scales.filter_width)
 
     def of(self, particles: ParticleSet, time: float | None = None) -> ResolvedFlow:
         """The resolved flow of particles; `time` tells what is foreseen of it."""

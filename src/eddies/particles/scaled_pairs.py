@@ -33,7 +33,7 @@ class ScaledPairs:
     @cached_property
     def x(self) -> Tensor:
         """(3, m)."""
-        return self.pairs.displacement.T / self.flow.scales.length
+        return self.pairs.displacement.T / self.flow.scales.filter_width
 
     @cached_property
     def v(self) -> Tensor:
@@ -57,7 +57,7 @@ class ScaledPairs:
     @cached_property
     def distance(self) -> Tensor:
         """|x| (m,)."""
-        return self.pairs.distance / self.flow.scales.length
+        return self.pairs.distance / self.flow.scales.filter_width
 
     @cached_property
     def approach(self) -> Tensor:

@@ -37,7 +37,7 @@ METRICS = {
     "skewness": "skewness of the longitudinal gradient", "flatness": "flatness of the longitudinal gradient",
     "energy": "kinetic energy", "dissipation_rate": "dissipation rate ε", "integral_scale": "integral scale",
     "eddy_turnover_time": "eddy turnover time T", "kolmogorov_time": "Kolmogorov time",
-    "density_rms": "density rms", "length": "filter width d", "spacing": "mean particle spacing",
+    "density_rms": "density rms", "filter_width": "filter width d", "spacing": "mean particle spacing",
     "velocity_rms": "velocity rms of the tracers", "acceleration_rms": "acceleration rms of the tracers",
 }
 
@@ -82,7 +82,7 @@ def spectra(
     filter.
 
     Arrays (shells,); `filtered` None for a run without tracers. `scales`: dissipation_rate,
-    kolmogorov_length, and length, the filter width, where there is a filter. Without viscosity, or with three
+    kolmogorov_length, and filter_width where there is a filter. Without viscosity, or with three
     shells or fewer, nothing is compensated.
     """
     inside = (wavenumber >= 1) & (energy > 1e-12 * energy.max())
@@ -94,7 +94,7 @@ def spectra(
         _compensated_panel(axes[0, 1], k, spectrum, scales)
     if filtered is not None:
         axes[0, 0].legend(loc="lower left")
-        _transfer_panel(axes[0, -1], k, filtered[inside] / spectrum, scales["length"])
+        _transfer_panel(axes[0, -1], k, filtered[inside] / spectrum, scales["filter_width"])
     for axis in axes.flat:
         number_wavenumbers(axis)
     letter(axes.flat)
@@ -208,8 +208,8 @@ def _add_spectra(shown: Section, flow: GroundTruth) -> None:
               "kolmogorov_length": flow.reference["kolmogorov_length"]}
     caption = f"At t = {flow.statistics['time'][flow.row]:.3g}; η = {scales['kolmogorov_length']:.3g}."
     if filtered is not None:
-        scales["length"], filtered = flow.reference["length"], filtered[frame]
+        scales["filter_width"], filtered = flow.reference["filter_width"], filtered[frame]
         kept = filtered.sum() / energy.sum()
-        caption += f" The filter of width d = {scales['length']:.3g} keeps {kept:.1%} of the energy."
+        caption += f" The filter of width d = {scales['filter_width']:.3g} keeps {kept:.1%} of the energy."
     figure = spectra(flow.spectra["wavenumber"], energy, filtered, scales)
     shown.add_figure("spectra", "Energy spectrum of the ground truth", figure, caption)

@@ -134,7 +134,7 @@ def _read_flow(file: File, record: Run, reference: dict[str, Any], statistics: d
     middle = velocity.shape[1] // 2
     if traced:
         spectra = record.eulerian = read_table(file, "spectra")
-        record.filter_width = reference["length"]
+        record.filter_width = reference["filter_width"]
     else:
         wavenumber, energy = energy_spectrum(velocity)
         spectra = {"wavenumber": wavenumber, "energy": energy[None]}

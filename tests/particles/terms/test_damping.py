@@ -31,7 +31,7 @@ class Known:
 
     def of(self, particles, time=None):
         relative = particles.velocity - particles.velocity.mean(0)
-        return ResolvedFlow(self.grid, self.modes, self.grid.points(particles.position), relative, SCALES.length)
+        return ResolvedFlow(self.grid, self.modes, self.grid.points(particles.position), relative, SCALES.filter_width)
 
 
 @torch.no_grad()
@@ -58,7 +58,7 @@ def waves(x, y, z):
 
 def unit_of_damping(square, wavenumber):
     """k_c times the rms of a component of the one wave above k_c / 2, with the filter undone; its mean square."""
-    return RESOLVED * math.sqrt(square * math.exp(wavenumber**2 * SCALES.length**2 / 12) / 3)
+    return RESOLVED * math.sqrt(square * math.exp(wavenumber**2 * SCALES.filter_width**2 / 12) / 3)
 
 
 def test_each_mode_is_damped_at_the_rate_of_its_wavenumber():
@@ -126,6 +126,6 @@ def test_relaxation_takes_what_is_not_resolved_and_keeps_the_momentum():
         lagrangian.terms["relaxation"].factor.fill_(1.5)
     force = acceleration(lagrangian, waves, position, resolved + missing)
     rms = math.sqrt((1 / 2 + 1 / 4 + 1 / 2) / 3)
-    rate = 1.5 * 2 * rms / SCALES.length
+    rate = 1.5 * 2 * rms / SCALES.filter_width
     assert torch.allclose(force, -rate * (missing - missing.mean(0)), atol=1e-12)
     assert force.sum(0).abs().max() < 1e-12 * force.abs().sum()

@@ -23,7 +23,7 @@ def test_the_closed_form_for_two_particles(speed):
     position = torch.tensor([[1.0, 1, 1], [1.5, 1, 1]], dtype=torch.float64)
     velocity = torch.tensor([[0.0, 0, 0], [speed, 0, 0]], dtype=torch.float64)
     found = rates(model(eddy_viscosity=dict(basis="paper")), position, velocity).acceleration
-    x, v = -0.5 / SCALES.length, -speed / SCALES.velocity
+    x, v = -0.5 / SCALES.filter_width, -speed / SCALES.velocity
     mu = x * v / (x * x + 0.1)
     expected = SCALES.acceleration / NEIGHBORS * (1 - (0.5 / CUTOFF) ** 2) ** 2 * 0.1 * (mu * mu - mu) * x
     assert float(found[0, 0]) == pytest.approx(expected, rel=1e-12)

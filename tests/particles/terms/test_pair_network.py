@@ -165,13 +165,13 @@ def test_the_sums_of_equation_3_over_one_neighbour(basis):
     velocity = torch.tensor([[0.0, 0, 0], [0.2, 0.7, 0]], dtype=torch.float64)
     found = rates(force, position, velocity, torch.ones(2, dtype=torch.float64)).acceleration[0]
     w = (1 - (0.5 / CUTOFF) ** 2) ** 2
-    x = torch.tensor([-0.5, 0, 0], dtype=torch.float64) / SCALES.length
+    x = torch.tensor([-0.5, 0, 0], dtype=torch.float64) / SCALES.filter_width
     v = -velocity[1] / SCALES.velocity
     if basis == "paper":
         expected = w * (2 * x + 3 * v) / NEIGHBORS
     else:
         # Sums over n evenly spread neighbours: 8/35 n of w, and 8/315 n h^2 of w x x^T.
-        matrix = w * torch.outer(x, x) + 1e-3 * 8 / 315 * NEIGHBORS * (CUTOFF / SCALES.length) ** 2 * torch.eye(3)
+        matrix = w * torch.outer(x, x) + 1e-3 * 8 / 315 * NEIGHBORS * (CUTOFF / SCALES.filter_width) ** 2 * torch.eye(3)
         expected = torch.linalg.solve(matrix, 2 * w * x) + 3 * w * v / (w + 1e-3 * 8 / 35 * NEIGHBORS)
     assert torch.allclose(found, SCALES.acceleration * expected, rtol=1e-12)
 
@@ -180,7 +180,7 @@ def test_forces_scale_with_the_units_of_the_flow():
     """The same network in a flow twice as large, three times as fast: accelerations in units of a_rms."""
     position, velocity, density = state()
     small = position / 2 + 1.0  # far from the faces
-    scales = replace(SCALES, length=SCALES.length / 2, velocity=3 * SCALES.velocity, acceleration=5.0)
+    scales = replace(SCALES, filter_width=SCALES.filter_width / 2, velocity=3 * SCALES.velocity, acceleration=5.0)
     half = FlowUnits(scales, CUTOFF / 2, NEIGHBORS)
     inside = ((position > CUTOFF) & (position < LENGTH - CUTOFF)).all(1)
     first = rates(model(pairs={}), position, velocity, density).acceleration[inside] / SCALES.acceleration
@@ -245,7 +245,7 @@ def test_what_the_network_is_told():
     expected = [own, other, x.norm(dim=1), v.norm(dim=1), (x * v).sum(1)]
     assert torch.allclose(everything, torch.stack(expected), atol=1e-14)
     listed = pairs.pairs
-    assert torch.allclose(x, listed.displacement / FLOW.scales.length)
+    assert torch.allclose(x, listed.displacement / FLOW.scales.filter_width)
     # In the order of the list, however they are named.
     assert torch.equal(pairs.invariants(("approach", "distance"), False), everything[[2, 4]])
     assert torch.allclose(pairs.invariants(("density",), True), torch.stack([own + other, (own - other) ** 2]))

@@ -73,7 +73,7 @@ def test_stress_of_two_waves_at_an_angle(form):
     def waves(x, y, z):
         return torch.sin(x + y), -torch.sin(x + y), torch.sin(x)
 
-    h = SCALES.length**2 / 12
+    h = SCALES.filter_width**2 / 12
     apart, together = (math.expm1(h), math.expm1(-h)) if form == "deconvolution" else (h, -h)
     # T = (apart cos y - together cos(2x + y)) / 2
     expected = -(apart * torch.sin(y) + together * torch.sin(2 * x + y)) / 2

@@ -28,7 +28,7 @@ MODES, PLANES, COUNT, NU = random_velocity(4), 48, 400, 0.05
 
 def lagrangian(width, *words, form="gradient", spacing=SCALES.spacing):
     """A model of these terms, and of one that reads a density."""
-    flow = FlowUnits(replace(SCALES, length=width, spacing=spacing, viscosity=NU), CUTOFF, NEIGHBORS)
+    flow = FlowUnits(replace(SCALES, filter_width=width, spacing=spacing, viscosity=NU), CUTOFF, NEIGHBORS)
     terms = model({word: dict(form=form) if word == "stress" else {} for word in words}, flow).terms
     return LagrangianModel({**terms, "reader": DensityReader()}, flow)
 

@@ -54,7 +54,7 @@ def test_scales_are_those_of_the_release_or_of_a_frame(comm, path, density):
             assert scales.density_rate == pytest.approx(rms(np.diff(values, axis=0) / interval), rel=1e-13)
         else:
             assert scales.density is scales.density_rate is None
-        for name in ("length", "spacing", "density_mean", "viscosity", "sound_speed"):
+        for name in ("filter_width", "spacing", "density_mean", "viscosity", "sound_speed"):
             assert getattr(scales, name) == getattr(release, name)
 
 

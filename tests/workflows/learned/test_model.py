@@ -15,7 +15,7 @@ from eddies.workflows.learned.description import describe, differences
 from eddies.workflows.learned.model import load_model, scene_model
 
 # Of the scene tiny: the filter is two spacings wide.
-SCALES = ReferenceScales(length=1.0471975511965976, spacing=0.5235987755982988, velocity=0.9, density_mean=1.0,
+SCALES = ReferenceScales(filter_width=1.0471975511965976, spacing=0.5235987755982988, velocity=0.9, density_mean=1.0,
                          density=0.02, acceleration=1.7, density_rate=0.05, sound_speed=20.0, viscosity=0.01)
 SMALL = "model.pairs.hidden=[4]"
 

@@ -17,7 +17,8 @@ from eddies.workflows.learned.description import describe
 from eddies.workflows.learned.source import read_source
 
 # Of the scene tiny: filter width two spacings, whatever their number.
-SCALES = ReferenceScales(length=0.5, spacing=0.25, velocity=1.0, acceleration=2.0, density_mean=1.0, viscosity=0.01)
+SCALES = ReferenceScales(filter_width=0.5, spacing=0.25, velocity=1.0, acceleration=2.0, density_mean=1.0,
+                         viscosity=0.01)
 OWN_TERM = """
 import eddies
 from pathlib import Path

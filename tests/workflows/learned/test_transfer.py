@@ -18,8 +18,8 @@ from eddies.workflows.learned.source import ModelSource
 from eddies.workflows.learned.transfer import trained_on
 
 # Of the scene tiny: filter width two spacings, whatever their number.
-SCALES = ReferenceScales(length=BOX_LENGTH / 6, spacing=BOX_LENGTH / 12, velocity=0.9, density_mean=1.0, density=0.02,
-                         acceleration=1.7, density_rate=0.05, sound_speed=11.0, viscosity=0.01)
+SCALES = ReferenceScales(filter_width=BOX_LENGTH / 6, spacing=BOX_LENGTH / 12, velocity=0.9, density_mean=1.0,
+                         density=0.02, acceleration=1.7, density_rate=0.05, sound_speed=11.0, viscosity=0.01)
 
 
 @pytest.mark.mpi(1)

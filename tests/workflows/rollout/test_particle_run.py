@@ -275,7 +275,7 @@ def test_steps_are_as_short_as_the_resolved_velocity_needs(comm, tmp_path, monke
     attributes, closure, columns = rolled_out(comm, tmp_path, scene, step=0.5)
     with open_product(comm, tmp_path / "ground_truth.h5", "ground_truth") as file:
         scales = GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes)).scales
-    highest = int(resolved_wavenumber(scales.spacing, scales.length, scales.kolmogorov_length))
+    highest = int(resolved_wavenumber(scales.spacing, scales.filter_width, scales.kolmogorov_length))
     assert attributes["status"] == "complete" and attributes["steps"] > 2
     assert attributes["time_step"] * highest * columns["velocity"][0].std() == pytest.approx(0.05, rel=0.2)
 

@@ -45,6 +45,6 @@ class DensityTransport(PairTerm):
         divergence = moments.contract_symmetric(around.inverse, sums[:6])
         contrast = (sums[6:] / around.weight)[0]
         compression, relaxation = self.factors
-        rate = (-compression * scales.density_mean * scales.velocity / scales.length * divergence
+        rate = (-compression * scales.density_mean * scales.velocity / scales.filter_width * divergence
                 + relaxation * scales.sound_speed / context.flow.cutoff * scales.density * contrast)
         return Rates(density_rate=rate.to(context.particles.velocity.dtype))

@@ -69,7 +69,7 @@ class TracerRun:
     def scales(self) -> dict[str, float]:
         """Scales of the filtered flow at the release: what the same flow does later does not change them."""
         return {"released_at": self.released_at, "sound_speed": self.scene.flow.sound_speed or np.inf,
-                "length": self.settings.width, "spacing": self.settings.spacing, "density_mean": MEAN_DENSITY,
+                "filter_width": self.settings.width, "spacing": self.settings.spacing, "density_mean": MEAN_DENSITY,
                 **self.segments.release_scales()}
 
     def state_dict(self) -> dict[str, Any]:

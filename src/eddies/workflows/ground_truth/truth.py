@@ -46,9 +46,9 @@ class GroundTruth:
         density = ({"density": r["density_rms"], "density_rate": r["density_rate_rms"],
                     "sound_speed": r["sound_speed"]} if self.has_density else {})
         return ReferenceScales(
-            length=r["length"], spacing=r["spacing"], velocity=r["velocity_rms"], acceleration=r["acceleration_rms"],
-            density_mean=r["density_mean"], viscosity=r["viscosity"], kolmogorov_length=r["kolmogorov_length"],
-            **density)
+            filter_width=r["filter_width"], spacing=r["spacing"], velocity=r["velocity_rms"],
+            acceleration=r["acceleration_rms"], density_mean=r["density_mean"], viscosity=r["viscosity"],
+            kolmogorov_length=r["kolmogorov_length"], **density)
 
     def scales_at(self, frame: int) -> ReferenceScales:
         """Reference scales of the flow at a frame, not the first, rates from the frame before; collective.

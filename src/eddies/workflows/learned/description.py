@@ -39,6 +39,6 @@ def differences(scene: Scene, description: Mapping[str, Any]) -> Iterator[tuple[
     if scene.kernel.neighbors != description["neighbors"]:
         yield "[kernel] neighbors", quoted(scene.kernel.neighbors), quoted(description["neighbors"])
     scales, tracers = description["scales"], scene.tracers
-    width = scales["length"] / scales["spacing"] * tracers.spacing
+    width = scales["filter_width"] / scales["spacing"] * tracers.spacing
     if not math.isclose(tracers.width, width, rel_tol=1e-6):
         yield "[tracers] filter_width", f"{tracers.width:.9g}", f"{width:.9g}"

@@ -119,7 +119,7 @@ def coarse_fluid(scene: Scene, truth: GroundTruth, grid: SpectralGrid) -> Compre
     if scene.simulation.injection != "none":
         forcing = LinearForcing(grid, injection_rate(scene, truth), forced_below(scene))
     if constant > 0:
-        subgrid = Smagorinsky(grid, constant, truth.scales.length)
+        subgrid = Smagorinsky(grid, constant, truth.scales.filter_width)
     return CompressibleFluid(grid, flow.viscosity, flow.sound_speed, forcing, subgrid)
 
 

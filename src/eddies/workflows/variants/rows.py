@@ -75,7 +75,7 @@ def measured(run: VariantRun, alone: Comm, ranks: int) -> dict[str, Any]:
         stored = StoredRollout(
             *(Trajectory(file, name) for name in ("model", "truth")),
             *(FieldSeries(file, name) for name in ("model", "truth")), turnover=rollout["eddy_turnover_time"],
-            kolmogorov_time=reference["kolmogorov_time"], filter_wavenumber=np.pi / reference["length"])
+            kolmogorov_time=reference["kolmogorov_time"], filter_wavenumber=np.pi / reference["filter_width"])
         complete = rollout["status"] == "complete"
         row = {"status": rollout["status"], "stopped_at": None if complete else rollout["turnovers"],
                **accuracy(stored, complete)}
