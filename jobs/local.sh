@@ -12,8 +12,8 @@ if [ $# -gt 0 ] && [ "${1#-}" = "$1" ]; then
     shift
 fi
 if [ -z "${EDDIES_RANKS:-}" ]; then
-    most=$("$jobs/../.venv/bin/eddies" check "$EDDIES_SCENE" --json |
-        "$jobs/../.venv/bin/python" -c 'import json, sys; print(json.load(sys.stdin)["most_ranks"])')
+    numbers=$("$jobs/../.venv/bin/eddies" check "$EDDIES_SCENE" --json)
+    most=$("$jobs/../.venv/bin/python" -c 'import json, sys; print(json.load(sys.stdin)["most_ranks"])' <<< "$numbers")
     EDDIES_RANKS=$((most < 8 ? most : 8))
 fi
 export EDDIES_RANKS

@@ -82,9 +82,11 @@ def test_a_term_of_the_users(example):
 
 @pytest.mark.mpi(2)
 def test_a_network_of_the_users(example):
-    _, terms, weights = results(example("own_network"))
+    run = example("own_network")
+    _, terms, weights = results(run)
     assert terms["pairs"]["network"] == "own_network:Waves"
     assert weights["terms.pairs.network.wavevectors"].shape == (16, 5)
+    assert "own_network:" in (run / "scene.toml").read_text()
 
 
 @pytest.mark.mpi(1)
@@ -144,7 +146,7 @@ def test_the_stress_of_the_example_is_linear_as_it_says(comm, examples, constant
 
 @pytest.mark.mpi(1, 2)
 def test_a_term_that_gives_nothing_has_one_error(comm, own):
-    """What is no term or no network at all is refused where the model is made: see test_trained_model."""
+    """What is no term or no network at all is refused where the model is made."""
     from eddies.parallel.slab import SlabDecomposition
     from eddies.particles.dynamics import ParticleDynamics
     from eddies.particles.particle_set import ParticleSet

@@ -16,7 +16,7 @@ class Stage:
     product : kind of the file that it makes, PRODUCT.h5 in the run directory; None: no such file.
     reads : what of a scene its product depends on beside the stages before it: sections and properties, see
         `Scene.fingerprint`.
-    depends_on : the stages whose products it starts from, of those that the scene has.
+    depends_on : all stages that its product depends on, those of its inputs included, of those that a scene has.
     checkpoints : the directory within the run directory where its checkpoints lie; None: it makes none.
     run : where the function is that does it, run(scene, comm, directory, stop).
     """

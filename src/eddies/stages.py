@@ -90,7 +90,9 @@ def check_inputs(stages: Sequence[str], scene: Scene, comm: Comm, directory: Pat
     if "train" in stages and scene.model is not None and scene.model.path is not None:
         read_source(scene, comm)
     first = STAGES[stages[0]]
-    for needed in [STAGES[name] for name in first.depends_on if name in scene.stages and first.product is not None]:
+    if first.product is None:  # it works with what there is
+        return
+    for needed in [STAGES[name] for name in first.depends_on if name in scene.stages]:
         with open_product(comm, directory / needed.file, needed.product):
             pass
         if not is_done(needed.name, scene, comm, directory):

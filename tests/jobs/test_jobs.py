@@ -41,7 +41,7 @@ def checkout(tmp_path):
     shutil.copy(CHECKOUT / "mpi_tools/launch.py", tmp_path / "mpi_tools")
     for name, text in {"mpi_tools/bootstrap.sh": "true", "bin/mpirun": 'echo "mpirun $*"; shift 2; "$@"',
                        "bin/srun": '"$@"', "bin/scontrol": 'echo "scontrol $*"',
-                       ".venv/bin/eddies": '[ "$1" != check ] || { echo "$CHECKED"; exit; }\n'
+                       ".venv/bin/eddies": '[ "$1" != check ] || { echo "$CHECKED"; exit ${CHECK_ENDS_WITH:-0}; }\n'
                                            'echo "eddies $*; threads $OMP_NUM_THREADS"\nexit ${ENDS_WITH:-0}',
                        ".venv/bin/python": f'exec {sys.executable} "$@"'}.items():
         path = tmp_path / name
@@ -70,6 +70,11 @@ def test_local_runs_on_the_cores_or_fewer(checkout, asked, ranks):
 def test_local_starts_no_more_ranks_than_the_scene_can_use(checkout):
     result = run(checkout, "local.sh", "tiny", CHECKED='{"most_ranks": 1}')
     assert "mpirun -n 1 " in result.stdout and "eddies run tiny" in result.stdout
+
+
+def test_local_ends_with_what_is_wrong_with_the_scene(checkout):
+    result = run(checkout, "local.sh", "tiny", CHECKED="", CHECK_ENDS_WITH="2")
+    assert result.returncode == 2 and "Traceback" not in result.stderr and "mpirun" not in result.stdout
 
 
 def test_local_passes_scene_and_options_on(checkout):

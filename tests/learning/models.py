@@ -27,7 +27,7 @@ def model_of(preset, support, neighbors, hidden, **settings):
 
 
 class Recorder:
-    """In place of a optimizer: takes no step but keeps the gradient, summed over ranks, and this rank's share."""
+    """In place of an optimizer: takes no step but keeps the gradient, summed over ranks, and this rank's share."""
 
     def __init__(self, comm, model):
         self.comm, self.model = comm, model

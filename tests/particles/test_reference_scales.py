@@ -2,7 +2,12 @@ from dataclasses import replace
 
 import pytest
 
+from eddies.particles.reference_scales import ReferenceScales
 from tests.particles.clouds import SCALES
+
+
+def test_scales_survive_a_dictionary():
+    assert ReferenceScales(**SCALES.to_dict()) == SCALES
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])

@@ -31,7 +31,7 @@ KEPT = 3
 STATE, MANIFEST = "state.h5", "manifest.json"
 # The dataset of what is no array.
 PLAIN = "plain"
-# Of the layout of a checkpoint: others are not used.
+# Of the layout of a checkpoint: others are not used. To be raised with that of the products too: frames are such.
 FORMAT = 3
 
 

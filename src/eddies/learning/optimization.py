@@ -56,7 +56,7 @@ class Adam:
 
     def state_dict(self) -> dict[str, int | np.ndarray]:
         """What there is besides the parameters: the steps taken, and Adam's running means; the same on all ranks."""
-        means = {f"{name}_{number}": np.atleast_1d(mean.cpu().numpy()) for name, means in self._moments.items()
+        means = {f"{name}_{number}": mean.cpu().numpy() for name, means in self._moments.items()
                  for number, mean in enumerate(means)}
         return {"taken": self.taken, **means}
 

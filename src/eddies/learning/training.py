@@ -25,7 +25,7 @@ class Phase:
     name : for the progress line.
     work : cost of each optimiser step, in any unit common to the phases, for the time left.
     rates : learning rate of the first and of the last step.
-    take : one step of the descent, given the number of the step within the phase; returns losses by name.
+    take : one step of the optimiser, given the number of the step within the phase; returns losses by name.
     validate : error on what is not trained on; the state where it was least is kept.
     validate_every : steps between two validations. The last step is always followed by one.
     """

@@ -43,10 +43,12 @@ def on_first_rank(comm: MPI.Comm, action: Callable[[], Result]) -> Result:
         except (UserError, OSError) as raised:
             error = raised
     if comm.size > 1:
-        result, kind, arguments = comm.bcast((result, type(error), _arguments(error)))
+        result, kind, arguments, known = comm.bcast((result, type(error), _arguments(error), getattr(
+            error, "__dict__", {})))
         if arguments and comm.rank > 0:
-            error = kind.__new__(kind, *arguments)
+            error = kind.__new__(kind, *arguments)  # not made anew: the text is all there, for each class another way
             error.args = arguments
+            vars(error).update(known)
     if error is not None:
         raise error
     return result

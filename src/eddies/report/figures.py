@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import io
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 import matplotlib
 import numpy as np
@@ -13,8 +14,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
-from eddies.parallel.communicator import Comm
 from eddies.report.page import Section
+
+if TYPE_CHECKING:
+    from eddies.parallel.communicator import Comm
 
 # Colour-blind safe (Okabe and Ito), the same quantity in the same colour in every figure.
 DNS, FILTERED, TRUTH, MODEL = "#000000", "#7f7f7f", "#0072B2", "#D55E00"

@@ -1,7 +1,7 @@
 """Turns a TOML document and the user's `--set` overrides into sections, and sections into TOML.
 
 Nothing here knows a particular section or key: what is allowed stands beside the fields of the dataclasses
-(`scene_values`), which check their values themselves.
+(`scene/values.py`), which check their values themselves.
 """
 
 import dataclasses

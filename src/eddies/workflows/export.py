@@ -28,6 +28,8 @@ def run(run_directory: Path, output: Path, comm: Comm) -> None:
     alone = comm.Split(comm.rank)
     try:
         on_first_rank(comm, lambda: _export(run_directory, output, alone))
+    except OSError as error:
+        raise ProductError(f"{error}; check the files and the directory") from None
     finally:
         alone.Free()
 

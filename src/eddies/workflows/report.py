@@ -200,11 +200,12 @@ def _stage_seconds(directory: Path) -> dict[str, float]:
 def _run_record(directory: Path, record: Run) -> RunRecord:
     rows = [("stage", "ranks", "wall time (s)", "date", "eddies", "commit", "libraries")]
     for kind, origin in record.provenance.items():
-        seconds = shown(record.seconds[MAKER_OF[kind].name]) if MAKER_OF[kind].name in record.seconds else "not stored"
+        stage = MAKER_OF[kind].name
+        seconds = shown(record.seconds[stage]) if stage in record.seconds else "not stored"
         commit = (origin["commit"] or "not a checkout")[:12]
         libraries = ", ".join(f"{name} {version}" for name, version in origin["libraries"].items())
         ranks = str(origin["ranks"])
-        rows.append((MAKER_OF[kind].name, ranks, seconds, origin["date"], origin["eddies"], commit, libraries))
+        rows.append((stage, ranks, seconds, origin["date"], origin["eddies"], commit, libraries))
     newest = list(record.provenance.values())[-1]
     stages = ", ".join(MAKER_OF[kind].name for kind in record.provenance)
     summary = f"Lagrangian large-eddy simulation; stages: {stages}; {newest['date']}"

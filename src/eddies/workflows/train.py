@@ -35,7 +35,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     """Train the model of a scene and write model.h5: weights, learning history, a-priori tests, and the range of
     what its networks were given.
 
-    With [model] path its weights are adopted instead. A training that is stopped goes on from a checkpoint.
+    With [model] path its weights are taken instead. A training that is stopped goes on from a checkpoint.
     """
     if scene.model.path is not None:
         transfer.run(scene, comm, directory)

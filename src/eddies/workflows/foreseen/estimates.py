@@ -148,7 +148,7 @@ def most_training_ranks(scene: Scene) -> dict[str, int]:
 
 
 def learns_pairs(scene: Scene) -> bool:
-    """Whether a model is trained or adopted that looks at pairs of particles."""
+    """Whether a model is trained or taken that looks at pairs of particles."""
     return "train" in scene.stages and "pairs" in scene.model.reads
 
 

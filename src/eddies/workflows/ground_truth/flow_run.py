@@ -28,8 +28,8 @@ class FlowRun:
     """A fluid with its state, the steps that it takes, its clock and its history.
 
     `guard` looks on before each step; after it `watch` ends a run that became unstable. `phase` is where it is on its
-    way: in the "spin-up", at the "start" of what follows, in the "run" of a given time, or with "tracers", which then
-    are those that follow it.
+    way: in the "spin-up", at the "start" of what follows, in the "run" of a given time, or with "tracers", of
+    which then `tracers` is the run.
     """
 
     fluid: Fluid

@@ -52,7 +52,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path) -> None:
 
 
 def trained_on(scene: Scene, source: ModelSource) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Path and Mach number of the run where weights were trained, and errors there; not of one that adopted them."""
+    """Path and Mach number of the run where weights were trained, and errors there; not of one that took them."""
     direct = {"path": scene.model.path, "mach_turbulent": source.provenance.get("mach_turbulent")}
     return (source.provenance.get("source", direct),
             source.tables.get("source_a_priori", source.tables["a_priori"]))

@@ -153,7 +153,7 @@ class VariantRun:
     def _share_all(self, directory: Path) -> None:
         shutil.rmtree(directory, ignore_errors=True)  # left by a comparison that was stopped
         directory.mkdir()
-        for name in ("ground_truth.h5", "kernel.h5", "model.h5"):
+        for name in [STAGES[stage].file for stage in STAGES["simulate"].depends_on]:
             if (self.directory / name).exists():
                 link(self.directory / name, directory)
 
@@ -166,7 +166,7 @@ def link(product: Path, directory: Path) -> None:
 
 
 def in_directories(comm: Comm, work: Callable[[], None]) -> None:
-    """Work in directories that rank 0 does alone; all ranks raise its SceneError, or one where it cannot write."""
+    """Work in directories that rank 0 does alone; all ranks raise its UserError, or one where it cannot write."""
     try:
         on_first_rank(comm, work)
     except OSError as error:

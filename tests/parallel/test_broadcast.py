@@ -1,0 +1,42 @@
+"""What only some ranks do is raised by all where it goes wrong."""
+
+import pytest
+
+from eddies.errors import UserError
+from eddies.parallel.broadcast import first_complaint, on_all_ranks, on_first_rank
+from eddies.scene.values import KeyProblem, SceneError
+
+pytestmark = pytest.mark.mpi(1, 2, 3)
+
+
+def test_what_the_first_rank_finds_is_known_to_all(comm):
+    asked = []
+    assert on_first_rank(comm, lambda: asked.append(comm.rank) or {"rank": comm.rank}) == {"rank": 0}
+    assert asked == ([0] if comm.rank == 0 else [])
+
+
+def raising(error):
+    raise error
+
+
+@pytest.mark.parametrize("error", [UserError("no"), SceneError("no", "flow.cells"), KeyProblem("flow", "cells", ": no"),
+                                   FileNotFoundError(2, "No such file", "there"), OSError("odd")], ids=repr)
+def test_an_error_of_the_first_rank_is_raised_by_all(comm, error):
+    with pytest.raises(type(error)) as raised:
+        on_first_rank(comm, lambda: raising(error))
+    assert str(raised.value) == str(error)
+    for name in ("errno", "strerror", "filename", "key", "section"):
+        assert getattr(raised.value, name, None) == getattr(error, name, None)
+
+
+def test_an_error_of_any_rank_is_raised_by_all(comm):
+    last = comm.size - 1
+    with pytest.raises(OSError, match="^disk full$"):
+        on_all_ranks(comm, lambda: raising(OSError(28, "disk full", "there")) if comm.rank == last else None)
+    assert on_all_ranks(comm, lambda: comm.rank) == comm.rank
+
+
+def test_the_complaint_of_the_lowest_rank_counts(comm):
+    assert first_complaint(comm, f"rank {comm.rank}" if comm.rank >= comm.size // 2 else None) == (
+        f"rank {comm.size // 2}")
+    assert first_complaint(comm, None) is None
