@@ -2,7 +2,7 @@
 
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import pytest
 
@@ -80,7 +80,7 @@ def test_every_preset_is_a_list_of_terms_that_fit_together(tmp_path, name):
 def test_every_term_has_settings_that_are_explained(word):
     kind = settings_class(word)
     assert kind.__name__ == TERMS[word][0].partition(":")[2]
-    assert kind.__doc__ and all(field.metadata["rule"].about for field in kind.__dataclass_fields__.values())
+    assert kind.__doc__ and all(field.metadata["rule"].about for field in fields(kind))
 
 
 def test_keys_of_a_term_are_written_over_those_of_the_preset(tmp_path):

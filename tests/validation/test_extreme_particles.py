@@ -68,7 +68,7 @@ def sound_model(total, neighbors=24.0, mach=0.1, relaxation=0.0):
     """Linear gas dynamics: dv/dt = -c^2 grad rho / rho_0, d rho/dt = -rho_0 div v (+ relaxation of the density)."""
     linear = model_of({"pairs": dict(hidden=(1,)), "density-transport": {}}, units(total, neighbors, mach))
     flow, small, network = linear.flow.scales, 1e-3, linear.terms["pairs"].network  # tanh is linear for small arguments
-    gain = flow.sound_speed**2 * flow.density / (flow.density_mean * flow.acceleration * flow.length)
+    gain = flow.sound_speed**2 * flow.density / (flow.density_mean * flow.acceleration * flow.filter_width)
     with torch.no_grad():
         network.weights[0][:] = torch.tensor([[-small, small, 0, 0, 0]])
         network.weights[1][:] = torch.tensor([[gain / small], [0]])

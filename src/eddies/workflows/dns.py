@@ -71,7 +71,7 @@ def build_run(scene: Scene, comm: Comm, guard: Guard, saved: Checkpoint | None) 
     fluid = build_fluid(scene, comm)
     state = initial_state(scene, fluid) if saved is None else None
     flow = FlowRun(fluid, state, STEPPERS[scene.time.stepper](fluid), build_step_limit(scene, fluid.grid),
-                   FlowHistory(fluid), guard, "start" if scene.spin_up is None else "spin-up")
+                   FlowHistory(fluid), guard, phase="start" if scene.spin_up is None else "spin-up")
     if saved is not None:
         flow.load_state_dict(saved)
         log.info("dns: goes on from step %d, time %.4g", flow.clock.steps, flow.clock.time)

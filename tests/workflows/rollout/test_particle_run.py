@@ -164,9 +164,9 @@ def test_every_method_has_the_units_of_its_start_and_runs(comm, tmp_path, method
     with open_product(comm, tmp_path / "ground_truth.h5", "ground_truth") as file:
         release = GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, 6)).scales
     write_model(comm, tmp_path, scene, release)
-    scales, _, method, particles, acceleration = method_of(comm, tmp_path, scene, 3)
-    assert getattr(method, "scales", scales) == scales
-    assert (particles.density is not None) == method.has_density == (method != "none")
+    scales, _, made, particles, acceleration = method_of(comm, tmp_path, scene, 3)
+    assert getattr(made, "scales", scales) == scales
+    assert (particles.density is not None) == made.has_density == (method != "none")
     assert len(acceleration) == 6**3 and bool(torch.isfinite(acceleration).all())
     assert bool(acceleration.any()) == (method != "none")
     simulate.run(scene, comm, tmp_path)

@@ -38,9 +38,9 @@ class FlowRun:
     step_limit: CourantLimit | FixedStep
     history: FlowHistory
     guard: Guard
+    clock: Clock = field(default_factory=Clock)
     phase: str = "start"
     tracers: TracerRun | None = None
-    clock: Clock = field(default_factory=Clock)
     watch: StabilityWatch = field(init=False)
 
     def __post_init__(self) -> None:
