@@ -180,6 +180,10 @@ def scene_reference():
             need = ", required" if default is dataclasses.MISSING else ", optional" if default is None else ""
             lines.append(f"| **`[{field.name}]`**{need} | | | *{kind.__doc__.splitlines()[0]}* |")
             lines += [key_row(key) for key in dataclasses.fields(kind) if "rule" in key.metadata]
+            for inner in [key for key in dataclasses.fields(kind) if "section" in key.metadata]:
+                of_it = inner.metadata["section"]
+                lines.append(f"| **`[{field.name}.{inner.name}]`**, optional | | | *{of_it.__doc__.splitlines()[0]}* |")
+                lines += [key_row(key) for key in dataclasses.fields(of_it)]
             if kind is Model:
                 lines += term_rows()
     return "\n".join(lines)

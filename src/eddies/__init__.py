@@ -10,8 +10,8 @@ __version__ = "0.2.0"
 _HOMES = {
     "eddies.api": ("check", "run", "simulate", "train"),
     "eddies.errors": ("UserError",),
-    "eddies.scene.scene": ("Scene", "SceneError", "load_scene", "Eulerian", "Flow", "Forcing", "Initial", "Kernel",
-                           "Model", "Simulation", "SpinUp", "Time", "Tracers", "Training", "Wcsph"),
+    "eddies.scene.scene": ("Scene", "SceneError", "load_scene", "Eulerian", "Flow", "Forcing", "Horizons", "Initial",
+                           "Kernel", "Model", "Simulation", "SpinUp", "Time", "Tracers", "Training", "Wcsph"),
     "eddies.scene.values": ("boolean", "choice", "integer", "integers", "named", "number", "text", "texts"),
     "eddies.particles.terms.settings": ("TermSettings",),
     "eddies.particles.terms.term": ("PairTerm", "Term"),

@@ -19,7 +19,7 @@ from eddies.report.learning import LOSSES
 from tests.learning.models import LENGTH, PER_SIDE, SPACING, Recorder, model_of, slope
 
 SUPPORT = 2.2 * SPACING
-ALL = LossWeights(1.0, 1.0, 0.1, 0.1)
+ALL = LossWeights(1.0, 0.1, 0.1)
 PRESETS = ["learned-density", "paper", "resolved + pairs", "resolved"]
 # The density that the pairs read is that of pressure and stress, and a part of it is learned.
 THROUGH_DENSITY = ("pressure", f"{__name__}:AmplifiedStress", "pairs")
@@ -195,11 +195,11 @@ def test_a_model_without_parameters_has_nothing_to_keep_but_its_rates(comm):
 
 @pytest.mark.mpi(1, 2, 3)
 def test_the_error_of_all_losses_is_that_of_the_acceleration_where_nothing_else_has_weight(comm):
-    trainer = trainer_of(comm, weights=LossWeights(trajectory=4.0), batch=10**6)
+    trainer = trainer_of(comm, weights=LossWeights(), batch=10**6)
     frame = trainer.frames[0]
     with torch.no_grad():
         squares = global_sum(comm, float(frame.errors()["acceleration"].square().sum()))
-    expected = 2 * (squares / (3 * frame.total)) ** 0.5 / frame.acceleration_rms
+    expected = (squares / (3 * frame.total)) ** 0.5 / frame.acceleration_rms
     assert trainer.combined_error(frame, draws=3) == pytest.approx(expected, rel=1e-12)
 
 
@@ -242,7 +242,8 @@ def test_every_loss_has_a_name_that_the_learning_curves_know(comm):
     row = trainer.combined_step(Adam(comm, trainer.model.parameters(), 1, 1e-2, 1e-2), 0)
     names = {"loss", "trajectory_loss", "field_loss", "velocity_kl_loss", "acceleration_kl_loss"}
     assert set(row) == names | {"gradient_norm"} and names <= {name for name, *_ in LOSSES}
-    weighted = sum(weight * row[f"{name}_loss"] for name, weight in vars(trainer.weights).items())
+    weighted = row["trajectory_loss"] + sum(weight * row[f"{name}_loss"]
+                                            for name, weight in vars(trainer.weights).items())
     assert row["loss"] == pytest.approx(weighted, rel=1e-12)
 
 

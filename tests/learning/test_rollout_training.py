@@ -60,7 +60,7 @@ def window_of(slab, with_density):
     return TrainingWindow(particles, true["velocity"], true.get("density"), energies)
 
 
-def trainer_of(comm, preset="resolved + pairs", integrator="verlet", steps=1, noise=0.0, iterations=ITERATIONS):
+def trainer_of(comm, preset="resolved + pairs", integrator="verlet", steps=1, iterations=ITERATIONS):
     slab = SlabDecomposition(comm, LENGTH, PER_SIDE)
     model = model_of(preset, SUPPORT, 17, (6, 5))
     dynamics = ParticleDynamics(slab, model, 0.0, torch.float64, fixed_ranks=True, drift=2 * SPACING)
@@ -68,7 +68,7 @@ def trainer_of(comm, preset="resolved + pairs", integrator="verlet", steps=1, no
         solving(dynamics.resolution, iterations)
     window = window_of(slab, model.integrates_density)
     trainer = RolloutTrainer(comm, INTEGRATORS[integrator](dynamics), [window], INTERVAL, steps, 0.5,
-                             solving(resolution(slab), iterations).band_energies, noise, 5)
+                             solving(resolution(slab), iterations).band_energies, 5)
     return trainer, model
 
 
@@ -122,7 +122,7 @@ def test_training_has_the_same_losses_on_any_number_of_ranks(comm):
     from mpi4py import MPI
 
     def losses(communicator):
-        trainer, model = trainer_of(communicator, noise=0.05)
+        trainer, model = trainer_of(communicator)
         optimizer = Adam(communicator, model.parameters(), 5, 3e-2, 1e-3)
         return [trainer.step(optimizer, step, 1 + step // 4) for step in range(5)]
 
@@ -158,7 +158,7 @@ def test_memory_does_not_grow_with_the_steps(comm):
 def test_without_a_weight_nobody_asks_for_energies(comm):
     with_energies, _ = trainer_of(comm)
     windows = [replace(window, energies=None) for window in with_energies.windows]
-    trainer = RolloutTrainer(comm, with_energies.integrator, windows, INTERVAL, 1, 0.0, None, 0.0, 5)
+    trainer = RolloutTrainer(comm, with_energies.integrator, windows, INTERVAL, 1, 0.0, None, 5)
     shares, expected = (each.loss_shares(each.windows[0], 2) for each in (trainer, with_energies))
     assert shares == {"rollout_loss": expected["rollout_loss"]}
 
@@ -187,12 +187,3 @@ def test_no_acceleration_has_an_error_of_one(comm):
         for parameter in model.parameters():
             parameter.zero_()
     assert trainer.validation_error(trainer.windows[0], FRAMES) == pytest.approx(1, rel=1e-9)
-
-
-@pytest.mark.mpi(1, 2, 3)
-def test_noise_depends_on_ids_alone(comm):
-    trainer, _ = trainer_of(comm, noise=0.1)
-    particles = trainer.windows[0].particles
-    noise = trainer._disturbed(particles, np.random.default_rng(3)).velocity - particles.velocity
-    expected = np.random.default_rng(3).normal(0, 0.1, (PER_SIDE**3, 3))[particles.id]
-    assert np.allclose(noise, expected, atol=1e-14)

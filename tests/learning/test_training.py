@@ -9,7 +9,7 @@ from eddies.parallel.halo import HaloError
 TARGET = torch.tensor([[1.0, -2.0, 0.5]], dtype=torch.float64)
 
 
-def training_of(comm, validate=None, patience=None, steps=(6, 5)):
+def training_of(comm, validate=None, steps=(6, 5)):
     """A linear map learned from random vectors, drawn for each step, in two phases; ranks share the loss evenly."""
     torch.manual_seed(3)
     model = nn.Linear(3, 1, bias=False).double()
@@ -24,7 +24,7 @@ def training_of(comm, validate=None, patience=None, steps=(6, 5)):
 
     phases = [Phase(f"phase {number}", np.ones(count), (0.1, 0.01), take, validate or error, 2)
               for number, count in enumerate(steps)]
-    return Training(comm, model, phases, patience)
+    return Training(comm, model, phases)
 
 
 def finished(training):
@@ -105,16 +105,6 @@ def test_errors_that_are_no_numbers_are_no_best_and_nothing_else(comm):
     errors = iter([np.nan] * 4)
     with pytest.raises(TrainingDiverged, match=r"step 5 of the training \(phase 0\): at no time .* finite"):
         finished(training_of(comm, validate, steps=(6,)))
-    errors = iter([np.nan] * 3)
-    with pytest.raises(TrainingDiverged, match="step 3 of the training"):
-        finished(training_of(comm, validate, patience=3, steps=(20,)))
-
-
-@pytest.mark.mpi(1)
-def test_a_phase_ends_after_too_many_validations_without_a_new_best(comm):
-    errors = iter([3.0, 1.0, 2.0, 2.0, 9.5, 9.0, 8.0, 7.0, 6.0])
-    training = finished(training_of(comm, lambda: next(errors), patience=2, steps=(20, 8)))
-    assert [np.sum(training.columns()["phase"] == number) for number in (0, 1)] == [6, 8]
 
 
 @pytest.mark.mpi(1)

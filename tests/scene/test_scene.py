@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 
 from eddies.pipeline import STAGES as TABLE
-from eddies.scene.scene import Eulerian, Flow, Scene, SceneError, Time, builtin_scenes, load_scene
+from eddies.scene.scene import Eulerian, Flow, Horizons, Scene, SceneError, Time, builtin_scenes, load_scene
 from eddies.scene.values import rule_of
 from tests.bad_scenes import BAD_OVERRIDES, BAD_TEXTS
 
@@ -89,11 +89,17 @@ def test_coarse_grid_of_the_filter():
 
 
 def test_rates_of_the_horizons_fall():
-    flat = ["training.horizon_learning_rate=1e-5", "training.horizon_steps=1"]
     with pytest.raises(SceneError, match=r"\[training\] final_learning_rate = 0.0001: must be at most "
-                                         "horizon_learning_rate = 1e-05"):
-        load_scene("tiny", flat)
-    assert load_scene("tiny", flat[:1]).training.horizon_steps == 0
+                                         r"\[training.horizons\] learning_rate = 1e-05"):
+        load_scene("tiny", ["training.horizons.learning_rate=1e-5", "training.horizons.steps=1"])
+
+
+def test_a_section_within_a_section_is_read_and_written():
+    scene = load_scene("tiny", ["training.horizons.steps=3", "training.horizons.frames=[2]"])
+    assert scene.training.horizons == Horizons(steps=3, frames=(2,)) and "[training.horizons]" in scene.to_toml()
+    assert load_scene("tiny").training.horizons is None and "horizons" not in load_scene("tiny").to_toml()
+    with pytest.raises(SceneError, match=r"\[training.horizons\] steps = 0: must be a whole number at least 1"):
+        Horizons(steps=0)
 
 
 def test_derived_lengths():

@@ -127,8 +127,7 @@ def trainer(comm, weights):
 def combined_step(comm, **weights):
     """A function that takes a step on all losses with these weights; the others are zero."""
     counting = CountingComm(comm)
-    learner = trainer(counting, LossWeights(**{"trajectory": 1.0, "field": 0.0, "velocity_kl": 0.0,
-                                               "acceleration_kl": 0.0, **weights}))
+    learner = trainer(counting, LossWeights(**weights))
     optimizer = Adam(counting, learner.model.parameters(), 9, 1e-2, 1e-3)
     learner.combined_step(optimizer, 0)
     counting.sent.clear()

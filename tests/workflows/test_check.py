@@ -157,7 +157,7 @@ def test_ranks_for_horizons_are_those_that_the_grid_and_the_particles_accept(com
             return False
         return True
 
-    scene = load_scene("tiny", ["training.horizon_steps=5", f"training.horizons=[1, {frames}]"])
+    scene = load_scene("tiny", ["training.horizons.steps=5", f"training.horizons.frames=[1, {frames}]"])
     limits = most_training_ranks(scene)
     by_reach, = (ranks for reason, ranks in limits.items() if reason.startswith("slabs no thinner"))
     by_grid = limits["ghost planes of the grid in the training through horizons"]
@@ -175,7 +175,7 @@ def test_ranks_for_horizons_are_those_that_the_grid_and_the_particles_accept(com
 
 def test_ranks_are_not_limited_by_horizons_that_are_not_trained():
     from eddies.workflows.foreseen.estimates import most_ranks
-    for changes in ([], ["training.horizon_steps=5", "model.path=runs/other"]):
+    for changes in ([], ["training.horizons.steps=5", "model.path=runs/other"]):
         scene = load_scene("hit-small", changes)
         assert min(most_ranks(scene).values()) == 12 and not any("horizons" in reason for reason in most_ranks(scene))
 
@@ -184,7 +184,7 @@ def test_what_no_term_reads_limits_no_ranks():
     from eddies.workflows.check import cost_lines, warnings
     from eddies.workflows.foreseen.cost_model import Speed
     from eddies.workflows.foreseen.estimates import most_ranks
-    fast, speed = ["training.horizon_steps=5", "training.horizons=[12]"], Speed(1e-6, 1e9)
+    fast, speed = ["training.horizons.steps=5", "training.horizons.frames=[12]"], Speed(1e-6, 1e9)
     limits = {preset: most_ranks(load_scene("tiny", [*fast, f"model.preset={preset}"]))
               for preset in ("resolved + pairs", "resolved", "learned-density")}
     found = {preset: {word for word in ("reach", "resolved") if any(word in reason for reason in reasons)}
@@ -197,7 +197,7 @@ def test_what_no_term_reads_limits_no_ranks():
             for preset in limits}
     assert told == {"resolved + pairs": [], "resolved": [], "learned-density": [
         '[model] terms: "density-transport" is trained through horizons alone, and stays as it starts without them: '
-        "set [training] horizon_steps"]}
+        "add [training.horizons]"]}
 
 
 def test_memory_of_pairs_is_that_of_the_widest_network():

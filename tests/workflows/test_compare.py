@@ -145,7 +145,7 @@ def test_runs_of_others_are_left_as_they_are(comm, folder, capfd, name, change, 
 @pytest.mark.mpi(1, 2)
 def test_more_ranks_than_a_variant_can_use_are_refused(comm, folder, capfd):
     if comm.rank == 0:
-        longer = '["training.horizon_steps=1", "training.horizons=[4]"]'
+        longer = '["training.horizons.steps=1", "training.horizons.frames=[4]"]'
         (folder / "wide.toml").write_text(FILE + f'[[variant]]\nname = "wide"\nset = {longer}\n')
     comm.Barrier()
     assert run_cli("compare", "wide.toml", "--output", "out") == 2

@@ -14,13 +14,13 @@ from eddies.scene.scene import SceneError, load_scene
 from eddies.workflows import dns, train, train_kernel
 from tests.workflows.stopping import StopAtStep
 
-# Ten frame intervals, all of them for training: six steps on single frames, two of them with every loss, and then two
-# of each horizon.
+# Ten frame intervals, all of them for training: six steps on single frames, two of them with every loss; and then, or
+# not, two of each horizon.
 SHORT = ["flow.cells=12", "tracers.particles_per_side=6", "tracers.field_cells=8", "spin_up.turnovers=0.01",
          "tracers.turnovers=0.14", "tracers.frame_interval=0.02", "tracers.field_every=3", "kernel.neighbors=20",
          "kernel.steps=2", "kernel.points=20", "model.pairs.hidden=[4]", "training.window=1", "training.frames=2",
-         "training.batch=50", "training.steps=6", "training.combined_steps=2", "training.horizon_steps=2",
-         "training.horizons=[1,2]", "training.noise=0.1", "simulation.start=0"]
+         "training.batch=50", "training.steps=6", "training.combined_steps=2", "simulation.start=0"]
+THROUGH_HORIZONS = [*SHORT, "training.horizons.steps=2", "training.horizons.frames=[1,2]"]
 
 
 @pytest.fixture(autouse=True)
@@ -29,9 +29,9 @@ def quick_solves(monkeypatch):
     monkeypatch.setattr(ResolvedVelocity, "iterations", 3)
 
 
-def prepared(comm, directory, *more):
+def prepared(comm, directory, settings=THROUGH_HORIZONS):
     """A directory with the ground truth and the kernel of the short scene."""
-    scene = load_scene("tiny", [*SHORT, *more])
+    scene = load_scene("tiny", settings)
     if comm.rank == 0:
         directory.mkdir(parents=True, exist_ok=True)
     comm.Barrier()
@@ -77,7 +77,7 @@ def test_a_stopped_training_is_the_one_never_stopped(comm, tmp_path):
 @pytest.mark.usefixtures("undrawn")
 @pytest.mark.mpi(2)
 def test_a_training_goes_on_from_products_that_are_still_those_it_began_with(comm, tmp_path):
-    scene = prepared(comm, tmp_path, "training.horizon_steps=0")
+    scene = prepared(comm, tmp_path, SHORT)
 
     def stopped(looks, step, resume, names=("train",)):
         with pytest.raises(Stopped, match=f"from step {step} of the training"):
@@ -108,8 +108,9 @@ def test_a_training_goes_on_from_products_that_are_still_those_it_began_with(com
 @pytest.mark.mpi(1, 2)
 def test_a_window_too_short_for_its_horizons_is_refused(comm, tmp_path):
     prepared(comm, tmp_path)
-    scene = load_scene("tiny", [*SHORT, "training.horizons=[1,5]"])
+    scene = load_scene("tiny", [*SHORT, "training.horizons.steps=1", "training.horizons.frames=[1,5]"])
     with pytest.raises(SceneError, match=r"\[training\] window = 1: holds 10 frames of the ground truth, too few with "
-                                         "5 held out for validation and horizons of 5; raise it or .* horizons"):
+                                         "5 held out for validation and horizons of 5; raise it or .* frame_interval "
+                                         r"or \[training.horizons\] frames"):
         train.run(scene, comm, tmp_path)
     assert not list(tmp_path.glob("model.h5*"))

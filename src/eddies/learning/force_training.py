@@ -28,9 +28,9 @@ HISTOGRAM_BINS, HISTOGRAM_REACH = 41, 5.0
 
 @dataclass(frozen=True)
 class LossWeights:
-    """Weights of Eq. 15: trajectory, field, and the divergences of velocity and acceleration."""
+    """Weights of Eq. 15 in units of that of the trajectory loss: field, and the divergences of velocity and
+    acceleration."""
 
-    trajectory: float = 1.0
     field: float = 0.0
     velocity_kl: float = 0.0
     acceleration_kl: float = 0.0
@@ -177,7 +177,7 @@ class ForceTrainer:
         return shares | self._divergence_shares(frame, rows, errors["acceleration"])
 
     def _weighted(self, shares: dict[str, Tensor]) -> Tensor:
-        return sum(getattr(self.weights, name) * share for name, share in shares.items())
+        return sum(getattr(self.weights, name, 1.0) * share for name, share in shares.items())
 
     def _step(self, optimizer: Adam, shares: dict[str, Tensor]) -> dict[str, float]:
         """A step down the weighted sum of the losses; returns them."""

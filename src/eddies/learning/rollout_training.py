@@ -61,15 +61,14 @@ class RolloutTrainer:
     frame_interval : time between frames. steps_per_frame : time steps in it.
     energy_weight : of the energies beside the velocity; if it is zero, neither windows nor `energies` give any.
     energies : gives those of particles.
-    noise : standard deviation of what is added to each component of the initial velocities.
     """
 
     def __init__(self, comm: Comm, integrator: Integrator, windows: Sequence[TrainingWindow], frame_interval: float,
                  steps_per_frame: int, energy_weight: float, energies: Callable[[ParticleSet], Tensor] | None,
-                 noise: float, seed: int) -> None:
+                 seed: int) -> None:
         self.comm, self.integrator, self.windows = comm, integrator, windows
         self.steps_per_frame, self.time_step = steps_per_frame, frame_interval / steps_per_frame
-        self.energy_weight, self.energies, self.noise, self.seed = energy_weight, energies, noise, seed
+        self.energy_weight, self.energies, self.seed = energy_weight, energies, seed
         self.total = int(global_sum(comm, len(windows[0].particles)))
         self.losses = mean_losses(windows) if energy_weight > 0 else None
 
@@ -77,7 +76,6 @@ class RolloutTrainer:
         """One optimiser step on windows of `horizon` frames; returns the losses."""
         random = np.random.default_rng([self.seed, step])
         window = self.windows[random.integers(len(self.windows))]
-        window = replace(window, particles=self._disturbed(window.particles, random))
         shares = self.loss_shares(window, horizon)
         total = sum(shares.values())
         norm = optimizer.step(total)
@@ -97,7 +95,7 @@ class RolloutTrainer:
 
     @torch.no_grad()
     def validation_error(self, window: TrainingWindow, horizon: int) -> float:
-        """Root of the loss of a window, without noise: but for the energy 1 without acceleration."""
+        """Root of the loss of a window: but for the energy 1 without acceleration."""
         shares = self.loss_shares(window, horizon)
         return sum(shared_values(self.comm, shares).values()) ** 0.5
 
@@ -157,13 +155,6 @@ class RolloutTrainer:
         """Root mean square of the change of one component."""
         squares = global_sum(self.comm, float((true - start).double().square().sum()))
         return float(np.sqrt(squares / (self.total * math.prod(true.shape[1:]))))
-
-    def _disturbed(self, particles: ParticleSet, random: np.random.Generator) -> ParticleSet:
-        """The particles with noise on their velocities, which depends on their ids alone."""
-        if self.noise == 0:
-            return particles
-        noise = torch.from_numpy(random.normal(0.0, self.noise, (self.total, 3))).to(particles.velocity)
-        return replace(particles, velocity=particles.velocity + noise[particles.id])
 
 
 def mean_losses(windows: Sequence[TrainingWindow]) -> Tensor:

@@ -54,14 +54,13 @@ class Training:
     Parameters
     ----------
     phases : in order, each of at least one step.
-    patience : validations without a new best after which a phase ends early; None: it never does.
 
     `history` holds a row for each step, with `start_error` in the first of each phase: the validation error before it.
     All ranks hold the same state.
     """
 
-    def __init__(self, comm: Comm, model: nn.Module, phases: Sequence[Phase], patience: int | None = None) -> None:
-        self.comm, self.model, self.patience = comm, model, patience
+    def __init__(self, comm: Comm, model: nn.Module, phases: Sequence[Phase]) -> None:
+        self.comm, self.model = comm, model
         self.phases = list(phases)
         self.history: list[dict[str, float]] = []
         self._started, self._seconds_before = time.perf_counter(), 0.0
@@ -69,7 +68,7 @@ class Training:
 
     def _begin(self, number: int) -> None:
         """Be at the start of a phase."""
-        self.number, self.best_error, self.best, self.unimproved = number, np.inf, self._weights(), 0
+        self.number, self.best_error, self.best = number, np.inf, self._weights()
         if self.running:
             self.optimizer = Adam(self.comm, self.model.parameters(), self.phase.steps, *self.phase.rates)
 
@@ -103,12 +102,11 @@ class Training:
         last = self.optimizer.taken == phase.steps
         if last or self.optimizer.taken % phase.validate_every == 0:
             row["validation_error"] = self._validate()
-        over = last or self.patience is not None and self.unimproved >= self.patience
-        if over and self.best_error == np.inf:
+        if last and self.best_error == np.inf:
             raise TrainingDiverged(f"{place}: at no time of this phase was the error on what is held out finite")
         row["seconds"] = self._seconds_before + time.perf_counter() - self._started
         self.history.append(row)
-        if over:
+        if last:
             self._load(self.best)
             self._begin(self.number + 1)
 
@@ -121,7 +119,7 @@ class Training:
         """All that goes on, for a checkpoint: numbers and arrays by name."""
         parts = {"model": self._weights(), "best": self.best, "history": self.columns(),
                  "optimizer": self.optimizer.state_dict()}
-        return {"number": self.number, "best_error": self.best_error, "unimproved": self.unimproved,
+        return {"number": self.number, "best_error": self.best_error,
                 "names": {part: list(values) for part, values in parts.items()},
                 **{f"{part} {name}": value if isinstance(value, int) else np.atleast_1d(value)
                    for part, values in parts.items() for name, value in values.items()}}
@@ -131,7 +129,7 @@ class Training:
         parts = {part: {name: state[f"{part} {name}"] for name in names} for part, names in state["names"].items()}
         self._load(parts["model"])
         self._begin(state["number"])
-        self.best, self.best_error, self.unimproved = parts["best"], state["best_error"], state["unimproved"]
+        self.best, self.best_error = parts["best"], state["best_error"]
         self.optimizer.load_state_dict(parts["optimizer"])
         rows = zip(*parts["history"].values())
         self.history = [{name: float(value) for name, value in zip(parts["history"], row) if value == value}
@@ -145,9 +143,8 @@ class Training:
         except HaloError:
             error = np.inf
         error = error if np.isfinite(error) else np.inf
-        self.unimproved += 1
         if error < self.best_error:
-            self.best_error, self.best, self.unimproved = error, self._weights(), 0
+            self.best_error, self.best = error, self._weights()
         return error
 
     def _weights(self) -> dict[str, np.ndarray]:

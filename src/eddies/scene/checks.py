@@ -206,13 +206,14 @@ def training_problems(scene: Scene) -> Iterator[str]:
     if training.final_learning_rate > training.learning_rate:
         yield (f"[training] final_learning_rate = {training.final_learning_rate:g}: must be at most "
                f"learning_rate = {training.learning_rate:g}")
-    step, interval = training.horizon_step, scene.tracers.frame_interval if scene.tracers else None
-    if step and interval and not _is_multiple(interval, step):
-        yield (f"[training] horizon_step = {step:g}: [tracers] frame_interval = {interval:g} must be a whole multiple "
-               "of it; change either")
-    if training.horizon_steps and training.final_learning_rate > training.horizon_learning_rate:
-        yield (f"[training] final_learning_rate = {training.final_learning_rate:g}: must be at most "
-               f"horizon_learning_rate = {training.horizon_learning_rate:g}")
+    if (horizons := training.horizons) is not None:
+        step, interval = horizons.time_step, scene.tracers.frame_interval if scene.tracers else None
+        if step and interval and not _is_multiple(interval, step):
+            yield (f"[training.horizons] time_step = {step:g}: [tracers] frame_interval = {interval:g} must be a whole "
+                   "multiple of it; change either")
+        if training.final_learning_rate > horizons.learning_rate:
+            yield (f"[training] final_learning_rate = {training.final_learning_rate:g}: must be at most "
+                   f"[training.horizons] learning_rate = {horizons.learning_rate:g}")
     if scene.tracers and training.batch > scene.tracers.particles:
         yield (f"[training] batch = {training.batch}: must be at most the number of particles, "
                f"{scene.tracers.particles}; lower it or raise [tracers] particles_per_side")

@@ -86,7 +86,7 @@ def read_section(kind: type[Section], table: Any, name: str = "") -> Any:
     values, inner = {}, {}
     for key, value in table.items():
         if key in fields:
-            values[key] = _read_value(fields[key], value)
+            values[key] = _read_value(fields[key], value, _within(name, key))
         elif holder and isinstance(value, dict):
             inner[key] = value
         else:
@@ -101,12 +101,15 @@ def read_section(kind: type[Section], table: Any, name: str = "") -> Any:
 
 
 def write_section(section: Section, name: str = "") -> list[str]:
-    """The lines `key = value  # meaning` of a section, and below them those of its own sections [name.NAME] that have
-    keys; keys that are None are left out."""
+    """The lines `key = value  # meaning` of a section, and below them those of its own sections; keys and sections that
+    are None are left out, and sections of terms that have no keys."""
     lines, inner = [], []
     for field in dataclasses.fields(section):
         value, rule = getattr(section, field.name), rule_of(type(section), field)
-        if "sub_sections" in field.metadata:
+        if "section" in field.metadata and value is not None:
+            own = _within(name, field.name)
+            inner += ["", f"[{own}]", *write_section(value, own)]
+        elif "sub_sections" in field.metadata:
             for key, part in value.items():
                 if written := write_section(part):
                     inner += ["", f"[{name}.{key}]", *written]
@@ -123,11 +126,16 @@ def _override_value(value: str) -> Any:
     return parsed["value"] if len(parsed) == 1 else value
 
 
-def _read_value(field: dataclasses.Field, value: Any) -> Any:
+def _within(section: str, name: str) -> str:
+    """The name of a section's own section."""
+    return f"{section}.{name}" if section else name
+
+
+def _read_value(field: dataclasses.Field, value: Any, name: str) -> Any:
     if "section" in field.metadata:
-        return read_section(field.metadata["section"], value, field.name)
+        return read_section(field.metadata["section"], value, name)
     if "sections" in field.metadata:
-        return _read_sections(field.metadata["sections"], value, field.name)
+        return _read_sections(field.metadata["sections"], value, name)
     return value
 
 

@@ -6,7 +6,7 @@ A section that is optional and absent is None, and then nothing is built for it.
 import hashlib
 import json
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -16,13 +16,12 @@ from eddies.scene.checks import first_inconsistency
 from eddies.scene.composition import origins, search_in
 from eddies.scene.model import Model, replace_terms
 from eddies.scene.reader import apply_overrides, find_document, parse_document, read_section, read_text, write_section
-from eddies.scene.sections import (BOX_LENGTH, DEFAULT_WINDOW, Eulerian, Flow, Forcing, Initial, Kernel, Simulation,
-                                   SpinUp, Time, Tracers, Training, Wcsph)
+from eddies.scene.sections import (BOX_LENGTH, DEFAULT_WINDOW, Eulerian, Flow, Forcing, Horizons, Initial, Kernel,
+                                   Simulation, SpinUp, Time, Tracers, Training, Wcsph)
 from eddies.scene.values import Document, SceneError, choice, import_paths, integer, section, text
 
-__all__ = ["BOX_LENGTH", "Scene", "SceneError", "builtin_scenes", "load_scene", "Eulerian",
-           "Flow", "Forcing", "Initial", "Kernel", "Model", "Simulation", "SpinUp", "Time", "Tracers", "Training",
-           "Wcsph"]
+__all__ = ["BOX_LENGTH", "Scene", "SceneError", "builtin_scenes", "load_scene", "Eulerian", "Flow", "Forcing",
+           "Horizons", "Initial", "Kernel", "Model", "Simulation", "SpinUp", "Time", "Tracers", "Training", "Wcsph"]
 
 # Sections that may name classes and functions of the user's.
 FOREIGN_IN = ("flow", "initial", "model", "simulation")
@@ -82,12 +81,7 @@ class Scene(Document):
 
     def to_toml(self) -> str:
         """The scene as a TOML text with a comment on every key; reading it back gives an equal scene."""
-        lines = write_section(self)
-        for field in fields(self):
-            part = getattr(self, field.name)
-            if "section" in field.metadata and part is not None:
-                lines += ["", f"[{field.name}]", *write_section(part, field.name)]
-        return "\n".join(lines) + "\n"
+        return "\n".join(write_section(self)) + "\n"
 
     def fingerprint(self, stage: str) -> str:
         """SHA-256 over what a stage's product depends on: its own settings and those of the earlier stages that

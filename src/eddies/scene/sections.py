@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from eddies.scene.composition import is_path, load
 from eddies.scene.methods import METHODS, needs_of
-from eddies.scene.values import Section, choice, integer, integers, named, number, text
+from eddies.scene.values import Section, choice, integer, integers, named, number, section, text
 
 BOX_LENGTH = 2 * math.pi
 DEFAULT_WINDOW = 0.5
@@ -135,6 +135,24 @@ class Kernel(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Horizons(Section):
+    """Training through several steps of the simulation, after all others."""
+
+    frames: tuple[int, ...] = integers("through which the simulation is differentiated, one after the other",
+                                       default=(1, 2, 4, 8), at_least=1)
+    steps: int = integer("optimiser steps through each number of frames", at_least=1)
+    time_step: float | None = number("of the simulation; absent: the interval of frames", default=None, above=0)
+    integrator: str = choice("time stepping of the simulation", "verlet", "rk2", "rk3", "rk4", default="verlet")
+    learning_rate: float = number("of the optimiser, at the start of each number of frames", default=1e-3, above=0)
+    energy_weight: float = number("weight of the energies by bands of wavenumbers in the loss", default=0.1, at_least=0)
+
+    @classmethod
+    def section_name(cls) -> str:
+        """Within [training]."""
+        return "training.horizons"
+
+
+@dataclass(frozen=True, kw_only=True)
 class Training(Section):
     """How the force is fitted to the tracers: to trajectories, to all losses together, to what the simulation does."""
 
@@ -146,23 +164,11 @@ class Training(Section):
     learning_rate: float = number("of the optimiser, at the start", default=5e-3, above=0)
     final_learning_rate: float = number("of the optimiser, at the end", default=1e-4, above=0)
     precision: str = choice("of the training", "float32", "float64", default="float32")
-    trajectory_weight: float = number("weight of the trajectory loss", default=1.0, at_least=0)
-    field_weight: float = number("weight of the field loss", default=0.0, at_least=0)
+    field_weight: float = number("weight of the field loss beside the trajectory loss", default=0.0, at_least=0)
     velocity_kl_weight: float = number("weight of the divergence of velocity PDFs", default=0.0, at_least=0)
     acceleration_kl_weight: float = number("the same for acceleration PDFs", default=0.0, at_least=0)
     combined_steps: int = integer("steps at the end that use every loss", default=0, at_least=0)
-    horizons: tuple[int, ...] = integers("frames through which the simulation is differentiated, one after the other",
-                                         default=(1, 2, 4, 8), at_least=1)
-    horizon_steps: int = integer("optimiser steps of each horizon, after all others", default=0, at_least=0)
-    horizon_step: float | None = number("time step of the horizons; absent: the interval of frames", default=None,
-                                        above=0)
-    horizon_integrator: str = choice("time stepping of the horizons", "verlet", "rk2", "rk3", "rk4", default="verlet")
-    horizon_learning_rate: float = number("of the optimiser, at the start of each horizon", default=1e-3, above=0)
-    energy_weight: float = number("weight of the energies by bands of wavenumbers in the loss of the horizons",
-                                  default=0.1, at_least=0)
-    noise: float = number("added to initial velocities of the horizons, in units of their rms", default=0.0, at_least=0)
-    patience: int | None = integer("validations without a new best that end a phase early; absent: none",
-                                   default=None, at_least=1)
+    horizons: Horizons | None = section(Horizons, default=None)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -174,11 +174,11 @@ def warnings(scene: Scene, ranks: int) -> Iterator[str]:
     if scene.model and scene.model.path and not scene.model.weights_file.is_file():
         yield (f'[model] path = "{scene.model.path}": there is no {scene.model.weights_file} yet, which `eddies train` '
                "will want")
-    if scene.training and scene.model.path is None and not scene.training.horizon_steps:
+    if scene.training and scene.model.path is None and scene.training.horizons is None:
         for name, settings in scene.model.settings.items():
             if settings.learns_through_horizons:
                 yield (f'[model] terms: "{name}" is trained through horizons alone, and stays as it starts without '
-                       "them: set [training] horizon_steps")
+                       "them: add [training.horizons]")
     if scene.simulation and "model" in scene.simulation.needs and "resolved" in scene.model.reads:
         allowed = foreseen_allowed_step(scene)
         if allowed and scene.simulation.injection != "none" and scene.simulation.step > allowed * (1 + 1e-9):

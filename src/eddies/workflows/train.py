@@ -53,7 +53,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
             log.info("train: the terms have no parameters, nothing is learned")
         else:
             phases = [*data.one_step_phases(), *data.horizon_phases()]
-            training = Training(comm, model, phases, scene.training.patience)
+            training = Training(comm, model, phases)
             take_all_steps(training, checkpoints, stop, LearningCurves(comm, directory / "learning.png"))
             history = {"history": training.columns()}
         tables = history | evaluate(truth, model, tests, last, data.dtype, device)
@@ -98,8 +98,8 @@ def take_all_steps(training: Training, checkpoints: CheckpointDirectory, stop: S
         try:
             training.step()
         except (TrainingDiverged, HaloError) as error:
-            raise SceneError(f"[training] {error}; lower learning_rate or horizon_learning_rate"
-                             ", or shorten horizon_step") from None
+            raise SceneError(f"[training] {error}; lower learning_rate here or in [training.horizons], or shorten "
+                             "time_step there") from None
         if training.running:
             progress(training.done, len(training.history))
         curves(training)

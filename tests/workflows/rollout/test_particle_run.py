@@ -46,8 +46,9 @@ batch = 60
 steps = 4
 combined_steps = 2
 field_weight = 0.1
-horizon_steps = 1
-horizons = [1]
+[training.horizons]
+steps = 1
+frames = [1]
 [simulation]
 step = 0.02
 turnovers = 0.05

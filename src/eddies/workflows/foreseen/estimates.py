@@ -141,7 +141,7 @@ def most_training_ranks(scene: Scene) -> dict[str, int]:
             reach = support + 2 * particle_drift(scene, time)
             limits[f"slabs no thinner than the particles' reach {reach:.3g} in the training through horizons"] = (
                 thick_slabs(scene.tracers.planes, reach))
-        if scene.training.energy_weight > 0 or "resolved" in scene.model.reads:
+        if scene.training.horizons.energy_weight > 0 or "resolved" in scene.model.reads:
             limits["ghost planes of the grid in the training through horizons"] = ranks_of_resolved_grid(
                 scene, particle_drift(scene, time, ALLOWED_VELOCITY))
     return limits
@@ -185,10 +185,10 @@ def foreseen_allowed_step(scene: Scene) -> float | None:
 
 def horizon_time(scene: Scene) -> float:
     """The longest time through which a model is trained and particles keep their rank; 0 without such training."""
-    settings = scene.training
-    if settings is None or settings.horizon_steps == 0 or scene.model.path is not None:
+    horizons = scene.training and scene.training.horizons
+    if horizons is None or scene.model.path is not None:
         return 0.0
-    return max(settings.horizons) * scene.tracers.frame_interval
+    return max(horizons.frames) * scene.tracers.frame_interval
 
 
 def ranks_of_resolved_grid(scene: Scene, outside: float) -> int:

@@ -45,7 +45,7 @@ class TrainingData:
         self.scene, self.settings, self.truth, self.kernel, self.device = scene, scene.training, truth, kernel, device
         self.dtype = getattr(torch, self.settings.precision)
         self.model = scene_model(scene, truth.scales).to(dtype=self.dtype, device=device)
-        self.longest = max(self.settings.horizons) if self.settings.horizon_steps else 0
+        self.longest = max(self.settings.horizons.frames) if self.settings.horizons else 0
         self.last = truth.last_frame_seen(self.settings.window)
         held_out = max(math.ceil(HELD_OUT * self.last), self.longest, 2)  # rates need a frame on both sides
         self.learned = self.last - held_out
@@ -53,7 +53,7 @@ class TrainingData:
             raise SceneError(
                 f"[training] window = {self.settings.window:g}: holds {self.last} frames of the ground truth, too few "
                 f"with {held_out} held out for validation and horizons of {self.longest}; raise it or [tracers] "
-                "turnovers, or lower [tracers] frame_interval or horizons")
+                "turnovers, or lower [tracers] frame_interval or [training.horizons] frames")
 
     @cached_property
     def frames(self) -> list[TrainingFrame]:
@@ -76,8 +76,7 @@ class TrainingData:
             first = self.frames[0]
             self.model.require_linear(first.dynamics.context(first.particles))
         validation = self._frame(self.last - 1)
-        weights = LossWeights(settings.trajectory_weight, settings.field_weight, settings.velocity_kl_weight,
-                              settings.acceleration_kl_weight)
+        weights = LossWeights(settings.field_weight, settings.velocity_kl_weight, settings.acceleration_kl_weight)
         trainer = ForceTrainer(self.model, self.frames, self.kernel, weights, settings.batch, self.scene.seed)
         alone = settings.steps - settings.combined_steps
         fall = settings.final_learning_rate / settings.learning_rate
@@ -96,8 +95,8 @@ class TrainingData:
 
     def horizon_phases(self) -> list[Phase]:
         """Steps through windows of frames, one phase for each horizon of the scene."""
-        settings, scene = self.settings, self.scene
-        if not settings.horizon_steps:
+        settings, scene = self.settings.horizons, self.scene
+        if settings is None:
             return []
         interval, slab = scene.tracers.frame_interval, self.truth.decomposition
         drift = ALLOWED_VELOCITY * self.model.flow.scales.velocity * interval * self.longest
@@ -108,27 +107,26 @@ class TrainingData:
         resolution = None
         if settings.energy_weight > 0:
             resolution = dynamics.resolution or ResolvedVelocity.on_slabs(slab, self.model.flow, drift)
-        starts = np.unique(np.linspace(0, self.learned - self.longest, settings.frames).astype(int))
+        starts = np.unique(np.linspace(0, self.learned - self.longest, self.settings.frames).astype(int))
         windows = [self._window(start, resolution) for start in starts]
         validation = self._window(self.last - self.longest, resolution)
-        substeps = round(interval / (settings.horizon_step or interval))
-        trainer = RolloutTrainer(slab.comm, INTEGRATORS[settings.horizon_integrator](dynamics), windows, interval,
-                                 substeps, settings.energy_weight, resolution and resolution.band_energies,
-                                 settings.noise * self.truth.scales.velocity, scene.seed)
-        rates = settings.horizon_learning_rate, settings.final_learning_rate
-        every = max(settings.horizon_steps // HORIZON_VALIDATIONS, 1)
+        substeps = round(interval / (settings.time_step or interval))
+        trainer = RolloutTrainer(slab.comm, INTEGRATORS[settings.integrator](dynamics), windows, interval,
+                                 substeps, settings.energy_weight, resolution and resolution.band_energies, scene.seed)
+        rates = settings.learning_rate, self.settings.final_learning_rate
+        every = max(settings.steps // HORIZON_VALIDATIONS, 1)
 
         def phase(number: int, horizon: int) -> Phase:
             def take(optimizer: Adam, step: int) -> dict[str, float]:
-                return trainer.step(optimizer, number * settings.horizon_steps + step, horizon)
+                return trainer.step(optimizer, number * settings.steps + step, horizon)
 
             # Each step through a window is evaluated, evaluated again on the way back, and differentiated.
-            work = np.full(settings.horizon_steps, 3.0 * substeps * horizon * trainer.total)
+            work = np.full(settings.steps, 3.0 * substeps * horizon * trainer.total)
             # All horizons are measured by the longest: a shorter one is a way to it.
             return Phase(f"horizon {horizon}", work, rates, take,
                          lambda: trainer.validation_error(validation, self.longest), every)
 
-        return [phase(number, horizon) for number, horizon in enumerate(settings.horizons)]
+        return [phase(number, horizon) for number, horizon in enumerate(settings.frames)]
 
     def _frame(self, index: int) -> TrainingFrame:
         return load_frame(self.truth, index, self.model, self.dtype, self.device)
