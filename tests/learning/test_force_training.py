@@ -184,6 +184,17 @@ def test_a_model_without_networks_trains(comm):
     assert -1e-9 < losses[-1] - least < 0.02 * (losses[0] - least)
 
 
+@pytest.mark.mpi(1, 2)
+@pytest.mark.parametrize("preset, cutoff", [("resolved", SUPPORT), ("paper", 0.6 * SUPPORT), ("paper", 1.5 * SUPPORT)])
+def test_the_field_loss_reaches_as_far_as_its_kernel_whatever_the_model_sees(comm, preset, cutoff):
+    kernel = WendlandC2(SUPPORT)
+    frame, expected = (frame_of(comm, model_of(*made, 45, (8, 8))) for made in ((preset, cutoff), ("paper", SUPPORT)))
+    found, known = frame.within(kernel), expected.within(kernel)
+    own = slice(0, len(frame.particles))
+    assert torch.allclose(found.volumes[own], known.volumes[own], rtol=1e-12)
+    assert found.neighborhood.cutoff >= SUPPORT
+
+
 @pytest.mark.mpi(1)
 def test_a_model_without_parameters_has_nothing_to_keep_but_its_rates(comm):
     trainer = trainer_of(comm, ("pressure", "pairs"), pairs={"inputs": ("distance", "speed", "approach")})

@@ -94,6 +94,21 @@ def test_rates_of_the_horizons_fall():
         load_scene("tiny", ["training.horizons.learning_rate=1e-5", "training.horizons.steps=1"])
 
 
+def test_the_radius_of_interaction_is_the_models_own():
+    tiny = load_scene("tiny")
+    assert tiny.neighbors == tiny.kernel.neighbors == 56 and tiny.interaction_radius == tiny.kernel_support
+    own = load_scene("tiny", ["model.neighbors=28"])
+    assert own.interaction_radius == pytest.approx(own.kernel_support / 2 ** (1 / 3), rel=1e-12)
+    alone = dataclasses.replace(load_scene("tracers-only"), kernel=None)
+    assert alone.neighbors == 60 and alone.kernel_support is None and "train-kernel" not in alone.stages
+    smoothed = load_scene("tiny", ["simulation.method=wcsph", "simulation.step=0.001", "wcsph.neighbors=40"])
+    assert smoothed.neighbors == 40
+    with pytest.raises(SceneError, match=r"\[model\] neighbors = 50: none of the terms .*reads pairs"):
+        load_scene("tiny", ["model.preset=resolved", "model.neighbors=50"])
+    with pytest.raises(SceneError, match=r"\[training\] field_weight = 0.1: this loss is .*; add \[kernel\], or"):
+        dataclasses.replace(load_scene("tiny", ["training.field_weight=0.1", "training.combined_steps=2"]), kernel=None)
+
+
 def test_a_section_within_a_section_is_read_and_written():
     scene = load_scene("tiny", ["training.horizons.steps=3", "training.horizons.frames=[2]"])
     assert scene.training.horizons == Horizons(steps=3, frames=(2,)) and "[training.horizons]" in scene.to_toml()
@@ -103,11 +118,11 @@ def test_a_section_within_a_section_is_read_and_written():
 
 
 def test_derived_lengths():
-    tracers, kernel = load_scene("hit-small").tracers, load_scene("hit-small").kernel
+    tracers = load_scene("hit-small").tracers
     assert tracers.width == 2 * tracers.spacing == pytest.approx(0.3926990817)
     assert (tracers.particles, tracers.cells) == (32768, 48)
     assert load_scene("tiny").tracers.cells == 18
-    assert kernel.support(tracers.particles) / tracers.spacing == pytest.approx(2.4287, rel=1e-4)
+    assert load_scene("hit-small").kernel_support / tracers.spacing == pytest.approx(2.4287, rel=1e-4)
 
 
 FINGERPRINTS = {"flow.viscosity=0.061": "dns", "seed=2": "dns", "kernel.steps=99": "train-kernel",

@@ -47,7 +47,7 @@ def folder(comm, tmp_path):
     comm.Barrier()
     scene = load_scene(path)
     dns.run(scene, comm, tmp_path)
-    network = KernelNetwork(scene.kernel.support(scene.tracers.particles), [4])
+    network = KernelNetwork(scene.kernel_support, [4])
     description = {"form": network.FORM, "support": network.support, "hidden": [4], "cutoff": "smooth"}
     weights = {name: tensor.numpy() for name, tensor in network.state_dict().items()}
     provenance = {"scene": SCENE, "fingerprint": scene.fingerprint("train-kernel")}

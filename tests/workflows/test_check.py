@@ -126,11 +126,11 @@ def test_most_ranks_is_what_the_parts_accept(comm, neighbors, most):
     SplineInterpolation(SpectralGrid(fields), "quintic")
     SplineInterpolation(SpectralGrid(particles), "cubic")
     if comm.size <= most:
-        require_thick_slabs(fields, scene.kernel.support(scene.tracers.particles))
+        require_thick_slabs(fields, scene.kernel_support)
         require_thick_slabs(particles, particle_reach(scene))
     else:
         with pytest.raises(HaloError):
-            require_thick_slabs(fields, scene.kernel.support(scene.tracers.particles))
+            require_thick_slabs(fields, scene.kernel_support)
             require_thick_slabs(particles, particle_reach(scene))
 
 
@@ -163,7 +163,7 @@ def test_ranks_for_horizons_are_those_that_the_grid_and_the_particles_accept(com
     by_grid = limits["ghost planes of the grid in the training through horizons"]
     assert (by_reach, by_grid) == (thick, planes)
     speed, tracers = expected_turbulence(scene).velocity_rms, scene.tracers
-    slab, support = SlabDecomposition(comm, BOX_LENGTH, tracers.planes), scene.kernel.support(12**3)
+    slab, support = SlabDecomposition(comm, BOX_LENGTH, tracers.planes), scene.kernel_support
     time = horizon_time(scene)
     drift = ALLOWED_VELOCITY * speed * time
     assert accepted(lambda: ResolvedVelocity.on_slabs(slab, FLOW, drift)) == (comm.size <= by_grid)

@@ -76,7 +76,7 @@ def test_pairs_outside_the_training_data_are_counted(run_directory):
         low, high = (file[f"feature_range/{bound}"][()] for bound in ("low", "high"))
         description = json.loads(file.attrs["description"])
     scene, length = load_scene("tiny"), description["scales"]["filter_width"]
-    support = scene.kernel.support(scene.tracers.particles) / length
+    support = scene.kernel_support / length
     # rho'_i, rho'_j, |x|, |v|, x.v
     assert low.shape == high.shape == (5,) and np.all(low < high)
     assert low[0] == low[1] and high[0] == high[1] and 0 < low[2] < 0.1 * support < 0.99 * support < high[2] <= support

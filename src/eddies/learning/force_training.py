@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 import torch
@@ -36,6 +35,16 @@ class LossWeights:
     acceleration_kl: float = 0.0
 
 
+@dataclass(frozen=True)
+class KernelNeighborhood:
+    """Halo and list within a kernel's support, positions (s, 3) and volumes (s,) of the particles and their ghosts."""
+
+    kernel: SmoothingKernel
+    neighborhood: Neighborhood
+    position: Tensor
+    volumes: Tensor
+
+
 class TrainingFrame:
     """The particles of one moment with their true rates, and the model's terms around them; making one is collective.
 
@@ -58,7 +67,7 @@ class TrainingFrame:
         self.acceleration_rms, self.total = self._rms(acceleration)
         self.density_rate_rms = None if density_rate is None else self._rms(density_rate)[0]
         self._sorted_ids, self._row_of_sorted = torch.sort(particles.id)
-        self._volumes: tuple[SmoothingKernel, Tensor] | None = None
+        self._within: KernelNeighborhood | None = None
 
     def _rms(self, rate: Tensor) -> tuple[float, int]:
         """Root mean square of a component over all ranks, and the number of rows."""
@@ -74,30 +83,18 @@ class TrainingFrame:
         place, wanted = place[inside], wanted[inside]
         return self._row_of_sorted[place[self._sorted_ids[place] == wanted]]
 
-    @cached_property
-    def neighborhood(self) -> Neighborhood:
-        """Halo and list of the pairs that the field loss looks at: the model's, if it has a list; the first use is
-        collective."""
-        if self.dynamics.neighborhood is not None:
-            return self.dynamics.neighborhood
-        slab, reach = self.decomposition, self.model.flow.cutoff
-        found = Neighborhood(slab, slab.length, reach, 0.0)
-        found.update(self.particles)
-        return found
-
-    @cached_property
-    def position(self) -> Tensor:
-        """Positions (s, 3) of the particles, then of the ghosts; its first use is collective."""
-        return self.neighborhood.local(self.particles).position
-
     @torch.no_grad()
-    def volumes(self, kernel: SmoothingKernel) -> Tensor:
-        """Volumes (s,) of the particles, ghosts included; collective, and kept until another kernel comes."""
-        if self._volumes is None or self._volumes[0] is not kernel:
-            own = self.position[: len(self.particles)]
-            pairs = self.neighborhood.neighbors.pairs(own, self.position, dtype=self.acceleration.dtype)
-            self._volumes = kernel, self.neighborhood.column(volumes(kernel, pairs))
-        return self._volumes[1]
+    def within(self, kernel: SmoothingKernel) -> KernelNeighborhood:
+        """What is within the support of a kernel; collective, and kept until another kernel comes."""
+        if self._within is None or self._within.kernel is not kernel:
+            found = self.dynamics.neighborhood
+            if found is None or found.cutoff < kernel.support * (1 - 1e-9):  # the model has no list, or a shorter one
+                found = Neighborhood(self.decomposition, self.decomposition.length, kernel.support, 0.0)
+                found.update(self.particles)
+            position = found.local(self.particles).position
+            pairs = found.neighbors.pairs(position[: len(self.particles)], position, dtype=self.acceleration.dtype)
+            self._within = KernelNeighborhood(kernel, found, position, found.column(volumes(kernel, pairs)))
+        return self._within
 
     def errors(self, rows: Tensor | None = None, density: Tensor | None = None) -> dict[str, Tensor]:
         """Predicted minus true "acceleration" (k, 3), and "density_rate" (k,) if the model has one, at all owned
@@ -125,11 +122,12 @@ class ForceTrainer:
     Parameters
     ----------
     model, frames : the frames all on the same slabs.
-    kernel : of the field loss, which compares on a grid of about as many points as there are particles.
+    kernel : of the field loss, which compares on a grid of about as many points as there are particles; None if it has
+        no weight.
     weights : of the losses. batch : particles of a step without the field loss.
     """
 
-    def __init__(self, model: LagrangianModel, frames: Sequence[TrainingFrame], kernel: SmoothingKernel,
+    def __init__(self, model: LagrangianModel, frames: Sequence[TrainingFrame], kernel: SmoothingKernel | None,
                  weights: LossWeights, batch: int, seed: int) -> None:
         self.decomposition, self.total = frames[0].decomposition, frames[0].total
         self.comm, self.length = self.decomposition.comm, self.decomposition.length
@@ -203,12 +201,12 @@ class ForceTrainer:
         The velocity predicted one step ahead is compared with that of the true particles, both through the kernel:
         its own error is many times what a step changes, and the force could not make up for it.
         """
-        spread = torch.zeros_like(frame.acceleration).index_add(0, rows, error)
-        local = frame.neighborhood.column(spread)
-        around = NeighborList(frame.neighborhood.box, self.kernel.support, 0.0)
-        around.build(points, frame.position, exclude_self=False)
-        pairs = around.pairs(points, frame.position, dtype=error.dtype)
-        field = reconstruct(self.kernel, pairs, frame.volumes(self.kernel), local)
+        within = frame.within(self.kernel)
+        local = within.neighborhood.column(torch.zeros_like(frame.acceleration).index_add(0, rows, error))
+        around = NeighborList(within.neighborhood.box, self.kernel.support, 0.0)
+        around.build(points, within.position, exclude_self=False)
+        pairs = around.pairs(points, within.position, dtype=error.dtype)
+        field = reconstruct(self.kernel, pairs, within.volumes, local)
         count = int(global_sum(self.comm, len(points)))
         return mean_square_share(field, frame.acceleration_rms, max(count, 1))
 

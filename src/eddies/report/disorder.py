@@ -35,8 +35,8 @@ class Disorder:
         return kl_divergence(self.distances["truth"], self.distances["model"])
 
 
-def measure(trajectories: Mapping[str, Frames], fields: Mapping[str, Frames], common: CommonFrames, length: float,
-            broken: float, wavenumber: float | None) -> Disorder:
+def measure(trajectories: Mapping[str, Frames], fields: Mapping[str, Frames] | None, common: CommonFrames,
+            length: float, broken: float, wavenumber: float | None) -> Disorder:
     """Measure model and truth, named so in both mappings: distances at the last common frame, series over all frames
     before `broken`."""
     last = {"model": int(common.model[-1]), "truth": int(common.truth[-1])}
@@ -45,7 +45,7 @@ def measure(trajectories: Mapping[str, Frames], fields: Mapping[str, Frames], co
                  for name, run in trajectories.items()}
     counts = {name: disorder.count_variance_series(run, before[name], length) for name, run in trajectories.items()}
     energies = None
-    if wavenumber is not None:
+    if fields is not None and wavenumber is not None:
         energies = {name: disorder.energy_above(fields[name], np.flatnonzero(fields[name].times < broken), wavenumber)
                     for name in trajectories}
     return Disorder(float(common.times[-1]), distances, counts, energies)
@@ -64,7 +64,7 @@ def add(shown: Section, found: Disorder, turnover: float) -> None:
         Metric("count_variance_ratio", "variance of particle counts, model / truth",
                variance["model"] / variance["truth"], "too few particles to be counted in cells"),
         Metric("high_wavenumber_energy_ratio", "energy at k > k_d, model / truth", ratio,
-               "the filter width is in ground_truth.h5, which is not here"),
+               "the filter width is in ground_truth.h5, which is not here, or there was no kernel"),
     ]
     shown.add_figure(
         "particle-disorder", "Disorder of the particles", draw(found, turnover),

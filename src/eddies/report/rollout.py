@@ -23,6 +23,7 @@ METHODS = {
     "eulerian": "Eulerian large-eddy simulation on {cells}³ cells, |kᵢ| ≤ {largest_wavenumber}, Smagorinsky constant "
                 "{smagorinsky:g}",
 }
+WITHOUT_KERNEL = "measured through the smoothing kernel, and the scene has none"
 TRUTH_NAMES = {"filtered": "filtered DNS", "truth": "true tracers"}
 
 
@@ -31,7 +32,8 @@ class Rollout:
     """A rollout as stored, with what it is compared with.
 
     attributes: of the group `rollout`; model, truth: trajectories; fields: the series "model", "truth" and
-    "filtered"; length: box edge; filter_width and eulerian (table `spectra`): of the ground truth, or None;
+    "filtered", or None where there was no kernel to make them; length: box edge; filter_width and eulerian (table
+    `spectra`): of the ground truth, or None;
     outside_training: share of the pairs outside the training range, (frames,), where it was counted;
     closure: columns over the frames on the solves for the resolved velocity, where there were any.
     """
@@ -39,7 +41,7 @@ class Rollout:
     attributes: Mapping[str, float | str]
     model: ParticleFrames
     truth: ParticleFrames
-    fields: Mapping[str, Frames]
+    fields: Mapping[str, Frames] | None
     length: float
     filter_width: float | None
     eulerian: Mapping[str, np.ndarray] | None
@@ -99,10 +101,14 @@ def section(run: Rollout) -> Section:
     shown.text += f"Numbers: at the last common time of model and true tracers, {last / run.turnover:.3g} T."
     shown.notices += _notices(run, last, broken)
     shown.metrics.append(Metric("last_common_time", "last common time / T", last / run.turnover))
-    _add_planes(shown, run, last)
     _add_particles(shown, run, common)
-    _add_invariants(shown, run, common)
-    _add_spectra(shown, run, last)
+    if run.fields is not None:
+        _add_planes(shown, run, run.fields, last)
+        _add_invariants(shown, run, common)
+        _add_spectra(shown, run, run.fields, last)
+    else:
+        shown.metrics += [Metric(key, key.replace("_", " "), None, WITHOUT_KERNEL)
+                          for key in ("spectrum_error", "qr_kl")]
     found = disorder.measure({"model": run.model, "truth": run.truth}, run.fields, common, run.length, broken,
                              run.filter_wavenumber)
     disorder.add(shown, found, run.turnover)
@@ -143,9 +149,9 @@ def _notices(run: Rollout, last: float, broken: float) -> list[str]:
     return notices
 
 
-def _add_planes(shown: Section, run: Rollout, last: float) -> None:
-    name = "filtered" if run.fields["filtered"].times.size else "truth"
-    model, truth = run.fields["model"], run.fields[name]
+def _add_planes(shown: Section, run: Rollout, fields: Mapping[str, Frames], last: float) -> None:
+    name = "filtered" if fields["filtered"].times.size else "truth"
+    model, truth = fields["model"], fields[name]
     common = CommonFrames.of(model, truth, _just_after(last))
     planes = [_plane_of_first_component(model, truth, common, index) for index in common.spread(4)]
     shown.add_figure(
@@ -153,14 +159,14 @@ def _add_planes(shown: Section, run: Rollout, last: float) -> None:
         rollout_figures.velocity_planes(planes, run.turnover, TRUTH_NAMES[name]),
         f"u_x in the plane z = π: {TRUTH_NAMES[name]} above, the model through the learned kernel below. "
         f"Relative difference in the last plane: {normalized_l2(planes[-1].model, planes[-1].truth):.3f}.")
-    fields = comparison.particle_pair(model, truth, common, common.times.size - 1, "velocity")
-    rotation = Pair(fields.time, _magnitude(vorticity(fields.model)), _magnitude(vorticity(fields.truth)))
-    energy = Pair(fields.time, _magnitude(fields.model) ** 2 / 2, _magnitude(fields.truth) ** 2 / 2)
+    at = comparison.particle_pair(model, truth, common, common.times.size - 1, "velocity")
+    rotation = Pair(at.time, _magnitude(vorticity(at.model)), _magnitude(vorticity(at.truth)))
+    energy = Pair(at.time, _magnitude(at.model) ** 2 / 2, _magnitude(at.truth) ** 2 / 2)
     ratios = [pair.model.mean() / pair.truth.mean() for pair in (rotation, energy)]
     shown.add_figure(
         "figure-5-vorticity-energy", "Vorticity and kinetic energy (the paper's Fig. 5)",
         rollout_figures.vorticity_and_energy(rotation, energy, TRUTH_NAMES[name]),
-        f"Plane z = π at t = {fields.time / run.turnover:.2f} T. Mean over the plane, model / truth: "
+        f"Plane z = π at t = {at.time / run.turnover:.2f} T. Mean over the plane, model / truth: "
         f"vorticity {ratios[0]:.2f}, energy {ratios[1]:.2f}.")
 
 
@@ -218,8 +224,8 @@ def _add_invariants(shown: Section, run: Rollout, common: CommonFrames) -> None:
         "frames until then. Orange: Vieillefosse line. Both are in units of the truth's ⟨Q_w⟩ = ⟨W:W⟩/2.")
 
 
-def _add_spectra(shown: Section, run: Rollout, last: float) -> None:
-    model, truth = run.fields["model"], run.fields["truth"]
+def _add_spectra(shown: Section, run: Rollout, fields: Mapping[str, Frames], last: float) -> None:
+    model, truth = fields["model"], fields["truth"]
     common = CommonFrames.of(model, truth, _just_after(last))
     series = [comparison.spectra_pair(model, truth, common, index) for index in common.spread(3)]
     at = series[-1]

@@ -122,8 +122,7 @@ def tracer_problems(scene: Scene) -> Iterator[str]:
 
 def section_problems(scene: Scene) -> Iterator[str]:
     """Which sections need which others."""
-    needs = {"kernel": ("tracers",), "model": ("tracers", "kernel"), "training": ("model",),
-             "simulation": ("tracers", "kernel")}
+    needs = {"kernel": ("tracers",), "model": ("tracers",), "training": ("model",), "simulation": ("tracers",)}
     if scene.simulation and "model" in scene.simulation.needs:
         needs["simulation"] = ("model",)
     for name, others in needs.items():
@@ -186,11 +185,14 @@ def _without_density(name: str, settings) -> str:
 
 def support_problems(scene: Scene) -> Iterator[str]:
     """A particle must not see another one and its image: support and skin stay below half the cube."""
-    if scene.kernel and scene.tracers:
-        skin = scene.simulation.skin if scene.simulation else 0.0
-        reach = scene.kernel.support(scene.tracers.particles) * (1 + skin)
+    if scene.tracers is None:
+        return
+    skin = scene.simulation.skin if scene.simulation else 0.0
+    for section, part in (("kernel", scene.kernel), ("model", scene.model), ("wcsph", scene.wcsph)):
+        neighbors = part.neighbors if part else None
+        reach = 0.0 if neighbors is None else scene.tracers.radius_of(neighbors) * (1 + skin)
         if reach >= math.pi:
-            yield (f"[kernel] neighbors = {scene.kernel.neighbors:g}: {scene.tracers.particles} particles "
+            yield (f"[{section}] neighbors = {neighbors:g}: {scene.tracers.particles} particles "
                    f"reach {reach:.3g} with the skin, and half the cube is {math.pi:.3g}; lower neighbors or "
                    "raise [tracers] particles_per_side")
 
@@ -217,6 +219,9 @@ def training_problems(scene: Scene) -> Iterator[str]:
     if scene.tracers and training.batch > scene.tracers.particles:
         yield (f"[training] batch = {training.batch}: must be at most the number of particles, "
                f"{scene.tracers.particles}; lower it or raise [tracers] particles_per_side")
+    if training.field_weight > 0 and scene.kernel is None:
+        yield (f"[training] field_weight = {training.field_weight:g}: this loss is an average with the kernel; add "
+               "[kernel], or remove the key")
     later = training.field_weight + training.velocity_kl_weight + training.acceleration_kl_weight
     if (later > 0) != (training.combined_steps > 0):
         yield (f"[training] combined_steps = {training.combined_steps}: they are the steps that use "
@@ -250,8 +255,8 @@ def baseline_problems(scene: Scene) -> Iterator[str]:
             yield f'[{name}]: only read with [simulation] method = "{name}"; set it, or remove [{name}]'
     if simulation and simulation.method == "wcsph" and simulation.step > acoustic_step(scene):
         yield (f'[simulation] step = {simulation.step:g}: method = "wcsph" must resolve sound, with a step of at most '
-               f"0.4 h / (c (1 + 0.6 alpha)) = {acoustic_step(scene):.3g}, h half the support of [kernel] neighbors "
-               "and c [flow] sound_speed; lower step")
+               f"0.4 h / (c (1 + 0.6 alpha)) = {acoustic_step(scene):.3g}, h half the support of {scene.neighbors:g} "
+               "neighbors and c [flow] sound_speed; lower step")
     if simulation and simulation.method == "eulerian":
         cells = (scene.eulerian or Eulerian()).cells_for(scene.tracers.width)
         if cells > scene.tracers.cells:
@@ -261,7 +266,7 @@ def baseline_problems(scene: Scene) -> Iterator[str]:
 
 def acoustic_step(scene: Scene) -> float:
     """The longest step of WCSPH, 0.4 h / (c (1 + 0.6 alpha)) (Monaghan 1992), h half the kernel's support."""
-    h, alpha = scene.kernel.support(scene.tracers.particles) / 2, (scene.wcsph or Wcsph()).alpha
+    h, alpha = scene.interaction_radius / 2, (scene.wcsph or Wcsph()).alpha
     return 0.4 * h / (scene.flow.sound_speed * (1 + 0.6 * alpha))
 
 

@@ -46,9 +46,11 @@ class Comparison(Document):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._check_names()
-        if load_scene(self.base).simulation is None:
-            raise SceneError(f'base = "{self.base}": has no [simulation], of which errors are compared; add it, '
-                             "or take another base")
+        base = load_scene(self.base)
+        for section, why in (("simulation", "of which errors are compared"),
+                             ("kernel", "through which fields are compared")):
+            if getattr(base, section) is None:
+                raise SceneError(f'base = "{self.base}": has no [{section}], {why}; add it, or take another base')
         for variant in self.variant:
             problem = self._difference(variant)
             if problem:

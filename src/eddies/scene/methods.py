@@ -7,7 +7,7 @@ from eddies.scene.values import SceneError
 NEEDS = ("model", "density", "pairs")
 
 #: Of each word the class behind it, and what it needs: a trained "model"; the "density" of the ground truth; "pairs",
-#: neighbours within the support of the kernel. A class of the user's says so in its attribute `needs`.
+#: neighbours within the radius of interaction. A class of the user's says so in its attribute `needs`.
 METHODS = {
     "learned": ("eddies.workflows.rollout.particle_run:LearnedRun", ("model",)),
     "none": ("eddies.workflows.rollout.particle_run:BallisticRun", ()),

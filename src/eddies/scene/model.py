@@ -11,7 +11,7 @@ from eddies.particles.terms.settings import GIVES, READS, TermSettings
 from eddies.scene.composition import is_path, load, short_name
 from eddies.scene.reader import read_section
 from eddies.scene.rules import nearest, quoted
-from eddies.scene.values import KeyProblem, SceneError, Section, choice, import_paths, sub_sections, text, texts
+from eddies.scene.values import KeyProblem, SceneError, Section, choice, import_paths, number, sub_sections, text, texts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,6 +26,8 @@ class Model(Section):
                                 *PRESETS, default=None)
     terms: tuple[str, ...] | None = texts("what accelerates the particles and gives their density, each with the keys "
                                           "of [model.NAME]", *TERMS, default=None, paths=True)
+    neighbors: float | None = number("mean number of particles within the radius of interaction, with terms that read "
+                                     "pairs; absent: as in [kernel], or 60", default=None, at_least=8)
     path: str | None = text("run directory or model.h5 whose trained weights are used; absent: they are trained",
                             default=None)
     settings: dict[str, TermSettings] = sub_sections()
@@ -50,6 +52,9 @@ class Model(Section):
                     for name, term in named.items()}
         for key, value in (("preset", None), ("terms", terms), ("settings", settings)):
             object.__setattr__(self, key, value)
+        if self.neighbors is not None and "pairs" not in self.reads:
+            raise KeyProblem("model", "neighbors", f" = {self.neighbors:g}: none of the terms {quoted(terms)} reads "
+                             "pairs, so nothing has a radius of interaction; remove the key")
 
     @property
     def weights_file(self) -> Path | None:

@@ -16,8 +16,8 @@ from eddies.scene.checks import first_inconsistency
 from eddies.scene.composition import origins, search_in
 from eddies.scene.model import Model, replace_terms
 from eddies.scene.reader import apply_overrides, find_document, parse_document, read_section, read_text, write_section
-from eddies.scene.sections import (BOX_LENGTH, DEFAULT_WINDOW, Eulerian, Flow, Forcing, Horizons, Initial, Kernel,
-                                   Simulation, SpinUp, Time, Tracers, Training, Wcsph)
+from eddies.scene.sections import (BOX_LENGTH, DEFAULT_WINDOW, NEIGHBORS, Eulerian, Flow, Forcing, Horizons, Initial,
+                                   Kernel, Simulation, SpinUp, Time, Tracers, Training, Wcsph)
 from eddies.scene.values import Document, SceneError, choice, import_paths, integer, section, text
 
 __all__ = ["BOX_LENGTH", "Scene", "SceneError", "builtin_scenes", "load_scene", "Eulerian", "Flow", "Forcing",
@@ -71,6 +71,23 @@ class Scene(Document):
     def seen(self) -> float:
         """Fraction of the ground truth that the model was trained on; 0 without [training], as with [model] path."""
         return self.training.window if self.training else 0.0
+
+    @property
+    def kernel_support(self) -> float | None:
+        """Radius h of the smoothing kernel; None without [kernel]."""
+        return self.tracers.radius_of(self.kernel.neighbors) if self.kernel else None
+
+    @property
+    def neighbors(self) -> float:
+        """Mean number of particles within the radius of interaction of pairs."""
+        smoothed = self.simulation is not None and self.simulation.method == "wcsph"
+        own, kernel = self.wcsph if smoothed else self.model, self.kernel.neighbors if self.kernel else NEIGHBORS
+        return own.neighbors if own and own.neighbors is not None else kernel
+
+    @property
+    def interaction_radius(self) -> float:
+        """Radius within which pairs of particles act on each other."""
+        return self.tracers.radius_of(self.neighbors)
 
     @property
     def foreign(self) -> tuple[str, ...]:

@@ -13,6 +13,8 @@ from eddies.scene.values import Section, choice, integer, integers, named, numbe
 
 BOX_LENGTH = 2 * math.pi
 DEFAULT_WINDOW = 0.5
+# Mean number of particles within a support or a radius of interaction, unless a scene says another: the paper's.
+NEIGHBORS = 60.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,6 +99,10 @@ class Tracers(Section):
         """Mean spacing L / N^(1/3) of the particles."""
         return BOX_LENGTH / self.particles_per_side
 
+    def radius_of(self, neighbors: float) -> float:
+        """Radius h of the ball that holds so many of the N particles on average: n = N (4/3) pi h^3 / L^3."""
+        return BOX_LENGTH * (neighbors / self.particles / (4 / 3 * math.pi)) ** (1 / 3)
+
     @property
     def width(self) -> float:
         """Filter width d in use: as given, or twice the mean particle spacing."""
@@ -118,7 +124,7 @@ class Tracers(Section):
 class Kernel(Section):
     """The smoothing kernel W, learned by reconstructing the filtered field from the particles."""
 
-    neighbors: float = number("mean number of particles within the support", default=60.0, at_least=8)
+    neighbors: float = number("mean number of particles within the support", default=NEIGHBORS, at_least=8)
     hidden: tuple[int, ...] = integers("widths of the network's tanh layers", default=(20, 20, 20, 20),
                                        at_least=1)
     cutoff: str = choice("factor that ends the kernel at its support", "smooth", "sigmoid", default="smooth")
@@ -128,10 +134,6 @@ class Kernel(Section):
     steps: int = integer("optimiser steps", at_least=1)
     points: int = integer("grid points drawn per step", default=2048, at_least=1)
     learning_rate: float = number("of the optimiser", default=2e-3, above=0)
-
-    def support(self, particles: int) -> float:
-        """Radius h of the ball that holds `neighbors` of `particles` on average: n = N (4/3) pi h^3 / L^3."""
-        return BOX_LENGTH * (self.neighbors / particles / (4 / 3 * math.pi)) ** (1 / 3)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -197,8 +199,9 @@ class Simulation(Section):
 class Wcsph(Section):
     """Weakly compressible smoothed particle hydrodynamics, with method = "wcsph"; absent: the defaults."""
 
-    kernel: str = choice("smoothing kernel, of the support of [kernel]", "cubic-spline", "wendland",
-                         default="cubic-spline")
+    neighbors: float | None = number("mean number of particles within the smoothing kernel's support; absent: as in "
+                                     "[kernel], or 60", default=None, at_least=8)
+    kernel: str = choice("smoothing kernel", "cubic-spline", "wendland", default="cubic-spline")
     alpha: float = number("linear coefficient of the artificial viscosity", default=1.0, at_least=0)
     beta: float = number("quadratic coefficient of the artificial viscosity", default=2.0, at_least=0)
     exponent: float = number("gamma of the pressure c^2 rho_0 / gamma ((rho / rho_0)^gamma - 1)", default=1.0,

@@ -15,7 +15,7 @@ from eddies.workflows.foreseen.cost_model import (LATENCY, NODE_BANDWIDTH, NODE_
                                                   probe)
 from eddies.workflows.foreseen.estimates import (expected_step, expected_turbulence, foreseen_allowed_step,
                                                  ground_truth_alone, largest_wavenumber, learns_pairs, most_ranks,
-                                                 particle_reach, run_time)
+                                                 particle_reach, run_time, sees_pairs)
 
 log = logging.getLogger("eddies")
 
@@ -57,7 +57,7 @@ def numbers(scene: Scene, ranks: int, speed: Speed) -> dict[str, Any]:
             "kolmogorov_time")},
         "particles": scene.tracers and scene.tracers.particles,
         "filter_width": scene.tracers and scene.tracers.width,
-        "kernel_support": scene.kernel and scene.tracers and scene.kernel.support(scene.tracers.particles),
+        "kernel_support": scene.kernel_support,
         "time_step": step and step[0], "steps": expected_steps(scene), "ranks": ranks,
         "most_ranks": min(limits.values()), "limits": limits, "most_ranks_dns": alone,
         "costs": [{"ranks": row.ranks, "nodes": row.nodes, "memory": row.memory, "seconds_per_step": row.seconds}
@@ -102,8 +102,10 @@ def particle_lines(scene: Scene) -> Iterator[str]:
     field_interval = tracers.field_every * tracers.frame_interval
     yield f"filtered fields on {tracers.cells}^3 points, every {field_interval:.3g}"
     if scene.kernel:
-        yield (f"kernel support {scene.kernel.support(tracers.particles):.4g}, {scene.kernel.neighbors:g} "
-               f"neighbours; reach with skin {particle_reach(scene):.4g}")
+        yield f"kernel support {scene.kernel_support:.4g}, {scene.kernel.neighbors:g} neighbours"
+    if sees_pairs(scene):
+        yield (f"radius of interaction {scene.interaction_radius:.4g}, {scene.neighbors:g} neighbours; reach with skin "
+               f"{particle_reach(scene):.4g}")
 
 
 def step_lines(scene: Scene) -> Iterator[str]:

@@ -31,6 +31,7 @@ from eddies.report.page import Metric, RunRecord, Section, metrics_json, shown, 
 from eddies.report.rollout import Rollout
 from eddies.report.rollout import section as rollout_section
 from eddies.scene.scene import Scene
+from eddies.workflows.rollout.frames import FIELDS
 
 log = logging.getLogger("eddies")
 
@@ -170,13 +171,13 @@ def _read_rollout(file: File, record: Run) -> list[Section]:
         record.cost.append(Metric("evaluations_per_turnover", "evaluations of the forces a turnover",
                                   attributes["evaluations"] / attributes["turnovers"]))
     model, truth = Trajectory(file, "model"), Trajectory(file, "truth")
-    fields = {name: FieldSeries(file, name) for name in ("model", "truth", "filtered")}
+    fields = {name: FieldSeries(file, name) for name in FIELDS} if "fields" in file else None
     outside = read_table(file, "outside_training")["share"] if "outside_training" in file else None
     closure = read_table(file, "closure") if "closure" in file else None
     rollout = Rollout(attributes, model, truth, fields, model.length, record.filter_width,
                       record.eulerian, outside, closure)
     sections = [rollout_section(rollout)]
-    if rollout.forced and record.stationary is not None and record.filter_width is not None:
+    if rollout.forced and fields and record.stationary is not None and record.filter_width is not None:
         sections.append(forced.section(rollout, record.stationary))
     return sections
 

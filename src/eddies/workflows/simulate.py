@@ -68,8 +68,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         truth = GroundTruth(truth_file, slab)
         start = start_frame(scene, truth)
         method = method_class(settings.method)(scene, truth, start, directory, device)
-        frames = RolloutFrames(file, truth, load_kernel(comm, directory / "kernel.h5"), truth.times[start],
-                               method.has_density)
+        kernel = load_kernel(comm, directory / "kernel.h5") if scene.kernel else None
+        frames = RolloutFrames(file, truth, kernel, truth.times[start], method.has_density)
         turnover = truth.reference["eddy_turnover_time"]
         count = int(np.ceil(settings.turnovers * turnover / settings.frame_interval - 1e-9))
         with torch.no_grad():

@@ -43,7 +43,9 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     device, directory, stop = prepare_torch(scene.device, comm), Path(directory), stop or StopRequest(comm)
     with open_product(comm, directory / "ground_truth.h5", "ground_truth") as file:
         truth = GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes))
-        data = TrainingData(scene, truth, load_kernel(comm, directory / "kernel.h5", device), device)
+        # Only the field loss averages with it.
+        kernel = load_kernel(comm, directory / "kernel.h5", device) if scene.training.field_weight > 0 else None
+        data = TrainingData(scene, truth, kernel, device)
         model, last, tests = data.model, data.last, evaluation_frames(truth)
         log.info("train: frames up to %d of the times up to %.3g of %.3g, %d held out; %d weights", data.learned,
                  truth.times[last], truth.times[-1], last - data.learned, sum(p.numel() for p in model.parameters()))

@@ -40,7 +40,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     prepare_torch("cpu", comm)
     settings, directory = scene.kernel, Path(directory)
     slab = SlabDecomposition(comm, BOX_LENGTH, scene.tracers.cells)
-    support = settings.support(scene.tracers.particles)
+    support = scene.kernel_support
     with open_product(comm, directory / "ground_truth.h5", "ground_truth") as file:
         truth = GroundTruth(file, slab)
         seen = np.flatnonzero(truth.fields.times <= scene.window * truth.times[-1])
@@ -86,7 +86,7 @@ def train(scene: Scene, samples: list[KernelSample], name: str, gradient_weight:
           stop: StopRequest) -> tuple[KernelNetwork, dict]:
     """A trained kernel network and the history of its losses."""
     settings = scene.kernel
-    support = settings.support(scene.tracers.particles)
+    support = scene.kernel_support
     network = KernelNetwork(support, settings.hidden, settings.cutoff, scene.seed).to(samples[0].particles.dtype)
     weights = KernelLossWeights(gradient_weight, settings.normalization_weight)
     trainer = KernelTrainer(network, samples, weights, settings.points, scene.seed)

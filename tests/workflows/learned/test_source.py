@@ -66,7 +66,7 @@ def test_a_run_directory_or_its_file_gives_description_weights_and_tables(comm, 
     ('model.pairs.inputs=["distance"]', '[model.pairs] inputs = ["distance"], but {} was trained with ["density", '),
     ("model.pairs.network=own_networks:Net", '[model.pairs] network = "own_networks:Net", but {} was trained with '
                                              '"dense"'),
-    ("kernel.neighbors=50", "[kernel] neighbors = 50.0, but {} was trained with 56.0"),
+    ("model.neighbors=50", "[model] neighbors = 50.0, but {} was trained with 56.0"),
     ("tracers.filter_width=0.9", "[tracers] filter_width = 0.9, but {} was trained with 1.04719755"),
 ])
 def test_another_form_is_refused_with_both_values(comm, tmp_path, own, override, message):

@@ -130,7 +130,7 @@ def flow_bytes(scene: Scene, ranks: int) -> float:
 def pair_bytes(scene: Scene, ranks: int) -> float:
     """Memory of a rank in the learned pair force: list, displacements, three copies of what the term that keeps most
     of a pair keeps."""
-    pairs = scene.tracers.particles * scene.kernel.neighbors * (1 + scene.simulation.skin) ** 3
+    pairs = scene.tracers.particles * scene.neighbors * (1 + scene.simulation.skin) ** 3
     item = 4 if scene.simulation.precision == "float32" else 8
     kept = max(settings.numbers_per_pair for settings in scene.model.settings.values())
     return PROCESS_BYTES + pairs / ranks * (16 + 4 * item + 3 * item * kept)

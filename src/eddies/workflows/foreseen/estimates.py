@@ -113,10 +113,9 @@ def most_ranks(scene: Scene) -> dict[str, int]:
         ghosts = GHOST_PLANES[splines]
         limits[f"{ghosts} ghost planes of the {splines} splines"] = scene.flow.cells // ghosts
     if scene.tracers and scene.kernel:
-        support = scene.kernel.support(scene.tracers.particles)
-        limits[f"slabs of the fields no thinner than the kernel's support {support:.3g}"] = thick_slabs(
-            scene.tracers.cells, support)
-    if learns_pairs(scene) or (scene.simulation and "pairs" in scene.simulation.needs):
+        limits[f"slabs of the fields no thinner than the kernel's support {scene.kernel_support:.3g}"] = thick_slabs(
+            scene.tracers.cells, scene.kernel_support)
+    if sees_pairs(scene):
         reach = particle_reach(scene)
         limits[f"slabs no thinner than the particles' reach {reach:.3g}"] = thick_slabs(scene.tracers.planes, reach)
     if "train" in scene.stages:
@@ -131,14 +130,14 @@ def most_training_ranks(scene: Scene) -> dict[str, int]:
     """The same for what a model is trained on and by."""
     # The a-priori test interpolates filtered fields to the particles, terms what they make of the resolved velocity.
     limits = {"ghost planes of the filtered fields": max(scene.tracers.cells // GHOST_PLANES["quintic"], 1)}
-    support, simulation = scene.kernel.support(scene.tracers.particles), scene.simulation
+    radius, simulation = scene.interaction_radius, scene.simulation
     if "resolved" in scene.model.reads:
-        skin = simulation.skin * support if simulation else 0.0
+        skin = simulation.skin * radius if simulation else 0.0
         limits["ghost planes of the resolved velocity"] = ranks_of_resolved_grid(scene, skin / 2)
     time = horizon_time(scene)
     if time > 0:
         if learns_pairs(scene):
-            reach = support + 2 * particle_drift(scene, time)
+            reach = radius + 2 * particle_drift(scene, time)
             limits[f"slabs no thinner than the particles' reach {reach:.3g} in the training through horizons"] = (
                 thick_slabs(scene.tracers.planes, reach))
         if scene.training.horizons.energy_weight > 0 or "resolved" in scene.model.reads:
@@ -152,6 +151,11 @@ def learns_pairs(scene: Scene) -> bool:
     return "train" in scene.stages and "pairs" in scene.model.reads
 
 
+def sees_pairs(scene: Scene) -> bool:
+    """Whether particles interact in pairs, in a training or in a rollout."""
+    return learns_pairs(scene) or scene.simulation is not None and "pairs" in scene.simulation.needs
+
+
 def ground_truth_alone(scene: Scene) -> Scene:
     """The scene without what learns of its ground truth, which may use more ranks."""
     return replace(scene, kernel=None, model=None, training=None, simulation=None, wcsph=None, eulerian=None)
@@ -163,8 +167,8 @@ def thick_slabs(planes: int, width: float) -> int:
 
 
 def particle_reach(scene: Scene) -> float:
-    """How thick slabs must be for the particles: kernel support, and skin of the neighbour list."""
-    return scene.kernel.support(scene.tracers.particles) * (1 + (scene.simulation.skin if scene.simulation else 0.0))
+    """How thick slabs must be for the particles: radius of interaction, and skin of the neighbour list."""
+    return scene.interaction_radius * (1 + (scene.simulation.skin if scene.simulation else 0.0))
 
 
 def particle_drift(scene: Scene, time: float, peak: float = PEAK_VELOCITY) -> float:

@@ -18,7 +18,8 @@ def describe(scene: Scene, scales: ReferenceScales) -> dict[str, Any]:
     """What is stored with the weights of a scene's model, ready for JSON: the terms with their settings, and the
     flow."""
     settings = {term: asdict(scene.model.settings[short_name(term)]) for term in scene.model.terms}
-    return {"terms": settings, "scales": scales.to_dict(), "neighbors": scene.kernel.neighbors}
+    neighbors = {"neighbors": scene.neighbors} if "pairs" in scene.model.reads else {}
+    return {"terms": settings, "scales": scales.to_dict(), **neighbors}
 
 
 def differences(scene: Scene, description: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
@@ -36,8 +37,8 @@ def differences(scene: Scene, description: Mapping[str, Any]) -> Iterator[tuple[
         for key in wanted.keys() | trained.keys():
             if wanted.get(key) != trained.get(key):
                 yield f"[model.{name}] {key}", quoted(wanted.get(key)), quoted(trained.get(key))
-    if scene.kernel.neighbors != description["neighbors"]:
-        yield "[kernel] neighbors", quoted(scene.kernel.neighbors), quoted(description["neighbors"])
+    if "pairs" in scene.model.reads and scene.neighbors != description["neighbors"]:
+        yield "[model] neighbors", quoted(scene.neighbors), quoted(description["neighbors"])
     scales, tracers = description["scales"], scene.tracers
     width = scales["filter_width"] / scales["spacing"] * tracers.spacing
     if not math.isclose(tracers.width, width, rel_tol=1e-6):

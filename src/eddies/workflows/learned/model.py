@@ -25,7 +25,7 @@ def scene_model(scene: Scene, scales: ReferenceScales) -> LagrangianModel:
 
     Raises SceneError where a class of the user's is no term, or cannot be made.
     """
-    flow = FlowUnits(scales, scene.kernel.support(scene.tracers.particles), scene.kernel.neighbors, scene.seed)
+    flow = FlowUnits(scales, scene.interaction_radius, scene.neighbors, scene.seed)
     try:
         return build_model(scene.model.settings, scene.model.terms, flow)
     except SceneError as error:

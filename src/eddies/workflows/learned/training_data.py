@@ -41,7 +41,7 @@ class TrainingData:
     validation.
     """
 
-    def __init__(self, scene: Scene, truth: GroundTruth, kernel: SmoothingKernel, device: torch.device) -> None:
+    def __init__(self, scene: Scene, truth: GroundTruth, kernel: SmoothingKernel | None, device: torch.device) -> None:
         self.scene, self.settings, self.truth, self.kernel, self.device = scene, scene.training, truth, kernel, device
         self.dtype = getattr(torch, self.settings.precision)
         self.model = scene_model(scene, truth.scales).to(dtype=self.dtype, device=device)

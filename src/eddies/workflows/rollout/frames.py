@@ -17,17 +17,19 @@ from eddies.workflows.ground_truth.truth import GroundTruth
 
 COLUMNS = {"position": (3,), "velocity": (3,), "density": (), "acceleration": (3,)}
 GRADIENT = {"velocity_gradient": (3, 3)}
+FIELDS = "model", "truth", "filtered"
 
 
 class RolloutFrames:
     """Stores frames of the model and, as long as the ground truth lasts, of the true tracers and the filtered field.
 
     Velocity gradients at the particles and velocities on the grid of the filtered fields are averages with the
-    learned kernel, for model and truth alike. `times` are those of the model's frames. `density`: whether the model's
+    learned kernel, for model and truth alike; without a kernel neither
+    they nor the filtered fields are stored. `times` are those of the model's frames. `density`: whether the model's
     particles have one; it is stored where the true ones have one too.
     """
 
-    def __init__(self, file: File, truth: GroundTruth, kernel: SmoothingKernel, start_time: float,
+    def __init__(self, file: File, truth: GroundTruth, kernel: SmoothingKernel | None, start_time: float,
                  density: bool) -> None:
         self.truth, self.kernel, self.start_time = truth, kernel, start_time
         self.times: list[float] = []
@@ -36,11 +38,11 @@ class RolloutFrames:
         self._slab = SlabDecomposition(comm, length, cells)
         self._columns = {name: shape for name, shape in COLUMNS.items()
                          if name != "density" or density and truth.has_density}
-        stored = self._columns | GRADIENT
-        self._trajectories = {name: TrajectoryWriter(file, name, truth.total, length, stored, np.float32)
+        self._stored = self._columns | (GRADIENT if kernel else {})
+        self._trajectories = {name: TrajectoryWriter(file, name, truth.total, length, self._stored, np.float32)
                               for name in ("model", "truth")}
         self._fields = {name: FieldWriter(file, name, cells, {"velocity": 3})
-                        for name in ("model", "truth", "filtered")}
+                        for name in (FIELDS if kernel else ())}
 
     def store(self, step: int, time: float, particles: ParticleSet, acceleration: torch.Tensor) -> None:
         """Store the model's particles and what is true at that time; `time` counts from the start of the rollout."""
@@ -51,21 +53,21 @@ class RolloutFrames:
             return
         self._store("truth", step, time, self.truth.particles_with_rates(frame))
         at = int(np.argmin(np.abs(self.truth.fields.times - self.truth.times[frame])))
-        if abs(self.truth.fields.times[at] - self.truth.times[frame]) < 1e-9:
+        if self._fields and abs(self.truth.fields.times[at] - self.truth.times[frame]) < 1e-9:
             planes = self.truth.fields.read(at, "velocity", self._slab.start, self._slab.stop)
             self._fields["filtered"].append(time, self._slab.start, {"velocity": planes})
 
     def _store(self, name: str, step: int, time: float, columns: dict[str, np.ndarray]) -> None:
         columns = migrate(self._slab, {column: columns[column] for column in ("id", *self._columns)})
-        position, velocity = (torch.from_numpy(columns[column]) for column in ("position", "velocity"))
-        particle_field = ParticleField(self._slab, self.kernel.support, position, velocity)
-        columns["velocity_gradient"] = as_numpy(particle_field.at_particles(self.kernel)[1])
+        if self.kernel is not None:
+            position, velocity = (torch.from_numpy(columns[column]) for column in ("position", "velocity"))
+            particle_field = ParticleField(self._slab, self.kernel.support, position, velocity)
+            columns["velocity_gradient"] = as_numpy(particle_field.at_particles(self.kernel)[1])
+            field, n = as_numpy(particle_field.velocity_on_whole_grid(self.kernel)).T, self._slab.planes
+            self._fields[name].append(time, self._slab.start, {"velocity": field.reshape(3, self._slab.count, n, n)})
         order = IdOrder(self._slab.comm, columns["id"], self.truth.total)
-        by_id = {column: order.apply(columns[column]) for column in (*self._columns, *GRADIENT)}
+        by_id = {column: order.apply(columns[column]) for column in self._stored}
         self._trajectories[name].append(step, time, order.start, by_id)
-        field = as_numpy(particle_field.velocity_on_whole_grid(self.kernel)).T
-        n = self._slab.planes
-        self._fields[name].append(time, self._slab.start, {"velocity": field.reshape(3, self._slab.count, n, n)})
 
     def _true_frame(self, time: float) -> int | None:
         """The frame of the ground truth at a time of the rollout, if there is one with rates."""

@@ -48,7 +48,7 @@ class ParticleRun:
 
     def __init__(self, scene: Scene, truth: GroundTruth, start: int, directory: Path, device: torch.device) -> None:
         self.settings, self.comm, self.scales = scene.simulation, truth.decomposition.comm, truth.scales_at(start)
-        self.flow = FlowUnits(self.scales, scene.kernel.support(truth.total), scene.kernel.neighbors, scene.seed)
+        self.flow = FlowUnits(self.scales, scene.interaction_radius, scene.neighbors, scene.seed)
         dtype = getattr(torch, self.settings.precision)
         self.model = self.with_forcing(self.build(scene, directory), scene, truth).to(dtype=dtype, device=device)
         self.dynamics = ParticleDynamics(truth.decomposition, self.model, self.settings.skin * self.flow.cutoff, dtype)
@@ -195,8 +195,9 @@ class SmoothedRun(ParticleRun):
     far from the mean without a fault."""
 
     def build(self, scene: Scene, directory: Path) -> LagrangianModel:
-        form = scene.wcsph or Wcsph()
-        settings = {"summation-density": SummationDensity(kernel=form.kernel), "wcsph": WCSPH(**asdict(form))}
+        form = asdict(scene.wcsph or Wcsph())
+        del form["neighbors"]  # which are in the units
+        settings = {"summation-density": SummationDensity(kernel=form["kernel"]), "wcsph": WCSPH(**form)}
         return build_model(settings, PRESETS["wcsph"], self.flow)
 
     def description(self) -> dict[str, float | str]:
