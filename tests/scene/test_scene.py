@@ -80,7 +80,7 @@ def test_the_form_of_a_baseline_counts_for_its_rollout_alone(first, second):
 
 
 def test_coarse_grid_of_the_filter():
-    widths = {name: load_scene(name).tracers.width for name in ("hit", "tiny")}
+    widths = {name: load_scene(name).tracers.filter_width for name in ("hit", "tiny")}
     assert Eulerian().cells_for(widths["hit"]) == 16  # Nyquist wavenumber 8 = pi / d
     assert Eulerian().cells_for(widths["tiny"]) == 8
     assert Eulerian(cells=24).cells_for(widths["hit"]) == 24
@@ -119,7 +119,7 @@ def test_a_section_within_a_section_is_read_and_written():
 
 def test_derived_lengths():
     tracers = load_scene("hit-small").tracers
-    assert tracers.width == 2 * tracers.spacing == pytest.approx(0.3926990817)
+    assert tracers.filter_width == 2 * tracers.spacing == pytest.approx(0.3926990817)
     assert (tracers.particles, tracers.cells) == (32768, 48)
     assert load_scene("tiny").tracers.cells == 18
     assert load_scene("hit-small").kernel_support / tracers.spacing == pytest.approx(2.4287, rel=1e-4)

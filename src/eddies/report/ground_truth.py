@@ -153,8 +153,8 @@ def _transfer_panel(axis: Axes, k: np.ndarray, ratio: np.ndarray, width: float) 
 
 
 @dataclass(frozen=True)
-class GroundTruth:
-    """The ground truth as stored: tables `statistics` and `spectra` (None without tracers), group
+class StoredFlow:
+    """The flow of a ground truth as stored: tables `statistics` and `spectra` (None without tracers), group
     `reference`.
 
     `planes` holds "velocity" (u_x) and "vorticity" (magnitude) [y, x] at z = pi of the last stored field,
@@ -181,7 +181,7 @@ class GroundTruth:
         return int(np.argmin(np.abs(self.statistics["time"] - self.released_at)))
 
 
-def section(flow: GroundTruth) -> Section:
+def section(flow: StoredFlow) -> Section:
     """The ground truth: figures, and the numbers when the tracers start, or at the end without tracers."""
     at = {name: float(values[flow.row]) for name, values in flow.statistics.items()} | dict(flow.reference)
     when = "at the end" if flow.released_at is None else "when the tracers start"
@@ -201,7 +201,7 @@ def section(flow: GroundTruth) -> Section:
     return shown
 
 
-def _add_spectra(shown: Section, flow: GroundTruth) -> None:
+def _add_spectra(shown: Section, flow: StoredFlow) -> None:
     frame = -1 if flow.released_at is None else int(np.argmin(np.abs(flow.spectra["time"])))
     energy, filtered = flow.spectra["energy"][frame], flow.spectra.get("filtered")
     scales = {"dissipation_rate": float(flow.statistics["dissipation_rate"][flow.row]),

@@ -75,7 +75,7 @@ class Scene(Document):
     @property
     def kernel_support(self) -> float | None:
         """Radius h of the smoothing kernel; None without [kernel]."""
-        return self.tracers.radius_of(self.kernel.neighbors) if self.kernel else None
+        return self.tracers.radius_of(self.kernel.neighbors) if self.kernel and self.tracers else None
 
     @property
     def neighbors(self) -> float:
@@ -86,8 +86,8 @@ class Scene(Document):
 
     @property
     def interaction_radius(self) -> float:
-        """Radius within which pairs of particles act on each other."""
-        return self.tracers.radius_of(self.neighbors)
+        """Radius within which pairs of particles act on each other; 0 without [tracers]."""
+        return self.tracers.radius_of(self.neighbors) if self.tracers else 0.0
 
     @property
     def foreign(self) -> tuple[str, ...]:

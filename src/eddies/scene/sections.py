@@ -76,18 +76,26 @@ class SpinUp(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class Tracers(Section):
-    """Particles that follow the filtered flow: the ground truth of learning."""
+    """Particles that follow the filtered flow: the ground truth of learning.
+
+    Once made it holds the filter width in use.
+    """
 
     particles_per_side: int = integer("the number of particles is the cube of this", at_least=2)
     placement: str = choice("where the particles start", "random", "lattice", default="random")
-    filter_width: float | None = number("of the Gaussian filter; absent: twice the mean spacing",
-                                        default=None, above=0, below=BOX_LENGTH)
+    filter_width: float = number("of the Gaussian filter; absent: twice the mean spacing",
+                                 default=None, above=0, below=BOX_LENGTH)
     interpolation: str = choice("splines from grid to particles", "cubic", "quintic", default="cubic")
     turnovers: float = number("large-eddy turnovers to follow the particles", above=0)
     frame_interval: float = number("time between stored frames", above=0)
     field_cells: int | None = integer("grid of the stored fields; absent: 1.5 x particles_per_side, even",
                                       default=None, at_least=4)
     field_every: int = integer("frames per stored field", default=5, at_least=1)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.filter_width is None:
+            object.__setattr__(self, "filter_width", 2 * self.spacing)
 
     @property
     def particles(self) -> int:
@@ -102,11 +110,6 @@ class Tracers(Section):
     def radius_of(self, neighbors: float) -> float:
         """Radius h of the ball that holds so many of the N particles on average: n = N (4/3) pi h^3 / L^3."""
         return BOX_LENGTH * (neighbors / self.particles / (4 / 3 * math.pi)) ** (1 / 3)
-
-    @property
-    def width(self) -> float:
-        """Filter width d in use: as given, or twice the mean particle spacing."""
-        return 2 * self.spacing if self.filter_width is None else self.filter_width
 
     @property
     def cells(self) -> int:

@@ -56,7 +56,7 @@ def numbers(scene: Scene, ranks: int, speed: Speed) -> dict[str, Any]:
             "velocity_rms", "dissipation_rate", "reynolds_lambda", "turnover_time", "kolmogorov_length",
             "kolmogorov_time")},
         "particles": scene.tracers and scene.tracers.particles,
-        "filter_width": scene.tracers and scene.tracers.width,
+        "filter_width": scene.tracers and scene.tracers.filter_width,
         "kernel_support": scene.kernel_support,
         "time_step": step and step[0], "steps": expected_steps(scene), "ranks": ranks,
         "most_ranks": min(limits.values()), "limits": limits, "most_ranks_dns": alone,
@@ -94,10 +94,10 @@ def particle_lines(scene: Scene) -> Iterator[str]:
         yield "none"
         return
     k_max, nyquist = largest_wavenumber(scene), tracers.particles_per_side / 2
-    k_max_transfer, nyquist_transfer = (math.exp(-(k * tracers.width) ** 2 / 24) for k in (k_max, nyquist))
+    k_max_transfer, nyquist_transfer = (math.exp(-(k * tracers.filter_width) ** 2 / 24) for k in (k_max, nyquist))
     yield (f"{tracers.particles_per_side}^3 = {tracers.particles}, mean spacing {tracers.spacing:.4g} = "
            f"{tracers.spacing * scene.flow.cells / BOX_LENGTH:.3g} cells")
-    yield (f"filter width {tracers.width:.4g}, passes {k_max_transfer:.2g} of the amplitude at k_max and "
+    yield (f"filter width {tracers.filter_width:.4g}, passes {k_max_transfer:.2g} of the amplitude at k_max and "
            f"{nyquist_transfer:.2g} at k = {nyquist:g}, where the particles' resolution ends")
     field_interval = tracers.field_every * tracers.frame_interval
     yield f"filtered fields on {tracers.cells}^3 points, every {field_interval:.3g}"
@@ -186,7 +186,7 @@ def warnings(scene: Scene, ranks: int) -> Iterator[str]:
         if allowed and scene.simulation.injection != "none" and scene.simulation.step > allowed * (1 + 1e-9):
             yield (f"[simulation] step = {scene.simulation.step:g}: the particles will take shorter steps, of about "
                    f"{allowed:.2g}, in which their resolved velocity can follow the flow")
-    if scene.tracers and scene.tracers.width < BOX_LENGTH / scene.flow.cells:
+    if scene.tracers and scene.tracers.filter_width < BOX_LENGTH / scene.flow.cells:
         yield "the filter is narrower than a cell of the grid: it filters nothing"
     if ranks > most:
         yield f"this job has {ranks} ranks, and the scene can use at most {most}"

@@ -142,7 +142,7 @@ def _read_flow(file: File, record: Run, reference: dict[str, Any], statistics: d
     record.cost.append(Metric("dns_seconds_per_step", "DNS, seconds per step (median)",
                               float(np.median(statistics["seconds_per_step"]))))
     planes = {"velocity": velocity[0, middle], "vorticity": vorticity_magnitude[middle]}
-    return ground_truth.section(ground_truth.GroundTruth(statistics, spectra, reference, planes, name))
+    return ground_truth.section(ground_truth.StoredFlow(statistics, spectra, reference, planes, name))
 
 
 def _read_kernel(file: File, record: Run) -> list[Section]:

@@ -121,7 +121,7 @@ def most_ranks(scene: Scene) -> dict[str, int]:
     if "train" in scene.stages:
         limits |= most_training_ranks(scene)
     if scene.simulation and scene.simulation.method == "eulerian":
-        cells = (scene.eulerian or Eulerian()).cells_for(scene.tracers.width)
+        cells = (scene.eulerian or Eulerian()).cells_for(scene.tracers.filter_width)
         limits["ghost planes of the coarse grid"] = max(cells // GHOST_PLANES[scene.tracers.interpolation], 1)
     return limits
 
@@ -183,7 +183,7 @@ def foreseen_allowed_step(scene: Scene) -> float | None:
     turbulence = expected_turbulence(scene)
     if turbulence is None:
         return None
-    highest = resolved_wavenumber(scene.tracers.spacing, scene.tracers.width, turbulence.kolmogorov_length)
+    highest = resolved_wavenumber(scene.tracers.spacing, scene.tracers.filter_width, turbulence.kolmogorov_length)
     return allowed_step(scene.simulation.integrator, highest, turbulence.velocity_rms)
 
 

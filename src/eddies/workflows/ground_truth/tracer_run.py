@@ -30,7 +30,7 @@ class TracerRun:
         self.scene, self.flow, self.segments, self.settings = scene, flow, segments, scene.tracers
         flow.fluid.forcing, flow.phase, flow.tracers = None, "tracers", self
         compressible = flow.fluid.compressible
-        field = FilteredField(flow.fluid.grid, self.settings.width, self.settings.interpolation)
+        field = FilteredField(flow.fluid.grid, self.settings.filter_width, self.settings.interpolation)
         self.comm = flow.fluid.grid.decomposition.comm
         if saved is None:
             self.released, self.released_at = flow.history.sample(flow.state, flow.clock), flow.clock.time
@@ -69,8 +69,8 @@ class TracerRun:
     def scales(self) -> dict[str, float]:
         """Scales of the filtered flow at the release: what the same flow does later does not change them."""
         return {"released_at": self.released_at, "sound_speed": self.scene.flow.sound_speed or np.inf,
-                "filter_width": self.settings.width, "spacing": self.settings.spacing, "density_mean": MEAN_DENSITY,
-                **self.segments.release_scales()}
+                "filter_width": self.settings.filter_width, "spacing": self.settings.spacing,
+                "density_mean": MEAN_DENSITY, **self.segments.release_scales()}
 
     def state_dict(self) -> dict[str, Any]:
         """What a checkpoint keeps beside the flow and the files of `segments`."""

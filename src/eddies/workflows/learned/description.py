@@ -41,5 +41,5 @@ def differences(scene: Scene, description: Mapping[str, Any]) -> Iterator[tuple[
         yield "[model] neighbors", quoted(scene.neighbors), quoted(description["neighbors"])
     scales, tracers = description["scales"], scene.tracers
     width = scales["filter_width"] / scales["spacing"] * tracers.spacing
-    if not math.isclose(tracers.width, width, rel_tol=1e-6):
-        yield "[tracers] filter_width", f"{tracers.width:.9g}", f"{width:.9g}"
+    if not math.isclose(tracers.filter_width, width, rel_tol=1e-6):
+        yield "[tracers] filter_width", f"{tracers.filter_width:.9g}", f"{width:.9g}"

@@ -43,7 +43,7 @@ class EulerianRun:
     def __init__(self, scene: Scene, truth: GroundTruth, start: int, directory: Path, device: torch.device) -> None:
         self.settings, self.longest_step = scene.eulerian or Eulerian(), scene.simulation.step
         comm, length = truth.decomposition.comm, truth.decomposition.length
-        cells = self.settings.cells_for(scene.tracers.width)
+        cells = self.settings.cells_for(scene.tracers.filter_width)
         grid = SpectralGrid(SlabDecomposition(comm, length, cells), scene.flow.precision)
         self.fluid = coarse_fluid(scene, truth, grid)
         self.stepper, self.clock = ETDRK4(self.fluid), Clock()

@@ -58,12 +58,12 @@ def notes(comparison: Comparison) -> list[str]:
     blank = " and ".join(MEASURES[measure] for measure in THROUGH_KERNEL)
     found = [f"{', '.join(own)}: no {blank}. These are measured on what the smoothing kernel makes of the particles; "
              "one of other settings than the base's shows another part of the flow."] if own else []
-    grids = {name: (scene.eulerian or Eulerian()).cells_for(scene.tracers.width)
+    grids = {name: (scene.eulerian or Eulerian()).cells_for(scene.tracers.filter_width)
              for name, scene in comparison.scenes.items() if scene.simulation.method == "eulerian"}
     if grids:
         kept = ", ".join(f"{(cells - 1) // 3} in {name}" for name, cells in grids.items())
         found.append(f"Of a grid the 2/3 rule leaves the wavenumbers |k_i| < cells/3, at most: {kept}; k_d = "
-                     f"{np.pi / comparison.base_scene.tracers.width:.3g}.")
+                     f"{np.pi / comparison.base_scene.tracers.filter_width:.3g}.")
     return found
 
 

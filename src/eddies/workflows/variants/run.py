@@ -26,6 +26,9 @@ MARK = "made-by-compare.txt"
 MARK_TEXT = "`eddies compare` replaces the products in this directory when it runs again.\n"
 TIMED_STEPS = 6  # at least, in a block that is run for its time alone; a rollout leaves its first two out as warm-up
 
+#: What is run for a variant, where it asks for it: all products but the ground truth.
+OWN_STAGES = [stage for stage in after("dns") if stage.product is not None]
+
 # Runs stages of a scene in a run directory, all ranks together, and skips those whose product is there.
 RunStages = Callable[[Sequence[str], Scene, Path], None]
 
@@ -65,7 +68,7 @@ class VariantRun:
     @property
     def stages(self) -> tuple[str, ...]:
         """The stages that a variant runs where their product is not shared: all but ground truth and report."""
-        return tuple(stage for stage in self.scene.stages if STAGES[stage].product is not None and stage != "dns")
+        return tuple(stage.name for stage in OWN_STAGES if stage.name in self.scene.stages)
 
     def check_directory(self, ground_truths: Sequence[Path]) -> None:
         """Refuse a run directory in which a comparison would replace what it has not made. Sends nothing.
@@ -94,9 +97,7 @@ class VariantRun:
         checkpoints = self.directory / STAGES["train"].checkpoints
         if not resume and checkpoints.exists():
             shutil.rmtree(checkpoints)
-        for stage in after("dns"):
-            if stage.product is None:
-                continue
+        for stage in OWN_STAGES:
             product = self.directory / stage.file
             fits = stage.name in self.stages and product_fingerprint(product) == self.scene.fingerprint(stage.name)
             if not (resume and fits and (stage.name != "simulate" or product_provenance(product)["ranks"] == ranks)):
