@@ -14,7 +14,7 @@ LONGEST_MODULE = 300
 # Modules below eddies, by layer. Imports go down, or stay within a group.
 LAYERS = (
     (("__init__", "__version__"), ("errors*",)),
-    (("pipeline*",), ("clock*",), ("time_stepping*",)),
+    (("pipeline*",), ("import_path*",), ("clock*",), ("time_stepping*",)),
     (("scene*", "particles.terms.settings*", "particles.terms.presets*"),),
     (("parallel*",),),
     (("io*",),),
@@ -37,9 +37,9 @@ ONLY_IN = {
     # Scene, rules, reader, sections, model, methods, checks, comparison
     **dict.fromkeys(("eddies.scene.[srm]*", "eddies.scene.ch*", "eddies.scene.compar*"),
                     ("scene*", "workflows*", "cli", "api", "stages", "logs")),
-    **dict.fromkeys(("eddies.scene.values*", "eddies.scene.compos*"),
-                    ("scene*", "particles.model", "particles.context", "particles.devices", "particles.terms.*",
-                     "workflows*")),
+    # Of the particles only the settings of terms declare keys of a scene.
+    "eddies.scene.values*": ("scene*", "particles.terms.settings", "workflows*"),
+    "eddies.import_path*": ("scene*", "particles.model", "particles.terms.pair_basis", "workflows*"),
     "pickle*": (),
 }
 COMM_WORLD_IN = ("cli", "api")
@@ -113,6 +113,8 @@ def test_tools_import_nothing_from_the_package():
     ("clock", "from eddies import scene", "not below it"),
     ("learning/losses", "def late():\n    from eddies.scene.scene import Scene", "imports eddies.scene.scene"),
     ("flow/forcing", "from eddies.scene.values import number", "imports eddies.scene.values"),
+    ("particles/model", "from eddies.scene.values import SceneError", "imports eddies.scene.values"),
+    ("learning/losses", "from eddies.import_path import load", "imports eddies.import_path"),
     ("particles/pairs", "from eddies.scene.sections import Flow", "imports eddies.scene.sections"),
     ("particles/pairs", "from eddies.scene.scene import Flow", "imports eddies.scene.scene"),
     ("flow/tracers", "import mpi4py", "imports mpi4py"),

@@ -9,15 +9,15 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
+from eddies.errors import UserError
+from eddies.import_path import is_path, load, short_name
 from eddies.parallel.reduction import any_rank
 from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.rates import Rates, total
 from eddies.particles.terms.presets import TERMS
 from eddies.particles.terms.settings import TermSettings
-from eddies.particles.terms.term import PairTerm, Term
-from eddies.scene.composition import is_path, load, short_name
-from eddies.scene.values import SceneError
+from eddies.particles.terms.term import PairTerm, Term, TermError
 
 
 class LagrangianModel(nn.Module):
@@ -29,7 +29,7 @@ class LagrangianModel(nn.Module):
     flow : what they were made for, and the units of their rates.
 
     Terms that do not read the density come first; what they give of it is the density that the others see. What no term
-    reads is not built, and the density is not computed where nobody reads it. Raises SceneError where a term both reads
+    reads is not built, and the density is not computed where nobody reads it. Raises TermError where a term both reads
     the density and gives a part of it.
     """
 
@@ -38,7 +38,7 @@ class LagrangianModel(nn.Module):
         self.terms, self.flow = nn.ModuleDict(terms), flow
         for name, term in self.terms.items():
             if "density" in term.reads and "density" in term.gives:
-                raise SceneError(f'term "{name}": reads the density and gives a part of it; it can do only one of both')
+                raise TermError(f'term "{name}": reads the density and gives a part of it; it can do only one of both')
 
     @property
     def reads(self) -> set[str]:
@@ -106,7 +106,7 @@ class LagrangianModel(nn.Module):
     @torch.no_grad()
     def require_linear(self, context: Context) -> None:
         """Check terms that declare themselves linear in their parameters at other parameters than what is kept was
-        made with; raises SceneError where one is not. Collective."""
+        made with; raises TermError where one is not. Collective."""
         for name, kept in self.linear_rates(context).items():
             term, sizes = self.terms[name], [parameter.shape for parameter in kept.parameters]
             others = [torch.linspace(0.3, 1.9, shape.numel()).reshape(shape).to(parameter)
@@ -117,8 +117,8 @@ class LagrangianModel(nn.Module):
             wrong = [what for what in _GIVEN if getattr(direct, what) is not None and not torch.allclose(
                 getattr(replace(kept, parameters=others).at(None), what), getattr(direct, what), rtol=1e-3, atol=1e-6)]
             if any_rank(context.comm, bool(wrong)):
-                raise SceneError(f'term "{name}": declares itself linear in its parameters, and is not; remove its '
-                                 "linear = True")
+                raise TermError(f'term "{name}": declares itself linear in its parameters, and is not; remove its '
+                                "linear = True")
 
     @property
     def _stages(self) -> list[list[tuple[str, Term]]]:
@@ -203,12 +203,12 @@ def _evaluated(term: Term, context: Context) -> Rates:
 
 
 def _required(found: object, term: Term) -> Rates:
-    """What a term's forward returned; SceneError unless these are Rates."""
+    """What a term's forward returned; TermError unless these are Rates."""
     if not isinstance(found, Rates):
-        raise SceneError(f"{type(term).__name__}: forward returns a {type(found).__name__}; it must return Rates")
+        raise TermError(f"{type(term).__name__}: forward returns a {type(found).__name__}; it must return Rates")
     if "density" in term.gives and found.density is None and found.pressure_modes is None:
-        raise SceneError(f'{type(term).__name__}: declares that it gives "density", and returns none; take it out of '
-                         "`gives` of its settings, or return density or pressure_modes")
+        raise TermError(f'{type(term).__name__}: declares that it gives "density", and returns none; take it out of '
+                        "`gives` of its settings, or return density or pressure_modes")
     return found
 
 
@@ -221,7 +221,8 @@ def build_model(settings: Mapping[str, TermSettings], paths: Iterable[str], flow
     paths : the word or import path of each.
     flow : what it is made for.
 
-    Raises SceneError where an import path does not lead to a Term, or it cannot be made.
+    Raises TermError where an import path does not lead to a Term, or it cannot be made; ImportPathError where it leads
+    nowhere.
     """
     terms = {short_name(path): _build_term(path, settings[short_name(path)], flow) for path in paths}
     return LagrangianModel(terms, flow)
@@ -230,12 +231,12 @@ def build_model(settings: Mapping[str, TermSettings], paths: Iterable[str], flow
 def _build_term(path: str, settings: TermSettings, flow: FlowUnits) -> Term:
     kind = load(path if is_path(path) else TERMS[path][0])
     if not (isinstance(kind, type) and issubclass(kind, Term)):
-        raise SceneError(f'term "{path}": must be a class derived from eddies.Term')
+        raise TermError(f'term "{path}": must be a class derived from eddies.Term')
     if not isinstance(settings, TermSettings):
-        raise SceneError(f'term "{path}": its Settings must be a frozen dataclass derived from eddies.TermSettings')
+        raise TermError(f'term "{path}": its Settings must be a frozen dataclass derived from eddies.TermSettings')
     try:
         return kind(settings, flow).double()
-    except SceneError:
-        raise
+    except UserError as error:
+        raise TermError(f'term "{path}": {error}') from error
     except Exception as error:  # of a class of the user's, anything
-        raise SceneError(f'term "{path}": cannot be made: {type(error).__name__}: {error}') from error
+        raise TermError(f'term "{path}": cannot be made: {type(error).__name__}: {error}') from error

@@ -15,6 +15,7 @@ from eddies.flow.history import FlowHistory
 from eddies.flow.initial_fields import INITIAL_FLOWS, balanced_density, sound_wave_density
 from eddies.flow.navier_stokes import FLUIDS, Fluid
 from eddies.flow.operators import project
+from eddies.import_path import is_path, load
 from eddies.io.checkpoint import Checkpoint
 from eddies.io.fields import FieldSeries, FieldWriter
 from eddies.io.hdf5 import File, create_product, open_product, write_attributes, write_table
@@ -22,7 +23,6 @@ from eddies.parallel.communicator import Comm
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import StopRequest
 from eddies.pipeline import STAGES
-from eddies.scene.composition import is_path, load
 from eddies.scene.scene import BOX_LENGTH, Scene, SceneError
 from eddies.scene.sections import SpinUp
 from eddies.spectral.spectral_grid import SpectralGrid

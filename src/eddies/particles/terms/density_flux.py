@@ -11,8 +11,7 @@ from eddies.particles.rates import Rates
 from eddies.particles.scaled_pairs import ScaledPairs
 from eddies.particles.terms import settings as declared
 from eddies.particles.terms.pair_basis import build_network
-from eddies.particles.terms.term import PairTerm
-from eddies.scene.values import SceneError
+from eddies.particles.terms.term import PairTerm, TermError
 
 
 class DensityFlux(PairTerm):
@@ -28,8 +27,8 @@ class DensityFlux(PairTerm):
         self.width = max(settings.hidden)
         if settings.zero_at_first:
             if not isinstance(self.network, DenseNetwork):
-                raise SceneError(f'zero_at_first = true: needs network = "dense", not "{settings.network}", whose last '
-                                 "layer is not known; leave one of the two out")
+                raise TermError(f'zero_at_first: needs network = "dense", not "{settings.network}", whose last '
+                                "layer is not known; leave one of the two out")
             self.network.zero_outputs()
 
     def features(self, pairs: ScaledPairs) -> Tensor:
