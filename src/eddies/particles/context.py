@@ -127,7 +127,7 @@ class Context:
 
     def forget_sums(self, term: object) -> None:
         """Take a term's sums over pairs anew when they are asked for next: its parameters are others."""
-        self._sums.pop(term, None)
+        self._sums = {summand: sums for summand, sums in self._sums.items() if summand is not term}
 
     @cached_property
     def moments(self) -> Moments:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -35,7 +36,8 @@ class LagrangianModel(nn.Module):
 
     def __init__(self, terms: Mapping[str, Term], flow: FlowUnits) -> None:
         super().__init__()
-        self.terms, self.flow = nn.ModuleDict(terms), flow
+        self.terms = cast(Mapping[str, Term], nn.ModuleDict(terms))  # which does not know the type of its modules
+        self.flow = flow
         for name, term in self.terms.items():
             if "density" in term.reads and "density" in term.gives:
                 raise TermError(f'term "{name}": reads the density and gives a part of it; it can do only one of both')
@@ -89,8 +91,9 @@ class LagrangianModel(nn.Module):
             context.sum_pairs([term for term in anew if isinstance(term, PairTerm) and not _everywhere(term)])
             found = [kept[name].at(context.rows) if name in kept else _evaluated(term, context) for name, term in stage]
             sums.append(self._at_particles(total(found), context))
-            if context.density is None and self.density_is_given:
-                context.density = context.flow.scales.density_mean + sums[0].density
+            deviation = sums[0].density
+            if context.density is None and self.density_is_given and deviation is not None:
+                context.density = context.flow.scales.density_mean + deviation
         result = total(sums)
         if result.acceleration is None:
             at_rest = torch.zeros_like(context.particles.velocity)
@@ -140,7 +143,7 @@ class LagrangianModel(nn.Module):
             parts.append(Rates(acceleration=context.without_mean(values[:, :3])).at(context.rows))
         if pressure is not None:
             scales = context.flow.scales
-            parts.append(Rates(density=values[:, -1] * (scales.density_mean / scales.sound_speed**2)))
+            parts.append(Rates(density=values[:, -1] * (scales.density_mean / scales.required("sound_speed") ** 2)))
         return total(parts)
 
     def _linear_rates(self, term: Term, context: Context) -> LinearRates:
@@ -172,7 +175,7 @@ class LinearRates:
 
     origin: Rates
     slopes: dict[str, Tensor]
-    parameters: list[nn.Parameter]
+    parameters: Sequence[Tensor]
 
     def at(self, rows: Tensor | None) -> Rates:
         """With acceleration and rate of some rows (k,) of the particles, or of all; differentiable in the

@@ -19,6 +19,7 @@ class DensityFlux(PairTerm):
     rate and NN_rho a network of its own."""
 
     Settings = declared.DensityFlux
+    settings: declared.DensityFlux
 
     def __init__(self, settings: declared.DensityFlux, flow: FlowUnits) -> None:
         super().__init__(settings, flow)
@@ -41,5 +42,5 @@ class DensityFlux(PairTerm):
 
     def rates_of(self, sums: Tensor, context: Context) -> Rates:
         """The rate of density."""
-        rate = context.flow.scales.density_rate / context.flow.neighbors * sums[0]
+        rate = context.flow.scales.required("density_rate") / context.flow.neighbors * sums[0]
         return Rates(density_rate=rate.to(context.particles.velocity.dtype))

@@ -25,6 +25,7 @@ class Forcing(Term):
     """
 
     Settings = declared.Forcing
+    settings: declared.Forcing
     linear = True
 
     def __init__(self, settings: declared.Forcing, flow: FlowUnits) -> None:
