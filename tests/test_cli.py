@@ -203,6 +203,14 @@ def test_seconds_of_stages_are_kept(comm, tmp_path, before, kept):
     assert len(list(tmp_path.iterdir())) == 1
 
 
+@pytest.mark.mpi(1, 2, timeout=30)
+def test_seconds_that_cannot_be_written_are_told_by_all(comm, tmp_path):
+    from eddies.io.hdf5 import ProductError
+    from eddies.stages import record_seconds
+    with pytest.raises(ProductError, match="nowhere/stage_seconds.json.partial: No such file or directory; check"):
+        record_seconds("train", 2.0, comm, tmp_path / "nowhere")
+
+
 @pytest.mark.mpi(1, 2)
 def test_levels_of_the_log(comm, capfd, monkeypatch):
     from eddies.logs import configure_logging

@@ -156,7 +156,7 @@ def test_a_term_that_gives_nothing_has_one_error(comm, own):
     dynamics = ParticleDynamics(SlabDecomposition(comm, LENGTH, 6), model_of(("wrong:Mine",), 1.5, 20, (4,)), 0.0)
     at_rest = ParticleSet.from_numpy({"id": np.array([comm.rank]), "position": np.ones((1, 3)),
                                       "velocity": np.zeros((1, 3))})
-    with pytest.raises(eddies.SceneError, match="Mine: forward returns a NoneType; it must return Rates"):
+    with pytest.raises(eddies.TermError, match="Mine: forward returns a NoneType; it must return Rates"):
         dynamics.rates(at_rest)
 
 

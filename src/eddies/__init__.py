@@ -10,11 +10,12 @@ __version__ = "0.2.0"
 _HOMES = {
     "eddies.api": ("check", "run", "simulate", "train"),
     "eddies.errors": ("UserError",),
+    "eddies.import_path": ("ImportPathError",),
     "eddies.scene.scene": ("Scene", "SceneError", "load_scene", "Eulerian", "Flow", "Forcing", "Horizons", "Initial",
                            "Kernel", "Model", "Simulation", "SpinUp", "Time", "Tracers", "Training", "Wcsph"),
     "eddies.scene.values": ("boolean", "choice", "integer", "integers", "named", "number", "text", "texts"),
     "eddies.particles.terms.settings": ("TermSettings",),
-    "eddies.particles.terms.term": ("PairTerm", "Term"),
+    "eddies.particles.terms.term": ("PairTerm", "Term", "TermError"),
     "eddies.particles.rates": ("Rates",),
     "eddies.particles.model": ("LagrangianModel", "build_model"),
     "eddies.particles.flow_units": ("FlowUnits",),

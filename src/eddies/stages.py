@@ -12,7 +12,7 @@ from pathlib import Path
 
 from eddies.clock import duration
 from eddies.io.checkpoint import CheckpointDirectory
-from eddies.io.hdf5 import open_product, product_fingerprint
+from eddies.io.hdf5 import in_files, open_product, product_fingerprint
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm
 from eddies.parallel.stop import StopRequest
@@ -129,11 +129,14 @@ def is_done(stage: str, scene: Scene, comm: Comm, directory: Path) -> bool:
 def record_seconds(stage: str, seconds: float, comm: Comm, directory: Path) -> None:
     """Log the wall time of a stage and keep it in stage_seconds.json, which holds the last of each stage."""
     log.info("%s: took %s", stage, duration(seconds))
-    if comm.rank == 0:
-        path = directory / "stage_seconds.json"
-        partial = path.with_name(path.name + ".partial")
+    path = directory / "stage_seconds.json"
+    partial = path.with_name(path.name + ".partial")
+
+    def write() -> None:
         partial.write_text(json.dumps({**_known_seconds(path), stage: round(seconds, 3)}, indent=2) + "\n")
         os.replace(partial, path)
+
+    in_files(comm, path, write)
 
 
 def _known_seconds(path: Path) -> dict[str, float]:

@@ -159,6 +159,27 @@ def test_a_full_disk_is_told_and_harms_nothing(comm, tmp_path, kilobytes):
     assert directory.newest().content["step"] == 2
 
 
+def refuse(path, *_, ignore_errors=False, **__):
+    """In place of shutil.rmtree, of which the message of an error is the same."""
+    if not ignore_errors:
+        raise PermissionError(13, "Permission denied", str(path))
+
+
+@pytest.mark.mpi(1, 2, timeout=30)
+@pytest.mark.parametrize("act", [CheckpointDirectory.remove, CheckpointDirectory.newest,
+                                 lambda directory: directory.write(4, {"time": 1.0})],
+                         ids=["remove", "clean", "keep the newest"])
+def test_what_cannot_be_removed_is_told_by_all(comm, tmp_path, monkeypatch, act):
+    directory = fill(comm, tmp_path, [1, 2, 3])
+    comm.Barrier()
+    if comm.rank == 0:
+        (directory.path / "step-00000009.partial").mkdir()
+    comm.Barrier()
+    monkeypatch.setattr(shutil, "rmtree", refuse)
+    with pytest.raises(ProductError, match="checkpoints.*: Permission denied; check the file, its directory"):
+        act(directory)
+
+
 WRITER = """
 import sys
 from pathlib import Path

@@ -1,14 +1,16 @@
 """Products: complete or absent, refused when they are not what they should be."""
 
 import json
+from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 
-from eddies.io.hdf5 import (CHUNK_BYTES, ProductError, append_frame, create_product, growing_dataset,
+from eddies.io.hdf5 import (CHUNK_BYTES, ProductError, append_frame, create_product, growing_dataset, in_files,
                             open_product, product_fingerprint, product_provenance, read_provenance, read_table,
                             write_attributes, write_table)
+from eddies.parallel.stop import Stopped
 
 
 def write(comm, path, kind="kernel"):
@@ -172,3 +174,41 @@ def test_blocks_of_any_size_make_a_frame(comm, tmp_path):
     with open_product(comm, tmp_path / "a.h5", "kernel") as file:
         assert np.array_equal(file["values"][0], np.arange(2 * total).reshape(-1, 2))
         assert np.array_equal(file["values"][1], np.full((total, 2), 7.0))
+
+
+def in_the_way(comm, path):
+    """A directory with a file in it where a file should be."""
+    if comm.rank == 0:
+        (path / "something").mkdir(parents=True)
+    comm.Barrier()
+
+
+@pytest.mark.mpi(1, 2, timeout=30)
+def test_a_file_that_rank_0_cannot_write_is_told_by_all(comm, tmp_path):
+    in_the_way(comm, tmp_path / "a.json")
+    with pytest.raises(ProductError, match="a.json: Is a directory; check the file, its directory and the space on"):
+        in_files(comm, tmp_path / "a.json", lambda: (tmp_path / "a.json").write_text("{}"))
+
+    def fail():
+        raise OSError("cannot synchronously read data")  # as HDF5 tells it, without the name of the file
+
+    with pytest.raises(ProductError, match="a.json: cannot synchronously read data; check the file"):
+        in_files(comm, tmp_path / "a.json", fail)
+
+
+@pytest.mark.mpi(1, 2, timeout=30)
+def test_a_product_that_cannot_get_its_name_is_told_by_all(comm, tmp_path):
+    in_the_way(comm, tmp_path / "a.h5")
+    with pytest.raises(ProductError, match="a.h5.partial: .*directory; check the file"):
+        write(comm, tmp_path / "a.h5")
+
+
+@pytest.mark.mpi(1, 2, timeout=30)
+def test_an_unfinished_product_that_cannot_be_removed_is_told_by_all(comm, tmp_path, monkeypatch):
+    def refuse(path, missing_ok=False):
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "unlink", refuse)
+    with pytest.raises(ProductError, match="a.h5.partial: Permission denied; check the file"):
+        with create_product(comm, tmp_path / "a.h5", "kernel", {}):
+            raise Stopped("SIGTERM")

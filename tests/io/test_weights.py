@@ -33,6 +33,12 @@ def test_weights_survive(comm, tmp_path):
     assert tables.keys() == {"history"} and np.array_equal(tables["history"]["step"], np.arange(4))
 
 
+@pytest.mark.mpi(1, 2, timeout=30)
+def test_weights_that_cannot_be_written_are_told_by_all(comm, tmp_path):
+    with pytest.raises(ProductError, match="nowhere/m.h5.partial: cannot be written: "):
+        save(comm, tmp_path / "nowhere/m.h5")
+
+
 def replace(file, name, tensor):
     del file["weights"][name]
     file["weights"][name] = tensor

@@ -45,6 +45,16 @@ def test_the_stop_file_is_removed_when_obeyed(comm, tmp_path, now):
     assert stop(), "forgot it"
 
 
+@pytest.mark.mpi(1, 2, timeout=30)
+def test_a_stop_file_that_cannot_be_removed_is_told_by_all(comm, tmp_path, now):
+    if comm.rank == 0:
+        (tmp_path / "STOP").mkdir()
+    comm.Barrier()
+    stop = StopRequest(comm, stop_file=tmp_path / "STOP")
+    with pytest.raises(OSError, match="STOP"):
+        stop()
+
+
 @pytest.mark.mpi(1, 2)
 def test_wall_time_is_that_of_rank_0(comm, now):
     stop = StopRequest(comm, max_seconds=10)

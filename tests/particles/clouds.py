@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from mpi4py import MPI
 
+from eddies.import_path import load
 from eddies.parallel.migration import migrate
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
@@ -22,7 +23,6 @@ from eddies.particles.scaled_pairs import ScaledPairs
 from eddies.particles.terms.presets import PRESETS, TERMS
 from eddies.particles.terms.settings import NetworkSettings, TermSettings
 from eddies.particles.terms.term import Term
-from eddies.scene.composition import load
 
 LENGTH = 2 * math.pi
 SCALES = ReferenceScales(filter_width=1.2, spacing=0.6, velocity=0.9, density_mean=1.0, density=0.02, acceleration=1.7,

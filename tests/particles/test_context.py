@@ -12,8 +12,7 @@ from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.rates import Rates
 from eddies.particles.resolved_velocity import ResolvedVelocity
 from eddies.particles.terms.settings import TermSettings
-from eddies.particles.terms.term import PairTerm, Term
-from eddies.scene.values import SceneError
+from eddies.particles.terms.term import PairTerm, Term, TermError
 from tests.particles.clouds import (CUTOFF, MODELS, NEIGHBORS, SCALES, ReadsNothing, alone, distributed, dynamics_of,
                                     model, of_terms, state)
 
@@ -89,7 +88,7 @@ class ReadsPairs(TermSettings):
     ("density", ReadsPairs(), '"density"'), ("resolved", ReadsPairs(), '"resolved"')])
 def test_what_a_term_does_not_declare_it_is_told_to(comm, name, settings, wanted):
     slab, particles = alone(*state()[:2])
-    with pytest.raises(SceneError, match=f"no term of this model reads {wanted}: add it to the `reads`"):
+    with pytest.raises(TermError, match=f"no term of this model reads {wanted}: add it to the `reads`"):
         dynamics_of(slab, of_terms(Asking(name, settings))).rates(particles)
 
 

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import torch
 
+from eddies.import_path import ImportPathError
 from eddies.parallel.reduction import sum_flat
 from eddies.particles import context as context_module
 from eddies.particles.model import LagrangianModel, build_model
 from eddies.particles.rates import Rates, total
 from eddies.particles.terms.presets import PRESETS
 from eddies.particles.terms.settings import TermSettings
-from eddies.particles.terms.term import PairTerm, Term
-from eddies.scene.values import SceneError
+from eddies.particles.terms.term import PairTerm, Term, TermError
 from tests.particles.clouds import (FLOW, MODELS, DensityReader, Field, ReadsNothing, distributed, dynamics_of, given,
                                     model, of_terms, state)
 
@@ -198,7 +198,7 @@ class Both(TermSettings):
 
 
 def test_a_term_cannot_read_the_density_and_give_it():
-    with pytest.raises(SceneError, match="reads the density and gives a part of it"):
+    with pytest.raises(TermError, match="reads the density and gives a part of it"):
         of_terms(Term(Both(), FLOW))
 
 
@@ -212,7 +212,7 @@ class NotRates(Field):
 @pytest.mark.mpi(1)
 def test_a_term_that_does_not_return_rates_is_named(comm):
     slab, particles = distributed(comm, *state())
-    with pytest.raises(SceneError, match="NotRates: forward returns a Tensor"):
+    with pytest.raises(TermError, match="NotRates: forward returns a Tensor"):
         dynamics_of(slab, of_terms(NotRates(None))).rates(particles)
     with pytest.raises(NotImplementedError, match="Term has no forward"):
         dynamics_of(slab, of_terms(Term(ReadsNothing(), FLOW))).rates(particles)
@@ -229,14 +229,14 @@ class NeedsMore(Term):
         super().__init__(settings, flow)
 
 
-@pytest.mark.parametrize("name, settings, complaint", [
-    ("NoTerm", ReadsNothing(), "must be a class derived from eddies.Term"),
-    ("Nothing", ReadsNothing(), "has no Nothing"),
-    ("NeedsMore", ReadsNothing(), "cannot be made"),
-    ("Term", object(), "frozen dataclass derived from eddies.TermSettings"),
+@pytest.mark.parametrize("name, settings, kind, complaint", [
+    ("NoTerm", ReadsNothing(), TermError, "must be a class derived from eddies.Term"),
+    ("Nothing", ReadsNothing(), ImportPathError, "has no Nothing"),
+    ("NeedsMore", ReadsNothing(), TermError, "cannot be made"),
+    ("Term", object(), TermError, "frozen dataclass derived from eddies.TermSettings"),
 ])
-def test_what_cannot_be_a_term_gets_one_clear_error(name, settings, complaint):
-    with pytest.raises(SceneError, match=complaint):
+def test_what_cannot_be_a_term_gets_one_clear_error(name, settings, kind, complaint):
+    with pytest.raises(kind, match=complaint):
         build_model({name: settings}, [f"{__name__}:{name}"], FLOW)
 
 

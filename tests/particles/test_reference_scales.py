@@ -2,8 +2,11 @@ from dataclasses import replace
 
 import pytest
 
+from eddies.particles.flow_units import FlowUnits
 from eddies.particles.reference_scales import ReferenceScales
-from tests.particles.clouds import SCALES
+from eddies.particles.terms.presets import PRESETS
+from eddies.particles.terms.term import TermError
+from tests.particles.clouds import CUTOFF, NEIGHBORS, SCALES, model
 
 
 def test_scales_survive_a_dictionary():
@@ -14,3 +17,12 @@ def test_scales_survive_a_dictionary():
 def test_a_scale_that_cannot_divide_is_refused(value):
     with pytest.raises(ValueError, match="velocity"):
         replace(SCALES, velocity=value)
+
+
+def test_a_scale_of_the_density_is_wanted_where_there_is_none():
+    incompressible = replace(SCALES, density=None, density_rate=None, sound_speed=None)
+    assert SCALES.required("sound_speed") == 11.0
+    with pytest.raises(ValueError, match="sound_speed: a flow without density has none"):
+        incompressible.required("sound_speed")
+    with pytest.raises(TermError, match='term "wcsph": cannot be made: .* sound_speed: a flow without density'):
+        model(PRESETS["wcsph"], FlowUnits(incompressible, CUTOFF, NEIGHBORS))

@@ -16,6 +16,7 @@ from eddies.scene.scene import load_scene
 from eddies.time_stepping import ETDRK4, STEPPERS
 from eddies.workflows import dns
 from eddies.workflows.ground_truth.flow_run import FlowRun
+from eddies.workflows.ground_truth.scene_flow import build_fluid, initial_state
 
 VISCOSITIES = [1e-4, 1e-3, 1e-2, 0.1, 1.0, 10.0, 100.0]
 TIME_STEPS = [1e-3, 0.1, 10.0]
@@ -149,8 +150,8 @@ def test_a_run_that_diverges_says_so_at_the_step_and_names_the_limit(comm, tmp_p
     with pytest.raises(FlowDiverged, match=f"Broken: {limit.split(',')[0]}, .* stable up to 2.[78]") as caught:
         dns.run(scene, comm, tmp_path)
     assert isinstance(caught.value, UserError)
-    fluid = dns.build_fluid(scene, comm)
-    states = [dns.initial_state(scene, fluid)]
+    fluid = build_fluid(scene, comm)
+    states = [initial_state(scene, fluid)]
     energies = [quadratic_energy(fluid, states[0])]
     with np.errstate(all="ignore"):
         while energies[-1] <= GROWTH * min(energies):

@@ -101,8 +101,8 @@ def test_what_limits_the_step(overrides, step, limit):
 @pytest.mark.mpi(1)
 def test_expected_step_is_the_one_taken_at_the_start(comm):
     from eddies.clock import Clock
-    from eddies.workflows.dns import build_fluid, build_step_limit, initial_state
     from eddies.workflows.foreseen.estimates import expected_step
+    from eddies.workflows.ground_truth.scene_flow import build_fluid, build_step_limit, initial_state
     for name in ("taylor-green", "abc"):
         scene = replace(load_scene(name), time=Time(duration=1e9, max_step=1e3))
         fluid = build_fluid(scene, comm)
@@ -306,8 +306,8 @@ def test_memory_and_time_fall_with_the_ranks():
 def test_bytes_sent_are_those_of_the_transposes(comm, fluid, monkeypatch):
     from eddies.parallel.reduction import global_sum
     from eddies.parallel.transpose import TransposeBuffers
-    from eddies.workflows.dns import build_fluid, initial_state
     from eddies.workflows.foreseen.cost_model import sent_bytes
+    from eddies.workflows.ground_truth.scene_flow import build_fluid, initial_state
     changes = ["flow.cells=20", f"flow.fluid={fluid}", "initial.kind=taylor-green"]
     scene = load_scene("taylor-green", changes + (["flow.sound_speed=10"] if fluid == "compressible" else []))
     equation = build_fluid(scene, comm)
@@ -345,8 +345,8 @@ def test_memory_of_a_step_is_as_expected(comm, fluid):
 
     from eddies.clock import Clock
     from eddies.time_stepping import ETDRK4
-    from eddies.workflows.dns import build_fluid, build_step_limit, initial_state
     from eddies.workflows.foreseen.cost_model import PROCESS_BYTES, flow_bytes
+    from eddies.workflows.ground_truth.scene_flow import build_fluid, build_step_limit, initial_state
     changes = ["flow.cells=48", f"flow.fluid={fluid}", "initial.kind=taylor-green"]
     scene = load_scene("taylor-green", changes + (["flow.sound_speed=10"] if fluid == "compressible" else []))
     tracemalloc.start()

@@ -2,11 +2,13 @@
 
 import csv
 import json
+from types import SimpleNamespace
 
 import pytest
 
 from eddies.io.hdf5 import ProductError
 from eddies.scene.scene import SceneError, load_scene
+from eddies.workflows import compare
 from eddies.workflows.compare import check_ground_truth
 from eddies.workflows.variants.run import VariantRun
 from tests.workflows.synthetic_run import write_ground_truth
@@ -152,6 +154,17 @@ def test_more_ranks_than_a_variant_can_use_are_refused(comm, folder, capfd):
     errors = capfd.readouterr().err
     if comm.size == 2 and comm.rank == 0:
         assert "wide: 2 ranks are more than the 1 that it can use" in errors
+
+
+@pytest.mark.mpi(1, 2, timeout=30)
+def test_a_table_that_cannot_be_written_is_told_by_all(comm, tmp_path, monkeypatch):
+    if comm.rank == 0:
+        (tmp_path / "comparison.csv").mkdir()
+    comm.Barrier()
+    monkeypatch.setattr(compare, "sections", lambda *_: [])
+    comparison = SimpleNamespace(subject="learned", turnovers=1.0, base_scene=SimpleNamespace(device="cpu"))
+    with pytest.raises(SceneError, match="comparison.csv: cannot be written .Is a directory.; choose another --output"):
+        compare.write(comparison, [], comm, tmp_path)
 
 
 def variant_of(scene, directory):

@@ -10,6 +10,7 @@ from eddies.io.trajectories import Trajectory
 from eddies.parallel.slab import SlabDecomposition
 from eddies.scene.scene import BOX_LENGTH, SceneError, load_scene
 from eddies.workflows import dns
+from eddies.workflows.ground_truth.scene_flow import build_fluid, initial_state
 
 SMALL = ["flow.cells=16", "tracers.particles_per_side=6", "tracers.turnovers=0.05", "tracers.field_cells=8"]
 
@@ -160,8 +161,8 @@ def test_an_incompressible_start_from_a_compressible_flow_is_solenoidal(comm, tm
     dns.run(load_scene("taylor-green", small + sound), comm, tmp_path)
     from_file = ["initial.kind=file", f"initial.path={tmp_path / 'ground_truth.h5'}"]
     scene = load_scene("taylor-green", small + from_file)
-    fluid = dns.build_fluid(scene, comm)
-    state = dns.initial_state(scene, fluid)
+    fluid = build_fluid(scene, comm)
+    state = initial_state(scene, fluid)
     assert np.abs(divergence(fluid.grid, state)).max(initial=0) < 1e-16
 
 
@@ -225,7 +226,7 @@ def test_a_start_that_is_no_velocity(comm, own, name, message):
     own("own_flow", OWN_FLOW)
     scene = load_scene("taylor-green", [*OWN, f"initial.kind=own_flow:{name}"])
     with pytest.raises(SceneError, match=message):
-        dns.initial_state(scene, dns.build_fluid(scene, comm))
+        initial_state(scene, build_fluid(scene, comm))
 
 
 @pytest.mark.mpi(1)
@@ -233,8 +234,8 @@ def test_a_start_of_the_users_in_a_compressible_fluid_makes_no_sound(comm, own):
     own("own_flow", OWN_FLOW)
     scene = load_scene("taylor-green", ["flow.cells=16", "flow.fluid=compressible", "flow.sound_speed=10",
                                         "initial.kind=own_flow:jet"])
-    fluid = dns.build_fluid(scene, comm)
-    state = dns.initial_state(scene, fluid)
+    fluid = build_fluid(scene, comm)
+    state = initial_state(scene, fluid)
     assert state.shape == (4, *fluid.grid.spectral_shape) and np.abs(state[3]).max() < 1e-16  # a jet has no pressure
 
 

@@ -5,6 +5,7 @@ import re
 import h5py
 import pytest
 
+from eddies import cli
 from eddies.analysis.rollout_comparison import CommonFrames, error_series, particle_series
 from eddies.io.hdf5 import ProductError, open_product
 from eddies.io.trajectories import Trajectory
@@ -106,6 +107,28 @@ def test_a_product_of_another_version_is_said_in_one_line(comm, tmp_path):
     with h5py.File(tmp_path / "kernel.h5", "r+") as file:
         del file.attrs["format"]
     with pytest.raises(ProductError, match="kernel.h5: written by eddies .* run `eddies train-kernel` again$"):
+        report.run(tmp_path, comm)
+
+
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.mpi(1, 2, timeout=60)
+def test_a_report_that_cannot_be_written_is_told_in_one_line(comm, tmp_path, capfd):
+    """A file where its directory should be. All ranks end with the exit code of what the user can mend."""
+    write_ground_truth(comm, tmp_path)
+    if comm.rank == 0:
+        (tmp_path / "report").write_text("precious")
+    comm.Barrier()
+    assert cli.main(["report", str(tmp_path)]) == 2
+    told = "report/figures: Not a directory; check the file, its directory and the space on the disk\n"
+    assert comm.rank > 0 or capfd.readouterr().err.endswith(told)
+
+
+@pytest.mark.mpi(2, timeout=30)
+def test_a_damaged_product_is_told_by_all(comm, tmp_path):
+    if comm.rank == 0:
+        (tmp_path / "kernel.h5").write_text("no HDF5")
+    comm.Barrier()
+    with pytest.raises(ProductError, match="kernel.h5: damaged or not an HDF5 file"):
         report.run(tmp_path, comm)
 
 

@@ -1,12 +1,14 @@
 """A training that is stopped and goes on is the one that was never stopped."""
 
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from eddies import stages
-from eddies.io.hdf5 import open_product, read_table
+from eddies.io.hdf5 import ProductError, open_product, read_table
 from eddies.io.weights import load_weights
 from eddies.parallel.stop import Stopped, StopRequest
 from eddies.particles.resolved_velocity import ResolvedVelocity
@@ -72,6 +74,18 @@ def test_a_stopped_training_is_the_one_never_stopped(comm, tmp_path):
     comm.Barrier()
     assert (tmp_path / "learning.png").read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
     assert {path.name for path in tmp_path.iterdir()} == {"ground_truth.h5", "kernel.h5", "model.h5", "learning.png"}
+
+
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.mpi(1, 2, timeout=30)
+def test_curves_that_cannot_be_written_are_told_by_all(comm, tmp_path, monkeypatch):
+    """At the same step, though the clocks of the ranks differ."""
+    monkeypatch.setattr("eddies.report.learning.curves", lambda history: Figure())
+    training, curves = SimpleNamespace(columns=dict), train.LearningCurves(comm, tmp_path / "nowhere/learning.png")
+    curves(training)
+    monkeypatch.setattr(train, "DRAWING_SECONDS", -1.0 if comm.rank == comm.size - 1 else 1e9)
+    with pytest.raises(ProductError, match="nowhere/learning.png: No such file or directory; check the file"):
+        curves(training)
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -21,7 +21,7 @@ import numpy as np
 from mpi4py import MPI
 
 from eddies.io.contiguous import Block, lay_out, write_arrays
-from eddies.io.hdf5 import ProductError
+from eddies.io.hdf5 import ProductError, in_files
 from eddies.io.manifest import find_damage, hash_file, manifest_text, parse_manifest
 from eddies.parallel.broadcast import first_complaint, on_all_ranks, on_first_rank
 
@@ -69,7 +69,8 @@ class Checkpoint(Mapping):
 
 
 class CheckpointDirectory:
-    """The checkpoints of a run, made with settings of a `fingerprint`. All methods are collective."""
+    """The checkpoints of a run, made with settings of a `fingerprint`. All methods are collective, and all ranks raise
+    a ProductError where rank 0 cannot write or remove a file."""
 
     def __init__(self, comm: MPI.Comm, path: Path, fingerprint: str) -> None:
         self.comm, self.path, self.fingerprint = comm, path, fingerprint
@@ -92,8 +93,9 @@ class CheckpointDirectory:
             on_first_rank(self.comm, lambda: _make_empty(partial))
             regions = on_first_rank(self.comm, lambda: lay_out(partial / STATE, arrays))
             on_all_ranks(self.comm, lambda: write_arrays(self.comm.rank, partial / STATE, regions, arrays))
+            size = on_first_rank(self.comm, lambda: (partial / STATE).stat().st_size)
             content = {"step": step, "format": FORMAT, "fingerprint": self.fingerprint,
-                       "state": hash_file(self.comm, partial / STATE, regions, (partial / STATE).stat().st_size),
+                       "state": hash_file(self.comm, partial / STATE, regions, size),
                        "files": {name: self._hash_whole(name) for name in files}}
             on_first_rank(self.comm, lambda: _finish(partial, final, manifest_text(content)))
         except OSError as error:
@@ -102,7 +104,7 @@ class CheckpointDirectory:
             raise ProductError(f"{final}: cannot be written ({error.strerror or error}); the checkpoints before it are "
                                "intact: once there is room, go on with --resume") from None
         for name in self._names()[KEPT:]:
-            self._remove(name)
+            in_files(self.comm, self.path / name, lambda: _delete(self.path / name))
 
     def newest(self) -> Checkpoint | None:
         """The newest sound checkpoint made with these settings; all else in the directory is removed, with a warning
@@ -116,14 +118,13 @@ class CheckpointDirectory:
             if self.comm.rank == 0:
                 log.warning("%s; this checkpoint is not used", complaint)
             names.pop(0)
-        self._clean({*names, *(found.files if found else ())} if found else set())
+        self._clean(set() if found is None else {*names, *found.files})
         return found
 
     def remove(self) -> None:
         """Remove the directory."""
-        if self.comm.rank == 0 and self.path.exists():
-            shutil.rmtree(self.path)
-        self.comm.Barrier()
+        self.comm.Barrier()  # a rank may still read what is in it
+        in_files(self.comm, self.path, lambda: shutil.rmtree(self.path) if self.path.exists() else None)
 
     def _examine(self, path: Path) -> tuple[dict[str, Any] | None, str | None]:
         manifest = path / MANIFEST
@@ -155,24 +156,12 @@ class CheckpointDirectory:
         return hash_file(self.comm, self.path / name, {"frames": (0, size)}, size)
 
     def _clean(self, kept: set[str]) -> None:
-        if self.comm.rank == 0 and self.path.exists():
-            for path in self.path.iterdir():
+        def clean() -> None:
+            for path in self.path.iterdir() if self.path.exists() else ():
                 if path.name not in kept:
-                    self._delete(path)
-        self.comm.Barrier()
+                    _delete(path)
 
-    def _remove(self, name: str) -> None:
-        if self.comm.rank == 0:
-            self._delete(self.path / name)
-
-    @staticmethod
-    def _delete(path: Path) -> None:
-        if path.is_dir():
-            # Renamed first: what is half deleted no longer looks like a checkpoint.
-            dying = path.with_name(path.name.removesuffix(".partial") + ".partial")
-            shutil.rmtree(path.rename(dying))
-        else:
-            path.unlink()
+        in_files(self.comm, self.path, clean)
 
 
 def _name(step: int) -> str:
@@ -183,6 +172,15 @@ def _make_empty(directory: Path) -> None:
     """Make a directory, in place of any that has its name."""
     shutil.rmtree(directory, ignore_errors=True)
     directory.mkdir(parents=True)
+
+
+def _delete(path: Path) -> None:
+    if path.is_dir():
+        # Renamed first: what is half deleted no longer looks like a checkpoint.
+        dying = path.with_name(path.name.removesuffix(".partial") + ".partial")
+        shutil.rmtree(path.rename(dying))
+    else:
+        path.unlink()
 
 
 def _finish(partial: Path, final: Path, manifest: str) -> None:

@@ -8,10 +8,10 @@ opens the file on every rank by itself.
 import json
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import h5py
 import numpy as np
@@ -19,7 +19,7 @@ from mpi4py import MPI
 
 from eddies.errors import UserError
 from eddies.io.provenance import environment
-from eddies.parallel.broadcast import share_text
+from eddies.parallel.broadcast import on_first_rank, share_text
 from eddies.parallel.stop import Stopped
 from eddies.pipeline import MAKER_OF
 
@@ -30,6 +30,7 @@ FORMAT = 3
 CHUNK_BYTES = 2**20
 # The type of an open product.
 File = h5py.File
+Result = TypeVar("Result")
 
 # Files whose writing was broken off by an exception. Closing one is collective, so it must not happen when
 # Python drops the last reference on one rank alone; they stay open until the process ends.
@@ -38,6 +39,18 @@ _abandoned: list[h5py.File] = []
 
 class ProductError(UserError, RuntimeError):
     """A product is missing, unfinished, damaged or of the wrong kind: the text says which and what to do."""
+
+
+def in_files(comm: MPI.Comm, path: Path, work: Callable[[], Result]) -> Result:
+    """What work with the files at `path` gives that rank 0 does alone, on every rank; all ranks call it.
+
+    Raises on all ranks the UserError of the work, or a ProductError where a file cannot be written, read or removed.
+    """
+    try:
+        return on_first_rank(comm, work)
+    except OSError as error:
+        raise ProductError(f"{error.filename or path}: {error.strerror or error}; check the file, its directory and "
+                           "the space on the disk") from None
 
 
 @contextmanager
@@ -50,7 +63,7 @@ def create_product(comm: MPI.Comm, path: str | Path, kind: str,
     `path` untouched.
 
     Raises:
-        ProductError: the file cannot be made, or there are several ranks and HDF5 is not parallel.
+        ProductError: the file cannot be made or get its name, or there are several ranks and HDF5 is not parallel.
     """
     path = Path(path)
     partial = path.with_name(path.name + ".partial")
@@ -61,8 +74,7 @@ def create_product(comm: MPI.Comm, path: str | Path, kind: str,
         yield file
     except Stopped:  # on all ranks alike, so that they can close the file together
         file.close()
-        if comm.rank == 0:
-            partial.unlink()
+        in_files(comm, partial, partial.unlink)
         raise
     except BaseException:
         if comm.size == 1:
@@ -72,8 +84,7 @@ def create_product(comm: MPI.Comm, path: str | Path, kind: str,
         raise
     file.attrs["complete"] = True
     file.close()
-    if comm.rank == 0:
-        os.replace(partial, path)
+    in_files(comm, path, lambda: os.replace(partial, path))
     comm.Barrier()
 
 

@@ -9,21 +9,25 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from eddies.io.hdf5 import ProductError, create_product, open_product, read_table, write_table
+from eddies.io.hdf5 import ProductError, create_product, in_files, open_product, read_table, write_table
 
 
 def save_weights(comm: MPI.Comm, path: str | Path, kind: str, description: Mapping[str, Any],
                  tensors: Mapping[str, np.ndarray], provenance: Mapping[str, Any],
                  tables: Mapping[str, Mapping[str, np.ndarray]] | None = None) -> None:
-    """Write rank 0's tensors, a JSON-able description and small tables as one product; all ranks call it."""
-    if comm.rank == 0:
+    """Write rank 0's tensors, a JSON-able description and small tables as one product; all ranks call it.
+
+    ProductError on all ranks where it cannot be written.
+    """
+    def write() -> None:
         with create_product(MPI.COMM_SELF, path, kind, {"ranks": comm.size, **provenance}) as file:
             file.attrs["description"] = json.dumps(dict(description))
             file.attrs["tensors"] = json.dumps({name: _signature(tensor) for name, tensor in tensors.items()})
             write_table(file, "weights", tensors)
             for name, columns in (tables or {}).items():
                 write_table(file, name, columns)
-    comm.Barrier()
+
+    in_files(comm, Path(path), write)
 
 
 def load_weights(comm: MPI.Comm, path: str | Path, kind: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:

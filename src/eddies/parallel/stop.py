@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+import os
 import signal
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from mpi4py import MPI
 
+from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.reduction import global_max
 
 LOOK_SECONDS = 1.0  # between two looks for the file: a look at a network file system may take longer than a step
@@ -50,8 +53,8 @@ class StopRequest:
         """Whether any rank knows a reason to stop; the same answer on all ranks, which must all call."""
         if self._answer <= _CHECKPOINT:
             self._answer = int(global_max(self.comm, self._own_answer()))
-            if self._answer > _CHECKPOINT and self.comm.rank == 0 and self.stop_file is not None:
-                self.stop_file.unlink(missing_ok=True)
+            if self._answer > _CHECKPOINT and self.stop_file is not None:
+                on_first_rank(self.comm, partial(self.stop_file.unlink, missing_ok=True))
         return self._answer > _CHECKPOINT
 
     def check(self) -> None:
@@ -83,7 +86,7 @@ class StopRequest:
         now = time.monotonic()
         if self.stop_file is not None and now >= self._look_at:
             self._look_at = now + LOOK_SECONDS
-            if self.stop_file.exists():
+            if os.path.exists(self.stop_file):  # raises nothing, which the others would not know of
                 return _FILE
         if now >= self._end:
             return _TIME

@@ -18,7 +18,7 @@ from eddies.particles.neighborhood import LocalParticles, Neighborhood
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.rank_sums import mean_over_ranks
 from eddies.particles.scaled_pairs import ScaledPairs
-from eddies.scene.values import SceneError
+from eddies.particles.terms.term import TermError
 
 if TYPE_CHECKING:
     from eddies.particles.resolved_flow import ResolvedFlow
@@ -81,7 +81,7 @@ class Context:
     def local(self) -> LocalParticles:
         """The particles that this rank sees, ghosts included, without columns."""
         if self._neighborhood is None:
-            raise SceneError(UNSEEN)
+            raise TermError(UNSEEN)
         return self._neighborhood.local(self.particles)
 
     @cached_property
@@ -97,12 +97,12 @@ class Context:
     def column(self, name: str) -> Tensor:
         """"velocity" (s, 3) or "density" (s,) of the particles that this rank sees, owned first; collective."""
         if self._neighborhood is None:
-            raise SceneError(UNSEEN)
+            raise TermError(UNSEEN)
         if name not in self._columns:
             owned = self.density if name == "density" else getattr(self.particles, name)
             if owned is None:
-                raise SceneError(f'no term of this model reads "{name}": add it to the `reads` of the settings; or the '
-                                 "particles have none")
+                raise TermError(f'no term of this model reads "{name}": add it to the `reads` of the settings; or the '
+                                "particles have none")
             self._columns[name] = self._neighborhood.column(owned)
         return self._columns[name]
 
@@ -110,7 +110,7 @@ class Context:
     def resolved(self) -> ResolvedFlow:
         """The velocity that the particles resolve; collective."""
         if self._resolution is None:
-            raise SceneError('no term of this model reads "resolved": add it to the `reads` of the settings')
+            raise TermError('no term of this model reads "resolved": add it to the `reads` of the settings')
         return self._resolution.of(self.particles, self._time)
 
     def without_mean(self, rows: Tensor) -> Tensor:
@@ -127,7 +127,7 @@ class Context:
 
     def forget_sums(self, term: object) -> None:
         """Take a term's sums over pairs anew when they are asked for next: its parameters are others."""
-        self._sums.pop(term, None)
+        self._sums = {summand: sums for summand, sums in self._sums.items() if summand is not term}
 
     @cached_property
     def moments(self) -> Moments:

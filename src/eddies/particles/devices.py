@@ -6,19 +6,23 @@ import os
 
 import torch
 
+from eddies.errors import UserError
 from eddies.parallel.communicator import Comm
 from eddies.parallel.node import node_rank
-from eddies.scene.values import SceneError
+
+
+class DeviceError(UserError, RuntimeError):
+    """There is no such device here."""
 
 
 def prepare_torch(device: str, comm: Comm) -> torch.device:
     """The device of this rank; sets the number of threads to OMP_NUM_THREADS (default 1 a rank).
 
-    Ranks share the GPUs of a node in turn. Raises SceneError where a GPU is asked for and there is none.
+    Ranks share the GPUs of a node in turn. Raises DeviceError where a GPU is asked for and there is none.
     """
     torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
     if device == "cpu":
         return torch.device("cpu")
     if not torch.cuda.is_available():
-        raise SceneError('device = "cuda": torch finds no GPU here; set device = "cpu"')
+        raise DeviceError('device "cuda": torch finds no GPU here; choose the device "cpu"')
     return torch.device("cuda", node_rank(comm) % torch.cuda.device_count())

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import cast
 
 import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
+from eddies.errors import UserError
+from eddies.import_path import is_path, load, short_name
 from eddies.parallel.reduction import any_rank
 from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.rates import Rates, total
 from eddies.particles.terms.presets import TERMS
 from eddies.particles.terms.settings import TermSettings
-from eddies.particles.terms.term import PairTerm, Term
-from eddies.scene.composition import is_path, load, short_name
-from eddies.scene.values import SceneError
+from eddies.particles.terms.term import PairTerm, Term, TermError
 
 
 class LagrangianModel(nn.Module):
@@ -29,16 +30,17 @@ class LagrangianModel(nn.Module):
     flow : what they were made for, and the units of their rates.
 
     Terms that do not read the density come first; what they give of it is the density that the others see. What no term
-    reads is not built, and the density is not computed where nobody reads it. Raises SceneError where a term both reads
+    reads is not built, and the density is not computed where nobody reads it. Raises TermError where a term both reads
     the density and gives a part of it.
     """
 
     def __init__(self, terms: Mapping[str, Term], flow: FlowUnits) -> None:
         super().__init__()
-        self.terms, self.flow = nn.ModuleDict(terms), flow
+        self.terms = cast(Mapping[str, Term], nn.ModuleDict(terms))  # which does not know the type of its modules
+        self.flow = flow
         for name, term in self.terms.items():
             if "density" in term.reads and "density" in term.gives:
-                raise SceneError(f'term "{name}": reads the density and gives a part of it; it can do only one of both')
+                raise TermError(f'term "{name}": reads the density and gives a part of it; it can do only one of both')
 
     @property
     def reads(self) -> set[str]:
@@ -89,8 +91,9 @@ class LagrangianModel(nn.Module):
             context.sum_pairs([term for term in anew if isinstance(term, PairTerm) and not _everywhere(term)])
             found = [kept[name].at(context.rows) if name in kept else _evaluated(term, context) for name, term in stage]
             sums.append(self._at_particles(total(found), context))
-            if context.density is None and self.density_is_given:
-                context.density = context.flow.scales.density_mean + sums[0].density
+            deviation = sums[0].density
+            if context.density is None and self.density_is_given and deviation is not None:
+                context.density = context.flow.scales.density_mean + deviation
         result = total(sums)
         if result.acceleration is None:
             at_rest = torch.zeros_like(context.particles.velocity)
@@ -106,7 +109,7 @@ class LagrangianModel(nn.Module):
     @torch.no_grad()
     def require_linear(self, context: Context) -> None:
         """Check terms that declare themselves linear in their parameters at other parameters than what is kept was
-        made with; raises SceneError where one is not. Collective."""
+        made with; raises TermError where one is not. Collective."""
         for name, kept in self.linear_rates(context).items():
             term, sizes = self.terms[name], [parameter.shape for parameter in kept.parameters]
             others = [torch.linspace(0.3, 1.9, shape.numel()).reshape(shape).to(parameter)
@@ -117,8 +120,8 @@ class LagrangianModel(nn.Module):
             wrong = [what for what in _GIVEN if getattr(direct, what) is not None and not torch.allclose(
                 getattr(replace(kept, parameters=others).at(None), what), getattr(direct, what), rtol=1e-3, atol=1e-6)]
             if any_rank(context.comm, bool(wrong)):
-                raise SceneError(f'term "{name}": declares itself linear in its parameters, and is not; remove its '
-                                 "linear = True")
+                raise TermError(f'term "{name}": declares itself linear in its parameters, and is not; remove its '
+                                "linear = True")
 
     @property
     def _stages(self) -> list[list[tuple[str, Term]]]:
@@ -140,7 +143,7 @@ class LagrangianModel(nn.Module):
             parts.append(Rates(acceleration=context.without_mean(values[:, :3])).at(context.rows))
         if pressure is not None:
             scales = context.flow.scales
-            parts.append(Rates(density=values[:, -1] * (scales.density_mean / scales.sound_speed**2)))
+            parts.append(Rates(density=values[:, -1] * (scales.density_mean / scales.required("sound_speed") ** 2)))
         return total(parts)
 
     def _linear_rates(self, term: Term, context: Context) -> LinearRates:
@@ -172,7 +175,7 @@ class LinearRates:
 
     origin: Rates
     slopes: dict[str, Tensor]
-    parameters: list[nn.Parameter]
+    parameters: Sequence[Tensor]
 
     def at(self, rows: Tensor | None) -> Rates:
         """With acceleration and rate of some rows (k,) of the particles, or of all; differentiable in the
@@ -203,12 +206,12 @@ def _evaluated(term: Term, context: Context) -> Rates:
 
 
 def _required(found: object, term: Term) -> Rates:
-    """What a term's forward returned; SceneError unless these are Rates."""
+    """What a term's forward returned; TermError unless these are Rates."""
     if not isinstance(found, Rates):
-        raise SceneError(f"{type(term).__name__}: forward returns a {type(found).__name__}; it must return Rates")
+        raise TermError(f"{type(term).__name__}: forward returns a {type(found).__name__}; it must return Rates")
     if "density" in term.gives and found.density is None and found.pressure_modes is None:
-        raise SceneError(f'{type(term).__name__}: declares that it gives "density", and returns none; take it out of '
-                         "`gives` of its settings, or return density or pressure_modes")
+        raise TermError(f'{type(term).__name__}: declares that it gives "density", and returns none; take it out of '
+                        "`gives` of its settings, or return density or pressure_modes")
     return found
 
 
@@ -221,7 +224,8 @@ def build_model(settings: Mapping[str, TermSettings], paths: Iterable[str], flow
     paths : the word or import path of each.
     flow : what it is made for.
 
-    Raises SceneError where an import path does not lead to a Term, or it cannot be made.
+    Raises TermError where an import path does not lead to a Term, or it cannot be made; ImportPathError where it leads
+    nowhere.
     """
     terms = {short_name(path): _build_term(path, settings[short_name(path)], flow) for path in paths}
     return LagrangianModel(terms, flow)
@@ -230,12 +234,12 @@ def build_model(settings: Mapping[str, TermSettings], paths: Iterable[str], flow
 def _build_term(path: str, settings: TermSettings, flow: FlowUnits) -> Term:
     kind = load(path if is_path(path) else TERMS[path][0])
     if not (isinstance(kind, type) and issubclass(kind, Term)):
-        raise SceneError(f'term "{path}": must be a class derived from eddies.Term')
+        raise TermError(f'term "{path}": must be a class derived from eddies.Term')
     if not isinstance(settings, TermSettings):
-        raise SceneError(f'term "{path}": its Settings must be a frozen dataclass derived from eddies.TermSettings')
+        raise TermError(f'term "{path}": its Settings must be a frozen dataclass derived from eddies.TermSettings')
     try:
         return kind(settings, flow).double()
-    except SceneError:
-        raise
+    except UserError as error:
+        raise TermError(f'term "{path}": {error}') from error
     except Exception as error:  # of a class of the user's, anything
-        raise SceneError(f'term "{path}": cannot be made: {type(error).__name__}: {error}') from error
+        raise TermError(f'term "{path}": cannot be made: {type(error).__name__}: {error}') from error

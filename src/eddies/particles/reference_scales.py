@@ -56,6 +56,13 @@ class ReferenceScales:
             if name not in MAY_VANISH and value is not None and not (math.isfinite(value) and value > 0):
                 raise ValueError(f"reference scale {name} = {value}: must be finite and positive")
 
+    def required(self, name: str) -> float:
+        """A scale that must be there; ValueError where the flow has no density, and so none of it or of sound."""
+        value = getattr(self, name)
+        if value is None:
+            raise ValueError(f"reference scale {name}: a flow without density has none")
+        return value
+
     def to_dict(self) -> dict[str, float | None]:
         """The scales by name, ready for JSON."""
         return {name: None if value is None else float(value) for name, value in asdict(self).items()}

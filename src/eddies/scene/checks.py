@@ -11,10 +11,10 @@ from collections.abc import Iterator
 from itertools import chain
 from typing import TYPE_CHECKING
 
-from eddies.scene.composition import is_path, load
+from eddies.import_path import ImportPathError, is_path, load
 from eddies.scene.rules import quoted
 from eddies.scene.sections import Eulerian, Wcsph
-from eddies.scene.values import SceneError, import_paths
+from eddies.scene.values import import_paths
 
 if TYPE_CHECKING:
     from eddies.scene.scene import Scene
@@ -45,7 +45,7 @@ def foreign_problems(scene: Scene) -> Iterator[str]:
         for key, path in import_paths(part) if part else ():
             try:
                 found = load(path)
-            except SceneError as error:
+            except ImportPathError as error:
                 yield f"[{section}] {key}: {error}"
                 continue
             lacking = [name for name in REQUIRED.get(key, ()) if not hasattr(found, name)]

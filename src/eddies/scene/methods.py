@@ -1,6 +1,6 @@
 """What can move the particles of a rollout: the words of [simulation] method."""
 
-from eddies.scene.composition import is_path, load
+from eddies.import_path import is_path, load
 from eddies.scene.rules import quoted
 from eddies.scene.values import SceneError
 

@@ -6,9 +6,9 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
+from eddies.import_path import ImportPathError, is_path, load, short_name
 from eddies.particles.terms.presets import DEFAULT_PRESET, PRESETS, TERMS
 from eddies.particles.terms.settings import GIVES, READS, TermSettings
-from eddies.scene.composition import is_path, load, short_name
 from eddies.scene.reader import read_section
 from eddies.scene.rules import nearest, quoted
 from eddies.scene.values import KeyProblem, SceneError, Section, choice, import_paths, number, sub_sections, text, texts
@@ -98,7 +98,8 @@ def replace_terms(table: dict[str, Any], keys: set[str]) -> None:
 def settings_class(term: str) -> type[TermSettings]:
     """The class of a term's settings: of a word of ours, or `Settings` of the class that an import path names.
 
-    Raises SceneError: the path names no class of a term, or its Settings are no settings.
+    Raises ImportPathError where the path leads nowhere; SceneError where it names no class of a term, or its Settings
+    are no settings.
     """
     if not is_path(term):
         return load(TERMS[term][1])
@@ -118,7 +119,7 @@ def _settings(term: str, name: str, preset: Mapping[str, Any],
     """The settings of a term: as given, or made of the keys that are given over those of the preset."""
     try:
         kind = settings_class(term)
-    except SceneError as error:
+    except (ImportPathError, SceneError) as error:
         raise SceneError(f"[model] terms: {error}", "model.terms") from None
     if isinstance(given, Section):
         if type(given) is not kind:

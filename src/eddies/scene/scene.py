@@ -11,9 +11,9 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from eddies.import_path import origins, search_in
 from eddies.pipeline import STAGES
 from eddies.scene.checks import first_inconsistency
-from eddies.scene.composition import origins, search_in
 from eddies.scene.model import Model, replace_terms
 from eddies.scene.reader import apply_overrides, find_document, parse_document, read_section, read_text, write_section
 from eddies.scene.sections import (BOX_LENGTH, DEFAULT_WINDOW, NEIGHBORS, Eulerian, Flow, Forcing, Horizons, Initial,

@@ -7,7 +7,7 @@ cube [0, 2 pi)^3, the mean density is 1, and times are in the unit that follows 
 import math
 from dataclasses import dataclass
 
-from eddies.scene.composition import is_path, load
+from eddies.import_path import is_path, load
 from eddies.scene.methods import METHODS, needs_of
 from eddies.scene.values import Section, choice, integer, integers, named, number, section, text
 

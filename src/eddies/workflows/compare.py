@@ -12,11 +12,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from eddies.io.hdf5 import ProductError, open_product, read_attributes, read_provenance
+from eddies.io.hdf5 import ProductError, in_files, open_product, read_attributes, read_provenance
 from eddies.parallel.communicator import Comm
 from eddies.report.comparison import ErrorAgainstTime, run_record, sections
 from eddies.report.figures import draw
-from eddies.report.page import write_page
+from eddies.report.page import Section, write_page
 from eddies.scene.comparison import BASELINE, Comparison
 from eddies.scene.scene import SceneError
 from eddies.workflows.variants.rows import COLUMNS, machine, notes, rows
@@ -52,10 +52,11 @@ def run(comparison: Comparison, comm: Comm, output: Path, resume: bool, run_stag
                 variant.attempt(errors, lambda: variant.time_block(comm, run_stages))
     errors.Free()
     alone = comm.Split(comm.rank)
-    table = rows(comparison, runs, alone, comm.size) if comm.rank == 0 else []
-    alone.Free()
+    try:
+        table = in_files(comm, output, lambda: rows(comparison, runs, alone, comm.size))
+    finally:
+        alone.Free()
     write(comparison, table, comm, output)
-    comm.Barrier()
 
 
 def check_directories(runs: Sequence[VariantRun]) -> None:
@@ -83,14 +84,21 @@ def check_ground_truth(comparison: Comparison, variant: VariantRun, comm: Comm) 
 
 
 def write(comparison: Comparison, table: list[dict[str, Any]], comm: Comm, output: Path) -> None:
-    """Write rank 0's rows and what is drawn of them; all ranks call it."""
+    """Write the rows and what is drawn of them; all ranks call it.
+
+    Raises SceneError where rank 0 cannot write.
+    """
     parts = []
     if comm.rank == 0:
         parts = sections(ErrorAgainstTime(table, comparison.subject, BASELINE), comparison.turnovers)
     draw(comm, parts)
-    if comm.rank > 0:
-        return
-    computer = machine(comparison.base_scene.device, comm.size)
+    in_directories(comm, lambda: write_files(comparison, table, parts, comm.size, output))
+
+
+def write_files(comparison: Comparison, table: list[dict[str, Any]], parts: Sequence[Section], ranks: int,
+                output: Path) -> None:
+    """Write rows as CSV and JSON, and the page of drawn sections; one rank calls it."""
+    computer = machine(comparison.base_scene.device, ranks)
     with open(output / "comparison.csv", "w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, COLUMNS)
         writer.writeheader()

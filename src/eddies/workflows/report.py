@@ -19,7 +19,7 @@ from eddies.analysis.isotropic_turbulence import StationarySpan
 from eddies.analysis.spectra import energy_spectrum, vorticity
 from eddies.analysis.tracer_statistics import tracer_statistics
 from eddies.io.fields import FieldSeries
-from eddies.io.hdf5 import File, ProductError, open_product, read_attributes, read_provenance, read_table
+from eddies.io.hdf5 import File, ProductError, in_files, open_product, read_attributes, read_provenance, read_table
 from eddies.io.trajectories import Trajectory
 from eddies.parallel.communicator import Comm
 from eddies.parallel.stop import StopRequest
@@ -60,18 +60,18 @@ def run(directory: str | Path, comm: Comm) -> None:
     """Write report/index.html, report/figures/*.png and report/metrics.json of a run directory; all ranks
     call it.
 
-    Raises ProductError if the directory holds no product, or a damaged one.
+    Raises ProductError if the directory holds no product, or a damaged one, or the report cannot be written.
     """
-    directory, record, sections = Path(directory), None, []
-    alone = comm.Split(comm.rank)
-    if comm.rank == 0:
-        record, sections = _read(directory, alone)
-    alone.Free()
-    draw(comm, sections)
-    if comm.rank == 0:
-        _write_files(directory / "report", record, sections)
+    directory, alone = Path(directory), comm.Split(comm.rank)
+    found: list[tuple[RunRecord, list[Section]]] = []  # of rank 0: figures are not for sending around
+    try:
+        in_files(comm, directory, lambda: found.append(_read(directory, alone)))
+    finally:
+        alone.Free()
+    draw(comm, [section for _, sections in found for section in sections])
+    in_files(comm, directory / "report", lambda: _write_files(directory / "report", *found[0]))
+    for _, sections in found:
         _log_main_numbers(sections)
-    comm.Barrier()
 
 
 def _read(directory: Path, alone: Comm) -> tuple[RunRecord, list[Section]]:

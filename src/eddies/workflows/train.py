@@ -8,11 +8,12 @@ from pathlib import Path
 
 from eddies.clock import ProgressLine
 from eddies.io.checkpoint import CheckpointDirectory
-from eddies.io.hdf5 import open_product
+from eddies.io.hdf5 import in_files, open_product
 from eddies.io.weights import save_weights
 from eddies.learning.training import Training, TrainingDiverged
 from eddies.parallel.communicator import Comm
 from eddies.parallel.halo import HaloError
+from eddies.parallel.reduction import any_rank
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import Stopped, StopRequest
 from eddies.particles.devices import prepare_torch
@@ -109,20 +110,23 @@ def take_all_steps(training: Training, checkpoints: CheckpointDirectory, stop: S
 
 
 class LearningCurves:
-    """Draws the history of a training to a file now and then, on rank 0."""
+    """Draws the history of a training to a file now and then; rank 0 does it, and all ranks raise a ProductError where
+    it cannot."""
 
     def __init__(self, comm: Comm, path: Path) -> None:
         self.comm, self.path, self._drawn = comm, path, time.monotonic()
 
     def __call__(self, training: Training) -> None:
-        """Draw if it is time."""
-        if time.monotonic() - self._drawn > DRAWING_SECONDS:
+        """Draw if it is time; all ranks call it, with one small message."""
+        if any_rank(self.comm, time.monotonic() - self._drawn > DRAWING_SECONDS):
             self.draw(training)
 
     def draw(self, training: Training) -> None:
-        """Draw now."""
-        if self.comm.rank == 0:
+        """Draw now; all ranks call it."""
+        def write() -> None:
             from eddies.report import figures  # matplotlib takes a while to start
             from eddies.report.learning import curves
             self.path.write_bytes(figures.png(curves(training.columns())))
+
+        in_files(self.comm, self.path, write)
         self._drawn = time.monotonic()

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from eddies.particles.flow_units import FlowUnits
-from eddies.scene.values import SceneError
+from eddies.particles.terms.term import TermError
 from tests.particles.clouds import CUTOFF, FLOW, LENGTH, NEIGHBORS, PAIR_MODELS, SCALES, cloud, model, rates, state
 
 pytestmark = pytest.mark.mpi(1)
@@ -63,7 +63,7 @@ def test_the_flux_is_in_units_of_the_density_rate_and_has_weights_of_its_own():
 
 
 def test_zero_at_first_wants_a_network_whose_last_layer_is_known():
-    with pytest.raises(SceneError, match="zero_at_first"):
+    with pytest.raises(TermError, match='term "density-flux": zero_at_first: needs network = "dense"'):
         model(density_flux=dict(zero_at_first=True, network="tests.particles.terms.test_density_transport:Network"))
 
 

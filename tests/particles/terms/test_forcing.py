@@ -3,6 +3,7 @@ import pytest
 import torch
 
 from eddies.parallel.reduction import global_sum
+from eddies.particles.terms.term import TermError
 from eddies.scene.values import SceneError
 from tests.particles.clouds import LENGTH, alone, along, distributed, dynamics_of, model, state
 
@@ -69,6 +70,6 @@ def test_what_cannot_be_forced_is_refused(comm):
     with pytest.raises(SceneError, match="wavenumber"):
         model(forcing=dict(injection_rate=1.0, wavenumber=1.0))
     slab, particles = alone(torch.rand(4, 3, dtype=torch.float64), torch.zeros(4, 3, dtype=torch.float64))
-    with pytest.raises(ValueError, match="no energy"):
+    with pytest.raises(TermError, match="no energy"):
         force_on(slab, particles, 1.0)
     assert torch.equal(force_on(slab, particles, 0.0), particles.velocity)

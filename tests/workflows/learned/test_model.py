@@ -117,4 +117,4 @@ def test_a_network_that_cannot_be_made_has_one_error(own):
     scene = load_scene("tiny", ["model.pairs.network=own_networks:mine"])
     with pytest.raises(SceneError) as error:
         scene_model(scene, SCALES)
-    assert 'network = "own_networks:mine"' in str(error.value) and message in str(error.value)
+    assert str(error.value).startswith('[model] terms: term "pairs": network = "own_networks:mine": ' + message)

@@ -11,8 +11,7 @@ from eddies.particles.rates import Rates
 from eddies.particles.scaled_pairs import ScaledPairs
 from eddies.particles.terms import settings as declared
 from eddies.particles.terms.pair_basis import build_network
-from eddies.particles.terms.term import PairTerm
-from eddies.scene.values import SceneError
+from eddies.particles.terms.term import PairTerm, TermError
 
 
 class DensityFlux(PairTerm):
@@ -20,6 +19,7 @@ class DensityFlux(PairTerm):
     rate and NN_rho a network of its own."""
 
     Settings = declared.DensityFlux
+    settings: declared.DensityFlux
 
     def __init__(self, settings: declared.DensityFlux, flow: FlowUnits) -> None:
         super().__init__(settings, flow)
@@ -28,8 +28,8 @@ class DensityFlux(PairTerm):
         self.width = max(settings.hidden)
         if settings.zero_at_first:
             if not isinstance(self.network, DenseNetwork):
-                raise SceneError(f'zero_at_first = true: needs network = "dense", not "{settings.network}", whose last '
-                                 "layer is not known; leave one of the two out")
+                raise TermError(f'zero_at_first: needs network = "dense", not "{settings.network}", whose last '
+                                "layer is not known; leave one of the two out")
             self.network.zero_outputs()
 
     def features(self, pairs: ScaledPairs) -> Tensor:
@@ -42,5 +42,5 @@ class DensityFlux(PairTerm):
 
     def rates_of(self, sums: Tensor, context: Context) -> Rates:
         """The rate of density."""
-        rate = context.flow.scales.density_rate / context.flow.neighbors * sums[0]
+        rate = context.flow.scales.required("density_rate") / context.flow.neighbors * sums[0]
         return Rates(density_rate=rate.to(context.particles.velocity.dtype))

@@ -27,6 +27,7 @@ class EddyViscosity(PairTerm):
     """
 
     Settings = declared.EddyViscosity
+    settings: declared.EddyViscosity
     parity, mutual = -torch.ones(3), True
 
     def __init__(self, settings: declared.EddyViscosity, flow: FlowUnits) -> None:

@@ -13,8 +13,7 @@ from eddies.particles.flow_units import FlowUnits
 from eddies.particles.rank_sums import sum_over_ranks
 from eddies.particles.rates import Rates
 from eddies.particles.terms import settings as declared
-from eddies.particles.terms.term import Term
-from eddies.scene.values import SceneError
+from eddies.particles.terms.term import Term, TermError
 
 
 class Forcing(Term):
@@ -26,6 +25,7 @@ class Forcing(Term):
     """
 
     Settings = declared.Forcing
+    settings: declared.Forcing
     linear = True
 
     def __init__(self, settings: declared.Forcing, flow: FlowUnits) -> None:
@@ -37,7 +37,7 @@ class Forcing(Term):
         self._half = torch.tensor(half, dtype=torch.float64)
 
     def forward(self, context: Context) -> Rates:
-        """The acceleration. Raises SceneError if the forced modes carry no energy that could be amplified."""
+        """The acceleration. Raises TermError if the forced modes carry no energy that could be amplified."""
         particles, wavevectors = context.particles, self._half * (2 * math.pi / context.decomposition.length)
         wavevectors = wavevectors.to(particles.position)
         phase = particles.position @ wavevectors.T
@@ -45,8 +45,8 @@ class Forcing(Term):
         modes, structure = _modes(context, waves, wavevectors)
         energy = 2 * (modes * modes).sum()
         if energy == 0 and self.settings.injection_rate > 0:
-            raise SceneError("the particles have no energy at the forced wavenumbers that could be amplified; leave "
-                             "the forcing out, or let its wavenumber reach to where they move")
+            raise TermError("the particles have no energy at the forced wavenumbers that could be amplified; leave "
+                            "the forcing out, or let its wavenumber reach to where they move")
         amplitude = self.settings.injection_rate / energy if energy > 0 else 0.0
         mean = torch.einsum("ck,ckd->d", structure, modes)
         force = torch.einsum("cnk,ckd->nd", waves, modes) - mean

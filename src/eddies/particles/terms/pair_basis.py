@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from torch import Tensor, nn
 
+from eddies.import_path import is_path, load
 from eddies.particles import moments
 from eddies.particles.context import Context
 from eddies.particles.dense_network import DenseNetwork
 from eddies.particles.terms.settings import NetworkSettings
-from eddies.scene.composition import is_path, load
-from eddies.scene.values import SceneError
+from eddies.particles.terms.term import TermError
 
 
 def along_separation(sums: Tensor, basis: str, context: Context) -> Tensor:
@@ -33,7 +33,7 @@ def acceleration(scaled: Tensor, context: Context) -> Tensor:
 def build_network(settings: NetworkSettings, outputs: int, seed: int) -> nn.Module:
     """The network of a term's settings: from features (inputs, m) of pairs to outputs (outputs, m).
 
-    One of the user's own is made as Network(inputs, hidden, outputs, seed). Raises SceneError if it cannot be, or is no
+    One of the user's own is made as Network(inputs, hidden, outputs, seed). Raises TermError if it cannot be, or is no
     torch.nn.Module.
     """
     inputs = len(settings.inputs) + ("density" in settings.inputs)
@@ -41,9 +41,9 @@ def build_network(settings: NetworkSettings, outputs: int, seed: int) -> nn.Modu
         return DenseNetwork(inputs, settings.hidden, outputs, seed)
     kind = load(settings.network)
     if not (isinstance(kind, type) and issubclass(kind, nn.Module)):
-        raise SceneError(f'network = "{settings.network}": must be a class derived from torch.nn.Module')
+        raise TermError(f'network = "{settings.network}": must be a class derived from torch.nn.Module')
     try:
         return kind(inputs, tuple(settings.hidden), outputs, seed)
     except TypeError as error:
-        raise SceneError(f'network = "{settings.network}": cannot be made with (inputs, hidden, outputs, seed): '
-                         f"{error}") from error
+        raise TermError(f'network = "{settings.network}": cannot be made with (inputs, hidden, outputs, seed): '
+                        f"{error}") from error

@@ -26,6 +26,7 @@ class PairNetwork(PairTerm):
     """
 
     Settings = declared.PairNetwork
+    settings: declared.PairNetwork
     parity = -torch.ones(6)
 
     def __init__(self, settings: declared.PairNetwork, flow: FlowUnits) -> None:

@@ -13,6 +13,7 @@ class Pressure(Term):
     that belongs to p: no density equation, no sound."""
 
     Settings = declared.Pressure
+    settings: declared.Pressure
     linear = True
 
     def forward(self, context: Context) -> Rates:

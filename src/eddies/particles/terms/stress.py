@@ -23,6 +23,7 @@ class Stress(Term):
     """
 
     Settings = declared.Stress
+    settings: declared.Stress
     linear = True
 
     def forward(self, context: Context) -> Rates:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -13,7 +15,7 @@ from eddies.particles.smoothing_kernels import CubicSpline, SmoothingKernel, Wen
 from eddies.particles.terms import settings as declared
 from eddies.particles.terms.term import PairTerm
 
-KERNELS: dict[str, type[SmoothingKernel]] = {"cubic-spline": CubicSpline, "wendland": WendlandC2}
+KERNELS: dict[str, Callable[[float], SmoothingKernel]] = {"cubic-spline": CubicSpline, "wendland": WendlandC2}
 
 
 def particle_mass(flow: FlowUnits) -> float:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
+from eddies.errors import UserError
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.rates import Rates
 from eddies.particles.terms.settings import TermSettings
@@ -15,6 +16,10 @@ from eddies.particles.terms.settings import TermSettings
 if TYPE_CHECKING:
     from eddies.particles.context import Context
     from eddies.particles.scaled_pairs import ScaledPairs
+
+
+class TermError(UserError, ValueError):
+    """A term cannot be made of its settings, or does other than it declares: the text says which, and what to do."""
 
 
 class Term(nn.Module):

@@ -40,7 +40,7 @@ class WCSPH(PairTerm):
         self.density = flow.scales.density_mean
         self.sound_speed, self.alpha, self.beta, self.exponent = (
             nn.Parameter(torch.tensor(value, dtype=torch.float64))
-            for value in (flow.scales.sound_speed, settings.alpha, settings.beta, settings.exponent))
+            for value in (flow.scales.required("sound_speed"), settings.alpha, settings.beta, settings.exponent))
 
     def pair_values(self, pairs: ScaledPairs) -> Tensor:
         """What each pair (i, j) accelerates i by, (3, m)."""

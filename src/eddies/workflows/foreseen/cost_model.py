@@ -25,8 +25,8 @@ from eddies.scene.scene import Initial, Scene
 from eddies.spectral.fourier_passes import BLOCK_BYTES
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.time_stepping import STEPPERS
-from eddies.workflows.dns import build_fluid, build_step_limit, initial_state
 from eddies.workflows.foreseen.estimates import expected_turbulence, largest_wavenumber
+from eddies.workflows.ground_truth.scene_flow import build_fluid, build_step_limit, initial_state
 
 PROBE_CELLS = 64
 EVALUATIONS = 4              # of the nonlinear term in a step, of either stepper

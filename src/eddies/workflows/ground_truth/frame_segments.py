@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from eddies.io.fields import FieldSeries, FieldWriter
-from eddies.io.hdf5 import File, create_product, open_product
+from eddies.io.hdf5 import File, create_product, in_files, open_product
 from eddies.io.trajectories import Trajectory, TrajectoryWriter
 from eddies.parallel.communicator import Comm
 from eddies.parallel.migration import id_block
@@ -35,9 +35,7 @@ class FrameSegments:
         """Begin a segment, unless one is open: `trajectory` and `fields` take its frames."""
         if self._name:
             return
-        if self.comm.rank == 0:
-            self.directory.mkdir(exist_ok=True)
-        self.comm.Barrier()
+        in_files(self.comm, self.directory, lambda: self.directory.mkdir(exist_ok=True))
         self._name = f"frames-{step:08d}.h5"
         file = self._file.enter_context(create_product(self.comm, self.directory / self._name, "frames", {}))
         self.trajectory, self.fields = self._writers(file)

@@ -8,8 +8,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from typing import Any
 
+from eddies.import_path import short_name
 from eddies.particles.reference_scales import ReferenceScales
-from eddies.scene.composition import short_name
 from eddies.scene.rules import quoted
 from eddies.scene.scene import Scene
 

@@ -16,6 +16,7 @@ from eddies.particles.feature_range import FeatureRange
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.model import LagrangianModel, build_model
 from eddies.particles.reference_scales import ReferenceScales
+from eddies.particles.terms.term import TermError
 from eddies.scene.scene import Scene, SceneError
 from eddies.workflows.learned.description import differences
 
@@ -28,7 +29,7 @@ def scene_model(scene: Scene, scales: ReferenceScales) -> LagrangianModel:
     flow = FlowUnits(scales, scene.interaction_radius, scene.neighbors, scene.seed)
     try:
         return build_model(scene.model.settings, scene.model.terms, flow)
-    except SceneError as error:
+    except TermError as error:
         raise SceneError(f"[model] terms: {error}") from None
 
 

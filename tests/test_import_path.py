@@ -2,8 +2,7 @@
 
 import pytest
 
-from eddies.scene.composition import load, origins, search_in, short_name
-from eddies.scene.scene import SceneError
+from eddies.import_path import ImportPathError, load, origins, search_in, short_name
 
 
 def test_what_a_path_names(own):
@@ -34,7 +33,7 @@ def test_bad_path(own, path, message):
     own("own_hungry", "import own_missing\n")
     own("own_broken", "1 / 0\n")
     own("own_odd", "class :\n")
-    with pytest.raises(SceneError) as error:
+    with pytest.raises(ImportPathError) as error:
         load(path)
     assert message in str(error.value)
 

@@ -1,6 +1,6 @@
-"""Classes that a scene names: by a word of this package, or by an import path "module:name" of the user's.
+"""Import paths "module:name": classes and functions of the user's, where a word names one of this package.
 
-A path is imported where a scene that the user runs names it, and nowhere else: never because a file does.
+A path is imported where a scene or a program that the user runs names it, and nowhere else: never because a file does.
 """
 
 from __future__ import annotations
@@ -13,7 +13,11 @@ from importlib import import_module, metadata
 from pathlib import Path
 from typing import Any
 
-from eddies.scene.values import SceneError
+from eddies.errors import UserError
+
+
+class ImportPathError(UserError, ValueError):
+    """An import path leads nowhere."""
 
 
 def is_path(name: str) -> bool:
@@ -36,22 +40,22 @@ def search_in(folder: str | Path) -> None:
 def load(path: str) -> Any:
     """What an import path "module:name" names.
 
-    Raises SceneError: it is not of this form, there is no such module or name, or the module raises while it is
+    Raises ImportPathError: it is not of this form, there is no such module or name, or the module raises while it is
     imported.
     """
     module_name, _, name = path.partition(":")
     if not module_name or not name.isidentifier():
-        raise SceneError(f'"{path}": an import path is "module:name", such as "mypackage.les:MyTerm"')
+        raise ImportPathError(f'"{path}": an import path is "module:name", such as "mypackage.les:MyTerm"')
     try:
         module = import_module(module_name)
     except ModuleNotFoundError as error:
         missing = f'there is no module "{error.name}"' + ("" if error.name == module_name else ", which it imports")
-        raise SceneError(f'"{path}": {missing}; put it beside the scene, into the working directory, or '
-                         "into a folder of PYTHONPATH") from None
+        raise ImportPathError(f'"{path}": {missing}; put it beside the scene, into the working directory, or '
+                              "into a folder of PYTHONPATH") from None
     except Exception as error:
-        raise SceneError(f'"{path}": importing {module_name} fails: {type(error).__name__}: {error}') from error
+        raise ImportPathError(f'"{path}": importing {module_name} fails: {type(error).__name__}: {error}') from error
     if not hasattr(module, name):
-        raise SceneError(f'"{path}": {module_name} has no {name}')
+        raise ImportPathError(f'"{path}": {module_name} has no {name}')
     return getattr(module, name)
 
 

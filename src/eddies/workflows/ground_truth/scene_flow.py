@@ -1,0 +1,86 @@
+"""The flow of a scene as it is built: the fluid on its grid, how its step is chosen, and the state at time 0."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from eddies.flow.courant import CourantLimit, FixedStep
+from eddies.flow.forcing import LinearForcing
+from eddies.flow.initial_fields import INITIAL_FLOWS, balanced_density, sound_wave_density
+from eddies.flow.navier_stokes import FLUIDS, Fluid
+from eddies.flow.operators import project
+from eddies.import_path import is_path, load
+from eddies.io.fields import FieldSeries
+from eddies.io.hdf5 import open_product
+from eddies.parallel.communicator import Comm
+from eddies.parallel.slab import SlabDecomposition
+from eddies.scene.scene import BOX_LENGTH, Scene, SceneError
+from eddies.spectral.spectral_grid import SpectralGrid
+
+
+def build_fluid(scene: Scene, comm: Comm) -> Fluid:
+    """The fluid of a scene on its grid, with its forcing if it has one."""
+    flow = scene.flow
+    grid = SpectralGrid(SlabDecomposition(comm, BOX_LENGTH, flow.cells), flow.precision)
+    forcing = None
+    if scene.forcing is not None:
+        forcing = LinearForcing(grid, scene.forcing.injection_rate, scene.forcing.wavenumber)
+    kind = load(flow.fluid) if is_path(flow.fluid) else FLUIDS[flow.fluid]
+    return kind(grid, flow.viscosity, flow.sound_speed if flow.compressible else math.inf, forcing)
+
+
+def build_step_limit(scene: Scene, grid: SpectralGrid) -> CourantLimit | FixedStep:
+    """How the step of a scene is chosen: fixed, or by the Courant number, with sound for the explicit stepper only."""
+    time = scene.time
+    if time.step is not None:
+        return FixedStep(time.step)
+    explicit_sound = scene.flow.sound_speed if time.stepper == "rk4" and scene.flow.compressible else 0.0
+    return CourantLimit(grid, time.courant, time.max_step, explicit_sound)
+
+
+def initial_state(scene: Scene, fluid: Fluid) -> np.ndarray:
+    """The state at time 0: velocity, and for a compressible fluid s = ln(rho / rho_0)."""
+    initial, grid = scene.initial, fluid.grid
+    if initial.kind == "file":
+        return _state_from_file(initial.path, fluid)
+    velocity = _own_velocity(scene, grid) if is_path(initial.kind) else INITIAL_FLOWS[initial.kind](
+        grid, initial, scene.seed)
+    if not fluid.compressible:
+        return velocity
+    if initial.kind == "sound-wave":
+        density = sound_wave_density(grid, initial.amplitude, initial.wavenumber)
+    else:
+        density = balanced_density(grid, velocity, fluid.sound_speed)
+    return np.concatenate([velocity, density[None]])
+
+
+def _own_velocity(scene: Scene, grid: SpectralGrid) -> np.ndarray:
+    """What the user's function of an initial flow returns, its solenoidal part; SceneError where it is no velocity."""
+    initial, shape = scene.initial, (3, *grid.spectral_shape)
+    velocity = load(initial.kind)(grid, initial, scene.seed)
+    if not isinstance(velocity, np.ndarray) or velocity.shape != shape:
+        found = f"an array {velocity.shape}" if isinstance(velocity, np.ndarray) else f"a {type(velocity).__name__}"
+        raise SceneError(f'[initial] kind = "{initial.kind}": returned {found}; must be the modes (3, kz, ky, kx) = '
+                         f"{shape} of the velocity on this rank, such as grid.forward(velocity) gives")
+    return project(grid, velocity.astype(grid.complex))
+
+
+def _state_from_file(path: str, fluid: Fluid) -> np.ndarray:
+    grid = fluid.grid
+    with open_product(grid.decomposition.comm, path, "ground_truth") as file:
+        fields = FieldSeries(file, "final")
+        if fields.cells != grid.cells:
+            raise SceneError(f"[initial] path = {path}: holds fields of {fields.cells} cells a side, [flow] cells is "
+                             f"{grid.cells}; make them equal")
+        planes = (grid.decomposition.start, grid.decomposition.stop)
+        state = grid.forward(fields.read(-1, "velocity", *planes))
+        if fluid.compressible:
+            if "density" in fields.variables:
+                s = grid.forward(np.log(fields.read(-1, "density", *planes)))
+            else:
+                s = balanced_density(grid, state, fluid.sound_speed)[None]
+            return np.concatenate([state, s])
+    # A velocity of a compressible flow, or in single precision, is not solenoidal.
+    return project(grid, state)
