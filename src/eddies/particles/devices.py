@@ -24,5 +24,5 @@ def prepare_torch(device: str, comm: Comm) -> torch.device:
     if device == "cpu":
         return torch.device("cpu")
     if not torch.cuda.is_available():
-        raise DeviceError('device "cuda": torch finds no GPU here; choose the device "cpu"')
+        raise DeviceError('device = "cuda": torch finds no GPU here; set device = "cpu"')
     return torch.device("cuda", node_rank(comm) % torch.cuda.device_count())

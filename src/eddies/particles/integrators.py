@@ -15,8 +15,8 @@ from eddies.particles.rates import Rates
 
 class Integrator:
     """A time stepping scheme; `memory` is what it carries from one step to the next besides the particles and the
-    state of the dynamics, with rows as in the particles last returned: a checkpoint must keep it, and `restore` gives
-    it back. `dense`: whether `rates` are those at the ends of steps, so that what is between can be told from them."""
+    state of the dynamics, with rows as in the particles last returned; `restore` gives it back. `dense`: whether
+    `rates` are those at the ends of steps, so that what is between can be told from them."""
 
     dense = False
 
@@ -25,7 +25,7 @@ class Integrator:
         self.restore(None, {})
 
     def restore(self, particles: ParticleSet | None, memory: dict[str, Tensor]) -> None:
-        """Go on from a checkpoint: `memory` belongs to these very particles."""
+        """Go on from these very particles, to which `memory` belongs."""
         self._last, self.memory = particles, memory
 
     def rates(self, particles: ParticleSet) -> tuple[ParticleSet, Rates]:

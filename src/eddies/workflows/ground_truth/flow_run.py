@@ -46,6 +46,10 @@ class FlowRun:
     def __post_init__(self) -> None:
         self.watch = StabilityWatch(self.fluid, self.stepper, self.history)
 
+    def begin_tracers(self, tracers: TracerRun) -> None:
+        """Be in the phase in which tracers are followed: nothing forces the flow from here on."""
+        self.phase, self.tracers, self.fluid.forcing = "tracers", tracers, None
+
     def advance(self, observers: Sequence[Callable], step_limit: Callable | None = None) -> None:
         """Take steps, of another limit if one is given, until the clock ends; every observer sees every step.
 

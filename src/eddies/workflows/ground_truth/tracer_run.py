@@ -28,7 +28,7 @@ class TracerRun:
 
     def __init__(self, scene: Scene, flow: FlowRun, segments: FrameSegments, saved: Checkpoint | None) -> None:
         self.scene, self.flow, self.segments, self.settings = scene, flow, segments, scene.tracers
-        flow.fluid.forcing, flow.phase, flow.tracers = None, "tracers", self
+        flow.begin_tracers(self)
         compressible = flow.fluid.compressible
         field = FilteredField(flow.fluid.grid, self.settings.filter_width, self.settings.interpolation)
         self.comm = flow.fluid.grid.decomposition.comm
