@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 
 from eddies.particles.reference_scales import ReferenceScales
-from tests.particles.clouds import SCALES
+from tests.particles.configurations import SCALES
 
 
 def test_scales_survive_a_dictionary():

@@ -11,8 +11,8 @@ from eddies.particles.flow_units import FlowUnits
 from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.reference_scales import ReferenceScales
 from eddies.particles.terms.presets import PRESETS
-from tests.particles.clouds import LENGTH, by_id, distributed
-from tests.particles.clouds import model as model_of
+from tests.particles.configurations import LENGTH, by_id, distributed
+from tests.particles.configurations import model as model_of
 
 TOTAL, SIDE, PLANES, SKIN = 343, 7, 12, 0.1  # of the grid 1.75 cells a particle and direction
 ITERATIONS = 10

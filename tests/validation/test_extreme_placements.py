@@ -9,7 +9,7 @@ from extreme_cases import (
 from mpi4py import MPI
 
 from eddies.parallel.reduction import any_rank, global_max
-from tests.particles.clouds import LENGTH, by_id
+from tests.particles.configurations import LENGTH, by_id
 
 SEPARATIONS = [0.0, 1e-300, 1e-16, 1e-8]  # of nearly coincident particles, in mean spacings
 

@@ -15,8 +15,8 @@ from eddies.parallel.halo import HaloError
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.faults import Limits, find_fault
 from eddies.particles.model import LagrangianModel
-from tests.particles.clouds import Field, by_id, distributed
-from tests.particles.clouds import model as model_of
+from tests.particles.configurations import Field, by_id, distributed
+from tests.particles.configurations import model as model_of
 
 MACH_NUMBERS = [0.01, 0.1, 0.3, 0.8]
 

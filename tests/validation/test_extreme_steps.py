@@ -12,8 +12,8 @@ from eddies.particles import moments
 from eddies.particles.context import REGULARISATION
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.integrators import INTEGRATORS
-from tests.particles.clouds import LENGTH, Field, distributed, of_terms
-from tests.particles.clouds import model as model_of
+from tests.particles.configurations import LENGTH, Field, distributed, of_terms
+from tests.particles.configurations import model as model_of
 
 NEIGHBORS = [30, 60, 120, 200]
 

@@ -4,7 +4,9 @@ import pytest
 import torch
 
 from eddies.scene.values import SceneError
-from tests.particles.clouds import CUTOFF, LENGTH, NEIGHBORS, PAIR_MODELS, SCALES, cloud, model, rates, state
+from tests.particles.configurations import (
+    CUTOFF, LENGTH, NEIGHBORS, PAIR_MODELS, SCALES, model, positions, rates, state,
+)
 
 pytestmark = pytest.mark.mpi(1)
 
@@ -15,7 +17,7 @@ def test_rate_of_a_uniform_expansion():
     with torch.no_grad():
         force.terms["density-transport"].factors[0] = 1.0
     middle = torch.tensor([[LENGTH / 2] * 3], dtype=torch.float64)
-    position = torch.cat([middle, middle + 0.3 * (cloud(count=60) - LENGTH / 2)])
+    position = torch.cat([middle, middle + 0.3 * (positions(count=60) - LENGTH / 2)])
     velocity, density = 0.2 * (position - middle), torch.ones(61, dtype=torch.float64)
     assert rates(force, position, velocity, density).density_rate[0].item() == pytest.approx(-0.6, rel=2e-3)
 

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from tests.particles.clouds import CUTOFF, NEIGHBORS, SCALES, model, rates, state
+from tests.particles.configurations import CUTOFF, NEIGHBORS, SCALES, model, rates, state
 
 pytestmark = pytest.mark.mpi(1)
 

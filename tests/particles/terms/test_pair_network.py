@@ -8,8 +8,9 @@ import torch
 from eddies.particles import moments
 from eddies.particles.flow_units import FlowUnits
 from eddies.scene.values import SceneError
-from tests.particles.clouds import (CUTOFF, FLOW, LENGTH, NEIGHBORS, PAIR_MODELS, SCALES, along, cloud, given, model,
-                                    rates, scaled_pairs, state)
+from tests.particles.configurations import (
+    CUTOFF, FLOW, LENGTH, NEIGHBORS, PAIR_MODELS, SCALES, along, given, model, positions, rates, scaled_pairs, state,
+)
 
 pytestmark = pytest.mark.mpi(1)
 ANTISYMMETRIC = PAIR_MODELS["antisymmetric"]
@@ -76,12 +77,12 @@ def test_neighbours_fade_out_at_the_cutoff(terms):
 
 
 DEGENERATE = {
-    "coincident": lambda: (cloud("coincident", 5), *state(5)[1:]),
-    "equal velocities": lambda: (cloud(count=50), torch.ones(50, 3, dtype=torch.float64), state(50)[2]),
+    "coincident": lambda: (positions("coincident", 5), *state(5)[1:]),
+    "equal velocities": lambda: (positions(count=50), torch.ones(50, 3, dtype=torch.float64), state(50)[2]),
     "equal densities": lambda: (*state(50)[:2], torch.ones(50, dtype=torch.float64)),
     "alone": lambda: state(1),
     "a pair": lambda: (torch.tensor([[1.0, 1, 1], [1.2, 1, 1]], dtype=torch.float64), *state(2)[1:]),
-    "coplanar": lambda: (cloud(count=30) * torch.tensor([1, 1, 0]), *state(30)[1:]),
+    "coplanar": lambda: (positions(count=30) * torch.tensor([1, 1, 0]), *state(30)[1:]),
     "all the same": lambda: tuple(column[:1].expand(4, *column.shape[1:]).clone() for column in state(4)),
 }
 

@@ -7,9 +7,7 @@ import torch
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.integrators import VelocityVerlet
 from eddies.particles.smoothing_kernels import CubicSpline, WendlandC2
-from tests.particles.clouds import (
-    LENGTH, SCALES, alone, by_id, distributed, dynamics_of, model, rates, state,
-)
+from tests.particles.configurations import LENGTH, SCALES, alone, by_id, distributed, dynamics_of, model, rates, state
 
 SUPPORT, COUNT = 1.5, 200
 TRUE = {"sound_speed": 10.0, "alpha": 1.0, "beta": 2.0, "exponent": 7.0}
