@@ -68,7 +68,7 @@ def test_divergence_is_zero_for_equal_and_positive_for_different_histograms():
 
 
 @pytest.mark.mpi(1, 2, 3)
-def test_descent_takes_the_same_steps_on_any_number_of_ranks(comm):
+def test_adam_takes_the_same_steps_on_any_number_of_ranks(comm):
     target = np.random.default_rng(4).standard_normal((60, 2))
 
     def fit(rows, communicator):

@@ -13,8 +13,9 @@ from eddies.particles.rates import Rates
 from eddies.particles.resolved_velocity import ResolvedVelocity
 from eddies.particles.terms.settings import TermSettings
 from eddies.particles.terms.term import PairTerm, Term, TermError
-from tests.particles.clouds import (CUTOFF, MODELS, NEIGHBORS, SCALES, ReadsNothing, alone, distributed, dynamics_of,
-                                    model, of_terms, state)
+from tests.particles.configurations import (
+    CUTOFF, MODELS, NEIGHBORS, SCALES, ReadsNothing, alone, distributed, dynamics_of, model, of_terms, state,
+)
 
 
 class Counted:

@@ -13,8 +13,10 @@ from eddies.particles.particle_set import ParticleSet
 from eddies.particles.rates import Rates
 from eddies.particles.terms.settings import TermSettings
 from eddies.particles.terms.term import Term
-from tests.particles.clouds import (LENGTH, MODELS, PAIR_MODELS, SCALES, alone, assert_close, by_id, distributed,
-                                    dynamics_of, given, model, of_terms, state)
+from tests.particles.configurations import (
+    LENGTH, MODELS, PAIR_MODELS, SCALES, alone, assert_close, by_id, distributed, dynamics_of, given, model, of_terms,
+    state,
+)
 
 SKIN = 0.2
 # Of each solve for the resolved velocity: on any number of ranks the same ones.

@@ -6,7 +6,7 @@ import torch
 from eddies.particles.faults import Limits, find_fault, find_unplaced
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.periodic_box import PeriodicBox
-from tests.particles.clouds import LENGTH, state
+from tests.particles.configurations import LENGTH, state
 
 LIMITS = Limits(speed=20.0, density_mean=1.0, density_deviation=0.5)
 

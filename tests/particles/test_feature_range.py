@@ -6,7 +6,7 @@ from mpi4py import MPI
 from eddies.particles import context
 from eddies.particles.dense_network import DenseNetwork
 from eddies.particles.feature_range import FeatureRange, pair_features
-from tests.particles.clouds import CUTOFF, SCALES, distributed, dynamics_of, model, state
+from tests.particles.configurations import CUTOFF, SCALES, distributed, dynamics_of, model, state
 
 CHOICES = {"corrected": dict(), "antisymmetric": dict(basis="paper", symmetry="antisymmetric")}
 every_model = pytest.mark.parametrize("choices", CHOICES.values(), ids=CHOICES)

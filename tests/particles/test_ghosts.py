@@ -5,7 +5,7 @@ import torch
 from eddies.parallel.halo import HaloExchange
 from eddies.parallel.reduction import global_sum
 from eddies.particles.ghosts import exchange_ghost_positions, exchange_ghosts
-from tests.particles.clouds import LENGTH, distributed, state
+from tests.particles.configurations import LENGTH, distributed, state
 
 
 @pytest.mark.mpi(1, 2, 3)

@@ -6,7 +6,7 @@ import torch
 
 from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.terms.presets import PRESETS
-from tests.particles.clouds import MODELS, Field, by_id, distributed, dynamics_of, model, of_terms, state
+from tests.particles.configurations import MODELS, Field, by_id, distributed, dynamics_of, model, of_terms, state
 
 SKIN = 0.1
 every_integrator = pytest.mark.parametrize("name", INTEGRATORS)

@@ -14,8 +14,9 @@ from eddies.particles.rates import Rates, total
 from eddies.particles.terms.presets import PRESETS
 from eddies.particles.terms.settings import TermSettings
 from eddies.particles.terms.term import PairTerm, Term, TermError
-from tests.particles.clouds import (FLOW, MODELS, DensityReader, Field, ReadsNothing, distributed, dynamics_of, given,
-                                    model, of_terms, state)
+from tests.particles.configurations import (
+    FLOW, MODELS, DensityReader, Field, ReadsNothing, distributed, dynamics_of, given, model, of_terms, state,
+)
 
 
 def randomised(lagrangian, seed=3):

@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 from eddies.particles import cell_grid
 from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.periodic_box import PeriodicBox
-from tests.particles.clouds import CLOUDS, LENGTH, cloud
+from tests.particles.configurations import CONFIGURATIONS, LENGTH, positions
 
 
 def listed(receivers, senders, cutoff, skin=0.0, exclude_self=True, periodic_z=True):
@@ -31,10 +31,10 @@ def oracle(receivers, senders, cutoff, exclude_self, periodic_z=True):
     return {(i, j) for i, row in enumerate(found) for j in row if not (exclude_self and i == j)}
 
 
-@pytest.mark.parametrize("kind", CLOUDS)
+@pytest.mark.parametrize("kind", CONFIGURATIONS)
 @pytest.mark.parametrize("cutoff", [0.05, 0.47, 1.3, LENGTH / 2 * 0.999])
 def test_pairs_are_those_of_a_tree(kind, cutoff):
-    position = cloud(kind, 192)
+    position = positions(kind, 192)
     # A lattice has pairs at exactly the cutoff of no interest here.
     cutoff = cutoff * 1.0123 if kind == "lattice" and cutoff < 2 else cutoff
     pairs = listed(position, position, cutoff).pairs(position, position)
@@ -43,13 +43,13 @@ def test_pairs_are_those_of_a_tree(kind, cutoff):
 
 @pytest.mark.parametrize("kind", ["even", "uneven"])
 def test_receivers_other_than_senders(kind):
-    senders, points = cloud(kind, 300), cloud("lattice", 128)
+    senders, points = positions(kind, 300), positions("lattice", 128)
     pairs = listed(points, senders, 0.9, exclude_self=False).pairs(points, senders)
     assert as_set(pairs) == oracle(points, senders, 0.9, exclude_self=False)
 
 
 def test_unwrapped_z_is_not_periodic():
-    senders = cloud(count=300) * torch.tensor([1.0, 1.0, 1.4]) - torch.tensor([0.0, 0.0, 1.0])
+    senders = positions(count=300) * torch.tensor([1.0, 1.0, 1.4]) - torch.tensor([0.0, 0.0, 1.0])
     receivers = senders[:150]
     pairs = listed(receivers, senders, 0.8, periodic_z=False).pairs(receivers, senders)
     assert as_set(pairs) == oracle(receivers, senders, 0.8, exclude_self=True, periodic_z=False)
@@ -57,7 +57,7 @@ def test_unwrapped_z_is_not_periodic():
 
 @pytest.mark.parametrize("receivers, senders", [(0, 0), (0, 5), (5, 0), (1, 1)])
 def test_few_or_no_particles(receivers, senders):
-    position = cloud(count=5)
+    position = positions(count=5)
     neighbors = listed(position[:receivers], position[:senders], 1.0)
     pairs = neighbors.pairs(position[:receivers], position[:senders])
     assert len(pairs.sender) == 0
@@ -67,7 +67,7 @@ def test_few_or_no_particles(receivers, senders):
 
 @pytest.mark.parametrize("together", [1, 7, 1000])
 def test_pairs_do_not_depend_on_how_many_are_searched_together(monkeypatch, together):
-    position = cloud("uneven", 150)
+    position = positions("uneven", 150)
     whole = listed(position, position, 0.7)
     monkeypatch.setitem(cell_grid.RECEIVERS_TOGETHER, "cpu", together)
     monkeypatch.setitem(cell_grid.CANDIDATES_TOGETHER, "cpu", together)
@@ -76,7 +76,7 @@ def test_pairs_do_not_depend_on_how_many_are_searched_together(monkeypatch, toge
 
 
 def test_list_is_symmetric_sorted_and_compressed():
-    position = cloud("uneven", 250)
+    position = positions("uneven", 250)
     neighbors = listed(position, position, 0.6, skin=0.2)
     receiver = torch.repeat_interleave(torch.arange(250), torch.diff(neighbors.offsets))
     pairs = set(zip(receiver.tolist(), neighbors.senders.tolist()))
@@ -85,16 +85,16 @@ def test_list_is_symmetric_sorted_and_compressed():
 
 
 def test_list_holds_while_nothing_moves_by_more_than_half_the_skin():
-    position = cloud(count=200)
+    position = positions(count=200)
     neighbors = listed(position, position, 0.9, skin=0.2)
-    direction = torch.nn.functional.normalize(cloud(count=200, seed=8) - LENGTH / 2)
+    direction = torch.nn.functional.normalize(positions(count=200, seed=8) - LENGTH / 2)
     moved = position + 0.0999 * direction
     assert as_set(neighbors.pairs(moved, moved)) == oracle(moved % LENGTH, moved % LENGTH, 0.9, True)
 
 
 @pytest.mark.parametrize("rows", [slice(20, 60), torch.tensor([7, 3, 190])], ids=["slice", "numbers"])
 def test_pairs_of_some_receivers(rows):
-    position = cloud(count=200)
+    position = positions(count=200)
     neighbors = listed(position, position, 1.0)
     number = torch.arange(200)[rows]
     pairs, everything = (neighbors.pairs(position, position, kept) for kept in (rows, None))
@@ -106,7 +106,7 @@ def test_pairs_of_some_receivers(rows):
 @pytest.mark.parametrize("rows", [None, slice(20, 60)], ids=["all", "slice"])
 def test_each_pair_of_receivers_once_and_every_other_sender(rows):
     """Of 150 receivers among 200 senders."""
-    position = cloud(count=200)
+    position = positions(count=200)
     neighbors = listed(position[:150], position, 1.0)
     once, both = (as_set(neighbors.pairs(position[:150], position, rows, once=each)) for each in (True, False))
     assert once == {(i, j) for i, j in both if i < j} and any(j >= 150 for _, j in once)
@@ -114,7 +114,7 @@ def test_each_pair_of_receivers_once_and_every_other_sender(rows):
 
 @pytest.mark.parametrize("parity", [1.0, -1.0])
 def test_values_of_pairs_that_stand_once_reach_both_particles_but_no_ghost(parity):
-    position = cloud(count=80)
+    position = positions(count=80)
     pairs = listed(position[:50], position, 1.5).pairs(position[:50], position, once=True)
     values = torch.rand(2, len(pairs.sender), dtype=torch.float64, requires_grad=True)
 
@@ -134,14 +134,14 @@ def test_values_of_pairs_that_stand_once_reach_both_particles_but_no_ghost(parit
 
 
 def test_blocks_are_all_rows_once():
-    position = cloud("uneven", 300)
+    position = positions("uneven", 300)
     neighbors = listed(position, position, 0.8)
     rows = [row for block in neighbors.blocks(100) for row in range(block.start, block.stop)]
     assert rows == list(range(300))
 
 
 def test_displacements_are_differentiable_and_nearest():
-    position = cloud(count=60).requires_grad_()
+    position = positions(count=60).requires_grad_()
     pairs = listed(position, position, 1.5).pairs(position, position)
     assert torch.allclose(pairs.distance, pairs.displacement.norm(dim=1))
     weight = torch.rand(len(pairs.sender), 3, dtype=torch.float64)
@@ -152,7 +152,7 @@ def test_displacements_are_differentiable_and_nearest():
 
 
 def test_single_precision_displacements_lose_nothing_to_the_box():
-    position = cloud(count=100)
+    position = positions(count=100)
     neighbors = listed(position, position, 1.0)
     single, double = (neighbors.pairs(position, position, dtype=t) for t in (torch.float32, torch.float64))
     assert single.displacement.dtype == single.distance.dtype == torch.float32
@@ -161,7 +161,7 @@ def test_single_precision_displacements_lose_nothing_to_the_box():
 
 @pytest.mark.parametrize("tail", [(), (2,), (2, 3)])
 def test_segment_sum_and_its_gradient(tail):
-    position = cloud("uneven", 50)
+    position = positions("uneven", 50)
     pairs = listed(position, position, 0.5).pairs(position, position)
     values = torch.rand(len(pairs.sender), *tail, dtype=torch.float64, requires_grad=True)
     expected = torch.zeros(50, *tail, dtype=torch.float64).index_add_(0, pairs.segment, values)

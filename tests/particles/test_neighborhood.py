@@ -7,7 +7,7 @@ from eddies.parallel.halo import HaloError
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.neighborhood import Neighborhood
 from eddies.particles.particle_set import ParticleSet
-from tests.particles.clouds import LENGTH
+from tests.particles.configurations import LENGTH
 
 
 def particles_at(comm, heights):

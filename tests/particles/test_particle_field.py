@@ -11,10 +11,10 @@ from eddies.particles.smoothing_kernels import WendlandC2
 LENGTH = 2 * np.pi
 
 
-def cloud_of(comm, field, per_side=16, cells=12, placement="lattice"):
+def field_of(comm, velocity, per_side=16, cells=12, placement="lattice"):
     slab = SlabDecomposition(comm, LENGTH, cells)
     position = torch.from_numpy(release(slab, 3, per_side, placement)["position"])
-    return ParticleField(slab, 2.5 * LENGTH / per_side, position, field(position), torch.float64)
+    return ParticleField(slab, 2.5 * LENGTH / per_side, position, velocity(position), torch.float64)
 
 
 def largest(comm, error):
@@ -23,19 +23,19 @@ def largest(comm, error):
 
 @pytest.mark.mpi(1, 2, 3)
 def test_constants_are_exact_and_have_no_gradient(comm):
-    cloud = cloud_of(comm, lambda x: torch.full_like(x, 2.0))
+    field = field_of(comm, lambda x: torch.full_like(x, 2.0))
     kernel = WendlandC2(2.5 * LENGTH / 16)
-    for velocity, gradient in (cloud.on_whole_grid(kernel), cloud.at_particles(kernel)):
+    for velocity, gradient in (field.on_whole_grid(kernel), field.at_particles(kernel)):
         assert largest(comm, velocity - 2) < 1e-12 and largest(comm, gradient) < 1e-11
 
 
 @pytest.mark.mpi(1, 2, 3)
 @pytest.mark.parametrize("neighbors", [60, 2])
 def test_velocities_spread_on_the_grid_are_those_of_the_neighbours_of_its_points(comm, neighbors):
-    """Also with so few neighbours that some points have none, and a kernel of less support than the cloud."""
-    cloud = cloud_of(comm, torch.cos, per_side=12, cells=16, placement="random")
+    """Also with so few neighbours that some points have none, and a kernel of less support than the field's."""
+    field = field_of(comm, torch.cos, per_side=12, cells=16, placement="random")
     kernel = WendlandC2(LENGTH / 12 * (neighbors / (4 / 3 * np.pi)) ** (1 / 3))
-    expected, spread = cloud.on_whole_grid(kernel)[0], cloud.velocity_on_whole_grid(kernel)
+    expected, spread = field.on_whole_grid(kernel)[0], field.velocity_on_whole_grid(kernel)
     assert spread.shape == expected.shape and largest(comm, expected) > 0.5
     # The order of summation differs, and where the sum of weights nearly vanishes, so do its last digits.
     assert largest(comm, spread - expected) < 1e-11
@@ -45,9 +45,9 @@ def test_velocities_spread_on_the_grid_are_those_of_the_neighbours_of_its_points
 
 @pytest.mark.mpi(1, 2, 3)
 def test_a_smooth_field_and_its_gradient_on_any_number_of_ranks(comm):
-    cloud = cloud_of(comm, lambda x: torch.stack([torch.sin(x[:, 1]), torch.sin(x[:, 2]), torch.sin(x[:, 0])], dim=1))
-    velocity, gradient = cloud.on_whole_grid(WendlandC2(2.5 * LENGTH / 16))
-    points = grid_points(cloud.decomposition, cloud.decomposition.planes)
+    field = field_of(comm, lambda x: torch.stack([torch.sin(x[:, 1]), torch.sin(x[:, 2]), torch.sin(x[:, 0])], dim=1))
+    velocity, gradient = field.on_whole_grid(WendlandC2(2.5 * LENGTH / 16))
+    points = grid_points(field.decomposition, field.decomposition.planes)
     # The kernel attenuates k = 1 by a few percent, and the jittered lattice adds noise of that order.
     assert largest(comm, velocity[:, 0] - torch.sin(points[:, 1])) < 0.12
     assert largest(comm, gradient[:, 1, 2] - torch.cos(points[:, 2])) < 0.4

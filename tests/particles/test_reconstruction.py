@@ -5,7 +5,7 @@ from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.periodic_box import PeriodicBox
 from eddies.particles.reconstruction import reconstruct, reconstruct_with_gradient, volumes
 from eddies.particles.smoothing_kernels import CubicSpline, KernelNetwork, WendlandC2
-from tests.particles.clouds import LENGTH, cloud
+from tests.particles.configurations import LENGTH, positions
 
 SUPPORT = 1.6
 FAMILIES = {"spline": CubicSpline, "wendland": WendlandC2, "learned": lambda h: KernelNetwork(h).table()}
@@ -26,7 +26,7 @@ def field(kernel, points, senders, values):
 
 @kernels
 def test_constants_are_reproduced_and_have_no_gradient(kernel):
-    senders, points = cloud("uneven", 400), cloud(count=80)
+    senders, points = positions("uneven", 400), positions(count=80)
     values = torch.tensor([[1.0, -30.0]], dtype=torch.float64).expand(400, 2)
     arguments = field(kernel, points, senders, values)
     near = arguments[1].sum(kernel.value(arguments[1].distance)) > 0
@@ -61,7 +61,7 @@ def test_in_voids_values_lie_between_those_of_the_neighbours(seed):
     network = KernelNetwork(SUPPORT, seed=seed)
     with torch.no_grad():
         network.network.weights[-1].mul_(80)
-    senders, points = cloud(count=100), cloud(count=2000, seed=9)
+    senders, points = positions(count=100), positions(count=2000, seed=9)
     values = torch.where(torch.arange(100) % 2 == 0, 1.0, -1.0).double()[:, None]
     with torch.no_grad():
         assert reconstruct(*field(network.table(), points, senders, values)).abs().max() <= 1 + 1e-12
@@ -69,7 +69,7 @@ def test_in_voids_values_lie_between_those_of_the_neighbours(seed):
 
 @kernels
 def test_gradient_is_the_derivative_of_the_reconstruction(kernel):
-    senders, points = cloud(count=300), cloud(count=40, seed=9).requires_grad_()
+    senders, points = positions(count=300), positions(count=40, seed=9).requires_grad_()
     arguments = field(kernel, points, senders, torch.sin(senders))
     values, gradient = reconstruct_with_gradient(*arguments)
     for component in range(3):
@@ -79,7 +79,7 @@ def test_gradient_is_the_derivative_of_the_reconstruction(kernel):
 
 @kernels
 def test_volumes_of_even_particles_fill_the_box(kernel):
-    lattice = cloud("lattice", 512)
+    lattice = positions("lattice", 512)
     volume = volumes(kernel, pairs_of(lattice, lattice, exclude_self=True))
     assert torch.allclose(volume, volume[0].expand(512), rtol=1e-10)
     assert volume.sum().item() == pytest.approx(LENGTH**3, rel=0.05)
@@ -87,10 +87,10 @@ def test_volumes_of_even_particles_fill_the_box(kernel):
 
 @families
 def test_finer_particles_reconstruct_a_wave_better(family):
-    points = cloud(count=100, seed=5)
+    points = positions(count=100, seed=5)
     errors = []
     for count in (500, 4000):
-        senders = cloud(count=count)
+        senders = positions(count=count)
         kernel = family(LENGTH * (60 / count / (4 / 3 * torch.pi)) ** (1 / 3))
         value = reconstruct(*field(kernel, points, senders, torch.sin(senders)))
         errors.append((value - torch.sin(points)).norm().item())
@@ -99,7 +99,7 @@ def test_finer_particles_reconstruct_a_wave_better(family):
 
 @kernels
 def test_values_are_differentiable(kernel):
-    senders, points = cloud(count=60), cloud(count=10, seed=9)
+    senders, points = positions(count=60), positions(count=10, seed=9)
     pairs = pairs_of(points, senders)
     values = torch.rand(60, 2, dtype=torch.float64, requires_grad=True)
     volume = torch.rand(60, dtype=torch.float64, requires_grad=True)

@@ -6,7 +6,7 @@ from eddies.particles.flow_units import FlowUnits
 from eddies.particles.reference_scales import ReferenceScales
 from eddies.particles.terms.presets import PRESETS
 from eddies.particles.terms.term import TermError
-from tests.particles.clouds import CUTOFF, NEIGHBORS, SCALES, model
+from tests.particles.configurations import CUTOFF, NEIGHBORS, SCALES, model
 
 
 def test_scales_survive_a_dictionary():

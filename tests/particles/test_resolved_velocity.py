@@ -14,8 +14,10 @@ from eddies.particles.flow_units import FlowUnits
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.reference_scales import ReferenceScales
 from eddies.particles.resolved_velocity import ResolvedVelocity
-from tests.particles.clouds import (CLOUDS, LENGTH, DensityReader, along, assert_close, by_id, cloud, distributed,
-                                    dynamics_of, model, of_terms)
+from tests.particles.configurations import (
+    CONFIGURATIONS, LENGTH, DensityReader, along, assert_close, by_id, distributed, dynamics_of, model, of_terms,
+    positions,
+)
 from tests.validation import filtered_fields
 
 SIDE, PLANES = 12, 22
@@ -45,7 +47,7 @@ def filtered_modes(highest, width):
 def in_known_flow(comm, side=SIDE, highest=4, planes=PLANES, kind="even"):
     """The slabs, side^3 particles in a filtered velocity of modes up to `highest`, and these modes."""
     modes = filtered_modes(highest, 2 * LENGTH / side)
-    position = cloud(kind, side**3)
+    position = positions(kind, side**3)
     velocity = torch.from_numpy(filtered_fields.at(modes, position.numpy()))
     return *distributed(comm, position, velocity, planes=planes), modes
 
@@ -88,11 +90,11 @@ def test_modes_beyond_the_nyquist_wavenumber_are_found(comm):
 
 
 @pytest.mark.mpi(1)
-@pytest.mark.parametrize("kind", [*CLOUDS, "empty octant"])
+@pytest.mark.parametrize("kind", [*CONFIGURATIONS, "empty octant"])
 def test_no_arrangement_of_particles_disturbs_a_solve(comm, kind):
     """Clusters, voids, all in one place: what is minimised is never more than without any mode; where there are
     particles everywhere, or but for an octant, the solve ends soon."""
-    position = cloud("even" if kind == "empty octant" else kind, 512)
+    position = positions("even" if kind == "empty octant" else kind, 512)
     if kind == "empty octant":
         position = position[(position > LENGTH / 2).any(1)]
     velocity = torch.from_numpy(filtered_fields.at(filtered_modes(4, LENGTH / 4), position.numpy()))
@@ -140,7 +142,7 @@ def test_the_same_on_any_number_of_ranks(comm):
 
 @pytest.mark.mpi(3)
 def test_a_rank_without_particles_takes_part_there_and_back(comm):
-    position = cloud(count=300) * torch.tensor([1.0, 1.0, 0.3], dtype=torch.float64)
+    position = positions(count=300) * torch.tensor([1.0, 1.0, 0.3], dtype=torch.float64)
     slab, particles = distributed(comm, position, torch.randn(300, 3, dtype=torch.float64), planes=PLANES)
     assert comm.rank != 2 or len(particles) == 0
     found = dynamics_of(slab, lagrangian(), fixed_ranks=True)
@@ -351,8 +353,8 @@ def test_what_is_foreseen_moves_along_with_the_mean(comm):
     found, mean, time = resolution_on(slab), torch.tensor([3.0, -1.0, 2.0], dtype=torch.float64), 0.7
     flow = found.of(particles)
     found.remember(0.0, flow, flow.grid.stress_divergence(flow.products))  # nothing else happens to it
-    moved = cloud(count=SIDE**3) + time * mean
-    velocity = torch.from_numpy(filtered_fields.at(modes, cloud(count=SIDE**3).numpy()))
+    moved = positions(count=SIDE**3) + time * mean
+    velocity = torch.from_numpy(filtered_fields.at(modes, positions(count=SIDE**3).numpy()))
     slab, later = distributed(comm, moved % LENGTH, velocity + mean, planes=PLANES)
     expected = resolution_on(slab).of(later)
     foreseen = found.foreseen(time, (velocity + mean).mean(0).numpy(), 0.0)

@@ -17,11 +17,16 @@ from mpi4py import MPI
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from test_extreme_particles import (  # noqa: E402
-    ARRANGEMENTS, CLOSURES, MACH_NUMBERS, NEIGHBORS, SEPARATIONS, SYSTEMS, TOTAL, amplification, arrangement,
-    at_mach_number, boundary, broken_step, density_contrast, few_particles, gradient_error, lattice_at_rest,
-    measured_boundary, momentum_gained, nearly_coincident, overdriven, precision_error, pushed_by_the_grid,
-    random_points, scales, translated_run, translation,
+from extreme_cases import ARRANGEMENTS, CLOSURES, TOTAL, random_points, scales  # noqa: E402
+from test_extreme_placements import (  # noqa: E402
+    SEPARATIONS, arrangement, few_particles, lattice_at_rest, nearly_coincident, pushed_by_the_grid,
+)
+from test_extreme_states import (  # noqa: E402
+    MACH_NUMBERS, at_mach_number, broken_step, density_contrast, momentum_gained, overdriven, precision_error,
+    translated_run, translation,
+)
+from test_extreme_steps import (  # noqa: E402
+    NEIGHBORS, SYSTEMS, amplification, boundary, gradient_error, measured_boundary,
 )
 
 from eddies.particles.integrators import INTEGRATORS  # noqa: E402

@@ -20,7 +20,7 @@ from eddies.particles.particle_set import ParticleSet
 from eddies.particles.reference_scales import ReferenceScales
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.time_stepping import ETDRK4
-from tests.particles.clouds import LENGTH, model
+from tests.particles.configurations import LENGTH, model
 
 CELLS, PER_SIDE, PLANES, VISCOSITY, STEP = 32, 24, 42, 0.03, 0.02
 WIDTH = 2 * LENGTH / PER_SIDE

@@ -26,7 +26,7 @@ from eddies.particles.smoothing_kernels import WendlandC2
 from eddies.particles.terms.eddy_viscosity import EddyViscosity
 from eddies.particles.terms.presets import PRESETS
 from eddies.spectral.spectral_grid import SpectralGrid
-from tests.particles.clouds import model
+from tests.particles.configurations import model
 
 LENGTH, PER_SIDE, STEP = 2 * np.pi, 9, 0.001
 SPACING = LENGTH / PER_SIDE

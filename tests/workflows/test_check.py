@@ -148,7 +148,7 @@ def test_ranks_for_horizons_are_those_that_the_grid_and_the_particles_accept(com
     from eddies.scene.scene import BOX_LENGTH
     from eddies.workflows.foreseen.estimates import (ALLOWED_VELOCITY, expected_turbulence, horizon_time,
                                                      most_training_ranks, particle_drift)
-    from tests.particles.clouds import FLOW
+    from tests.particles.configurations import FLOW
 
     def accepted(build):
         try:

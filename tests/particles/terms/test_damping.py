@@ -13,7 +13,7 @@ from eddies.particles.fourier_grid import FourierGrid
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.resolved_flow import ResolvedFlow
 from eddies.particles.terms.damping import RATES
-from tests.particles.clouds import CUTOFF, LENGTH, NEIGHBORS, SCALES, dynamics_of, model
+from tests.particles.configurations import CUTOFF, LENGTH, NEIGHBORS, SCALES, dynamics_of, model
 
 pytestmark = pytest.mark.mpi(1)
 RESOLVED, CELLS = 6, 18

@@ -3,9 +3,10 @@
 import pytest
 import torch
 
-from eddies.particles.flow_units import FlowUnits
 from eddies.particles.terms.term import TermError
-from tests.particles.clouds import CUTOFF, FLOW, LENGTH, NEIGHBORS, PAIR_MODELS, SCALES, cloud, model, rates, state
+from tests.particles.configurations import (
+    CUTOFF, LENGTH, NEIGHBORS, PAIR_MODELS, SCALES, model, positions, rates, state,
+)
 
 pytestmark = pytest.mark.mpi(1)
 
@@ -16,7 +17,7 @@ def test_rate_of_a_uniform_expansion():
     with torch.no_grad():
         force.terms["density-transport"].factors[0] = 1.0
     middle = torch.tensor([[LENGTH / 2] * 3], dtype=torch.float64)
-    position = torch.cat([middle, middle + 0.3 * (cloud(count=60) - LENGTH / 2)])
+    position = torch.cat([middle, middle + 0.3 * (positions(count=60) - LENGTH / 2)])
     velocity, density = 0.2 * (position - middle), torch.ones(61, dtype=torch.float64)
     assert rates(force, position, velocity, density).density_rate[0].item() == pytest.approx(-0.6, rel=2e-3)
 
@@ -51,11 +52,19 @@ def test_a_flux_begins_at_zero_if_it_is_told_to():
     assert rate.abs().max() > 0
 
 
-def test_the_flux_is_in_units_of_the_density_rate_and_has_weights_of_its_own():
-    particles = state()
-    flow = FlowUnits(type(SCALES)(**{**vars(SCALES), "density_rate": 3 * SCALES.density_rate}), CUTOFF, NEIGHBORS)
-    first, second = (rates(model(density_flux={}, flow=each), *particles).density_rate for each in (FLOW, flow))
-    assert torch.allclose(3 * first, second, rtol=1e-12)
+def test_the_flux_between_two_particles():
+    """r_rms / n w NN of one neighbour, here with NN = rho'_j - 2 rho'_i."""
+    force = model(density_flux=dict(inputs=("density",), network=f"{__name__}:Network"))
+    force.terms["density-flux"].network.weights.data = torch.tensor([[-2.0, 1.0]], dtype=torch.float64)
+    position = torch.tensor([[1.0, 1, 1], [1.5, 1, 1]], dtype=torch.float64)
+    density = torch.tensor([1.01, 0.98], dtype=torch.float64)
+    found = rates(force, position, torch.zeros_like(position), density).density_rate
+    first, second = 0.01 / SCALES.density, -0.02 / SCALES.density
+    unit = SCALES.density_rate / NEIGHBORS * (1 - (0.5 / CUTOFF) ** 2) ** 2
+    assert found.tolist() == pytest.approx([unit * (second - 2 * first), unit * (first - 2 * second)], rel=1e-10)
+
+
+def test_the_flux_has_weights_of_its_own():
     force = model(pairs={}, density_flux={})
     networks = [force.terms[name].network for name in ("pairs", "density-flux")]
     assert not torch.equal(networks[0].weights[0], networks[1].weights[0])

@@ -5,7 +5,7 @@ import torch
 from eddies.parallel.reduction import global_sum
 from eddies.particles.terms.term import TermError
 from eddies.scene.values import SceneError
-from tests.particles.clouds import LENGTH, alone, along, distributed, dynamics_of, model, state
+from tests.particles.configurations import LENGTH, alone, along, distributed, dynamics_of, model, state
 
 
 def force_on(slab, particles, rate, wavenumber=2.0):

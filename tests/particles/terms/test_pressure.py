@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from tests.particles.clouds import SCALES, DensityReader, given, model, of_terms
+from tests.particles.configurations import SCALES, DensityReader, given, model, of_terms
 from tests.particles.terms.test_damping import evaluated, lattice
 
 pytestmark = pytest.mark.mpi(1)

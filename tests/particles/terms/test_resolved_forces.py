@@ -19,7 +19,7 @@ from eddies.particles.fourier_grid import FourierGrid
 from eddies.particles.model import LagrangianModel
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.resolved_flow import ResolvedFlow
-from tests.particles.clouds import CUTOFF, LENGTH, NEIGHBORS, SCALES, DensityReader, model
+from tests.particles.configurations import CUTOFF, LENGTH, NEIGHBORS, SCALES, DensityReader, model
 from tests.validation.filtered_fields import CELLS, WAVE, Filtered, at, fields_of, modes_of, random_velocity
 
 pytestmark = pytest.mark.mpi(1)

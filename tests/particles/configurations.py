@@ -1,4 +1,4 @@
-"""Particle clouds and models that the tests of particles share."""
+"""Configurations of particles, and models, that the tests of particles share."""
 
 import math
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ SCALES = ReferenceScales(filter_width=1.2, spacing=0.6, velocity=0.9, density_me
                          density_rate=0.05, sound_speed=11.0, viscosity=0.03)
 CUTOFF, NEIGHBORS = 1.5, 12.0
 FLOW = FlowUnits(SCALES, CUTOFF, NEIGHBORS)
-CLOUDS = {
+CONFIGURATIONS = {
     "even": lambda random, n: random.uniform(0, LENGTH, (n, 3)),
     "cluster across a corner": lambda random, n: random.normal(0, 0.4, (n, 3)) % LENGTH,
     "void": lambda random, n: random.uniform(0, LENGTH, (n, 3)) * [1, 1, 0.3],
@@ -56,17 +56,17 @@ RESOLVED_MODELS = {
 MODELS = PAIR_MODELS | RESOLVED_MODELS
 
 
-def cloud(kind="even", count=200, seed=3):
+def positions(kind="even", count=200, seed=3):
     """Positions (count, 3) as a tensor."""
-    return torch.as_tensor(CLOUDS[kind](np.random.default_rng(seed), count) % LENGTH)
+    return torch.as_tensor(CONFIGURATIONS[kind](np.random.default_rng(seed), count) % LENGTH)
 
 
 def state(count=200, seed=3, kind="even"):
-    """Position, velocity and density of a cloud."""
+    """Position, velocity and density of the particles of a configuration."""
     random = np.random.default_rng(seed + 1)
     velocity = torch.as_tensor(random.normal(0, SCALES.velocity, (count, 3)))
     density = torch.as_tensor(random.normal(1, SCALES.density, count))
-    return cloud(kind, count, seed), velocity, density
+    return positions(kind, count, seed), velocity, density
 
 
 def model(terms=None, flow=FLOW, **more):
