@@ -60,7 +60,7 @@ def load(path: str) -> Any:
 
 
 def origins(paths: Iterable[str]) -> dict[str, dict[str, str | None]]:
-    """Of each import path the version of its package, if it is an installed one, and the SHA-256 of its source."""
+    """The version of each import path's package, if it is an installed one, and the SHA-256 of its source."""
     return {path: _origin(path) for path in sorted(set(paths))}
 
 

@@ -19,8 +19,8 @@ class ForcingError(UserError, ValueError):
 class LinearForcing:
     """f(k) = A u_s(k) for 0 < |k| < k_f with A = rate / sum |u_s|^2, so that the mean of u.f is `injection_rate`.
 
-    u_s is the solenoidal part of the velocity. After Lundgren (2003) and Petersen and Livescu (2010), with the
-    amplitude set at every evaluation. `wavenumber` is k_f.
+    u_s is the solenoidal part of the velocity. Its form is that of Lundgren (2003) and Petersen and
+    Livescu (2010), with the amplitude set at every evaluation. `wavenumber` is k_f.
 
     The few forced modes are collected on all ranks in one message. Their mirror images in the plane kx = 0 are made
     exact conjugates there: otherwise round-off in the part that no real field has would be amplified by the forcing.

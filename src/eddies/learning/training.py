@@ -48,7 +48,7 @@ class TrainingDiverged(ValueError):
 
 
 class Training:
-    """Takes a model through phases. At the end of each it returns to the state of least validation error, its start
+    """Takes a model through phases. It returns at the end of each to the state of least validation error, its start
     included.
 
     Parameters

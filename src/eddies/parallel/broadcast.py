@@ -33,8 +33,8 @@ def first_complaint(comm: MPI.Comm, complaint: str | None) -> str | None:
 
 
 def on_first_rank(comm: MPI.Comm, action: Callable[[], Result]) -> Result:
-    """What an action gives on rank 0, the only one that does it, on every rank. Where it raises a UserError or an
-    OSError there, all ranks raise the same. One rank sends nothing."""
+    """What an action gives on rank 0, the only one that does it, on every rank. All ranks raise
+    the UserError or OSError that it raises there. One rank sends nothing."""
     result: Any = None
     error: Exception | None = None
     if comm.rank == 0:
@@ -55,8 +55,8 @@ def on_first_rank(comm: MPI.Comm, action: Callable[[], Result]) -> Result:
 
 
 def on_all_ranks(comm: MPI.Comm, action: Callable[[], Result]) -> Result:
-    """What an action gives on this rank. Where it raises an OSError on some, all ranks raise one, with the words of the
-    lowest."""
+    """What an action gives on this rank. All ranks raise an OSError that it raises on some, with the words of the lowest of
+    these."""
     result: Any = None
     complaint = None
     try:

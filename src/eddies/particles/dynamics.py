@@ -81,8 +81,8 @@ class ParticleDynamics:
     ) -> tuple[ParticleSet, dict[str, Tensor]]:
         """Bring particles to the ranks of their slabs, where halo and list must be built anew.
 
-        To be called before rates are asked for. `companions` are further columns (n, ...) that move with the
-        particles. Where a gradient is being recorded nothing changes rank, since that would cut it off.
+        It is called before rates are asked for. `companions` are further columns (n, ...) that move with the
+        particles. Nothing changes rank where a gradient is being recorded, since that would cut it off.
         Collective.
         """
         companions = companions or {}

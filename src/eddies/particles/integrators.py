@@ -45,7 +45,7 @@ class VelocityVerlet(Integrator):
     step's first half kick as well. A density with a rate is integrated by the trapezoidal rule; one that terms give
     is left as last evaluated.
 
-    `memory` holds those rates. For any other particles than those last returned they are evaluated anew.
+    `memory` holds those rates. They are evaluated anew for any other particles than those last returned.
     """
 
     def rates(self, particles: ParticleSet) -> tuple[ParticleSet, Rates]:

@@ -102,8 +102,8 @@ class LagrangianModel(nn.Module):
 
     @torch.no_grad()
     def linear_rates(self, context: Context) -> dict[str, LinearRates]:
-        """Of the terms that are linear in their parameters and do not read the density, by name, what the single
-        parameters do at given particles: what a training that looks at them again and again keeps; collective."""
+        """What the single parameters do at given particles, by name of the terms that are linear in them and do not
+        read the density: a training that looks at these particles again and again keeps it; collective."""
         return {name: self._linear_rates(term, context) for name, term in self._stages[0] if term.linear}
 
     @torch.no_grad()
@@ -130,8 +130,8 @@ class LagrangianModel(nn.Module):
         return [[item for item in named if ("density" in item[1].reads) == reading] for reading in (False, True)]
 
     def _at_particles(self, rates: Rates, context: Context) -> Rates:
-        """With what was given as modes taken to the particles: the force less its mean over them, as it keeps their
-        momentum. It would have none in continuous space, and has one where particles sample the grid unevenly."""
+        """Rates of which what was given as modes is taken to the particles: the force less its mean over them, as it
+        keeps their momentum. It would have none in continuous space, and has one where particles sample the grid unevenly."""
         pressure = rates.pressure_modes if self.density_is_given else None
         modes = [part for part in (rates.force_modes, None if pressure is None else pressure[None]) if part is not None]
         local = Rates(rates.acceleration, rates.density_rate, rates.density, rates.force_modes)
@@ -178,8 +178,8 @@ class LinearRates:
     parameters: Sequence[Tensor]
 
     def at(self, rows: Tensor | None) -> Rates:
-        """With acceleration and rate of some rows (k,) of the particles, or of all; differentiable in the
-        parameters."""
+        """The rates, acceleration and rate of density of some rows (k,) of the particles, or of all; differentiable
+        in the parameters."""
         values = {}
         for name in _GIVEN:
             value, slope = getattr(self.origin, name), self.slopes.get(name)

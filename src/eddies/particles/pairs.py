@@ -61,7 +61,7 @@ class Pairs:
         """Add values (components, m) of pairs that stand once to totals (components, n) of the owned particles.
 
         A value is added at the receiver and, times its `parity` (components,), 1 or -1, at the sender, unless that is
-        a ghost, whose owner has the pair as well. In place; the order is fixed, except on a GPU.
+        a ghost, whose owner has the pair as well. It works in place; the order is fixed, except on a GPU.
         """
         totals.index_add_(1, self.receiver, values)
         home = torch.nonzero(self.sender < totals.shape[1]).squeeze(1)

@@ -30,7 +30,7 @@ class Rates:
     pressure_modes: Tensor | None = None
 
     def at(self, rows: Tensor | None) -> Rates:
-        """With acceleration and rate of some rows (k,) of the particles alone."""
+        """The same with acceleration and rate of density of some rows (k,) of the particles alone."""
         if rows is None:
             return self
         kept = {name: None if getattr(self, name) is None else getattr(self, name)[rows]

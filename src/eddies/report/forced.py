@@ -50,7 +50,7 @@ class ForcedStatistics:
 
     @classmethod
     def of(cls, run: Rollout, span: StationarySpan) -> "ForcedStatistics":
-        """From a rollout whose filter width is known; the frames before it broke, if it did.
+        """The statistics of a rollout whose filter width is known; the frames before it broke, if it did.
 
         Raises ValueError if there is no such frame.
         """

@@ -19,7 +19,7 @@ TOO_FEW = "too few frames, or too few pairs of tracers"
 
 @dataclass(frozen=True)
 class Units:
-    """Of time and length, with their names: Kolmogorov's, or those of the large eddies without viscosity."""
+    """Units of time and length, with their names: Kolmogorov's, or those of the large eddies without viscosity."""
 
     time: float
     time_name: str
@@ -28,7 +28,7 @@ class Units:
 
     @classmethod
     def of(cls, scales: Mapping[str, float]) -> "Units":
-        """From the scales of the flow when the tracers start."""
+        """The units by the scales of the flow when the tracers start."""
         if scales["viscosity"] > 0:
             return cls(scales["kolmogorov_time"], r"t_\eta", scales["kolmogorov_length"], r"\eta")
         return cls(scales["eddy_turnover_time"], "T", scales["integral_scale"], "L")

@@ -81,8 +81,8 @@ class Model(Section):
 
 
 def replace_terms(table: dict[str, Any], keys: set[str]) -> None:
-    """Where one of preset and terms was written over a [model] of a file, let the other go, and with it the file's
-    settings of terms that there are no more. `keys` are those written over the file, "section.key"."""
+    """Let preset go where terms were written over a [model] of a file, and terms where a preset was; with them the
+    file's settings of terms that there are no more. `keys` are those written over the file, "section.key"."""
     if ("model.preset" in keys) == ("model.terms" in keys):
         return
     written, other = ("preset", "terms") if "model.preset" in keys else ("terms", "preset")

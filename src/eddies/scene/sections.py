@@ -153,7 +153,7 @@ class Horizons(Section):
 
     @classmethod
     def section_name(cls) -> str:
-        """Within [training]."""
+        """The name of this section within [training]."""
         return "training.horizons"
 
 

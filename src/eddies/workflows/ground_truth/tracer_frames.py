@@ -21,7 +21,7 @@ from eddies.workflows.ground_truth.frame_segments import FrameSegments
 class TracerFrames:
     """Stores frames of tracers in segments, and collects the spectra.
 
-    Times are counted from the release. Of a `compressible` flow the density is stored as well.
+    Times are counted from the release. The density of a `compressible` flow is stored as well.
     """
 
     def __init__(self, segments: FrameSegments, tracers: TracerParticles, settings: Tracers, released_at: float,

@@ -59,7 +59,7 @@ class EulerianRun:
 
     @property
     def time(self) -> float:
-        """Of the flow, since the start."""
+        """Time of the flow since the start."""
         return self.clock.time
 
     def advance(self, until: float, number: int) -> str | None:

@@ -77,7 +77,7 @@ class ParticleRun:
 
     @property
     def time(self) -> float:
-        """Of the particles, since the start."""
+        """Time of the particles since the start."""
         return self.dynamics.time
 
     def advance(self, until: float, number: int) -> str | None:

@@ -43,7 +43,7 @@ class StepSeconds:
 
     @classmethod
     def of_rollout(cls, attributes: Mapping[str, Any]) -> StepSeconds:
-        """As a rollout has measured itself."""
+        """The seconds that a rollout has measured of itself."""
         return cls(*(attributes[f"seconds_per_step{end}"] for end in ("", "_low", "_high")))
 
 
