@@ -55,8 +55,8 @@ def on_first_rank(comm: MPI.Comm, action: Callable[[], Result]) -> Result:
 
 
 def on_all_ranks(comm: MPI.Comm, action: Callable[[], Result]) -> Result:
-    """What an action gives on this rank. All ranks raise an OSError that it raises on some, with the words of the lowest of
-    these."""
+    """What an action gives on this rank. All ranks raise an OSError that it raises on some, with the words of the
+    lowest of these."""
     result: Any = None
     complaint = None
     try:

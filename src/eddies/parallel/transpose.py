@@ -12,7 +12,7 @@ class Transpose:
     """Exchange of arrays (components, z, y, x) between cuts along z and along y, all components in one message.
 
     `rows` is the length of the full z axis, `columns` of the full y axis. This rank holds, as planes,
-    `z_starts[rank]` to `z_starts[rank + 1]` of z and all of y; as columns, all of z and the block of y by the same rule.
+    `z_starts[rank]` to `z_starts[rank + 1]` of z and all of y; as columns, all of z and a block of y by the same rule.
     """
 
     def __init__(self, comm: MPI.Comm, rows: int, columns: int) -> None:

@@ -131,7 +131,8 @@ class LagrangianModel(nn.Module):
 
     def _at_particles(self, rates: Rates, context: Context) -> Rates:
         """Rates of which what was given as modes is taken to the particles: the force less its mean over them, as it
-        keeps their momentum. It would have none in continuous space, and has one where particles sample the grid unevenly."""
+        keeps their momentum. It would have none in continuous space, and has one where particles sample the grid
+        unevenly."""
         pressure = rates.pressure_modes if self.density_is_given else None
         modes = [part for part in (rates.force_modes, None if pressure is None else pressure[None]) if part is not None]
         local = Rates(rates.acceleration, rates.density_rate, rates.density, rates.force_modes)

@@ -48,7 +48,7 @@ def curves(history: Mapping[str, np.ndarray]) -> Figure:
 
 
 def _places(phase: np.ndarray) -> np.ndarray:
-    """The places where steps are drawn: those of the first phase in (0, 1], those of the second in (1, 2], and so on."""
+    """Where steps are drawn: those of the first phase in (0, 1], those of the second in (1, 2], and so on."""
     _, index, count = np.unique(phase, return_inverse=True, return_counts=True)
     before = np.cumsum(count) - count
     return index + (np.arange(len(phase)) - before[index] + 1) / count[index]

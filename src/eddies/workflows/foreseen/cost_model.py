@@ -49,7 +49,8 @@ LATENCY = 2e-6               # seconds of a message
 
 @dataclass(frozen=True)
 class Speed:
-    """The speed of the ranks at hand: `work`, seconds of a step for a cell of 64^3, and `bandwidth`, bytes a second to others."""
+    """The speed of the ranks at hand: `work`, seconds of a step for a cell of 64^3, and `bandwidth`, bytes a second to
+    others."""
 
     work: float
     bandwidth: float
