@@ -6,7 +6,7 @@ import h5py
 import pytest
 
 from eddies import cli
-from eddies.analysis.rollout_comparison import CommonFrames, error_series, particle_series
+from eddies.analysis.against_truth import CommonFrames, error_series, particle_series
 from eddies.io.hdf5 import ProductError, open_product
 from eddies.io.trajectories import Trajectory
 from eddies.report.rollout_figures import errors_over_time

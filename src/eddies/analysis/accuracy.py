@@ -5,10 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from eddies.analysis.against_truth import (EDGES, CommonFrames, Frames, first_broken_time, invariant_statistics,
+                                           particle_pair, pdf_divergence, spectra_pair)
 from eddies.analysis.errors import normalized_l2
-from eddies.analysis.rollout_comparison import (
-    EDGES, CommonFrames, Frames, first_broken_time, invariant_statistics, particle_pair, pdf_divergence, spectra_pair,
-)
 from eddies.analysis.spectra import spectrum_error
 
 # Name of each measure and what it is; zero is perfect but for the energy ratio. In the order of tables and figures.

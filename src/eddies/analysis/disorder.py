@@ -8,9 +8,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from eddies.analysis.against_truth import Frames
 from eddies.analysis.lagrangian import minimum_image
 from eddies.analysis.pdfs import bin_probabilities
-from eddies.analysis.rollout_comparison import Frames
 from eddies.analysis.spectra import energy_spectrum
 
 # Bins of the PDF of nearest-neighbour distances, in mean spacings; of random points exp(-14) lie beyond.

@@ -7,8 +7,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from eddies.analysis import disorder
+from eddies.analysis.against_truth import CommonFrames, Frames
 from eddies.analysis.pdfs import kl_divergence
-from eddies.analysis.rollout_comparison import CommonFrames, Frames
 from eddies.report.figures import GUIDE, letter, panels, styled
 from eddies.report.page import Metric, Section
 from eddies.report.rollout_figures import LINES

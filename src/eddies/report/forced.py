@@ -7,9 +7,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from eddies.analysis.against_truth import EDGES, Frames, first_broken_time, normalized_invariants
 from eddies.analysis.isotropic_turbulence import StationarySpan
 from eddies.analysis.pdfs import bin_probabilities, gaussian, kl_divergence, pdf, standardized
-from eddies.analysis.rollout_comparison import EDGES, Frames, first_broken_time, normalized_invariants
 from eddies.analysis.spectra import energy_spectrum, spectrum_error
 from eddies.analysis.velocity_gradients import InvariantBins, enstrophy_scale
 from eddies.report.figures import GUIDE, MODEL, TRUTH, letter, number_wavenumbers, panels, styled

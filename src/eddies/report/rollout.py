@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from eddies.analysis import rollout_comparison as comparison
+from eddies.analysis import against_truth
+from eddies.analysis.against_truth import CommonFrames, Frames, Pair, ParticleFrames
 from eddies.analysis.errors import normalized_l2
-from eddies.analysis.rollout_comparison import CommonFrames, Frames, Pair, ParticleFrames
 from eddies.analysis.spectra import spectrum_error, vorticity
 from eddies.report import disorder, rollout_figures
 from eddies.report.page import Metric, Section
@@ -77,7 +77,7 @@ class Rollout:
 
 def section(run: Rollout) -> Section:
     """The rollout: figures 4 to 9 and Lagrangian statistics; `run` is read frame by frame."""
-    broken = comparison.first_broken_time(run.model)
+    broken = against_truth.first_broken_time(run.model)
     text = (f"Moved by: {run.method}; integrator {run.attributes['integrator']}, time step "
             f"{float(run.attributes['time_step']):.3g}. T = {run.turnover:.3g} is the eddy turnover time. ")
     shown = Section("rollout", "Rollout against the truth", text, main=MAIN, metrics=[
@@ -159,7 +159,7 @@ def _add_planes(shown: Section, run: Rollout, fields: Mapping[str, Frames], last
         rollout_figures.velocity_planes(planes, run.turnover, TRUTH_NAMES[name]),
         f"u_x in the plane z = π: {TRUTH_NAMES[name]} above, the model through the learned kernel below. "
         f"Relative difference in the last plane: {normalized_l2(planes[-1].model, planes[-1].truth):.3f}.")
-    at = comparison.particle_pair(model, truth, common, common.times.size - 1, "velocity")
+    at = against_truth.particle_pair(model, truth, common, common.times.size - 1, "velocity")
     rotation = Pair(at.time, _magnitude(vorticity(at.model)), _magnitude(vorticity(at.truth)))
     energy = Pair(at.time, _magnitude(at.model) ** 2 / 2, _magnitude(at.truth) ** 2 / 2)
     ratios = [pair.model.mean() / pair.truth.mean() for pair in (rotation, energy)]
@@ -171,10 +171,10 @@ def _add_planes(shown: Section, run: Rollout, fields: Mapping[str, Frames], last
 
 
 def _add_particles(shown: Section, run: Rollout, common: CommonFrames) -> None:
-    errors = comparison.error_series(run.model, run.truth, common)
+    errors = against_truth.error_series(run.model, run.truth, common)
     final = {name: float(values[-1]) for name, values in errors.items()}
-    model = comparison.particle_series(run.model, np.arange(run.model.times.size), run.length)
-    truth = comparison.particle_series(run.truth, common.truth, run.length)
+    model = against_truth.particle_series(run.model, np.arange(run.model.times.size), run.length)
+    truth = against_truth.particle_series(run.truth, common.truth, run.length)
     ratio = float(model["energy"][common.model[-1]] / truth["energy"][-1])
     shown.metrics += [
         Metric("energy_ratio", "particle kinetic energy, model / truth", ratio),
@@ -182,10 +182,10 @@ def _add_particles(shown: Section, run: Rollout, common: CommonFrames) -> None:
         Metric("velocity_kl", "KL divergence of the velocity PDF", final["velocity_kl"]),
         Metric("acceleration_kl", "KL divergence of the acceleration PDF", final["acceleration_kl"]),
     ]
-    pairs = {column: [comparison.particle_pair(run.model, run.truth, common, index, column)
-                      for index in common.spread(3)] for column in comparison.EDGES}
-    floors = {column: comparison.sampling_floor(pairs[column][-1], edges)
-              for column, edges in comparison.EDGES.items()}
+    pairs = {column: [against_truth.particle_pair(run.model, run.truth, common, index, column)
+                      for index in common.spread(3)] for column in against_truth.EDGES}
+    floors = {column: against_truth.sampling_floor(pairs[column][-1], edges)
+              for column, edges in against_truth.EDGES.items()}
     accelerations = pairs["acceleration"][-1]
     shown.metrics += [
         *(Metric(f"{column}_kl_floor", f"the same of two samples of the true {column}, as large as this", floor)
@@ -214,7 +214,7 @@ def _add_particles(shown: Section, run: Rollout, common: CommonFrames) -> None:
 
 
 def _add_invariants(shown: Section, run: Rollout, common: CommonFrames) -> None:
-    statistics = comparison.invariant_statistics(run.model, run.truth, common)
+    statistics = against_truth.invariant_statistics(run.model, run.truth, common)
     shown.metrics.append(Metric("qr_kl", "KL divergence of the Q–R joint PDF", statistics.divergence))
     shown.add_figure(
         "figure-7-invariants", "Invariants Q and R of the velocity gradient (the paper's Fig. 7)",
@@ -227,7 +227,7 @@ def _add_invariants(shown: Section, run: Rollout, common: CommonFrames) -> None:
 def _add_spectra(shown: Section, run: Rollout, fields: Mapping[str, Frames], last: float) -> None:
     model, truth = fields["model"], fields["truth"]
     common = CommonFrames.of(model, truth, _just_after(last))
-    series = [comparison.spectra_pair(model, truth, common, index) for index in common.spread(3)]
+    series = [against_truth.spectra_pair(model, truth, common, index) for index in common.spread(3)]
     at = series[-1]
     caption = "Model and true tracers through the learned kernel; the DNS at the nearest stored time."
     cutoff, half, whole = run.filter_wavenumber, None, None

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from eddies.analysis.rollout_comparison import Pair, SpectraAt
+from eddies.analysis.against_truth import Pair, SpectraAt
 from eddies.report.figures import (DNS, FILTERED, FOURTH, GUIDE, MODEL, POSITIVE, SIGNED, TRUTH, colour_bar,
                                    guide_power_law, largest, letter, number_wavenumbers, panels, show_plane, styled)
 

@@ -7,8 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
+from eddies.analysis.against_truth import EDGES, InvariantStatistics, Pair, pdf_divergence
 from eddies.analysis.pdfs import gaussian, pdf, standardized
-from eddies.analysis.rollout_comparison import EDGES, InvariantStatistics, Pair, pdf_divergence
 from eddies.analysis.velocity_gradients import ConditionalVelocity, InvariantBins, vieillefosse_line
 from eddies.report.figures import GUIDE, MODEL, TRUTH, colour_bar, letter, panels, styled
 
