@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from eddies.parallel.halo import HaloError
-from eddies.parallel.reduction import any_rank, global_sum
+from eddies.parallel.reduction import global_max, global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.fourier_grid import FourierGrid, Points
@@ -254,11 +254,12 @@ class ResolvedVelocity:
         return solve
 
     def _require_reach(self, position: Tensor) -> None:
-        slab = self.grid.decomposition
-        if slab.size == 1:
-            return
-        z, reach = position[:, 2].detach(), self.grid.reach
-        if any_rank(slab.comm, bool(((z < slab.lower - reach) | (z >= slab.upper + reach)).any())):
+        slab, reach, position = self.grid.decomposition, self.grid.reach, position.detach()
+        z, lost = position[:, 2], not bool(torch.isfinite(position).all())
+        outside = slab.size > 1 and bool(((z < slab.lower - reach) | (z >= slab.upper + reach)).any())
+        if (worst := global_max(slab.comm, 2.0 * lost or 1.0 * outside)) == 2:
+            raise HaloError("the position of a particle is not finite: shorten the time step")
+        if worst == 1:
             raise HaloError(f"a particle moves more than {reach:.3g} out of its slab before it can change rank, and "
                             "the ghost planes reach no farther: shorten the time step or the skin")
 
