@@ -26,15 +26,6 @@ CLOUDS = {
 }
 
 
-@pytest.fixture(params=["plain", "avx2", "avx512"])
-def library(request):
-    if not instruction_sets():
-        pytest.skip("the library is not compiled")
-    if request.param not in instruction_sets():
-        pytest.skip("this processor does not run it")
-    return load(request.param)
-
-
 def padded_planes(cells):
     """Of a slab that is the whole box."""
     return PaddedPlanes(cells, SPACING, -BELOW, BELOW + cells + ABOVE)

@@ -100,7 +100,7 @@ def test_no_arrangement_of_particles_disturbs_a_solve(comm, kind):
     found = ResolvedVelocity.on_slabs(slab, units(8))
     found.most_iterations = 150
     flow = found.of(particles)
-    penalty = (found._penalty * flow.grid.multiplicity * flow.velocity.abs().square().sum(0)).sum()
+    penalty = (found.equations.penalty * flow.grid.multiplicity * flow.velocity.abs().square().sum(0)).sum()
     assert flow.missing().square().sum() + penalty <= flow.relative_velocity.square().sum()
     # Where most particles are in a few places a solve takes hundreds of iterations, and says that it did not converge.
     assert flow.converged == (kind not in ("cluster across a corner", "void", "uneven"))

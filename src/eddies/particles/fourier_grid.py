@@ -40,8 +40,10 @@ class FourierGrid:
         #: |k|, in units of the smallest one
         self.shell = torch.from_numpy(np.sqrt(self.spectral.index_squared))
         self.wavenumber_squared = torch.from_numpy(self.spectral.wavenumber_squared)
-        self._inverse_squared = torch.where(self.shell > 0, 1 / self.wavenumber_squared, 0.0)
-        self._prefilter = torch.from_numpy(self.spline.inverse)
+        #: 1/k^2, 0 for k = 0
+        self.inverse_squared = torch.where(self.shell > 0, 1 / self.wavenumber_squared, 0.0)
+        #: by which modes become those of spline coefficients
+        self.prefilter = torch.from_numpy(self.spline.inverse)
         #: how often a stored mode stands in the full sum
         self.multiplicity = torch.from_numpy(self.spectral.multiplicity)
 
@@ -62,13 +64,13 @@ class FourierGrid:
     def at(self, modes: Tensor, position: Tensor | Points) -> Tensor:
         """Values (n, c) of modes at positions, by cubic splines; differentiable in both."""
         points = self._as_points(position)
-        return _Interpolated.apply(self.to_fields(modes * self._prefilter), points.position, points)
+        return _Interpolated.apply(self.to_fields(modes * self.prefilter), points.position, points)
 
     def spread(self, values: Tensor, position: Tensor | Points) -> Tensor:
         """Modes (c, kz, ky, kx) of a sum of splines around positions with weights `values` (n, c); differentiable in
         both. Up to the number of points and the multiplicity of modes the adjoint of `at`."""
         points = self._as_points(position)
-        return self.to_modes(_Spread.apply(values, points.position, points)) * self._prefilter
+        return self.to_modes(_Spread.apply(values, points.position, points)) * self.prefilter
 
     def _as_points(self, position: Tensor | Points) -> Points:
         return position if isinstance(position, Points) else self.points(position)
@@ -89,7 +91,7 @@ class FourierGrid:
 
     def solenoidal(self, vector: Tensor) -> Tensor:
         """u - k (k.u) / k^2, the projection of a vector on solenoidal fields."""
-        longitudinal = self._along(vector) * self._inverse_squared
+        longitudinal = self._along(vector) * self.inverse_squared
         return vector - torch.stack([k * longitudinal for k in self.wavevector])
 
     def stress_divergence(self, stress: Tensor) -> Tensor:
@@ -99,7 +101,7 @@ class FourierGrid:
 
     def pressure_of(self, stress: Tensor) -> Tensor:
         """p (kz, ky, kx) with  laplacian p = -d_i d_j tau_ij  and mean zero, of a symmetric matrix (6, kz, ky, kx)."""
-        return self.divergence(self.stress_divergence(stress)) * self._inverse_squared
+        return self.divergence(self.stress_divergence(stress)) * self.inverse_squared
 
     def hidden_stress(self, stress: Tensor) -> Rates:
         """What a stress tau that the filter hides does to the filtered flow, of (6, kz, ky, kx): its divergence and the

@@ -53,17 +53,18 @@ class SplineInterpolation:
         """Values (n, c) at positions (n, 3), x and y anywhere, z within the slab and the margin (periodically).
 
         Errors are those of `around`."""
-        return self.around(positions).at(coefficients)
+        return self.around(positions, once=True).at(coefficients)
 
-    def around(self, positions: np.ndarray) -> Splines | CompiledSplines:
-        """The splines around positions (n, 3), for values, slopes and sums of splines at the same points.
+    def around(self, positions: np.ndarray, once: bool = False) -> Splines | CompiledSplines:
+        """The splines around positions (n, 3), for values, slopes and sums of splines at the same points; to be used
+        again, or but `once`.
 
         Raises HaloError where one is outside the slab and the margin, ValueError where one is not finite.
         """
         compiled, padded = library(), self._padded
         try:
             if compiled is None:
-                return Splines(self.degree, positions, padded)
+                return Splines(self.degree, positions, padded, held=not once)
             return CompiledSplines(compiled, self.degree, positions, padded)
         except MisplacedPoint as error:
             position = np.asarray(positions)[error.number]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -16,11 +16,12 @@ class Splines:
     """The s = (degree + 1)^3 tensor-product B-splines around each of some points (n, 3), of degree 3 or 5.
 
     x and y are periodic; z, periodically, must be where there are planes. Planes are given as parts that follow each
-    other, (c, planes, y, x) each. Raises MisplacedPoint.
+    other, (c, planes, y, x) each. `held`: keep the splines, 16 s bytes a point, for further calls. Raises
+    MisplacedPoint.
     """
 
-    def __init__(self, degree: int, positions: np.ndarray, padded: PaddedPlanes) -> None:
-        self.degree, self._padded = degree, padded
+    def __init__(self, degree: int, positions: np.ndarray, padded: PaddedPlanes, held: bool = False) -> None:
+        self.degree, self._padded, self._held = degree, padded, {} if held else None
         scaled = np.asarray(positions, np.float64) / padded.spacing
         cell = np.floor(scaled)
         placed = (np.abs(cell) < FARTHEST).all(1)
@@ -44,7 +45,7 @@ class Splines:
         """Transpose of `at`: values (n, c) added to planes."""
         cells, planes = self._padded.cells, self._padded.planes
         added = np.zeros((values.shape[1], planes * cells**2))
-        for block, rows, weights in self._stencils(None):
+        for block, rows, weights in self._stencils():
             for component, column in zip(added, values[block].T):
                 np.add.at(component, rows, weights * column[:, None])
         ends = np.cumsum([part.shape[1] for part in parts])
@@ -59,7 +60,14 @@ class Splines:
             values[block] = np.matmul(weights[:, None], flat[rows])[:, 0]
         return values
 
-    def _stencils(self, derivative: int | None) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
+    def _stencils(self, derivative: int | None = None) -> Iterable[tuple[slice, np.ndarray, np.ndarray]]:
+        if self._held is None:
+            return self._made(derivative)
+        if derivative not in self._held:
+            self._held[derivative] = list(self._made(derivative))
+        return self._held[derivative]
+
+    def _made(self, derivative: int | None) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
         """Block by block of points, the splines around them: their rows (n, s) in the flattened planes, and their
         values (n, s) at the points, or the derivatives of these along one axis."""
         cells, width = self._padded.cells, self.degree + 1
