@@ -149,6 +149,17 @@ def test_a_rank_without_particles_takes_part_there_and_back(comm):
     assert all(torch.isfinite(column.grad).all() for column in columns)
 
 
+@pytest.mark.mpi(1, 2)
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_a_position_that_is_not_finite_is_refused_on_all_ranks(comm, value):
+    slab, particles, _ = in_known_flow(comm)
+    lost = particles.position.clone()
+    if comm.rank == comm.size - 1:
+        lost[0, 1] = value
+    with pytest.raises(HaloError, match="not finite"):
+        resolution_on(slab).of(replace(particles, position=lost))
+
+
 @pytest.mark.mpi(2)
 def test_a_particle_beyond_the_ghost_planes_is_refused_on_all_ranks(comm):
     slab, particles, _ = in_known_flow(comm)
