@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Sets eddies up in this checkout, in .venv: MPI, parallel HDF5 and h5py on it, the pinned Python packages, eddies.
+# Sets eddies up in this checkout, in .venv: MPI, parallel HDF5 and h5py on it, the pinned Python packages, eddies with
+# its compiled kernels.
 # Safe to repeat and to interrupt; does nothing where nothing has changed.
 #   EDDIES_PYTHON  the Python to use (3.11 or newer); default: the first of python3, python3.13, .12, .11
 #   HDF5_DIR       parallel HDF5, built with the mpicc on the PATH; default: Debian's, or that of h5pcc
@@ -16,7 +17,8 @@ fail() { echo "bootstrap: $*" >&2; exit 1; }
 have() { command -v "$1" > /dev/null 2>&1; }
 
 fingerprint() {
-    { cat setup.cfg $constraints mpi_tools/bootstrap.sh; echo "$checkout"; "$venv/bin/python" -V; } 2>&1 | sha256sum
+    { cat setup.cfg setup.py src/eddies/kernels/*.cpp $constraints mpi_tools/bootstrap.sh; echo "$checkout"
+      "$venv/bin/python" -V; } 2>&1 | sha256sum
 }
 
 # ---- system packages
@@ -59,7 +61,7 @@ missing_packages() {
     python=$(find_python)
     if ! have mpicc || ! have mpirun; then echo openmpi-bin libopenmpi-dev libhdf5-openmpi-dev
     elif [ -z "$(find_hdf5)" ]; then echo "libhdf5-$(mpi_flavour)-dev"; fi
-    if ! have gcc; then echo gcc libc6-dev; fi
+    if ! have gcc; then echo gcc g++ libc6-dev; fi
     if [ -z "$python" ]; then echo python3 python3-venv python3-dev; return; fi
     if ! "$python" -c 'import venv, ensurepip' 2> /dev/null; then echo python3-venv; fi
     if [ ! -e "$("$python" -c 'import sysconfig; print(sysconfig.get_path("include"))')/Python.h" ]; then
@@ -146,6 +148,10 @@ make_environment
 say "installing Python packages (torch is large)"
 install setuptools wheel cython pkgconfig numpy mpi4py
 install_h5py
+rm -f src/eddies/kernels/*.so  # not written over: a job may have them loaded
 install --no-build-isolation --editable '.[test]'
+if ! [ -e src/eddies/kernels/plain.so ]; then
+    say "no C++17 compiler with OpenMP (CXX=${CXX:-g++}): without compiled kernels everything runs, several times slower"
+fi
 fingerprint > "$venv/set-up"
 say "done: .venv/bin/eddies"

@@ -19,7 +19,7 @@ LAYERS = (
     (("__init__", "__version__"), ("errors*",)),
     (("pipeline*",), ("import_path*",), ("clock*",), ("time_stepping*",)),
     (("scene*", "particles.terms.settings*", "particles.terms.presets*"),),
-    (("parallel*",),),
+    (("parallel*",), ("kernels*",)),
     (("io*",),),
     (("spectral*",),),
     (("flow*",), ("particles*",)),
@@ -44,6 +44,7 @@ ONLY_IN = {
     # Of the particles only the settings of terms declare keys of a scene.
     "eddies.scene.values*": ("scene*", "particles.terms.settings", "workflows*"),
     "eddies.import_path*": ("scene*", "particles.model", "particles.terms.pair_basis", "workflows*"),
+    "ctypes*": ("kernels*",),
     "pickle*": (),
 }
 COMM_WORLD_IN = ("cli", "api")
@@ -130,6 +131,8 @@ def test_tools_import_nothing_from_the_package():
     ("analysis/spectra", "import matplotlib.pyplot", "imports matplotlib.pyplot"),
     ("workflows/train", "import matplotlib.pyplot", "imports matplotlib.pyplot"),
     ("workflows/simulate", "from eddies.report import ground_truth", "imports eddies.report.ground_truth"),
+    ("spectral/splines", "import ctypes", "imports ctypes"),
+    ("kernels/library", "import eddies.parallel.slab", "not below it"),
     ("io/hdf5", "import pickle", "imports pickle"),
     ("io/hdf5", "from mpi4py import MPI\ncomm = MPI.COMM_WORLD", "uses COMM_WORLD"),
     ("io/hdf5", "from mpi4py.MPI import COMM_WORLD", "uses COMM_WORLD"),

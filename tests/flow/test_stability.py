@@ -129,5 +129,5 @@ def test_a_watch_that_goes_on_remembers_the_energy_before(comm):
 def test_a_start_that_is_not_finite_is_told_before_the_first_step(comm):
     fluid, state = compressible(comm)
     state[0, 0, 0, 1] = np.nan
-    with pytest.raises(FlowDiverged, match=r"step 0, time 0: the flow is not finite. .*\[initial\]"):
+    with pytest.raises(FlowDiverged, match=r"step 0, time 0: the flow is not finite. .*amplitude or path"):
         FlowHistory(fluid).sample(state, Clock())

@@ -102,7 +102,7 @@ def test_no_arrangement_of_particles_disturbs_a_solve(comm, kind):
     found = ResolvedVelocity.on_slabs(slab, units(8))
     found.most_iterations = 150
     flow = found.of(particles)
-    penalty = (found._penalty * flow.grid.multiplicity * flow.velocity.abs().square().sum(0)).sum()
+    penalty = (found.equations.penalty * flow.grid.multiplicity * flow.velocity.abs().square().sum(0)).sum()
     assert flow.missing().square().sum() + penalty <= flow.relative_velocity.square().sum()
     # Where most particles are in a few places a solve takes hundreds of iterations, and says that it did not converge.
     assert flow.converged == (kind not in ("cluster across a corner", "void", "uneven"))
@@ -149,6 +149,17 @@ def test_a_rank_without_particles_takes_part_there_and_back(comm):
     columns = [column.clone().requires_grad_() for column in (particles.position, particles.velocity)]
     found.rates(replace(particles, position=columns[0], velocity=columns[1])).acceleration.square().sum().backward()
     assert all(torch.isfinite(column.grad).all() for column in columns)
+
+
+@pytest.mark.mpi(1, 2)
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_a_position_that_is_not_finite_is_refused_on_all_ranks(comm, value):
+    slab, particles, _ = in_known_flow(comm)
+    lost = particles.position.clone()
+    if comm.rank == comm.size - 1:
+        lost[0, 1] = value
+    with pytest.raises(HaloError, match="not finite"):
+        resolution_on(slab).of(replace(particles, position=lost))
 
 
 @pytest.mark.mpi(2)

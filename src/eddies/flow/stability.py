@@ -29,8 +29,8 @@ LEAK = 0.5
 GROWTH = 10
 
 EXACT = ', or take stepper = "etdrk4", which knows no such limit'
-REMEDIES = {"advection": "lower [time] courant or step", "sound": "lower [time] courant or step" + EXACT,
-            "viscosity": "lower [time] max_step or step" + EXACT}
+REMEDIES = {"advection": "lower courant or step", "sound": "lower courant or step" + EXACT,
+            "viscosity": "lower max_step or step" + EXACT}
 
 
 class FlowDiverged(UserError, RuntimeError):
@@ -43,8 +43,8 @@ class FlowDiverged(UserError, RuntimeError):
     def unless_finite(cls, number: float, clock: Clock) -> None:
         """Raise it unless a number measured of a flow is finite; a flow that is watched hardly can but at its start."""
         if not math.isfinite(number):
-            raise cls("the flow is not finite", clock, "Correct what it starts from: [initial] amplitude or path"
-                      if clock.steps == 0 else "Lower [time] courant or step, or raise [flow] cells or viscosity")
+            raise cls("the flow is not finite", clock, "Correct what it starts from: amplitude or path"
+                      if clock.steps == 0 else "Lower courant or step, or raise cells or viscosity")
 
 
 @dataclass(frozen=True)
@@ -101,9 +101,9 @@ def advice(fluid: Fluid, limits: Sequence[StepLimit], kmax_eta: float) -> str:
         return "Broken: " + "; ".join(f"{limit}: {REMEDIES[limit.name]}" for limit in broken)
     resolution = f"k_max eta was {kmax_eta:.2g}, about 1 is needed" if fluid.viscosity > 0 else "there is no viscosity"
     text = ("The step broke no limit (" + "; ".join(map(str, limits)) + f"), so the grid is likely too coarse "
-            f"({resolution}): raise [flow] cells or viscosity")
+            f"({resolution}): raise cells or viscosity")
     if fluid.compressible and len(limits) == 1 and limits[0].number > LEAK:
-        text += ". Or sound grows that is hardly damped: lower [time] courant or step"
+        text += ". Or sound grows that is hardly damped: lower courant or step"
     return text
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from mpi4py import MPI
 
@@ -25,32 +27,33 @@ class PlaneHalo:
                 f"{max(decomposition.planes // needed, 1)} ranks"
             )
 
-    def forward(self, planes: np.ndarray) -> np.ndarray:
-        """(z_local, ...) -> (below + z_local + above, ...)."""
-        count = len(planes)
-        padded = np.empty((self.below + count + self.above, *planes.shape[1:]), planes.dtype)
-        padded[self.below : self.below + count] = planes
-        lowest, highest = planes[: self.above], planes[count - self.below :]
-        if self.decomposition.size == 1:
-            padded[: self.below], padded[self.below + count :] = highest, lowest
-        else:
-            slab = self.decomposition
-            self._exchange(lowest, slab.below, padded[self.below + count :], slab.above)
-            self._exchange(highest, slab.above, padded[: self.below], slab.below)
-        return padded
+    def forward(self, planes: np.ndarray) -> list[np.ndarray]:
+        """Planes (c, z_local, ...) -> parts that follow each other, (c, below, ...), the planes, (c, above, ...)."""
+        slab, count = self.decomposition, planes.shape[1]
+        lowest, highest = planes[:, : self.above], planes[:, count - self.below :]
+        if slab.size == 1:
+            return [highest, planes, lowest]
+        from_below, from_above = np.empty(highest.shape, planes.dtype), np.empty(lowest.shape, planes.dtype)
+        self._exchange(lowest, slab.below, from_above, slab.above)
+        self._exchange(highest, slab.above, from_below, slab.below)
+        return [from_below, planes, from_above]
 
-    def adjoint(self, padded: np.ndarray) -> np.ndarray:
-        """Transpose of `forward`: ghost planes added at home, (below + z_local + above, ...) -> (z_local, ...)."""
-        slab, count = self.decomposition, len(padded) - self.below - self.above
-        planes = padded[self.below : self.below + count].copy()
-        lowest, highest = padded[self.below + count :], padded[: self.below]
+    def parts(self, planes: np.ndarray) -> list[np.ndarray]:
+        """The parts of (c, z_local, ...) with ghost planes of nothing, for `adjoint`."""
+        shape = planes.shape[0], planes.shape[2:]
+        return [np.zeros((shape[0], self.below, *shape[1])), planes, np.zeros((shape[0], self.above, *shape[1]))]
+
+    def adjoint(self, parts: Sequence[np.ndarray]) -> np.ndarray:
+        """Transpose of `forward`: ghost planes added at home, to the planes (c, z_local, ...) themselves."""
+        highest, planes, lowest = parts
+        slab, count = self.decomposition, planes.shape[1]
         if slab.size > 1:
-            received = np.empty(lowest.shape, padded.dtype), np.empty(highest.shape, padded.dtype)
-            self._exchange(lowest, slab.above, received[0], slab.below)
-            self._exchange(highest, slab.below, received[1], slab.above)
-            lowest, highest = received
-        planes[: self.above] += lowest
-        planes[count - self.below :] += highest
+            from_below, from_above = np.empty(lowest.shape, lowest.dtype), np.empty(highest.shape, highest.dtype)
+            self._exchange(lowest, slab.above, from_below, slab.below)
+            self._exchange(highest, slab.below, from_above, slab.above)
+            lowest, highest = from_below, from_above
+        planes[:, : self.above] += lowest
+        planes[:, count - self.below :] += highest
         return planes
 
     def _exchange(self, sent: np.ndarray, destination: int, received: np.ndarray, source: int) -> None:

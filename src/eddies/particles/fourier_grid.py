@@ -5,17 +5,20 @@ Everything made of them is a formula that differentiates itself.
 
 from __future__ import annotations
 
-import warnings
+import functools
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from eddies.kernels.splines import CompiledSplines
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.particle_set import as_numpy
 from eddies.particles.rates import Rates
 from eddies.spectral.interpolation import SplineInterpolation
 from eddies.spectral.spectral_grid import SpectralGrid
+from eddies.spectral.splines import Splines
 
 
 class FourierGrid:
@@ -37,8 +40,10 @@ class FourierGrid:
         #: |k|, in units of the smallest one
         self.shell = torch.from_numpy(np.sqrt(self.spectral.index_squared))
         self.wavenumber_squared = torch.from_numpy(self.spectral.wavenumber_squared)
-        self._inverse_squared = torch.where(self.shell > 0, 1 / self.wavenumber_squared, 0.0)
-        self._prefilter = torch.from_numpy(self.spline.inverse)
+        #: 1/k^2, 0 for k = 0
+        self.inverse_squared = torch.where(self.shell > 0, 1 / self.wavenumber_squared, 0.0)
+        #: by which modes become those of spline coefficients
+        self.prefilter = torch.from_numpy(self.spline.inverse)
         #: how often a stored mode stands in the full sum
         self.multiplicity = torch.from_numpy(self.spectral.multiplicity)
 
@@ -59,13 +64,13 @@ class FourierGrid:
     def at(self, modes: Tensor, position: Tensor | Points) -> Tensor:
         """Values (n, c) of modes at positions, by cubic splines; differentiable in both."""
         points = self._as_points(position)
-        return _Interpolated.apply(self.to_fields(modes * self._prefilter), points.position, points)
+        return _Interpolated.apply(self.to_fields(modes * self.prefilter), points.position, points)
 
     def spread(self, values: Tensor, position: Tensor | Points) -> Tensor:
         """Modes (c, kz, ky, kx) of a sum of splines around positions with weights `values` (n, c); differentiable in
         both. Up to the number of points and the multiplicity of modes the adjoint of `at`."""
         points = self._as_points(position)
-        return self.to_modes(_Spread.apply(values, points.position, points)) * self._prefilter
+        return self.to_modes(_Spread.apply(values, points.position, points)) * self.prefilter
 
     def _as_points(self, position: Tensor | Points) -> Points:
         return position if isinstance(position, Points) else self.points(position)
@@ -86,7 +91,7 @@ class FourierGrid:
 
     def solenoidal(self, vector: Tensor) -> Tensor:
         """u - k (k.u) / k^2, the projection of a vector on solenoidal fields."""
-        longitudinal = self._along(vector) * self._inverse_squared
+        longitudinal = self._along(vector) * self.inverse_squared
         return vector - torch.stack([k * longitudinal for k in self.wavevector])
 
     def stress_divergence(self, stress: Tensor) -> Tensor:
@@ -96,7 +101,7 @@ class FourierGrid:
 
     def pressure_of(self, stress: Tensor) -> Tensor:
         """p (kz, ky, kx) with  laplacian p = -d_i d_j tau_ij  and mean zero, of a symmetric matrix (6, kz, ky, kx)."""
-        return self.divergence(self.stress_divergence(stress)) * self._inverse_squared
+        return self.divergence(self.stress_divergence(stress)) * self.inverse_squared
 
     def hidden_stress(self, stress: Tensor) -> Rates:
         """What a stress tau that the filter hides does to the filtered flow, of (6, kz, ky, kx): its divergence and the
@@ -133,47 +138,26 @@ class FourierGrid:
 
 
 class Points:
-    """Positions (n, 3) among the planes of a grid, and the splines around them as sparse matrices (n, rows of the
-    padded planes): they cost more to make than to use, and are used in every iteration of a solve."""
+    """Positions (n, 3) among the planes of a grid, and the splines around them, which are found once."""
 
     def __init__(self, spline: SplineInterpolation, position: Tensor) -> None:
         self.spline, self.position = spline, position
-        self._matrices: dict[int | None, Tensor] = {}
 
-    def at(self, padded: np.ndarray) -> Tensor:
-        """Values (n, c) of padded planes (z, y, x, c)."""
-        return (self._matrix() @ _flat(padded)).to(self.position.device)
+    @functools.cached_property
+    def _splines(self) -> Splines | CompiledSplines:
+        return self.spline.around(as_numpy(self.position))
 
-    def slope_along(self, padded: np.ndarray, factors: Tensor) -> Tensor:
+    def at(self, parts: Sequence[np.ndarray]) -> Tensor:
+        """Values (n, c) of planes with those of the neighbours."""
+        return torch.from_numpy(self._splines.at(parts)).to(self.position.device)
+
+    def slope_along(self, parts: Sequence[np.ndarray], factors: Tensor) -> Tensor:
         """Gradient (n, 3) with respect to the positions of sum_c factors_c f_c, the factors (n, c) held fixed."""
-        fields, factors = _flat(padded), factors.detach().cpu().double()
-        return torch.stack([(factors * (self._matrix(axis) @ fields)).sum(1) for axis in range(3)], 1).to(self.position)
+        return torch.from_numpy(self._splines.slope(parts, as_numpy(factors.double()))).to(self.position)
 
     def spread(self, values: Tensor) -> Tensor:
         """Transpose of `at` on planes with ghosts: values (n, c) added to planes (c, z_local, y, x)."""
-        matrix, n, planes = self._matrix(), self.spline.grid.cells, self.spline.padded_planes()
-        rows, weights = matrix.col_indices().numpy(), matrix.values().view(-1, (self.spline.degree + 1) ** 3)
-        # Of no points at all `bincount` makes integers.
-        padded = np.stack([np.bincount(rows, (weights * column[:, None]).numpy().ravel(), planes * n * n)
-                           for column in values.detach().cpu().double().T], axis=-1, dtype=np.float64)
-        return torch.from_numpy(self.spline.without_ghosts(padded.reshape(planes, n, n, -1)))
-
-    def _matrix(self, derivative: int | None = None) -> Tensor:
-        if derivative not in self._matrices:
-            planes = self.spline.padded_planes()
-            rows, weights = self.spline.stencil(as_numpy(self.position), planes, derivative)
-            n, width = rows.shape
-            with warnings.catch_warnings():
-                warnings.filterwarnings("ignore", "Sparse CSR tensor support is in beta")
-                self._matrices[derivative] = torch.sparse_csr_tensor(
-                    torch.arange(0, n * width + 1, width), torch.from_numpy(rows.ravel()),
-                    torch.from_numpy(weights.ravel()), (n, planes * self.spline.grid.cells**2),
-                    check_invariants=False)
-        return self._matrices[derivative]
-
-
-def _flat(padded: np.ndarray) -> Tensor:
-    return torch.from_numpy(padded.reshape(-1, padded.shape[-1]))
+        return torch.from_numpy(self.spline.spread(as_numpy(values.double()), self._splines))
 
 
 # Modes with kx > 0 stand for two, so the transform back is the adjoint of the transform forth but for `multiplicity`
@@ -211,13 +195,13 @@ class _Interpolated(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, planes: Tensor, position: Tensor, points: Points) -> Tensor:
-        ctx.points, ctx.padded = points, points.spline.with_ghosts(as_numpy(planes))
-        return points.at(ctx.padded)
+        ctx.points, ctx.parts = points, points.spline.with_ghosts(as_numpy(planes))
+        return points.at(ctx.parts)
 
     @staticmethod
     def backward(ctx, gradient: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
         by_planes = ctx.points.spread(gradient) if ctx.needs_input_grad[0] else None
-        by_position = ctx.points.slope_along(ctx.padded, gradient) if ctx.needs_input_grad[1] else None
+        by_position = ctx.points.slope_along(ctx.parts, gradient) if ctx.needs_input_grad[1] else None
         return by_planes, by_position, None
 
 
@@ -233,5 +217,5 @@ class _Spread(torch.autograd.Function):
     @staticmethod
     def backward(ctx, gradient: Tensor) -> tuple[Tensor, Tensor, None]:
         points, (values,) = ctx.points, ctx.saved_tensors
-        padded = points.spline.with_ghosts(as_numpy(gradient))
-        return points.at(padded).to(values), points.slope_along(padded, values), None
+        parts = points.spline.with_ghosts(as_numpy(gradient))
+        return points.at(parts).to(values), points.slope_along(parts, values), None

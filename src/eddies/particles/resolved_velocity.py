@@ -11,10 +11,11 @@ import torch
 from torch import Tensor
 
 from eddies.parallel.halo import HaloError
-from eddies.parallel.reduction import any_rank, global_sum
+from eddies.parallel.reduction import global_max, global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.flow_units import FlowUnits
-from eddies.particles.fourier_grid import FourierGrid, Points
+from eddies.particles.fourier_grid import FourierGrid
+from eddies.particles.least_squares import LeastSquares
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.rank_sums import mean_over_ranks, sum_over_ranks
 from eddies.particles.reference_scales import resolved_wavenumber
@@ -27,9 +28,6 @@ EXPONENT, WEIGHT = 11 / 3, 30.0
 # what is foreseen. The latter's is spread over all modes, the former's is left in those that are hardest to tell.
 TOLERANCE, TOLERANCE_FORESEEN = 2e-4, 2e-3
 MOST_ITERATIONS = 300
-# How many times stronger the preconditioner holds the small scales back: their errors count most, as the filter is
-# undone, and the first iterations would make many of them.
-SMOOTHING = 5.0
 # Wavenumber shells in a band of the energy.
 BAND = 2
 
@@ -69,13 +67,15 @@ class ResolvedVelocity:
 
     def __init__(self, grid: FourierGrid, filter_width: float, weight: float = WEIGHT) -> None:
         self.grid, self.filter_width = grid, filter_width
-        self._inside = (grid.shell > 0) & (grid.shell <= grid.resolved)
+        inside = (grid.shell > 0) & (grid.shell <= grid.resolved)
         self._moments: list[_Moment] = []
         self.solves = []
         #: rms u' of a component of the resolved velocity last remembered; 0 before
         self.speed = 0.0
-        law, tail = _prior(grid, filter_width, self._inside)
-        self._penalty = torch.where(self._inside, weight * tail / (3 * torch.where(self._inside, law, 1.0)), 0.0)
+        law, tail = _prior(grid, filter_width, inside)
+        penalty = torch.where(inside, weight * tail / (3 * torch.where(inside, law, 1.0)), 0.0)
+        #: whose solution it is
+        self.equations = LeastSquares(grid, inside, penalty)
 
     @classmethod
     def on_slabs(cls, decomposition: SlabDecomposition, flow: FlowUnits, margin: float = 0.0) -> ResolvedVelocity:
@@ -124,7 +124,7 @@ class ResolvedVelocity:
         (3, kz, ky, kx) of the particles' acceleration as a field: du/dt = P[force - div(uu)], P the solenoidal
         projection, in the frame that moves with the particles' mean velocity."""
         change = -self.grid.stress_divergence(flow.products)
-        rate = self._solenoidal(change if force is None else force.detach() + change)
+        rate = self.equations.projected(change if force is None else force.detach() + change)
         self._moments = [moment for moment in self._moments if moment.time != time][-1:]
         self._moments.append(_Moment(time, flow.velocity.detach(), rate))
         self.speed = float(flow.rms)
@@ -179,60 +179,23 @@ class ResolvedVelocity:
         if start is not None:
             flow = replace(flow, velocity=start)
         right = self._descent(flow)
-        begin, tolerance = self._size(right, count), self.tolerance if start is None else self.tolerance_foreseen
+        begin = self.equations.size(right, count)
+        tolerance = self.tolerance if start is None else self.tolerance_foreseen
         if begin > square and start is not None:  # worse than nothing is
             return self._solved(replace(flow, velocity=torch.zeros_like(start)), None, count, square)
-        change, iterations, left = self._conjugate_gradients(flow, right, count, tolerance**2 * square)
+        change, iterations, left = self._change(flow, right, count, tolerance**2 * square)
         # What is not finite has not converged.
         return replace(flow, velocity=flow.velocity + change, iterations=iterations,
                        residual=math.sqrt(left / square) if square > 0 else 0.0,
                        converged=self.iterations is not None or left <= tolerance**2 * square)
 
-    def _conjugate_gradients(self, flow: ResolvedFlow, right: Tensor, count: float,
-                             enough: float) -> tuple[Tensor, int, float]:
-        """Modes y with A y = `right` until the squared residual is `enough`; the iterations, and what is left of it."""
-        inverse = self._preconditioner(count)
-        found, residual = torch.zeros_like(right), right
-        direction = preconditioned = inverse * residual
-        left, iterations = self._product(residual, preconditioned), 0
-        while (left > enough and iterations < self.most_iterations) if self.iterations is None else (
-                iterations < self.iterations and left > 0):
-            image = self._applied(direction, flow)
-            length = left / self._product(direction, image)
-            found, residual = found + length * direction, residual - length * image
-            preconditioned = inverse * residual
-            before, left = left, self._product(residual, preconditioned)
-            direction = preconditioned + left / before * direction
-            iterations += 1
-        return found, iterations, left
+    def _change(self, flow: ResolvedFlow, right: Tensor, count: float, enough: float) -> tuple[Tensor, int, float]:
+        return self.equations.solve(flow.points, right, count, enough, self.iterations, self.most_iterations)
 
     def _descent(self, flow: ResolvedFlow) -> Tensor:
         """Half the steepest descent of what is minimised, P B^T (v - B u) - (sigma^2/P_k) u, zero at its minimum."""
         missing = flow.relative_velocity.double() - self.grid.at(flow.velocity, flow.points)
-        return self._gathered(missing, flow.points) - self._penalty * flow.velocity
-
-    def _applied(self, modes: Tensor, flow: ResolvedFlow) -> Tensor:
-        """A = P B^T B + sigma^2/P_k on solenoidal modes; B gives values at the particles."""
-        return self._gathered(self.grid.at(modes, flow.points), flow.points) + self._penalty * modes
-
-    def _gathered(self, values: Tensor, points: Points) -> Tensor:
-        """P B^T of values (n, 3) at the particles."""
-        return self._solenoidal(self.grid.spread(values, points) * self.grid.spectral.cells**3)
-
-    def _solenoidal(self, modes: Tensor) -> Tensor:
-        return torch.where(self._inside, self.grid.solenoidal(modes), 0.0)
-
-    def _preconditioner(self, count: float) -> Tensor:
-        return torch.where(self._inside, 1 / (count + SMOOTHING * self._penalty), 0.0)
-
-    def _size(self, residual: Tensor, count: float) -> float:
-        """Square of a residual, such that it is comparable to sum_i |v_i|^2."""
-        return self._product(residual, self._preconditioner(count) * residual)
-
-    def _product(self, first: Tensor, second: Tensor) -> float:
-        """Inner product of two real fields by their modes, over all ranks."""
-        local = self.grid.multiplicity * (first.real * second.real + first.imag * second.imag)
-        return float(global_sum(self.grid.decomposition.comm, float(local.sum())))
+        return self.equations.gathered(missing, flow.points) - self.equations.penalty * flow.velocity
 
     def _adjoint(self, flow: ResolvedFlow) -> Callable[[Tensor], Tensor]:
         """By the implicit function theorem: the gradient by modes of the minimum -> that by the descent there.
@@ -244,9 +207,10 @@ class ResolvedVelocity:
 
         def solve(gradient: Tensor) -> Tensor:
             # The part that belongs to a real field; what else there is has no effect on any value.
-            right = self._solenoidal(grid.to_modes(grid.to_fields(gradient.resolve_conj() / grid.multiplicity)))
-            enough = self.tolerance**2 * self._size(right, count)
-            found, iterations, left = self._conjugate_gradients(flow, right, count, enough)
+            fields = grid.to_fields(gradient.resolve_conj() / grid.multiplicity)
+            right = self.equations.projected(grid.to_modes(fields))
+            enough = self.tolerance**2 * self.equations.size(right, count)
+            found, iterations, left = self._change(flow, right, count, enough)
             self.solves.append((iterations, self.tolerance * math.sqrt(left / enough) if enough > 0 else 0.0,
                                 self.iterations is not None or left <= enough))
             return grid.multiplicity * found
@@ -254,11 +218,12 @@ class ResolvedVelocity:
         return solve
 
     def _require_reach(self, position: Tensor) -> None:
-        slab = self.grid.decomposition
-        if slab.size == 1:
-            return
-        z, reach = position[:, 2].detach(), self.grid.reach
-        if any_rank(slab.comm, bool(((z < slab.lower - reach) | (z >= slab.upper + reach)).any())):
+        slab, reach, position = self.grid.decomposition, self.grid.reach, position.detach()
+        z, lost = position[:, 2], not bool(torch.isfinite(position).all())
+        outside = slab.size > 1 and bool(((z < slab.lower - reach) | (z >= slab.upper + reach)).any())
+        if (worst := global_max(slab.comm, 2.0 * lost or 1.0 * outside)) == 2:
+            raise HaloError("the position of a particle is not finite: shorten the time step")
+        if worst == 1:
             raise HaloError(f"a particle moves more than {reach:.3g} out of its slab before it can change rank, and "
                             "the ghost planes reach no farther: shorten the time step or the skin")
 

@@ -1,0 +1,40 @@
+"""Builds the compiled library, once for each instruction set; everything else of the package stands in setup.cfg.
+
+What the compiler cannot build is left out, and without any of it the package runs by numpy and torch.
+"""
+
+import platform
+from pathlib import Path
+
+from setuptools import Extension, setup
+from setuptools.command.build_ext import build_ext
+
+FLAGS = ["-std=c++17", "-O3", "-fno-math-errno", "-fno-trapping-math", "-Wno-psabi", "-fopenmp"]
+# As src/eddies/kernels/library.py has them.
+INSTRUCTION_SETS = {"plain": []}
+if platform.machine() in ("x86_64", "AMD64"):
+    INSTRUCTION_SETS["avx2"] = ["-mavx2", "-mfma"]
+    INSTRUCTION_SETS["avx512"] = ["-mavx2", "-mfma", "-mavx512f", "-mavx512dq", "-mavx512bw", "-mavx512vl"]
+
+
+class BuildKernels(build_ext):
+    """Builds shared objects that are loaded as plain libraries, so their names tell no version of Python."""
+
+    def get_ext_filename(self, fullname: str) -> str:
+        return fullname.replace(".", "/") + ".so"
+
+    def run(self) -> None:
+        super().run()
+        missing = [extension.name for extension in self.extensions
+                   if not Path(self.get_ext_fullpath(extension.name)).exists()]
+        if missing:
+            self.warn(f"not built: {', '.join(missing)}, for want of a C++17 compiler with OpenMP; the package works "
+                      "without, several times slower")
+
+
+setup(
+    ext_modules=[Extension(f"eddies.kernels.{name}", sorted(map(str, Path("src/eddies/kernels").glob("*.cpp"))),
+                           extra_compile_args=FLAGS + more, extra_link_args=["-fopenmp"], language="c++", optional=True)
+                 for name, more in INSTRUCTION_SETS.items()],
+    cmdclass={"build_ext": BuildKernels},
+)

@@ -1,0 +1,44 @@
+"""The compiled library: one shared object for each instruction set, of which the processor gets its best."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import logging
+from pathlib import Path
+
+# As setup.py has them; a processor that runs one runs those before it.
+INSTRUCTION_SETS = ("plain", "avx2", "avx512")
+MISSING = ("no compiled kernels (no C++ compiler at installation?): everything runs by numpy and torch, several times "
+           "slower")
+
+log = logging.getLogger("eddies")
+
+
+@functools.cache
+def library() -> ctypes.CDLL | None:
+    """The library for this processor; None, and a line in the log the first time, where there is none."""
+    found = instruction_sets()
+    if not found:
+        log.info(MISSING)
+        return None
+    return load(found[-1])
+
+
+def instruction_sets() -> list[str]:
+    """Those that the library is built for and this processor runs, the best one last."""
+    built = [name for name in INSTRUCTION_SETS if _path(name) is not None]
+    if "plain" not in built:
+        return []
+    best = load("plain").best_instruction_set()
+    return [name for name in built if INSTRUCTION_SETS.index(name) <= best]
+
+
+@functools.cache
+def load(instruction_set: str) -> ctypes.CDLL:
+    """The library for an instruction set that it is built for."""
+    return ctypes.CDLL(str(_path(instruction_set)))
+
+
+def _path(instruction_set: str) -> Path | None:
+    return next(iter(sorted(Path(__file__).parent.glob(f"{instruction_set}.*so"))), None)

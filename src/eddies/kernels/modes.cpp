@@ -1,0 +1,115 @@
+// Passes over the Fourier modes of a vector field, for conjugate gradients on solenoidal ones: each reads and writes the
+// memory once; particles/least_squares.py has them as formulas. Sums are made plane by plane, and these summed in order,
+// so that nothing depends on the number of threads.
+
+#include <cstdint>
+#include <vector>
+
+extern "C" {
+
+// Real weights of modes: of each (z, y, x), and along the axes; kernels/modes.py has the same structure.
+struct Weights {
+    std::int64_t z, y, x;
+    const double *kx, *ky, *kz;
+    const double* multiplicity;     // (x), how often a stored mode stands in the full sum
+    const double* inverse_squared;  // 1/k^2, 0 for k = 0
+    const double* scale;            // of what is projected; 0 where a mode is not solved for
+    const double* penalty;
+};
+
+}  // extern "C"
+
+namespace {
+
+
+// The sum of function(z, y, where the line starts in an array of weights) over all lines.
+template <typename Function>
+double sum_over_lines(const Weights& weights, const Function& function) {
+    std::vector<double> sums(weights.z);
+#pragma omp parallel for schedule(static)
+    for (std::int64_t z = 0; z < weights.z; ++z)
+        for (std::int64_t y = 0; y < weights.y; ++y) sums[z] += function(z, y, (z * weights.y + y) * weights.x);
+    double sum = 0.0;
+    for (const double part : sums) sum += part;
+    return sum;
+}
+
+}  // namespace
+
+extern "C" {
+
+// image = P (scale given) + penalty modes, P the projection on solenoidal fields; the local sum of modes times image.
+// Vectors are (3, z, y, x) of complex numbers.
+double modes_image(const Weights* given_weights, const double* given, const double* modes, double* image) {
+    const Weights& w = *given_weights;
+    const std::int64_t size = 2 * w.z * w.y * w.x;
+    return sum_over_lines(w, [&](std::int64_t z, std::int64_t y, std::int64_t start) {
+        double sum = 0.0;
+        const double ky = w.ky[y], kz = w.kz[z];
+#pragma omp simd reduction(+ : sum)
+        for (std::int64_t x = 0; x < w.x; ++x) {
+            const std::int64_t at = start + x;
+            const double kx = w.kx[x], scale = w.scale[at], penalty = w.penalty[at];
+            const double along = scale * w.inverse_squared[at];
+            double product = 0.0;
+            for (int part = 0; part < 2; ++part) {
+                const std::int64_t i = 2 * at + part;
+                const double a = given[i], b = given[i + size], c = given[i + 2 * size];
+                const double longitudinal = along * (kx * a + ky * b + kz * c);
+                const double p = modes[i], q = modes[i + size], r = modes[i + 2 * size];
+                const double d = scale * a - kx * longitudinal + penalty * p;
+                const double e = scale * b - ky * longitudinal + penalty * q;
+                const double f = scale * c - kz * longitudinal + penalty * r;
+                image[i] = d;
+                image[i + size] = e;
+                image[i + 2 * size] = f;
+                product += p * d + q * e + r * f;
+            }
+            sum += w.multiplicity[x] * product;
+        }
+        return sum;
+    });
+}
+
+// found += length direction, residual -= length image; the local sum of inverse times the residual squared.
+double modes_descend(const Weights* given_weights, double length, const double* inverse, const double* direction,
+                     const double* image, double* found, double* residual) {
+    const Weights& w = *given_weights;
+    const std::int64_t size = 2 * w.z * w.y * w.x;
+    return sum_over_lines(w, [&](std::int64_t, std::int64_t, std::int64_t start) {
+        double sum = 0.0;
+        for (int component = 0; component < 3; ++component) {
+            const std::int64_t first = component * size + 2 * start;
+#pragma omp simd reduction(+ : sum)
+            for (std::int64_t x = 0; x < w.x; ++x) {
+                const std::int64_t i = first + 2 * x;
+                const double real = residual[i] - length * image[i], imaginary = residual[i + 1] - length * image[i + 1];
+                found[i] += length * direction[i];
+                found[i + 1] += length * direction[i + 1];
+                residual[i] = real;
+                residual[i + 1] = imaginary;
+                sum += w.multiplicity[x] * inverse[start + x] * (real * real + imaginary * imaginary);
+            }
+        }
+        return sum;
+    });
+}
+
+// direction = inverse residual + share direction.
+void modes_turn(const Weights* given_weights, double share, const double* inverse, const double* residual,
+                double* direction) {
+    const Weights& w = *given_weights;
+    const std::int64_t plane = w.y * w.x;
+#pragma omp parallel for schedule(static)
+    for (std::int64_t z = 0; z < 3 * w.z; ++z) {
+        const double* weight = inverse + z % w.z * plane;
+#pragma omp simd
+        for (std::int64_t i = 0; i < plane; ++i) {
+            const std::int64_t at = 2 * (z * plane + i);
+            direction[at] = weight[i] * residual[at] + share * direction[at];
+            direction[at + 1] = weight[i] * residual[at + 1] + share * direction[at + 1];
+        }
+    }
+}
+
+}  // extern "C"

@@ -1,0 +1,110 @@
+"""Regularised least squares for the solenoidal modes of a velocity that is known at points."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from eddies.kernels.library import library
+from eddies.kernels.modes import CompiledModePasses
+from eddies.parallel.reduction import global_sum
+from eddies.particles.fourier_grid import FourierGrid, Points
+
+# How many times stronger the preconditioner holds the small scales back: their errors count most, as the filter is
+# undone, and the first iterations would make many of them.
+SMOOTHING = 5.0
+
+
+class LeastSquares:
+    """The equations  A u = P B^T v,  A = P B^T B + penalty,  of the minimum of
+
+        sum_i |v_i - u(x_i)|^2 + sum_k penalty_k |u(k)|^2
+
+    over solenoidal modes u (3, kz, ky, kx): B gives values at points, P projects on the solenoidal modes `inside`.
+
+    Parameters
+    ----------
+    inside : (kz, ky, kx), which modes are solved for. penalty : likewise, real, 0 outside.
+    """
+
+    def __init__(self, grid: FourierGrid, inside: Tensor, penalty: Tensor) -> None:
+        self.grid, self.inside, self.penalty = grid, inside, penalty
+        scale = torch.where(inside, grid.prefilter * grid.spectral.cells**3, 0.0)
+        weights = (grid.spectral.wavevector, grid.spectral.multiplicity, grid.inverse_squared.numpy(), scale.numpy(),
+                   penalty.numpy())
+        compiled = library()
+        self._passes = ModePasses(*weights) if compiled is None else CompiledModePasses(compiled, *weights)
+
+    def gathered(self, values: Tensor, points: Points) -> Tensor:
+        """P B^T of values (n, 3) at points; collective, differentiable."""
+        return self.projected(self.grid.spread(values, points) * self.grid.spectral.cells**3)
+
+    def projected(self, modes: Tensor) -> Tensor:
+        """P of modes; differentiable."""
+        return torch.where(self.inside, self.grid.solenoidal(modes), 0.0)
+
+    def preconditioner(self, count: float) -> Tensor:
+        """1 / (N + 5 penalty), next to the inverse of A for N = `count` points; 0 outside."""
+        return torch.where(self.inside, 1 / (count + SMOOTHING * self.penalty), 0.0)
+
+    def size(self, residual: Tensor, count: float) -> float:
+        """Square of a residual over all ranks, such that it is comparable to sum_i |v_i|^2."""
+        square = residual.real.square() + residual.imag.square()
+        return self._over_ranks(float((self.grid.multiplicity * self.preconditioner(count) * square).sum()))
+
+    @torch.no_grad()
+    def solve(self, points: Points, right: Tensor, count: float, enough: float, iterations: int | None,
+              most: int) -> tuple[Tensor, int, float]:
+        """Modes y with A y = `right` by preconditioned conjugate gradients, and the iterations and the squared residual
+        (`size`) that is left; until that is `enough`, in `most` iterations, or in a given number of them."""
+        inverse, residual = self.preconditioner(count).numpy(), np.array(right.numpy(), order="C")
+        found, direction, passes = np.zeros_like(residual), inverse * residual, self._passes
+        left, taken = self.size(right, count), 0
+        while (left > enough and taken < most) if iterations is None else (taken < iterations and left > 0):
+            values = self.grid.at(torch.from_numpy(direction), points)
+            image, product = passes.image(self.grid.to_modes(points.spread(values)).numpy(), direction)
+            length = left / self._over_ranks(product)
+            before = left
+            left = self._over_ranks(passes.descend(length, inverse, direction, image, found, residual))
+            passes.turn(left / before, inverse, residual, direction)
+            taken += 1
+        return torch.from_numpy(found), taken, left
+
+    def _over_ranks(self, value: float) -> float:
+        return float(global_sum(self.grid.decomposition.comm, value))
+
+
+class ModePasses:
+    """What an iteration does to modes (3, kz, ky, kx), by numpy: the definition of `CompiledModePasses`.
+
+    Real fields have inner products by their modes, of which each counts by its `multiplicity`.
+    """
+
+    def __init__(self, wavevector: tuple[np.ndarray, ...], multiplicity: np.ndarray, inverse_squared: np.ndarray,
+                 scale: np.ndarray, penalty: np.ndarray) -> None:
+        self.wavevector, self.multiplicity, self.inverse_squared = wavevector, multiplicity, inverse_squared
+        self.scale, self.penalty = scale, penalty
+
+    def image(self, given: np.ndarray, modes: np.ndarray) -> tuple[np.ndarray, float]:
+        """P (scale given) + penalty modes, and the inner product of that with `modes`, of this rank."""
+        scaled = self.scale * given
+        along = sum(k * component for k, component in zip(self.wavevector, scaled)) * self.inverse_squared
+        image = scaled - np.stack([k * along for k in self.wavevector]) + self.penalty * modes
+        return image, self._product(image, modes)
+
+    def descend(self, length: float, inverse: np.ndarray, direction: np.ndarray, image: np.ndarray, found: np.ndarray,
+                residual: np.ndarray) -> float:
+        """found += length direction, residual -= length image, and the inner product of the residual with `inverse`
+        times it, of this rank."""
+        found += length * direction
+        residual -= length * image
+        return self._product(residual, inverse * residual)
+
+    def turn(self, share: float, inverse: np.ndarray, residual: np.ndarray, direction: np.ndarray) -> None:
+        """direction = inverse residual + share direction."""
+        direction *= share
+        direction += inverse * residual
+
+    def _product(self, first: np.ndarray, second: np.ndarray) -> float:
+        return float(np.sum(self.multiplicity * (first.real * second.real + first.imag * second.imag)))

@@ -1,0 +1,87 @@
+"""Compiled passes over modes against those of numpy, for each instruction set that this processor runs."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from eddies.kernels.library import instruction_sets, load
+from eddies.kernels.modes import CompiledModePasses
+from eddies.particles.least_squares import ModePasses
+
+SHAPES = [(9, 5, 5), (7, 0, 4), (33, 17, 17), (1, 1, 1)]
+VECTORS = ("given", "modes", "direction", "image", "found", "residual")
+
+
+def passes(library, shape, seed=1):
+    """Both of them, and arrays for them."""
+    random = np.random.default_rng(seed)
+    z, y, x = shape
+    wavevector = [random.standard_normal(axis) for axis in ((1, 1, x), (1, y, 1), (z, 1, 1))]
+    weights = [random.uniform(0, 1, shape) for _ in range(3)]
+    weights[1][random.uniform(0, 1, shape) < 0.3] = 0
+    given = wavevector, random.integers(1, 3, (1, 1, x)).astype(float), *weights
+    vectors = {name: random.standard_normal((3, *shape)) + 1j * random.standard_normal((3, *shape)) for name in VECTORS}
+    return ModePasses(*given), CompiledModePasses(library, *given), random.uniform(0, 1, shape), vectors
+
+
+def run(made, inverse, vectors):
+    """All passes, one after the other, on copies: the sums and the vectors."""
+    given, modes, direction, image, found, residual = (vectors[name].copy() for name in VECTORS)
+    made_image, product = made.image(given, modes)
+    square = made.descend(0.7, inverse, direction, image, found, residual)
+    made.turn(-0.3, inverse, residual, direction)
+    return (product, square), (made_image, direction, found, residual)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_passes_are_those_of_numpy(library, shape):
+    numpy, compiled, inverse, vectors = passes(library, shape)
+    (sums, arrays), (expected_sums, expected) = (run(made, inverse, vectors) for made in (compiled, numpy))
+    scale = 3 * np.prod(shape)
+    assert sums == pytest.approx(expected_sums, abs=1e-13 * scale)
+    for one, other in zip(arrays, expected):
+        assert np.abs(one - other).max(initial=0) <= 1e-14 * np.abs(other).max(initial=0)
+
+
+def test_what_is_not_a_number_stays_so(library):
+    _, compiled, inverse, vectors = passes(library, (9, 5, 5))
+    for name in VECTORS:
+        spoiled = {**vectors, name: vectors[name].copy()}
+        spoiled[name][1, 4, 2, 3] = np.nan
+        sums, arrays = run(compiled, inverse, spoiled)
+        assert np.isnan(sums).any() or any(np.isnan(array).any() for array in arrays), name
+
+
+def test_arrays_of_another_kind_are_refused(library):
+    _, compiled, inverse, vectors = passes(library, (9, 5, 5))
+    for spoiled in (vectors["given"][:2], vectors["given"].astype(np.complex64), vectors["given"][..., ::-1]):
+        with pytest.raises(ValueError, match="is needed"):
+            compiled.turn(1.0, inverse, vectors["residual"], spoiled)
+    with pytest.raises(ValueError, match="weights of sizes"):
+        CompiledModePasses(library, [np.ones(5)] * 3, np.ones(5), *[np.ones((9, 5, 5))] * 3)
+
+
+def test_the_same_bits_with_any_number_of_threads(library):
+    program = """
+import hashlib, sys
+from tests.kernels.test_modes import load, passes, run
+digest = hashlib.sha256()
+_, compiled, inverse, vectors = passes(load(sys.argv[1]), (33, 17, 17))
+sums, arrays = run(compiled, inverse, vectors)
+digest.update(repr(sums).encode())
+for array in arrays:
+    digest.update(array.tobytes())
+print(digest.hexdigest())
+"""
+    name = next(name for name in instruction_sets() if load(name) is library)
+    found = set()
+    for threads in ("1", "2", "3"):
+        made = subprocess.run([sys.executable, "-c", program, name], cwd=Path(__file__).parents[2], timeout=60,
+                              capture_output=True, check=True, text=True,
+                              env={**os.environ, "OMP_NUM_THREADS": threads})
+        found.add(made.stdout)
+    assert len(found) == 1

@@ -1,0 +1,148 @@
+"""Compiled splines against those of numpy, for each instruction set that this processor runs."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from eddies.kernels.library import instruction_sets, load
+from eddies.kernels.splines import CompiledSplines, MisplacedPoint, PaddedPlanes
+from eddies.spectral.splines import Splines
+
+CHECKOUT = Path(__file__).parents[2]
+SPACING, BELOW, ABOVE = 0.3, 3, 4
+# With fewer cells than splines are wide, with one chunk of lines, an odd number of them, and many.
+CELLS = (4, 7, 11, 18, 41)
+CLOUDS = {
+    "even": lambda random, n: random.uniform(-2 * n, 3 * n, (1500, 3)),
+    "coincident": lambda random, n: np.full((500, 3), 0.37 * n),
+    "one cell": lambda random, n: n - 1 + random.uniform(0, 1, (500, 3)),
+    "on grid points": lambda random, n: random.integers(-n, 2 * n, (200, 3)).astype(float),
+    "one": lambda random, n: random.uniform(0, n, (1, 3)),
+    "none": lambda random, n: np.zeros((0, 3)),
+}
+
+
+def padded_planes(cells):
+    """Of a slab that is the whole box."""
+    return PaddedPlanes(cells, SPACING, -BELOW, BELOW + cells + ABOVE)
+
+
+def parts(cells, components=3, seed=1):
+    """Planes below, own ones, planes above."""
+    random = np.random.default_rng(seed)
+    return [random.standard_normal((components, planes, cells, cells)) for planes in (BELOW, cells, ABOVE)]
+
+
+def both(library, degree, positions, cells):
+    padded = padded_planes(cells)
+    return Splines(degree, positions, padded), CompiledSplines(library, degree, positions, padded)
+
+
+def assert_close(found, expected, relative=1e-12):
+    assert found.shape == expected.shape and found.dtype == expected.dtype
+    assert np.abs(found - expected).max(initial=0) <= relative * np.abs(expected).max(initial=0)
+
+
+@pytest.mark.parametrize("kind", CLOUDS)
+@pytest.mark.parametrize("cells", CELLS)
+@pytest.mark.parametrize("degree, components", [(3, 3), (3, 1), (5, 3), (5, 7)])
+def test_values_slopes_and_sums_are_those_of_numpy(library, degree, components, cells, kind):
+    random = np.random.default_rng(2)
+    positions = SPACING * CLOUDS[kind](random, cells)
+    numpy, compiled = both(library, degree, positions, cells)
+    planes, values = parts(cells, components), random.standard_normal((len(positions), components))
+    assert_close(compiled.at(planes), numpy.at(planes))
+    assert_close(compiled.slope(planes, values), numpy.slope(planes, values))
+    found, expected = parts(cells, components), parts(cells, components)
+    compiled.spread(values, found)
+    numpy.spread(values, expected)
+    assert_close(np.concatenate(found, axis=1), np.concatenate(expected, axis=1))
+
+
+@pytest.mark.parametrize("degree", [3, 5])
+def test_planes_in_single_precision_and_views_of_planes(library, degree):
+    positions = np.random.default_rng(2).uniform(0, 5, (3000, 3))
+    numpy, compiled = both(library, degree, positions, 18)
+    single = [part.astype(np.float32) for part in parts(18)]
+    assert_close(compiled.at(single), numpy.at(single))
+    turned = [np.asfortranarray(part) for part in parts(18)]
+    assert np.array_equal(compiled.at(turned), compiled.at(parts(18)))
+
+
+@pytest.mark.parametrize("degree", [3, 5])
+def test_spreading_is_the_transpose_of_interpolation(library, degree):
+    random = np.random.default_rng(5)
+    _, compiled = both(library, degree, random.uniform(0, 5, (4000, 3)), 18)
+    values, planes, spread = random.standard_normal((4000, 3)), parts(18), [0 * part for part in parts(18)]
+    compiled.spread(values, spread)
+    expected = np.sum(values * compiled.at(planes))
+    assert sum(np.sum(a * b) for a, b in zip(spread, planes)) == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("degree", [3, 5])
+def test_slopes_are_those_of_finite_differences(library, degree):
+    random = np.random.default_rng(5)
+    positions, factors, planes = random.uniform(0, 5, (500, 3)), random.standard_normal((500, 3)), parts(18)
+    slope = both(library, degree, positions, 18)[1].slope(planes, factors)
+    for axis, change in enumerate(1e-6 * np.eye(3)):
+        ends = [(factors * both(library, degree, x, 18)[1].at(planes)).sum(1)
+                for x in (positions + change, positions - change)]
+        assert_close((ends[0] - ends[1]) / 2e-6, slope[:, axis], 1e-7)
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf, 1e300, -1e18])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_position_without_a_cell_is_told(library, wrong, axis):
+    positions = np.ones((5000, 3))
+    positions[[3777, 4999], axis] = wrong
+    for splines in (Splines, lambda *given: CompiledSplines(library, *given)):
+        with pytest.raises(MisplacedPoint) as raised:
+            splines(3, positions, padded_planes(11))
+        assert raised.value.number == 3777
+
+
+def test_a_position_too_far_from_the_planes_is_told(library):
+    padded = PaddedPlanes(20, 1.0, 8, 7)  # planes 8 ... 14: splines of points from 9 on, and below 13
+    for z, placed in ((8.999, False), (9.0, True), (12.999, True), (13.0, False), (32.9, True), (-10.9, True)):
+        for splines in (Splines, lambda *given: CompiledSplines(library, *given)):
+            try:
+                splines(3, np.array([[0.0, 0.0, z]]), padded)
+            except MisplacedPoint:
+                assert not placed
+            else:
+                assert placed
+
+
+def test_columns_and_planes_of_another_size_are_refused(library):
+    _, compiled = both(library, 3, np.zeros((4, 3)), 11)
+    with pytest.raises(ValueError, match="4 points are needed"):
+        compiled.spread(np.zeros((3, 2)), parts(11, 2))
+    with pytest.raises(ValueError, match="18 planes"):
+        compiled.at(parts(11)[1:])
+
+
+def test_the_same_bits_with_any_number_of_threads_and_from_run_to_run(library):
+    """Threads are a process's own; those of spreading meet, on lattices with an odd number of lines too."""
+    program = """
+import hashlib, sys, numpy as np
+from tests.kernels.test_splines import both, load, parts
+random, digest = np.random.default_rng(7), hashlib.sha256()
+for degree, cells in ((3, 41), (5, 18), (3, 11)):
+    positions, values = random.uniform(0, 20, (30000, 3)), random.standard_normal((30000, 3))
+    compiled, planes = both(load(sys.argv[1]), degree, positions, cells)[1], parts(cells)
+    compiled.spread(values, planes)
+    for array in (compiled.at(planes), compiled.slope(planes, values), *planes):
+        digest.update(array.tobytes())
+print(digest.hexdigest())
+"""
+    name = next(name for name in instruction_sets() if load(name) is library)
+    found = set()
+    for threads in ("1", "2", "3", "2"):
+        made = subprocess.run([sys.executable, "-c", program, name], cwd=CHECKOUT, timeout=60, check=True, text=True,
+                              capture_output=True, env={**os.environ, "OMP_NUM_THREADS": threads})
+        found.add(made.stdout)
+    assert len(found) == 1

@@ -1,0 +1,44 @@
+"""Conjugate gradients find the modes that solve the equations, with compiled passes and without."""
+
+import numpy as np
+import pytest
+import torch
+
+from eddies.kernels.library import library
+from eddies.kernels.modes import CompiledModePasses
+from eddies.parallel.slab import SlabDecomposition
+from eddies.particles import least_squares
+from eddies.particles.fourier_grid import FourierGrid
+from eddies.particles.least_squares import LeastSquares, ModePasses
+from eddies.spectral import interpolation
+
+
+def equations_on(comm):
+    """Equations with a penalty that grows with the wavenumber, 300 points of this rank, and values there."""
+    grid, random = FourierGrid(SlabDecomposition(comm, 5.0, 13), 4), np.random.default_rng(comm.rank)
+    inside = (grid.shell > 0) & (grid.shell <= 4)
+    slab = grid.decomposition
+    position = random.uniform([0, 0, slab.lower], [5, 5, slab.upper], (300, 3))
+    equations = LeastSquares(grid, inside, torch.where(inside, 20 * grid.wavenumber_squared, 0.0))
+    return equations, grid.points(torch.from_numpy(position)), torch.from_numpy(random.standard_normal((300, 3)))
+
+
+@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.parametrize("compiled", [True, False])
+def test_what_is_found_solves_the_equations(comm, monkeypatch, compiled):
+    if not compiled:
+        for module in (least_squares, interpolation):
+            monkeypatch.setattr(module, "library", lambda: None)
+    equations, points, values = equations_on(comm)
+    assert isinstance(equations._passes, CompiledModePasses if compiled and library() else ModePasses)
+    right = equations.gathered(values, points)
+    count = 300.0 * comm.size
+    size = equations.size(right, count)
+    found, iterations, left = equations.solve(points, right, count, 1e-24 * size, None, 100)
+    assert 5 < iterations < 100 and left <= 1e-24 * size
+    image = equations.gathered(equations.grid.at(found, points), points) + equations.penalty * found
+    assert equations.size(right - image, count) <= 1e-22 * size
+    # A given number of iterations is taken, and what is left of the residual told.
+    found, iterations, left = equations.solve(points, right, count, 0.0, 3, 100)
+    image = equations.gathered(equations.grid.at(found, points), points) + equations.penalty * found
+    assert iterations == 3 and equations.size(right - image, count) == pytest.approx(left, rel=1e-9)

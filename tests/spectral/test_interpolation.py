@@ -1,0 +1,86 @@
+"""Values at points and sums of splines around them on slabs: by the compiled library as by numpy."""
+
+import numpy as np
+import pytest
+
+from eddies.kernels.library import library
+from eddies.kernels.splines import CompiledSplines
+from eddies.parallel.halo import HaloError
+from eddies.parallel.reduction import global_sum
+from eddies.parallel.slab import SlabDecomposition
+from eddies.spectral import interpolation
+from eddies.spectral.interpolation import SplineInterpolation
+from eddies.spectral.spectral_grid import SpectralGrid
+from eddies.spectral.splines import Splines
+
+LENGTH, CELLS = 5.0, 19
+KINDS = ("cubic", "quintic")
+
+
+def without_library(monkeypatch):
+    monkeypatch.setattr(interpolation, "library", lambda: None)
+
+
+def interpolation_on(comm, kind, precision="float64"):
+    return SplineInterpolation(SpectralGrid(SlabDecomposition(comm, LENGTH, CELLS), precision), kind)
+
+
+def points(comm, spline, seed=3):
+    """Positions in this rank's slab and up to the margin outside; none on the last of several ranks."""
+    slab, random = spline.grid.decomposition, np.random.default_rng([seed, comm.rank])
+    count = 0 if comm.rank == comm.size - 1 > 0 else 400
+    position = random.uniform(-LENGTH, 2 * LENGTH, (count, 3))
+    position[:, 2] = random.uniform(slab.lower - 0.99 * slab.spacing, slab.upper + 0.99 * slab.spacing, count)
+    return position
+
+
+@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_compiled_and_numpy_are_the_same(comm, monkeypatch, kind, precision):
+    spline = interpolation_on(comm, kind, precision)
+    position, random = points(comm, spline), np.random.default_rng(comm.rank)
+    fields = random.standard_normal((4, *spline.grid.physical_shape)).astype(spline.grid.real)
+    values = random.standard_normal((len(position), 4))
+    found = []
+    for compiled in (True, False):
+        if not compiled:
+            without_library(monkeypatch)
+        splines = spline.around(position)
+        assert isinstance(splines, CompiledSplines if compiled and library() else Splines)
+        found.append((spline.at(spline.with_ghosts(fields), position), spline.spread(values, splines)))
+    for one, other in zip(*found):
+        assert one.dtype == other.dtype == np.float64
+        assert np.abs(one - other).max(initial=0) <= 1e-12 * np.abs(other).max(initial=0)
+
+
+@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("kind", KINDS)
+def test_spreading_over_slabs_is_the_transpose_of_values_at_points(comm, monkeypatch, kind, compiled):
+    if not compiled:
+        without_library(monkeypatch)
+    spline = interpolation_on(comm, kind)
+    position, random = points(comm, spline), np.random.default_rng(comm.rank)
+    fields = random.standard_normal((2, *spline.grid.physical_shape))
+    values = random.standard_normal((len(position), 2))
+    products = [np.sum(spline.at(spline.with_ghosts(fields), position) * values),
+                np.sum(spline.spread(values, spline.around(position)) * fields)]
+    found, expected = global_sum(comm, np.array(products))
+    assert found == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.mpi(1, 2)
+@pytest.mark.parametrize("compiled", [True, False])
+def test_positions_without_a_place_are_told(comm, monkeypatch, compiled):
+    if not compiled:
+        without_library(monkeypatch)
+    spline = interpolation_on(comm, "cubic")
+    slab = spline.grid.decomposition
+    position = np.full((3, 3), slab.lower)
+    position[1, 0] = np.nan
+    with pytest.raises(ValueError, match="interpolation: position .*nan.* is not finite"):
+        spline.around(position)
+    if comm.size > 1:
+        with pytest.raises(HaloError, match="farther out of its slab"):
+            spline.around(np.array([[0, 0, slab.upper + 1.01 * slab.spacing]]))
