@@ -69,7 +69,7 @@ def test_advice_names_what_was_broken_and_the_grid_if_nothing_was(comm):
     assert "Broken: sound" in text and "= 4.76, stable up to 2.83" in text and "courant" in text
     assert "advection" not in text and "cells" not in text
     text = advice(fluid, step_limits(fluid, ETDRK4(fluid), 0.1, 2.0), 0.31)
-    assert "broke no limit (advection" in text and "k_max eta was 0.31" in text and "[flow] cells" in text
+    assert "broke no limit (advection" in text and "k_max eta was 0.31" in text and "raise cells" in text
     assert "sound grows that is hardly damped" in text
     inviscid, _ = compressible(comm, nu=0.0)
     assert "no viscosity" in advice(inviscid, [], 0.0)
