@@ -9,7 +9,6 @@ from eddies import stages
 from eddies.io.hdf5 import open_product, read_table
 from eddies.io.weights import load_weights
 from eddies.parallel.stop import Stopped, StopRequest
-from eddies.particles.resolved_velocity import ResolvedVelocity
 from eddies.scene.scene import SceneError, load_scene
 from eddies.workflows import dns, train, train_kernel
 from tests.workflows.stopping import StopAtStep
@@ -23,10 +22,8 @@ SHORT = ["flow.cells=12", "tracers.particles_per_side=6", "tracers.field_cells=8
          "training.horizons=[1,2]", "training.noise=0.1", "simulation.start=0"]
 
 
-@pytest.fixture(autouse=True)
-def quick_solves(monkeypatch):
-    """What is learned does not matter here, but that it is the same."""
-    monkeypatch.setattr(ResolvedVelocity, "iterations", 3)
+# What is learned does not matter here, but that it is the same.
+pytestmark = pytest.mark.usefixtures("quick_solves", "no_figures")
 
 
 def prepared(comm, directory, *more):
@@ -49,7 +46,6 @@ def trained(comm, directory):
     return numbers
 
 
-@pytest.mark.usefixtures("undrawn")
 @pytest.mark.mpi(2)
 def test_a_stopped_training_is_the_one_never_stopped(comm, tmp_path):
     scene = prepared(comm, tmp_path)
@@ -74,7 +70,6 @@ def test_a_stopped_training_is_the_one_never_stopped(comm, tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"ground_truth.h5", "kernel.h5", "model.h5", "learning.png"}
 
 
-@pytest.mark.usefixtures("undrawn")
 @pytest.mark.mpi(2)
 def test_a_training_goes_on_from_products_that_are_still_those_it_began_with(comm, tmp_path):
     scene = prepared(comm, tmp_path, "training.horizon_steps=0")
