@@ -2,16 +2,14 @@
 
 import importlib
 import logging
-import os
-import runpy
+import pkgutil
 import sys
-from pathlib import Path
 
 import pytest
 
-pytest_plugins = ["mpi_tools.pytest_mpi"]
+import eddies.report
 
-UNDRAWN = Path(__file__).parent / "undrawn"
+pytest_plugins = ["mpi_tools.pytest_mpi"]
 
 
 @pytest.fixture(autouse=True)
@@ -26,11 +24,27 @@ def logger_as_before():
 
 @pytest.fixture
 def undrawn(monkeypatch):
-    """Figures are made but not drawn, here and in programs that are started: that is most of a report's time."""
+    """Figures are made but not drawn: that is most of a report's time."""
     from eddies.report import figures
-    monkeypatch.setattr(figures, "png", figures.png)  # what is set in the next line ends with the test
-    runpy.run_path(str(UNDRAWN / "sitecustomize.py"))
-    monkeypatch.setenv("PYTHONPATH", str(UNDRAWN), prepend=os.pathsep)
+    monkeypatch.setattr(figures, "png", lambda figure: b"\x89PNG\r\n\x1a\n" + bytes(16))
+
+
+@pytest.fixture
+def no_figures(monkeypatch, undrawn):
+    """Figures are not even made, which is most of the rest: for tests of a report's numbers and words."""
+    from matplotlib.figure import Figure
+    for found in pkgutil.iter_modules(eddies.report.__path__, "eddies.report."):
+        module = importlib.import_module(found.name)
+        for name, function in list(vars(module).items()):
+            if getattr(function, "__annotations__", {}).get("return") in (Figure, "Figure"):
+                monkeypatch.setattr(module, name, lambda *given, **named: None)
+
+
+@pytest.fixture
+def quick_solves(monkeypatch):
+    """Three iterations in each solve for the resolved velocity, where it does not matter what is learned of it."""
+    from eddies.particles.resolved_velocity import ResolvedVelocity
+    monkeypatch.setattr(ResolvedVelocity, "iterations", 3)
 
 
 @pytest.fixture

@@ -28,6 +28,7 @@ def test_every_name_is_there_and_explained(name):
     assert getattr(eddies, name).__doc__
 
 
+@pytest.mark.usefixtures("no_figures")
 @pytest.mark.mpi(2)
 def test_a_flow_from_a_program(comm, tmp_path):
     scene = eddies.load_scene("abc", ["time.duration=0.1"])
@@ -39,6 +40,7 @@ def test_a_flow_from_a_program(comm, tmp_path):
     assert (tmp_path / "ground_truth.h5").stat().st_mtime_ns == before
 
 
+@pytest.mark.usefixtures("no_figures")
 @pytest.mark.mpi(1, 2)
 def test_classes_of_the_users_are_told_once(comm, tmp_path, own, caplog, monkeypatch):
     own("own_start", "from eddies.flow.initial_fields import abc\n"
@@ -57,6 +59,7 @@ def test_a_mistake_is_raised(comm, tmp_path):
         eddies.train("abc", output=tmp_path, comm=comm)
 
 
+@pytest.mark.usefixtures("no_figures")
 @pytest.mark.mpi(1)
 def test_a_scene_that_a_program_makes_and_names_a_run_directory(comm, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

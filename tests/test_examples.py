@@ -1,11 +1,10 @@
 """The examples of the documentation, and of the README: each trains, runs and reports, from any directory."""
 
 import json
+import logging
 import math
-import os
 import re
 import runpy
-import subprocess
 import sys
 from pathlib import Path
 
@@ -15,19 +14,12 @@ import pytest
 
 import eddies
 
-EXAMPLES = Path(__file__).parents[1] / "docs" / "examples"
+CHECKOUT = Path(__file__).parents[1]
+EXAMPLES = CHECKOUT / "docs" / "examples"
 SMALL = ["flow.cells=16", "spin_up.turnovers=0.1", "tracers.particles_per_side=8", "tracers.field_cells=12",
          "tracers.turnovers=0.3", "tracers.field_every=4", "kernel.neighbors=30", "kernel.steps=4", "kernel.points=50",
          "training.steps=8", "training.combined_steps=2", "training.frames=2", "training.batch=64",
          "simulation.turnovers=0.05", "simulation.frame_interval=0.08"]
-UNDRAWN = Path(__file__).parent / "undrawn" / "sitecustomize.py"
-# What Python runs as it starts: the scenes are smaller, figures are not drawn.
-SMALLER = f"""
-import eddies, runpy
-runpy.run_path({str(UNDRAWN)!r})
-load = eddies.load_scene
-eddies.load_scene = lambda name, overrides: load(name, [*overrides, *{SMALL!r}])
-"""
 
 
 def results(directory):
@@ -39,34 +31,35 @@ def results(directory):
         return metrics, json.loads(file.attrs["description"])["terms"], weights
 
 
-def test_ten_lines_set_a_rollout_going(tmp_path):
-    """As a program of its own."""
-    readme = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
-    program = tmp_path / "program.py"
-    program.write_text(re.search(r"^```python\n(import dataclasses\n.*?)^```", readme, re.MULTILINE | re.DOTALL)[1])
-    (tmp_path / "sitecustomize.py").write_text(SMALLER)
-    path = os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])])
-    ended = subprocess.run([sys.executable, str(program)], cwd=tmp_path, stdin=subprocess.DEVNULL, timeout=110,
-                           env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": path}, capture_output=True,
-                           text=True)
-    assert ended.returncode == 0, ended.stdout + ended.stderr
-    assert ended.stdout.count("rollout: complete") == 2
-    assert list(results(tmp_path / "runs" / "mine")[1]) == ["pressure", "relaxation", "pairs"]
-
-
 @pytest.fixture
-def example(comm, tmp_path, monkeypatch, undrawn, examples):
-    """A function that runs an example as on the command line, with smaller scenes; gives its run directory."""
+def smaller(tmp_path, monkeypatch, no_figures, quick_solves):
+    """A folder to work in, where scenes are smaller."""
     load = eddies.load_scene
     monkeypatch.setattr(eddies, "load_scene", lambda name, overrides: load(name, [*overrides, *SMALL]))
     monkeypatch.chdir(tmp_path)
+    return tmp_path
 
+
+@pytest.fixture
+def example(comm, smaller, examples):
+    """A function that runs an example as on the command line, with smaller scenes; gives its run directory."""
     def run(name):
         runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
         comm.Barrier()
-        return tmp_path / "runs" / name.replace("_", "-")
+        return smaller / "runs" / name.replace("_", "-")
 
     return run
+
+
+@pytest.mark.mpi(1)
+def test_ten_lines_set_a_rollout_going(smaller, caplog, monkeypatch):
+    readme = (CHECKOUT / "README.md").read_text(encoding="utf-8")
+    program = re.search(r"^```python\n(import dataclasses\n.*?)^```", readme, re.MULTILINE | re.DOTALL)[1]
+    monkeypatch.setattr(logging.getLogger("eddies"), "propagate", True)
+    with caplog.at_level(logging.INFO, "eddies"):
+        exec(compile(program, "README.md", "exec"), {})
+    assert caplog.text.count("rollout: complete") == 2
+    assert list(results(smaller / "runs" / "mine")[1]) == ["pressure", "relaxation", "pairs"]
 
 
 @pytest.mark.mpi(1)

@@ -42,8 +42,17 @@ def test_unmarked():
     assert all(f"test_sum[mpi-{ranks}] PASSED" in output for ranks in (1, 2, 3))
 
 
-def test_failure_on_one_rank_is_reported_and_the_rest_runs(tmp_path):
-    output, closing = run(tmp_path, """
+@pytest.fixture(scope="module")
+def failing(tmp_path_factory):
+    """Output and closing line for tests that end in every way, each after another that failed."""
+    return run(tmp_path_factory.mktemp("failing"), """
+@pytest.mark.mpi(2, timeout=2)
+def test_hangs(comm):
+    if comm.rank == 1:
+        time.sleep(1000)  # here
+    comm.Barrier()
+
+
 @pytest.mark.mpi(2)
 def test_uneven(comm):
     print("value", 40 + comm.rank)
@@ -57,44 +66,6 @@ def test_others_wait(comm):
     comm.Barrier()
 
 
-@pytest.mark.mpi(2)
-def test_after(comm):
-    comm.Barrier()
-""")
-    assert " 2 failed, 1 passed" in closing, output
-    assert "rank 1 of 2 failed in call" in output
-    assert "Captured stdout of rank 1 call" in output and "value 41" in output
-    assert "ValueError: raised while rank 0 is in a barrier" in output
-
-
-def test_hanging_and_dying_ranks_are_reported(tmp_path):
-    output, closing = run(tmp_path, """
-@pytest.mark.mpi(2, timeout=2)
-def test_hangs(comm):
-    if comm.rank == 1:
-        time.sleep(1000)  # here
-    comm.Barrier()
-
-
-@pytest.mark.mpi(2)
-def test_dies(comm):
-    if comm.rank == 1:
-        os._exit(3)
-    comm.Barrier()
-
-
-@pytest.mark.mpi(2)
-def test_after(comm):
-    comm.Barrier()
-""")
-    assert " 2 failed, 1 passed" in closing, output
-    assert "rank 1 of 2 did not finish\nnot at its end after the time limit of 2 s" in output
-    assert "test_made_up.py\", line 10 in test_hangs" in output
-    assert "died; output of the run" in output
-
-
-def test_outcomes_other_than_passed_and_failed(tmp_path):
-    output, closing = run(tmp_path, """
 @pytest.mark.mpi(2)
 def test_leaves(comm):
     pytest.skip("no reason")
@@ -116,18 +87,47 @@ def test_setup(broken):
     pass
 
 
+@pytest.mark.mpi(2)
+def test_dies(comm):
+    if comm.rank == 1:
+        os._exit(3)
+    comm.Barrier()
+
+
+@pytest.mark.mpi(2)
+def test_after(comm):
+    comm.Barrier()
+
+
 def test_without_marker(comm):
     pass
 """)
-    assert " 1 failed, 1 skipped, 1 xfailed, 1 error" in closing, output
-    assert "failed in setup" in output and "in the fixture" in output
+
+
+def test_the_rest_runs_after_a_failure(failing):
+    output, closing = failing
+    assert " 5 failed, 1 passed, 1 skipped, 1 xfailed, 1 error" in closing, output
+    assert "test_after[mpi-2] PASSED" in output
     assert "needs @pytest.mark.mpi" in output
 
 
+def test_a_failure_on_one_rank_is_reported(failing):
+    output, _ = failing
+    assert "rank 1 of 2 failed in call" in output
+    assert "Captured stdout of rank 1 call" in output and "value 41" in output
+    assert "ValueError: raised while rank 0 is in a barrier" in output
+    assert "failed in setup" in output and "in the fixture" in output
+
+
+def test_hanging_and_dying_ranks_are_reported(failing):
+    output, _ = failing
+    assert "rank 1 of 2 did not finish\nnot at its end after the time limit of 2 s" in output
+    assert "test_made_up.py\", line 10 in test_hangs" in output
+    assert "died; output of the run" in output
+
+
 @pytest.mark.parametrize("options, passed", [
-    (["-k", "mpi-2"], 3),
-    (["test_made_up.py::test_one"], 2),
-    (["test_made_up.py::test_two[mpi-2-b]"], 1),
+    (["test_made_up.py::test_one", "test_made_up.py::test_two[mpi-2-b]", "-k", "mpi-2"], 2),
     (["-m", "not mpi"], 1)])
 def test_selection(tmp_path, options, passed):
     output, closing = run(tmp_path, """

@@ -89,7 +89,7 @@ def test_pairs_outside_the_training_data_are_counted(run_directory):
     assert shown["rollout"]["outside_training"] == share.max()
 
 
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("no_figures")
 def test_resume_skips_what_is_done_and_redoes_what_changed(comm, run_directory, capfd):
     before = {path: path.stat().st_mtime_ns for path in run_directory.glob("*.h5")}
     comm.Barrier()
@@ -100,7 +100,7 @@ def test_resume_skips_what_is_done_and_redoes_what_changed(comm, run_directory, 
     assert [path.name for path, time in before.items() if path.stat().st_mtime_ns != time] == ["rollout.h5"]
 
 
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("no_figures")
 def test_a_trained_model_runs_on_another_flow(comm, run_directory, tmp_path):
     """At twice the Mach number, with nothing of that flow but its scales; all of it is unseen."""
     slower = load_scene("tiny", ["flow.sound_speed=11", "seed=2", "tracers.turnovers=0.25", "kernel.steps=4",

@@ -11,7 +11,6 @@ from eddies import stages
 from eddies.io.hdf5 import ProductError, open_product, read_table
 from eddies.io.weights import load_weights
 from eddies.parallel.stop import Stopped, StopRequest
-from eddies.particles.resolved_velocity import ResolvedVelocity
 from eddies.scene.scene import SceneError, load_scene
 from eddies.workflows import dns, train, train_kernel
 from tests.workflows.stopping import StopAtStep
@@ -25,10 +24,8 @@ SHORT = ["flow.cells=12", "tracers.particles_per_side=6", "tracers.field_cells=8
 THROUGH_HORIZONS = [*SHORT, "training.horizons.steps=2", "training.horizons.frames=[1,2]"]
 
 
-@pytest.fixture(autouse=True)
-def quick_solves(monkeypatch):
-    """What is learned does not matter here, but that it is the same."""
-    monkeypatch.setattr(ResolvedVelocity, "iterations", 3)
+# What is learned does not matter here, but that it is the same.
+pytestmark = pytest.mark.usefixtures("quick_solves", "no_figures")
 
 
 def prepared(comm, directory, settings=THROUGH_HORIZONS):
@@ -51,7 +48,6 @@ def trained(comm, directory):
     return numbers
 
 
-@pytest.mark.usefixtures("undrawn")
 @pytest.mark.mpi(2)
 def test_a_stopped_training_is_the_one_never_stopped(comm, tmp_path):
     scene = prepared(comm, tmp_path)
@@ -76,7 +72,6 @@ def test_a_stopped_training_is_the_one_never_stopped(comm, tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"ground_truth.h5", "kernel.h5", "model.h5", "learning.png"}
 
 
-@pytest.mark.usefixtures("undrawn")
 @pytest.mark.mpi(1, 2, timeout=30)
 def test_curves_that_cannot_be_written_are_told_by_all(comm, tmp_path, monkeypatch):
     """At the same step, though the clocks of the ranks differ."""
@@ -88,7 +83,6 @@ def test_curves_that_cannot_be_written_are_told_by_all(comm, tmp_path, monkeypat
         curves(training)
 
 
-@pytest.mark.usefixtures("undrawn")
 @pytest.mark.mpi(2)
 def test_a_training_goes_on_from_products_that_are_still_those_it_began_with(comm, tmp_path):
     scene = prepared(comm, tmp_path, SHORT)

@@ -292,7 +292,7 @@ def test_a_rollout_that_goes_wrong_ends_there_and_keeps_its_frames(comm, tmp_pat
     assert "stopped: step" in reported(comm, tmp_path, ("kernel.h5", "model.h5"))[1]
 
 
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("no_figures", "quick_solves")
 @pytest.mark.mpi(2)
 @pytest.mark.parametrize("model, weights, rate", [
     ('preset = "paper"\n[model.pairs]\nhidden = [4]\n[model.density-flux]\nhidden = [4]', 4 + 4, True),
@@ -313,7 +313,7 @@ def test_other_models_run(comm, tmp_path, model, weights, rate):
         assert list(json.loads(file.attrs["description"])["terms"]) == list(terms)
 
 
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("no_figures", "quick_solves")
 @pytest.mark.mpi(2)
 @pytest.mark.parametrize("kind", WITHOUT_DENSITY)
 def test_where_no_term_reads_the_density_an_incompressible_truth_will_do(comm, tmp_path, kind):
