@@ -27,7 +27,7 @@ def library() -> ctypes.CDLL | None:
 
 def instruction_sets() -> list[str]:
     """Those that the library is built for and this processor runs, the best one last."""
-    built = [name for name in INSTRUCTION_SETS if _path(name) is not None]
+    built = [name for name in INSTRUCTION_SETS if _path(name).exists()]
     if "plain" not in built:
         return []
     best = load("plain").best_instruction_set()
@@ -40,5 +40,5 @@ def load(instruction_set: str) -> ctypes.CDLL:
     return ctypes.CDLL(str(_path(instruction_set)))
 
 
-def _path(instruction_set: str) -> Path | None:
-    return next(iter(sorted(Path(__file__).parent.glob(f"{instruction_set}.*so"))), None)
+def _path(instruction_set: str) -> Path:
+    return Path(__file__).with_name(f"{instruction_set}.so")

@@ -21,7 +21,6 @@ struct Weights {
 
 namespace {
 
-
 // The sum of function(z, y, where the line starts in an array of weights) over all lines.
 template <typename Function>
 double sum_over_lines(const Weights& weights, const Function& function) {
