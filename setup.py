@@ -9,6 +9,7 @@ from pathlib import Path
 from setuptools import Extension, setup
 from setuptools.command.build_ext import build_ext
 
+KERNELS = Path("src/eddies/kernels")
 FLAGS = ["-std=c++17", "-O3", "-fno-math-errno", "-fno-trapping-math", "-Wno-psabi", "-fopenmp"]
 # As src/eddies/kernels/library.py has them.
 INSTRUCTION_SETS = {"plain": []}
@@ -33,8 +34,9 @@ class BuildKernels(build_ext):
 
 
 setup(
-    ext_modules=[Extension(f"eddies.kernels.{name}", sorted(map(str, Path("src/eddies/kernels").glob("*.cpp"))),
-                           extra_compile_args=FLAGS + more, extra_link_args=["-fopenmp"], language="c++", optional=True)
+    ext_modules=[Extension(f"eddies.kernels.{name}", sorted(map(str, KERNELS.glob("*.cpp"))),
+                           depends=sorted(map(str, KERNELS.glob("*.hpp"))), extra_compile_args=FLAGS + more,
+                           extra_link_args=["-fopenmp"], language="c++", optional=True)
                  for name, more in INSTRUCTION_SETS.items()],
     cmdclass={"build_ext": BuildKernels},
 )

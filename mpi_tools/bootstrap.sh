@@ -17,7 +17,7 @@ fail() { echo "bootstrap: $*" >&2; exit 1; }
 have() { command -v "$1" > /dev/null 2>&1; }
 
 fingerprint() {
-    { cat setup.cfg setup.py src/eddies/kernels/*.cpp $constraints mpi_tools/bootstrap.sh; echo "$checkout"
+    { cat setup.cfg setup.py src/eddies/kernels/*.[ch]pp $constraints mpi_tools/bootstrap.sh; echo "$checkout"
       "$venv/bin/python" -V; } 2>&1 | sha256sum
 }
 

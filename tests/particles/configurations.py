@@ -157,6 +157,11 @@ def scaled_pairs(position, velocity, density=None, once=False, flow=FLOW):
     return ScaledPairs(listed.pairs(position, position, once=once), columns.__getitem__, flow)
 
 
+def by_torch(monkeypatch):
+    """Let sums over pairs be taken by the expressions of the terms, not by the compiled library."""
+    monkeypatch.setattr("eddies.particles.context.available", lambda device: False)
+
+
 def distributed(comm, position, velocity, density=None, planes=13):
     """The slabs, and the particles of this rank out of those of all."""
     slab = SlabDecomposition(comm, LENGTH, planes)

@@ -6,7 +6,7 @@ from mpi4py import MPI
 from eddies.particles import context
 from eddies.particles.dense_network import DenseNetwork
 from eddies.particles.feature_range import FeatureRange, pair_features
-from tests.particles.configurations import CUTOFF, SCALES, distributed, dynamics_of, model, state
+from tests.particles.configurations import CUTOFF, SCALES, by_torch, distributed, dynamics_of, model, state
 
 CHOICES = {"corrected": dict(), "antisymmetric": dict(basis="paper", symmetry="antisymmetric")}
 every_model = pytest.mark.parametrize("choices", CHOICES.values(), ids=CHOICES)
@@ -51,6 +51,7 @@ def test_range_and_share_are_the_same_on_any_number_of_ranks(comm, choices):
 @pytest.mark.mpi(1)
 def test_features_are_what_the_network_is_given(comm, monkeypatch):
     dynamics, particles = set_up(comm, {})
+    by_torch(monkeypatch)
     given, plain = [], DenseNetwork.forward
 
     def noting(network, features):

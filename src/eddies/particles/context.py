@@ -8,11 +8,14 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from eddies.parallel.slab import SlabDecomposition
+from eddies.kernels.pairs import PairSpace, Summand
 from eddies.particles import moments
+from eddies.particles.compiled_pairs import CompiledSum, available, compiled_sums
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.neighborhood import LocalParticles, Neighborhood
 from eddies.particles.particle_set import ParticleSet
@@ -33,8 +36,12 @@ REGULARISATION = 1e-3
 UNSEEN = 'no term of this model reads "pairs": add it to the `reads` of the settings'
 
 
-class Summand(Protocol):
-    """What is summed over pairs: a pair term, or the moments that several of them share."""
+class PairSum(Protocol):
+    """What is summed over pairs: a pair term, or the moments that several of them share.
+
+    Where a class of its own defines `compiled(context)`, the compiled library is told by that what to sum, unless it
+    returns None; classes derived from it define it anew, or are summed by their `pair_values`.
+    """
 
     width: int
     mutual: bool
@@ -75,7 +82,7 @@ class Context:
         self.dtype = dtype or particles.position.dtype
         self._neighborhood, self._resolution, self._time = neighborhood, resolution, time
         self._columns: dict[str, Tensor] = {}
-        self._sums: dict[Summand, Tensor] = {}
+        self._sums: dict[PairSum, Tensor] = {}
 
     @cached_property
     def local(self) -> LocalParticles:
@@ -106,6 +113,14 @@ class Context:
             self._columns[name] = self._neighborhood.column(owned)
         return self._columns[name]
 
+    @property
+    def density_fluctuation(self) -> Tensor:
+        """rho' = (rho - rho_0)/rho_rms of the particles that this rank sees, (s,); collective."""
+        name, scales = "density fluctuation", self.flow.scales
+        if name not in self._columns:
+            self._columns[name] = (self.column("density") - scales.density_mean) / scales.required("density")
+        return self._columns[name]
+
     @cached_property
     def resolved(self) -> ResolvedFlow:
         """The velocity that the particles resolve; collective."""
@@ -119,7 +134,7 @@ class Context:
 
     # ---- sums over pairs
 
-    def pair_sums(self, term: Summand) -> Tensor:
+    def pair_sums(self, term: PairSum) -> Tensor:
         """Sums (components, k) of a term's pair values over each particle's neighbours."""
         if term not in self._sums:
             self.sum_pairs([term])
@@ -138,16 +153,36 @@ class Context:
         return Moments(moments.invert_symmetric(sums[1:] + REGULARISATION * expected * diagonal),
                        sums[:1] + REGULARISATION * moments.expected_weight(flow.neighbors))
 
-    def sum_pairs(self, terms: Sequence[Summand]) -> None:
+    def sum_pairs(self, terms: Sequence[PairSum]) -> None:
         """Take the sums of terms together, with the moments that some of them need; collective."""
         moments_too = any(getattr(term, "needs_moments", False) for term in terms)
         summands = [summand for summand in (*terms, *([_MOMENTS] if moments_too else [])) if summand not in self._sums]
-        if summands:
-            mutual = self.rows is None and all(summand.mutual for summand in summands)
-            found = self._mutual_sums(summands) if mutual else self._sums_of(summands)
-            self._sums |= dict(zip(summands, found))
+        if not summands:
+            return
+        mutual = self.rows is None and all(summand.mutual for summand in summands)
+        told = {summand: self._told(summand) for summand in summands}
+        if compiled := {summand: known for summand, known in told.items() if known is not None}:
+            self._sums |= zip(compiled, self._compiled_sums(list(compiled.values()), mutual))
+        if rest := [summand for summand in summands if told[summand] is None]:
+            self._sums |= zip(rest, self._mutual_sums(rest) if mutual else self._sums_of(rest))
 
-    def _sums_of(self, summands: Sequence[Summand]) -> Sequence[Tensor]:
+    def _told(self, summand: PairSum) -> CompiledSum | None:
+        """What the compiled library is told of a summand; None where it does not know it, or serves no such device."""
+        tell = vars(type(summand)).get("compiled")
+        return tell(summand, self) if tell and available(self.particles.position.device) else None
+
+    def _compiled_sums(self, summands: Sequence[CompiledSum], mutual: bool) -> list[Tensor]:
+        local, flow, owned = self.local, self.flow, len(self.particles)
+        wanted = np.zeros(len(local.position), bool)
+        wanted[: owned if self.rows is None else 0] = True
+        if self.rows is not None:
+            wanted[self.rows.numpy()] = True
+        space = PairSpace(local.box.length, local.box.periodic_z, flow.cutoff, flow.scales.filter_width,
+                          flow.scales.velocity, mutual)
+        found = compiled_sums(space, summands, local.position, self.column("velocity"), wanted, self.dtype)
+        return [sums[:, :owned] if self.rows is None else sums.index_select(1, self.rows) for sums in found]
+
+    def _sums_of(self, summands: Sequence[PairSum]) -> Sequence[Tensor]:
         blocks = []
         for block in self._blocks(summands):
             pairs = self._pairs(block)
@@ -155,7 +190,7 @@ class Context:
             blocks.append(pairs.pairs.sum(torch.cat(values).T).T)
         return torch.cat(blocks, dim=1).split([len(value) for value in values])
 
-    def _mutual_sums(self, summands: Sequence[Summand]) -> list[Tensor]:
+    def _mutual_sums(self, summands: Sequence[PairSum]) -> list[Tensor]:
         """Each pair of owned particles evaluated once; those with ghosts on both sides."""
         totals = [self.local.position.new_zeros((len(summand.parity), len(self.particles)), dtype=self.dtype)
                   for summand in summands]
@@ -170,7 +205,7 @@ class Context:
         pairs = self.local.neighbors.pairs(position[: len(self.particles)], position, block, self.dtype, once)
         return ScaledPairs(pairs, self.column, self.flow)
 
-    def _blocks(self, summands: Sequence[Summand]) -> Iterator[Tensor | slice | None]:
+    def _blocks(self, summands: Sequence[PairSum]) -> Iterator[Tensor | slice | None]:
         """Receivers to take together: few enough for the cache, or all where a gradient is recorded."""
         if self.rows is not None or torch.is_grad_enabled():
             yield self.rows
@@ -197,6 +232,10 @@ class _SharedMoments:
     def pair_values(self, pairs: ScaledPairs) -> Tensor:
         weighted = pairs.weight * pairs.x
         return torch.stack([pairs.weight, *moments.products(weighted, pairs.x)])
+
+    def compiled(self, context: Context) -> CompiledSum:
+        """The same for the compiled library."""
+        return CompiledSum(Summand("moments", 7), torch.empty(0))
 
 
 _MOMENTS = _SharedMoments()

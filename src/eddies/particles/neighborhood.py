@@ -28,15 +28,20 @@ class LocalParticles:
     Parameters
     ----------
     position : (s, 3); on several ranks z is not periodic here, and ghosts stand where they are seen from.
-    neighbors : the list of pairs, built from these rows.
+    neighborhood : whose rows these are.
     halo : for further columns, with `ghosts.exchange_ghosts`; another one whenever rows of ghosts change.
     box : the box in which differences of these positions are taken.
     """
 
     position: Tensor
-    neighbors: NeighborList
+    neighborhood: Neighborhood
     halo: HaloExchange
     box: PeriodicBox
+
+    @property
+    def neighbors(self) -> NeighborList:
+        """The list of pairs of these rows."""
+        return self.neighborhood.neighbors
 
 
 class Neighborhood:
@@ -55,7 +60,8 @@ class Neighborhood:
     def __init__(self, decomposition: SlabDecomposition, length: float, cutoff: float, skin: float) -> None:
         self.decomposition, self.cutoff, self.skin = decomposition, cutoff, skin
         self.box = PeriodicBox(length, periodic_z=decomposition.size == 1)
-        self.neighbors = NeighborList(self.box, cutoff, skin)
+        self._neighbors = NeighborList(self.box, cutoff, skin)
+        self._seen: Tensor | None = None
         self.builds = 0
         self.forget()
 
@@ -92,14 +98,21 @@ class Neighborhood:
         self._ids, self._built_at = particles.id, particles.position.detach().clone()
         self.builds += 1
         with torch.no_grad():
-            position = self._with_ghosts(particles.position, exchange_ghost_positions)
-        self.neighbors.build(position[: len(particles)], position, exclude_self=True)
+            self._seen = self._with_ghosts(particles.position, exchange_ghost_positions)
+
+    @property
+    def neighbors(self) -> NeighborList:
+        """The list of pairs, which is built where somebody asks for it."""
+        if self._seen is not None:
+            self._neighbors.build(self._seen[: len(self._built_at)], self._seen, exclude_self=True)
+            self._seen = None
+        return self._neighbors
 
     def local(self, particles: ParticleSet) -> LocalParticles:
         """Positions with ghosts, as of now."""
         # Stored component by component, as the gathering of pairs wants it.
         position = self._with_ghosts(particles.position, exchange_ghost_positions).T.contiguous().T
-        return LocalParticles(position, self.neighbors, self.halo, self.box)
+        return LocalParticles(position, self, self.halo, self.box)
 
     def column(self, owned: Tensor) -> Tensor:
         """A column (n, ...) of owned particles followed by its ghost rows."""

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from torch import Tensor
 
+from eddies.particles.compiled_pairs import CompiledSum
 from eddies.particles.context import Context
 from eddies.particles.dense_network import DenseNetwork
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.rates import Rates
 from eddies.particles.scaled_pairs import ScaledPairs
 from eddies.particles.terms import settings as declared
-from eddies.particles.terms.pair_basis import build_network
+from eddies.particles.terms.pair_basis import build_network, compiled_network
 from eddies.particles.terms.term import PairTerm, TermError
 
 
@@ -39,6 +40,10 @@ class DensityFlux(PairTerm):
     def pair_values(self, pairs: ScaledPairs) -> Tensor:
         """w NN_rho, (1, m)."""
         return pairs.weight * self.network(self.features(pairs))
+
+    def compiled(self, context: Context) -> CompiledSum | None:
+        """The same for the compiled library."""
+        return compiled_network(self.network, self.settings.inputs, 1, False, context)
 
     def rates_of(self, sums: Tensor, context: Context) -> Rates:
         """The rate of density."""

@@ -5,7 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from eddies.kernels.pairs import Summand
 from eddies.particles import moments
+from eddies.particles.compiled_pairs import CompiledSum
 from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.rates import Rates
@@ -38,6 +40,10 @@ class DensityTransport(PairTerm):
         """The entries of w (x v^T + v x^T)/2, and w (rho'_j - rho'_i): (7, m)."""
         own, other = pairs.densities
         return torch.stack([*moments.symmetric_products(pairs.weight * pairs.x, pairs.v), pairs.weight * (other - own)])
+
+    def compiled(self, context: Context) -> CompiledSum:
+        """The same for the compiled library."""
+        return CompiledSum(Summand("density-transport", 7), self.factors.new_zeros(0), (context.density_fluctuation,))
 
     def rates_of(self, sums: Tensor, context: Context) -> Rates:
         """The rate of density."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from eddies.kernels.pairs import Summand
+from eddies.particles.compiled_pairs import CompiledSum
 from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.rates import Rates
@@ -46,6 +48,11 @@ class EddyViscosity(PairTerm):
     def pair_values(self, pairs: ScaledPairs) -> Tensor:
         """w Pi x, (3, m)."""
         return (pairs.weight * self.strength(pairs.distance, pairs.approach)) * pairs.x
+
+    def compiled(self, context: Context) -> CompiledSum:
+        """The same for the compiled library."""
+        return CompiledSum(Summand("eddy-viscosity", 3, (self.settings.form == "monaghan",), (SOFTENING,)),
+                           self.coefficients.abs())
 
     def rates_of(self, sums: Tensor, context: Context) -> Rates:
         """The acceleration."""

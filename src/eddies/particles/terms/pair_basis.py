@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import torch
 from torch import Tensor, nn
 
 from eddies.import_path import is_path, load
+from eddies.kernels.pairs import Summand
 from eddies.particles import moments
+from eddies.particles.compiled_pairs import CompiledSum
 from eddies.particles.context import Context
 from eddies.particles.dense_network import DenseNetwork
 from eddies.particles.terms.settings import NetworkSettings
@@ -28,6 +33,20 @@ def along_velocity(sums: Tensor, basis: str, context: Context) -> Tensor:
 def acceleration(scaled: Tensor, context: Context) -> Tensor:
     """A dimensionless acceleration (3, k) in the units of the flow, (k, 3)."""
     return (context.flow.scales.acceleration * scaled.T).to(context.particles.velocity.dtype)
+
+
+def compiled_network(network: nn.Module, inputs: Sequence[str], outputs: int, symmetric: bool,
+                     context: Context) -> CompiledSum | None:
+    """What the compiled library is told of a term whose network has one or two `outputs`; None of a network that it
+    does not know."""
+    if type(network) is not DenseNetwork:
+        return None
+    layers = list(zip(network.weights, network.biases))
+    told = [name in inputs for name in ("density", "distance", "speed", "approach")]
+    options = outputs, symmetric, *told, *(len(bias) for _, bias in layers[:-1])
+    return CompiledSum(Summand("pair-network", 6 if outputs == 2 else 1, options),
+                       torch.cat([parameter.flatten() for layer in layers for parameter in layer]),
+                       (context.density_fluctuation,) if "density" in inputs else ())
 
 
 def build_network(settings: NetworkSettings, outputs: int, seed: int) -> nn.Module:

@@ -5,12 +5,15 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from eddies.particles.compiled_pairs import CompiledSum
 from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.rates import Rates
 from eddies.particles.scaled_pairs import ScaledPairs
 from eddies.particles.terms import settings as declared
-from eddies.particles.terms.pair_basis import acceleration, along_separation, along_velocity, build_network
+from eddies.particles.terms.pair_basis import (
+    acceleration, along_separation, along_velocity, build_network, compiled_network,
+)
 from eddies.particles.terms.term import PairTerm
 
 
@@ -43,6 +46,10 @@ class PairNetwork(PairTerm):
         """w NN_1 x and w NN_2 v, (6, m)."""
         along_x, along_v = self.network(self.features(pairs))
         return torch.cat([(pairs.weight * along_x) * pairs.x, (pairs.weight * along_v) * pairs.v])
+
+    def compiled(self, context: Context) -> CompiledSum | None:
+        """The same for the compiled library."""
+        return compiled_network(self.network, self.settings.inputs, 2, self.mutual, context)
 
     def rates_of(self, sums: Tensor, context: Context) -> Rates:
         """The acceleration."""

@@ -7,6 +7,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from eddies.kernels.pairs import Summand
+from eddies.particles.compiled_pairs import CompiledSum
 from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.rates import Rates
@@ -28,6 +30,7 @@ class SummationDensity(PairTerm):
     support."""
 
     Settings = declared.SummationDensity
+    settings: declared.SummationDensity
     parity, mutual = torch.ones(1), True
 
     def __init__(self, settings: declared.SummationDensity, flow: FlowUnits) -> None:
@@ -37,6 +40,12 @@ class SummationDensity(PairTerm):
     def pair_values(self, pairs: ScaledPairs) -> Tensor:
         """W, (1, m)."""
         return self.kernel.value(pairs.pairs.distance).unsqueeze(0)
+
+    def compiled(self, context: Context) -> CompiledSum:
+        """The same for the compiled library."""
+        support = self.kernel.support
+        return CompiledSum(Summand("summation-density", 1, (self.settings.kernel == "wendland",),
+                                   (support / context.flow.scales.filter_width, support**-3)), torch.empty(0))
 
     def rates_of(self, sums: Tensor, context: Context) -> Rates:
         """The density's deviation from the mean."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from eddies.kernels.pairs import Summand
+from eddies.particles.compiled_pairs import CompiledSum
 from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.rates import Rates
@@ -31,6 +33,7 @@ class WCSPH(PairTerm):
     """
 
     Settings = declared.WCSPH
+    settings: declared.WCSPH
     # The forces of a pair are opposite, so each pair is evaluated once.
     parity, mutual = -torch.ones(3), True
 
@@ -52,6 +55,15 @@ class WCSPH(PairTerm):
         # The slope of W vanishes at r = 0, so that the quotient is 0 for coincident particles.
         slope = self.kernel.derivative(listed.distance) / listed.distance.clamp(min=torch.finfo(x.dtype).tiny)
         return -self.mass * strength * slope * x
+
+    def compiled(self, context: Context) -> CompiledSum:
+        """The same for the compiled library."""
+        scales, density, support = context.flow.scales, context.column("density"), self.kernel.support
+        width = scales.filter_width
+        options = Summand("wcsph", 3, (self.settings.kernel == "wendland",),
+                          (support / width, self.mass * width / support**5, SOFTENING * (support / (2 * width)) ** 2))
+        viscosity = torch.stack([scales.velocity * self.alpha * self.sound_speed, scales.velocity**2 * self.beta])
+        return CompiledSum(options, viscosity, (self.pressure(density) / density**2, density))
 
     def rates_of(self, sums: Tensor, context: Context) -> Rates:
         """The acceleration."""

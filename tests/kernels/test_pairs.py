@@ -1,0 +1,181 @@
+"""Compiled sums over pairs against those of torch, for each instruction set that this processor runs."""
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from eddies.kernels.library import instruction_sets, load
+from eddies.kernels.pairs import CompiledPairs, PairSpace, Summand
+from eddies.particles.flow_units import FlowUnits
+from eddies.particles.smoothing_kernels import CubicSpline, WendlandC2
+from tests.particles.configurations import (
+    CONFIGURATIONS, CUTOFF, FLOW, LENGTH, NEIGHBORS, PAIR_MODELS, SCALES, alone, by_torch, dynamics_of, given, model,
+    state,
+)
+
+TERMS = PAIR_MODELS | {
+    "wide and deep": {"pairs": dict(hidden=(7, 33, 4)), "density-flux": dict(hidden=(9,))},
+    "antisymmetric alone": {"pairs": dict(basis="paper", symmetry="antisymmetric")},
+    "two-sided": {"eddy-viscosity": dict(form="two-sided", basis="paper")},
+    "cubic spline": {"summation-density": dict(kernel="cubic-spline"), "wcsph": dict(kernel="cubic-spline")},
+    "wendland": {"summation-density": dict(kernel="wendland"), "wcsph": dict(kernel="wendland")},
+}
+# Of at most 1, 2 or 3 rows of cells across, and of many.
+CUTOFFS = {"large": 3.0, "half": 2.2, "third": CUTOFF, "small": 0.7}
+
+
+@pytest.fixture
+def served(library, monkeypatch):
+    """Let dynamics use that library."""
+    monkeypatch.setattr("eddies.particles.compiled_pairs.library", lambda: library)
+
+
+def set_up(terms, kind, cutoff=CUTOFF, count=128, dtype=torch.float64):
+    flow = FlowUnits(SCALES, cutoff, NEIGHBORS) if cutoff != CUTOFF else FLOW
+    slab, particles = alone(*state(count, kind=kind))
+    lagrangian = model(terms, flow).to(dtype)
+    return dynamics_of(slab, lagrangian, skin=0.05, dtype=dtype), particles
+
+
+def rates_and_gradients(dynamics, particles, rows=None):
+    """Rates by name, and the gradient of a number that depends on all of them by parameters and the particles."""
+    columns = {name: column.clone().requires_grad_() for name, column in particles.columns().items() if name != "id"}
+    rates = given(dynamics.rates(replace(particles, **columns), rows))
+    random = torch.Generator().manual_seed(5)
+    total = sum((rate.double() * torch.randn(rate.shape, generator=random, dtype=torch.float64)).sum()
+                for rate in rates.values())
+    inputs = [*columns.values(), *dynamics.model.parameters()]
+    gradients = torch.autograd.grad(total, inputs, allow_unused=True, materialize_grads=True)
+    return [rate.detach() for rate in rates.values()] + list(gradients)
+
+
+def assert_same(found, expected, relative):
+    assert len(found) == len(expected)
+    for one, other in zip(found, expected):
+        assert one.dtype == other.dtype and one.shape == other.shape
+        assert (one - other).abs().max() <= relative * other.abs().max() + 1e-13
+
+
+def compare(monkeypatch, dynamics, particles, relative, rows=None):
+    found = rates_and_gradients(dynamics, particles, rows)
+    with monkeypatch.context() as other:
+        by_torch(other)
+        expected = rates_and_gradients(dynamics, particles, rows)
+    assert_same(found, expected, relative)
+
+
+# The gradient of a force of particles in one place, W'(r)/r x, is what torch's quotient 0/0 does not tell.
+CASES = [(name, kind) for name in TERMS for kind in CONFIGURATIONS
+         if not (kind == "coincident" and "wcsph" in TERMS[name])]
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("name, kind", CASES)
+def test_sums_and_gradients_are_those_of_torch(comm, served, monkeypatch, name, kind):
+    dynamics, particles = set_up(TERMS[name], kind)
+    compare(monkeypatch, dynamics, particles, 1e-11)
+    compare(monkeypatch, dynamics, particles, 1e-11, rows=torch.arange(3, 128, 7))
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("cutoff", CUTOFFS.values(), ids=CUTOFFS)
+@pytest.mark.parametrize("kind", ["even", "uneven"])
+def test_with_any_number_of_rows_of_cells(comm, served, monkeypatch, kind, cutoff):
+    compare(monkeypatch, *set_up(PAIR_MODELS["corrected"], kind, cutoff), 1e-11)
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("name", ["corrected", "antisymmetric", "cubic spline"])
+def test_single_precision_differs_by_its_rounding(comm, served, monkeypatch, name):
+    """Sums of up to a hundred pairs of either sign, of which each is rounded several times."""
+    compare(monkeypatch, *set_up(TERMS[name], "even", dtype=torch.float32), 3e-5)
+
+
+def sums(library, position, kind="summation-density", radius=CUTOFF, wanted=None, dtype=np.float64):
+    space = PairSpace(LENGTH, True, radius, 1.0, 1.0, mutual=True)
+    wanted = np.ones(len(position), bool) if wanted is None else wanted
+    pairs = CompiledPairs(library, space, position, np.zeros_like(position), np.zeros((0, len(position))), wanted,
+                          dtype)
+    return pairs.sums([Summand(kind, 1, (0,), (radius, radius**-3))], [np.zeros(0)])[0][0]
+
+
+def value(kernel, distance, support=CUTOFF):
+    return float(kernel(support).value(torch.tensor(distance, dtype=torch.float64)))
+
+
+def test_ten_thousand_particles_in_one_place(library):
+    """Of which three ask for their sums."""
+    found = sums(library, np.full((10000, 3), 3.1), wanted=np.arange(10000) % 4000 == 7)
+    assert found[7::4000] == pytest.approx([9999 * value(CubicSpline, 0.0)] * 3, rel=1e-12)
+
+
+def test_a_pair_across_every_face_edge_and_corner(library):
+    """Half a radius apart, wherever it is in the box; particles that lie whole periods away are the same."""
+    ends = 1e-9 + np.indices((2, 2, 2)).reshape(3, -1).T * (LENGTH - 2e-9)
+    for direction in np.eye(3):
+        for end in ends:
+            found = sums(library, np.array([end - CUTOFF / 4 * direction, end + CUTOFF / 4 * direction]), radius=CUTOFF)
+            assert found == pytest.approx([value(CubicSpline, CUTOFF / 2)] * 2, rel=1e-9)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_position_that_is_not_finite_is_told(library, value):
+    position = np.random.default_rng(1).uniform(0, LENGTH, (20, 3))
+    position[7, 1] = value
+    with pytest.raises(ValueError, match="particle 7 is not finite"):
+        sums(library, position)
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_without_pairs_sums_are_zero(library, count):
+    assert np.array_equal(sums(library, np.full((count, 3), 0.2)), np.zeros(count))
+
+
+def test_kernels_end_where_they_should(library):
+    for kind, kernel in ((0, CubicSpline), (1, WendlandC2)):
+        for distance in (0.0, 0.1, 0.49, 0.51, 0.99):
+            position = np.array([[1.0, 2, 3], [1.0, 2 + distance, 3]])
+            space = PairSpace(LENGTH, True, 1.0, 1.0, 1.0, mutual=True)
+            pairs = CompiledPairs(library, space, position, np.zeros_like(position), np.zeros((0, 2)),
+                                  np.ones(2, bool), np.float64)
+            found = pairs.sums([Summand("summation-density", 1, (kind,), (1.0, 1.0))], [np.zeros(0)])[0]
+            assert found == pytest.approx(value(kernel, distance, 1.0))
+
+
+PROGRAM = """
+import hashlib, sys
+import numpy as np
+from eddies.kernels.library import load
+from eddies.kernels.pairs import CompiledPairs, PairSpace, Summand
+
+random, digest = np.random.default_rng(1), hashlib.sha256()
+position, velocity = random.uniform(0, 1, (5000, 3)), random.standard_normal((5000, 3))
+summands = [Summand("pair-network", 6, (2, 1, 1, 1, 1, 1, 9, 6)), Summand("moments", 7)]
+parameters = [random.standard_normal(9 * 6 + 6 * 10 + 2 * 7), np.zeros(0)]
+for kind in (np.float32, np.float64):
+    for mutual in (True, False):
+        space = PairSpace(1.0, mutual, 0.13, 0.1, 1.0, mutual)
+        pairs = CompiledPairs(load(sys.argv[1]), space, position, velocity, random.standard_normal((1, 5000)),
+                              random.uniform(size=5000) < 0.9, kind)
+        sums = pairs.sums(summands, parameters)
+        by_parameters, by_columns = pairs.gradients(summands, parameters, sums, True)
+        for array in (*sums, *by_parameters, *by_columns):
+            digest.update(array.tobytes())
+assert all(np.abs(array).max() > 0 for array in (*sums, by_parameters[0], *by_columns))
+print(digest.hexdigest())
+"""
+
+
+def test_the_same_bits_with_any_number_of_threads_and_from_run_to_run(library):
+    name = next(name for name in instruction_sets() if load(name) is library)
+    found = set()
+    for threads in ("1", "2", "3", "2"):
+        made = subprocess.run([sys.executable, "-c", PROGRAM, name], timeout=60, capture_output=True, check=True,
+                              text=True, env={**os.environ, "OMP_NUM_THREADS": threads})
+        found.add(made.stdout)
+    assert len(found) == 1
