@@ -6,7 +6,7 @@ from eddies.flow.tracers import release
 from eddies.parallel.reduction import global_max, global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.particle_field import ParticleField, grid_points
-from eddies.particles.smoothing_kernels import WendlandC2
+from eddies.particles.smoothing_kernels import KernelNetwork, WendlandC2
 
 LENGTH = 2 * np.pi
 
@@ -41,6 +41,17 @@ def test_velocities_spread_on_the_grid_are_those_of_the_neighbours_of_its_points
     assert largest(comm, spread - expected) < 1e-11
     empty = float(global_sum(comm, float((expected == 0).all(1).sum())))
     assert (empty > 100) == (neighbors == 2)
+
+
+@pytest.mark.mpi(1, 2)
+def test_volumes_and_their_gradient_by_entries_of_the_table(comm):
+    field = field_of(comm, torch.cos, placement="random")
+    for seed in (1, 2):
+        network = KernelNetwork(2.5 * LENGTH / 16, (5,), seed=seed).double()
+        found, expected = (volumes(network.table()) for volumes in (field.volumes_by_table, field.volumes))
+        assert largest(comm, found / expected - 1) < 1e-12
+        by = [torch.autograd.grad((volumes**2).sum(), list(network.parameters())) for volumes in (found, expected)]
+        assert all(torch.allclose(a, b, rtol=1e-9, atol=1e-12) and bool(b.abs().max() > 0) for a, b in zip(*by))
 
 
 @pytest.mark.mpi(1, 2, 3)

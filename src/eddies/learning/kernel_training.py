@@ -75,7 +75,7 @@ class KernelTrainer:
         sample = self.samples[random.integers(len(self.samples))]
         rows = sample.own_rows(np.sort(random.choice(self.total, self.points, replace=False)))
         kernel = self.network.table()
-        velocity, gradient = sample.particles.on_grid(kernel, sample.particles.volumes(kernel), rows)
+        velocity, gradient = sample.particles.on_grid(kernel, sample.particles.volumes_by_table(kernel), rows)
         # Each term in units of the mean square of what it reconstructs.
         error = velocity - sample.field[rows]
         shares = {"velocity": mean_square_share(error, sample.mean_square[0] ** 0.5, self.points)}

@@ -15,7 +15,7 @@ from eddies.particles.pairs import Pairs
 from eddies.particles.particle_set import as_numpy
 from eddies.particles.periodic_box import PeriodicBox
 from eddies.particles.reconstruction import reconstruct_on_grid, reconstruct_with_gradient
-from eddies.particles.smoothing_kernels import SmoothingKernel
+from eddies.particles.smoothing_kernels import HermiteKernel, SmoothingKernel
 
 # Pairs taken together where no gradient is recorded: about a core's cache.
 PAIRS_TOGETHER = 1 << 16
@@ -40,10 +40,28 @@ class ParticleField:
         self._position = torch.cat([position, exchange_ghost_positions(self.halo, position)])
         self._velocity = torch.cat([velocity, exchange_ghosts(self.halo, velocity)]).to(dtype)
         self._points, self._support = grid_points(decomposition, decomposition.planes).to(position.device), support
+        self._entries: Tensor | None = None
 
     def volumes(self, kernel: SmoothingKernel) -> Tensor:
         """Volumes 1 / sum_j W(x_i - x_j), i itself counted, of all local particles (s,); collective, differentiable."""
-        own = torch.cat([1 / pairs.sum(kernel.value(pairs.distance)) for pairs in self._own_pairs])
+        return self._with_ghosts(torch.cat([1 / pairs.sum(kernel.value(pairs.distance)) for pairs in self._own_pairs]))
+
+    def volumes_by_table(self, kernel: HermiteKernel) -> Tensor:
+        """The same of a tabulated kernel, fast for one table after the other: what an entry adds to the sum of each
+        particle is found once, 8 bytes for each knot and particle. Collective, differentiable."""
+        if self._entries is None or self._entries.shape[1] != len(kernel.table):
+            with torch.no_grad():
+                self._entries = torch.cat([self._by_entry(kernel, pairs) for pairs in self._own_pairs])
+            del self._own_pairs
+        return self._with_ghosts(1 / (self._entries @ kernel.table))
+
+    def _by_entry(self, kernel: HermiteKernel, pairs: Pairs) -> Tensor:
+        entries, factors = kernel.in_table(pairs.distance)
+        total = len(kernel.table)
+        sums = pairs.distance.new_zeros(pairs.count * total)
+        return sums.index_add_(0, (entries + pairs.segment * total).flatten(), factors.flatten()).reshape(-1, total)
+
+    def _with_ghosts(self, own: Tensor) -> Tensor:
         return torch.cat([own, exchange_ghosts(self.halo, own)])
 
     def on_grid(self, kernel: SmoothingKernel, volume: Tensor, rows: Tensor | slice) -> tuple[Tensor, Tensor]:

@@ -90,23 +90,42 @@ class HermiteKernel:
 
     def value(self, distance: Tensor) -> Tensor:
         """W(r) in 1/length^3, same shape as `distance`."""
-        inside, t, (a, b, c, d) = self._locate(distance)
+        inside, cell, t = self._locate(distance)
+        a, b, c, d = self._cubic(cell)
         value = torch.clamp(a + t * (b + t * (c + t * d)), min=0)  # below zero by rounding alone
         return torch.where(inside, value, torch.zeros_like(value)) / self.support**3
 
     def derivative(self, distance: Tensor) -> Tensor:
         """dW/dr in 1/length^4, same shape as `distance`."""
-        inside, t, (_, b, c, d) = self._locate(distance)
+        inside, cell, t = self._locate(distance)
+        _, b, c, d = self._cubic(cell)
         slope = (b + t * (2 * c + t * (3 * d))) * self.cells
         return torch.where(inside, slope, torch.zeros_like(slope)) / self.support**4
 
-    def _locate(self, distance: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
-        """Whether each distance is inside, its place in [0, 1] within its cell, and the cell's cubic."""
+    @property
+    def table(self) -> Tensor:
+        """Values and slopes (2 knots,), of which every W(r) is a linear function."""
+        return torch.cat([self.values, self.slopes])
+
+    def in_table(self, distance: Tensor) -> tuple[Tensor, Tensor]:
+        """The four entries of the table that each distance (m,) asks for, and the factors that make W(r) of them:
+        (4, m) each."""
+        inside, cell, t = self._locate(distance)
+        last = t * t * (3 - 2 * t)
+        factors = torch.stack([1 - last, last, t * (1 - t) ** 2 / self.cells, t * t * (t - 1) / self.cells])
+        entries = torch.stack([cell, cell + 1, cell + self.cells + 1, cell + self.cells + 2])
+        return entries, torch.where(inside, factors, torch.zeros_like(factors)) / self.support**3
+
+    def _locate(self, distance: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Whether each distance is inside, its cell, and its place in [0, 1] there."""
         position = distance * (self.cells / self.support)
         cell = torch.clamp(position.detach().to(torch.int64), 0, self.cells - 1)
+        return distance < self.support, cell, torch.clamp(position - cell, max=1)
+
+    def _cubic(self, cell: Tensor) -> list[Tensor]:
+        """The coefficients of the cubic in each cell."""
         flat = cell.flatten()
-        cubic = [coefficient.index_select(0, flat).reshape(cell.shape) for coefficient in self._coefficients]
-        return distance < self.support, torch.clamp(position - cell, max=1), cubic
+        return [coefficient.index_select(0, flat).reshape(cell.shape) for coefficient in self._coefficients]
 
 
 class KernelNetwork(nn.Module):
