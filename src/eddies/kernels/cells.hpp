@@ -41,6 +41,13 @@ struct Turns<double> {
     }
 };
 
+// The first of some positions (count, 3) that is not finite, or -1.
+inline std::int64_t not_finite(const double* position, std::int64_t count) {
+    for (std::int64_t p = 0; p < count; ++p)
+        if (!std::isfinite(position[3 * p] + position[3 * p + 1] + position[3 * p + 2])) return p;
+    return -1;
+}
+
 // A range of particles in order of place.
 struct Range {
     std::int64_t first, last;
@@ -68,26 +75,31 @@ class Cells {
     std::vector<std::int64_t> start;                             // of each cell, x fastest
     Real scale[3];                                               // of differences of turns
 
-    // Particles (count, 3) in a box of this length, periodic along x and y, and along z if so told; cells no narrower
-    // than `reach` across rows. Returns -1, or the first particle whose position is not finite.
-    std::int64_t arrange(const double* position, std::int64_t particles, double length, bool periodic_z, double reach) {
+    // Put particles (count, 3) in order, in a box of this length, periodic along x and y, and along z if so told; cells
+    // no narrower than `reach` across rows. Points (number, 3) are others that `place` will be asked of, or null. All
+    // are finite.
+    void arrange(const double* position, std::int64_t particles, const double* points, std::int64_t number, double length,
+                 bool periodic_z, double reach) {
         count = particles;
         double lowest = 0.0, highest = length;
-        for (std::int64_t p = 0; p < count; ++p)
-            for (int axis = 0; axis < 3; ++axis)
-                if (!std::isfinite(position[3 * p + axis])) return p;
         if (!periodic_z) {
-            lowest = highest = count ? position[2] : 0.0;
-            for (std::int64_t p = 0; p < count; ++p) {
-                lowest = std::min(lowest, position[3 * p + 2]);
-                highest = std::max(highest, position[3 * p + 2]);
-            }
+            lowest = count ? position[2] : number ? points[2] : 0.0;
+            highest = lowest;
+            const auto span_of = [&](const double* some, std::int64_t size) {
+                for (std::int64_t p = 0; p < size; ++p) {
+                    lowest = std::min(lowest, some[3 * p + 2]);
+                    highest = std::max(highest, some[3 * p + 2]);
+                }
+            };
+            span_of(position, count);
+            span_of(points, number);
         }
         wraps[0] = wraps[1] = true;
         wraps[2] = periodic_z;
-        const double origin[3] = {0.0, 0.0, lowest}, span = highest - lowest;
+        origin = lowest;
+        const double span = highest - lowest;
         // Where it is not periodic, z has a period so long that no image is near.
-        for (int axis = 0; axis < 3; ++axis) period[axis] = length;
+        for (double& one : period) one = length;
         if (!periodic_z) period[2] = 4.0 * std::max(span, reach);
         const double most = std::sqrt(static_cast<double>(count)) + 1.0;  // never many more cells than particles
         lines = at_least_one(std::min(std::floor(length / reach), most));
@@ -97,32 +109,43 @@ class Cells {
         width[0] = 1.0 / static_cast<double>(columns);
         width[1] = 1.0 / static_cast<double>(lines);
         width[2] = (periodic_z ? 1.0 : span / period[2]) / static_cast<double>(planes);
-        std::vector<double> fraction(3 * count);
-        std::vector<std::int64_t> cell(count);
+        std::vector<Place> places(count);
         start.assign(rows() * columns + 1, 0);
-        for (std::int64_t p = 0; p < count; ++p) {
-            std::int64_t index[3];
-            for (int axis = 0; axis < 3; ++axis) {
-                const double turns = (position[3 * p + axis] - origin[axis]) / period[axis];
-                const double f = std::min(std::max(turns - std::floor(turns), 0.0), 1.0 - 1e-15);
-                fraction[3 * p + axis] = f;
-                const std::int64_t cells = axis == 0 ? columns : axis == 1 ? lines : planes;
-                index[axis] = width[axis] > 0.0 ? std::min(static_cast<std::int64_t>(f / width[axis]), cells - 1) : 0;
-            }
-            cell[p] = (index[2] * lines + index[1]) * columns + index[0];
-            ++start[cell[p] + 1];
-        }
+#pragma omp parallel for schedule(static)
+        for (std::int64_t p = 0; p < count; ++p) places[p] = place(position + 3 * p);
+        for (const Place& one : places) ++start[one.cell(*this) + 1];
         for (std::size_t c = 1; c < start.size(); ++c) start[c] += start[c - 1];
         std::vector<std::int64_t> next(start.begin(), start.end() - 1);
         order.resize(count);
         for (auto& column : turn) column.resize(count);
         for (std::int64_t p = 0; p < count; ++p) {
-            const std::int64_t place = next[cell[p]]++;
-            order[place] = static_cast<std::int32_t>(p);
-            for (int axis = 0; axis < 3; ++axis) turn[axis][place] = Turns<Real>::of(fraction[3 * p + axis]);
+            const std::int64_t at = next[places[p].cell(*this)]++;
+            order[at] = static_cast<std::int32_t>(p);
+            for (int axis = 0; axis < 3; ++axis) turn[axis][at] = Turns<Real>::of(places[p].fraction[axis]);
         }
         for (int axis = 0; axis < 3; ++axis) scale[axis] = static_cast<Real>(period[axis] * Turns<Real>::UNIT);
-        return -1;
+    }
+
+    // Where a point is: fractions of the periods, and indices of its cell along x, y and z.
+    struct Place {
+        double fraction[3];
+        std::int64_t index[3];
+
+        std::int64_t row(const Cells& cells) const { return index[2] * cells.lines + index[1]; }
+        std::int64_t cell(const Cells& cells) const { return row(cells) * cells.columns + index[0]; }
+    };
+
+    Place place(const double* position) const {
+        Place found;
+        const std::int64_t cells[3] = {columns, lines, planes};
+        for (int axis = 0; axis < 3; ++axis) {
+            const double turns = (position[axis] - (axis == 2 ? origin : 0.0)) / period[axis];
+            const double fraction = std::min(std::max(turns - std::floor(turns), 0.0), 1.0 - 1e-15);
+            found.fraction[axis] = fraction;
+            found.index[axis] =
+                width[axis] > 0.0 ? std::min(static_cast<std::int64_t>(fraction / width[axis]), cells[axis] - 1) : 0;
+        }
+        return found;
     }
 
     std::int64_t rows() const { return lines * planes; }
@@ -174,25 +197,44 @@ class Cells {
         return 2;
     }
 
-    // How far a particle in a row is from the rows on both sides of that.
-    void edges(std::int64_t place, std::int64_t line, std::int64_t plane, Edges* found) const {
-        const std::int64_t index[2] = {line, plane}, cells[2] = {lines, planes};
+    // How far a point is from the rows on both sides of its own.
+    void edges(const Place& place, Edges* found) const {
+        const std::int64_t cells[2] = {lines, planes};
         for (int across = 0; across < 2; ++across) {
             const int axis = across + 1;
-            const double at = fraction(axis, place), lower = static_cast<double>(index[across]) * width[axis];
+            const double at = place.fraction[axis], lower = static_cast<double>(place.index[axis]) * width[axis];
             // Where there are only two rows, one is on both sides of the other.
             const double known = wraps[axis] && cells[across] < 3 ? 0.0 : period[axis];
             found[across] = {{std::max(at - lower, 0.0) * known, 0.0, std::max(lower + width[axis] - at, 0.0) * known}};
         }
     }
 
-    // Fraction of a period at which a particle is.
-    double fraction(int axis, std::int64_t place) const {
-        return static_cast<double>(turn[axis][place]) * Turns<Real>::UNIT;
+    // Of a particle, whose row is known.
+    Place place_of(std::int64_t at, std::int64_t row) const {
+        Place found;
+        for (int axis = 0; axis < 3; ++axis) found.fraction[axis] = static_cast<double>(turn[axis][at]) * Turns<Real>::UNIT;
+        found.index[0] = 0;
+        found.index[1] = row % lines;
+        found.index[2] = row / lines;
+        return found;
+    }
+
+    // Squares of the distances of a point at these turns to particles that follow each other.
+    void squares(const Turn* at, std::int64_t begin, int number, Real* square) const {
+        using T = Turns<Real>;
+        const Turn x = at[0], y = at[1], z = at[2];
+        const Turn *xs = &turn[0][begin], *ys = &turn[1][begin], *zs = &turn[2][begin];
+        const Real a = scale[0], b = scale[1], c = scale[2];
+#pragma omp simd
+        for (int p = 0; p < number; ++p) {
+            const Real dx = T::difference(x, xs[p]) * a, dy = T::difference(y, ys[p]) * b,
+                       dz = T::difference(z, zs[p]) * c;
+            square[p] = dx * dx + dy * dy + dz * dz;
+        }
     }
 
    private:
-    double period[3], width[3];  // and how wide a cell is, in periods
+    double origin, period[3], width[3];  // of z; and how wide a cell is, in periods
     bool wraps[3];
 
     static std::int64_t at_least_one(double number) { return std::max<std::int64_t>(static_cast<std::int64_t>(number), 1); }

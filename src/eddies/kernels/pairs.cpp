@@ -85,9 +85,9 @@ struct Sorted {
         : given(given), width(padded<Real>(6 + static_cast<int>(given.scalars))), records(given.count * width) {}
 
     std::int64_t arrange() {
-        const std::int64_t misplaced =
-            cells.arrange(given.position, given.count, given.length, given.periodic_z, given.radius);
+        const std::int64_t misplaced = not_finite(given.position, given.count);
         if (misplaced >= 0) return misplaced;
+        cells.arrange(given.position, given.count, nullptr, 0, given.length, given.periodic_z, given.radius);
         wanted.resize(given.count);
 #pragma omp parallel for schedule(static)
         for (std::int64_t p = 0; p < given.count; ++p) {
@@ -179,11 +179,11 @@ class Worker {
         Edges edges[2];
         Range ranges[2];
         for (std::int64_t i = own.first; i < own.last; ++i) {
-            cells_.edges(i, row % cells_.lines, row / cells_.lines, edges);
-            const double x = cells_.fraction(0, i);
+            const auto place = cells_.place_of(i, row);
+            cells_.edges(place, edges);
             for (const NearRow& other : near_) {
                 if (other.row < row) continue;
-                const int number = cells_.within(x, edges, other, radius_, ranges);
+                const int number = cells_.within(place.fraction[0], edges, other, radius_, ranges);
                 for (int r = 0; r < number; ++r)
                     look(i, other.row == row ? std::max(ranges[r].first, i + 1) : ranges[r].first, ranges[r].last);
             }
@@ -216,10 +216,11 @@ class Worker {
     void look(std::int64_t i, std::int64_t first, std::int64_t last) {
         const auto limit = static_cast<Real>(radius_ * radius_);
         const int wanted = sorted_.wanted[i];
+        const typename Cells<Real>::Turn at[3] = {cells_.turn[0][i], cells_.turn[1][i], cells_.turn[2][i]};
         alignas(64) Real square[CANDIDATES];
         for (std::int64_t begin = first; begin < last; begin += CANDIDATES) {
             const int number = static_cast<int>(std::min(CANDIDATES, last - begin));
-            squares(i, begin, number, square);
+            cells_.squares(at, begin, number, square);
             if (sorted_.all_wanted) {
                 for (int c = 0; c < number; ++c) both_.add(i, begin + c, square[c] < limit);
             } else {
@@ -232,20 +233,6 @@ class Worker {
                 take_blocks(one_, false);
             }
             take_blocks(both_, true);
-        }
-    }
-
-    // Squares of the distances of a particle to others that follow each other.
-    void squares(std::int64_t i, std::int64_t begin, int number, Real* square) const {
-        using T = Turns<Real>;
-        const auto x = cells_.turn[0][i], y = cells_.turn[1][i], z = cells_.turn[2][i];
-        const auto *xs = &cells_.turn[0][begin], *ys = &cells_.turn[1][begin], *zs = &cells_.turn[2][begin];
-        const Real a = cells_.scale[0], b = cells_.scale[1], c = cells_.scale[2];
-#pragma omp simd
-        for (int p = 0; p < number; ++p) {
-            const Real dx = T::difference(x, xs[p]) * a, dy = T::difference(y, ys[p]) * b,
-                       dz = T::difference(z, zs[p]) * c;
-            square[p] = dx * dx + dy * dy + dz * dz;
         }
     }
 

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Iterator
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from eddies.kernels.library import library
+from eddies.kernels.neighbors import Box, neighbors_within, pairs_within
 from eddies.particles.cell_grid import CellGrid, blocks_of
 from eddies.particles.pairs import Pairs, gather_rows
 from eddies.particles.periodic_box import PeriodicBox, safe_norm
@@ -49,7 +53,14 @@ class NeighborList:
             raise ValueError("neighbour list: a position is not finite")
         # Slightly too far: whether a pair at the very edge interacts is decided in `pairs`, the same way for
         # both.
-        grid = CellGrid(self.box, senders, (self.cutoff + self.skin) * (1 + 1e-9))
+        reach = (self.cutoff + self.skin) * (1 + 1e-9)
+        self.builds += 1
+        self._receivers = None
+        if (compiled := self._compiled(receivers)) is not None:
+            found = neighbors_within(compiled, self._space, reach, receivers.numpy(), senders.numpy(), exclude_self)
+            self.offsets, self.senders = map(torch.from_numpy, found)
+            return
+        grid = CellGrid(self.box, senders, reach)
         found = [(receivers.new_empty(0, dtype=torch.int64),) * 2]
         for receiver, sender in grid.search(self.box.wrap(receivers).T.contiguous()):
             if exclude_self:
@@ -59,7 +70,6 @@ class NeighborList:
         self._receivers, self.senders = (torch.cat(column) for column in zip(*found))
         neighbors = torch.bincount(self._receivers, minlength=len(receivers))
         self.offsets = torch.cat([neighbors.new_zeros(1), neighbors.cumsum(0)])
-        self.builds += 1
 
     def blocks(self, together: int) -> Iterator[slice]:
         """Consecutive receivers with about `together` listed pairs; one empty block without receivers."""
@@ -87,6 +97,10 @@ class NeighborList:
         once : leave out the second of the two orders of each pair of receivers; for lists whose senders are the
             receivers, then others.
         """
+        recorded = torch.is_grad_enabled() and (receivers.requires_grad or senders.requires_grad)
+        compiled = self._compiled(receivers)
+        if compiled is not None and not recorded:
+            return self._compiled_pairs(compiled, receivers, senders, rows, dtype or receivers.dtype, once)
         receiver, segment, sender, count = self._listed(rows)
         if once:
             first = torch.nonzero(receiver < sender).squeeze(1)
@@ -98,12 +112,32 @@ class NeighborList:
             square = sum(component * component for component in components)
             near = torch.nonzero(square < self.cutoff**2).squeeze(1)
         receiver, segment, sender = (index.index_select(0, near) for index in (receiver, segment, sender))
-        if torch.is_grad_enabled() and (receivers.requires_grad or senders.requires_grad):
+        if recorded:
             components = self._components(points, others, receiver, sender)
         else:
             components = [component.index_select(0, near) for component in components]
         displacement = torch.stack([component.to(dtype or points.dtype) for component in components])
         return Pairs(receiver, segment, sender, displacement.T, safe_norm(displacement, dim=0), count)
+
+    @property
+    def _space(self) -> Box:
+        return Box(self.box.length, self.box.periodic_z)
+
+    def _compiled(self, points: Tensor) -> ctypes.CDLL | None:
+        return library() if points.device.type == "cpu" else None
+
+    def _compiled_pairs(self, compiled: ctypes.CDLL, receivers: Tensor, senders: Tensor, rows: Tensor | slice | None,
+                        dtype: torch.dtype, once: bool) -> Pairs:
+        total = len(self.offsets) - 1
+        if isinstance(rows, Tensor):
+            numbers = rows.numpy()
+        else:
+            numbers = np.arange(*(rows or slice(None)).indices(total))
+        found = pairs_within(compiled, self._space, self.cutoff, receivers.detach().numpy(), senders.detach().numpy(),
+                             self.offsets.numpy(), self.senders.numpy(), numbers, once,
+                             np.dtype(str(dtype).removeprefix("torch.")))
+        receiver, segment, sender, displacement, distance = map(torch.from_numpy, found)
+        return Pairs(receiver, segment, sender, displacement.T, distance, len(numbers))
 
     def _components(self, points: Tensor, others: Tensor, receiver: Tensor, sender: Tensor) -> list[Tensor]:
         return [
@@ -114,6 +148,9 @@ class NeighborList:
     def _listed(self, rows: Tensor | slice | None) -> tuple[Tensor, Tensor, Tensor, int]:
         """Receiver, output row and sender of each listed pair, and the number of output rows."""
         receivers = len(self.offsets) - 1
+        if self._receivers is None:
+            self._receivers = torch.repeat_interleave(torch.arange(receivers, device=self.offsets.device),
+                                                      self.offsets.diff())
         if rows is None:
             return self._receivers, self._receivers, self.senders, receivers
         if isinstance(rows, slice):
