@@ -23,6 +23,7 @@ from mpi4py import MPI
 from eddies.io.contiguous import Block, lay_out, write_arrays
 from eddies.io.hdf5 import ProductError, in_files
 from eddies.io.manifest import find_damage, hash_file, manifest_text, parse_manifest
+from eddies.kernels.library import in_use
 from eddies.parallel.broadcast import first_complaint, on_all_ranks, on_first_rank
 
 log = logging.getLogger("eddies")
@@ -32,7 +33,7 @@ STATE, MANIFEST = "state.h5", "manifest.json"
 # The dataset of what is no array.
 PLAIN = "plain"
 # Of the layout of a checkpoint: others are not used. To be raised with that of the products too: frames are such.
-FORMAT = 3
+FORMAT = 4
 
 
 @dataclass(frozen=True)
@@ -96,7 +97,7 @@ class CheckpointDirectory:
             size = on_first_rank(self.comm, lambda: (partial / STATE).stat().st_size)
             content = {"step": step, "format": FORMAT, "fingerprint": self.fingerprint,
                        "state": hash_file(self.comm, partial / STATE, regions, size),
-                       "files": {name: self._hash_whole(name) for name in files}}
+                       "files": {name: self._hash_whole(name) for name in files}, "kernels": in_use()}
             on_first_rank(self.comm, lambda: _finish(partial, final, manifest_text(content)))
         except OSError as error:
             if self.comm.rank == 0:
@@ -114,6 +115,7 @@ class CheckpointDirectory:
             content, complaint = self._examine(self.path / names[0])
             if complaint is None:
                 found = Checkpoint(self.path / names[0], content)
+                self._compare_kernels(content["kernels"])
                 break
             if self.comm.rank == 0:
                 log.warning("%s; this checkpoint is not used", complaint)
@@ -141,6 +143,11 @@ class CheckpointDirectory:
         for name, entry in content["files"].items() if complaint is None else ():
             complaint = complaint or find_damage(self.comm, self.path / name, entry)
         return content, complaint
+
+    def _compare_kernels(self, then: str) -> None:
+        if self.comm.rank == 0 and then != in_use():
+            log.warning("the checkpoint was made with compiled kernels for %s, and this processor has them for %s: the "
+                        "run goes on, but not bit for bit as it would have", then, in_use())
 
     def _names(self) -> list[str]:
         """Checkpoints, the newest first, as rank 0 sees them."""

@@ -9,6 +9,7 @@ import h5py
 from mpi4py import MPI
 
 import eddies
+from eddies.kernels.library import in_use
 
 LIBRARIES = ("numpy", "mpi4py", "h5py", "pyfftw", "torch")
 
@@ -22,7 +23,7 @@ def environment(ranks: int) -> dict[str, object]:
             versions[library] = metadata.version(library)
         except metadata.PackageNotFoundError:
             continue
-    return {"eddies": eddies.__version__, "commit": commit(), "libraries": versions, "ranks": ranks,
+    return {"eddies": eddies.__version__, "commit": commit(), "libraries": versions, "kernels": in_use(), "ranks": ranks,
             "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")}
 
 

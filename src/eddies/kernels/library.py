@@ -12,6 +12,8 @@ INSTRUCTION_SETS = ("plain", "avx2", "avx512")
 MISSING = ("no compiled kernels (no C++ compiler at installation?): everything runs by numpy and torch, several times "
            "slower")
 
+Library = ctypes.CDLL
+
 log = logging.getLogger("eddies")
 
 
@@ -32,6 +34,11 @@ def instruction_sets() -> list[str]:
         return []
     best = load("plain").best_instruction_set()
     return [name for name in built if INSTRUCTION_SETS.index(name) <= best]
+
+
+def in_use() -> str:
+    """The instruction set of the library that serves this process, or "none"."""
+    return (instruction_sets() or ["none"])[-1]
 
 
 @functools.cache

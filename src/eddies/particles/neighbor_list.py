@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Iterator
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from eddies.kernels.library import library
+from eddies.kernels.library import Library, library
 from eddies.kernels.neighbors import Box, neighbors_within, pairs_within
 from eddies.particles.cell_grid import CellGrid, blocks_of
 from eddies.particles.pairs import Pairs, gather_rows
@@ -123,10 +122,10 @@ class NeighborList:
     def _space(self) -> Box:
         return Box(self.box.length, self.box.periodic_z)
 
-    def _compiled(self, points: Tensor) -> ctypes.CDLL | None:
+    def _compiled(self, points: Tensor) -> Library | None:
         return library() if points.device.type == "cpu" else None
 
-    def _compiled_pairs(self, compiled: ctypes.CDLL, receivers: Tensor, senders: Tensor, rows: Tensor | slice | None,
+    def _compiled_pairs(self, compiled: Library, receivers: Tensor, senders: Tensor, rows: Tensor | slice | None,
                         dtype: torch.dtype, once: bool) -> Pairs:
         total = len(self.offsets) - 1
         if isinstance(rows, Tensor):
