@@ -23,8 +23,8 @@ def environment(ranks: int) -> dict[str, object]:
             versions[library] = metadata.version(library)
         except metadata.PackageNotFoundError:
             continue
-    return {"eddies": eddies.__version__, "commit": commit(), "libraries": versions, "kernels": in_use(), "ranks": ranks,
-            "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")}
+    return {"eddies": eddies.__version__, "commit": commit(), "libraries": versions, "kernels": in_use(),
+            "ranks": ranks, "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")}
 
 
 def commit() -> str | None:
