@@ -46,7 +46,7 @@ using namespace eddies;
 constexpr int ROWS_TOGETHER = 4;      // of a colour, for one thread
 constexpr std::int64_t CANDIDATES = 64;  // looked at together
 
-enum Kind { PAIR_NETWORK, MOMENTS, EDDY_VISCOSITY, DENSITY_TRANSPORT, SUMMATION_DENSITY, WCSPH };
+enum Kind { PAIR_NETWORK, MOMENTS, EDDY_VISCOSITY, DENSITY_TRANSPORT, SUMMATION_DENSITY, WCSPH, KERNEL_SUM, KERNEL_AVERAGE };
 
 template <typename Real>
 std::unique_ptr<Summand<Real>> make(const Given& given) {
@@ -64,6 +64,10 @@ std::unique_ptr<Summand<Real>> make(const Given& given) {
             return std::make_unique<DensityTransport<Real>>(scalar);
         case SUMMATION_DENSITY:
             return std::make_unique<SummationDensity<Real>>(options[0], given.constants);
+        case KERNEL_SUM:
+            return std::make_unique<KernelSum<Real>>(given.constants);
+        case KERNEL_AVERAGE:
+            return std::make_unique<KernelAverage<Real>>(scalar, given.constants);
         default:
             return std::make_unique<Wcsph<Real>>(options[0], scalar, given.constants, given.parameters);
     }

@@ -5,11 +5,12 @@
 #include <memory>
 
 #include "network.hpp"
+#include "smoothing.hpp"
 
 namespace eddies {
 
 constexpr int MOST_SCALARS = 4;     // columns of numbers that particles carry
-constexpr int MOST_COMPONENTS = 8;  // of what one summand gives
+constexpr int MOST_COMPONENTS = 16;  // of what one summand gives
 
 // Pairs: the separation in filter widths and the velocity difference in units of the velocity, first less second
 // particle; length of the separation, weight (1 - q^2)^2, and numbers of first and second.
@@ -466,6 +467,57 @@ class Wcsph : public Summand<Real> {
         return pairs.scalar[0][push_][p] + pairs.scalar[1][push_][p] +
                mu * (quadratic_ * mu - linear_) / mean(pairs, p);
     }
+};
+
+// W of the distance, in units of length.
+template <typename Real>
+class KernelSum : public Summand<Real> {
+   public:
+    explicit KernelSum(const double* constants) : Summand<Real>(1, Real(1)), kernel_(constants) {}
+
+    void values(const Block<Real>& pairs, Components<Real> found) override {
+        for (int p = 0; p < BLOCK; ++p) found[0][p] = kernel_.value(pairs.distance[p]);
+    }
+
+    void gradients(const Block<Real>&, GivenComponents<Real>, ByPairs<Real>*, Real*) override {}
+
+   private:
+    Smoothing<Real> kernel_;
+};
+
+// What makes the average of a vector a and its gradient, relative to the first particle's own: V W, V W a', V grad W and
+// V a'_c grad_d W with a' = a_j - a_i. Scalars: V, and the components of a.
+template <typename Real>
+class KernelAverage : public Summand<Real> {
+   public:
+    KernelAverage(int scalar, const double* constants)
+        : Summand<Real>(16, Real(1)), scalar_(scalar), kernel_(constants) {}
+
+    void values(const Block<Real>& pairs, Components<Real> found) override {
+        const Real* volume = pairs.scalar[1][scalar_];
+        alignas(64) Real slope[BLOCK];
+        for (int p = 0; p < BLOCK; ++p) {
+            const Real r = pairs.distance[p];
+            found[0][p] = volume[p] * kernel_.value(r);
+            slope[p] = r > 0 ? volume[p] * kernel_.slope(r) / r : Real(0);
+        }
+        for (int d = 0; d < 3; ++d)
+            EDDIES_PAIRS found[4 + d][p] = slope[p] * pairs.x[d][p];
+        for (int c = 0; c < 3; ++c) {
+            const Real *own = pairs.scalar[0][scalar_ + 1 + c], *other = pairs.scalar[1][scalar_ + 1 + c];
+            EDDIES_PAIRS {
+                const Real apart = other[p] - own[p];
+                found[1 + c][p] = found[0][p] * apart;
+                for (int d = 0; d < 3; ++d) found[7 + 3 * c + d][p] = found[4 + d][p] * apart;
+            }
+        }
+    }
+
+    void gradients(const Block<Real>&, GivenComponents<Real>, ByPairs<Real>*, Real*) override {}
+
+   private:
+    int scalar_;
+    Smoothing<Real> kernel_;
 };
 
 #undef EDDIES_PAIRS

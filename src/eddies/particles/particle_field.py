@@ -4,17 +4,22 @@ from __future__ import annotations
 
 from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from eddies.kernels.library import library
+from eddies.kernels.pairs import PairSpace, Summand
+from eddies.kernels.reconstruction import GridPlanes, sums_on_grid, told_kernel
 from eddies.parallel.halo import HaloExchange
 from eddies.parallel.slab import SlabDecomposition
+from eddies.particles.compiled_pairs import CompiledSum, available, compiled_sums
 from eddies.particles.ghosts import exchange_ghost_positions, exchange_ghosts
 from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.pairs import Pairs
 from eddies.particles.particle_set import as_numpy
 from eddies.particles.periodic_box import PeriodicBox
-from eddies.particles.reconstruction import reconstruct_on_grid, reconstruct_with_gradient
+from eddies.particles.reconstruction import reciprocal, reconstruct_on_grid, reconstruct_with_gradient
 from eddies.particles.smoothing_kernels import HermiteKernel, SmoothingKernel
 
 # Pairs taken together where no gradient is recorded: about a core's cache.
@@ -44,6 +49,9 @@ class ParticleField:
 
     def volumes(self, kernel: SmoothingKernel) -> Tensor:
         """Volumes 1 / sum_j W(x_i - x_j), i itself counted, of all local particles (s,); collective, differentiable."""
+        if self._served and not torch.is_grad_enabled():
+            sums, = self._sums(kernel, "kernel-sum", 1, self._position, len(self.owned))
+            return self._with_ghosts(1 / (sums[0] + kernel.value(sums.new_zeros(()))))
         return self._with_ghosts(torch.cat([1 / pairs.sum(kernel.value(pairs.distance)) for pairs in self._own_pairs]))
 
     def volumes_by_table(self, kernel: HermiteKernel) -> Tensor:
@@ -73,18 +81,66 @@ class ParticleField:
     def on_whole_grid(self, kernel: SmoothingKernel) -> tuple[Tensor, Tensor]:
         """Velocity (m, 3) and gradient (m, 3, 3) at all of this rank's grid points; collective."""
         volume = self.volumes(kernel)
+        if self._served:
+            none = self._velocity.new_zeros(len(self._points), 4)
+            return self._averages(kernel, torch.cat([self._points, self._position]),
+                                  torch.cat([none, self._columns(volume)]), none)
         return _joined(self.on_grid(kernel, volume, block) for block in self._around.blocks(PAIRS_TOGETHER))
 
+    @torch.no_grad()
     def velocity_on_whole_grid(self, kernel: SmoothingKernel) -> Tensor:
         """Velocity (m, 3) at all of this rank's grid points, cheaper than with its gradient; collective, not
         differentiable."""
-        return reconstruct_on_grid(kernel, self.decomposition, self._position, self.volumes(kernel), self._velocity)
+        volume, slab = self.volumes(kernel), self.decomposition
+        if self._served:
+            weighted = volume.unsqueeze(1) * torch.cat([torch.ones_like(volume).unsqueeze(1), self._velocity], dim=1)
+            planes = GridPlanes(slab.planes, slab.spacing, slab.start, slab.count, slab.size == 1)
+            sums = torch.from_numpy(sums_on_grid(library(), planes, kernel.support, kernel.pieces.numpy(),
+                                                 self._position.numpy(), weighted.numpy()))
+            return sums[:, 1:] * reciprocal(sums[:, :1])
+        return reconstruct_on_grid(kernel, slab, self._position, volume, self._velocity)
 
     @torch.no_grad()
     def at_particles(self, kernel: SmoothingKernel) -> tuple[Tensor, Tensor]:
         """Velocity (n, 3) and gradient (n, 3, 3) [component, direction] at the owned particles; collective."""
         volume = self.volumes(kernel)
+        if self._served:
+            columns = self._columns(volume)
+            itself = columns[: len(self.owned)].clone()
+            itself[:, :1] *= kernel.value(itself.new_zeros(()))
+            return self._averages(kernel, self._position, columns, itself)
         return _joined(reconstruct_with_gradient(kernel, pairs, volume, self._velocity) for pairs in self._own_pairs)
+
+    # ---- by the compiled library
+
+    @property
+    def _served(self) -> bool:
+        return available(self.owned.device)
+
+    def _columns(self, volume: Tensor) -> Tensor:
+        """Volume and velocity of each particle, (s, 4)."""
+        return torch.cat([volume.unsqueeze(1), self._velocity], dim=1)
+
+    def _averages(self, kernel: SmoothingKernel, position: Tensor, columns: Tensor,
+                  itself: Tensor) -> tuple[Tensor, Tensor]:
+        """Velocity (m, 3) and its gradient (m, 3, 3) at the first m of some positions (s, 3), from sums over all others,
+        which have `columns` (s, 4) of volume and velocity. `itself` (m, 4): V W(0) of each as one of its own
+        neighbours, and the velocity that others are taken relative to."""
+        sums = self._sums(kernel, "kernel-average", 16, position, len(itself), tuple(columns.T))[0]
+        factor = reciprocal(sums[:1] + itself.T[:1])
+        relative = sums[1:4] * factor
+        gradient = (sums[7:].reshape(3, 3, -1) - relative.unsqueeze(1) * sums[4:7]) * factor
+        return (relative + itself.T[1:]).T, gradient.permute(2, 0, 1)
+
+    def _sums(self, kernel: SmoothingKernel, kind: str, components: int, position: Tensor, count: int,
+              scalars: tuple[Tensor, ...] = ()) -> tuple[Tensor, ...]:
+        """Sums over the particles within the support, (components, count), of the first `count` positions."""
+        told = Summand(kind, components, constants=told_kernel(kernel.support, kernel.pieces.numpy()))
+        space = PairSpace(self.decomposition.length, self.decomposition.size == 1, kernel.support, 1.0, 1.0, False)
+        wanted = np.arange(len(position)) < count
+        found = compiled_sums(space, [CompiledSum(told, torch.empty(0), scalars)], position,
+                              torch.zeros_like(position), wanted, self.dtype)
+        return tuple(sums[:, :count] for sums in found)
 
     @cached_property
     def _own_pairs(self) -> list[Pairs]:

@@ -69,7 +69,7 @@ def reconstruct_on_grid(
         point, particle = point.index_select(0, near), some.index_select(0, near // side**3)
         for column, total in zip(columns, sums):
             total.index_add_(0, point, weight * column.index_select(0, particle))
-    return (sums[1:] * _reciprocal(sums[0])).T
+    return (sums[1:] * reciprocal(sums[0])).T
 
 
 def reconstruct_with_gradient(
@@ -81,22 +81,22 @@ def reconstruct_with_gradient(
     exactly the derivative of the reconstructed field. Arguments as there.
     """
     volume, value, distance = pairs.at_senders(sender_volumes), pairs.at_senders(sender_values).T, pairs.distance
-    average, reciprocal = _average(kernel, pairs, volume, value)
+    average, factor = _average(kernel, pairs, volume, value)
     # Both the slope and the direction vanish with the distance.
     apart = torch.where(distance > 0, distance, torch.ones_like(distance))
     gradient = (volume * kernel.derivative(distance) / apart) * pairs.displacement.T
     deviation = value - average.T.contiguous().index_select(1, pairs.segment)
     products = deviation.unsqueeze(1) * gradient.unsqueeze(0)
     sums = pairs.sum(products.flatten(0, 1).T).reshape(pairs.count, *products.shape[:2])
-    return average, sums * reciprocal[:, :, None]
+    return average, sums * factor[:, :, None]
 
 
 def _average(kernel: SmoothingKernel, pairs: Pairs, volume: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
     """<A> (count, components) of volumes (m,) and values (components, m) of pairs, and 1 / sum_j V_j W (count, 1)."""
     weight = volume * kernel.value(pairs.distance)
     sums = pairs.sum(torch.cat([weight.unsqueeze(0), weight * value]).T)
-    reciprocal = _reciprocal(sums[:, :1])
-    return sums[:, 1:] * reciprocal, reciprocal
+    factor = reciprocal(sums[:, :1])
+    return sums[:, 1:] * factor, factor
 
 
 def _outer_sum(z: Tensor, y: Tensor, x: Tensor) -> Tensor:
@@ -105,7 +105,7 @@ def _outer_sum(z: Tensor, y: Tensor, x: Tensor) -> Tensor:
     return (z[:, :, None, None] + plane.unsqueeze(1)).flatten()
 
 
-def _reciprocal(denominator: Tensor) -> Tensor:
+def reciprocal(denominator: Tensor) -> Tensor:
     """1 / denominator, and zero where no particle contributes."""
     empty = denominator == 0
     return torch.where(empty, torch.zeros_like(denominator), 1 / torch.where(empty, 1, denominator))

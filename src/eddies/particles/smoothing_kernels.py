@@ -25,6 +25,11 @@ class SmoothingKernel(Protocol):
 
     support: float
 
+    @property
+    def pieces(self) -> Tensor:
+        """W(r) in each of equally long pieces of 0 <= r < support: the coefficients of u^0, u^1, ... for u = 1 ... 0 from
+        a piece's begin to its end, (pieces, coefficients). Near the support, where u is small, they cancel least."""
+
     def value(self, distance: Tensor) -> Tensor: ...
 
     def derivative(self, distance: Tensor) -> Tensor: ...
@@ -33,8 +38,15 @@ class SmoothingKernel(Protocol):
 class _Polynomial:
     """Kernel from a shape W h^3 and its slope, functions of q = r/h on [0, 1)."""
 
+    shape_pieces: tuple[tuple[float, ...], ...]
+
     def __init__(self, support: float) -> None:
         self.support = support
+
+    @property
+    def pieces(self) -> Tensor:
+        """See SmoothingKernel."""
+        return torch.tensor(self.shape_pieces, dtype=torch.float64) / self.support**3
 
     def value(self, distance: Tensor) -> Tensor:
         """W(r) in 1/length^3, same shape as `distance`."""
@@ -50,6 +62,9 @@ class _Polynomial:
 class CubicSpline(_Polynomial):
     """Cubic B-spline kernel of Monaghan & Lattanzio (1985), zero at r >= h."""
 
+    shape_pieces = tuple(tuple(8 / math.pi * c for c in piece)
+                         for piece in ((0.25, 0.75, 0.75, -0.75), (0, 0, 0, 0.25)))
+
     def _shape(self, q: Tensor) -> Tensor:
         return 8 / math.pi * torch.where(q < 0.5, 1 - 6 * q**2 * (1 - q), 2 * (1 - q) ** 3)
 
@@ -59,6 +74,8 @@ class CubicSpline(_Polynomial):
 
 class WendlandC2(_Polynomial):
     """Wendland C2 kernel (Wendland 1995; Dehnen & Aly 2012) in three dimensions, zero at r >= h."""
+
+    shape_pieces = (tuple(21 / (2 * math.pi) * c for c in (0, 0, 0, 0, 5, -4)),)
 
     def _shape(self, q: Tensor) -> Tensor:
         return 21 / (2 * math.pi) * (1 - q) ** 4 * (1 + 4 * q)
@@ -101,6 +118,14 @@ class HermiteKernel:
         _, b, c, d = self._cubic(cell)
         slope = (b + t * (2 * c + t * (3 * d))) * self.cells
         return torch.where(inside, slope, torch.zeros_like(slope)) / self.support**4
+
+    @property
+    def pieces(self) -> Tensor:
+        """See SmoothingKernel."""
+        fall = self.values[:-1] - self.values[1:]
+        last, first = -self.slopes[:-1] / self.cells, -self.slopes[1:] / self.cells
+        cubics = self.values[1:], first, 3 * fall - 2 * first - last, first + last - 2 * fall
+        return torch.stack(cubics, dim=1) / self.support**3
 
     @property
     def table(self) -> Tensor:
