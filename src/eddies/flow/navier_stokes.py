@@ -114,7 +114,7 @@ class CompressibleFluid:
 
     def _with_gradients(self, modes: np.ndarray) -> list[np.ndarray]:
         """u, and the derivatives of (u, v, w, s) along x, along y and along z."""
-        return [modes[:3], self.grid.d_dx * modes[:4], self.grid.d_dy * modes[:4], modes[4:]]
+        return [modes[:3], (self.grid.d_dx, modes[:4]), (self.grid.d_dy, modes[:4]), modes[4:]]
 
     def _products(self, fields: np.ndarray, out: np.ndarray) -> None:
         u, gradients = fields[:3], fields[3:].reshape(3, 4, *fields.shape[1:])
