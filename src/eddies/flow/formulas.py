@@ -24,7 +24,7 @@ class Formulas:
     """What is done to fields (c, ...) at grid points and to modes (c, kz, ky, kx); `CompiledFormulas` has the same
     methods.
 
-    Terms of a sum are pairs of factors (n, kz >= 0, ky, kx), which are the same for -kz, and of a state.
+    Terms of a sum are pairs of factors (kz >= 0, ky, n, kx), which are the same for -kz, and of a state.
     """
 
     def __init__(self, grid: SpectralGrid) -> None:
@@ -52,11 +52,11 @@ class Formulas:
         return project(self.grid, vector)
 
     def sum_of_decays(self, terms: Terms) -> np.ndarray:
-        """The sum of factors (1, ...) times states."""
+        """The sum of factors, n = 1, times states."""
         return sum(_at_all_kz(factors) * state for factors, state in terms)
 
     def sum_of_acoustic_blocks(self, terms: Terms) -> np.ndarray:
-        """The sum of states (4, ...) to which the `AcousticBlock` of factors (5, ...) is applied."""
+        """The sum of states (4, ...), to each of which the `AcousticBlock` of its factors is applied, n = 5."""
         result = np.zeros_like(terms[0][1])
         for factors, state in terms:
             transverse, excess, elastic, identity, coupling = _at_all_kz(factors)
@@ -69,5 +69,5 @@ class Formulas:
 
 
 def _at_all_kz(factors: np.ndarray) -> np.ndarray:
-    """Factors (n, kz >= 0, ky, kx) at kz = 0 ... K, -K ... -1."""
-    return np.concatenate([factors, factors[:, :0:-1]], axis=1)
+    """Factors (kz >= 0, ky, n, kx) at kz = 0 ... K, -K ... -1: (n, kz, ky, kx)."""
+    return np.moveaxis(np.concatenate([factors, factors[:0:-1]]), 2, 0)

@@ -14,8 +14,8 @@ class Decay:
     """Multiplies each mode by a real function of k^2."""
 
     def __init__(self, grid: SpectralGrid, function: Callable[[np.ndarray], np.ndarray]) -> None:
-        #: (1, kz >= 0, ky, kx)
-        self.factors = by_wavenumber(grid, function)[None]
+        #: (kz >= 0, ky, 1, kx)
+        self.factors = by_wavenumber(grid, function)[:, :, None]
 
 
 class AcousticBlock:
@@ -28,8 +28,8 @@ class AcousticBlock:
 
     def __init__(self, grid: SpectralGrid, **factors: Callable[[np.ndarray], np.ndarray]) -> None:
         names = ("transverse", "excess", "elastic", "identity", "coupling")
-        #: (5, kz >= 0, ky, kx)
-        self.factors = np.stack([by_wavenumber(grid, factors[name]) for name in names])
+        #: (kz >= 0, ky, 5, kx)
+        self.factors = np.stack([by_wavenumber(grid, factors[name]) for name in names], axis=2)
 
 
 def by_wavenumber(grid: SpectralGrid, function: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:

@@ -91,9 +91,9 @@ void project(const Modes& modes, const Real* vector, Real* result) {
     });
 }
 
-// Factors of lines along kx, which are those of |kz|.
+// Where the line is whose factors are those of a line of modes: that of |kz|.
 inline Int line_of_factors(const Modes& modes, Int z, Int y) {
-    return (std::min(z, 2 * modes.cutoff + 1 - z) * modes.lines + y) * (modes.cutoff + 1);
+    return std::min(z, 2 * modes.cutoff + 1 - z) * modes.lines + y;
 }
 
 template <typename Real>
@@ -101,7 +101,7 @@ void decays(const Modes& modes, Int components, Int terms, const Real* const* fa
             Real* result) {
     const Int width = modes.cutoff + 1, size = 2 * (2 * modes.cutoff + 1) * modes.lines * width;
     for_lines(modes, [&](Int line, Int z, Int y) {
-        const Int at = line_of_factors(modes, z, y);
+        const Int at = line_of_factors(modes, z, y) * width;
         for (Int component = 0; component < components; ++component) {
             const Int start = component * size + 2 * line * width;
             Real* const to = result + start;
@@ -118,51 +118,58 @@ void decays(const Modes& modes, Int components, Int terms, const Real* const* fa
     });
 }
 
+// Components of the state are `size` numbers apart.
+template <typename Real>
+void add_acoustic_block(Int width, Int size, const Real* __restrict factors, const Real* __restrict state,
+                        const Real* __restrict kx, Real ky, Real kz, Real* __restrict sums, Real* __restrict along) {
+#pragma omp simd
+    for (Int x = 0; x < width; ++x) {
+        const Real transverse = factors[x], excess = factors[x + width], elastic = factors[x + 2 * width];
+        const Real identity = factors[x + 3 * width], coupling = factors[x + 4 * width];
+        const Real ur = state[2 * x], ui = state[2 * x + 1];
+        const Real vr = state[2 * x + size], vi = state[2 * x + 1 + size];
+        const Real wr = state[2 * x + 2 * size], wi = state[2 * x + 1 + 2 * size];
+        const Real sr = state[2 * x + 1 + 3 * size], si = -state[2 * x + 3 * size];  // sigma = -i s
+        const Real dotted_r = kx[x] * ur + ky * vr + kz * wr, dotted_i = kx[x] * ui + ky * vi + kz * wi;
+        sums[x] += transverse * ur;
+        sums[x + width] += transverse * ui;
+        sums[x + 2 * width] += transverse * vr;
+        sums[x + 3 * width] += transverse * vi;
+        sums[x + 4 * width] += transverse * wr;
+        sums[x + 5 * width] += transverse * wi;
+        sums[x + 6 * width] += identity * sr - coupling * dotted_r;
+        sums[x + 7 * width] += identity * si - coupling * dotted_i;
+        along[x] += excess * dotted_r + elastic * sr;
+        along[x + width] += excess * dotted_i + elastic * si;
+    }
+}
+
 template <typename Real>
 void acoustic_blocks(const Modes& modes, Int terms, const Real* const* factors, const Real* const* states,
                      Real* result) {
-    const Int width = modes.cutoff + 1, table = width * modes.lines * width;
-    const Int size = 2 * (2 * modes.cutoff + 1) * modes.lines * width;
+    const Int width = modes.cutoff + 1, size = 2 * (2 * modes.cutoff + 1) * modes.lines * width;
     for_lines(modes, [&](Int line, Int z, Int y) {
+        // Of the line (u, v, w, sigma) and what is to be multiplied by k, real parts and imaginary ones apart.
         thread_local std::vector<Real> memory;
-        memory.assign(4 * width, 0);
-        Real *const along = memory.data(), *const sigma = along + 2 * width;
+        memory.assign(10 * width, 0);
+        Real *const sums = memory.data(), *const along = sums + 8 * width;
         const Real* const kx = static_cast<const Real*>(modes.kx);
         const Real ky = static_cast<const Real*>(modes.ky)[y], kz = static_cast<const Real*>(modes.kz)[z];
-        Real* const to = result + 2 * line * width;
-        std::fill(to, to + 2 * width, Real(0));
-        std::fill(to + size, to + size + 2 * width, Real(0));
-        std::fill(to + 2 * size, to + 2 * size + 2 * width, Real(0));
-        for (Int term = 0; term < terms; ++term) {
-            const Real* const transverse = factors[term] + line_of_factors(modes, z, y);
-            const Real *const excess = transverse + table, *const elastic = excess + table;
-            const Real *const identity = elastic + table, *const coupling = identity + table;
-            const Real* const from = states[term] + 2 * line * width;
-#pragma omp simd
-            for (Int x = 0; x < width; ++x) {
-                for (Int part = 0; part < 2; ++part) {
-                    const Int i = 2 * x + part;
-                    const Real a = from[i], b = from[i + size], c = from[i + 2 * size];
-                    // -i s
-                    const Real s = part ? -from[3 * size + 2 * x] : from[3 * size + 2 * x + 1];
-                    const Real dotted = kx[x] * a + ky * b + kz * c;
-                    to[i] += transverse[x] * a;
-                    to[i + size] += transverse[x] * b;
-                    to[i + 2 * size] += transverse[x] * c;
-                    along[i] += excess[x] * dotted + elastic[x] * s;
-                    sigma[i] += identity[x] * s - coupling[x] * dotted;
-                }
-            }
-        }
+        for (Int term = 0; term < terms; ++term)
+            add_acoustic_block(width, size, factors[term] + 5 * line_of_factors(modes, z, y) * width,
+                               states[term] + 2 * line * width, kx, ky, kz, sums, along);
+        Real* __restrict const to = result + 2 * line * width;
 #pragma omp simd
         for (Int x = 0; x < width; ++x) {
-            for (Int i = 2 * x; i < 2 * x + 2; ++i) {
-                to[i] += kx[x] * along[i];
-                to[i + size] += ky * along[i];
-                to[i + 2 * size] += kz * along[i];
-            }
-            to[3 * size + 2 * x] = -sigma[2 * x + 1];
-            to[3 * size + 2 * x + 1] = sigma[2 * x];
+            const Real real = along[x], imaginary = along[x + width];
+            to[2 * x] = sums[x] + kx[x] * real;
+            to[2 * x + 1] = sums[x + width] + kx[x] * imaginary;
+            to[2 * x + size] = sums[x + 2 * width] + ky * real;
+            to[2 * x + 1 + size] = sums[x + 3 * width] + ky * imaginary;
+            to[2 * x + 2 * size] = sums[x + 4 * width] + kz * real;
+            to[2 * x + 1 + 2 * size] = sums[x + 5 * width] + kz * imaginary;
+            to[2 * x + 3 * size] = -sums[x + 7 * width];
+            to[2 * x + 1 + 3 * size] = sums[x + 6 * width];
         }
     });
 }

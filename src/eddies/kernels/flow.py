@@ -64,7 +64,7 @@ class CompiledFormulas:
         z, y, x = self._shape
         for given, state in terms:
             self._require(state, components)
-            if given.shape != (factors, (z + 1) // 2, y, x) or given.dtype != self._real or not given.flags.c_contiguous:
+            if given.shape != ((z + 1) // 2, y, factors, x) or given.dtype != self._real or not given.flags.c_contiguous:
                 raise ValueError(f"{given.dtype} {given.shape}: factors for modes of shape {self._shape} are needed")
         result = np.empty_like(terms[0][1])
         addresses = np.array([[array.ctypes.data for array in term] for term in terms], np.uint64).T.copy()
