@@ -37,11 +37,13 @@ class CompiledFormulas:
 
     def advection(self, fields: np.ndarray, viscosity: float, out: np.ndarray) -> None:
         """-u.grad u + 2 nu (S - 1/3 div u).grad s  and  -u.grad s."""
-        self._advection(fields[0].size, *self._place(fields, 15), viscosity, *self._place(out, 4))
+        size = fields[0].size
+        self._advection(size, *self._place(fields, 15, size), viscosity, *self._place(out, 4, size))
 
     def cross(self, fields: np.ndarray, out: np.ndarray) -> None:
         """u x omega."""
-        self._cross(fields[0].size, *self._place(fields, 6), *self._place(out, 3))
+        size = fields[0].size
+        self._cross(size, *self._place(fields, 6, size), *self._place(out, 3, size))
 
     def project(self, vector: np.ndarray) -> np.ndarray:
         """u - k (k.u) / k^2."""
@@ -64,8 +66,9 @@ class CompiledFormulas:
         z, y, x = self._shape
         for given, state in terms:
             self._require(state, components)
-            if given.shape != ((z + 1) // 2, y, factors, x) or given.dtype != self._real or not given.flags.c_contiguous:
-                raise ValueError(f"{given.dtype} {given.shape}: factors for modes of shape {self._shape} are needed")
+            shape = ((z + 1) // 2, y, factors, x)
+            if given.shape != shape or given.dtype != self._real or not given.flags.c_contiguous:
+                raise ValueError(f"{given.dtype} {given.shape}: contiguous factors {shape} are needed")
         result = np.empty_like(terms[0][1])
         addresses = np.array([[array.ctypes.data for array in term] for term in terms], np.uint64).T.copy()
         function(ctypes.byref(self._modes), *counts, len(terms), addresses[0].ctypes.data, addresses[1].ctypes.data,
@@ -78,8 +81,10 @@ class CompiledFormulas:
             raise ValueError(f"{modes.dtype} {modes.shape}: contiguous modes {(components, *self._shape)} of "
                              f"{self._real} are needed")
 
-    def _place(self, fields: np.ndarray, count: int) -> tuple[int, int]:
+    def _place(self, fields: np.ndarray, count: int, size: int) -> tuple[int, int]:
         """How many numbers fields are apart, and their address."""
-        if len(fields) != count or fields.dtype != self._real or not fields[0].flags.c_contiguous:
-            raise ValueError(f"{fields.dtype} {fields.shape}: {count} fields of contiguous {self._real} are needed")
+        if (len(fields) != count or fields[0].size != size or fields.dtype != self._real
+                or not fields[0].flags.c_contiguous):
+            raise ValueError(f"{fields.dtype} {fields.shape}: {count} fields of contiguous {self._real}, {size} values "
+                             "each, are needed")
         return fields.strides[0] // self._real.itemsize, fields.ctypes.data

@@ -14,11 +14,12 @@ Blocks = Sequence[np.ndarray]
 
 
 class ColumnCopies:
-    """Copies between modes (c, kz, y, x), columns (z, rows, x) that are transformed along z, and the blocks (c, z, y, x)
-    of columns that ranks exchange, which follow each other in z. `rows` are those of y in a column."""
+    """Copies between modes (kz, y, x) of a component, columns (z, rows, x) that are transformed along z, and the blocks
+    (c, z, y, x) of columns that ranks exchange, which follow each other in z. `rows` are those of y in a column."""
 
     def __init__(self, cells: int, cutoff: int, dtype: np.dtype) -> None:
-        self.kept = ((slice(0, cutoff + 1), slice(0, cutoff + 1)), (slice(cutoff + 1, None), slice(cells - cutoff, None)))
+        K = cutoff
+        self.kept = ((slice(0, K + 1), slice(0, K + 1)), (slice(K + 1, None), slice(cells - K, None)))
 
     def described(self, blocks: Blocks) -> Blocks:
         """Blocks as the other methods want them."""

@@ -131,10 +131,10 @@ class SpectralGrid:
         ----------
         spectral : modes (c, kz, ky_local, kx).
         fields : number of fields yielded.
-        expand : makes the fields, in parts (c_i, pairs, ky, kx), from packed modes in (ky, kx) of pairs of planes: those
-            of `spectral`, followed by the derivatives along z of its first `z_derivatives` components. It may combine
-            them and multiply by `d_dx` and `d_dy`; (d_dx, modes) is such a product that is made on the way. By default
-            the fields are what it would be given.
+        expand : makes the fields, in parts (c_i, pairs, ky, kx), from packed modes in (ky, kx) of pairs of planes:
+            those of `spectral`, followed by the derivatives along z of its first `z_derivatives` components. It may
+            combine them and multiply by `d_dx` and `d_dy`; (d_dx, modes) is such a product that is made on the way. By
+            default the fields are what it would be given.
         """
         for planes, values in self._value_blocks(spectral, fields, expand, z_derivatives):
             yield values[..., ::2] if planes.stop - planes.start == 1 else values
@@ -156,13 +156,14 @@ class SpectralGrid:
         spectral, components = np.require(spectral, self.complex, "CW"), len(spectral)
         sent, copies = self.buffers("backward", components + z_derivatives), self.column_pass.copies
         d_dz = (1j * self.wavevector[2].ravel()).astype(self.complex)
+        fields = [(modes, None, number) for number, modes in enumerate(spectral)]
+        fields += [(modes, d_dz, components + number) for number, modes in enumerate(spectral[:z_derivatives])]
         for rows in self.column_pass.rows(self.spectral_shape[1]):
             plan = self.column_pass.plan("BACKWARD", rows)
-            for number, modes in enumerate(spectral):
-                for factors, place in ((None, number), (d_dz, components + number))[: 1 + (number < z_derivatives)]:
-                    copies.fill(modes, rows, factors, plan.input_array)
-                    plan.execute()
-                    copies.send(plan.output_array, sent.columns, place, rows)
+            for modes, factors, place in fields:
+                copies.fill(modes, rows, factors, plan.input_array)
+                plan.execute()
+                copies.send(plan.output_array, sent.columns, place, rows)
         sent.memory.to_planes()
         return sent
 
