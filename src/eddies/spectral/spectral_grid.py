@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -44,7 +43,7 @@ class SpectralGrid:
         self.precision, self.real, self.complex = precision, REAL[precision], COMPLEX[precision]
         self.modes = 2 * self.cutoff + 1
         self._transpose = Transpose(decomposition.comm, self.cells, self.modes)
-        self._buffers: dict[tuple[str, int], GridBuffers] = {}
+        self._buffers: dict[tuple[str, int], TransposeBuffers] = {}
         self.column_pass = ColumnPass(self.cells, self.cutoff, self.complex)
         self.plane_pass = PlanePass(self.cells, self.cutoff, self.complex)
         self._wavenumbers()
@@ -147,14 +146,16 @@ class SpectralGrid:
             yield planes, self.plane_pass.to_physical(parts, fields, packed.shape[1]).values
 
     def _packed_blocks(self, spectral: np.ndarray, z_derivatives: int = 0) -> Iterator[tuple[slice, np.ndarray]]:
-        sent = self._columns_to_planes(spectral, z_derivatives)
+        copies = self.plane_pass.copies
+        blocks = copies.described(self._columns_to_planes(spectral, z_derivatives).plane_blocks)
         for planes in self.plane_pass.blocks(self.decomposition.count):
-            yield planes, self.plane_pass.copies.pack(sent.planes, planes)
+            yield planes, copies.pack(blocks, planes)
 
-    def _columns_to_planes(self, spectral: np.ndarray, z_derivatives: int) -> GridBuffers:
+    def _columns_to_planes(self, spectral: np.ndarray, z_derivatives: int) -> TransposeBuffers:
         """Transform along z, components and the z derivatives of the first of them, and make them planes."""
         spectral, components = np.require(spectral, self.complex, "CW"), len(spectral)
-        sent, copies = self.buffers("backward", components + z_derivatives), self.column_pass.copies
+        buffers, copies = self.buffers("backward", components + z_derivatives), self.column_pass.copies
+        blocks = copies.described(buffers.column_blocks)
         d_dz = (1j * self.wavevector[2].ravel()).astype(self.complex)
         fields = [(modes, None, number) for number, modes in enumerate(spectral)]
         fields += [(modes, d_dz, components + number) for number, modes in enumerate(spectral[:z_derivatives])]
@@ -163,17 +164,15 @@ class SpectralGrid:
             for modes, factors, place in fields:
                 copies.fill(modes, rows, factors, plan.input_array)
                 plan.execute()
-                copies.send(plan.output_array, sent.columns, place, rows)
-        sent.memory.to_planes()
-        return sent
+                copies.send(plan.output_array, blocks, place, rows)
+        buffers.to_planes()
+        return buffers
 
-    def buffers(self, direction: str, components: int) -> GridBuffers:
+    def buffers(self, direction: str, components: int) -> TransposeBuffers:
         """What a batch of components is sent in; used again, so a direction is for one transform at a time."""
         key = (direction, components)
         if key not in self._buffers:
-            memory = self._transpose.buffers(components, self.cutoff + 1, self.complex)
-            self._buffers[key] = GridBuffers(memory, self.column_pass.copies.described(memory.column_blocks),
-                                             self.plane_pass.copies.described(memory.plane_blocks))
+            self._buffers[key] = self._transpose.buffers(components, self.cutoff + 1, self.complex)
         return self._buffers[key]
 
     def sum_modes(self, density: np.ndarray) -> float:
@@ -186,21 +185,13 @@ class SpectralGrid:
         return total / self.cells**3
 
 
-@dataclass(frozen=True)
-class GridBuffers:
-    """The memory that a batch is sent in, and its blocks as the copies of columns and of planes want them."""
-
-    memory: TransposeBuffers
-    columns: Any
-    planes: Any
-
-
 class Collector:
     """Takes real fields a block of planes at a time and gives their Fourier coefficients."""
 
     def __init__(self, grid: SpectralGrid, components: int) -> None:
         self.grid, self.components = grid, components
-        self._sent = grid.buffers("forward", components)
+        self._buffers = grid.buffers("forward", components)
+        self._blocks = grid.plane_pass.copies.described(self._buffers.plane_blocks)
 
     def plans(self, fields: int, planes: slice) -> PlanePlans:
         """Plans with memory for a block of planes of so many fields, to be filled and added."""
@@ -208,17 +199,18 @@ class Collector:
 
     def add(self, planes: slice, plans: PlanePlans, component: int = 0) -> None:
         """Transform a block of planes along x and y: fields that are components from a first one on."""
-        self.grid.plane_pass.to_modes(plans, self._sent.planes, component, planes)
+        self.grid.plane_pass.to_modes(plans, self._blocks, component, planes)
 
     def modes(self) -> np.ndarray:
         """The Fourier coefficients (components, kz, ky_local, kx), once all planes are there; all ranks call it."""
         grid, copies = self.grid, self.grid.column_pass.copies
-        self._sent.memory.to_columns()
+        self._buffers.to_columns()
+        blocks = copies.described(self._buffers.column_blocks)
         spectral = np.empty((self.components, *grid.spectral_shape), grid.complex)
         for rows in grid.column_pass.rows(grid.spectral_shape[1]):
             plan = grid.column_pass.plan("FORWARD", rows)
             for component, modes in enumerate(spectral):
-                copies.receive(self._sent.columns, component, rows, plan.input_array)
+                copies.receive(blocks, component, rows, plan.input_array)
                 plan.execute()
                 copies.store(plan.output_array, 0.5 / grid.cells**3, modes, rows)
         return spectral
