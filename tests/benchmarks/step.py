@@ -160,7 +160,7 @@ def transform_bounds(grid: SpectralGrid) -> dict[str, float]:
     columns = 0.0
     for direction, components in (("BACKWARD", SENT), ("FORWARD", FORWARD)):
         for rows in grid.column_pass.rows(grid.spectral_shape[1]):
-            columns += components * best(grid.column_pass.plan(direction, rows).execute)
+            columns += components * best(grid.column_pass.plan(direction, rows).plan.execute)
     return {"plane transforms": EVALUATIONS * planes, "column transforms": EVALUATIONS * columns}
 
 

@@ -46,11 +46,11 @@ def assert_close(found, expected):
 def test_planes_are_packed_and_unpacked_as_by_numpy(library, cells, cutoff, cut, planes, dtype):
     definition, compiled = both(library, "planes", cells, cutoff, dtype)
     blocks = plane_blocks(cutoff, cut, dtype)
-    assert_close(compiled.pack(compiled.described(blocks), planes), definition.pack(blocks, planes))
+    assert_close(compiled.pack(compiled.described_blocks(blocks), planes), definition.pack(blocks, planes))
     pairs = (planes.stop - planes.start + 1) // 2
     rows = noise(9, dtype, pairs, cells, min(cells, 2 * cutoff + 3))
     found, expected = plane_blocks(cutoff, cut, dtype), plane_blocks(cutoff, cut, dtype)
-    compiled.unpack(rows, compiled.described(found), 1, planes)
+    compiled.unpack(compiled.described(rows), compiled.described_blocks(found), 1, planes)
     definition.unpack(rows, expected, 1, planes)
     for one, other in zip(found, expected):
         assert_close(one, other)
@@ -66,22 +66,23 @@ def test_rows_are_filled_as_by_numpy_and_their_gap_is_left_alone(library, cells,
     filled = []
     for copies in both(library, "planes", cells, cutoff, dtype):
         rows = np.full((pairs, cells, min(cells, modes + 2)), 7, dtype)
-        filled.append([rows.copy() for _ in copies.filled(part, factors, rows)])
+        filled.append([rows.copy() for _ in copies.filled(part, factors, copies.described(rows))])
     assert len(filled[0]) == len(filled[1]) == 2
     for found, expected in zip(*filled[::-1]):
         assert_close(found, expected)
 
 
 @pytest.mark.parametrize("dtype", TOLERANCE)
-@pytest.mark.parametrize("planes", [6, 2, 1])
+@pytest.mark.parametrize("planes", PLANES, ids=str)
 def test_planes_are_joined_and_split_as_by_numpy(library, planes, dtype):
-    real = noise(5, dtype, planes, 5, 5).real.copy()
+    real, count = noise(5, dtype, 3, 7, 5, 5).real.copy(), planes.stop - planes.start
     for copies in both(library, "planes", 5, 1, dtype):
-        joined, split = np.zeros(((planes + 1) // 2, 5, 5), dtype), np.zeros_like(real)
-        copies.join(real, joined)
-        copies.split(joined, split)
-        assert np.array_equal(split, real)
-        assert np.array_equal(joined.real, real[: len(joined)]) and np.array_equal(joined.imag, real[-len(joined) :])
+        joined, split = np.zeros(((count + 1) // 2, 5, 5), dtype), np.zeros_like(real)
+        copies.join(copies.described(real), 1, planes, copies.described(joined))
+        copies.split(copies.described(joined), copies.described(split), 1, planes)
+        assert np.array_equal(split[1, planes], real[1, planes]) and np.count_nonzero(split) == count * 25
+        f, g = real[1, planes][: len(joined)], real[1, planes][-len(joined) :]
+        assert np.array_equal(joined.real, f) and np.array_equal(joined.imag, g)
 
 
 @pytest.mark.parametrize("dtype", TOLERANCE)
@@ -93,14 +94,15 @@ def test_columns_are_copied_as_by_numpy(library, cells, cutoff, cut, rows, dtype
     results = []
     for copies in both(library, "columns", cells, cutoff, dtype):
         blocks = [noise(rank, dtype, 3, planes, lines, width) for rank, planes in enumerate(cut)]
-        described, column = copies.described(blocks), np.zeros((cells, rows.stop - rows.start, width), dtype)
-        stored, made = noise(6, dtype, modes, lines, width), []
-        for factors in (None, noise(7, dtype, modes)):
-            copies.fill(noise(8, dtype, modes, lines, width), rows, factors, column)
+        column = np.zeros((cells, rows.stop - rows.start, width), dtype)
+        stored = noise(6, dtype, 2, modes, lines, width)
+        described, place, made = copies.described_blocks(blocks), copies.described(column), []
+        for factors in (None, copies.described(noise(7, dtype, modes))):
+            copies.fill(copies.described(noise(8, dtype, 3, modes, lines, width)), 2, rows, factors, place)
             made.append(column.copy())
-        copies.receive(described, 2, rows, column)
-        copies.store(column, 0.3, stored, rows)
-        copies.send(noise(9, dtype, *column.shape), described, 1, rows)
+        copies.receive(described, 2, rows, place)
+        copies.store(place, 0.3, copies.described(stored), 1, rows)
+        copies.send(copies.described(noise(9, dtype, *column.shape)), described, 1, rows)
         results.append([*made, column, stored, *blocks])
     for found, expected in zip(*results[::-1]):
         assert_close(found, expected)
@@ -108,24 +110,30 @@ def test_columns_are_copied_as_by_numpy(library, cells, cutoff, cut, rows, dtype
 
 def test_arrays_of_another_kind_are_refused(library):
     planes, columns = (both(library, kind, 12, 3, np.complex128)[1] for kind in ("planes", "columns"))
-    blocks = planes.described(plane_blocks(3, (7,), np.complex128))
-    rows = noise(1, np.complex128, 1, 12, 9)
-    with pytest.raises(ValueError, match="are needed"):
-        planes.described(plane_blocks(3, (7,), np.complex64))
-    with pytest.raises(ValueError, match="an even number"):
-        planes.pack(blocks, slice(0, 3))
-    with pytest.raises(ValueError, match="6 to 8 of 7"):
-        planes.pack(blocks, slice(6, 8))
-    with pytest.raises(ValueError, match="3 to 4 of 3"):
-        planes.unpack(rows, blocks, 3, slice(0, 2))
-    with pytest.raises(ValueError, match="are needed"):
-        planes.unpack(rows[:, :11], blocks, 0, slice(0, 2))
-    with pytest.raises(ValueError, match="are needed"):
-        next(planes.filled(noise(1, np.complex128, 1, 1, 7, 6), None, rows))
-    with pytest.raises(ValueError, match="are needed"):
-        planes.join(np.zeros((2, 12, 12), np.float32), np.zeros((1, 12, 12), complex))
-    with pytest.raises(ValueError, match="2 to 5 of 4"):
-        columns.fill(noise(1, np.complex128, 7, 4, 4), slice(2, 5), None, noise(1, np.complex128, 12, 3, 4))
+    blocks = planes.described_blocks(plane_blocks(3, (7,), np.complex128))
+
+    def array(*shape, dtype=np.complex128):
+        return planes.described(noise(1, dtype, *shape))
+
+    refused = {
+        "are needed": [
+            lambda: planes.described_blocks(plane_blocks(3, (7,), np.complex64)),
+            lambda: planes.described(np.zeros((2, 3, 4))[..., ::2]),
+            lambda: planes.unpack(array(1, 11, 9), blocks, 0, slice(0, 2)),
+            lambda: planes.unpack(array(1, 12, 9, dtype=np.complex64), blocks, 0, slice(0, 2)),
+            lambda: next(planes.filled(noise(1, np.complex128, 1, 1, 7, 6), None, array(1, 12, 9))),
+            lambda: planes.join(array(1, 2, 12, 12), 0, slice(0, 2), array(1, 12, 12)),
+            lambda: columns.fill(array(1, 7, 4, 4), 0, slice(0, 3), array(6), array(12, 3, 4))],
+        "an even number": [lambda: planes.pack(blocks, slice(0, 3))],
+        "6 to 8 of 7": [lambda: planes.pack(blocks, slice(6, 8))],
+        "3 to 4 of 3": [lambda: planes.unpack(array(1, 12, 9), blocks, 3, slice(0, 2))],
+        "2 to 5 of 4": [lambda: columns.fill(array(1, 7, 4, 4), 0, slice(2, 5), None, array(12, 3, 4))],
+        "1 to 2 of 1": [lambda: columns.store(array(12, 3, 4), 1.0, array(1, 7, 4, 4), 1, slice(0, 3))],
+    }
+    for message, calls in refused.items():
+        for call in calls:
+            with pytest.raises(ValueError, match=message):
+                call()
 
 
 def test_the_same_bits_with_any_number_of_threads(library):
@@ -134,14 +142,14 @@ import hashlib, sys, numpy as np
 from tests.kernels.test_copies import CompiledColumnCopies, CompiledPlaneCopies, load, noise
 digest, size = hashlib.sha256(), (144, 47, np.complex128)
 planes, columns = (kind(load(sys.argv[1]), *size) for kind in (CompiledPlaneCopies, CompiledColumnCopies))
-arrays = [noise(1, complex, 2, 4, 95, 48)]
-blocks = planes.described(arrays)
-arrays += [planes.pack(blocks, slice(0, 4)), noise(2, complex, 2, 144, 98), noise(3, complex, 144, 20, 48),
-           noise(4, complex, 95, 40, 48)]
-for _ in planes.filled(arrays[1], noise(5, complex, 1, 1, 95, 1), arrays[2]):
-    planes.unpack(arrays[2], blocks, 1, slice(0, 4))
-columns.store(arrays[3], 0.3, arrays[4], slice(7, 27))
-columns.fill(arrays[4], slice(9, 29), noise(6, complex, 95), arrays[3])
+arrays = [noise(1, complex, 2, 4, 95, 48), noise(2, complex, 2, 144, 98), noise(3, complex, 144, 20, 48),
+          noise(4, complex, 1, 95, 40, 48), noise(5, complex, 95)]
+blocks, (rows, column, modes, factors) = planes.described_blocks(arrays[:1]), map(planes.described, arrays[1:])
+arrays.append(planes.pack(blocks, slice(0, 4)))
+for _ in planes.filled(arrays[-1], noise(5, complex, 1, 1, 95, 1), rows):
+    planes.unpack(rows, blocks, 1, slice(0, 4))
+columns.store(column, 0.3, modes, 0, slice(7, 27))
+columns.fill(modes, 0, slice(9, 29), factors, column)
 for array in arrays:
     digest.update(array.tobytes())
 print(digest.hexdigest())

@@ -1,7 +1,8 @@
 """What is copied around the one-dimensional passes of a slab transform, by numpy: definitions.
 
 Of an axis of `cells` a transform keeps the modes 0 ... K, -K ... -1, which stand at the ends of its arrays; what lies
-between them is a gap that stays zero. `kernels/copies.py` has compiled classes with the same methods.
+between them is a gap that stays zero. `kernels/copies.py` has compiled classes with the same methods, which want arrays
+`described` once, as they are used many times.
 """
 
 from __future__ import annotations
@@ -14,26 +15,33 @@ Blocks = Sequence[np.ndarray]
 
 
 class ColumnCopies:
-    """Copies between modes (kz, y, x) of a component, columns (z, rows, x) that are transformed along z, and the blocks
-    (c, z, y, x) of columns that ranks exchange, which follow each other in z. `rows` are those of y in a column."""
+    """Copies between modes (c, kz, y, x), columns (z, rows, x) of one component that are transformed along z, and the
+    blocks (c, z, y, x) of columns that ranks exchange, which follow each other in z. `rows` are those of y in a column.
+    """
 
     def __init__(self, cells: int, cutoff: int, dtype: np.dtype) -> None:
         K = cutoff
         self.kept = ((slice(0, K + 1), slice(0, K + 1)), (slice(K + 1, None), slice(cells - K, None)))
 
-    def described(self, blocks: Blocks) -> Blocks:
+    def described_blocks(self, blocks: Blocks) -> Blocks:
         """Blocks as the other methods want them."""
         return blocks
 
-    def fill(self, modes: np.ndarray, rows: slice, factors: np.ndarray | None, column: np.ndarray) -> None:
-        """Modes of one component, times factors (kz) if there are any, to a column."""
-        for kept, place in self.kept:
-            column[place] = modes[kept, rows] if factors is None else modes[kept, rows] * factors[kept, None, None]
+    def described(self, array: np.ndarray) -> np.ndarray:
+        """Any other array as the other methods want it."""
+        return array
 
-    def store(self, column: np.ndarray, scale: float, modes: np.ndarray, rows: slice) -> None:
-        """A column times a number to modes of one component."""
+    def fill(self, modes: np.ndarray, component: int, rows: slice, factors: np.ndarray | None,
+             column: np.ndarray) -> None:
+        """Modes, times factors (kz) if there are any, to a column."""
         for kept, place in self.kept:
-            np.multiply(column[place], modes.real.dtype.type(scale), out=modes[kept, rows])
+            given = modes[component, kept, rows]
+            column[place] = given if factors is None else given * factors[kept, None, None]
+
+    def store(self, column: np.ndarray, scale: float, modes: np.ndarray, component: int, rows: slice) -> None:
+        """A column times a number to modes."""
+        for kept, place in self.kept:
+            np.multiply(column[place], modes.real.dtype.type(scale), out=modes[component, kept, rows])
 
     def send(self, column: np.ndarray, blocks: Blocks, component: int, rows: slice) -> None:
         """A column to blocks."""
@@ -58,9 +66,13 @@ class PlaneCopies:
     def __init__(self, cells: int, cutoff: int, dtype: np.dtype) -> None:
         self.cutoff, self.dtype = cutoff, np.dtype(dtype)
 
-    def described(self, blocks: Blocks) -> Blocks:
+    def described_blocks(self, blocks: Blocks) -> Blocks:
         """Blocks as the other methods want them."""
         return blocks
+
+    def described(self, array: np.ndarray) -> np.ndarray:
+        """Any other array as the other methods want it."""
+        return array
 
     def pack(self, blocks: Blocks, planes: slice) -> np.ndarray:
         """Packed modes of some planes."""
@@ -98,14 +110,15 @@ class PlaneCopies:
             block[component, planes] = modes[: planes.stop - planes.start, start : start + block.shape[2]]
             start += block.shape[2]
 
-    def split(self, planes: np.ndarray, real: np.ndarray) -> None:
-        """Complex planes (pairs, y, x) to real ones (planes, y, x)."""
-        real[: len(planes)] = planes.real
-        real[len(planes) :] = planes[: len(real) - len(planes)].imag
+    def split(self, complex_planes: np.ndarray, real: np.ndarray, component: int, planes: slice) -> None:
+        """Complex planes (pairs, y, x) to some real ones of fields (c, planes, y, x)."""
+        pairs, real = len(complex_planes), real[component, planes]
+        real[:pairs], real[pairs:] = complex_planes.real, complex_planes[: len(real) - pairs].imag
 
-    def join(self, real: np.ndarray, planes: np.ndarray) -> None:
-        """Real planes (planes, y, x) to complex ones (pairs, y, x)."""
-        planes.real, planes.imag = real[: len(planes)], real[-len(planes) :]
+    def join(self, real: np.ndarray, component: int, planes: slice, complex_planes: np.ndarray) -> None:
+        """Some real planes of fields (c, planes, y, x) to complex ones (pairs, y, x)."""
+        pairs, real = len(complex_planes), real[component, planes]
+        complex_planes.real, complex_planes.imag = real[:pairs], real[-pairs:]
 
     def _kept(self, modes: np.ndarray) -> list[np.ndarray]:
         """The kept modes in the corners of an array (pairs, ky, kx)."""

@@ -35,21 +35,30 @@ class ColumnPass:
         self.cells, self.width, self.dtype = cells, cutoff + 1, np.dtype(dtype)
         given, compiled = (cells, cutoff, self.dtype), library()
         self.copies = ColumnCopies(*given) if compiled is None else CompiledColumnCopies(compiled, *given)
-        self._plans: dict[tuple[str, int], pyfftw.FFTW] = {}
+        self._plans: dict[tuple[str, int], ColumnPlan] = {}
 
     def rows(self, count: int) -> list[slice]:
         """The blocks of y, out of `count`, that are transformed together."""
         size = max(1, BLOCK_BYTES // (self.cells * self.width * self.dtype.itemsize))
         return [slice(start, min(start + size, count)) for start in range(0, count, size)]
 
-    def plan(self, direction: str, rows: slice) -> pyfftw.FFTW:
-        """The plan for a block, with its own arrays; whoever fills the input of "BACKWARD" leaves its gap zero."""
+    def plan(self, direction: str, rows: slice) -> ColumnPlan:
+        """The plan for a block; whoever fills the input of "BACKWARD" leaves its gap zero."""
         key = (direction, rows.stop - rows.start)
         if key not in self._plans:
             given, result = (pyfftw.zeros_aligned((self.cells, key[1], self.width), self.dtype) for _ in range(2))
-            self._plans[key] = pyfftw.FFTW(given, result, axes=(0,), direction=f"FFTW_{direction}",
-                                           flags=("FFTW_ESTIMATE",))
+            plan = pyfftw.FFTW(given, result, axes=(0,), direction=f"FFTW_{direction}", flags=("FFTW_ESTIMATE",))
+            self._plans[key] = ColumnPlan(plan, *map(self.copies.described, (given, result)))
         return self._plans[key]
+
+
+@dataclass(frozen=True)
+class ColumnPlan:
+    """A plan and its arrays (z, rows, x), as `ColumnPass.copies` want them."""
+
+    plan: pyfftw.FFTW
+    given: Any
+    result: Any
 
 
 @dataclass(frozen=True)
@@ -57,12 +66,13 @@ class PlanePlans:
     """Plans for pairs of planes, one field after the other.
 
     `rows` (pairs, y, kx), transformed along y, are used for all fields in turn; gaps of dropped modes stay zero, as no
-    plan writes to its input. `planes` are the complex planes (pairs, y, x) of each field, and `values` (fields, pairs,
-    y, 2 x) the same as real numbers: those of a point of the first and of the second plane of a pair side by side.
+    plan writes to its input. `planes` are the complex planes (pairs, y, x) of each field, both as `PlanePass.copies`
+    want them, and `values` (fields, pairs, y, 2 x) the same planes as real numbers: those of a point of the first and
+    of the second plane of a pair side by side.
     """
 
-    rows: np.ndarray
-    planes: list[np.ndarray]
+    rows: Any
+    planes: list[Any]
     values: np.ndarray
     plans: list[list[pyfftw.FFTW]]
 
@@ -131,7 +141,8 @@ class PlanePass:
         else:
             along_y = [pyfftw.FFTW(b, a, axes=(1,), **settings) for a, b in kept if a.size]
             plans = [[pyfftw.FFTW(field, lines, axes=(2,), **settings), *along_y] for field in planes]
-        return PlanePlans(rows, planes, values, plans)
+        described = self.copies.described
+        return PlanePlans(described(rows), [described(field) for field in planes], values, plans)
 
     def _values(self, fields: int, pairs: int) -> np.ndarray:
         """Zeros (fields, pairs, y, 2 x), fields an odd number of cache lines apart: a loop over the points of many of

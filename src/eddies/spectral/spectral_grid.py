@@ -87,22 +87,24 @@ class SpectralGrid:
 
     def forward(self, physical: np.ndarray) -> np.ndarray:
         """Fourier coefficients (c, kz, ky_local, kx) of a real field (c, z_local, y, x); `backward` is its inverse."""
-        physical = np.require(physical, self.real, "CW")
-        collected = Collector(self, len(physical))
+        collected, copies = Collector(self, len(physical)), self.plane_pass.copies
+        given = copies.described(np.require(physical, self.real, "CW"))
         for planes in self.plane_pass.blocks(self.decomposition.count):
             plans = collected.plans(1, planes)
-            for component, real in enumerate(physical):
-                self.plane_pass.copies.join(real[planes], plans.planes[0])
+            for component in range(len(physical)):
+                copies.join(given, component, planes, plans.planes[0])
                 collected.add(planes, plans, component)
         return collected.modes()
 
     def backward(self, spectral: np.ndarray) -> np.ndarray:
         """Real field (c, z_local, y, x) of Fourier coefficients (c, kz, ky_local, kx); the inverse of `forward`."""
         physical = np.empty((len(spectral), *self.physical_shape), self.real)
+        copies = self.plane_pass.copies
+        result = copies.described(physical)
         for planes, packed in self._packed_blocks(spectral):
-            for component, real in enumerate(physical):
+            for component in range(len(physical)):
                 plans = self.plane_pass.to_physical([packed[component : component + 1]], 1, packed.shape[1])
-                self.plane_pass.copies.split(plans.planes[0], real[planes])
+                copies.split(plans.planes[0], result, component, planes)
         return physical
 
     def multiply(self, spectral: np.ndarray, product: Callable[[np.ndarray, np.ndarray], None], results: int,
@@ -147,24 +149,25 @@ class SpectralGrid:
 
     def _packed_blocks(self, spectral: np.ndarray, z_derivatives: int = 0) -> Iterator[tuple[slice, np.ndarray]]:
         copies = self.plane_pass.copies
-        blocks = copies.described(self._columns_to_planes(spectral, z_derivatives).plane_blocks)
+        blocks = copies.described_blocks(self._columns_to_planes(spectral, z_derivatives).plane_blocks)
         for planes in self.plane_pass.blocks(self.decomposition.count):
             yield planes, copies.pack(blocks, planes)
 
     def _columns_to_planes(self, spectral: np.ndarray, z_derivatives: int) -> TransposeBuffers:
         """Transform along z, components and the z derivatives of the first of them, and make them planes."""
-        spectral, components = np.require(spectral, self.complex, "CW"), len(spectral)
-        buffers, copies = self.buffers("backward", components + z_derivatives), self.column_pass.copies
-        blocks = copies.described(buffers.column_blocks)
-        d_dz = (1j * self.wavevector[2].ravel()).astype(self.complex)
-        fields = [(modes, None, number) for number, modes in enumerate(spectral)]
-        fields += [(modes, d_dz, components + number) for number, modes in enumerate(spectral[:z_derivatives])]
+        components, copies = len(spectral), self.column_pass.copies
+        buffers = self.buffers("backward", components + z_derivatives)
+        blocks = copies.described_blocks(buffers.column_blocks)
+        modes = copies.described(np.require(spectral, self.complex, "CW"))
+        d_dz = copies.described((1j * self.wavevector[2].ravel()).astype(self.complex))
+        fields = [(component, None) for component in range(components)]
+        fields += [(component, d_dz) for component in range(z_derivatives)]
         for rows in self.column_pass.rows(self.spectral_shape[1]):
-            plan = self.column_pass.plan("BACKWARD", rows)
-            for modes, factors, place in fields:
-                copies.fill(modes, rows, factors, plan.input_array)
-                plan.execute()
-                copies.send(plan.output_array, blocks, place, rows)
+            column = self.column_pass.plan("BACKWARD", rows)
+            for place, (component, factors) in enumerate(fields):
+                copies.fill(modes, component, rows, factors, column.given)
+                column.plan.execute()
+                copies.send(column.result, blocks, place, rows)
         buffers.to_planes()
         return buffers
 
@@ -191,7 +194,7 @@ class Collector:
     def __init__(self, grid: SpectralGrid, components: int) -> None:
         self.grid, self.components = grid, components
         self._buffers = grid.buffers("forward", components)
-        self._blocks = grid.plane_pass.copies.described(self._buffers.plane_blocks)
+        self._blocks = grid.plane_pass.copies.described_blocks(self._buffers.plane_blocks)
 
     def plans(self, fields: int, planes: slice) -> PlanePlans:
         """Plans with memory for a block of planes of so many fields, to be filled and added."""
@@ -205,14 +208,15 @@ class Collector:
         """The Fourier coefficients (components, kz, ky_local, kx), once all planes are there; all ranks call it."""
         grid, copies = self.grid, self.grid.column_pass.copies
         self._buffers.to_columns()
-        blocks = copies.described(self._buffers.column_blocks)
+        blocks = copies.described_blocks(self._buffers.column_blocks)
         spectral = np.empty((self.components, *grid.spectral_shape), grid.complex)
+        result = copies.described(spectral)
         for rows in grid.column_pass.rows(grid.spectral_shape[1]):
-            plan = grid.column_pass.plan("FORWARD", rows)
-            for component, modes in enumerate(spectral):
-                copies.receive(blocks, component, rows, plan.input_array)
-                plan.execute()
-                copies.store(plan.output_array, 0.5 / grid.cells**3, modes, rows)
+            column = grid.column_pass.plan("FORWARD", rows)
+            for component in range(self.components):
+                copies.receive(blocks, component, rows, column.given)
+                column.plan.execute()
+                copies.store(column.result, 0.5 / grid.cells**3, result, component, rows)
         return spectral
 
 
