@@ -18,7 +18,7 @@ CHECKOUT = Path(__file__).parents[1]
 # Columns of the table: what the parts of the step's benchmark are summed up to.
 GROUPS = {"transforms": ("plane transforms", "column transforms"),
           "transposes": ("transposes",),
-          "pointwise": ("pairs of planes", "derivatives", "products", "linear operators", "the rest")}
+          "pointwise": ("pairs of planes", "products", "linear operators", "the rest")}
 
 
 def output_of(arguments: list[str], ranks: int = 0) -> str:
@@ -36,9 +36,9 @@ def measured(cells: int, ranks: int, precision: str, steps: int) -> dict:
 
 def row(result: dict, first: dict) -> str:
     """A line of the table, against the result on the first number of ranks."""
-    speed_up = first["seconds"] / result["seconds"]
-    shares = [sum(result["parts"][part] for part in parts) / result["seconds"] for parts in GROUPS.values()]
-    return (f"{result['cells']:5} {result['precision']:>9} {result['ranks']:6} {result['seconds']:9.4f} "
+    speed_up = first["seconds_per_step"] / result["seconds_per_step"]
+    shares = [sum(result["parts"][part] for part in parts) / result["seconds_per_step"] for parts in GROUPS.values()]
+    return (f"{result['cells']:5} {result['precision']:>9} {result['ranks']:6} {result['seconds_per_step']:9.4f} "
             f"{speed_up:8.2f} {speed_up * first['ranks'] / result['ranks']:10.0%} "
             + " ".join(f"{share:10.0%}" for share in shares)
             + f" {result['memory_bytes'] / 1e6:9.0f} MB")

@@ -89,8 +89,10 @@ class ETDRK4:
         a = combine((half, state), (q, n0))
         na = N(a)
         nb = N(combine((half, state), (q, na)))
-        nc = N(combine((half, a), (q, 2 * nb - n0)))
         na += nb
+        nb *= 2
+        nb -= n0
+        nc = N(combine((half, a), (q, nb)))
         return combine((full, state), (f1, n0), (f2, na), (f3, nc))
 
     def _prepare(self, step: float) -> list[Any]:

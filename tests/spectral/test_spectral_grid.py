@@ -90,12 +90,43 @@ def test_one_rank_sends_nothing(comm, monkeypatch):
     assert len(sent) == (0 if comm.size == 1 else 2)
 
 
-@pytest.mark.mpi(1)
-def test_a_block_of_planes_leaves_nothing_for_the_next(comm):
+@pytest.mark.mpi(1, 2)
+def test_what_stood_in_the_memory_of_a_transform_does_not_show(comm):
     # An odd plane out has no partner: what stands in its place, from the block before, must not show in the
     # last digits.
     grid = make_grid(comm, 15)
     field = np.random.default_rng(4).standard_normal((2, *grid.physical_shape))
-    first = grid.plane_pass.to_modes(field[:, -1:])
-    grid.plane_pass.to_modes(1e12 * field[:, -3:-1])
-    assert np.array_equal(grid.plane_pass.to_modes(field[:, -1:]), first)
+    first = grid.forward(field)
+    grid.backward(grid.forward(1e12 * field))
+    assert np.array_equal(grid.forward(field), first)
+    assert np.array_equal(grid.backward(first), grid.backward(first))
+
+
+@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.parametrize("cells", [7, 8, 15])
+def test_blocks_have_the_values_at_all_grid_points_once(comm, cells):
+    grid = make_grid(comm, cells)
+    modes = grid.forward(np.random.default_rng(comm.rank).standard_normal((3, *grid.physical_shape)))
+    slopes = [grid.backward(1j * k * modes) for k in grid.wavevector]
+    expected = np.concatenate([*slopes, grid.backward(modes)]).reshape(12, -1)
+
+    def expand(packed):
+        return [(grid.d_dx, packed[:3]), grid.d_dy * packed[:3], packed[3:], packed[:3]]
+
+    found = [values.reshape(12, -1).copy() for values in grid.blocks(modes, 12, expand, z_derivatives=3)]
+    found = np.concatenate([np.zeros((12, 0)), *found], axis=1)
+    assert np.abs(np.sort(found) - np.sort(expected)).max(initial=0) < 1e-13
+
+
+@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.parametrize("cells", [7, 8])
+def test_a_product_of_fields_is_that_at_the_grid_points(comm, cells):
+    grid = make_grid(comm, cells, cutoff=2)
+    modes = grid.forward(np.random.default_rng(comm.rank).standard_normal((2, *grid.physical_shape)))
+
+    def ratio(fields, out):
+        out[0] = fields[0] / (2 + fields[1] ** 2)
+
+    first, second = grid.backward(modes)
+    found = grid.multiply(modes, ratio, 1, fields=2)
+    assert np.abs(found - grid.forward((first / (2 + second**2))[None])).max(initial=0) < 1e-14

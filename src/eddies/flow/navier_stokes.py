@@ -8,8 +8,9 @@ from typing import Any, Protocol
 import numpy as np
 
 from eddies.flow.forcing import LinearForcing
-from eddies.flow.linear_operators import AcousticBlock, Decay, sum_of_acoustic_blocks, sum_of_decays
-from eddies.flow.operators import divergence, dot_wavevector, project
+from eddies.flow.formulas import formulas
+from eddies.flow.linear_operators import AcousticBlock, Decay
+from eddies.flow.operators import divergence, dot_wavevector
 from eddies.flow.subgrid import Smagorinsky
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.time_stepping import ScalarFunction, divided_difference
@@ -54,12 +55,13 @@ class IncompressibleFluid:
     def __init__(self, grid: SpectralGrid, viscosity: float, sound_speed: float = math.inf,
                  forcing: LinearForcing | None = None) -> None:
         self.grid, self.viscosity, self.sound_speed, self.forcing = grid, viscosity, sound_speed, forcing
+        self._formulas = formulas(grid)
 
     def nonlinear(self, state: np.ndarray) -> np.ndarray:
         """P[u x omega + f]."""
-        products = self.grid.multiply(state, _cross_vorticity, 3, fields=6, expand=self._with_vorticity,
+        products = self.grid.multiply(state, self._formulas.cross, 3, fields=6, expand=self._with_vorticity,
                                       z_derivatives=2)
-        tendency = project(self.grid, products)
+        tendency = self._formulas.project(products)
         if self.forcing is not None:
             self.forcing.add(state, tendency)
         return tendency
@@ -80,7 +82,7 @@ class IncompressibleFluid:
 
     def combine(self, *terms: tuple[Decay, np.ndarray]) -> np.ndarray:
         """The sum of linear functions applied to states."""
-        return sum_of_decays(self.grid, terms)
+        return self._formulas.sum_of_decays([(operator.factors, state) for operator, state in terms])
 
 
 class CompressibleFluid:
@@ -100,11 +102,11 @@ class CompressibleFluid:
     def __init__(self, grid: SpectralGrid, viscosity: float, sound_speed: float,
                  forcing: LinearForcing | None = None, subgrid: Smagorinsky | None = None) -> None:
         self.grid, self.viscosity, self.sound_speed = grid, viscosity, sound_speed
-        self.forcing, self.subgrid = forcing, subgrid
+        self.forcing, self.subgrid, self._formulas = forcing, subgrid, formulas(grid)
 
     def nonlinear(self, state: np.ndarray) -> np.ndarray:
         """-u.grad u + 2 nu (S - 1/3 div u).grad s + f, and -u.grad s."""
-        tendency = self.grid.multiply(state, self._products, 4, fields=15, expand=self._with_gradients,
+        tendency = self.grid.multiply(state, self._advection, 4, fields=15, expand=self._with_gradients,
                                       z_derivatives=4)
         if self.forcing is not None:
             self.forcing.add(state[:3], tendency[:3])
@@ -114,27 +116,10 @@ class CompressibleFluid:
 
     def _with_gradients(self, modes: np.ndarray) -> list[np.ndarray]:
         """u, and the derivatives of (u, v, w, s) along x, along y and along z."""
-        return [modes[:3], self.grid.d_dx * modes[:4], self.grid.d_dy * modes[:4], modes[4:]]
+        return [modes[:3], (self.grid.d_dx, modes[:4]), (self.grid.d_dy, modes[:4]), modes[4:]]
 
-    def _products(self, fields: np.ndarray, out: np.ndarray) -> None:
-        u, gradients = fields[:3], fields[3:].reshape(3, 4, *fields.shape[1:])
-        # u.grad u - 2 nu S.grad s = (u - H).grad u - grad u.H  with H = nu grad s, grad u.H = H_j d_i u_j
-        if self.viscosity > 0:
-            H = self.viscosity * gradients[:, 3]
-            carrier = u - H
-        else:
-            carrier = u
-        _along(carrier, gradients[:, :3], out[:3])
-        _along(u, gradients[:, 3:], out[3:])
-        np.negative(out, out=out)
-        if self.viscosity > 0:
-            divergence = (gradients[0, 0] + gradients[1, 1] + gradients[2, 2]) * self.grid.real(2 / 3)
-            for i in range(3):
-                turned = gradients[i, :3] * H
-                turned[0] += turned[1]
-                turned[0] += turned[2]
-                out[i] += turned[0]
-                out[i] -= np.multiply(divergence, H[i], out=turned[1])
+    def _advection(self, fields: np.ndarray, out: np.ndarray) -> None:
+        self._formulas.advection(fields, self.viscosity, out)
 
     def linear(self, state: np.ndarray) -> np.ndarray:
         """-c^2 grad s - nu (k^2 u + 1/3 k (k.u)), and -div u."""
@@ -177,28 +162,12 @@ class CompressibleFluid:
 
     def combine(self, *terms: tuple[AcousticBlock, np.ndarray]) -> np.ndarray:
         """The sum of linear functions applied to states."""
-        return sum_of_acoustic_blocks(self.grid, terms)
-
-
-def _along(u: np.ndarray, gradients: np.ndarray, out: np.ndarray) -> None:
-    """u.grad of fields from their gradients (3, c, ...): out (c, ...)."""
-    np.multiply(u[0], gradients[0], out=out)
-    term = u[1] * gradients[1]
-    out += term
-    out += np.multiply(u[2], gradients[2], out=term)
-
-
-def _cross_vorticity(fields: np.ndarray, out: np.ndarray) -> None:
-    """u x omega of (u, omega): (6, ...) -> (3, ...)."""
-    u, omega = fields[:3], fields[3:]
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        np.multiply(u[j], omega[k], out=out[i])
-        out[i] -= u[k] * omega[j]
+        return self._formulas.sum_of_acoustic_blocks([(operator.factors, state) for operator, state in terms])
 
 
 def advective_speed(grid: SpectralGrid, velocity: np.ndarray) -> float:
     """Largest |u| + |v| + |w| on this rank's grid points: the speed of the advective Courant number."""
-    return float(np.abs(grid.backward(velocity)).sum(axis=0).max(initial=0.0))
+    return float(np.max([np.abs(u).sum(axis=0).max() for u in grid.blocks(velocity, fields=3)], initial=0.0))
 
 
 #: The fluids that [flow] fluid names by a word.

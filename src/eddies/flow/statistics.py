@@ -54,10 +54,10 @@ def turbulence_scales(spectrum: np.ndarray, dissipation_rate: float, viscosity: 
 def gradient_moments(grid: SpectralGrid, velocity: np.ndarray) -> tuple[float, float]:
     """Skewness and flatness of du/dx, dv/dy and dw/dz of the modes (3, kz, ky, kx) of a velocity, averaged."""
     def longitudinal(modes: np.ndarray) -> list[np.ndarray]:
-        return [grid.d_dx * modes[1:2], grid.d_dy * modes[2:3], modes[3:]]
+        return [(grid.d_dx, modes[1:2]), (grid.d_dy, modes[2:3]), modes[3:]]
 
     sums = np.zeros((3, 3))
-    for _, gradient in grid.blocks(velocity[[2, 0, 1]], fields=3, expand=longitudinal, z_derivatives=1):
+    for gradient in grid.blocks(velocity[[2, 0, 1]], fields=3, expand=longitudinal, z_derivatives=1):
         sums += _powers(gradient)
     return _skewness_and_flatness(global_sum(grid.decomposition.comm, sums) / grid.cells**3)
 
@@ -92,10 +92,10 @@ def compressible_budget(grid: SpectralGrid, state: np.ndarray, viscosity: float,
     in the longitudinal velocity, and the `gradient_moments`, for which the same gradients serve.
     """
     def with_gradients(modes: np.ndarray) -> list[np.ndarray]:
-        return [modes[:4], grid.d_dx * modes[:3], grid.d_dy * modes[:3], modes[4:]]
+        return [modes[:4], (grid.d_dx, modes[:3]), (grid.d_dy, modes[:3]), modes[4:]]
 
     sums, powers = np.zeros(4), np.zeros((3, 3))
-    for _, fields in grid.blocks(state, fields=13, expand=with_gradients, z_derivatives=3):
+    for fields in grid.blocks(state, fields=13, expand=with_gradients, z_derivatives=3):
         u, s, A = fields[:3], fields[3], fields[4:].reshape(3, 3, *fields.shape[1:])
         diagonal = np.stack([A[0, 0], A[1, 1], A[2, 2]])
         rho = np.exp(s)

@@ -41,7 +41,7 @@ class Smagorinsky:
 
     def _gradients(self, modes: np.ndarray) -> list[np.ndarray]:
         """Derivatives of the velocity along x, along y and along z."""
-        return [self.grid.d_dx * modes[:3], self.grid.d_dy * modes[:3], modes[3:]]
+        return [(self.grid.d_dx, modes[:3]), (self.grid.d_dy, modes[:3]), modes[3:]]
 
     def _stress(self, gradients: np.ndarray, out: np.ndarray) -> None:
         d_dx, d_dy, d_dz = gradients.reshape(3, 3, *gradients.shape[1:])

@@ -11,12 +11,12 @@ from eddies.parallel.migration import Redistribution
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.transpose import Transpose, TransposeBuffers
-from eddies.spectral.fourier_passes import ColumnPass, PlanePass
+from eddies.spectral.fourier_passes import ColumnPass, Part, PlanePass, PlanePlans
 
 REAL = {"float64": np.float64, "float32": np.float32}
 COMPLEX = {"float64": np.complex128, "float32": np.complex64}
 
-Expansion = Callable[[np.ndarray], Sequence[np.ndarray]]
+Expansion = Callable[[np.ndarray], Sequence[Part]]
 
 
 class SpectralGrid:
@@ -44,7 +44,7 @@ class SpectralGrid:
         self.modes = 2 * self.cutoff + 1
         self._transpose = Transpose(decomposition.comm, self.cells, self.modes)
         self._buffers: dict[tuple[str, int], TransposeBuffers] = {}
-        self.column_pass = ColumnPass(self.cells, self.cutoff + 1, self.complex)
+        self.column_pass = ColumnPass(self.cells, self.cutoff, self.complex)
         self.plane_pass = PlanePass(self.cells, self.cutoff, self.complex)
         self._wavenumbers()
 
@@ -87,79 +87,87 @@ class SpectralGrid:
 
     def forward(self, physical: np.ndarray) -> np.ndarray:
         """Fourier coefficients (c, kz, ky_local, kx) of a real field (c, z_local, y, x); `backward` is its inverse."""
-        collected = Collector(self, len(physical))
+        collected, copies = Collector(self, len(physical)), self.plane_pass.copies
+        given = copies.described(np.require(physical, self.real, "CW"))
         for planes in self.plane_pass.blocks(self.decomposition.count):
-            collected.add(planes, physical[:, planes])
+            plans = collected.plans(1, planes)
+            for component in range(len(physical)):
+                copies.join(given, component, planes, plans.planes[0])
+                collected.add(planes, plans, component)
         return collected.modes()
 
     def backward(self, spectral: np.ndarray) -> np.ndarray:
         """Real field (c, z_local, y, x) of Fourier coefficients (c, kz, ky_local, kx); the inverse of `forward`."""
         physical = np.empty((len(spectral), *self.physical_shape), self.real)
+        copies = self.plane_pass.copies
+        result = copies.described(physical)
         for planes, packed in self._packed_blocks(spectral):
-            self.plane_pass.to_physical([packed], planes.stop - planes.start, physical[:, planes])
+            for component in range(len(physical)):
+                plans = self.plane_pass.to_physical([packed[component : component + 1]], 1, packed.shape[1])
+                copies.split(plans.planes[0], result, component, planes)
         return physical
 
     def multiply(self, spectral: np.ndarray, product: Callable[[np.ndarray, np.ndarray], None], results: int,
                  **fields: Any) -> np.ndarray:
         """Fourier coefficients (results, kz, ky_local, kx) of products of fields, formed at the grid points.
 
-        `product(values, out)` gets what `blocks` yields for the same arguments and fills (results, planes, y, x).
+        `product(values, out)` gets the values (fields, pairs, y, 2 x) of the fields that `blocks` yields for the same
+        arguments at some points and fills (results, pairs, y, 2 x).
         """
-        collected, out = Collector(self, results), None
-        for planes, values in self.blocks(spectral, **fields):
-            if out is None or out.shape[1:] != values.shape[1:]:
-                out = np.empty((results, *values.shape[1:]), self.real)
-            product(values, out)
-            collected.add(planes, out)
+        collected = Collector(self, results)
+        for planes, values in self._value_blocks(spectral, **fields):
+            plans = collected.plans(results, planes)
+            product(values, plans.values)
+            collected.add(planes, plans)
         return collected.modes()
 
     def blocks(self, spectral: np.ndarray, fields: int, expand: Expansion | None = None,
-               z_derivatives: int = 0) -> Iterator[tuple[slice, np.ndarray]]:
-        """Real fields at the grid points, some planes at a time: pairs of planes and values (fields, planes, y, x).
+               z_derivatives: int = 0) -> Iterator[np.ndarray]:
+        """Real fields at all grid points of this rank, those of some planes at a time: values (fields, pairs, y, 2 x).
 
-        A block of planes stays in cache while it is worked on; its memory is used again for the next one.
+        Planes come in pairs, the values of both at a point side by side; one of an odd number comes last, (fields, 1,
+        y, x). A block of planes stays in cache while it is worked on; its memory is used again for the next one.
 
         Parameters
         ----------
         spectral : modes (c, kz, ky_local, kx).
         fields : number of fields yielded.
-        expand : makes the fields, in parts (c_i, planes, ky, kx), from modes in (ky, kx) of planes: those of
-            `spectral`, followed by the derivatives along z of its first `z_derivatives` components. It may combine
-            them and multiply by `d_dx` and `d_dy`. By default the fields are what it would be given.
+        expand : makes the fields, in parts (c_i, pairs, ky, kx), from packed modes in (ky, kx) of pairs of planes:
+            those of `spectral`, followed by the derivatives along z of its first `z_derivatives` components. It may
+            combine them and multiply by `d_dx` and `d_dy`; (d_dx, modes) is such a product that is made on the way. By
+            default the fields are what it would be given.
         """
-        values: dict[int, np.ndarray] = {}
+        for planes, values in self._value_blocks(spectral, fields, expand, z_derivatives):
+            yield values[..., ::2] if planes.stop - planes.start == 1 else values
+
+    def _value_blocks(self, spectral: np.ndarray, fields: int, expand: Expansion | None = None,
+                      z_derivatives: int = 0) -> Iterator[tuple[slice, np.ndarray]]:
+        """Blocks of planes and values (fields, pairs, y, 2 x); a single plane is its own partner."""
         for planes, packed in self._packed_blocks(spectral, z_derivatives):
-            size = planes.stop - planes.start
-            if size not in values:
-                values[size] = np.empty((fields, size, self.cells, self.cells), self.real)
-            self.plane_pass.to_physical([packed] if expand is None else expand(packed), size, values[size])
-            yield planes, values[size]
+            parts = [packed] if expand is None else expand(packed)
+            yield planes, self.plane_pass.to_physical(parts, fields, packed.shape[1]).values
 
     def _packed_blocks(self, spectral: np.ndarray, z_derivatives: int = 0) -> Iterator[tuple[slice, np.ndarray]]:
-        buffers = self._columns_to_planes(spectral, z_derivatives)
+        copies = self.plane_pass.copies
+        blocks = copies.described_blocks(self._columns_to_planes(spectral, z_derivatives).plane_blocks)
         for planes in self.plane_pass.blocks(self.decomposition.count):
-            yield planes, self.plane_pass.pack(_joined(buffers.plane_blocks, planes))
+            yield planes, copies.pack(blocks, planes)
 
     def _columns_to_planes(self, spectral: np.ndarray, z_derivatives: int) -> TransposeBuffers:
         """Transform along z, components and the z derivatives of the first of them, and make them planes."""
-        components, K, n = len(spectral), self.cutoff, self.cells
+        components, copies = len(spectral), self.column_pass.copies
         buffers = self.buffers("backward", components + z_derivatives)
-        d_dz = (1j * self.wavevector[2][:, 0]).astype(self.complex)[:, None]
-        parts = [(spectral, slice(0, components), None)]
-        if z_derivatives:
-            parts.append((spectral[:z_derivatives], slice(components, components + z_derivatives), d_dz))
-        for modes, where, factor in parts:
-            for rows in self.column_pass.rows(self.spectral_shape[1], len(modes)):
-                plan = self.column_pass.plan("BACKWARD", len(modes), rows.stop - rows.start)
-                column = plan.input_array
-                for kept, place in ((slice(0, K + 1), slice(0, K + 1)), (slice(K + 1, None), slice(n - K, None))):
-                    if factor is None:
-                        column[:, place] = modes[:, kept, rows]
-                    else:
-                        np.multiply(modes[:, kept, rows], factor[kept], out=column[:, place])
-                plan.execute()
-                for block, start in zip(buffers.column_blocks, self._transpose.z_starts):
-                    block[where, :, rows] = plan.output_array[:, start : start + block.shape[1]]
+        blocks = copies.described_blocks(buffers.column_blocks)
+        modes = copies.described(np.require(spectral, self.complex, "CW"))
+        d_dz = copies.described((1j * self.wavevector[2].ravel()).astype(self.complex))
+        fields = [(component, None) for component in range(components)]
+        fields += [(component, d_dz) for component in range(z_derivatives)]
+        for rows in self.column_pass.rows(self.spectral_shape[1]):
+            column = self.column_pass.plan("BACKWARD", rows)
+            for place, (component, factors) in enumerate(fields):
+                copies.fill(modes, component, rows, factors, column.given)
+                column.plan.execute()
+                copies.send(column.result, blocks, place, rows)
         buffers.to_planes()
         return buffers
 
@@ -181,40 +189,35 @@ class SpectralGrid:
 
 
 class Collector:
-    """Takes real fields (components, planes, y, x) a block of planes at a time and gives their Fourier coefficients."""
+    """Takes real fields a block of planes at a time and gives their Fourier coefficients."""
 
     def __init__(self, grid: SpectralGrid, components: int) -> None:
         self.grid, self.components = grid, components
         self._buffers = grid.buffers("forward", components)
+        self._blocks = grid.plane_pass.copies.described_blocks(self._buffers.plane_blocks)
 
-    def add(self, planes: slice, values: np.ndarray) -> None:
-        """Transform a block of planes along x and y."""
-        transform = self.grid.plane_pass
-        modes = transform.unpack(transform.to_modes(values), planes.stop - planes.start)
-        start = 0
-        for block in self._buffers.plane_blocks:
-            block[:, planes] = modes[:, :, start : start + block.shape[2]]
-            start += block.shape[2]
+    def plans(self, fields: int, planes: slice) -> PlanePlans:
+        """Plans with memory for a block of planes of so many fields, to be filled and added."""
+        return self.grid.plane_pass.plans("FORWARD", fields, (planes.stop - planes.start + 1) // 2)
+
+    def add(self, planes: slice, plans: PlanePlans, component: int = 0) -> None:
+        """Transform a block of planes along x and y: fields that are components from a first one on."""
+        self.grid.plane_pass.to_modes(plans, self._blocks, component, planes)
 
     def modes(self) -> np.ndarray:
         """The Fourier coefficients (components, kz, ky_local, kx), once all planes are there; all ranks call it."""
-        grid, K = self.grid, self.grid.cutoff
+        grid, copies = self.grid, self.grid.column_pass.copies
         self._buffers.to_columns()
+        blocks = copies.described_blocks(self._buffers.column_blocks)
         spectral = np.empty((self.components, *grid.spectral_shape), grid.complex)
-        scale = grid.real(0.5 / grid.cells**3)
-        for rows in grid.column_pass.rows(grid.spectral_shape[1], self.components):
-            plan = grid.column_pass.plan("FORWARD", self.components, rows.stop - rows.start)
-            np.concatenate([block[:, :, rows] for block in self._buffers.column_blocks], axis=1, out=plan.input_array)
-            plan.execute()
-            column = plan.output_array
-            np.multiply(column[:, : K + 1], scale, out=spectral[:, : K + 1, rows])
-            np.multiply(column[:, grid.cells - K :], scale, out=spectral[:, K + 1 :, rows])
+        result = copies.described(spectral)
+        for rows in grid.column_pass.rows(grid.spectral_shape[1]):
+            column = grid.column_pass.plan("FORWARD", rows)
+            for component in range(self.components):
+                copies.receive(blocks, component, rows, column.given)
+                column.plan.execute()
+                copies.store(column.result, 0.5 / grid.cells**3, result, component, rows)
         return spectral
-
-
-def _joined(blocks: Sequence[np.ndarray], planes: slice) -> np.ndarray:
-    """Some planes of blocks (c, planes, y, x) that follow each other in y."""
-    return blocks[0][:, planes] if len(blocks) == 1 else np.concatenate([block[:, planes] for block in blocks], axis=2)
 
 
 def restrict(fine: SpectralGrid, coarse: SpectralGrid, spectral: np.ndarray) -> np.ndarray:
