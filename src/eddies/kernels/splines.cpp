@@ -300,6 +300,8 @@ void interpolate(const Cloud& cloud, std::int64_t components, const Real* const*
             tile.read(planes + c * cloud.planes, count);
             for (std::int64_t begin = tile.begin; begin < tile.end; begin += BLOCK<Real>) {
                 const Block<degree, Real> block(cloud, begin, tile.end);
+                for (int p = 0; p < block.count; ++p)
+                    __builtin_prefetch(values + cloud.order[begin + p] * components + c, 1);
                 for (int p = 0; p < block.count; ++p) {
                     const Real* around = tile.around(begin + p);
                     Wide sums[wides] = {};
