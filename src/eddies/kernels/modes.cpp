@@ -1,6 +1,6 @@
-// Passes over the Fourier modes of a vector field, for conjugate gradients on solenoidal ones: each reads and writes the
-// memory once; particles/least_squares.py has them as formulas. Sums are made plane by plane, and these summed in order,
-// so that nothing depends on the number of threads.
+// Passes over the Fourier modes of a vector field, for conjugate gradients on solenoidal ones: each reads and writes
+// the memory once; particles/least_squares.py has them as formulas. Sums are made in double precision plane by plane, and
+// these summed in order, so that nothing depends on the number of threads.
 
 #include <cstdint>
 #include <vector>
@@ -65,8 +65,8 @@ double image_of(const Weights<Real>& w, const Real* given, const Real* modes, Re
 
 // found += length direction, residual -= length image; the local sum of inverse times the residual squared.
 template <typename Real>
-double descend(const Weights<Real>& w, Real length, const Real* inverse, const Real* direction,
-                     const Real* image, Real* found, Real* residual) {
+double descend(const Weights<Real>& w, Real length, const Real* inverse, const Real* direction, const Real* image,
+               Real* found, Real* residual) {
     const std::int64_t size = 2 * w.z * w.y * w.x;
     return sum_over_lines(w, [&](std::int64_t, std::int64_t, std::int64_t start) {
         double sum = 0.0;
@@ -89,8 +89,7 @@ double descend(const Weights<Real>& w, Real length, const Real* inverse, const R
 
 // direction = inverse residual + share direction.
 template <typename Real>
-void turn(const Weights<Real>& w, Real share, const Real* inverse, const Real* residual,
-                Real* direction) {
+void turn(const Weights<Real>& w, Real share, const Real* inverse, const Real* residual, Real* direction) {
     const std::int64_t plane = w.y * w.x;
 #pragma omp parallel for schedule(static)
     for (std::int64_t z = 0; z < 3 * w.z; ++z) {
@@ -106,16 +105,16 @@ void turn(const Weights<Real>& w, Real share, const Real* inverse, const Real* r
 
 }  // namespace
 
-#define FOR_PRECISION(Real, name)                                                                                       \
+#define FOR_PRECISION(Real, name)                                                                                      \
     double modes_image_##name(const Weights<Real>* weights, const Real* given, const Real* modes, Real* image) {       \
-        return image_of(*weights, given, modes, image);                                                                 \
-    }                                                                                                                   \
+        return image_of(*weights, given, modes, image);                                                                \
+    }                                                                                                                  \
     double modes_descend_##name(const Weights<Real>* weights, double length, const Real* inverse,                      \
                                 const Real* direction, const Real* image, Real* found, Real* residual) {               \
         return descend(*weights, static_cast<Real>(length), inverse, direction, image, found, residual);               \
-    }                                                                                                                   \
+    }                                                                                                                  \
     void modes_turn_##name(const Weights<Real>* weights, double share, const Real* inverse, const Real* residual,      \
-                           Real* direction) {                                                                           \
+                           Real* direction) {                                                                          \
         turn(*weights, static_cast<Real>(share), inverse, residual, direction);                                        \
     }
 

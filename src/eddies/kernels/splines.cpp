@@ -1,10 +1,10 @@
 // Tensor-product B-splines between points and the planes of a periodic grid; spectral/splines.py is the definition.
 //
-// Points are put in order of place once, into bins. What the splines around the points of a bin reach is copied to a tile
-// that fits a core's first cache, in which the components of a grid point are neighbours, and spread points are added
-// there first. The splines are made anew in each call from what fraction of a cell the points are at: that costs less than
-// to store and load them. Nothing depends on the number of threads: a value is the sum of one thread, and what points add
-// to a plane they add in one order.
+// Points are put in order of place once, into bins. What the splines around the points of a bin reach is copied to a
+// tile that fits a core's first cache, in which the components of a grid point are neighbours, and spread points are
+// added there first. The splines are made anew in each call from what fraction of a cell the points are at: that costs
+// less than to store and load them. Nothing depends on the number of threads: a value is the sum of one thread, and what
+// points add to a plane they add in one order.
 
 #include <cmath>
 #include <cstdint>
@@ -16,12 +16,9 @@ extern "C" {
 // Points in order of place, as `splines_arrange` makes it; kernels/splines.py has the same structure.
 //
 // The splines around a point begin at the column, line and plane `first`, which is (degree - 1)/2 before its cell; the
-// point is at `fraction` of the cell. Bins are chunks of lines, cut into layers of planes, cut into strips of columns, all
-// about equally large. Chunks are one or an even number of them, so long that what lies around the points of every other
-// one has no line in common.
+// point is at `fraction` of the cell.
 struct Cloud {
     std::int64_t points, cells, planes, degree;
-    std::int64_t chunks, layers, strips;
     std::int32_t* order;   // (points), rows of the caller's arrays
     std::int32_t* first;   // (points, 3)
     double* fraction;      // (3, points + 8)
@@ -32,12 +29,26 @@ struct Cloud {
 
 namespace {
 
-// The most of a bin: kernels/splines.py cuts them so.
-constexpr int LINES = 16, PLANES = 8, COLUMNS = 8;
+constexpr int LINES = 16, PLANES = 8, COLUMNS = 8;  // the most of a bin
 constexpr int TOGETHER = 4;        // components in a tile
 constexpr int PADDING = 8;         // numbers behind the fractions along an axis that may be read
 constexpr int FEW = 2000;          // points that are not worth a second thread
 constexpr double FARTHEST = 1e15;  // in cells; beyond, numbers do not tell one from the next
+
+// Bins are chunks of lines, cut into layers of planes, cut into strips of columns, all about equally large. Chunks are
+// one or an even number of them, so long that what lies around the points of every other one has no line in common.
+struct Bins {
+    std::int64_t chunks, layers, strips;
+
+    Bins(std::int64_t cells, std::int64_t planes)
+        : chunks(cells < LINES ? 1 : cells / LINES * 2), layers((planes - 1) / PLANES + 1),
+          strips((cells - 1) / COLUMNS + 1) {}
+
+    explicit Bins(const Cloud& cloud) : Bins(cloud.cells, cloud.planes) {}
+
+    std::int64_t of_a_chunk() const { return layers * strips; }
+    std::int64_t all() const { return chunks * of_a_chunk(); }
+};
 
 template <typename Vector, typename Real>
 inline Vector loaded(const Real* place) {
@@ -178,7 +189,8 @@ struct Block {
 template <int degree, typename Real>
 struct Tile {
     using Point = typename Vectors<Real>::Point;
-    static constexpr int columns = (COLUMNS + degree + TOGETHER - 1) / TOGETHER * TOGETHER, row = TOGETHER * columns, plane = (LINES + degree) * row;
+    static constexpr int columns = (COLUMNS + degree + TOGETHER - 1) / TOGETHER * TOGETHER;
+    static constexpr int row = TOGETHER * columns, plane = (LINES + degree) * row;
     const Cloud& cloud;
     std::int64_t begin, end, lowest[3];
     int size[3];
@@ -209,7 +221,8 @@ struct Tile {
     // Where the splines around a point begin.
     Real* around(std::int64_t point) {
         const std::int32_t* first = cloud.first + 3 * point;
-        return numbers + (first[2] - lowest[2]) * plane + (first[1] - lowest[1]) * row + (first[0] - lowest[0]) * TOGETHER;
+        return numbers + (first[2] - lowest[2]) * plane + (first[1] - lowest[1]) * row +
+               (first[0] - lowest[0]) * TOGETHER;
     }
 
     void clear() {
@@ -291,7 +304,7 @@ void interpolate(const Cloud& cloud, std::int64_t components, const Real* const*
     using V = Vectors<Real>;
     using Wide = typename V::Wide;
     constexpr int width = degree + 1, wides = width / V::neighbours;
-    const std::int64_t bins = cloud.chunks * cloud.layers * cloud.strips;
+    const std::int64_t bins = Bins(cloud).all();
 #pragma omp parallel for schedule(static) if (cloud.points > FEW)
     for (std::int64_t bin = 0; bin < bins; ++bin) {
         if (cloud.starts[bin] == cloud.starts[bin + 1]) continue;
@@ -328,7 +341,7 @@ void slope(const Cloud& cloud, std::int64_t components, const Real* const* plane
            double* gradients) {
     using Point = typename Vectors<Real>::Point;
     constexpr int width = degree + 1;
-    const std::int64_t bins = cloud.chunks * cloud.layers * cloud.strips;
+    const std::int64_t bins = Bins(cloud).all();
 #pragma omp parallel for schedule(static) if (cloud.points > FEW)
     for (std::int64_t bin = 0; bin < bins; ++bin) {
         if (cloud.starts[bin] == cloud.starts[bin + 1]) continue;
@@ -351,7 +364,8 @@ void slope(const Cloud& cloud, std::int64_t components, const Real* const* plane
                         Point value{}, along_y{}, along_z{};
                         for (int k = 0; k < width; ++k)
                             for (int j = 0; j < width; ++j) {
-                                const Point point = loaded<Point>(around + k * tile.plane + j * tile.row + i * TOGETHER);
+                                const Point point =
+                                    loaded<Point>(around + k * tile.plane + j * tile.row + i * TOGETHER);
                                 value += block.across[k][j][p] * point;
                                 along_y += dy[k][j][p] * point;
                                 along_z += dz[k][j][p] * point;
@@ -402,11 +416,11 @@ void spread_bin(const Cloud& cloud, std::int64_t bin, std::int64_t components, R
 
 template <int degree, typename Real>
 void spread(const Cloud& cloud, std::int64_t components, Real* const* planes, const double* values) {
-    const std::int64_t bins = cloud.layers * cloud.strips;  // of a chunk
+    const Bins bins(cloud);
     for (std::int64_t parity = 0; parity < 2; ++parity) {
 #pragma omp parallel for schedule(dynamic, 1) if (cloud.points > FEW)
-        for (std::int64_t chunk = parity; chunk < cloud.chunks; chunk += 2)
-            for (std::int64_t bin = chunk * bins; bin < (chunk + 1) * bins; ++bin)
+        for (std::int64_t chunk = parity; chunk < bins.chunks; chunk += 2)
+            for (std::int64_t bin = chunk * bins.of_a_chunk(); bin < (chunk + 1) * bins.of_a_chunk(); ++bin)
                 if (cloud.starts[bin] < cloud.starts[bin + 1])
                     spread_bin<degree, Real>(cloud, bin, components, planes, values);
     }
@@ -425,16 +439,19 @@ std::vector<std::int32_t> parts_of(std::int64_t size, std::int64_t parts) {
 
 extern "C" {
 
+// Of points on a grid of so many cells and planes.
+int splines_bins(int cells, int planes) { return static_cast<int>(Bins(cells, planes).all()); }
+
 // Makes the arrays of a cloud, of points (n, 3) on a grid of this spacing whose plane `lowest` is the first in memory.
 // Returns -1, or the number of the first point that has no place there, and then the arrays are not made.
 std::int64_t splines_arrange(const Cloud* arranged, const double* positions, double spacing, std::int64_t lowest) {
     const Cloud& cloud = *arranged;
     const std::int64_t cells = cloud.cells, before = (cloud.degree - 1) / 2;
-    const std::int64_t bins = cloud.chunks * cloud.layers * cloud.strips;
-    const std::vector<std::int32_t> strip = parts_of(cells, cloud.strips), chunk = parts_of(cells, cloud.chunks),
-                                    layer = parts_of(cloud.planes, cloud.layers);
+    const Bins bins(cloud);
+    const std::vector<std::int32_t> strip = parts_of(cells, bins.strips), chunk = parts_of(cells, bins.chunks),
+                                    layer = parts_of(cloud.planes, bins.layers);
     std::vector<std::int32_t> first(3 * cloud.points), bin_of(cloud.points);
-    std::vector<std::int64_t> next(bins + 1);
+    std::vector<std::int64_t> next(bins.all() + 1);
     std::int64_t misplaced = cloud.points;
 #pragma omp parallel for schedule(static) reduction(min : misplaced) if (cloud.points > FEW)
     for (std::int64_t p = 0; p < cloud.points; ++p) {
@@ -449,12 +466,12 @@ std::int64_t splines_arrange(const Cloud* arranged, const double* positions, dou
         }
         if (placed && place[2] + cloud.degree < cloud.planes)
             bin_of[p] = static_cast<std::int32_t>(
-                (chunk[place[1]] * cloud.layers + layer[place[2]]) * cloud.strips + strip[place[0]]);
+                (chunk[place[1]] * bins.layers + layer[place[2]]) * bins.strips + strip[place[0]]);
         else if (p < misplaced) misplaced = p;
     }
     if (misplaced < cloud.points) return misplaced;
     for (std::int64_t p = 0; p < cloud.points; ++p) ++next[bin_of[p] + 1];
-    for (std::int64_t bin = 0; bin < bins; ++bin) next[bin + 1] += next[bin];
+    for (std::int64_t bin = 0; bin < bins.all(); ++bin) next[bin + 1] += next[bin];
     std::memcpy(cloud.starts, next.data(), next.size() * sizeof(next[0]));
     for (std::int64_t p = 0; p < cloud.points; ++p) cloud.order[next[bin_of[p]]++] = static_cast<std::int32_t>(p);
 #pragma omp parallel for schedule(static) if (cloud.points > FEW)
@@ -472,20 +489,20 @@ std::int64_t splines_arrange(const Cloud* arranged, const double* positions, dou
 // (points, components), gradients (points, 3).
 
 #define FOR_PRECISION(Real, name)                                                                                      \
-    void splines_at_##name(const Cloud* cloud, std::int64_t components, const Real* const* planes, double* values) {  \
-        (cloud->degree == 3 ? interpolate<3, Real> : interpolate<5, Real>)(*cloud, components, planes, values);       \
+    void splines_at_##name(const Cloud* cloud, std::int64_t components, const Real* const* planes, double* values) {   \
+        (cloud->degree == 3 ? interpolate<3, Real> : interpolate<5, Real>)(*cloud, components, planes, values);        \
     }                                                                                                                  \
                                                                                                                        \
-    /* Gradients by position, in cells, of the sum over components of `factors` (points, components) times values. */ \
-    void splines_slope_##name(const Cloud* cloud, std::int64_t components, const Real* const* planes,                 \
-                              const double* factors, double* gradients) {                                             \
-        (cloud->degree == 3 ? slope<3, Real> : slope<5, Real>)(*cloud, components, planes, factors, gradients);       \
+    /* Gradients by position, in cells, of the sum over components of `factors` (points, components) times values. */  \
+    void splines_slope_##name(const Cloud* cloud, std::int64_t components, const Real* const* planes,                  \
+                              const double* factors, double* gradients) {                                              \
+        (cloud->degree == 3 ? slope<3, Real> : slope<5, Real>)(*cloud, components, planes, factors, gradients);        \
     }                                                                                                                  \
                                                                                                                        \
     /* Adds to the planes. */                                                                                          \
-    void splines_spread_##name(const Cloud* cloud, std::int64_t components, Real* const* planes,                      \
+    void splines_spread_##name(const Cloud* cloud, std::int64_t components, Real* const* planes,                       \
                                const double* values) {                                                                 \
-        (cloud->degree == 3 ? spread<3, Real> : spread<5, Real>)(*cloud, components, planes, values);                 \
+        (cloud->degree == 3 ? spread<3, Real> : spread<5, Real>)(*cloud, components, planes, values);                  \
     }
 
 FOR_PRECISION(double, float64)

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import ctypes
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-# As splines.cpp has them: points are put in order by chunks of so many lines or up to twice as many, layers of at most
-# so many planes and strips of at most so many columns; so many numbers may be read behind the fractions along an axis.
-CHUNK, LAYER, STRIP = 8, 8, 8
+# What may be read behind the fractions along an axis; splines.cpp has it too.
 PADDING = 8
 
 
@@ -38,8 +35,7 @@ class MisplacedPoint(ValueError):
 class _Cloud(ctypes.Structure):
     """Points as splines.cpp wants them."""
 
-    _fields_ = ([(name, ctypes.c_int64)
-                 for name in ("points", "cells", "planes", "degree", "chunks", "layers", "strips")]
+    _fields_ = ([(name, ctypes.c_int64) for name in ("points", "cells", "planes", "degree")]
                 + [(name, ctypes.c_void_p) for name in ("order", "first", "fraction", "starts")])
 
 
@@ -52,13 +48,11 @@ class CompiledSplines:
 
     def __init__(self, library: ctypes.CDLL, degree: int, positions: np.ndarray, padded: PaddedPlanes) -> None:
         self._library, self._padded, count = library, padded, len(positions)
-        # An even number of chunks of lines, for threads that add to every other one of them.
-        bins = max(padded.cells // CHUNK // 2 * 2, 1), -(-padded.planes // LAYER), -(-padded.cells // STRIP)
+        sizes = padded.cells, padded.planes
         self._arrays = {"order": np.empty(count, np.int32), "first": np.empty((count, 3), np.int32),
                         "fraction": np.zeros((3, count + PADDING)),
-                        "starts": np.empty(math.prod(bins) + 1, np.int64)}
-        self._cloud = _Cloud(count, padded.cells, padded.planes, degree, *bins,
-                             *(array.ctypes.data for array in self._arrays.values()))
+                        "starts": np.empty(library.splines_bins(*sizes) + 1, np.int64)}
+        self._cloud = _Cloud(count, *sizes, degree, *(array.ctypes.data for array in self._arrays.values()))
         arrange = library.splines_arrange
         arrange.restype = ctypes.c_int64
         misplaced = arrange(ctypes.byref(self._cloud), _address(_doubles(positions)), ctypes.c_double(padded.spacing),
