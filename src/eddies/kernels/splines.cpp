@@ -3,8 +3,8 @@
 // Points are put in order of place once, into bins. What the splines around the points of a bin reach is copied to a
 // tile that fits a core's first cache, in which the components of a grid point are neighbours, and spread points are
 // added there first. The splines are made anew in each call from what fraction of a cell the points are at: that costs
-// less than to store and load them. Nothing depends on the number of threads: a value is the sum of one thread, and what
-// points add to a plane they add in one order.
+// less than to store and load them. Nothing depends on the number of threads: a value is the sum of one thread, and
+// what points add to a plane they add in one order.
 
 #include <cmath>
 #include <cstdint>
