@@ -167,7 +167,8 @@ class ResolvedVelocity:
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Inverse of `state_dict`."""
-        self._moments = [_Moment(float(time), *modes) for time, modes in zip(state["times"], state["modes"])]
+        modes = state["modes"].to(self.grid.dtype.to_complex())
+        self._moments = [_Moment(float(time), *pair) for time, pair in zip(state["times"], modes)]
         self.speed = float(state["speed"])
 
     def _carried(self, modes: Tensor, step: float, mean: np.ndarray) -> Tensor:
