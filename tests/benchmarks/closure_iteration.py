@@ -1,9 +1,11 @@
 """One iteration of the closure's conjugate gradients and its parts, and splines by the compiled library and by numpy.
 
     mpirun -n 2 .venv/bin/python -m mpi4py tests/benchmarks/closure_iteration.py [PARTICLES A SIDE] [--numpy]
+        [--precision float64]
 
-Random particles on a grid of 1.75 planes a particle, modes up to 1.5 times their Nyquist wavenumber. `--numpy` leaves
-the compiled library aside. Prints a JSON line with medians of seconds, of the slowest rank.
+Random particles on a grid of 1.75 planes a particle, modes up to 1.5 times their Nyquist wavenumber, in single
+precision unless asked otherwise, as in a rollout. `--numpy` leaves the compiled library aside. Prints a JSON line with
+medians of seconds, of the slowest rank.
 """
 
 import argparse
@@ -37,10 +39,10 @@ def seconds(comm: MPI.Comm, action: Callable[[], object]) -> float:
     return median(times[1:])
 
 
-def measure(comm: MPI.Comm, side: int) -> dict[str, float]:
+def measure(comm: MPI.Comm, side: int, dtype: torch.dtype) -> dict[str, float]:
     """Seconds of each part."""
     slab = SlabDecomposition(comm, 2 * math.pi, int(PLANES * side))
-    grid, random = FourierGrid(slab, int(HIGHEST * side)), np.random.default_rng(1)
+    grid, random = FourierGrid(slab, int(HIGHEST * side), 1, dtype), np.random.default_rng(1)
     position, velocity = random.uniform(0, slab.length, (side**3, 3)), random.standard_normal((side**3, 3))
     own = (position[:, 2] >= slab.lower) & (position[:, 2] < slab.upper)
     velocity, points = torch.from_numpy(velocity[own]), grid.points(torch.from_numpy(position[own]))
@@ -71,6 +73,7 @@ def measure(comm: MPI.Comm, side: int) -> dict[str, float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("side", nargs="?", type=int, default=64)
+    parser.add_argument("--precision", choices=("float32", "float64"), default="float32")
     parser.add_argument("--numpy", action="store_true", help="without the compiled library")
     options, comm = parser.parse_args(), MPI.COMM_WORLD
     torch.set_num_threads(1)
@@ -78,11 +81,11 @@ def main() -> None:
         for module in (eddies.spectral.interpolation, eddies.particles.least_squares):
             module.library = lambda: None
     with torch.no_grad():
-        found = measure(comm, options.side)
+        found = measure(comm, options.side, getattr(torch, options.precision))
     if comm.rank == 0:
         rate = {name: options.side**3 / found[name] for name in ("interpolation", "spreading")}
-        print(json.dumps({"particles": options.side, "ranks": comm.size, "compiled": not options.numpy,
-                          "seconds": found, "points_per_second": rate}))
+        print(json.dumps({"particles": options.side, "ranks": comm.size, "precision": options.precision,
+                          "compiled": not options.numpy, "seconds": found, "points_per_second": rate}))
 
 
 if __name__ == "__main__":

@@ -16,16 +16,18 @@ SHAPES = [(9, 5, 5), (7, 0, 4), (33, 17, 17), (1, 1, 1)]
 VECTORS = ("given", "modes", "direction", "image", "found", "residual")
 
 
-def passes(library, shape, seed=1):
-    """Both of them, and arrays for them."""
+def passes(library, shape, seed=1, kind=np.float64):
+    """Both of them, numpy's in double precision, and arrays for them."""
     random = np.random.default_rng(seed)
     z, y, x = shape
     wavevector = [random.standard_normal(axis) for axis in ((1, 1, x), (1, y, 1), (z, 1, 1))]
     weights = [random.uniform(0, 1, shape) for _ in range(3)]
     weights[1][random.uniform(0, 1, shape) < 0.3] = 0
+    weights[1:] = [weight.astype(kind) for weight in weights[1:]]
     given = wavevector, random.integers(1, 3, (1, 1, x)).astype(float), *weights
-    vectors = {name: random.standard_normal((3, *shape)) + 1j * random.standard_normal((3, *shape)) for name in VECTORS}
-    return ModePasses(*given), CompiledModePasses(library, *given), random.uniform(0, 1, shape), vectors
+    vectors = {name: (random.standard_normal((3, *shape)) + 1j * random.standard_normal((3, *shape))).astype(
+        np.result_type(kind, np.complex64)) for name in VECTORS}
+    return (ModePasses(*given), CompiledModePasses(library, *given), random.uniform(0, 1, shape).astype(kind), vectors)
 
 
 def run(made, inverse, vectors):
@@ -37,14 +39,18 @@ def run(made, inverse, vectors):
     return (product, square), (made_image, direction, found, residual)
 
 
+@pytest.mark.parametrize("kind, of_sums, of_modes", [(np.float64, 1e-13, 1e-14), (np.float32, 1e-7, 1e-6)])
 @pytest.mark.parametrize("shape", SHAPES)
-def test_passes_are_those_of_numpy(library, shape):
-    numpy, compiled, inverse, vectors = passes(library, shape)
-    (sums, arrays), (expected_sums, expected) = (run(made, inverse, vectors) for made in (compiled, numpy))
+def test_passes_are_those_of_numpy(library, shape, kind, of_sums, of_modes):
+    numpy, compiled, inverse, vectors = passes(library, shape, kind=kind)
+    exact = {name: vector.astype(complex) for name, vector in vectors.items()}
+    sums, arrays = run(compiled, inverse, vectors)
+    expected_sums, expected = run(numpy, inverse.astype(float), exact)
     scale = 3 * np.prod(shape)
-    assert sums == pytest.approx(expected_sums, abs=1e-13 * scale)
+    assert sums == pytest.approx(expected_sums, abs=of_sums * scale)
     for one, other in zip(arrays, expected):
-        assert np.abs(one - other).max(initial=0) <= 1e-14 * np.abs(other).max(initial=0)
+        assert one.dtype == np.result_type(kind, np.complex64)
+        assert np.abs(one - other).max(initial=0) <= of_modes * np.abs(other).max(initial=0)
 
 
 def test_what_is_not_a_number_stays_so(library):
@@ -70,11 +76,12 @@ def test_the_same_bits_with_any_number_of_threads(library):
 import hashlib, sys
 from tests.kernels.test_modes import load, passes, run
 digest = hashlib.sha256()
-_, compiled, inverse, vectors = passes(load(sys.argv[1]), (33, 17, 17))
-sums, arrays = run(compiled, inverse, vectors)
-digest.update(repr(sums).encode())
-for array in arrays:
-    digest.update(array.tobytes())
+for kind in ("f8", "f4"):
+    _, compiled, inverse, vectors = passes(load(sys.argv[1]), (33, 17, 17), kind=kind)
+    sums, arrays = run(compiled, inverse, vectors)
+    digest.update(repr(sums).encode())
+    for array in arrays:
+        digest.update(array.tobytes())
 print(digest.hexdigest())
 """
     name = next(name for name in instruction_sets() if load(name) is library)

@@ -1,29 +1,26 @@
-// Passes over the Fourier modes of a vector field, for conjugate gradients on solenoidal ones: each reads and writes the
-// memory once; particles/least_squares.py has them as formulas. Sums are made plane by plane, and these summed in order,
-// so that nothing depends on the number of threads.
+// Passes over the Fourier modes of a vector field, for conjugate gradients on solenoidal ones: each reads and writes
+// the memory once; particles/least_squares.py has them as formulas. Sums are made in double precision plane by plane,
+// and these summed in order, so that nothing depends on the number of threads.
 
 #include <cstdint>
 #include <vector>
 
-extern "C" {
-
-// Real weights of modes: of each (z, y, x), and along the axes; kernels/modes.py has the same structure.
-struct Weights {
-    std::int64_t z, y, x;
-    const double *kx, *ky, *kz;
-    const double* multiplicity;     // (x), how often a stored mode stands in the full sum
-    const double* inverse_squared;  // 1/k^2, 0 for k = 0
-    const double* scale;            // of what is projected; 0 where a mode is not solved for
-    const double* penalty;
-};
-
-}  // extern "C"
-
 namespace {
 
+// Real weights of modes: of each (z, y, x), and along the axes; kernels/modes.py has the same structure.
+template <typename Real>
+struct Weights {
+    std::int64_t z, y, x;
+    const Real *kx, *ky, *kz;
+    const Real* multiplicity;     // (x), how often a stored mode stands in the full sum
+    const Real* inverse_squared;  // 1/k^2, 0 for k = 0
+    const Real* scale;            // of what is projected; 0 where a mode is not solved for
+    const Real* penalty;
+};
+
 // The sum of function(z, y, where the line starts in an array of weights) over all lines.
-template <typename Function>
-double sum_over_lines(const Weights& weights, const Function& function) {
+template <typename Real, typename Function>
+double sum_over_lines(const Weights<Real>& weights, const Function& function) {
     std::vector<double> sums(weights.z);
 #pragma omp parallel for schedule(static)
     for (std::int64_t z = 0; z < weights.z; ++z)
@@ -33,32 +30,28 @@ double sum_over_lines(const Weights& weights, const Function& function) {
     return sum;
 }
 
-}  // namespace
-
-extern "C" {
-
 // image = P (scale given) + penalty modes, P the projection on solenoidal fields; the local sum of modes times image.
 // Vectors are (3, z, y, x) of complex numbers.
-double modes_image(const Weights* given_weights, const double* given, const double* modes, double* image) {
-    const Weights& w = *given_weights;
+template <typename Real>
+double image_of(const Weights<Real>& w, const Real* given, const Real* modes, Real* image) {
     const std::int64_t size = 2 * w.z * w.y * w.x;
     return sum_over_lines(w, [&](std::int64_t z, std::int64_t y, std::int64_t start) {
         double sum = 0.0;
-        const double ky = w.ky[y], kz = w.kz[z];
+        const Real ky = w.ky[y], kz = w.kz[z];
 #pragma omp simd reduction(+ : sum)
         for (std::int64_t x = 0; x < w.x; ++x) {
             const std::int64_t at = start + x;
-            const double kx = w.kx[x], scale = w.scale[at], penalty = w.penalty[at];
-            const double along = scale * w.inverse_squared[at];
-            double product = 0.0;
+            const Real kx = w.kx[x], scale = w.scale[at], penalty = w.penalty[at];
+            const Real along = scale * w.inverse_squared[at];
+            Real product = 0;
             for (int part = 0; part < 2; ++part) {
                 const std::int64_t i = 2 * at + part;
-                const double a = given[i], b = given[i + size], c = given[i + 2 * size];
-                const double longitudinal = along * (kx * a + ky * b + kz * c);
-                const double p = modes[i], q = modes[i + size], r = modes[i + 2 * size];
-                const double d = scale * a - kx * longitudinal + penalty * p;
-                const double e = scale * b - ky * longitudinal + penalty * q;
-                const double f = scale * c - kz * longitudinal + penalty * r;
+                const Real a = given[i], b = given[i + size], c = given[i + 2 * size];
+                const Real longitudinal = along * (kx * a + ky * b + kz * c);
+                const Real p = modes[i], q = modes[i + size], r = modes[i + 2 * size];
+                const Real d = scale * a - kx * longitudinal + penalty * p;
+                const Real e = scale * b - ky * longitudinal + penalty * q;
+                const Real f = scale * c - kz * longitudinal + penalty * r;
                 image[i] = d;
                 image[i + size] = e;
                 image[i + 2 * size] = f;
@@ -71,9 +64,9 @@ double modes_image(const Weights* given_weights, const double* given, const doub
 }
 
 // found += length direction, residual -= length image; the local sum of inverse times the residual squared.
-double modes_descend(const Weights* given_weights, double length, const double* inverse, const double* direction,
-                     const double* image, double* found, double* residual) {
-    const Weights& w = *given_weights;
+template <typename Real>
+double descend(const Weights<Real>& w, Real length, const Real* inverse, const Real* direction, const Real* image,
+               Real* found, Real* residual) {
     const std::int64_t size = 2 * w.z * w.y * w.x;
     return sum_over_lines(w, [&](std::int64_t, std::int64_t, std::int64_t start) {
         double sum = 0.0;
@@ -82,7 +75,7 @@ double modes_descend(const Weights* given_weights, double length, const double* 
 #pragma omp simd reduction(+ : sum)
             for (std::int64_t x = 0; x < w.x; ++x) {
                 const std::int64_t i = first + 2 * x;
-                const double real = residual[i] - length * image[i], imaginary = residual[i + 1] - length * image[i + 1];
+                const Real real = residual[i] - length * image[i], imaginary = residual[i + 1] - length * image[i + 1];
                 found[i] += length * direction[i];
                 found[i + 1] += length * direction[i + 1];
                 residual[i] = real;
@@ -95,13 +88,12 @@ double modes_descend(const Weights* given_weights, double length, const double* 
 }
 
 // direction = inverse residual + share direction.
-void modes_turn(const Weights* given_weights, double share, const double* inverse, const double* residual,
-                double* direction) {
-    const Weights& w = *given_weights;
+template <typename Real>
+void turn(const Weights<Real>& w, Real share, const Real* inverse, const Real* residual, Real* direction) {
     const std::int64_t plane = w.y * w.x;
 #pragma omp parallel for schedule(static)
     for (std::int64_t z = 0; z < 3 * w.z; ++z) {
-        const double* weight = inverse + z % w.z * plane;
+        const Real* weight = inverse + z % w.z * plane;
 #pragma omp simd
         for (std::int64_t i = 0; i < plane; ++i) {
             const std::int64_t at = 2 * (z * plane + i);
@@ -110,5 +102,25 @@ void modes_turn(const Weights* given_weights, double share, const double* invers
         }
     }
 }
+
+}  // namespace
+
+#define FOR_PRECISION(Real, name)                                                                                      \
+    double modes_image_##name(const Weights<Real>* weights, const Real* given, const Real* modes, Real* image) {       \
+        return image_of(*weights, given, modes, image);                                                                \
+    }                                                                                                                  \
+    double modes_descend_##name(const Weights<Real>* weights, double length, const Real* inverse,                      \
+                                const Real* direction, const Real* image, Real* found, Real* residual) {               \
+        return descend(*weights, static_cast<Real>(length), inverse, direction, image, found, residual);               \
+    }                                                                                                                  \
+    void modes_turn_##name(const Weights<Real>* weights, double share, const Real* inverse, const Real* residual,      \
+                           Real* direction) {                                                                          \
+        turn(*weights, static_cast<Real>(share), inverse, residual, direction);                                        \
+    }
+
+extern "C" {
+
+FOR_PRECISION(double, float64)
+FOR_PRECISION(float, float32)
 
 }  // extern "C"

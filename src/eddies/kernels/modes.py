@@ -23,13 +23,13 @@ class CompiledModePasses:
     Parameters
     ----------
     wavevector : kx, ky, kz, to broadcast over (kz, ky, kx); `multiplicity` likewise, of kx alone.
-    inverse_squared, scale, penalty : (kz, ky, kx).
+    inverse_squared, scale, penalty : (kz, ky, kx); `scale` has the precision of all that follows.
     """
 
     def __init__(self, library: ctypes.CDLL, wavevector: Sequence[np.ndarray], multiplicity: np.ndarray,
                  inverse_squared: np.ndarray, scale: np.ndarray, penalty: np.ndarray) -> None:
-        self._library, shape = library, scale.shape
-        self._arrays = [np.ascontiguousarray(array, np.float64)
+        self._library, shape, self._kind = library, scale.shape, scale.dtype
+        self._arrays = [np.ascontiguousarray(array, self._kind)
                         for array in (*wavevector, multiplicity, inverse_squared, scale, penalty)]
         sizes = [array.size for array in self._arrays]
         if sizes != [shape[2], shape[1], shape[0], shape[2], *3 * [scale.size]]:
@@ -52,12 +52,12 @@ class CompiledModePasses:
 
     def _call(self, name: str, result: type | None, given: list, vectors: list[np.ndarray]) -> float:
         """Call a function with a number and an array (kz, ky, kx), or neither, and vectors."""
-        needed = [(array, self._shape, np.float64) for array in given[1:]]
-        needed += [(array, (3, *self._shape), np.complex128) for array in vectors]
+        needed = [(array, self._shape, self._kind) for array in given[1:]]
+        needed += [(array, (3, *self._shape), np.result_type(self._kind, np.complex64)) for array in vectors]
         for array, shape, kind in needed:
             if array.shape != shape or array.dtype != kind or not array.flags.c_contiguous:
-                raise ValueError(f"{name}: {array.dtype} {array.shape}, contiguous {np.dtype(kind)} {shape} is needed")
-        function = getattr(self._library, name)
+                raise ValueError(f"{name}: {array.dtype} {array.shape}, contiguous {kind} {shape} is needed")
+        function = getattr(self._library, f"{name}_{self._kind}")
         function.restype = result
         return function(ctypes.byref(self._weights), *map(ctypes.c_double, given[:1]),
                         *(ctypes.c_void_p(array.ctypes.data) for array, _, _ in needed))

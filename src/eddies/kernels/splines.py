@@ -8,6 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+# What may be read behind the fractions along an axis; splines.cpp has it too.
+PADDING = 8
+
 
 @dataclass(frozen=True)
 class PaddedPlanes:
@@ -32,8 +35,8 @@ class MisplacedPoint(ValueError):
 class _Cloud(ctypes.Structure):
     """Points as splines.cpp wants them."""
 
-    _fields_ = ([(name, ctypes.c_int64) for name in ("points", "cells", "planes", "degree", "chunks")]
-                + [(name, ctypes.c_void_p) for name in ("order", "first", "fraction", "starts", "lines")])
+    _fields_ = ([(name, ctypes.c_int64) for name in ("points", "cells", "planes", "degree")]
+                + [(name, ctypes.c_void_p) for name in ("order", "first", "fraction", "starts")])
 
 
 class CompiledSplines:
@@ -45,13 +48,11 @@ class CompiledSplines:
 
     def __init__(self, library: ctypes.CDLL, degree: int, positions: np.ndarray, padded: PaddedPlanes) -> None:
         self._library, self._padded, count = library, padded, len(positions)
-        # Chunks are as long as splines are wide, for threads that add to every other one of them.
-        chunks = max(padded.cells // (degree + 1) // 2 * 2, 1)
+        sizes = padded.cells, padded.planes
         self._arrays = {"order": np.empty(count, np.int32), "first": np.empty((count, 3), np.int32),
-                        "fraction": np.empty((count, 3)), "starts": np.empty(chunks + 1, np.int64),
-                        "lines": np.empty(padded.cells + degree, np.int64)}
-        self._cloud = _Cloud(count, padded.cells, padded.planes, degree, chunks,
-                             *(array.ctypes.data for array in self._arrays.values()))
+                        "fraction": np.zeros((3, count + PADDING)),
+                        "starts": np.empty(library.splines_bins(*sizes) + 1, np.int64)}
+        self._cloud = _Cloud(count, *sizes, degree, *(array.ctypes.data for array in self._arrays.values()))
         arrange = library.splines_arrange
         arrange.restype = ctypes.c_int64
         misplaced = arrange(ctypes.byref(self._cloud), _address(_doubles(positions)), ctypes.c_double(padded.spacing),
@@ -60,32 +61,39 @@ class CompiledSplines:
             raise MisplacedPoint(misplaced)
 
     def at(self, parts: Sequence[np.ndarray]) -> np.ndarray:
-        """Values (n, c) of planes in single or double precision."""
+        """Values (n, c) of planes in single or double precision, in which they are summed."""
         values = np.empty((self._cloud.points, len(parts[0])))
-        kind = np.result_type(*parts, np.float32)
-        self._call(f"splines_at_{kind}", [part.astype(kind, order="C", copy=False) for part in parts], values)
+        self._call("splines_at", _alike(parts), values)
         return values
 
     def slope(self, parts: Sequence[np.ndarray], factors: np.ndarray) -> np.ndarray:
         """Gradient (n, 3) with respect to the positions of sum_c factors_c f_c, the factors (n, c) held fixed."""
         gradients = np.empty((self._cloud.points, 3))
-        self._call("splines_slope", [_doubles(part) for part in parts], _doubles(factors), gradients)
+        self._call("splines_slope", _alike(parts), _doubles(factors), gradients)
         return gradients / self._padded.spacing
 
     def spread(self, values: np.ndarray, parts: Sequence[np.ndarray]) -> None:
-        """Transpose of `at`: values (n, c) added to planes, contiguous and in double precision."""
+        """Transpose of `at`: values (n, c) added to planes, contiguous and in one precision."""
         self._call("splines_spread", parts, _doubles(values))
 
     def _call(self, name: str, parts: Sequence[np.ndarray], *columns: np.ndarray) -> None:
         """Call a function of the library with the addresses of planes (components, planes) and columns of points."""
+        kind = parts[0].dtype
+        if any(part.dtype != kind or not part[0, 0].flags.c_contiguous for part in parts):
+            raise ValueError(f"planes of {[part.dtype for part in parts]}: contiguous ones in one precision are needed")
         rows = [part.ctypes.data + part.strides[0] * np.arange(len(part))[:, None]
                 + part.strides[1] * np.arange(part.shape[1]) for part in parts]
         planes = np.concatenate(rows, axis=1, dtype=np.uint64, casting="unsafe")
         if planes.shape[1] != self._padded.planes or any(len(column) != self._cloud.points for column in columns):
             raise ValueError(f"{planes.shape[1]} planes, columns of {[len(column) for column in columns]}: "
                              f"{self._padded.planes} planes and {self._cloud.points} points are needed")
-        getattr(self._library, name)(ctypes.byref(self._cloud), ctypes.c_int64(len(planes)), _address(planes),
-                                     *map(_address, columns))
+        function = getattr(self._library, f"{name}_{kind}")
+        function(ctypes.byref(self._cloud), ctypes.c_int64(len(planes)), _address(planes), *map(_address, columns))
+
+
+def _alike(parts: Sequence[np.ndarray]) -> list[np.ndarray]:
+    kind = np.result_type(*parts, np.float32)
+    return [part.astype(kind, order="C", copy=False) for part in parts]
 
 
 def _doubles(array: np.ndarray) -> np.ndarray:

@@ -40,8 +40,9 @@ class PlaneHalo:
 
     def parts(self, planes: np.ndarray) -> list[np.ndarray]:
         """The parts of (c, z_local, ...) with ghost planes of nothing, for `adjoint`."""
-        shape = planes.shape[0], planes.shape[2:]
-        return [np.zeros((shape[0], self.below, *shape[1])), planes, np.zeros((shape[0], self.above, *shape[1]))]
+        below, above = (np.zeros((len(planes), count, *planes.shape[2:]), planes.dtype)
+                        for count in (self.below, self.above))
+        return [below, planes, above]
 
     def adjoint(self, parts: Sequence[np.ndarray]) -> np.ndarray:
         """Transpose of `forward`: ghost planes added at home, to the planes (c, z_local, ...) themselves."""

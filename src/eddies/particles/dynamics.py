@@ -30,8 +30,9 @@ class ParticleDynamics:
     model : the terms. If none of them reads pairs or the resolved velocity there is no neighbour list, no halo, and
         particles do not change rank.
     skin : extra radius of list and halo; they are built anew when some particle has moved by half of it.
-    dtype : precision of pair arithmetic; that of positions unless given. Positions stay in double precision,
-        and pair displacements are converted after the nearest image is taken.
+    dtype : precision of pair arithmetic, and of fields and modes of the resolved velocity; that of positions unless
+        given. Positions stay in double precision, and pair displacements are converted after the nearest image is
+        taken.
     fixed_ranks : particles never change rank, nor rows; for a few steps of which gradients are taken. The halo
         is as much wider as they stray from their slab.
     drift : how far they may stray then, where the resolved velocity is asked for.
@@ -47,7 +48,8 @@ class ParticleDynamics:
         self.neighborhood: Neighborhood | None = None
         if "resolved" in model.reads:
             from eddies.particles import resolved_velocity  # pyfftw, where a transform is needed
-            self.resolution = resolved_velocity.ResolvedVelocity.on_slabs(decomposition, model.flow, skin / 2 + drift)
+            self.resolution = resolved_velocity.ResolvedVelocity.on_slabs(decomposition, model.flow, skin / 2 + drift,
+                                                                          dtype)
         if "pairs" in model.reads:
             self.neighborhood = Neighborhood(decomposition, decomposition.length, model.flow.cutoff, skin)
 

@@ -24,15 +24,17 @@ from eddies.spectral.splines import Splines
 class FourierGrid:
     """A periodic grid of one cell for each plane of the slabs, with the modes |k_i| <= `resolved`.
 
-    Fields are real tensors (c, z_local, y, x), modes complex ones (c, kz, ky, kx) as in `SpectralGrid`; both are in
-    double precision and on the host. Vectors have the order x, y, z, symmetric matrices xx, yy, zz, xy, xz, yz.
-    Positions (n, 3) lie in this rank's slab or at most `reach` outside, which is `margin` grid planes. All methods that
-    change between particles, fields and modes are collective, also on the way back of a gradient.
+    Fields are real tensors (c, z_local, y, x), modes complex ones (c, kz, ky, kx) as in `SpectralGrid`; both are on the
+    host and of the precision of `dtype`, single or double. Values at positions are in double precision. Vectors have
+    the order x, y, z, symmetric matrices xx, yy, zz, xy, xz, yz. Positions (n, 3) lie in this rank's slab or at most
+    `reach` outside, which is `margin` grid planes. All methods that change between particles, fields and modes are
+    collective, also on the way back of a gradient.
     """
 
-    def __init__(self, decomposition: SlabDecomposition, resolved: int, margin: int = 1) -> None:
-        self.decomposition, self.resolved = decomposition, resolved
-        self.spectral = SpectralGrid(decomposition, cutoff=resolved)
+    def __init__(self, decomposition: SlabDecomposition, resolved: int, margin: int = 1,
+                 dtype: torch.dtype = torch.float64) -> None:
+        self.decomposition, self.resolved, self.dtype = decomposition, resolved, dtype
+        self.spectral = SpectralGrid(decomposition, str(dtype).removeprefix("torch."), cutoff=resolved)
         self.spline = SplineInterpolation(self.spectral, "cubic", margin)
         self.reach = margin * decomposition.spacing
         #: kx, ky, kz, to broadcast over (kz, ky, kx)
@@ -77,7 +79,7 @@ class FourierGrid:
 
     def zeros(self, *leading: int) -> Tensor:
         """Modes (*leading, kz, ky, kx) of nothing."""
-        return torch.zeros(*leading, *self.spectral.spectral_shape, dtype=torch.complex128)
+        return torch.zeros(*leading, *self.spectral.spectral_shape, dtype=self.dtype.to_complex())
 
     # ---- formulas on modes
 

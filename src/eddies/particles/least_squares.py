@@ -29,10 +29,10 @@ class LeastSquares:
     """
 
     def __init__(self, grid: FourierGrid, inside: Tensor, penalty: Tensor) -> None:
-        self.grid, self.inside, self.penalty = grid, inside, penalty
+        self.grid, self.inside, self.penalty = grid, inside, penalty.to(grid.dtype)
         scale = torch.where(inside, grid.prefilter * grid.spectral.cells**3, 0.0)
         weights = (grid.spectral.wavevector, grid.spectral.multiplicity, grid.inverse_squared.numpy(), scale.numpy(),
-                   penalty.numpy())
+                   self.penalty.numpy())
         compiled = library()
         self._passes = ModePasses(*weights) if compiled is None else CompiledModePasses(compiled, *weights)
 
@@ -51,7 +51,8 @@ class LeastSquares:
     def size(self, residual: Tensor, count: float) -> float:
         """Square of a residual over all ranks, such that it is comparable to sum_i |v_i|^2."""
         square = residual.real.square() + residual.imag.square()
-        return self._over_ranks(float((self.grid.multiplicity * self.preconditioner(count) * square).sum()))
+        weighted = self.grid.multiplicity * self.preconditioner(count) * square
+        return self._over_ranks(float(weighted.sum(dtype=torch.float64)))
 
     @torch.no_grad()
     def solve(self, points: Points, right: Tensor, count: float, enough: float, iterations: int | None,
@@ -107,4 +108,5 @@ class ModePasses:
         direction += inverse * residual
 
     def _product(self, first: np.ndarray, second: np.ndarray) -> float:
-        return float(np.sum(self.multiplicity * (first.real * second.real + first.imag * second.imag)))
+        products = self.multiplicity * (first.real * second.real + first.imag * second.imag)
+        return float(np.sum(products, dtype=np.float64))

@@ -71,6 +71,6 @@ class ResolvedFlow:
 
     def _rms_of(self, modes: Tensor, above: float) -> Tensor:
         square = (modes.real.square() + modes.imag.square()).sum(0) * self.grid.multiplicity
-        square = torch.where(self.grid.shell > above, square, 0.0).sum()
+        square = torch.where(self.grid.shell > above, square, 0.0).sum(dtype=torch.float64)
         # Where nothing moves the slope of the root is taken for zero.
         return (sum_over_ranks(self.grid.decomposition.comm, square) / 3).clamp_min(1e-300).sqrt()

@@ -78,14 +78,17 @@ class ResolvedVelocity:
         self.equations = LeastSquares(grid, inside, penalty)
 
     @classmethod
-    def on_slabs(cls, decomposition: SlabDecomposition, flow: FlowUnits, margin: float = 0.0) -> ResolvedVelocity:
-        """On a grid of one cell for each plane of the slabs, for particles that lie at most `margin` outside them."""
+    def on_slabs(cls, decomposition: SlabDecomposition, flow: FlowUnits, margin: float = 0.0,
+                 dtype: torch.dtype | None = None) -> ResolvedVelocity:
+        """On a grid of one cell for each plane of the slabs, for particles that lie at most `margin` outside them; in
+        double precision unless `dtype` is another."""
         scales = flow.scales
         highest = resolved_wavenumber(scales.spacing, scales.filter_width, scales.kolmogorov_length)
         shells = int(highest * decomposition.length / (2 * math.pi) + 1e-9)
         resolved = min(max(shells, 1), (decomposition.planes - 1) // 2)
         planes = max(math.ceil(margin / decomposition.spacing - 1e-9), 1)
-        return cls(FourierGrid(decomposition, resolved, planes), flow.scales.filter_width)
+        grid = FourierGrid(decomposition, resolved, planes, dtype or torch.float64)
+        return cls(grid, flow.scales.filter_width)
 
     def of(self, particles: ParticleSet, time: float | None = None) -> ResolvedFlow:
         """The resolved flow of particles; `time` tells what is foreseen of it."""
@@ -112,9 +115,9 @@ class ResolvedVelocity:
         energy = 0.5 * grid.multiplicity * (modes.real.square() + modes.imag.square()).sum(0)
         shell = torch.round(grid.shell).long()
         inside = (shell > 0) & (shell <= grid.resolved)
-        bands = energy.new_zeros((grid.resolved - 1) // BAND + 1)
+        bands = energy.new_zeros((grid.resolved - 1) // BAND + 1, dtype=torch.float64)
         return sum_over_ranks(grid.decomposition.comm,
-                              bands.index_add(0, (shell[inside] - 1) // BAND, energy[inside]))
+                              bands.index_add(0, (shell[inside] - 1) // BAND, energy[inside].double()))
 
     # ---- from one evaluation to the next
 
@@ -164,7 +167,8 @@ class ResolvedVelocity:
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Inverse of `state_dict`."""
-        self._moments = [_Moment(float(time), *modes) for time, modes in zip(state["times"], state["modes"])]
+        modes = state["modes"].to(self.grid.dtype.to_complex())
+        self._moments = [_Moment(float(time), *pair) for time, pair in zip(state["times"], modes)]
         self.speed = float(state["speed"])
 
     def _carried(self, modes: Tensor, step: float, mean: np.ndarray) -> Tensor:

@@ -76,7 +76,7 @@ class SplineInterpolation:
     def spread(self, values: np.ndarray, splines: Splines | CompiledSplines) -> np.ndarray:
         """The transpose of `with_ghosts` and values at points: planes (c, z_local, y, x) of values (n, c) times the
         splines around them."""
-        parts = self._halo.parts(np.zeros((values.shape[1], *self.grid.physical_shape)))
+        parts = self._halo.parts(np.zeros((values.shape[1], *self.grid.physical_shape), self.grid.real))
         splines.spread(values, parts)
         return self._halo.adjoint(parts)
 

@@ -45,4 +45,4 @@ class Damping(Term):
         place = grid.shell * (len(self.rates) / grid.resolved)
         below = place.long().clamp_max(len(self.rates) - 1)
         fraction = (place - below).clamp_max(1.0)
-        return (1 - fraction) * rates[below] + fraction * rates[below + 1]
+        return ((1 - fraction) * rates[below] + fraction * rates[below + 1]).to(grid.dtype)

@@ -106,7 +106,7 @@ class TrainingData:
             dynamics.resolution.tolerance_foreseen = dynamics.resolution.tolerance
         resolution = None
         if settings.energy_weight > 0:
-            resolution = dynamics.resolution or ResolvedVelocity.on_slabs(slab, self.model.flow, drift)
+            resolution = dynamics.resolution or ResolvedVelocity.on_slabs(slab, self.model.flow, drift, self.dtype)
         starts = np.unique(np.linspace(0, self.learned - self.longest, self.settings.frames).astype(int))
         windows = [self._window(start, resolution) for start in starts]
         validation = self._window(self.last - self.longest, resolution)

@@ -1,0 +1,154 @@
+"""An evaluation of a particle model within a rollout, and its parts.
+
+    mpirun -n 2 .venv/bin/python -m mpi4py tests/benchmarks/particle_step.py [PARTICLES A SIDE] [--model NAME]
+        [--threads T] [--precision float64]
+
+Particles at random in a solenoidal velocity of spectrum k^(-5/3), filtered at two particle spacings, are moved by a
+model of initial weights. Steps are as long as a rollout takes them. Ten go before those that count. Prints a JSON line
+with medians over the steps: seconds an evaluation, of the slowest rank, and of it each part; iterations of a solve;
+evaluations and seconds for a turnover of the field.
+"""
+
+import argparse
+import json
+import math
+import time
+from collections import Counter
+from statistics import median
+
+import numpy as np
+import torch
+from mpi4py import MPI
+from step import Stopwatch
+
+from eddies.flow.filtering import gaussian_transfer
+from eddies.flow.initial_fields import random_velocity
+from eddies.flow.statistics import energy_spectrum, turbulence_scales
+from eddies.flow.tracers import release
+from eddies.import_path import load
+from eddies.kernels.modes import CompiledModePasses
+from eddies.parallel.slab import SlabDecomposition
+from eddies.particles.context import Context
+from eddies.particles.dynamics import ParticleDynamics
+from eddies.particles.flow_units import FlowUnits
+from eddies.particles.fourier_grid import Points
+from eddies.particles.integrators import INTEGRATORS
+from eddies.particles.least_squares import LeastSquares, ModePasses
+from eddies.particles.model import build_model
+from eddies.particles.neighborhood import Neighborhood
+from eddies.particles.particle_set import ParticleSet
+from eddies.particles.reference_scales import ReferenceScales, allowed_step
+from eddies.particles.resolved_velocity import ResolvedVelocity
+from eddies.particles.terms.presets import DEFAULT_PRESET, PRESETS, TERMS
+from eddies.scene.sections import Tracers
+from eddies.spectral.interpolation import SplineInterpolation
+from eddies.spectral.spectral_grid import SpectralGrid
+
+WARM_UP, STEPS, INTEGRATOR, NEIGHBORS = 10, 6, "rk3", 60.0
+PARTS = {
+    "transforms": [(SpectralGrid, "forward"), (SpectralGrid, "backward")],
+    "splines": [(Points, "at"), (Points, "spread"), (SplineInterpolation, "with_ghosts")],
+    "vectors": [(passes, name) for passes in (ModePasses, CompiledModePasses) for name in ("image", "descend", "turn")],
+    "solve, the rest": [(LeastSquares, "solve")],
+    "closure, the rest": [(ResolvedVelocity, "of"), (ResolvedVelocity, "remember")],
+    "pairs": [(Context, "sum_pairs"), (Neighborhood, "update")],
+    "settle": [(ParticleDynamics, "settle")],
+}
+
+
+def filtered_velocity(comm: MPI.Comm, side: int, width: float) -> tuple[SpectralGrid, np.ndarray]:
+    """A grid of two cells a particle and direction, and modes on it: rms 1 a component before the filter."""
+    grid = SpectralGrid(SlabDecomposition(comm, 2 * math.pi, 2 * side), cutoff=side - 1)
+    modes = random_velocity(grid, 1, 1.0, side)
+    k, energy = energy_spectrum(grid, modes)
+    target = np.where((k > 0) & (k < side), np.maximum(k, 1) ** (-5 / 3), 0.0)
+    shares = np.sqrt(np.divide(1.5 * target / target.sum(), energy, out=np.zeros(len(k)), where=energy > 0))
+    modes *= shares[np.rint(np.sqrt(grid.index_squared)).astype(int)]
+    return grid, gaussian_transfer(grid.wavenumber_squared, width) * modes
+
+
+class Run:
+    """Particles and what moves them, from the beginning."""
+
+    def __init__(self, comm: MPI.Comm, side: int, model: str, precision: str) -> None:
+        tracers = Tracers(particles_per_side=side, turnovers=1.0, frame_interval=1.0)
+        width = 2 * tracers.spacing
+        grid, modes = filtered_velocity(comm, side, width)
+        scales = turbulence_scales(energy_spectrum(grid, modes)[1], 0.0, 0.0, grid.cutoff)
+        self.speed, self.turnover = scales["velocity_rms"], scales["eddy_turnover_time"]
+        slab = SlabDecomposition(comm, 2 * math.pi, tracers.planes)
+        columns = release(slab, 1, side, "random")
+        columns["velocity"] = self._velocity(grid, modes, columns["position"])
+        self.particles = ParticleSet.from_numpy(columns)
+        flow = FlowUnits(ReferenceScales(filter_width=width, spacing=tracers.spacing, velocity=self.speed,
+                                         acceleration=self.speed / self.turnover, density_mean=1.0, viscosity=1e-3),
+                         tracers.radius_of(NEIGHBORS), NEIGHBORS)
+        dtype, terms = getattr(torch, precision), PRESETS[model]
+        settings = {word: load(TERMS[word][1])(**chosen) for word, chosen in terms.items()}
+        self.dynamics = ParticleDynamics(slab, build_model(settings, terms, flow).to(dtype), 0.0, dtype)
+        self.integrator = INTEGRATORS[INTEGRATOR](self.dynamics)
+
+    @staticmethod
+    def _velocity(grid: SpectralGrid, modes: np.ndarray, position: np.ndarray) -> np.ndarray:
+        # The slabs of the particles are not cut where those of the field are.
+        spline = SplineInterpolation(grid, "quintic", margin=2)
+        return spline.at(spline.coefficients(modes), position)
+
+    @property
+    def step(self) -> float:
+        """As long as the flow allows."""
+        resolution = self.dynamics.resolution
+        if resolution is None:
+            raise SystemExit("particle_step: the model has no resolved velocity, which sets the step")
+        highest = resolution.grid.resolved * 2 * math.pi / self.dynamics.box.length
+        return allowed_step(INTEGRATOR, highest, resolution.speed or self.speed)
+
+    def advance(self) -> None:
+        """Take a step."""
+        self.particles = self.integrator.step(self.particles, self.step)
+
+
+def measure(comm: MPI.Comm, run: Run) -> dict[str, object]:
+    """Medians over steps; of each the seconds of the slowest rank."""
+    watch = Stopwatch()
+    for part, functions in PARTS.items():
+        for owner, name in functions:
+            watch.wrap(owner, name, part)
+    found: list[Counter] = []
+    for number in range(WARM_UP + STEPS):
+        run.dynamics.evaluations, run.dynamics.resolution.solves = 0, []
+        comm.Barrier()
+        watch.reset()
+        watch.last = start = time.perf_counter()
+        run.advance()
+        watch.switch()
+        seconds = Counter({part: comm.allreduce(watch.seconds[part], MPI.MAX) for part in (*PARTS, "the rest")})
+        seconds["whole"] = comm.allreduce(time.perf_counter() - start, MPI.MAX)
+        taken = Counter({name: value / run.dynamics.evaluations for name, value in seconds.items()})
+        taken["iterations"] = np.mean([solve[0] for solve in run.dynamics.resolution.solves])
+        if number >= WARM_UP:
+            found.append(taken)
+    medians = {name: float(median(step[name] for step in found)) for name in found[0]}
+    whole, evaluations = medians.pop("whole"), run.dynamics.evaluations * run.turnover / run.step
+    return {"seconds_per_evaluation": whole, "iterations": medians.pop("iterations"),
+            "evaluations_per_turnover": evaluations, "seconds_per_turnover": whole * evaluations, "parts": medians}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("side", nargs="?", type=int, default=64)
+    parser.add_argument("--model", choices=[name for name in PRESETS if "resolved" in name], default=DEFAULT_PRESET)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--precision", choices=("float32", "float64"), default="float32")
+    options, comm = parser.parse_args(), MPI.COMM_WORLD
+    torch.set_num_threads(options.threads)
+    with torch.no_grad():
+        run = Run(comm, options.side, options.model, options.precision)
+        found = measure(comm, run)
+    if comm.rank == 0:
+        print(json.dumps({"particles": options.side, "ranks": comm.size, "threads": options.threads,
+                          "model": options.model, "precision": options.precision, **found}))
+
+
+if __name__ == "__main__":
+    main()
