@@ -123,8 +123,8 @@ class ParticleField:
 
     def _averages(self, kernel: SmoothingKernel, position: Tensor, columns: Tensor,
                   itself: Tensor) -> tuple[Tensor, Tensor]:
-        """Velocity (m, 3) and its gradient (m, 3, 3) at the first m of some positions (s, 3), from sums over all others,
-        which have `columns` (s, 4) of volume and velocity. `itself` (m, 4): V W(0) of each as one of its own
+        """Velocity (m, 3) and its gradient (m, 3, 3) at the first m of some positions (s, 3), from sums over all
+        others, which have `columns` (s, 4) of volume and velocity. `itself` (m, 4): V W(0) of each as one of its own
         neighbours, and the velocity that others are taken relative to."""
         sums = self._sums(kernel, "kernel-average", 16, position, len(itself), tuple(columns.T))[0]
         factor = reciprocal(sums[:1] + itself.T[:1])

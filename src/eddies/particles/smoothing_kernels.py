@@ -27,8 +27,9 @@ class SmoothingKernel(Protocol):
 
     @property
     def pieces(self) -> Tensor:
-        """W(r) in each of equally long pieces of 0 <= r < support: the coefficients of u^0, u^1, ... for u = 1 ... 0 from
-        a piece's begin to its end, (pieces, coefficients). Near the support, where u is small, they cancel least."""
+        """W(r) in each of equally long pieces of 0 <= r < support: the coefficients of u^0, u^1, ... for u = 1 ... 0
+        from a piece's begin to its end, (pieces, coefficients). Near the support, where u is small, they cancel least.
+        """
 
     def value(self, distance: Tensor) -> Tensor: ...
 
