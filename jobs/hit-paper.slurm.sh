@@ -16,7 +16,7 @@
 #SBATCH --requeue
 #SBATCH --open-mode=append
 EDDIES_SCENE=hit-paper
-ground_truth() { srun "$1" dns "${@:3}"; }  # this stage instead of `run`, which is all of them
+ground_truth() { srun --cpus-per-task="${SLURM_CPUS_PER_TASK:-1}" "$1" dns "${@:3}"; }  # this stage instead of `run`, which is all of them
 launcher=(ground_truth)
 resubmit=(scontrol requeue "${SLURM_JOB_ID:-}")
 

@@ -3,13 +3,15 @@
 # Submit from the checkout, or set EDDIES_CHECKOUT to it. Load your cluster's modules first, as for set-up.
 #BSUB -J eddies
 #BSUB -n 8
+# With T threads a rank: core(T), and OMP_NUM_THREADS=T in the environment of bsub.
+#BSUB -R "affinity[core(1)]"
 #BSUB -W 4:00
 #BSUB -o eddies.%J.log
 # SIGUSR1 five minutes before the limit: the ranks end with 75, which queues the job again.
 #BSUB -wa USR1
 #BSUB -wt 5
 #BSUB -Q 75
-launcher=(mpirun)
+launcher=(mpirun --map-by "slot:PE=${OMP_NUM_THREADS:-1}")
 resubmit=(true)
 
 # ---- the same for every scheduler

@@ -5,11 +5,11 @@
 # Read from the environment of the job:
 #   EDDIES_SCENE     built-in name or path (default: hit-small)
 #   EDDIES_OUTPUT    run directory (default: runs/NAME)
-#   OMP_NUM_THREADS  threads a rank (default: 1)
+#   OMP_NUM_THREADS  threads a rank (default: those that Slurm gives a rank, or 1)
 # Arguments go to `eddies run`: --set section.key=value and the like.
 
 checkout=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
-export OMP_NUM_THREADS=${OMP_NUM_THREADS:-1}
+export OMP_NUM_THREADS=${OMP_NUM_THREADS:-${SLURM_CPUS_PER_TASK:-1}}
 arguments=(run "${EDDIES_SCENE:-hit-small}" --resume)
 if [ -n "${EDDIES_OUTPUT:-}" ]; then arguments+=(--output "$EDDIES_OUTPUT"); fi
 

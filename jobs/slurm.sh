@@ -4,13 +4,14 @@
 #SBATCH --job-name=eddies
 #SBATCH --nodes=1
 #SBATCH --ntasks-per-node=8
+# Threads a rank:
 #SBATCH --cpus-per-task=1
 #SBATCH --time=04:00:00
 # SIGUSR1 to the ranks five minutes before the limit: they end with 75, and the job is queued again.
 #SBATCH --signal=USR1@300
 #SBATCH --requeue
 #SBATCH --open-mode=append
-launcher=(srun)
+launcher=(srun --cpus-per-task="${SLURM_CPUS_PER_TASK:-1}")
 resubmit=(scontrol requeue "${SLURM_JOB_ID:-}")
 
 # ---- the same for every scheduler

@@ -4,8 +4,8 @@ SIGTERM and SIGUSR1 reach the ranks as SIGUSR1, so that they can end in order; a
 
     python mpi_tools/launch.py [-n RANKS] -- COMMAND...
 
-RANKS is the number of cores, or EDDIES_RANKS where that is smaller. Variables that are set already stay as
-they are.
+RANKS is the number of cores over OMP_NUM_THREADS, or EDDIES_RANKS where that is smaller. Variables that are set already
+stay as they are.
 """
 
 import argparse
@@ -31,11 +31,19 @@ def local_cores() -> int:
 
 
 def default_ranks() -> int:
-    """All cores, or EDDIES_RANKS where that asks for fewer; ValueError if it is no positive integer."""
-    asked = os.environ.get("EDDIES_RANKS") or str(local_cores())
+    """As many as there are cores for OMP_NUM_THREADS threads each, or EDDIES_RANKS where that asks for fewer.
+
+    Raises ValueError if one of these is no positive integer.
+    """
+    most = max(local_cores() // _number("OMP_NUM_THREADS", 1), 1)
+    return min(most, _number("EDDIES_RANKS", most))
+
+
+def _number(name: str, otherwise: int) -> int:
+    asked = os.environ.get(name) or str(otherwise)
     if not asked.isdigit() or int(asked) < 1:
-        raise ValueError(f"EDDIES_RANKS = {asked!r}: a positive number of ranks is expected")
-    return min(local_cores(), int(asked))
+        raise ValueError(f"{name} = {asked!r}: a positive number is expected")
+    return int(asked)
 
 
 def mpi_environment(ranks: int) -> dict[str, str]:

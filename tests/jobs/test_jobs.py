@@ -40,7 +40,7 @@ def checkout(tmp_path):
     (tmp_path / "mpi_tools").mkdir()
     shutil.copy(CHECKOUT / "mpi_tools/launch.py", tmp_path / "mpi_tools")
     for name, text in {"mpi_tools/bootstrap.sh": "true", "bin/mpirun": 'echo "mpirun $*"; shift 2; "$@"',
-                       "bin/srun": '"$@"', "bin/scontrol": 'echo "scontrol $*"',
+                       "bin/srun": 'echo "srun $1"; shift; "$@"', "bin/scontrol": 'echo "scontrol $*"',
                        ".venv/bin/eddies": '[ "$1" != check ] || { echo "$CHECKED"; exit ${CHECK_ENDS_WITH:-0}; }\n'
                                            'echo "eddies $*; threads $OMP_NUM_THREADS"\nexit ${ENDS_WITH:-0}',
                        ".venv/bin/python": f'exec {sys.executable} "$@"'}.items():
@@ -52,7 +52,7 @@ def checkout(tmp_path):
 
 
 def run(checkout, script, *arguments, **variables):
-    ours = {name: value for name, value in os.environ.items() if not re.match("EDDIES_|OMP_|PBS_", name)}
+    ours = {name: value for name, value in os.environ.items() if not re.match("EDDIES_|OMP_|PBS_|SLURM_", name)}
     path = f"{checkout / 'bin'}:{os.environ['PATH']}"
     return subprocess.run(["bash", checkout / "jobs" / script, *arguments], cwd=checkout, text=True,
                           capture_output=True, timeout=60,
@@ -93,9 +93,9 @@ def test_local_refuses_a_wrong_number_of_ranks(checkout, asked):
 @pytest.mark.parametrize("status, requeued", [("0", False), ("2", False), ("75", True)])
 def test_batch_job_is_requeued_after_a_checkpoint(checkout, status, requeued):
     result = run(checkout, "slurm.sh", SLURM_JOB_ID="17", ENDS_WITH=status, EDDIES_SCENE="hit",
-                 EDDIES_OUTPUT="there", OMP_NUM_THREADS="3")
+                 EDDIES_OUTPUT="there", SLURM_CPUS_PER_TASK="3")
     assert result.returncode == int(status)
-    assert "eddies run hit --resume --output there; threads 3\n" in result.stdout
+    assert "srun --cpus-per-task=3\neddies run hit --resume --output there; threads 3\n" in result.stdout
     assert ("scontrol requeue 17" in result.stdout) == requeued
 
 

@@ -20,12 +20,18 @@ def launched(ranks, *python_arguments, cwd=None):
 
 def test_ranks_are_the_cores_or_fewer(monkeypatch):
     monkeypatch.setattr(launch, "local_cores", lambda: 4)
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     for asked, ranks in {"": 4, "3": 3, "9": 4}.items():
         monkeypatch.setenv("EDDIES_RANKS", asked)
         assert launch.default_ranks() == ranks
-    monkeypatch.setenv("EDDIES_RANKS", "many")
-    with pytest.raises(ValueError, match="EDDIES_RANKS = 'many'"):
-        launch.default_ranks()
+    for threads, ranks in {"2": 2, "3": 1, "8": 1}.items():
+        monkeypatch.setenv("OMP_NUM_THREADS", threads)
+        assert launch.default_ranks() == ranks
+    for name in ("OMP_NUM_THREADS", "EDDIES_RANKS"):
+        with monkeypatch.context() as other:
+            other.setenv(name, "many")
+            with pytest.raises(ValueError, match=f"{name} = 'many'"):
+                launch.default_ranks()
 
 
 def test_container_quota_limits_the_cores(monkeypatch, tmp_path):
