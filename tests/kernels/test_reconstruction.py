@@ -1,0 +1,63 @@
+"""Compiled averages over particles against those of torch, for each instruction set that this processor runs."""
+
+import numpy as np
+import pytest
+import torch
+
+from eddies.flow.tracers import release
+from eddies.kernels.reconstruction import GridPlanes, sums_on_grid
+from eddies.parallel.slab import SlabDecomposition
+from eddies.particles.particle_field import ParticleField
+from eddies.particles.smoothing_kernels import CubicSpline, KernelNetwork, WendlandC2
+
+LENGTH = 2 * np.pi
+KERNELS = {"cubic spline": CubicSpline, "wendland": WendlandC2,
+           "tabulated": lambda support: KernelNetwork(support, (5,)).double().table()}
+
+
+@pytest.mark.parametrize("kind", KERNELS)
+def test_pieces_are_the_kernel(kind):
+    with torch.no_grad():
+        kernel = KERNELS[kind](0.7)
+    coefficients = kernel.pieces.double()
+    distance = torch.linspace(0, 0.7, 1001, dtype=torch.float64)[:-1]
+    place = distance / 0.7 * len(coefficients)
+    u = 1 - (place - place.floor())
+    found = sum(c * u**power for power, c in enumerate(coefficients[place.long()].T))
+    assert torch.allclose(found, kernel.value(distance), rtol=1e-12, atol=1e-14)
+
+
+def averages(field, kernel):
+    """Everything that a field is asked for without a gradient."""
+    with torch.no_grad():
+        return [field.volumes(kernel), field.velocity_on_whole_grid(kernel), *field.on_whole_grid(kernel),
+                *field.at_particles(kernel)]
+
+
+@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.parametrize("neighbors", [60, 3])
+@pytest.mark.parametrize("dtype, rounding", [(torch.float64, 1e-11), (torch.float32, 2e-4)])
+@pytest.mark.parametrize("kind", KERNELS)
+def test_averages_are_those_of_torch(comm, library, monkeypatch, kind, dtype, rounding, neighbors):
+    """Also with so few neighbours that some points have none, and gradients are quotients of small numbers."""
+    if neighbors == 3 and dtype == torch.float32:
+        pytest.skip("of one neighbour at the very edge of the kernel single precision tells nothing")
+    slab = SlabDecomposition(comm, LENGTH, 15)
+    position = torch.from_numpy(release(slab, 3, 12, "random")["position"])
+    support = LENGTH / 12 * (neighbors / (4 / 3 * np.pi)) ** (1 / 3)
+    field = ParticleField(slab, 1.2 * support, position, torch.sin(2 * position), dtype)
+    with torch.no_grad():
+        kernel = KERNELS[kind](support)
+    monkeypatch.setattr("eddies.particles.compiled_pairs.library", lambda: library)
+    monkeypatch.setattr("eddies.particles.particle_field.library", lambda: library)
+    found = averages(field, kernel)
+    monkeypatch.setattr("eddies.particles.particle_field.available", lambda device: False)
+    expected = averages(field, kernel)
+    for one, other in zip(found, expected, strict=True):
+        assert one.shape == other.shape
+        assert (one - other).abs().max() <= rounding * other.abs().max() > 0
+
+
+def test_wrong_columns_are_refused(library):
+    with pytest.raises(ValueError, match="four are needed"):
+        sums_on_grid(library, GridPlanes(8, 0.1, 0, 8, True), 0.2, np.ones((1, 4)), np.zeros((5, 3)), np.zeros((5, 3)))
