@@ -105,6 +105,6 @@ def test_few_particles_move_straight_on(comm, integrator, total):
 @pytest.mark.mpi(1)
 @every_closure
 def test_a_lattice_at_rest_stays_at_rest(comm, kind):
-    assert lattice_at_rest(comm, kind) < 1e-13
     # The pressures of WCSPH are c^2, a hundred times the accelerations, and cancel.
+    assert lattice_at_rest(comm, kind) < (1e-11 if kind == "wcsph" else 1e-13)
     assert lattice_at_rest(comm, kind, torch.float32) < (1e-3 if kind == "wcsph" else 1e-5)

@@ -189,10 +189,9 @@ def test_a_density_contrast_of_a_thousand_leaves_forces_bounded(comm, kind):
 @pytest.mark.mpi(1)
 @every_closure
 def test_single_precision_follows_double_precision(comm, kind):
-    # Round-off of single precision, 6e-8, a few times.
-    # What is made on the grid is in double precision whatever that of the particles is.
-    least = 1e-9 if "pairs" in network_model(kind, TOTAL).reads else 1e-11
-    assert least < precision_error(comm, kind, 8) < 1e-6
+    # Round-off of single precision, 6e-8, a few times; more often where there are transforms and a solve.
+    most = 1e-5 if "resolved" in network_model(kind, TOTAL).reads else 1e-6
+    assert 1e-9 < precision_error(comm, kind, 8) < most
 
 
 @pytest.mark.mpi(1, 2)

@@ -18,7 +18,7 @@ from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.fourier_grid import FourierGrid
 from eddies.particles.integrators import INTEGRATORS
-from eddies.particles.neighbor_list import NeighborList
+from eddies.particles.neighborhood import Neighborhood
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.reference_scales import ReferenceScales
 from eddies.particles.resolved_velocity import ResolvedVelocity
@@ -213,14 +213,14 @@ def test_a_model_pays_with_transposes_for_the_terms_that_it_has_alone(comm):
 def test_without_a_pair_sum_no_neighbours_are_searched_and_no_density_travels(comm):
     found = {}
     for name in ("resolved + pairs", "resolved"):
-        with counted((NeighborList, "build"), (NeighborList, "pairs")) as calls:
+        with counted((Neighborhood, "update"), (Context, "sum_pairs")) as calls:
             counting = CountingComm(comm)
             step = particle_step(counting, PRESETS[name])
             counting.sent.clear()
             step()
-        found[name] = calls.count("build"), calls.count("pairs"), counting.sent.count("Sendrecv")
+        found[name] = calls.count("update"), "sum_pairs" in calls, counting.sent.count("Sendrecv")
     # Position, velocity and density of ghost particles go up and down.
-    assert found["resolved"][:2] == (0, 0) < found["resolved + pairs"][:2]
+    assert found["resolved"][0] == 0 < found["resolved + pairs"][0] and found["resolved + pairs"][1]
     assert found["resolved"][2] == found["resolved + pairs"][2] - 6
 
 
@@ -288,10 +288,10 @@ def test_a_term_that_is_not_there_is_not_evaluated(comm):
     found = {}
     for name, terms in (("none", {"pairs": {}}), ("both", {"pairs": {}, "eddy-viscosity": {}})):
         step = particle_step(comm, terms)
-        with counted((EddyViscosity, "pair_values"), (ResolvedVelocity, "of"), (Context, "without_mean")) as calls:
+        with counted((EddyViscosity, "rates_of"), (ResolvedVelocity, "of"), (Context, "without_mean")) as calls:
             step()
         found[name] = calls
-    assert found["none"] == [] and set(found["both"]) == {"pair_values"}
+    assert found["none"] == [] and set(found["both"]) == {"rates_of"}
 
 
 @pytest.mark.mpi(1)

@@ -21,11 +21,13 @@ class CompiledSum:
     ----------
     summand : kind and options.
     parameters : (p,), differentiable. scalars : columns (s,) of all particles that this rank sees, likewise.
+    reads_velocity : whether velocities matter.
     """
 
     summand: Summand
     parameters: Tensor
     scalars: tuple[Tensor, ...] = ()
+    reads_velocity: bool = True
 
 
 def available(device: torch.device) -> bool:
@@ -33,14 +35,15 @@ def available(device: torch.device) -> bool:
     return device.type == "cpu" and library() is not None
 
 
-def compiled_sums(space: PairSpace, summands: Sequence[CompiledSum], position: Tensor, velocity: Tensor,
-                  wanted: np.ndarray, dtype: torch.dtype) -> tuple[Tensor, ...]:
+def compiled_sums(space: PairSpace, summands: Sequence[CompiledSum], position: Tensor,
+                  velocity: Tensor | None, wanted: np.ndarray, dtype: torch.dtype) -> tuple[Tensor, ...]:
     """The sums (components, s) of each summand at the particles `wanted`, bool (s,), over those within the radius;
     elsewhere they mean nothing. Differentiable.
 
     Parameters
     ----------
-    position, velocity : (s, 3), of all particles that this rank sees. dtype : of the arithmetic.
+    position, velocity : (s, 3), of all particles that this rank sees; no velocity where no summand reads it.
+    dtype : of the arithmetic.
 
     Raises ValueError where a position is not finite.
     """
@@ -53,6 +56,7 @@ def compiled_sums(space: PairSpace, summands: Sequence[CompiledSum], position: T
             columns += summand.scalars
         placed.append(replace(summand.summand, scalar=known))
     scalars = torch.stack(columns).double() if columns else position.new_zeros(0, len(position))
+    velocity = torch.zeros_like(position) if velocity is None else velocity
     return _PairSums.apply(space, placed, wanted, dtype, position, velocity, scalars,
                            *(summand.parameters for summand in summands))
 

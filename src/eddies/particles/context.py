@@ -179,7 +179,8 @@ class Context:
             wanted[self.rows.numpy()] = True
         space = PairSpace(local.box.length, local.box.periodic_z, flow.cutoff, flow.scales.filter_width,
                           flow.scales.velocity, mutual)
-        found = compiled_sums(space, summands, local.position, self.column("velocity"), wanted, self.dtype)
+        velocity = self.column("velocity") if any(summand.reads_velocity for summand in summands) else None
+        found = compiled_sums(space, summands, local.position, velocity, wanted, self.dtype)
         return [sums[:, :owned] if self.rows is None else sums.index_select(1, self.rows) for sums in found]
 
     def _sums_of(self, summands: Sequence[PairSum]) -> Sequence[Tensor]:
@@ -235,7 +236,7 @@ class _SharedMoments:
 
     def compiled(self, context: Context) -> CompiledSum:
         """The same for the compiled library."""
-        return CompiledSum(Summand("moments", 7), torch.empty(0))
+        return CompiledSum(Summand("moments", 7), torch.empty(0), reads_velocity=False)
 
 
 _MOMENTS = _SharedMoments()

@@ -138,8 +138,8 @@ class ParticleField:
         told = Summand(kind, components, constants=told_kernel(kernel.support, kernel.pieces.numpy()))
         space = PairSpace(self.decomposition.length, self.decomposition.size == 1, kernel.support, 1.0, 1.0, False)
         wanted = np.arange(len(position)) < count
-        found = compiled_sums(space, [CompiledSum(told, torch.empty(0), scalars)], position,
-                              torch.zeros_like(position), wanted, self.dtype)
+        summand = CompiledSum(told, torch.empty(0), scalars, reads_velocity=False)
+        found = compiled_sums(space, [summand], position, None, wanted, self.dtype)
         return tuple(sums[:, :count] for sums in found)
 
     @cached_property

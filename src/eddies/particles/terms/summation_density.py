@@ -44,8 +44,9 @@ class SummationDensity(PairTerm):
     def compiled(self, context: Context) -> CompiledSum:
         """The same for the compiled library."""
         support = self.kernel.support
-        return CompiledSum(Summand("summation-density", 1, (self.settings.kernel == "wendland",),
-                                   (support / context.flow.scales.filter_width, support**-3)), torch.empty(0))
+        told = Summand("summation-density", 1, (self.settings.kernel == "wendland",),
+                       (support / context.flow.scales.filter_width, support**-3))
+        return CompiledSum(told, torch.empty(0), reads_velocity=False)
 
     def rates_of(self, sums: Tensor, context: Context) -> Rates:
         """The density's deviation from the mean."""
