@@ -78,8 +78,8 @@ class Cells {
     // Put particles (count, 3) in order, in a box of this length, periodic along x and y, and along z if so told; cells
     // no narrower than `reach` across rows. Points (number, 3) are others that `place` will be asked of, or null. All
     // are finite.
-    void arrange(const double* position, std::int64_t particles, const double* points, std::int64_t number, double length,
-                 bool periodic_z, double reach) {
+    void arrange(const double* position, std::int64_t particles, const double* points, std::int64_t number,
+                 double length, bool periodic_z, double reach) {
         count = particles;
         double lowest = 0.0, highest = length;
         if (!periodic_z) {
@@ -212,7 +212,8 @@ class Cells {
     // Of a particle, whose row is known.
     Place place_of(std::int64_t at, std::int64_t row) const {
         Place found;
-        for (int axis = 0; axis < 3; ++axis) found.fraction[axis] = static_cast<double>(turn[axis][at]) * Turns<Real>::UNIT;
+        for (int axis = 0; axis < 3; ++axis)
+            found.fraction[axis] = static_cast<double>(turn[axis][at]) * Turns<Real>::UNIT;
         found.index[0] = 0;
         found.index[1] = row % lines;
         found.index[2] = row / lines;
@@ -237,7 +238,7 @@ class Cells {
     double origin, period[3], width[3];  // of z; and how wide a cell is, in periods
     bool wraps[3];
 
-    static std::int64_t at_least_one(double number) { return std::max<std::int64_t>(static_cast<std::int64_t>(number), 1); }
+    static std::int64_t at_least_one(double number) { return static_cast<std::int64_t>(std::max(number, 1.0)); }
 };
 
 }  // namespace eddies

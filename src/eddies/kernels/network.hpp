@@ -160,7 +160,8 @@ class Network {
     // After `forward`: from the gradient by outputs those by parameters, added to a vector for each, and by features.
     void backward(Real* by_parameters, bool features_too) {
         constexpr int lanes = VectorOf<Real>::lanes;
-        for (int layer = 0; layer < layers(); ++layer) by_parameters += lanes * (widths_[layer] + 1) * widths_[layer + 1];
+        for (int layer = 0; layer < layers(); ++layer)
+            by_parameters += lanes * (widths_[layer] + 1) * widths_[layer + 1];
         for (int layer = layers() - 1; layer >= 0; --layer) {
             const int inputs = widths_[layer], outputs = widths_[layer + 1];
             const Real *delta = deltas_[layer + 1][0], *given = values_[layer][0];

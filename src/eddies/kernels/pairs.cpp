@@ -43,10 +43,13 @@ namespace {
 
 using namespace eddies;
 
-constexpr int ROWS_TOGETHER = 4;      // of a colour, for one thread
+constexpr int ROWS_TOGETHER = 4;         // of a colour, for one thread
 constexpr std::int64_t CANDIDATES = 64;  // looked at together
 
-enum Kind { PAIR_NETWORK, MOMENTS, EDDY_VISCOSITY, DENSITY_TRANSPORT, SUMMATION_DENSITY, WCSPH, KERNEL_SUM, KERNEL_AVERAGE };
+// In the order of kernels/pairs.py.
+enum Kind {
+    PAIR_NETWORK, MOMENTS, EDDY_VISCOSITY, DENSITY_TRANSPORT, SUMMATION_DENSITY, WCSPH, KERNEL_SUM, KERNEL_AVERAGE
+};
 
 template <typename Real>
 std::unique_ptr<Summand<Real>> make(const Given& given) {
@@ -159,8 +162,8 @@ class Worker {
     std::vector<std::unique_ptr<Summand<Real>>> summands;
     std::vector<Aligned<Real>> by_parameters;  // a vector for each
 
-    // `results` (count, width) in order of place are added to: sums, or where their gradients `by_sums` (count, width of
-    // sums) are given, those by position, velocity and scalars, unless null.
+    // `results` (count, width) in order of place are added to: sums, or where their gradients `by_sums` (count, width
+    // of sums) are given, those by position, velocity and scalars, unless null.
     Worker(const Sorted<Real>& sorted, std::int64_t number, const Given* given, Real* results, const Real* by_sums)
         : sorted_(sorted), cells_(sorted.cells), results_(results), by_sums_(by_sums),
           by_pairs_(sorted.width), first_(sorted.width), second_(sorted.width),
@@ -196,8 +199,8 @@ class Worker {
 
     // Take what is left.
     void finish() {
-        take(both_, both_.count, 0, true);
-        take(one_, one_.count, 0, false);
+        take(both_, both_.count, true);
+        take(one_, one_.count, false);
         both_.count = one_.count = 0;
     }
 
@@ -242,16 +245,17 @@ class Worker {
 
     void take_blocks(Queue& queue, bool both) {
         if (queue.count < BLOCK) return;
-        take(queue, BLOCK, 0, both);
+        take(queue, BLOCK, both);
         queue.count -= BLOCK;
         std::memmove(queue.first, queue.first + BLOCK, queue.count * sizeof(*queue.first));
         std::memmove(queue.second, queue.second + BLOCK, queue.count * sizeof(*queue.second));
     }
 
-    // Evaluate `count` pairs of a queue and add what they give: to the first, and to the second if that is wanted too.
-    void take(Queue& queue, int count, int begin, bool both) {
+    // Evaluate the first pairs of a queue, `count` of them, and add what they give: to the first particles, and to the
+    // second ones where they are wanted too.
+    void take(Queue& queue, int count, bool both) {
         if (count == 0) return;
-        std::int32_t *first = queue.first + begin, *second = queue.second + begin;
+        std::int32_t *first = queue.first, *second = queue.second;
         for (int p = count; p < BLOCK; ++p) {  // a lane that counts for nothing
             first[p] = first[0];
             second[p] = second[0];
@@ -308,7 +312,8 @@ class Worker {
             }
             const V inside = Real(1) - square * inverse_square_, left = inside > Real(0) ? inside : V{};
             *reinterpret_cast<V*>(pairs_.weight + p) = left * left;
-            for (int lane = 0; lane < VectorOf<Real>::lanes; ++lane) pairs_.distance[p + lane] = std::sqrt(square[lane]);
+            for (int lane = 0; lane < VectorOf<Real>::lanes; ++lane)
+                pairs_.distance[p + lane] = std::sqrt(square[lane]);
         }
         for (std::int64_t s = 0; s < sorted_.given.scalars; ++s) {
             pairs_.scalar[0][s] = first_[static_cast<int>(6 + s)];
@@ -450,7 +455,8 @@ std::int64_t sums(const Particles& particles, std::int64_t number, const Given* 
     const int width = padded<Real>(components_of(number, given));
     Aligned<Real> results(particles.count * width);
     take_all<Real>(sorted, number, given, results.data(), nullptr);
-    each_column(sorted, number, given, [&](const Given& one, std::int64_t row, std::int64_t place, std::int64_t column) {
+    each_column(sorted, number, given, [&](const Given& one, std::int64_t row, std::int64_t place,
+                                           std::int64_t column) {
         static_cast<Real*>(one.sums)[row] = results.data()[place * width + column];
     });
     return -1;
@@ -463,7 +469,8 @@ std::int64_t gradients(const Particles& particles, std::int64_t number, const Gi
     if (misplaced >= 0) return misplaced;
     const int width = padded<Real>(components_of(number, given));
     Aligned<Real> by_sums(particles.count * width), results(by.position ? particles.count * sorted.width : 0);
-    each_column(sorted, number, given, [&](const Given& one, std::int64_t row, std::int64_t place, std::int64_t column) {
+    each_column(sorted, number, given, [&](const Given& one, std::int64_t row, std::int64_t place,
+                                           std::int64_t column) {
         by_sums.data()[place * width + column] = static_cast<const Real*>(one.by_sums)[row];
     });
     take_all<Real>(sorted, number, given, by.position ? results.data() : nullptr, by_sums.data());

@@ -79,12 +79,18 @@ class Summand {
 // One lane after the other, for the compiler to take several together.
 #define EDDIES_PAIRS _Pragma("omp simd") for (int p = 0; p < BLOCK; ++p)
 
+// Of two vectors of a pair.
+template <typename Real>
+inline Real dot(const Real (*a)[BLOCK], const Real (*b)[BLOCK], int p) {
+    return a[0][p] * b[0][p] + a[1][p] * b[1][p] + a[2][p] * b[2][p];
+}
+
 // w NN_1 x and w NN_2 v, or with one output w NN, of a network of the pairs' invariants.
 template <typename Real>
 class PairNetwork : public Summand<Real> {
    public:
-    // Options: outputs, whether densities enter as sum and square of the difference, whether the network is told density
-    // (the scalar), distance, speed, approach; widths of hidden layers.
+    // Options: outputs, whether densities enter as sum and square of the difference, whether the network is told
+    // density (the scalar), distance, speed, approach; widths of hidden layers.
     PairNetwork(const std::int64_t* options, int count, int scalar, const double* parameters)
         : Summand<Real>(options[0] == 2 ? 6 : 1, Real(options[0] == 2 ? -1 : 1)),
           symmetric_(options[1]), density_(options[2] ? scalar : -1), distance_(options[3]), speed_(options[4]),
@@ -114,8 +120,8 @@ class PairNetwork : public Summand<Real> {
             EDDIES_PAIRS by_outputs[0][p] = w[p] * given[0][p];
         } else {
             Real *by_x = by_outputs[0], *by_v = by_outputs[1];
-            EDDIES_PAIRS by_x[p] = w[p] * (given[0][p] * pairs.x[0][p] + given[1][p] * pairs.x[1][p] + given[2][p] * pairs.x[2][p]);
-            EDDIES_PAIRS by_v[p] = w[p] * (given[3][p] * pairs.v[0][p] + given[4][p] * pairs.v[1][p] + given[5][p] * pairs.v[2][p]);
+            EDDIES_PAIRS by_x[p] = w[p] * dot(given, pairs.x, p);
+            EDDIES_PAIRS by_v[p] = w[p] * dot(given + 3, pairs.v, p);
         }
         network_.backward(by_parameters, by_pairs != nullptr);
         if (by_pairs) add_by_pairs(pairs, given, *by_pairs);
@@ -153,12 +159,12 @@ class PairNetwork : public Summand<Real> {
         }
         if (distance_) std::copy(pairs.distance, pairs.distance + BLOCK, features[row++]);
         if (speed_) {
-            EDDIES_PAIRS speed_of_[p] = std::sqrt(pairs.v[0][p] * pairs.v[0][p] + pairs.v[1][p] * pairs.v[1][p] + pairs.v[2][p] * pairs.v[2][p]);
+            EDDIES_PAIRS speed_of_[p] = std::sqrt(dot(pairs.v, pairs.v, p));
             std::copy(speed_of_, speed_of_ + BLOCK, features[row++]);
         }
         if (approach_) {
             Real* feature = features[row];
-            EDDIES_PAIRS feature[p] = pairs.x[0][p] * pairs.v[0][p] + pairs.x[1][p] * pairs.v[1][p] + pairs.x[2][p] * pairs.v[2][p];
+            EDDIES_PAIRS feature[p] = dot(pairs.x, pairs.v, p);
         }
         network_.forward();
     }
@@ -171,7 +177,8 @@ class PairNetwork : public Summand<Real> {
         } else {
             const Real* along_v = outputs[1];
             for (int c = 0; c < 3; ++c) EDDIES_PAIRS {
-                    by.weight[p] += given[c][p] * along_x[p] * pairs.x[c][p] + given[3 + c][p] * along_v[p] * pairs.v[c][p];
+                    by.weight[p] += given[c][p] * along_x[p] * pairs.x[c][p];
+                    by.weight[p] += given[3 + c][p] * along_v[p] * pairs.v[c][p];
                     by.x[c][p] += given[c][p] * w[p] * along_x[p];
                     by.v[c][p] += given[3 + c][p] * w[p] * along_v[p];
                 }
@@ -271,9 +278,10 @@ class EddyViscosity : public Summand<Real> {
         add_lanes(by_quadratic, by_parameters + VectorOf<Real>::lanes);
         if (!by) return;
         EDDIES_PAIRS {
-            const Real r = pairs.distance[p], below = 1 / (r * r + softening_), mu = rate(pairs, p), w = pairs.weight[p];
+            const Real r = pairs.distance[p], w = pairs.weight[p], mu = rate(pairs, p);
+            const Real below = 1 / (r * r + softening_);
             const Real strength = mu * (quadratic_ * mu - linear_);
-            const Real along = given[0][p] * pairs.x[0][p] + given[1][p] * pairs.x[1][p] + given[2][p] * pairs.x[2][p];
+            const Real along = dot(given, pairs.x, p);
             const Real by_mu = approaching_ && mu >= 0 ? Real(0) : w * along * (2 * quadratic_ * mu - linear_);
             by->weight[p] += along * strength;
             by->distance[p] -= by_mu * mu * 2 * r * below;
@@ -290,7 +298,7 @@ class EddyViscosity : public Summand<Real> {
 
     Real rate(const Block<Real>& pairs, int p) const {
         const Real r = pairs.distance[p];
-        const Real mu = (pairs.x[0][p] * pairs.v[0][p] + pairs.x[1][p] * pairs.v[1][p] + pairs.x[2][p] * pairs.v[2][p]) /
+        const Real mu = dot(pairs.x, pairs.v, p) /
                         (r * r + softening_);
         return approaching_ && mu > 0 ? Real(0) : mu;
     }
@@ -402,7 +410,8 @@ template <typename Real>
 class Wcsph : public Summand<Real> {
    public:
     Wcsph(bool wendland, int scalar, const double* constants, const double* parameters)
-        : Summand<Real>(3, Real(-1)), kernel_{wendland}, push_(scalar), density_(scalar + 1), support_(constants[0]), unit_(constants[1]), softening_(constants[2]),
+        : Summand<Real>(3, Real(-1)), kernel_{wendland}, push_(scalar), density_(scalar + 1),
+          support_(constants[0]), unit_(constants[1]), softening_(constants[2]),
           linear_(parameters[0]), quadratic_(parameters[1]) {}
 
     void values(const Block<Real>& pairs, Components<Real> found) override {
@@ -417,7 +426,7 @@ class Wcsph : public Summand<Real> {
         alignas(64) Real by_linear[BLOCK], by_quadratic[BLOCK], by_total[BLOCK];
         EDDIES_PAIRS {
             const Real slope = -unit_ * kernel_.slope_over_q(pairs.distance[p] / support_), mu = rate(pairs, p);
-            const Real along = given[0][p] * pairs.x[0][p] + given[1][p] * pairs.x[1][p] + given[2][p] * pairs.x[2][p];
+            const Real along = dot(given, pairs.x, p);
             by_total[p] = along * slope;
             by_linear[p] = -by_total[p] * mu / mean(pairs, p);
             by_quadratic[p] = by_total[p] * mu * mu / mean(pairs, p);
@@ -427,7 +436,7 @@ class Wcsph : public Summand<Real> {
         if (!by) return;
         EDDIES_PAIRS {
             const Real r = pairs.distance[p], q = r / support_, mu = rate(pairs, p), average = mean(pairs, p);
-            const Real along = given[0][p] * pairs.x[0][p] + given[1][p] * pairs.x[1][p] + given[2][p] * pairs.x[2][p];
+            const Real along = dot(given, pairs.x, p);
             const Real slope = -unit_ * kernel_.slope_over_q(q), strength = total(pairs, p);
             const Real viscous = mu * (quadratic_ * mu - linear_) / average;
             const Real below = 1 / (r * r + softening_);
@@ -457,7 +466,7 @@ class Wcsph : public Summand<Real> {
 
     Real rate(const Block<Real>& pairs, int p) const {
         const Real r = pairs.distance[p];
-        const Real approach = pairs.x[0][p] * pairs.v[0][p] + pairs.x[1][p] * pairs.v[1][p] + pairs.x[2][p] * pairs.v[2][p];
+        const Real approach = dot(pairs.x, pairs.v, p);
         const Real mu = half_support() * approach / (r * r + softening_);
         return mu > 0 ? Real(0) : mu;
     }
@@ -485,8 +494,8 @@ class KernelSum : public Summand<Real> {
     Smoothing<Real> kernel_;
 };
 
-// What makes the average of a vector a and its gradient, relative to the first particle's own: V W, V W a', V grad W and
-// V a'_c grad_d W with a' = a_j - a_i. Scalars: V, and the components of a.
+// What makes the average of a vector a and its gradient, relative to the first particle's own: V W, V W a', V grad W
+// and V a'_c grad_d W with a' = a_j - a_i. Scalars: V, and the components of a.
 template <typename Real>
 class KernelAverage : public Summand<Real> {
    public:

@@ -1,5 +1,5 @@
-// Numbers that are worked on together: a register of the processor, blocks of points, and records of numbers that belong
-// to one point against rows of one number for each point of a block.
+// Numbers that are worked on together: a register of the processor, blocks of points, and records of numbers that
+// belong to one point against rows of one number for each point of a block.
 
 #pragma once
 
