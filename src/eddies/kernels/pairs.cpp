@@ -414,7 +414,7 @@ void take_all(const Sorted<Real>& sorted, std::int64_t number, const Given* give
                 for (std::size_t r = tasks[t].begin; r < tasks[t].end; ++r) worker.row(sorted.colours[colour][r]);
                 worker.finish();
                 if (!by_sums) continue;
-                double* place = &by_task[t * parameters];
+                double* place = by_task.data() + t * parameters;
                 for (std::int64_t s = 0; s < number; ++s) {
                     Real* lane = worker.by_parameters[s].data();
                     for (std::int64_t q = 0; q < given[s].parameters_count; ++q, ++place)
