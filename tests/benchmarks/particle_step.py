@@ -4,7 +4,8 @@
         [--threads T] [--precision float64]
 
 Particles at random in a solenoidal velocity of a turbulent spectrum, filtered at two particle spacings, are moved by a
-model of initial weights, but for the damping, which is that learned in hit-small. Steps are as long as a rollout takes them. Ten go before those that count. Prints a JSON line
+model of initial weights, but for the damping, which is that learned in hit-small. Steps are as long as a rollout takes
+them. Ten go before those that count. Prints a JSON line
 with medians over the steps: seconds an evaluation, of the slowest rank, and of it each part; iterations of a solve;
 evaluations and seconds for a turnover of the field.
 """

@@ -130,6 +130,7 @@ def rank_lines(scene: Scene) -> Iterator[str]:
         yield f"    {ranks}: {reason}"
     if min(alone.values()) > min(limits.values()):
         yield f"the direct simulation alone (`eddies dns`) at most {min(alone.values())}: {min(alone, key=alone.get)}"
+    yield "cores beyond that serve the loops over particles as threads: OMP_NUM_THREADS of each rank"
 
 
 def time_lines(scene: Scene, ranks: int, speed: Speed) -> Iterator[str]:
