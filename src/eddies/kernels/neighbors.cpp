@@ -20,7 +20,7 @@ struct Search {
 // Those pairs of a list that are within a radius now, and for receivers that are senders, if `once`, the first of both
 // orders of each alone. `rows` (count) are the receivers asked for. Outputs are given in the second of two calls.
 struct Listed {
-    std::int64_t count, senders;
+    std::int64_t count;
     const std::int64_t *rows, *offsets, *sender;
     const double *receivers, *positions;
     double length;

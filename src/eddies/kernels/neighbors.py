@@ -23,7 +23,7 @@ class _Search(ctypes.Structure):
 
 
 class _Listed(ctypes.Structure):
-    _fields_ = ([("count", ctypes.c_int64), ("senders", ctypes.c_int64)]
+    _fields_ = ([("count", ctypes.c_int64)]
                 + [(name, ctypes.c_void_p) for name in ("rows", "offsets", "sender", "receivers", "positions")]
                 + [("length", ctypes.c_double), ("periodic_z", ctypes.c_int64), ("radius", ctypes.c_double),
                    ("once", ctypes.c_int64)]
@@ -54,7 +54,7 @@ def pairs_within(library: ctypes.CDLL, box: Box, radius: float, receivers: np.nd
     orders of a pair is left out."""
     receivers, senders = (np.ascontiguousarray(points, np.float64) for points in (receivers, senders))
     rows, first = np.ascontiguousarray(rows, np.int64), np.empty(len(rows) + 1, np.int64)
-    given = _Listed(len(rows), len(senders), *map(_address, (rows, offsets, listed, receivers, senders)), box.length,
+    given = _Listed(len(rows), *map(_address, (rows, offsets, listed, receivers, senders)), box.length,
                     box.periodic_z, radius, once, _address(first))
     library.neighbors_count(ctypes.byref(given))
     indices, count = np.empty((3, first[-1]), np.int64), first[-1]
