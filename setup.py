@@ -25,7 +25,6 @@ class BuildKernels(build_ext):
         return fullname.replace(".", "/") + ".so"
 
     def run(self) -> None:
-        self.parallel = True  # on all cores, one for each instruction set
         super().run()
         missing = [extension.name for extension in self.extensions
                    if not Path(self.get_ext_fullpath(extension.name)).exists()]
