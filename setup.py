@@ -25,7 +25,7 @@ class BuildKernels(build_ext):
         return fullname.replace(".", "/") + ".so"
 
     def run(self) -> None:
-        super().run()
+        super().run()  # one after the other: all instruction sets have the same object files
         missing = [extension.name for extension in self.extensions
                    if not Path(self.get_ext_fullpath(extension.name)).exists()]
         if missing:
