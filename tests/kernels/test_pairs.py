@@ -136,6 +136,14 @@ def test_without_pairs_sums_are_zero(library, count):
     assert np.array_equal(sums(library, np.full((count, 3), 0.2)), np.zeros(count))
 
 
+def test_sums_without_a_gradient_say_so(library):
+    space = PairSpace(LENGTH, True, 1.0, 1.0, 1.0, mutual=False)
+    pairs = CompiledPairs(library, space, np.zeros((2, 3)), np.zeros((2, 3)), np.zeros((0, 2)), np.ones(2, bool),
+                          np.float64)
+    with pytest.raises(ValueError, match="no compiled gradient"):
+        pairs.gradients([Summand("kernel-sum", 1)], [np.zeros(0)], [np.zeros((1, 2))], True)
+
+
 def test_kernels_end_where_they_should(library):
     for kind, kernel in ((0, CubicSpline), (1, WendlandC2)):
         for distance in (0.0, 0.1, 0.49, 0.51, 0.99):

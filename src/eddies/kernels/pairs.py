@@ -89,7 +89,9 @@ class CompiledPairs:
     def gradients(self, summands: Sequence[Summand], parameters: Sequence[np.ndarray], by_sums: Sequence[np.ndarray],
                   columns: bool) -> tuple[list[np.ndarray], tuple[np.ndarray, ...]]:
         """From gradients by the sums, zero where none are wanted: those by the parameters, and, if asked for, by
-        position, velocity and scalars."""
+        position, velocity and scalars. Raises ValueError for averages by a kernel, which have none."""
+        if any(summand.kind.startswith("kernel-") for summand in summands):
+            raise ValueError("sums of a smoothing kernel have no compiled gradient")
         by_parameters = [np.zeros(len(values)) for values in parameters]
         by_columns = tuple(np.empty_like(column) for column in self._columns[:3]) if columns else ()
         given = (ctypes.c_void_p * 3)(*map(_address, by_columns))
