@@ -40,7 +40,7 @@ class Redistribution:
         column = np.asarray(column)
         if self.comm.size == 1:
             return column.copy()
-        sent = np.ascontiguousarray(column[self._order])
+        sent = np.take(column, self._order, axis=0)
         received = np.empty((int(self._received.sum()), *column.shape[1:]), column.dtype)
         # Counts are in rows: in bytes they would leave the range of MPI's integers above 2 GiB.
         row = MPI.BYTE.Create_contiguous(column.dtype.itemsize * math.prod(column.shape[1:])).Commit()
@@ -115,4 +115,4 @@ class IdOrder:
 
     def apply(self, column: np.ndarray) -> np.ndarray:
         """This rank's block of `column` (n, ...), ordered by id: (stop - start, ...)."""
-        return self._redistribution.apply(column)[self._order]
+        return np.take(self._redistribution.apply(column), self._order, axis=0)

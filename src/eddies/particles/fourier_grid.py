@@ -48,6 +48,7 @@ class FourierGrid:
         self.prefilter = torch.from_numpy(self.spline.inverse)
         #: how often a stored mode stands in the full sum
         self.multiplicity = torch.from_numpy(self.spectral.multiplicity)
+        self._transfers: dict[float, Tensor] = {}
 
     # ---- linear steps
 
@@ -82,6 +83,12 @@ class FourierGrid:
         return torch.zeros(*leading, *self.spectral.spectral_shape, dtype=self.dtype.to_complex())
 
     # ---- formulas on modes
+
+    def filter_transfer(self, width: float) -> Tensor:
+        """G = exp(-k^2 d^2 / 24) of each mode (kz, ky, kx), of the Gaussian filter of width d; made once."""
+        if width not in self._transfers:
+            self._transfers[width] = torch.exp(-self.wavenumber_squared * (width**2 / 24))
+        return self._transfers[width]
 
     def gradient(self, scalar: Tensor) -> Tensor:
         """i k f of one component (kz, ky, kx): (3, kz, ky, kx)."""

@@ -49,12 +49,12 @@ class ResolvedFlow:
         """Modes (6, kz, ky, kx) of u_i u_j; collective, differentiable."""
         return self.grid.squares(self.velocity)
 
-    @cached_property
+    @property
     def filter_transfer(self) -> Tensor:
         """G = exp(-k^2 d^2 / 24) of each mode (kz, ky, kx)."""
-        return torch.exp(-self.grid.wavenumber_squared * (self.filter_width**2 / 24))
+        return self.grid.filter_transfer(self.filter_width)
 
-    @property
+    @cached_property
     def unfiltered(self) -> Tensor:
         """Modes (3, kz, ky, kx) of u* = u / G."""
         return self.velocity / self.filter_transfer

@@ -173,8 +173,9 @@ class ResolvedVelocity:
 
     def _carried(self, modes: Tensor, step: float, mean: np.ndarray) -> Tensor:
         """Modes of a field that has moved with the mean velocity for a time."""
-        kx, ky, kz = self.grid.wavevector
-        return modes * torch.exp(-1j * step * (kx * mean[0] + ky * mean[1] + kz * mean[2]))
+        for k, velocity in zip(self.grid.wavevector, mean):
+            modes = modes * torch.exp(-1j * step * velocity * k)
+        return modes
 
     # ---- the solve
 
