@@ -62,13 +62,15 @@ def test_the_newest_three_are_kept(comm, tmp_path):
 
 
 @pytest.mark.mpi(1, 2)
-def test_other_kernels_than_those_that_made_it_are_told(comm, tmp_path, caplog, monkeypatch):
+def test_other_kernels_and_threads_than_those_that_made_it_are_told(comm, tmp_path, caplog, monkeypatch):
     directory = fill(comm, tmp_path, [1])
     comm.Barrier()
     assert directory.newest() is not None and "bit for bit" not in caplog.text
     monkeypatch.setattr("eddies.io.checkpoint.in_use", lambda: "another")
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
     assert directory.newest().content["step"] == 1
-    assert comm.rank > 0 or "this processor has them for another: the run goes on, but not bit for bit" in caplog.text
+    assert comm.rank > 0 or ("this run has compiled kernels: another, threads a rank: 7: it goes on, but not bit for "
+                             "bit") in caplog.text
 
 
 @pytest.mark.mpi(1, 2)

@@ -25,6 +25,7 @@ from eddies.io.hdf5 import ProductError, in_files
 from eddies.io.manifest import find_damage, hash_file, manifest_text, parse_manifest
 from eddies.kernels.library import in_use
 from eddies.parallel.broadcast import first_complaint, on_all_ranks, on_first_rank
+from eddies.parallel.node import threads
 
 log = logging.getLogger("eddies")
 
@@ -33,7 +34,7 @@ STATE, MANIFEST = "state.h5", "manifest.json"
 # The dataset of what is no array.
 PLAIN = "plain"
 # Of the layout of a checkpoint: others are not used. To be raised with that of the products too: frames are such.
-FORMAT = 4
+FORMAT = 5
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,11 @@ class Checkpoint(Mapping):
             return file[name][(slice(None),) * axis + (slice(start, stop),)]
 
 
+def computed_by() -> str:
+    """What else the bits of a run depend on, beside its settings and ranks."""
+    return f"compiled kernels: {in_use()}, threads a rank: {threads()}"
+
+
 class CheckpointDirectory:
     """The checkpoints of a run, made with settings of a `fingerprint`. All methods are collective, and all ranks raise
     a ProductError where rank 0 cannot write or remove a file."""
@@ -97,7 +103,7 @@ class CheckpointDirectory:
             size = on_first_rank(self.comm, lambda: (partial / STATE).stat().st_size)
             content = {"step": step, "format": FORMAT, "fingerprint": self.fingerprint,
                        "state": hash_file(self.comm, partial / STATE, regions, size),
-                       "files": {name: self._hash_whole(name) for name in files}, "kernels": in_use()}
+                       "files": {name: self._hash_whole(name) for name in files}, "computed_by": computed_by()}
             on_first_rank(self.comm, lambda: _finish(partial, final, manifest_text(content)))
         except OSError as error:
             if self.comm.rank == 0:
@@ -115,7 +121,7 @@ class CheckpointDirectory:
             content, complaint = self._examine(self.path / names[0])
             if complaint is None:
                 found = Checkpoint(self.path / names[0], content)
-                self._compare_kernels(content["kernels"])
+                self._compare(content["computed_by"])
                 break
             if self.comm.rank == 0:
                 log.warning("%s; this checkpoint is not used", complaint)
@@ -144,10 +150,10 @@ class CheckpointDirectory:
             complaint = complaint or find_damage(self.comm, self.path / name, entry)
         return content, complaint
 
-    def _compare_kernels(self, then: str) -> None:
-        if self.comm.rank == 0 and then != in_use():
-            log.warning("the checkpoint was made with compiled kernels for %s, and this processor has them for %s: the "
-                        "run goes on, but not bit for bit as it would have", then, in_use())
+    def _compare(self, then: str) -> None:
+        if self.comm.rank == 0 and then != computed_by():
+            log.warning("the checkpoint was made by %s, and this run has %s: it goes on, but not bit for bit as it "
+                        "would have", then, computed_by())
 
     def _names(self) -> list[str]:
         """Checkpoints, the newest first, as rank 0 sees them."""

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import os
-
 import torch
 
 from eddies.errors import UserError
 from eddies.parallel.communicator import Comm
-from eddies.parallel.node import node_rank
+from eddies.parallel.node import node_rank, threads
 
 
 class DeviceError(UserError, RuntimeError):
@@ -20,7 +18,7 @@ def prepare_torch(device: str, comm: Comm) -> torch.device:
 
     Ranks share the GPUs of a node in turn. Raises DeviceError where a GPU is asked for and there is none.
     """
-    torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
+    torch.set_num_threads(threads())
     if device == "cpu":
         return torch.device("cpu")
     if not torch.cuda.is_available():

@@ -18,9 +18,10 @@ import pyfftw
 
 from eddies.kernels.copies import CompiledColumnCopies, CompiledPlaneCopies
 from eddies.kernels.library import library
+from eddies.parallel.node import threads
 from eddies.spectral.copies import ColumnCopies, PlaneCopies
 
-BLOCK_BYTES = 2**18  # of one component in a pass: a few of them fit the second-level cache of a core
+BLOCK_BYTES = 2**18  # of one component and thread in a pass: a few of them fit the second-level cache of a core
 PADDING = 8           # complex numbers between the lines along x of a plane that is transformed along y
 CACHE_LINE = 64
 
@@ -39,7 +40,7 @@ class ColumnPass:
 
     def rows(self, count: int) -> list[slice]:
         """The blocks of y, out of `count`, that are transformed together."""
-        size = max(1, BLOCK_BYTES // (self.cells * self.width * self.dtype.itemsize))
+        size = max(1, threads() * BLOCK_BYTES // (self.cells * self.width * self.dtype.itemsize))
         return [slice(start, min(start + size, count)) for start in range(0, count, size)]
 
     def plan(self, direction: str, rows: slice) -> ColumnPlan:
@@ -47,7 +48,7 @@ class ColumnPass:
         key = (direction, rows.stop - rows.start)
         if key not in self._plans:
             given, result = (pyfftw.zeros_aligned((self.cells, key[1], self.width), self.dtype) for _ in range(2))
-            plan = pyfftw.FFTW(given, result, axes=(0,), direction=f"FFTW_{direction}", flags=("FFTW_ESTIMATE",))
+            plan = _plan(given, result, 0, direction)
             self._plans[key] = ColumnPlan(plan, *map(self.copies.described, (given, result)))
         return self._plans[key]
 
@@ -91,7 +92,7 @@ class PlanePass:
 
     def blocks(self, count: int) -> list[slice]:
         """The blocks of planes, out of `count`, that are transformed together: even numbers, and an odd one alone."""
-        size, even = 2 * max(1, BLOCK_BYTES // (self.cells**2 * self.dtype.itemsize)), count - count % 2
+        size, even = 2 * max(1, threads() * BLOCK_BYTES // (self.cells**2 * self.dtype.itemsize)), count - count % 2
         blocks = [slice(start, min(start + size, even)) for start in range(0, even, size)]
         return blocks if even == count else [*blocks, slice(even, count)]
 
@@ -134,13 +135,12 @@ class PlanePass:
         values = self._values(fields, pairs)
         planes = [field.view(self.dtype) for field in values]
         kept = [(rows[..., :stop], lines[..., :stop]), (rows[..., stop:], lines[..., start:])]
-        settings = {"direction": f"FFTW_{direction}", "flags": ("FFTW_ESTIMATE",)}
         if direction == "BACKWARD":
-            along_y = [pyfftw.FFTW(a, b, axes=(1,), **settings) for a, b in kept if a.size]
-            plans = [[*along_y, pyfftw.FFTW(lines, field, axes=(2,), **settings)] for field in planes]
+            along_y = [_plan(a, b, 1, direction) for a, b in kept if a.size]
+            plans = [[*along_y, _plan(lines, field, 2, direction)] for field in planes]
         else:
-            along_y = [pyfftw.FFTW(b, a, axes=(1,), **settings) for a, b in kept if a.size]
-            plans = [[pyfftw.FFTW(field, lines, axes=(2,), **settings), *along_y] for field in planes]
+            along_y = [_plan(b, a, 1, direction) for a, b in kept if a.size]
+            plans = [[_plan(field, lines, 2, direction), *along_y] for field in planes]
         described = self.copies.described
         return PlanePlans(described(rows), [described(field) for field in planes], values, plans)
 
@@ -152,3 +152,8 @@ class PlanePass:
         memory = pyfftw.zeros_aligned(fields * apart, np.uint8, n=CACHE_LINE)
         real = np.zeros(1, self.dtype).real.dtype
         return np.ndarray((fields, pairs, n, 2 * n), real, memory, strides=(apart, n * n * item, n * item, item // 2))
+
+
+def _plan(given: np.ndarray, result: np.ndarray, axis: int, direction: str) -> pyfftw.FFTW:
+    return pyfftw.FFTW(given, result, axes=(axis,), direction=f"FFTW_{direction}", flags=("FFTW_ESTIMATE",),
+                       threads=threads())

@@ -16,6 +16,7 @@ from eddies.io.hdf5 import open_product, read_attributes, read_table
 from eddies.io.provenance import environment
 from eddies.io.trajectories import Trajectory
 from eddies.parallel.communicator import Comm
+from eddies.parallel.node import threads
 from eddies.scene.comparison import Comparison
 from eddies.scene.scene import Eulerian
 from eddies.workflows.variants.run import StepSeconds, VariantRun
@@ -100,11 +101,6 @@ def step_costs(samples: list[StepSeconds], step: float, turnover: float, ranks: 
 def finite(value: Any) -> Any:
     """The value, or None for a number that is none."""
     return None if isinstance(value, float) and not np.isfinite(value) else value
-
-
-def threads() -> int:
-    """Threads of every rank."""
-    return int(os.environ.get("OMP_NUM_THREADS", "1"))
 
 
 def machine(device: str, ranks: int) -> dict[str, Any]:
