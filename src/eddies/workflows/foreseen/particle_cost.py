@@ -100,16 +100,14 @@ def part_calls(work: ParticleWork, speed: ParticleSpeed) -> dict[str, float]:
 
 
 def part_units(work: ParticleWork, speed: ParticleSpeed, ranks: int) -> dict[str, float]:
-    """What the busiest rank works on in each part: pairs, components at particles or grid points, modes, particles.
-
-    On one rank only the list of pairs asks that particles settle."""
+    """What the busiest rank works on in each part: pairs, components at particles or grid points, modes, particles."""
     own = work.own(ranks)
     grown = own * growth(PARTICLE_GROWTH, own)
     return {"pairs": work.pairs(ranks), "splines": components(work, speed, "splines") * own,
             "transforms": (components(work, speed, "transforms") * work.points(ranks)
                            * growth(TRANSFORM_GROWTH, work.cells)),
             "modes": work.iterations * work.modes(ranks), "formulas": grown,
-            "settling": grown * (MIGRATION if ranks > 1 else work.neighbors > 0)}
+            "settling": grown * (MIGRATION if ranks > 1 else 1.0) * work.settles(ranks)}
 
 
 def components(work: ParticleWork, speed: ParticleSpeed, part: str) -> float:
@@ -148,6 +146,8 @@ def halo_seconds(work: ParticleWork, speed: ParticleSpeed, network: Network) -> 
 def settling_seconds(work: ParticleWork, network: Network) -> float:
     """Seconds in which particles change rank, to the next one in nearly all cases: each column, and how many there are,
     from each rank to every other; with sums that tell whether any is lost."""
+    if not work.settles(network.ranks):
+        return 0.0
     return (network.all_to_all(0.0, 1 + work.settled_columns())
             + network.to_neighbors(work.movers() * work.settled_bytes() / 2, 0) + network.sum_over_ranks(
                 SUMS_OF_SETTLING))

@@ -187,7 +187,7 @@ class Probe:
         self.watch.seconds["settling"] = time.perf_counter() - began
 
     def seconds(self) -> dict[str, float]:
-        """The least over evaluations, as others on the machine may disturb some; the first one plans and fills tables."""
+        """The least over evaluations, as others on the machine may disturb some; the first plans and fills tables."""
         found = []
         for number in range(1 + REPEATS):
             self.evaluate(number)

@@ -28,7 +28,7 @@ class ParticleWork:
     neighbors, radius : of pairs; 0 without them. skin : by which the halo is wider.
     iterations : of the solve.
     drift : rms distance by which particles move along z from one evaluation to the next.
-    evaluations : in a step. real : bytes of a number of grid and pairs.
+    evaluations : in a step. real : bytes of a number of grid and pairs. density : whether it is a state of its own.
     """
 
     particles: int
@@ -41,6 +41,7 @@ class ParticleWork:
     drift: float = 0.0
     evaluations: int = 1
     real: int = 4
+    density: bool = False
 
     # ---- the busiest rank's share
 
@@ -72,8 +73,14 @@ class ParticleWork:
 
     def modes(self, ranks: int) -> float:
         """Modes of a component: those of a rank are cut along ky."""
+        if not self.wavenumber:
+            return 0.0
         along = 2 * self.wavenumber + 1
         return along * math.ceil(along / ranks) * (self.wavenumber + 1)
+
+    def settles(self, ranks: int) -> bool:
+        """Whether particles change rank or order: for a list of pairs, or for the slabs of the grid."""
+        return self.neighbors > 0 or self.wavenumber > 0 and ranks > 1
 
     def ghost_planes(self) -> int:
         """Planes that splines want of the neighbours, above and below a slab together."""
@@ -94,14 +101,23 @@ class ParticleWork:
         """Bytes of the ghost planes of components that a rank sends, up and down together."""
         return components * self.ghost_planes() * self.cells**2 * self.real
 
+    @property
+    def companions(self) -> tuple[float, float]:
+        """Vectors and densities that settle beside the particles of a stage: of position and velocity at the start and
+        at the end of a step, but for its first stage; with one evaluation a step velocities alone."""
+        if self.evaluations == 1:
+            return 1, self.density
+        later = (self.evaluations - 1) / self.evaluations
+        return 4 * later, 2 * later * self.density
+
     def settled_columns(self) -> float:
-        """Columns that a settling sends: id and two vectors, and beside all but the first stage of a step the vectors
-        of two sets of particles more."""
-        return 3 + 4 * (self.evaluations - 1) / self.evaluations
+        """Columns that a settling sends: those of the particles, with their id, and companions."""
+        return 3 + self.density + sum(self.companions)
 
     def settled_bytes(self) -> float:
         """Bytes of a particle that changes its rank."""
-        return 8 + VECTOR * (self.settled_columns() - 1)
+        vectors, densities = self.companions
+        return 8 + VECTOR * (2 + vectors) + 8 * (self.density + densities)
 
     def movers(self) -> float:
         """Particles that leave a slab through its two faces between evaluations, of normal velocities."""
@@ -129,7 +145,7 @@ def particle_work(scene: Scene) -> ParticleWork:
         min(max(int(highest + 1e-9), 1), (tracers.planes - 1) // 2) if resolved else 0,
         scene.neighbors if paired else 0.0, radius if paired else 0.0,
         settings.skin * radius if paired or resolved else 0.0, ITERATIONS[settings.integrator] if resolved else 0.0,
-        way / evaluations, evaluations, 4 if settings.precision == "float32" else 8)
+        way / evaluations, evaluations, 4 if settings.precision == "float32" else 8, "density_rate" in model.gives)
 
 
 def rollout_step(scene: Scene) -> float:
