@@ -212,7 +212,7 @@ def test_a_rollout_is_foreseen_where_a_model_moves_the_particles_of_a_cpu(comm):
     lines = list(rollout_lines(learned, rows))
     assert len(lines) == len(rows) + 2 and "3 evaluations a step, 2.8 iterations each" in lines[0]
     assert all(row.binds in line and f"{row.ranks} x {row.threads}" in line for row, line in zip(rows, lines[2:]))
-    for changes in (["simulation.method=none"], ["simulation.method=wcsph"], ["device=cuda"]):
+    for changes in (["simulation.method=none"], ["simulation.method=wcsph", "simulation.step=0.005"], ["device=cuda"]):
         other = load_scene("tiny", changes)
         assert rollout_costs(other, comm, Speed(1e-6, 1e9)) == [] == list(rollout_lines(other, []))
 

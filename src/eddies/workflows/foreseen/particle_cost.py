@@ -30,11 +30,12 @@ TRANSFORM_GROWTH = {42: 1.0, 112: 1.0, 168: 1.25, 448: 1.3, 896: 1.75}
 PARTICLE_GROWTH = {14e3: 1.0, 110e3: 1.3, 262e3: 1.45, 885e3: 2.0}
 # Settling on several ranks over that on one: rows are put in order of ranks and copied as well. From the same, on two.
 MIGRATION = 1.7
-# Memory of a rank: of a process with torch; of a grid point and of a particle, seen ones included, from rollouts with
-# 48^3 to 96^3 particles; of a listed neighbour, with the compiled search and without.
-PROCESS_BYTES = 300e6
-POINT_BYTES = 120
-PARTICLE_BYTES = 600
+# Memory of a rank: of a process with torch; of a grid point in single precision and of a particle, ghosts included,
+# from steps with 48^3 to 96^3 particles on one and two ranks; of a listed neighbour, with the compiled search and
+# without.
+PROCESS_BYTES = 285e6
+POINT_BYTES = 160
+PARTICLE_BYTES = 800
 NEIGHBOR_BYTES = {True: 8, False: 32}
 
 

@@ -21,8 +21,8 @@ from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.context import PAIR_VALUES_TOGETHER, Context
 from eddies.particles.devices import prepare_torch
 from eddies.particles.dynamics import ParticleDynamics
-from eddies.particles.fourier_grid import Points
 from eddies.particles.flow_units import FlowUnits
+from eddies.particles.fourier_grid import Points
 from eddies.particles.model import LagrangianModel, build_model
 from eddies.particles.neighborhood import at_home
 from eddies.particles.particle_set import ParticleSet
@@ -60,7 +60,7 @@ class ParticleSpeed:
     ----------
     rates : by part.
     calls, components : of transforms and splines in an evaluation, those of the iterations left out.
-    ghost_columns : bytes of a ghost particle, of each column that an evaluation sends.
+    ghost_columns : bytes of a ghost particle in each column that an evaluation sends.
     listed : whether some term's pairs are listed. block_bytes : what terms keep of the pairs that are taken together.
     """
 
@@ -145,7 +145,6 @@ class Probe:
 
     def _watch(self) -> None:
         watch, dynamics = self.watch, self.dynamics
-        watch.on(dynamics, "context", "formulas")
         make_context = dynamics.context
         dynamics.context = lambda *given, **named: self._watched(make_context(*given, **named))
         if (around := dynamics.neighborhood) is not None:
@@ -212,12 +211,11 @@ class Probe:
             call = max(few[part] - units[part] * unit, 0.0) / max(calls.get(part, 1), 1)
             rates[part] = Rate(call, unit * (torch.get_num_threads() if part in THREADED else 1))
         iterations = ITERATIONS if self.dynamics.resolution else 0
-        return ParticleSpeed(
-            rates, {part: watch.calls[part] - 2 * iterations for part in SHARED},
-            {part: watch.components[part] - 6 * iterations for part in SHARED},
-            # The halo has the positions twice, once for a list of neighbours.
-            (VECTOR, VECTOR, *self.columns) if self.dynamics.neighborhood else (), listed,
-            self._block_bytes() if listed else 0.0)
+        # The positions are sent twice, once for a list of neighbours that somebody may ask for.
+        ghosts = (VECTOR, VECTOR, *self.columns) if self.dynamics.neighborhood else ()
+        return ParticleSpeed(rates, {part: watch.calls[part] - 2 * iterations for part in SHARED},
+                             {part: watch.components[part] - 6 * iterations for part in SHARED},
+                             ghosts, listed, self._block_bytes() if listed else 0.0)
 
     def _listed(self) -> bool:
         """Whether evaluations asked for the list of neighbours: where the compiled library knows what is summed, it is
