@@ -10,7 +10,7 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -65,9 +65,9 @@ class ParticleSpeed:
     """
 
     rates: dict[str, Rate]
-    calls: dict[str, float] = field(default_factory=dict)
-    components: dict[str, float] = field(default_factory=dict)
-    ghost_columns: tuple[int, ...] = ()
+    calls: dict[str, float]
+    components: dict[str, float]
+    ghost_columns: tuple[int, ...]
     listed: bool = False
     block_bytes: float = 0.0
 
