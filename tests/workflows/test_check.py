@@ -51,6 +51,12 @@ def test_numbers_for_programs(comm, capfd):
     assert told["most_ranks"] == min(told["limits"].values()) <= told["most_ranks_dns"] and told["ranks"] == comm.size
     assert told["turbulence"]["reynolds_lambda"] == pytest.approx(50.3, abs=0.05)
     assert [row["ranks"] for row in told["costs"]][:3] == [1, 2, 4] and told["warnings"] == []
+    rows = told["rollout_costs"]
+    assert [row["cores"] for row in rows] == [2**m for m in range(len(rows))] and len(rows) <= 14
+    for row in rows:
+        assert row["ranks"] <= told["most_ranks"] and row["cores"] == row["ranks"] * row["threads"]
+        assert row["seconds_per_step"] == pytest.approx(3 * row["seconds_per_evaluation"]) and row["seconds"] > 0
+        assert sum(row["parts"].values()) == pytest.approx(row["seconds_per_evaluation"])
 
 
 @pytest.mark.mpi(1)
@@ -59,6 +65,7 @@ def test_what_is_not_foreseen_is_null(comm, capfd):
     check.run(load_scene("abc"), comm, as_json=True)
     told = json.loads(capfd.readouterr().out)
     assert told["turbulence"] is told["particles"] is told["kernel_support"] is None
+    assert told["rollout_costs"] == []
 
 
 @pytest.mark.mpi(1)
@@ -181,18 +188,14 @@ def test_ranks_are_not_limited_by_horizons_that_are_not_trained():
 
 
 def test_what_no_term_reads_limits_no_ranks():
-    from eddies.workflows.check import cost_lines, warnings
-    from eddies.workflows.foreseen.cost_model import Speed
+    from eddies.workflows.check import warnings
     from eddies.workflows.foreseen.estimates import most_ranks
-    fast, speed = ["training.horizons.steps=5", "training.horizons.frames=[12]"], Speed(1e-6, 1e9)
+    fast = ["training.horizons.steps=5", "training.horizons.frames=[12]"]
     limits = {preset: most_ranks(load_scene("tiny", [*fast, f"model.preset={preset}"]))
               for preset in ("resolved + pairs", "resolved", "learned-density")}
     found = {preset: {word for word in ("reach", "resolved") if any(word in reason for reason in reasons)}
              for preset, reasons in limits.items()}
     assert found == {"resolved": {"resolved"}, "learned-density": {"reach"}, "resolved + pairs": {"reach", "resolved"}}
-    tables = {preset: next(line for line in cost_lines(load_scene("tiny", [f"model.preset={preset}"]), speed)
-                           if line.startswith("ranks")) for preset in limits}
-    assert [("pair force" in table) for table in tables.values()] == [True, False, True]
     told = {preset: [line for line in warnings(load_scene("tiny", [f"model.preset={preset}"]), 1) if "horizons" in line]
             for preset in limits}
     assert told == {"resolved + pairs": [], "resolved": [], "learned-density": [
@@ -200,12 +203,18 @@ def test_what_no_term_reads_limits_no_ranks():
         "add [training.horizons]"]}
 
 
-def test_memory_of_pairs_is_that_of_the_widest_network():
-    from eddies.workflows.foreseen.cost_model import pair_bytes
-    sizes = [pair_bytes(load_scene("tiny", ["model.preset=paper", f"model.pairs.hidden=[{first}]",
-                                            f"model.density-flux.hidden=[{second}]"]), 1)
-             for first, second in ((4, 4), (4, 200), (200, 4))]
-    assert sizes[0] < sizes[1] == sizes[2]
+@pytest.mark.mpi(1)
+def test_a_rollout_is_foreseen_where_a_model_moves_the_particles_of_a_cpu(comm):
+    from eddies.workflows.check import rollout_costs, rollout_lines
+    from eddies.workflows.foreseen.cost_model import Speed
+    learned = load_scene("tiny")
+    rows = rollout_costs(learned, comm, Speed(1e-6, 1e9))
+    lines = list(rollout_lines(learned, rows))
+    assert len(lines) == len(rows) + 2 and "3 evaluations a step, 2.8 iterations each" in lines[0]
+    assert all(row.binds in line and f"{row.ranks} x {row.threads}" in line for row, line in zip(rows, lines[2:]))
+    for changes in (["simulation.method=none"], ["simulation.method=wcsph", "simulation.step=0.005"], ["device=cuda"]):
+        other = load_scene("tiny", changes)
+        assert rollout_costs(other, comm, Speed(1e-6, 1e9)) == [] == list(rollout_lines(other, []))
 
 
 @pytest.mark.mpi(1)
@@ -273,17 +282,11 @@ def rows_of(scene):
 
 
 def test_table_goes_to_the_most_slabs():
-    from eddies.workflows.foreseen.cost_model import NODE_RANKS
-
-    def words(*overrides):
-        return [[word.strip() for word in row if word.strip()] for row in rows_of(load_scene("hit-paper", overrides))]
-
-    rows = words("model.preset=resolved + pairs")
+    from eddies.workflows.foreseen.network import NODE_RANKS
+    rows = [[word.strip() for word in row if word.strip()] for row in rows_of(load_scene("hit-paper"))]
     assert [int(row[0]) for row in rows] == [2**m for m in range(9)]  # at most 341
     assert [int(row[1]) for row in rows] == [max(1, 2**m // NODE_RANKS) for m in range(9)]
     assert [int(row[2]) for row in rows] == [1024 // 2**m for m in range(9)]
-    assert [len(row) for row in rows] == [8] * 5 + [7] * 4  # the pair force is for 16 ranks and fewer
-    assert words() == [row[:7] for row in words()]  # and there is none without pairs
     # without tracers: a plane each, twelve rows and no more
     scene = load_scene("taylor-green", ["flow.cells=4096"])
     assert [int(row[0]) for row in map(lambda row: [word for word in row if word], rows_of(scene))] == [
@@ -325,8 +328,8 @@ def test_bytes_sent_are_those_of_the_transposes(comm, fluid, monkeypatch):
 
 
 def test_messages_cost_time_beyond_a_node():
-    from eddies.workflows.foreseen.cost_model import (LATENCY, NODE_BANDWIDTH, NODE_RANKS, Speed, exchange_seconds,
-                                                      sent_bytes)
+    from eddies.workflows.foreseen.cost_model import Speed, exchange_seconds, sent_bytes
+    from eddies.workflows.foreseen.network import LATENCY, NODE_BANDWIDTH, NODE_RANKS
     scene, speed = load_scene("hit-paper"), Speed(1e-6, 1e9)
     assert exchange_seconds(scene, 1, speed) == 0
     # Two nodes: each holds half of all bytes and keeps half of that, in messages from each rank to all others.

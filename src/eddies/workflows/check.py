@@ -5,17 +5,21 @@ from __future__ import annotations
 import json
 import logging
 import math
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
 
 from eddies.clock import duration
 from eddies.parallel.communicator import Comm
 from eddies.scene.scene import BOX_LENGTH, Scene
-from eddies.workflows.foreseen.cost_model import (LATENCY, NODE_BANDWIDTH, NODE_RANKS, Speed, cost, costs, pair_bytes,
-                                                  probe)
+from eddies.workflows.foreseen.cost_model import Speed, cost, costs, probe
 from eddies.workflows.foreseen.estimates import (expected_step, expected_turbulence, foreseen_allowed_step,
-                                                 ground_truth_alone, largest_wavenumber, learns_pairs, most_ranks,
-                                                 particle_reach, run_time, sees_pairs)
+                                                 ground_truth_alone, largest_wavenumber, most_ranks, particle_reach,
+                                                 run_time, sees_pairs)
+from eddies.workflows.foreseen.network import LATENCY, NODE_BANDWIDTH, NODE_RANKS
+from eddies.workflows.foreseen.particle_work import EVALUATIONS, particle_work, rollout_evaluations
+
+if TYPE_CHECKING:
+    from eddies.workflows.foreseen.particle_cost import ParticleCost
 
 log = logging.getLogger("eddies")
 
@@ -24,14 +28,15 @@ def run(scene: Scene, comm: Comm, as_json: bool = False) -> None:
     """Log every derived number of a scene, estimates of steps and time, and warnings; or print them for programs. All
     ranks call it."""
     speed = probe(scene, comm)
+    rollout = rollout_costs(scene, comm, speed)
     if as_json:
         if comm.rank == 0:
-            print(json.dumps(numbers(scene, comm.size, speed), indent=2, allow_nan=False))
+            print(json.dumps(numbers(scene, comm.size, speed, rollout), indent=2, allow_nan=False))
         return
     subjects = {"grid": grid_lines(scene), "turbulence": turbulence_lines(scene),
                 "particles": particle_lines(scene), "time step": step_lines(scene),
                 "ranks": rank_lines(scene), "time": time_lines(scene, comm.size, speed),
-                "more ranks": cost_lines(scene, speed)}
+                "more ranks": cost_lines(scene, speed), "rollout": rollout_lines(scene, rollout)}
     log.info("%s: %s", scene.name, scene.title)
     log.info("stages: %s", ", ".join(scene.stages))
     for title, lines in subjects.items():
@@ -42,10 +47,22 @@ def run(scene: Scene, comm: Comm, as_json: bool = False) -> None:
             log.warning(problem)
 
 
-def numbers(scene: Scene, ranks: int, speed: Speed) -> dict[str, Any]:
+def rollout_costs(scene: Scene, comm: Comm, speed: Speed) -> list[ParticleCost]:
+    """Costs of the particles' evaluations where the scene simulates with a model, and not on a GPU, else none; all
+    ranks call it."""
+    settings = scene.simulation
+    if settings is None or scene.model is None or "model" not in settings.needs or scene.device != "cpu":
+        return []
+    from eddies.workflows.foreseen import particle_cost, particle_probe  # torch, where there is a model
+    found = particle_probe.probe_particles(scene, comm)
+    return particle_cost.particle_costs(particle_work(scene), found, min(most_ranks(scene).values()), speed.bandwidth)
+
+
+def numbers(scene: Scene, ranks: int, speed: Speed, rollout: Sequence[ParticleCost]) -> dict[str, Any]:
     """The same for programs: lengths and times in the scene's units, memory in bytes; None where nothing is foreseen.
 
-    `limits` are the largest numbers of ranks by what limits them, `costs` those of the direct simulation.
+    `limits` are the largest numbers of ranks by what limits them, `costs` those of the direct simulation,
+    `rollout_costs` those of the particles with the learned model.
     """
     turbulence, step, limits = expected_turbulence(scene), expected_step(scene), most_ranks(scene)
     alone = min(most_ranks(ground_truth_alone(scene)).values())
@@ -62,8 +79,18 @@ def numbers(scene: Scene, ranks: int, speed: Speed) -> dict[str, Any]:
         "most_ranks": min(limits.values()), "limits": limits, "most_ranks_dns": alone,
         "costs": [{"ranks": row.ranks, "nodes": row.nodes, "memory": row.memory, "seconds_per_step": row.seconds}
                   for row in costs(scene, alone, speed)],
+        "rollout_costs": [rollout_numbers(scene, row) for row in rollout],
         "warnings": list(warnings(scene, ranks)),
     }
+
+
+def rollout_numbers(scene: Scene, row: ParticleCost) -> dict[str, Any]:
+    """A row of the rollout's costs; `seconds` are those of the whole rollout, `parts` those of an evaluation."""
+    evaluations = rollout_evaluations(scene)
+    return {"ranks": row.ranks, "threads": row.threads, "cores": row.cores, "nodes": row.nodes, "memory": row.memory,
+            "seconds_per_evaluation": row.seconds,
+            "seconds_per_step": EVALUATIONS[scene.simulation.integrator] * row.seconds,
+            "seconds": evaluations and evaluations * row.seconds, "parts": row.parts, "binds": row.binds}
 
 
 def grid_lines(scene: Scene) -> Iterator[str]:
@@ -130,7 +157,6 @@ def rank_lines(scene: Scene) -> Iterator[str]:
         yield f"    {ranks}: {reason}"
     if min(alone.values()) > min(limits.values()):
         yield f"the direct simulation alone (`eddies dns`) at most {min(alone.values())}: {min(alone, key=alone.get)}"
-    yield "cores beyond that serve the loops over particles as threads: OMP_NUM_THREADS of each rank"
 
 
 def time_lines(scene: Scene, ranks: int, speed: Speed) -> Iterator[str]:
@@ -143,22 +169,33 @@ def time_lines(scene: Scene, ranks: int, speed: Speed) -> Iterator[str]:
 
 
 def cost_lines(scene: Scene, speed: Speed) -> Iterator[str]:
-    """Memory and wall time of the direct simulation on any number of ranks, and memory of the learned pair force."""
-    pairs = scene.simulation is not None and learns_pairs(scene)
+    """Memory and wall time of the direct simulation on any number of ranks."""
     yield (f"estimates, from the work of the ranks at hand, for nodes of {NODE_RANKS} ranks that share "
            f"{NODE_BANDWIDTH / 1e9:g} GB/s, {1e6 * LATENCY:g} us a message")
-    yield ("ranks  nodes  planes  memory a rank  s a step     wall time  core hours"
-           + ("  pair force a rank" if pairs else ""))
-    most, most_alone = (min(most_ranks(case).values()) for case in (scene, ground_truth_alone(scene)))
+    yield "ranks  nodes  planes  memory a rank  s a step     wall time  core hours"
     steps = expected_steps(scene)
-    for row in costs(scene, most_alone, speed):
+    for row in costs(scene, min(most_ranks(ground_truth_alone(scene)).values()), speed):
         line = f"{row.ranks:5}  {row.nodes:5}  {row.planes:6}  {megabytes(row.memory):>13}  {number(row.seconds):>8}"
         if steps:
             seconds = row.seconds * steps
             line += f"  {duration(seconds):>12}  {row.ranks * seconds / 3600:10,.1f}"
-        if pairs and row.ranks <= most:
-            line += f"  {megabytes(pair_bytes(scene, row.ranks)):>17}"
         yield line
+
+
+def rollout_lines(scene: Scene, rows: Sequence[ParticleCost]) -> Iterator[str]:
+    """Memory and wall time of the particles with the learned model on any number of cores."""
+    if not rows:
+        return
+    work, evaluations = particle_work(scene), rollout_evaluations(scene)
+    per_step = EVALUATIONS[scene.simulation.integrator]
+    steps = f"{per_step} evaluations a step" + (f", {work.iterations:g} iterations each" if work.iterations else "")
+    yield f"the same for the learned model, {steps}; threads are OMP_NUM_THREADS of a rank"
+    yield "cores  ranks x threads  memory a rank  s an evaluation  s a step     wall time  most of it"
+    for row in rows:
+        wall = duration(row.seconds * evaluations) if evaluations else "-"
+        yield (f"{row.cores:5}  {row.ranks:5} x {row.threads:<7}  {megabytes(row.memory):>13}  "
+               f"{number(row.seconds):>15}  {number(per_step * row.seconds):>8}  {wall:>12}  {row.binds} "
+               f"{row.parts[row.binds] / row.seconds:.0%}")
 
 
 def expected_steps(scene: Scene) -> int | None:

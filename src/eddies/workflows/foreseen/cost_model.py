@@ -26,6 +26,7 @@ from eddies.spectral.fourier_passes import BLOCK_BYTES
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.time_stepping import STEPPERS
 from eddies.workflows.foreseen.estimates import expected_turbulence, largest_wavenumber
+from eddies.workflows.foreseen.network import LATENCY, NODE_RANKS, RANK_BANDWIDTH, Network
 from eddies.workflows.ground_truth.scene_flow import build_fluid, build_step_limit, initial_state
 
 PROBE_CELLS = 64
@@ -40,11 +41,6 @@ WORK_GROWTH = {64: 1.0, 128: 1.0, 256: 1.35, 512: 1.7, 1024: 2.75, 2048: 4.8}
 FLOW_BYTES = {True: 320, False: 220}
 BLOCK_ARRAYS = {True: 64, False: 32}
 PROCESS_BYTES = 100e6
-# The cluster that a job on more ranks than are at hand is imagined on.
-NODE_RANKS = 64
-NODE_BANDWIDTH = 10e9        # bytes a second into and out of a node while all nodes talk to all: 100 Gbit/s, not quite
-RANK_BANDWIDTH = 2e9         # bytes a second of a rank to others of its node, where one rank at hand cannot tell
-LATENCY = 2e-6               # seconds of a message
 
 
 @dataclass(frozen=True)
@@ -108,12 +104,7 @@ def sent_bytes(scene: Scene) -> float:
 
 def exchange_seconds(scene: Scene, ranks: int, speed: Speed) -> float:
     """Seconds of the messages of a step."""
-    if ranks == 1:
-        return 0.0
-    on_node = min(ranks, NODE_RANKS)
-    own = sent_bytes(scene) / ranks
-    within, beyond = own * (on_node - 1) / ranks, own * (ranks - on_node) / ranks
-    return EVALUATIONS * (within / speed.bandwidth + beyond * on_node / NODE_BANDWIDTH + 2 * (ranks - 1) * LATENCY)
+    return EVALUATIONS * Network(ranks, speed.bandwidth).all_to_all(sent_bytes(scene), times=2)
 
 
 def real_bytes(scene: Scene) -> int:
@@ -126,15 +117,6 @@ def flow_bytes(scene: Scene, ranks: int) -> float:
     fluid, cells, real = scene.flow.compressible, scene.flow.cells, real_bytes(scene)
     block = BLOCK_ARRAYS[fluid] * max(BLOCK_BYTES, 2 * cells**2 * real)
     return PROCESS_BYTES + FLOW_BYTES[fluid] * real / 8 * cells**2 * math.ceil(cells / ranks) + block
-
-
-def pair_bytes(scene: Scene, ranks: int) -> float:
-    """Memory of a rank in the learned pair force: list, displacements, three copies of what the term that keeps most
-    of a pair keeps."""
-    pairs = scene.tracers.particles * scene.neighbors * (1 + scene.simulation.skin) ** 3
-    item = 4 if scene.simulation.precision == "float32" else 8
-    kept = max(settings.numbers_per_pair for settings in scene.model.settings.values())
-    return PROCESS_BYTES + pairs / ranks * (16 + 4 * item + 3 * item * kept)
 
 
 def probe(scene: Scene, comm: Comm, steps: int = 5) -> Speed:

@@ -1,0 +1,64 @@
+"""The probe of the particle step: it runs with any terms, counts what they ask for, and leaves nothing behind."""
+
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from eddies.kernels.library import library
+from eddies.particles.terms.presets import PRESETS
+from eddies.scene.scene import load_scene
+from eddies.workflows.foreseen.particle_probe import PARTS, probe_particles
+
+EXAMPLES = Path(__file__).parents[3] / "docs/examples"
+OWN_PAIRS = """
+from eddies.particles.terms.pair_network import PairNetwork
+
+class Unknown(PairNetwork):
+    pass
+"""
+
+
+def scene_of(*changes):
+    return load_scene("tiny", list(changes))
+
+
+@pytest.mark.mpi(1, 2)
+@pytest.mark.parametrize("preset", [name for name in PRESETS if name != "wcsph"])
+def test_every_preset_is_probed(comm, preset):
+    speed = probe_particles(scene_of(f"model.preset={preset}"), comm)
+    assert set(speed.rates) == set(PARTS)
+    assert all(rate.call >= 0 and rate.unit >= 0 for rate in speed.rates.values())
+    assert speed.listed is (library() is None and "pairs" in PRESETS[preset])
+    # The residual that a solve starts from and the products are two transforms each, the stress two, what it misses of
+    # the velocities one, the force one.
+    expected = {"resolved": (8, 30), "resolved + pairs": (8, 31)}.get(preset, (0, 0))
+    assert (speed.calls["transforms"], speed.components["transforms"]) == expected
+    assert bool(speed.ghost_columns) == ("pairs" in PRESETS[preset])
+
+
+@pytest.mark.mpi(1, 2)
+def test_terms_of_the_users_are_probed(comm, own, monkeypatch):
+    monkeypatch.setattr(sys, "path", [*sys.path, str(EXAMPLES)])
+    stress = probe_particles(scene_of('model.terms=["pressure", "own_term:SmagorinskyStress", "pairs"]'), comm)
+    # It transforms nine slopes and six products in the place of three velocities and six products.
+    assert stress.components["transforms"] == 31 - 3 - 3 + 9
+    own("own_pairs", OWN_PAIRS)
+    unknown = probe_particles(scene_of('model.terms=["pressure", "own_pairs:Unknown"]'), comm)
+    assert unknown.listed and unknown.block_bytes > 0
+
+
+@pytest.mark.mpi(1)
+def test_forcing_is_probed_too(comm):
+    forced = probe_particles(scene_of("simulation.injection=0.5"), comm)
+    assert forced.components["transforms"] == 31
+
+
+@pytest.mark.mpi(1, 2)
+def test_nothing_is_left_behind(comm, monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
+    threads, state, grad = torch.get_num_threads(), torch.random.get_rng_state(), torch.is_grad_enabled()
+    probe_particles(scene_of(), comm)
+    assert (torch.get_num_threads(), torch.is_grad_enabled()) == (threads, grad)
+    assert torch.equal(torch.random.get_rng_state(), state)
