@@ -64,18 +64,27 @@ def letter(axes: Sequence[Axes]) -> None:
 def png(figure: Figure) -> bytes:
     """The figure as a PNG image."""
     buffer = io.BytesIO()
-    # Not `savefig`, which draws every figure twice: the first time for its layout alone.
-    FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": None})
+    # Not `savefig`, which draws every figure twice: the first time for its layout alone. Level 2 of 9 takes half the
+    # time of the usual 6 and a fifth more space.
+    FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": None}, pil_kwargs={"compress_level": 2})
     return buffer.getvalue()
 
 
 def draw(comm: Comm, sections: Sequence[Section]) -> None:
-    """Turn the figures of rank 0's sections into PNG images; all ranks call it, and each draws its share."""
+    """Turn the figures of this rank's sections into PNG images; all ranks call it, and each draws as many as any."""
     illustrations = [illustration for section in sections for illustration in section.illustrations]
-    shares = [[illustration.image for illustration in illustrations[rank::comm.size]] for rank in range(comm.size)]
-    images = comm.gather([png(figure) for figure in comm.scatter(shares)])
-    for index, illustration in enumerate(illustrations):
-        illustration.image = images[index % comm.size][index // comm.size]
+    counts = comm.allgather(len(illustrations))
+    share = -(-sum(counts) // comm.size)
+    # A figure stays where it was made, if there is no rank with fewer: to send one takes a tenth of drawing it.
+    free = [rank for rank, count in enumerate(counts) for _ in range(share - count)]
+    before = sum(max(count - share, 0) for count in counts[:comm.rank])
+    surplus = len(illustrations) - min(len(illustrations), share)
+    places = [comm.rank] * (len(illustrations) - surplus) + free[before:before + surplus]
+    given = comm.alltoall([[illustration.image for illustration, place in zip(illustrations, places) if place == rank]
+                           for rank in range(comm.size)])
+    drawn = comm.alltoall([[png(figure) for figure in figures] for figures in given])
+    for illustration, place in zip(illustrations, places):
+        illustration.image = drawn[place].pop(0)
 
 
 def largest(*arrays: np.ndarray, quantile: float = 0.998) -> float:
