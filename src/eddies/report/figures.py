@@ -12,7 +12,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.lines import TICKDOWN, TICKLEFT, Line2D
 from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
+from matplotlib.transforms import Bbox
 
 from eddies.report.page import Section
 
@@ -44,11 +46,27 @@ def styled(draw: Callable[..., Figure]) -> Callable[..., Figure]:
     return drawn
 
 
+class Panel(Axes):
+    """Axes that measure once what stands around them: a constrained layout asks twice, before and after it has put
+    the axes in their place, and to measure all ticks is most of a figure's time."""
+
+    _margins: np.ndarray | None = None
+
+    def get_tightbbox(self, renderer=None, **options) -> Bbox:
+        """The box of the axes with what stands around them, in pixels."""
+        if self._margins is None:
+            box = super().get_tightbbox(renderer, **options)
+            self._margins = box.extents - self.bbox.extents
+            return box
+        self.apply_aspect()
+        return Bbox.from_extents(*(self.bbox.extents + self._margins))
+
+
 def panels(rows: int, columns: int, size: tuple[float, float], **sharing) -> tuple[Figure, np.ndarray]:
     """A figure of rows x columns axes, always a two-dimensional array; `size` is of one panel in inches."""
     figure = Figure(figsize=(size[0] * columns, size[1] * rows), layout="constrained")
     figure.get_layout_engine().set(w_pad=0.06, h_pad=0.06)
-    return figure, figure.subplots(rows, columns, squeeze=False, **sharing)
+    return figure, figure.subplots(rows, columns, squeeze=False, subplot_kw={"axes_class": Panel}, **sharing)
 
 
 def letter(axes: Sequence[Axes]) -> None:
@@ -60,9 +78,27 @@ def letter(axes: Sequence[Axes]) -> None:
             panel.set_title("", loc="center")
 
 
+def merge_minor_ticks(axes: Axes) -> None:
+    """Draw the minor ticks that have no label as one line of markers: every tick is five artists to matplotlib, and the
+    many of a logarithmic axis are half of a figure's time."""
+    for axis, marker in ((axes.xaxis, TICKDOWN), (axes.yaxis, TICKLEFT)):
+        places = axis.get_minorticklocs()
+        places = places[(places >= min(axis.get_view_interval())) & (places <= max(axis.get_view_interval()))]
+        if any(axis.get_minor_formatter().format_ticks(places)) or not len(places):
+            continue
+        axis.set_minor_locator(NullLocator())
+        across, up = (places, 0 * places) if axis is axes.xaxis else (0 * places, places)
+        axes.add_artist(Line2D(
+            across, up, marker=marker, linestyle="none", color="black", clip_on=False, in_layout=False, zorder=2.01,
+            markersize=matplotlib.rcParams["xtick.minor.size"], markeredgewidth=matplotlib.rcParams["xtick.minor.width"],
+            transform=axes.get_xaxis_transform() if axis is axes.xaxis else axes.get_yaxis_transform()))
+
+
 @styled
 def png(figure: Figure) -> bytes:
     """The figure as a PNG image."""
+    for axes in figure.axes:
+        merge_minor_ticks(axes)
     buffer = io.BytesIO()
     # Not `savefig`, which draws every figure twice: the first time for its layout alone. Level 2 of 9 takes half the
     # time of the usual 6 and a fifth more space.
