@@ -69,7 +69,8 @@ def run(directory: str | Path, comm: Comm) -> None:
     directory, alone = Path(directory), comm.Split(comm.rank)
     try:
         record = in_files(comm, directory, lambda: _survey(directory, alone))
-        own = _on_all_ranks(comm, lambda: in_files(alone, directory, lambda: _read_share(directory, comm, alone, record)))
+        own = _on_all_ranks(comm, lambda: in_files(alone, directory,
+                                                   lambda: _read_share(directory, comm, alone, record)))
     finally:
         alone.Free()
     draw(comm, own)
