@@ -58,11 +58,11 @@ def pairs_at(position: np.ndarray, length: float, distances: Sequence[float], to
     pairs = [[np.empty((2, 0), int)] for _ in distances]
     components, reach = np.ascontiguousarray(position.T), 1.001 * (1 + tolerance) * max(distances, default=0.0)
     for row, start in enumerate(position[:followed]):
-        apart = np.sqrt(np.sum(minimum_image(components - start[:, None], length) ** 2, axis=0))
-        near = np.flatnonzero(apart <= reach)
+        near = np.flatnonzero(np.abs(minimum_image(components[0] - start[0], length)) <= reach)
         near = near[(near >= followed) | (near > row)]  # each pair once
+        apart = np.sqrt(np.sum(minimum_image(components[:, near] - start[:, None], length) ** 2, axis=0))
         for distance, found in zip(distances, pairs):
-            others = near[np.abs(apart[near] - distance) <= tolerance * distance]
+            others = near[np.abs(apart - distance) <= tolerance * distance]
             found.append(np.stack([np.full(others.size, row), others]))
     return [np.concatenate(found, axis=1) for found in pairs]
 
