@@ -56,11 +56,13 @@ def pairs_at(position: np.ndarray, length: float, distances: Sequence[float], to
     The first of a pair is one of the first `followed` rows, which are compared with all.
     """
     pairs = [[np.empty((2, 0), int)] for _ in distances]
+    components, reach = np.ascontiguousarray(position.T), 1.001 * (1 + tolerance) * max(distances, default=0.0)
     for row, start in enumerate(position[:followed]):
-        apart = np.sqrt(np.sum(minimum_image(position - start, length) ** 2, axis=1))
+        near = np.flatnonzero(np.abs(minimum_image(components[0] - start[0], length)) <= reach)
+        near = near[(near >= followed) | (near > row)]  # each pair once
+        apart = np.sqrt(np.sum(minimum_image(components[:, near] - start[:, None], length) ** 2, axis=0))
         for distance, found in zip(distances, pairs):
-            others = np.flatnonzero(np.abs(apart - distance) <= tolerance * distance)
-            others = others[(others >= followed) | (others > row)]  # each pair once
+            others = near[np.abs(apart - distance) <= tolerance * distance]
             found.append(np.stack([np.full(others.size, row), others]))
     return [np.concatenate(found, axis=1) for found in pairs]
 

@@ -9,7 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
-from eddies.analysis.lagrangian import pair_dispersion, pairs_at, structure_function
+from eddies.analysis.lagrangian import pairs_at, separations, structure_function
 from eddies.analysis.pdfs import bin_edges, pdf
 
 FOLLOWED = 2**14  # tracers of which all velocities are held at once
@@ -124,12 +124,20 @@ def _accelerations(velocity: np.ndarray) -> tuple[np.ndarray, float]:
 def _dispersion(tracers: Tracers, spacing: float) -> list[Dispersion]:
     start, velocity = (tracers.read(0, column) for column in ("position", "velocity"))
     distances = [spacing * factor for factor in SEPARATIONS if spacing * factor < tracers.length / 2]
-    found = []
-    for distance, pairs in zip(distances, pairs_at(start, tracers.length, distances, TOLERANCE, CENTRES)):
-        if pairs.shape[1] >= FEWEST:
-            first, second = pairs[:, ::-(-pairs.shape[1] // PAIRS)]
-            frames = (tracers.read(frame, "position") for frame in range(tracers.times.size))
-            spread = pair_dispersion(frames, first, second, tracers.length)
-            structure = float(np.mean(np.sum((velocity[first] - velocity[second]) ** 2, axis=1)))
-            found.append(Dispersion(distance, first.size, spread, structure))
-    return found
+    found = [(distance, pairs[:, ::-(-pairs.shape[1] // PAIRS)]) for distance, pairs
+             in zip(distances, pairs_at(start, tracers.length, distances, TOLERANCE, CENTRES))
+             if pairs.shape[1] >= FEWEST]
+    if not found:
+        return []
+    first, second = np.concatenate([pairs for _, pairs in found], axis=1)
+    ends = np.cumsum([pairs.shape[1] for _, pairs in found])[:-1]
+    paths = separations((tracers.read(frame, "position") for frame in range(tracers.times.size)), first, second,
+                        tracers.length)
+    begin = next(paths)
+    spreads = [np.zeros(len(found))]  # all distances together: each frame is read once
+    for separation in paths:
+        squared = np.sum((separation - begin) ** 2, axis=1)
+        spreads.append(np.array([part.mean() for part in np.split(squared, ends)]))
+    parting = np.sum((velocity[first] - velocity[second]) ** 2, axis=1)
+    return [Dispersion(distance, pairs.shape[1], spread, float(part.mean())) for (distance, pairs), spread, part
+            in zip(found, np.transpose(spreads), np.split(parting, ends))]

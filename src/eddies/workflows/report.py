@@ -1,17 +1,18 @@
 """The report of a run: the paper's figures from the run's own products, one page, and the numbers as JSON.
 
-Every product is optional; a section appears for what there is. Rank 0 reads and computes, all ranks draw.
+Every product is optional; a section appears for what there is. Each rank makes some of the sections, all draw.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from eddies.analysis.tracer_statistics import tracer_statistics
 from eddies.io.fields import FieldSeries
 from eddies.io.hdf5 import File, ProductError, in_files, open_product, read_attributes, read_provenance, read_table
 from eddies.io.trajectories import Trajectory
+from eddies.parallel.broadcast import first_complaint
 from eddies.parallel.communicator import Comm
 from eddies.parallel.stop import StopRequest
 from eddies.pipeline import MAKER_OF
@@ -31,17 +33,19 @@ from eddies.report.page import Metric, RunRecord, Section, metrics_json, shown, 
 from eddies.report.rollout import Rollout
 from eddies.report.rollout import section as rollout_section
 from eddies.scene.scene import Scene
-from eddies.workflows.rollout.frames import FIELDS
 
 log = logging.getLogger("eddies")
+Result = TypeVar("Result")
 
+KINDS = "ground_truth", "kernel", "model", "rollout"  # products, in the order of the page
 ROLLOUT_COST = {"seconds_per_step": "rollout, seconds per step", "particles": "particles of the rollout",
                 "ranks": "ranks of the rollout"}
 
 
 @dataclass
 class Run:
-    """What has been read so far: wall seconds by stage, provenance by product, and what later sections need."""
+    """What all products say in short: wall seconds by stage, provenance by product, cost, and what sections need of
+    another product than their own."""
 
     seconds: dict[str, float]
     provenance: dict[str, dict[str, Any]] = field(default_factory=dict)
@@ -63,35 +67,87 @@ def run(directory: str | Path, comm: Comm) -> None:
     Raises ProductError if the directory holds no product, or a damaged one, or the report cannot be written.
     """
     directory, alone = Path(directory), comm.Split(comm.rank)
-    found: list[tuple[RunRecord, list[Section]]] = []  # of rank 0: figures are not for sending around
     try:
-        in_files(comm, directory, lambda: found.append(_read(directory, alone)))
+        record = in_files(comm, directory, lambda: _survey(directory, alone))
+        own = _on_all_ranks(comm, lambda: in_files(alone, directory,
+                                                   lambda: _read_share(directory, comm, alone, record)))
     finally:
         alone.Free()
-    draw(comm, [section for _, sections in found for section in sections])
-    in_files(comm, directory / "report", lambda: _write_files(directory / "report", *found[0]))
-    for _, sections in found:
-        _log_main_numbers(sections)
+    draw(comm, own)
+    gathered = comm.gather(own) or []
+    sections = [section for own in gathered for section in own] + [_cost_section(record)]
+    in_files(comm, directory / "report", lambda: _write_report(directory, record, sections))
 
 
-def _read(directory: Path, alone: Comm) -> tuple[RunRecord, list[Section]]:
-    record, sections = Run(seconds=_stage_seconds(directory)), []
-    readers = {"ground_truth": _read_ground_truth, "kernel": _read_kernel, "model": _read_model,
-               "rollout": _read_rollout}
-    for kind, read in readers.items():
+def _survey(directory: Path, alone: Comm) -> Run:
+    """What the sections have in common."""
+    record = Run(seconds=_stage_seconds(directory))
+    for kind in KINDS:
         path = directory / f"{kind}.h5"
         if path.exists():
             with open_product(alone, path, kind) as file:
                 record.provenance[kind] = read_provenance(file)
-                found = read(file, record)
-            sections += found
-            for section in found:
-                log.info("report: %s, %d figures", section.title, len(section.illustrations))
-    if not sections:
-        raise ProductError(f"{directory}: holds none of {', '.join(f'{kind}.h5' for kind in readers)}; "
+                if kind == "ground_truth":
+                    _survey_ground_truth(file, record)
+                elif kind == "rollout":
+                    _survey_rollout(file, record)
+    if not record.provenance:
+        raise ProductError(f"{directory}: holds none of {', '.join(f'{kind}.h5' for kind in KINDS)}; "
                            "run `eddies dns SCENE` first")
-    sections.append(_cost_section(record))
-    return _run_record(directory, record), sections
+    return record
+
+
+def _survey_ground_truth(file: File, record: Run) -> None:
+    reference, statistics = read_attributes(file, "reference"), read_table(file, "statistics")
+    record.cost.append(Metric("dns_seconds_per_step", "DNS, seconds per step (median)",
+                              float(np.median(statistics["seconds_per_step"]))))
+    if "released_at" in reference:
+        record.eulerian, record.filter_width = read_table(file, "spectra"), reference["filter_width"]
+    if "stationary" in file:
+        with contextlib.suppress(ProductError):  # told in its section
+            record.stationary = read_stationary_span(file)
+
+
+def _survey_rollout(file: File, record: Run) -> None:
+    attributes = read_attributes(file, "rollout")
+    record.cost += [Metric(key, label, attributes[key]) for key, label in ROLLOUT_COST.items()]
+    if "evaluations" in attributes and attributes["turnovers"] > 0:
+        record.cost.append(Metric("evaluations_per_turnover", "evaluations of the forces a turnover",
+                                  attributes["evaluations"] / attributes["turnovers"]))
+
+
+def _read_share(directory: Path, comm: Comm, alone: Comm, record: Run) -> list[Section]:
+    """The sections of this rank, neighbours on the page, without that on the cost."""
+    readers = {"ground_truth": (_read_flow, _read_tracers), "kernel": (_read_kernel,), "model": (_read_model,),
+               "rollout": (_read_rollout,)}
+    parts = [(kind, read) for kind in record.provenance for read in readers[kind]]
+    sections = []
+    for index in np.array_split(np.arange(len(parts)), comm.size)[comm.rank]:
+        kind, read = parts[index]
+        with open_product(alone, directory / f"{kind}.h5", kind) as file:
+            sections += read(file, record)
+    return sections
+
+
+def _on_all_ranks(comm: Comm, work: Callable[[], Result]) -> Result:
+    """What work gives on this rank; all ranks raise the ProductError that it raises on the lowest of them."""
+    result: Any = None
+    complaint = None
+    try:
+        result = work()
+    except ProductError as error:
+        complaint = str(error)
+    complaint = first_complaint(comm, complaint)
+    if complaint is not None:
+        raise ProductError(complaint)
+    return result
+
+
+def _write_report(directory: Path, record: Run, sections: Sequence[Section]) -> None:
+    for section in sections[:-1]:
+        log.info("report: %s, %d figures", section.title, len(section.illustrations))
+    _write_files(directory / "report", _run_record(directory, record), sections)
+    _log_main_numbers(sections)
 
 
 def read_stationary_span(file: File) -> StationarySpan:
@@ -108,41 +164,36 @@ def read_stationary_span(file: File) -> StationarySpan:
         raise ProductError(f"{file.filename}: {error}; raise [spin_up] stationary and run `eddies dns` again") from None
 
 
-def _read_ground_truth(file: File, record: Run) -> list[Section]:
-    reference, statistics = read_attributes(file, "reference"), read_table(file, "statistics")
-    sections = [_read_flow(file, record, reference, statistics)]
-    if "stationary" in file:
-        sections.append(_read_stationary(file, record, statistics))
-    if "particles/tracers" in file:
-        found = tracer_statistics(Trajectory(file, "tracers"), record.eulerian, reference["spacing"])
-        sections.append(tracers.section(found, reference))
-    return sections
-
-
-def _read_stationary(file: File, record: Run, statistics: dict[str, np.ndarray]) -> Section:
+def _read_stationary(file: File, statistics: dict[str, np.ndarray]) -> Section:
     try:
-        record.stationary = read_stationary_span(file)
-        return stationary.section(statistics, record.stationary)
+        return stationary.section(statistics, read_stationary_span(file))
     except ProductError as error:
         return Section("stationary", "Stationary turbulence", notices=[str(error)])
 
 
-def _read_flow(file: File, record: Run, reference: dict[str, Any], statistics: dict[str, np.ndarray]) -> Section:
+def _read_flow(file: File, record: Run) -> list[Section]:
+    reference, statistics = read_attributes(file, "reference"), read_table(file, "statistics")
     traced = "released_at" in reference
     name = "filtered" if traced else "final"
     velocity = FieldSeries(file, name).read(-1, "velocity")
     vorticity_magnitude = np.linalg.norm(vorticity(velocity), axis=0)
     middle = velocity.shape[1] // 2
     if traced:
-        spectra = record.eulerian = read_table(file, "spectra")
-        record.filter_width = reference["filter_width"]
+        spectra = record.eulerian
     else:
         wavenumber, energy = energy_spectrum(velocity)
         spectra = {"wavenumber": wavenumber, "energy": energy[None]}
-    record.cost.append(Metric("dns_seconds_per_step", "DNS, seconds per step (median)",
-                              float(np.median(statistics["seconds_per_step"]))))
     planes = {"velocity": velocity[0, middle], "vorticity": vorticity_magnitude[middle]}
-    return ground_truth.section(ground_truth.StoredFlow(statistics, spectra, reference, planes, name))
+    sections = [ground_truth.section(ground_truth.StoredFlow(statistics, spectra, reference, planes, name))]
+    return sections + ([_read_stationary(file, statistics)] if "stationary" in file else [])
+
+
+def _read_tracers(file: File, record: Run) -> list[Section]:
+    if "particles/tracers" not in file:
+        return []
+    reference = read_attributes(file, "reference")
+    found = tracer_statistics(Trajectory(file, "tracers"), record.eulerian, reference["spacing"])
+    return [tracers.section(found, reference)]
 
 
 def _read_kernel(file: File, record: Run) -> list[Section]:
@@ -166,12 +217,8 @@ def _read_model(file: File, record: Run) -> list[Section]:
 
 def _read_rollout(file: File, record: Run) -> list[Section]:
     attributes = read_attributes(file, "rollout")
-    record.cost += [Metric(key, label, attributes[key]) for key, label in ROLLOUT_COST.items()]
-    if "evaluations" in attributes and attributes["turnovers"] > 0:
-        record.cost.append(Metric("evaluations_per_turnover", "evaluations of the forces a turnover",
-                                  attributes["evaluations"] / attributes["turnovers"]))
     model, truth = Trajectory(file, "model"), Trajectory(file, "truth")
-    fields = {name: FieldSeries(file, name) for name in FIELDS} if "fields" in file else None
+    fields = {name: FieldSeries(file, name) for name in file["fields"]} if "fields" in file else None
     outside = read_table(file, "outside_training")["share"] if "outside_training" in file else None
     closure = read_table(file, "closure") if "closure" in file else None
     rollout = Rollout(attributes, model, truth, fields, model.length, record.filter_width,
