@@ -1,0 +1,201 @@
+"""Values of a velocity's three components at points, and their adjoint, by the closure's splines and by FINUFFT: the
+same points and modes, the same accuracy, one run.
+
+    OMP_NUM_THREADS=1 .venv/bin/python tests/benchmarks/splines.py [PARTICLES A SIDE] [--threads T]
+
+FINUFFT (pip install --no-binary finufft finufft, so that it is built for this processor) does its best: single
+precision, plans that are measured and used again, the fastest of several grids, of three transforms at once and of two,
+the first with two components as real and imaginary part. Neither this packing nor the modes kx < 0 that it wants as
+well are in its time. The velocity has the spectrum that the closure expects (`ResolvedVelocity`). Errors are against
+exact sums, at some points and in some modes, these weighted by that spectrum. Of FINUFFT's tolerances counts the
+largest that makes an error not above that of the splines, and 1e-3.
+
+Prints JSON lines: "interpolation" is from modes to points, "spreading" from points to modes, each whole and between
+grid and points alone (FINUFFT's `spreadinterponly` with the same grid and tolerance). Seconds are medians.
+"""
+
+import argparse
+import json
+import math
+import time
+from collections.abc import Callable
+from statistics import median
+
+import finufft
+import numpy as np
+import torch
+from mpi4py import MPI
+
+from eddies.parallel.slab import SlabDecomposition
+from eddies.particles.fourier_grid import FourierGrid
+from eddies.particles.resolved_velocity import ResolvedVelocity
+
+PLANES, HIGHEST, REPEATS, CHECKED = 1.75, 0.75, 9, 100
+UPSAMPLING = (1.15, 1.23, 1.25)  # the first is the least that FINUFFT allows; 2, its other standard, takes far longer
+TOLERANCES, TOLERANCE = [10 ** (-i / 6) for i in range(6, 30)], 1e-3
+MEASURE = 0                      # FFTW's flag
+
+Action = Callable[[], np.ndarray]
+
+
+class Case:
+    """Points, a velocity there and its modes, and exact sums."""
+
+    def __init__(self, side: int) -> None:
+        slab = SlabDecomposition(MPI.COMM_SELF, 2 * math.pi, int(PLANES * side))
+        self.grid, random = FourierGrid(slab, int(HIGHEST * side), 1, torch.float32), np.random.default_rng(1)
+        self.position = random.uniform(0, slab.length, (side**3, 3))
+        self.points = self.grid.points(torch.from_numpy(self.position))
+        equations = ResolvedVelocity(self.grid, 2 * slab.length / side).equations
+        penalty = equations.penalty.numpy()
+        self.energy = np.divide(1, penalty, out=np.zeros_like(penalty), where=penalty > 0)
+        noise = random.standard_normal((3, *self.grid.spectral.physical_shape), np.float32)
+        self.modes = equations.projected(self.grid.to_modes(torch.from_numpy(noise))
+                                         * torch.from_numpy(np.sqrt(self.energy / self.energy.max())))
+        self.values = self.grid.at(self.modes, self.points)
+        self.checked = random.integers(0, side**3, CHECKED)
+        self.shells = self._modes_of_all_shells(random)
+        self.exact = {"interpolation": self._exact_values(), "spreading": self._exact_modes()}
+
+    def _modes_of_all_shells(self, random: np.random.Generator) -> np.ndarray:
+        """Some (kz, ky, kx), |k| spread evenly."""
+        direction = random.standard_normal((CHECKED, 3))
+        direction /= np.linalg.norm(direction, axis=1)[:, None] * np.sign(direction[:, 2:])
+        return np.rint(direction * random.uniform(1, self.grid.resolved - 1, (CHECKED, 1))).astype(int)
+
+    def _exact_values(self) -> np.ndarray:
+        """Values (points, 3)."""
+        total = self.grid.spectral.multiplicity * self.modes.numpy().astype(complex)
+        kx, ky, kz = (axis.numpy().ravel().astype(float) for axis in self.grid.wavevector)
+        x, y, z = self.position[self.checked].T
+        waves = [np.exp(1j * np.outer(k, at)) for k, at in ((kz, z), (ky, y), (kx, x))]
+        return np.einsum("czyp,zp,yp->pc", total @ waves[2], *waves[:2], optimize=True).real
+
+    def _exact_modes(self) -> np.ndarray:
+        """Modes (3, modes)."""
+        return np.stack([self.values.numpy().T @ np.exp(-1j * (self.position @ mode[::-1])) for mode in self.shells], 1)
+
+    def error(self, name: str, result: np.ndarray) -> float:
+        """Relative error of values (n, 3) or of modes (3, kz, ky, kx)."""
+        exact = self.exact[name]
+        if name == "interpolation":
+            return float(np.linalg.norm(result[self.checked] - exact) / np.linalg.norm(exact))
+        place = tuple(self.shells.T)
+        weight = np.sqrt(self.energy[place] * (self.shells**2).sum(1))
+        return float(np.linalg.norm(weight * (result[:, *place] - exact)) / np.linalg.norm(weight * exact))
+
+
+def ours(case: Case) -> dict[str, tuple[Action, Action]]:
+    """Of interpolation and spreading the whole, and the part between grid and points."""
+    grid, points = case.grid, case.points
+    fields, count = grid.to_fields(case.modes * grid.prefilter), grid.spectral.cells**3
+    return {"interpolation": (lambda: grid.at(case.modes, points).numpy(),
+                              lambda: points.at(points.spline.with_ghosts(fields.numpy()))),
+            "spreading": (lambda: grid.spread(case.values, points).numpy() * np.float32(count),
+                          lambda: points.spread(case.values))}
+
+
+class Peer:
+    """FINUFFT in one of its forms."""
+
+    def __init__(self, case: Case, threads: int, name: str, packed: bool, upsampling: float) -> None:
+        self.case, self.name, self.packed, self.upsampling, self.threads = case, name, packed, upsampling, threads
+        self.size = 2 * case.grid.resolved + 1
+        given = _all_kx(case.modes.numpy()) if name == "interpolation" else case.values.numpy().T
+        self.given = np.ascontiguousarray(_pair(given) if packed else given, np.complex64)
+
+    def whole(self, tolerance: float) -> Action:
+        """From modes to points or back."""
+        plan = self._plan(self.size, tolerance)
+        return lambda: plan.execute(self.given)
+
+    def part(self, tolerance: float) -> Action:
+        """Between its grid and points."""
+        cells = _fine(self.upsampling * self.size)
+        plan = self._plan(cells, tolerance, spreadinterponly=1)
+        shape = (len(self.given), cells, cells, cells)
+        given = np.ones(shape, np.complex64) if self.name == "interpolation" else self.given
+        return lambda: plan.execute(given)
+
+    def error(self, result: np.ndarray) -> float:
+        """Of what `whole` gives."""
+        if self.name == "interpolation":
+            pairs = [part for one in result for part in (one.real, one.imag)] if self.packed else result.real
+            return self.case.error(self.name, np.stack(pairs[:3], 1))
+        if self.packed:
+            mirrored = np.roll(result[:, ::-1, ::-1, ::-1], 1, (1, 2, 3)).conj()
+            first, second = (result + mirrored) / 2, (result - mirrored) / 2j
+            result = np.stack([first[0], second[0], first[1]])
+        return self.case.error(self.name, result)
+
+    def _plan(self, size: int, tolerance: float, **options: int) -> finufft.Plan:
+        kind, sign = (2, 1) if self.name == "interpolation" else (1, -1)
+        plan = finufft.Plan(kind, (size,) * 3, len(self.given), tolerance, sign, "complex64", modeord=1, fftw=MEASURE,
+                            upsampfac=self.upsampling, nthreads=self.threads, **options)
+        plan.setpts(*(np.ascontiguousarray(x, np.float32) for x in self.case.position.T[::-1]))
+        return plan
+
+
+def _all_kx(modes: np.ndarray) -> np.ndarray:
+    """Modes (c, kz, ky, kx) with those of kx < 0."""
+    return np.concatenate([modes, np.roll(modes[:, ::-1, ::-1, :0:-1], 1, (1, 2)).conj()], 3)
+
+
+def _pair(fields: np.ndarray) -> np.ndarray:
+    return np.stack([fields[0] + 1j * fields[1], fields[2] + 0j])
+
+
+def _fine(least: float) -> int:
+    """The smallest even number from `least` on without prime factors above 5, FINUFFT's grid."""
+    return next(n for n in range(2 * math.ceil(least / 2), 2 * math.ceil(least), 2) if 30**20 % n == 0)
+
+
+def medians(actions: dict[str, Action]) -> dict[str, float]:
+    """Seconds of each, by turns."""
+    seconds: dict[str, list[float]] = {name: [] for name in actions}
+    for _ in range(REPEATS + 1):
+        for name, action in actions.items():
+            start = time.perf_counter()
+            action()
+            seconds[name].append(time.perf_counter() - start)
+    return {name: median(taken[1:]) for name, taken in seconds.items()}
+
+
+def compare(case: Case, threads: int, name: str) -> list[dict[str, object]]:
+    """Interpolation or spreading by both: the fastest of FINUFFT's forms."""
+    whole, part = ours(case)[name]
+    error = case.error(name, whole())
+    actions, parts, errors = {"eddies": whole}, {"eddies": part}, {"eddies": error}
+    for form in (Peer(case, threads, name, packed, factor) for packed in (False, True) for factor in UPSAMPLING):
+        same = next(tolerance for tolerance in TOLERANCES if form.error(form.whole(tolerance)()) <= error)
+        for what, tolerance in (("same error", same), (f"{TOLERANCE:g}", TOLERANCE)):
+            label = f"finufft, {what}: {tolerance:g}, grid of {form.upsampling}, {len(form.given)} transforms"
+            actions[label], parts[label] = form.whole(tolerance), form.part(tolerance)
+            errors[label] = form.error(actions[label]())
+    both = medians(actions | {f"part {label}": action for label, action in parts.items()})
+    found, count = [], len(case.position)
+    for who in ("eddies", "finufft, same error", f"finufft, {TOLERANCE:g}"):
+        labels = [label for label in actions if label.startswith(who)]
+        best, alone = (min(labels, key=lambda label: both[part + label]) for part in ("", "part "))
+        found.append({"by": best, "error": errors[best], "seconds": both[best],
+                      "points_per_second": count / both[best], "between_grid_and_points_by": alone,
+                      "between_grid_and_points_per_second": count / both["part " + alone]})
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("side", nargs="?", type=int, default=64)
+    parser.add_argument("--threads", type=int, default=1)
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    with torch.no_grad():
+        case = Case(options.side)
+        for name in ("interpolation", "spreading"):
+            for found in compare(case, options.threads, name):
+                print(json.dumps({"particles": options.side, "threads": options.threads, "finufft": finufft.__version__,
+                                  "what": name, **found}), flush=True)
+
+
+if __name__ == "__main__":
+    main()
