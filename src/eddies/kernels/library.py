@@ -7,6 +7,8 @@ import functools
 import logging
 from pathlib import Path
 
+from eddies.parallel.node import threads
+
 # As setup.py has them; a processor that runs one runs those before it.
 INSTRUCTION_SETS = ("plain", "avx2", "avx512")
 MISSING = ("no compiled kernels (no C++ compiler at installation?): everything runs by numpy and torch, several times "
@@ -44,7 +46,22 @@ def in_use() -> str:
 @functools.cache
 def load(instruction_set: str) -> ctypes.CDLL:
     """The library for an instruction set that it is built for."""
+    share_threads()
     return ctypes.CDLL(str(_path(instruction_set)))
+
+
+@functools.cache
+def share_threads() -> None:
+    """Let what is loaded from here on, kernels and torch, take the threads of pyfftw's OpenMP runtime, which its wheel
+    brings along: those of two runtimes would wait for each other, spinning on the same cores, and a step of the direct
+    simulation take twenty times as long."""
+    if threads() == 1:
+        return
+    import pyfftw  # noqa: F401
+    with open("/proc/self/maps") as file:
+        runtimes = {line.split()[-1] for line in file if "/libgomp" in line}
+    for runtime in runtimes:
+        ctypes.CDLL(runtime, mode=ctypes.RTLD_GLOBAL)
 
 
 def _path(instruction_set: str) -> Path:

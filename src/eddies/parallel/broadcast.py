@@ -54,18 +54,18 @@ def on_first_rank(comm: MPI.Comm, action: Callable[[], Result]) -> Result:
     return result
 
 
-def on_all_ranks(comm: MPI.Comm, action: Callable[[], Result]) -> Result:
-    """What an action gives on this rank. All ranks raise an OSError that it raises on some, with the words of the
-    lowest of these."""
+def on_all_ranks(comm: MPI.Comm, action: Callable[[], Result], kind: type[Exception] = OSError) -> Result:
+    """What an action gives on this rank. All ranks raise an error of this kind that it raises on some, with the words
+    of the lowest of these."""
     result: Any = None
     complaint = None
     try:
         result = action()
-    except OSError as error:
-        complaint = error.strerror or str(error)
+    except kind as error:
+        complaint = getattr(error, "strerror", None) or str(error)
     complaint = first_complaint(comm, complaint)
     if complaint is not None:
-        raise OSError(complaint)
+        raise kind(complaint)
     return result
 
 

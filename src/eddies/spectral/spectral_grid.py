@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -43,7 +43,7 @@ class SpectralGrid:
         self.precision, self.real, self.complex = precision, REAL[precision], COMPLEX[precision]
         self.modes = 2 * self.cutoff + 1
         self._transpose = Transpose(decomposition.comm, self.cells, self.modes)
-        self._buffers: dict[tuple[str, int], TransposeBuffers] = {}
+        self._batches: dict[tuple[str, int], _Batch] = {}
         self.column_pass = ColumnPass(self.cells, self.cutoff, self.complex)
         self.plane_pass = PlanePass(self.cells, self.cutoff, self.complex)
         self._wavenumbers()
@@ -149,15 +149,14 @@ class SpectralGrid:
 
     def _packed_blocks(self, spectral: np.ndarray, z_derivatives: int = 0) -> Iterator[tuple[slice, np.ndarray]]:
         copies = self.plane_pass.copies
-        blocks = copies.described_blocks(self._columns_to_planes(spectral, z_derivatives).plane_blocks)
+        blocks = self._columns_to_planes(spectral, z_derivatives).planes
         for planes in self.plane_pass.blocks(self.decomposition.count):
             yield planes, copies.pack(blocks, planes)
 
-    def _columns_to_planes(self, spectral: np.ndarray, z_derivatives: int) -> TransposeBuffers:
+    def _columns_to_planes(self, spectral: np.ndarray, z_derivatives: int) -> _Batch:
         """Transform along z, components and the z derivatives of the first of them, and make them planes."""
         components, copies = len(spectral), self.column_pass.copies
-        buffers = self.buffers("backward", components + z_derivatives)
-        blocks = copies.described_blocks(buffers.column_blocks)
+        batch = self._batch("backward", components + z_derivatives)
         modes = copies.described(np.require(spectral, self.complex, "CW"))
         d_dz = copies.described((1j * self.wavevector[2].ravel()).astype(self.complex))
         fields = [(component, None) for component in range(components)]
@@ -167,16 +166,21 @@ class SpectralGrid:
             for place, (component, factors) in enumerate(fields):
                 copies.fill(modes, component, rows, factors, column.given)
                 column.plan.execute()
-                copies.send(column.result, blocks, place, rows)
-        buffers.to_planes()
-        return buffers
+                copies.send(column.result, batch.columns, place, rows)
+        batch.buffers.to_planes()
+        return batch
 
     def buffers(self, direction: str, components: int) -> TransposeBuffers:
         """What a batch of components is sent in; used again, so a direction is for one transform at a time."""
+        return self._batch(direction, components).buffers
+
+    def _batch(self, direction: str, components: int) -> _Batch:
         key = (direction, components)
-        if key not in self._buffers:
-            self._buffers[key] = self._transpose.buffers(components, self.cutoff + 1, self.complex)
-        return self._buffers[key]
+        if key not in self._batches:
+            buffers = self._transpose.buffers(components, self.cutoff + 1, self.complex)
+            self._batches[key] = _Batch(buffers, self.column_pass.copies.described_blocks(buffers.column_blocks),
+                                        self.plane_pass.copies.described_blocks(buffers.plane_blocks))
+        return self._batches[key]
 
     def sum_modes(self, density: np.ndarray) -> float:
         """Sum of a real spectral quantity (..., kz, ky_local, kx) over all modes of the full spectrum, all ranks."""
@@ -188,13 +192,20 @@ class SpectralGrid:
         return total / self.cells**3
 
 
+class _Batch(NamedTuple):
+    """The memory that components are sent in, and its blocks as the copies of either side want them."""
+
+    buffers: TransposeBuffers
+    columns: Any
+    planes: Any
+
+
 class Collector:
     """Takes real fields a block of planes at a time and gives their Fourier coefficients."""
 
     def __init__(self, grid: SpectralGrid, components: int) -> None:
         self.grid, self.components = grid, components
-        self._buffers = grid.buffers("forward", components)
-        self._blocks = grid.plane_pass.copies.described_blocks(self._buffers.plane_blocks)
+        self._batch = grid._batch("forward", components)
 
     def plans(self, fields: int, planes: slice) -> PlanePlans:
         """Plans with memory for a block of planes of so many fields, to be filled and added."""
@@ -202,19 +213,18 @@ class Collector:
 
     def add(self, planes: slice, plans: PlanePlans, component: int = 0) -> None:
         """Transform a block of planes along x and y: fields that are components from a first one on."""
-        self.grid.plane_pass.to_modes(plans, self._blocks, component, planes)
+        self.grid.plane_pass.to_modes(plans, self._batch.planes, component, planes)
 
     def modes(self) -> np.ndarray:
         """The Fourier coefficients (components, kz, ky_local, kx), once all planes are there; all ranks call it."""
         grid, copies = self.grid, self.grid.column_pass.copies
-        self._buffers.to_columns()
-        blocks = copies.described_blocks(self._buffers.column_blocks)
+        self._batch.buffers.to_columns()
         spectral = np.empty((self.components, *grid.spectral_shape), grid.complex)
         result = copies.described(spectral)
         for rows in grid.column_pass.rows(grid.spectral_shape[1]):
             column = grid.column_pass.plan("FORWARD", rows)
             for component in range(self.components):
-                copies.receive(blocks, component, rows, column.given)
+                copies.receive(self._batch.columns, component, rows, column.given)
                 column.plan.execute()
                 copies.store(column.result, 0.5 / grid.cells**3, result, component, rows)
         return spectral

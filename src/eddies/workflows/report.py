@@ -9,10 +9,10 @@ import contextlib
 import json
 import logging
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from eddies.analysis.tracer_statistics import tracer_statistics
 from eddies.io.fields import FieldSeries
 from eddies.io.hdf5 import File, ProductError, in_files, open_product, read_attributes, read_provenance, read_table
 from eddies.io.trajectories import Trajectory
-from eddies.parallel.broadcast import first_complaint
+from eddies.parallel.broadcast import on_all_ranks
 from eddies.parallel.communicator import Comm
 from eddies.parallel.stop import StopRequest
 from eddies.pipeline import MAKER_OF
@@ -35,7 +35,6 @@ from eddies.report.rollout import section as rollout_section
 from eddies.scene.scene import Scene
 
 log = logging.getLogger("eddies")
-Result = TypeVar("Result")
 
 KINDS = "ground_truth", "kernel", "model", "rollout"  # products, in the order of the page
 ROLLOUT_COST = {"seconds_per_step": "rollout, seconds per step", "particles": "particles of the rollout",
@@ -69,8 +68,8 @@ def run(directory: str | Path, comm: Comm) -> None:
     directory, alone = Path(directory), comm.Split(comm.rank)
     try:
         record = in_files(comm, directory, lambda: _survey(directory, alone))
-        own = _on_all_ranks(comm, lambda: in_files(alone, directory,
-                                                   lambda: _read_share(directory, comm, alone, record)))
+        own = on_all_ranks(comm, lambda: in_files(alone, directory,
+                                                  lambda: _read_share(directory, comm, alone, record)), ProductError)
     finally:
         alone.Free()
     draw(comm, own)
@@ -127,20 +126,6 @@ def _read_share(directory: Path, comm: Comm, alone: Comm, record: Run) -> list[S
         with open_product(alone, directory / f"{kind}.h5", kind) as file:
             sections += read(file, record)
     return sections
-
-
-def _on_all_ranks(comm: Comm, work: Callable[[], Result]) -> Result:
-    """What work gives on this rank; all ranks raise the ProductError that it raises on the lowest of them."""
-    result: Any = None
-    complaint = None
-    try:
-        result = work()
-    except ProductError as error:
-        complaint = str(error)
-    complaint = first_complaint(comm, complaint)
-    if complaint is not None:
-        raise ProductError(complaint)
-    return result
 
 
 def _write_report(directory: Path, record: Run, sections: Sequence[Section]) -> None:
