@@ -145,7 +145,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("side", nargs="?", type=int, default=64)
     parser.add_argument("--model", choices=[name for name in PRESETS if "resolved" in name], default=DEFAULT_PRESET)
-    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--threads", type=int, default=1, help="as many as OMP_NUM_THREADS")
     parser.add_argument("--precision", choices=("float32", "float64"), default="float32")
     options, comm = parser.parse_args(), MPI.COMM_WORLD
     torch.set_num_threads(options.threads)

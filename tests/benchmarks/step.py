@@ -150,18 +150,18 @@ def ring_bandwidth(comm: MPI.Comm) -> float:
     return RING_ROUNDS * RING_BYTES / best(ring)
 
 
-def transform_bounds(grid: SpectralGrid) -> dict[str, float]:
-    """Seconds of the transforms of a step by FFTW alone."""
+def transform_bounds(grid: SpectralGrid, backward: int, sent: int, forward: int) -> dict[str, float]:
+    """Seconds of transforms of so many components by FFTW alone, `sent` of those back along z too."""
     count, planes = grid.decomposition.count, 0.0
-    for direction, components in (("BACKWARD", BACKWARD), ("FORWARD", FORWARD)):
+    for direction, components in (("BACKWARD", backward), ("FORWARD", forward)):
         for pairs, blocks in Counter((b.stop - b.start + 1) // 2 for b in grid.plane_pass.blocks(count)).items():
             plans = grid.plane_pass.plans(direction, components, pairs).plans
             planes += blocks * best(lambda: [plan.execute() for of_field in plans for plan in of_field])
     columns = 0.0
-    for direction, components in (("BACKWARD", SENT), ("FORWARD", FORWARD)):
+    for direction, components in (("BACKWARD", sent), ("FORWARD", forward)):
         for rows in grid.column_pass.rows(grid.spectral_shape[1]):
             columns += components * best(grid.column_pass.plan(direction, rows).plan.execute)
-    return {"plane transforms": EVALUATIONS * planes, "column transforms": EVALUATIONS * columns}
+    return {"plane transforms": planes, "column transforms": columns}
 
 
 def sent_bytes(grid: SpectralGrid) -> int:
@@ -194,7 +194,7 @@ def measure(comm: MPI.Comm, watch: Stopwatch, cells: int, precision: str, steps:
     seconds = {part: comm.allreduce(median(step.get(part, 0.0) for step in parts)) / comm.size
                for part in [*PARTS, "the rest"]}
     memory = comm.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, MPI.MAX)
-    bounds = transform_bounds(grid)
+    bounds = {part: EVALUATIONS * bound for part, bound in transform_bounds(grid, BACKWARD, SENT, FORWARD).items()}
     block = watch.bytes["products"] // (3 * watch.calls["products"])
     bounds["products"] = watch.bytes["products"] / triad_bandwidth(block)
     bounds["linear operators"] = watch.bytes["linear operators"] / triad_bandwidth(TRIAD_BYTES)

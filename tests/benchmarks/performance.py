@@ -1,0 +1,186 @@
+"""What an evaluation of a particle model costs, over particles, ranks and threads: measured, bounded, foreseen.
+
+    .venv/bin/python tests/benchmarks/performance.py measure docs/performance.json     # a quarter of an hour, two cores
+    .venv/bin/python tests/benchmarks/performance.py draw docs/performance.json docs/performance.png
+
+Measures by the programs beside it, each a job of its own: `particle_step.py` on one rank, on one rank of two threads
+and on two ranks, `step.py` for the grid of 1.5 cells a particle and direction that the same filter would take, and the
+least that pairs, transforms and splines could take: their arithmetic at the speed of a matrix product, or FFTW alone.
+"""
+
+import argparse
+import json
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from mpi4py import MPI
+from step import best, transform_bounds
+
+from eddies.parallel.slab import SlabDecomposition
+from eddies.report.figures import MODEL, SECOND, THIRD, TRUTH, letter, panels, png, styled
+from eddies.scene.scene import Scene, load_scene
+from eddies.spectral.spectral_grid import SpectralGrid
+from eddies.workflows.foreseen.cost_model import RANK_BANDWIDTH
+from eddies.workflows.foreseen.estimates import most_ranks
+from eddies.workflows.foreseen.particle_cost import components, particle_costs
+from eddies.workflows.foreseen.particle_probe import probe_particles
+from eddies.workflows.foreseen.particle_work import particle_work
+from eddies.workflows.variants.rows import processor
+
+HERE = Path(__file__).parent
+LAYOUTS, MODELS, SIDES = ((1, 1), (1, 2), (2, 1)), ("resolved", "resolved + pairs"), (16, 24, 32, 48, 64, 96)
+FORESEEN = (64, 128, 256, 512)
+CELLS_A_PARTICLE = 1.5
+# Of the network 16-16, both ways of a pair: multiplications with additions, and tanh as eleven of them.
+PAIR_FLOPS = 2 * 2 * (5 * 16 + 16 * 16 + 16 * 2 + 32 * 11)
+SPLINE_FLOPS = 2 * 4**3      # of a component at a particle
+# 64^3 particles: notebooks published with the method, force and neighbours, on two cores; the paper, on one A100.
+NOTEBOOKS, PAPER = 46.0, 0.5
+
+
+def measure() -> dict:
+    """All of it."""
+    found = {"processor": processor(), "cores": os.cpu_count(), "steps": [],
+             "grid": [], "bounds": bounds(), "foreseen": foreseen()}
+    for side in SIDES:
+        for model in MODELS:
+            for ranks, threads in LAYOUTS:
+                found["steps"].append(of_job(ranks, threads, "particle_step.py", side, "--model", model,
+                                             "--threads", threads))
+        found["grid"].append(of_job(2, 1, "step.py", round(CELLS_A_PARTICLE * side), "--precision", "float32"))
+    return found
+
+
+def of_job(ranks: int, threads: int, program: str, *arguments: object) -> dict:
+    """The last line of a program on so many ranks, which is JSON."""
+    command = [sys.executable, HERE.parents[1] / "mpi_tools/launch.py", "-n", ranks, "--", sys.executable, "-m",
+               "mpi4py", HERE / program, *arguments]
+    done = subprocess.run(list(map(str, command)), env={**os.environ, "OMP_NUM_THREADS": str(threads)}, check=True,
+                          capture_output=True, text=True)
+    line = done.stdout.splitlines()[-1]
+    print(line, flush=True)
+    return json.loads(line)
+
+
+def scene_of(side: int, model: str) -> Scene:
+    """`hit` with more particles and cells."""
+    return load_scene("hit", [f"tracers.particles_per_side={side}", f"flow.cells={4 * side}",
+                              f"flow.viscosity={0.0072 * (32 / side) ** (4 / 3)}", f'model.preset="{model}"'])
+
+
+def bounds() -> dict[str, float]:
+    """Seconds of parts of an evaluation with 64^3 particles and three iterations on one core, at best."""
+    a, b = np.ones((2, 1024, 1024), np.float32)
+    flops = 2 * 1024**3 / best(lambda: a @ b)
+    scene = scene_of(64, MODELS[1])
+    work, speed = particle_work(scene), probe_particles(scene, MPI.COMM_SELF)
+    grid = SpectralGrid(SlabDecomposition(MPI.COMM_SELF, 2 * math.pi, work.cells), "float32", work.wavenumber)
+    return {"flops": flops,
+            "pairs": work.pairs(1) * PAIR_FLOPS / flops,
+            "transforms": sum(transform_bounds(grid, 1, 1, 1).values()) * components(work, speed, "transforms") / 2,
+            "splines": components(work, speed, "splines") * work.particles * SPLINE_FLOPS / flops}
+
+
+def foreseen() -> list[dict]:
+    """Seconds on 1 to 4096 cores, by the model that `eddies check` has."""
+    rows = []
+    for side in FORESEEN:
+        scene = scene_of(side, MODELS[1])
+        speed, most = probe_particles(scene, MPI.COMM_SELF), min(most_ranks(scene).values())
+        rows += [{"particles": side, "cores": row.cores, "ranks": row.ranks, "threads": row.threads,
+                  "seconds": row.seconds, "memory": row.memory, "binds": row.binds}
+                 for row in particle_costs(particle_work(scene), speed, most, RANK_BANDWIDTH)]
+    return rows
+
+
+@styled
+def draw(found: dict) -> bytes:
+    """Over particles; parts and bounds; over cores."""
+    figure, (axes,) = panels(1, 3, (4.2, 3.6))
+    over_particles(axes[0], found)
+    parts(axes[1], found)
+    over_cores(axes[2], found)
+    letter(axes)
+    return png(figure)
+
+
+def seconds_of(found: dict, model: str, ranks: int, threads: int) -> tuple[np.ndarray, np.ndarray]:
+    """Particles a side and seconds an evaluation of a layout."""
+    rows = [row for row in found["steps"] if (row["model"], row["ranks"], row["threads"]) == (model, ranks, threads)]
+    return np.array([row["particles"] for row in rows]), np.array([row["seconds_per_evaluation"] for row in rows])
+
+
+def over_particles(axis: Axes, found: dict) -> None:
+    """Seconds an evaluation on two ranks, with slopes."""
+    for model, colour in zip(MODELS, (TRUTH, MODEL)):
+        side, seconds = seconds_of(found, model, 2, 1)
+        slope = np.polyfit(np.log(side[2:] ** 3), np.log(seconds[2:]), 1)[0]
+        axis.loglog(side**3, seconds, "o-", color=colour, label=f"{model}, slope {slope:.2f}")
+    cells = np.array([row["cells"] for row in found["grid"]])
+    axis.loglog((cells / CELLS_A_PARTICLE) ** 3, [row["seconds_per_step"] / 4 for row in found["grid"]], "s-",
+                color=SECOND, label="grid of 1.5 cells a particle")
+    axis.loglog(64**3, NOTEBOOKS, "*", color="black", markersize=10)
+    axis.annotate("published notebooks", (64**3, NOTEBOOKS), xytext=(-6, -3), textcoords="offset points", ha="right")
+    axis.loglog(64**3, PAPER, "D", color=THIRD, label="the paper, one A100")
+    axis.set_xticks([side**3 for side in SIDES], [f"{side}³" for side in SIDES])
+    axis.minorticks_off()
+    axis.set(title="two cores", xlabel="particles", ylabel="seconds an evaluation")
+    axis.legend(loc="upper left", bbox_to_anchor=(0, 0.93))
+
+
+def parts(axis: Axes, found: dict) -> None:
+    """Parts of an evaluation with 64^3 particles by layout, and what they could take at least."""
+    names = ("pairs", "transforms", "splines", "settle", "the rest")
+    for number, (ranks, threads) in enumerate(LAYOUTS):
+        row = next(row for row in found["steps"] if (row["particles"], row["model"], row["ranks"], row["threads"])
+                   == (64, MODELS[1], ranks, threads))
+        given = dict(row["parts"])
+        values = [given.pop(name) for name in names[:-1]]
+        label = f"{ranks} rank{'s' * (ranks > 1)}" + f" x {threads} threads" * (threads > 1)
+        axis.bar(np.arange(5) + 0.27 * (number - 1), [*values, sum(given.values())], 0.25, label=label,
+                 color=(TRUTH, SECOND, MODEL)[number])
+    for place, name in enumerate(names[:3]):
+        for shift, cores in ((-0.27, 1), (0.135, 2)):
+            width = 0.25 if cores == 1 else 0.52
+            bound = found["bounds"][name] / cores
+            axis.hlines(bound, place + shift - width / 2, place + shift + width / 2, color="black", linewidth=2,
+                        label="least" if place == 0 and cores == 1 else None)
+    axis.set_xticks(range(5), names)
+    axis.set(title="64³ particles, with pairs", ylabel="seconds an evaluation")
+    axis.legend()
+
+
+def over_cores(axis: Axes, found: dict) -> None:
+    """What is foreseen for more cores, and what was measured on one and two."""
+    for side, colour in zip(FORESEEN, (TRUTH, MODEL, SECOND, THIRD)):
+        rows = [row for row in found["foreseen"] if row["particles"] == side]
+        axis.loglog([row["cores"] for row in rows], [row["seconds"] for row in rows], "--", color=colour,
+                    label=f"{side}³")
+        threaded = [row for row in rows if row["threads"] > 1]
+        axis.loglog([row["cores"] for row in threaded], [row["seconds"] for row in threaded], ".", color=colour)
+    for ranks, threads in LAYOUTS:
+        side, seconds = seconds_of(found, MODELS[1], ranks, threads)
+        axis.loglog(ranks * threads, seconds[side == 64], "s" if threads > 1 else "o", color=TRUTH)
+    axis.set(title="foreseen, with pairs", xlabel="cores", ylabel="seconds an evaluation")
+    axis.legend(title="particles", loc="upper right")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("action", choices=("measure", "draw"))
+    parser.add_argument("results", type=Path)
+    parser.add_argument("figure", type=Path, nargs="?")
+    options = parser.parse_args()
+    if options.action == "measure":
+        options.results.write_text(json.dumps(measure(), indent=1) + "\n")
+    else:
+        options.figure.write_bytes(draw(json.loads(options.results.read_text())))
+
+
+if __name__ == "__main__":
+    main()
