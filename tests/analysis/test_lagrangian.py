@@ -48,7 +48,7 @@ def test_pairs_that_part_at_constant_velocity():
     time = np.linspace(0, 4, 21)
     velocity = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]])
     position = np.array([[1.0, 2.0, 3.0]] * 3) + time[:, None, None] * velocity
-    dispersion = pair_dispersion(position % LENGTH, np.array([0, 1]), np.array([1, 2]), LENGTH)
+    dispersion, = pair_dispersion(position % LENGTH, [np.array([[0, 1], [1, 2]])], LENGTH)
     assert np.allclose(dispersion, 2 * time**2)
 
 

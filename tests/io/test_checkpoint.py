@@ -69,8 +69,8 @@ def test_other_kernels_and_threads_than_those_that_made_it_are_told(comm, tmp_pa
     monkeypatch.setattr("eddies.io.checkpoint.in_use", lambda: "another")
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     assert directory.newest().content["step"] == 1
-    assert comm.rank > 0 or ("this run has compiled kernels: another, threads a rank: 7: it goes on, but not bit for "
-                             "bit") in caplog.text
+    assert comm.rank > 0 or ("now there are compiled kernels: another, threads a rank: 7: the run goes on, but not "
+                             "bit for bit") in caplog.text
 
 
 @pytest.mark.mpi(1, 2)

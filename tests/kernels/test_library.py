@@ -1,7 +1,12 @@
 """The library is found and built for, or said to be missing."""
 
 import logging
+import os
+import subprocess
+import sys
+from pathlib import Path
 
+import pyfftw
 import pytest
 
 from eddies.kernels import library as module
@@ -32,3 +37,43 @@ def test_the_best_that_the_processor_runs_is_taken():
     if not found:
         pytest.skip("the library is not compiled")
     assert found[0] == "plain" and module.library() is module.load(found[-1])
+
+
+@pytest.mark.parametrize("given, threads", [(None, 1), ("3", 3), (" 4 ,2", 4)])
+def test_threads_are_those_of_openmp(monkeypatch, given, threads):
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    if given:
+        monkeypatch.setenv("OMP_NUM_THREADS", given)
+    assert module.threads() == threads
+
+
+@pytest.mark.parametrize("given", ["", "auto", "0", "-1", "2.5"])
+def test_what_is_no_number_of_threads_is_told(monkeypatch, given):
+    monkeypatch.setenv("OMP_NUM_THREADS", given)
+    with pytest.raises(module.ThreadsError, match="must be the number of threads that each rank takes"):
+        module.threads()
+
+
+RUNTIME = """
+import ctypes
+from eddies.kernels.library import library
+library()
+try:
+    place = ctypes.cast(ctypes.CDLL(None).GOMP_parallel, ctypes.c_void_p).value
+except AttributeError:
+    place = None
+for line in open("/proc/self/maps"):
+    first, last = (int(end, 16) for end in line.split()[0].split("-"))
+    if place and first <= place < last:
+        print(line.split()[-1])
+"""
+
+
+@pytest.mark.skipif(not (Path(pyfftw.__file__).parents[1] / "pyfftw.libs").exists(), reason="pyfftw brings no OpenMP")
+@pytest.mark.parametrize("threads, runtime", [("1", ""), ("2", "pyfftw.libs")])
+def test_kernels_take_the_threads_of_the_transforms(threads, runtime):
+    if module.library() is None:
+        pytest.skip("the library is not compiled")
+    found = subprocess.run([sys.executable, "-c", RUNTIME], timeout=60, check=True, capture_output=True, text=True,
+                           env={**os.environ, "OMP_NUM_THREADS": threads}).stdout.strip()
+    assert Path(found).parent.name == runtime

@@ -322,6 +322,19 @@ def test_what_is_foreseen_of_a_rate_that_changes_linearly_is_exact(comm):
     assert_close(found.foreseen(0.2, zero, 0.0), at(0.2), 1e-12)
 
 
+@pytest.mark.mpi(1)
+def test_what_is_foreseen_comes_from_the_nearer_evaluation(comm):
+    slab, particles, _ = in_known_flow(comm)
+    found, zero = resolution_on(slab), np.zeros(3)
+    flow = found.of(particles)
+    for time in (0.0, 1.0):  # du/dt = t^2 w: what the parabola through both rates misses grows with the way
+        now = replace(flow, velocity=(1 + time**3 / 3) * flow.velocity)
+        found.remember(time, now, time**2 * flow.velocity + flow.grid.stress_divergence(now.products))
+    for time, way, side in ((0.2, 0.2, -1), (0.8, 0.2, 1), (0.5, 0.5, 1)):  # the later one where both are as near
+        missed = side * (way**2 / 2 - way**3 / 3)
+        assert_close(found.foreseen(time, zero, 0.0), (1 + time**3 / 3 - missed) * flow.velocity, 1e-12)
+
+
 @pytest.mark.mpi(1, 2)
 def test_a_forecast_is_as_large_as_it_deserves(comm):
     """Modes that a velocity U carries along, u exp(-ik.Ut), normally distributed with 0.8 a component: in the mean over

@@ -56,7 +56,6 @@ def test_numbers_for_programs(comm, capfd):
     for row in rows:
         assert row["ranks"] <= told["most_ranks"] and row["cores"] == row["ranks"] * row["threads"]
         assert row["seconds_per_step"] == pytest.approx(3 * row["seconds_per_evaluation"]) and row["seconds"] > 0
-        assert sum(row["parts"].values()) == pytest.approx(row["seconds_per_evaluation"])
 
 
 @pytest.mark.mpi(1)
@@ -217,6 +216,14 @@ def test_a_rollout_is_foreseen_where_a_model_moves_the_particles_of_a_cpu(comm):
         assert rollout_costs(other, comm, Speed(1e-6, 1e9)) == [] == list(rollout_lines(other, []))
 
 
+@pytest.mark.mpi(1, 2)
+def test_a_term_that_fails_leaves_the_rest_foreseen(comm, own, caplog, recorded):
+    own("own_fault", "from eddies.particles.terms.viscosity import Viscosity\nclass Fault(Viscosity):\n"
+                     "    def forward(self, context): raise ValueError('not among so few')")
+    text = lines_of(load_scene("tiny", ['model.terms=["pressure", "own_fault:Fault"]']), comm, caplog)
+    assert comm.rank > 0 or "particles are not foreseen: ValueError: not among so few" in text
+
+
 @pytest.mark.mpi(1)
 def test_check_of_a_start_of_the_users(comm, own, caplog, recorded):
     own("own_start", "def swirl(grid, initial, seed): pass\n")
@@ -282,10 +289,10 @@ def rows_of(scene):
 
 
 def test_table_goes_to_the_most_slabs():
-    from eddies.workflows.foreseen.network import NODE_RANKS
+    from eddies.workflows.foreseen.network import NODE_CORES
     rows = [[word.strip() for word in row if word.strip()] for row in rows_of(load_scene("hit-paper"))]
     assert [int(row[0]) for row in rows] == [2**m for m in range(9)]  # at most 341
-    assert [int(row[1]) for row in rows] == [max(1, 2**m // NODE_RANKS) for m in range(9)]
+    assert [int(row[1]) for row in rows] == [max(1, 2**m // NODE_CORES) for m in range(9)]
     assert [int(row[2]) for row in rows] == [1024 // 2**m for m in range(9)]
     # without tracers: a plane each, twelve rows and no more
     scene = load_scene("taylor-green", ["flow.cells=4096"])
@@ -329,13 +336,13 @@ def test_bytes_sent_are_those_of_the_transposes(comm, fluid, monkeypatch):
 
 def test_messages_cost_time_beyond_a_node():
     from eddies.workflows.foreseen.cost_model import Speed, exchange_seconds, sent_bytes
-    from eddies.workflows.foreseen.network import LATENCY, NODE_BANDWIDTH, NODE_RANKS
+    from eddies.workflows.foreseen.network import LATENCY, NODE_BANDWIDTH, NODE_CORES
     scene, speed = load_scene("hit-paper"), Speed(1e-6, 1e9)
     assert exchange_seconds(scene, 1, speed) == 0
     # Two nodes: each holds half of all bytes and keeps half of that, in messages from each rank to all others.
-    ranks = 2 * NODE_RANKS
+    ranks = 2 * NODE_CORES
     crossing = sent_bytes(scene) / 4 / NODE_BANDWIDTH
-    within = sent_bytes(scene) / ranks * (NODE_RANKS - 1) / ranks / speed.bandwidth
+    within = sent_bytes(scene) / ranks * (NODE_CORES - 1) / ranks / speed.bandwidth
     assert exchange_seconds(scene, ranks, speed) == pytest.approx(
         4 * (crossing + within + 2 * (ranks - 1) * LATENCY))
 

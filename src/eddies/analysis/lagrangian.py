@@ -40,13 +40,16 @@ def separations(position: Iterable[np.ndarray], first: np.ndarray, second: np.nd
         yield separation
 
 
-def pair_dispersion(position: Iterable[np.ndarray], first: np.ndarray, second: np.ndarray,
-                    length: float) -> np.ndarray:
-    """Mean-square change of separation <|r(t) - r(0)|^2> of the pairs (first, second): (frames, n, 3) ->
-    (frames,)."""
-    paths = separations(position, first, second, length)
-    start = next(paths)
-    return np.array([0.0, *(np.mean(np.sum((separation - start) ** 2, axis=1)) for separation in paths)])
+def pair_dispersion(position: Iterable[np.ndarray], groups: Sequence[np.ndarray], length: float) -> np.ndarray:
+    """Mean-square change of separation <|r(t) - r(0)|^2> of groups of pairs, rows (2, m), which are followed together:
+    (frames, n, 3) -> (groups, frames)."""
+    paths = separations(position, *np.concatenate(groups, axis=1), length)
+    start, ends = next(paths), np.cumsum([pairs.shape[1] for pairs in groups])[:-1]
+    spread = [[0.0] * len(groups)]
+    for separation in paths:
+        squared = np.sum((separation - start) ** 2, axis=1)
+        spread.append([np.mean(group) for group in np.split(squared, ends)])
+    return np.transpose(spread)
 
 
 def pairs_at(position: np.ndarray, length: float, distances: Sequence[float], tolerance: float,
@@ -81,4 +84,5 @@ def neighbor_dispersion(position: np.ndarray, length: float) -> np.ndarray:
     first = np.arange(position.shape[1])
     second = nearest_neighbors(position[0], length)
     separation = minimum_image(position[0][first] - position[0][second], length)
-    return pair_dispersion(position, first, second, length) / np.mean(np.sum(separation**2, axis=1))
+    spread, = pair_dispersion(position, [np.stack([first, second])], length)
+    return spread / np.mean(np.sum(separation**2, axis=1))

@@ -9,7 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
-from eddies.analysis.lagrangian import pairs_at, separations, structure_function
+from eddies.analysis.lagrangian import pair_dispersion, pairs_at, structure_function
 from eddies.analysis.pdfs import bin_edges, pdf
 
 FOLLOWED = 2**14  # tracers of which all velocities are held at once
@@ -129,15 +129,8 @@ def _dispersion(tracers: Tracers, spacing: float) -> list[Dispersion]:
              if pairs.shape[1] >= FEWEST]
     if not found:
         return []
-    first, second = np.concatenate([pairs for _, pairs in found], axis=1)
-    ends = np.cumsum([pairs.shape[1] for _, pairs in found])[:-1]
-    paths = separations((tracers.read(frame, "position") for frame in range(tracers.times.size)), first, second,
-                        tracers.length)
-    begin = next(paths)
-    spreads = [np.zeros(len(found))]  # all distances together: each frame is read once
-    for separation in paths:
-        squared = np.sum((separation - begin) ** 2, axis=1)
-        spreads.append(np.array([part.mean() for part in np.split(squared, ends)]))
-    parting = np.sum((velocity[first] - velocity[second]) ** 2, axis=1)
-    return [Dispersion(distance, pairs.shape[1], spread, float(part.mean())) for (distance, pairs), spread, part
-            in zip(found, np.transpose(spreads), np.split(parting, ends))]
+    frames = (tracers.read(frame, "position") for frame in range(tracers.times.size))
+    spreads = pair_dispersion(frames, [pairs for _, pairs in found], tracers.length)
+    return [Dispersion(distance, pairs.shape[1], spread,
+                       float(np.mean(np.sum((velocity[pairs[0]] - velocity[pairs[1]]) ** 2, axis=1))))
+            for (distance, pairs), spread in zip(found, spreads)]

@@ -23,9 +23,8 @@ from mpi4py import MPI
 from eddies.io.contiguous import Block, lay_out, write_arrays
 from eddies.io.hdf5 import ProductError, in_files
 from eddies.io.manifest import find_damage, hash_file, manifest_text, parse_manifest
-from eddies.kernels.library import in_use
+from eddies.kernels.library import in_use, threads
 from eddies.parallel.broadcast import first_complaint, on_all_ranks, on_first_rank
-from eddies.parallel.node import threads
 
 log = logging.getLogger("eddies")
 
@@ -70,7 +69,7 @@ class Checkpoint(Mapping):
             return file[name][(slice(None),) * axis + (slice(start, stop),)]
 
 
-def computed_by() -> str:
+def _computed_by() -> str:
     """What else the bits of a run depend on, beside its settings and ranks."""
     return f"compiled kernels: {in_use()}, threads a rank: {threads()}"
 
@@ -103,7 +102,7 @@ class CheckpointDirectory:
             size = on_first_rank(self.comm, lambda: (partial / STATE).stat().st_size)
             content = {"step": step, "format": FORMAT, "fingerprint": self.fingerprint,
                        "state": hash_file(self.comm, partial / STATE, regions, size),
-                       "files": {name: self._hash_whole(name) for name in files}, "computed_by": computed_by()}
+                       "files": {name: self._hash_whole(name) for name in files}, "computed_by": _computed_by()}
             on_first_rank(self.comm, lambda: _finish(partial, final, manifest_text(content)))
         except OSError as error:
             if self.comm.rank == 0:
@@ -151,9 +150,9 @@ class CheckpointDirectory:
         return content, complaint
 
     def _compare(self, then: str) -> None:
-        if self.comm.rank == 0 and then != computed_by():
-            log.warning("the checkpoint was made by %s, and this run has %s: it goes on, but not bit for bit as it "
-                        "would have", then, computed_by())
+        if self.comm.rank == 0 and then != _computed_by():
+            log.warning("the checkpoint was made with %s; now there are %s: the run goes on, but not bit for bit as it "
+                        "would have", then, _computed_by())
 
     def _names(self) -> list[str]:
         """Checkpoints, the newest first, as rank 0 sees them."""

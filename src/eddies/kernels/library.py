@@ -5,9 +5,10 @@ from __future__ import annotations
 import ctypes
 import functools
 import logging
+import os
 from pathlib import Path
 
-from eddies.parallel.node import threads
+from eddies.errors import UserError
 
 # As setup.py has them; a processor that runs one runs those before it.
 INSTRUCTION_SETS = ("plain", "avx2", "avx512")
@@ -17,6 +18,10 @@ MISSING = ("no compiled kernels (no C++ compiler at installation?): everything r
 Library = ctypes.CDLL
 
 log = logging.getLogger("eddies")
+
+
+class ThreadsError(UserError, ValueError):
+    """OMP_NUM_THREADS is no number of threads."""
 
 
 @functools.cache
@@ -50,18 +55,30 @@ def load(instruction_set: str) -> ctypes.CDLL:
     return ctypes.CDLL(str(_path(instruction_set)))
 
 
+def threads() -> int:
+    """Threads of each rank, which kernels, transforms and torch take: OMP_NUM_THREADS, its first number if there are
+    several, 1 unless set. Raises ThreadsError where that is no number of threads."""
+    given = os.environ.get("OMP_NUM_THREADS", "1").split(",")[0].strip()
+    if not given.isdecimal() or int(given) == 0:
+        raise ThreadsError(f'OMP_NUM_THREADS = "{given}": must be the number of threads that each rank takes, 1 or '
+                           "more; set it to 1, or unset it")
+    return int(given)
+
+
 @functools.cache
 def share_threads() -> None:
-    """Let what is loaded from here on, kernels and torch, take the threads of pyfftw's OpenMP runtime, which its wheel
-    brings along: those of two runtimes would wait for each other, spinning on the same cores, and a step of the direct
-    simulation take twenty times as long."""
-    if threads() == 1:
+    """Let kernels, and torch if it is loaded later, use the OpenMP runtime that pyfftw's wheel brings along. The
+    threads of two runtimes would wait for each other, spinning on the same cores: a step of the direct simulation took
+    twenty times as long."""
+    maps = Path("/proc/self/maps")
+    if threads() == 1 or not maps.exists():
         return
-    import pyfftw  # noqa: F401
-    with open("/proc/self/maps") as file:
-        runtimes = {line.split()[-1] for line in file if "/libgomp" in line}
-    for runtime in runtimes:
-        ctypes.CDLL(runtime, mode=ctypes.RTLD_GLOBAL)
+    import pyfftw
+    places = (line.split(maxsplit=5)[5] for line in maps.read_text().splitlines() if "/libgomp" in line)
+    brought = Path(pyfftw.__file__).parents[1] / "pyfftw.libs"  # elsewhere it has that of the system, as all do
+    for place in dict.fromkeys(places):
+        if Path(place).parent == brought:
+            ctypes.CDLL(place, mode=ctypes.RTLD_GLOBAL)
 
 
 def _path(instruction_set: str) -> Path:

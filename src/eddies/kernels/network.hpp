@@ -25,8 +25,7 @@ inline V clipped(V x, Real largest) {
     return x < -largest ? V{} - largest : x;
 }
 
-// x P(x^2) / Q(x^2), within 7e-9 of tanh below 8, from where on it is 1 to single precision: a minimax fit of the
-// relative error.
+// x P(x^2) / Q(x^2), to 7e-9 of tanh up to 8, a minimax fit, and beyond as there, where 2e-7 are missing to 1.
 inline Vector<float> tanh_of(Vector<float> x) {
     constexpr float upper[] = {1.0f, 1.34468052e-1f, 3.57432509e-3f, 2.19393224e-5f, 1.52927450e-8f};
     constexpr float lower[] = {1.0f, 4.67801345e-1f, 2.61748484e-2f, 3.41573804e-4f, 8.54780856e-7f};

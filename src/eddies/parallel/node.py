@@ -1,15 +1,8 @@
-"""What a rank has of its node: its place among the ranks there, and threads."""
+"""Where a rank stands among those of its node."""
 
 from __future__ import annotations
 
-import os
-
 from mpi4py import MPI
-
-
-def threads() -> int:
-    """Threads of each rank, which kernels, transforms and torch take: OMP_NUM_THREADS, 1 unless set."""
-    return int(os.environ.get("OMP_NUM_THREADS", "1"))
 
 
 def node_rank(comm: MPI.Comm) -> int:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import torch
 
 from eddies.errors import UserError
+from eddies.kernels.library import threads
 from eddies.parallel.communicator import Comm
-from eddies.parallel.node import node_rank, threads
+from eddies.parallel.node import node_rank
 
 
 class DeviceError(UserError, RuntimeError):

@@ -146,7 +146,7 @@ def at_home(decomposition: SlabDecomposition, columns: dict[str, Tensor], reach:
     """All columns after each particle moved to the rank of its slab, ordered by place in cells of side `reach` and then
     by id; collective.
 
-    The order depends on nothing but ids and positions, and keeps neighbours close in memory.
+    The order depends on nothing but ids and positions of a rank, and keeps neighbours close in memory.
     """
     device = columns["id"].device
     moved = migrate(decomposition, {name: as_numpy(column) for name, column in columns.items()})

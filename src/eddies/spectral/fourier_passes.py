@@ -17,8 +17,7 @@ import numpy as np
 import pyfftw
 
 from eddies.kernels.copies import CompiledColumnCopies, CompiledPlaneCopies
-from eddies.kernels.library import library
-from eddies.parallel.node import threads
+from eddies.kernels.library import library, threads
 from eddies.spectral.copies import ColumnCopies, PlaneCopies
 
 BLOCK_BYTES = 2**18  # of one component and thread in a pass: a few of them fit the second-level cache of a core

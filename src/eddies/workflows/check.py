@@ -9,13 +9,14 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from eddies.clock import duration
+from eddies.kernels.library import threads
 from eddies.parallel.communicator import Comm
 from eddies.scene.scene import BOX_LENGTH, Scene
 from eddies.workflows.foreseen.cost_model import Speed, cost, costs, probe
 from eddies.workflows.foreseen.estimates import (expected_step, expected_turbulence, foreseen_allowed_step,
                                                  ground_truth_alone, largest_wavenumber, most_ranks, particle_reach,
                                                  run_time, sees_pairs)
-from eddies.workflows.foreseen.network import LATENCY, NODE_BANDWIDTH, NODE_RANKS
+from eddies.workflows.foreseen.network import LATENCY, NODE_BANDWIDTH, NODE_CORES
 from eddies.workflows.foreseen.particle_work import EVALUATIONS, particle_work, rollout_evaluations
 
 if TYPE_CHECKING:
@@ -54,7 +55,12 @@ def rollout_costs(scene: Scene, comm: Comm, speed: Speed) -> list[ParticleCost]:
     if settings is None or scene.model is None or "model" not in settings.needs or scene.device != "cpu":
         return []
     from eddies.workflows.foreseen import particle_cost, particle_probe  # torch, where there is a model
-    found = particle_probe.probe_particles(scene, comm)
+    try:
+        found = particle_probe.probe_particles(scene, comm)
+    except particle_probe.ProbeError as error:  # on all ranks
+        if comm.rank == 0:
+            log.warning("time and memory of the particles are not foreseen: %s", error)
+        return []
     return particle_cost.particle_costs(particle_work(scene), found, min(most_ranks(scene).values()), speed.bandwidth)
 
 
@@ -170,15 +176,17 @@ def time_lines(scene: Scene, ranks: int, speed: Speed) -> Iterator[str]:
 
 def cost_lines(scene: Scene, speed: Speed) -> Iterator[str]:
     """Memory and wall time of the direct simulation on any number of ranks."""
-    yield (f"estimates, from the work of the ranks at hand, for nodes of {NODE_RANKS} ranks that share "
+    yield (f"estimates, from the work of the ranks at hand, for nodes of {NODE_CORES} cores that share "
            f"{NODE_BANDWIDTH / 1e9:g} GB/s, {1e6 * LATENCY:g} us a message")
+    if threads() > 1:
+        yield f"the direct simulation, {threads()} threads a rank:"
     yield "ranks  nodes  planes  memory a rank  s a step     wall time  core hours"
     steps = expected_steps(scene)
     for row in costs(scene, min(most_ranks(ground_truth_alone(scene)).values()), speed):
         line = f"{row.ranks:5}  {row.nodes:5}  {row.planes:6}  {megabytes(row.memory):>13}  {number(row.seconds):>8}"
         if steps:
             seconds = row.seconds * steps
-            line += f"  {duration(seconds):>12}  {row.ranks * seconds / 3600:10,.1f}"
+            line += f"  {duration(seconds):>12}  {row.ranks * threads() * seconds / 3600:10,.1f}"
         yield line
 
 

@@ -37,6 +37,7 @@ from eddies.scene.scene import Scene
 log = logging.getLogger("eddies")
 
 KINDS = "ground_truth", "kernel", "model", "rollout"  # products, in the order of the page
+FIELDS = "model", "truth", "filtered"  # of a rollout, by what they are made of
 ROLLOUT_COST = {"seconds_per_step": "rollout, seconds per step", "particles": "particles of the rollout",
                 "ranks": "ranks of the rollout"}
 
@@ -203,7 +204,7 @@ def _read_model(file: File, record: Run) -> list[Section]:
 def _read_rollout(file: File, record: Run) -> list[Section]:
     attributes = read_attributes(file, "rollout")
     model, truth = Trajectory(file, "model"), Trajectory(file, "truth")
-    fields = {name: FieldSeries(file, name) for name in file["fields"]} if "fields" in file else None
+    fields = {name: FieldSeries(file, name) for name in FIELDS} if "fields" in file else None
     outside = read_table(file, "outside_training")["share"] if "outside_training" in file else None
     closure = read_table(file, "closure") if "closure" in file else None
     rollout = Rollout(attributes, model, truth, fields, model.length, record.filter_width,

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from eddies.scene.scene import load_scene
-from eddies.workflows.foreseen.network import NODE_RANKS
+from eddies.workflows.foreseen.network import NODE_CORES
 from eddies.workflows.foreseen.particle_cost import (MOST_CORES, TRANSFORM_GROWTH, growth, particle_bytes,
                                                      particle_cost, particle_costs)
 from eddies.workflows.foreseen.particle_probe import PARTS, THREADED, ParticleSpeed, Rate
@@ -55,10 +55,9 @@ def test_rows_are_the_fastest_splits_into_ranks_and_threads(side, most):
     rows = particle_costs(work, SPEED, most, 2e9)
     for row in rows:
         cores.append(row.cores)
-        assert row.ranks <= most and row.threads <= NODE_RANKS
-        assert row.seconds == sum(row.parts.values()) and row.parts[row.binds] == max(row.parts.values())
+        assert row.ranks <= most and row.threads <= NODE_CORES
         for ranks in (2**m for m in range(13)):
-            if ranks <= min(most, row.cores) and row.cores // ranks <= NODE_RANKS:
+            if ranks <= min(most, row.cores) and row.cores // ranks <= NODE_CORES:
                 assert row.seconds <= cost_of(work, ranks, row.cores // ranks).seconds
     assert cores == [2**m for m in range(len(cores))] and len(rows) <= 14 and cores[-1] <= MOST_CORES
     assert min(row.seconds for row in rows) == rows[-1].seconds

@@ -9,7 +9,7 @@ import torch
 from eddies.kernels.library import library
 from eddies.particles.terms.presets import PRESETS
 from eddies.scene.scene import load_scene
-from eddies.workflows.foreseen.particle_probe import PARTS, probe_particles
+from eddies.workflows.foreseen.particle_probe import PARTS, ProbeError, probe_particles
 
 EXAMPLES = Path(__file__).parents[3] / "docs/examples"
 OWN_PAIRS = """
@@ -47,6 +47,19 @@ def test_terms_of_the_users_are_probed(comm, own, monkeypatch):
     own("own_pairs", OWN_PAIRS)
     unknown = probe_particles(scene_of('model.terms=["pressure", "own_pairs:Unknown"]'), comm)
     assert unknown.listed and unknown.block_bytes > 0
+
+
+@pytest.mark.mpi(1, 2)
+def test_a_term_that_fails_is_told(comm, own):
+    own("own_fault", OWN_PAIRS.replace("pass", "compiled = None\n    def pair_values(self, pairs): return 1 / 0"))
+    with pytest.raises(ProbeError, match="ZeroDivisionError: division by zero"):
+        probe_particles(scene_of('model.terms=["pressure", "own_fault:Unknown"]'), comm)
+
+
+@pytest.mark.mpi(1)
+def test_a_flow_of_a_single_resolved_shell_is_probed(comm):
+    speed = probe_particles(scene_of("flow.viscosity=1.0", "flow.cells=36", "tracers.particles_per_side=24"), comm)
+    assert speed.rates["modes"].unit == 0 < speed.rates["transforms"].unit
 
 
 @pytest.mark.mpi(1)

@@ -195,9 +195,9 @@ def test_steps_of_a_rollout():
 def test_one_rank_sends_nothing_and_neighbours_on_other_nodes_share_its_network():
     alone = Network(1, 1e9)
     assert alone.all_to_all(1e9, 5) == alone.to_neighbors(1e9, 5) == alone.sum_over_ranks(5) == 0
-    from eddies.workflows.foreseen.network import LATENCY, NODE_BANDWIDTH, NODE_RANKS
-    assert [Network(2 * NODE_RANKS, 1e9, threads).nodes for threads in (1, 2, NODE_RANKS)] == [2, 4, 2 * NODE_RANKS]
+    from eddies.workflows.foreseen.network import LATENCY, NODE_BANDWIDTH, NODE_CORES
+    assert [Network(2 * NODE_CORES, 1e9, threads).nodes for threads in (1, 2, NODE_CORES)] == [2, 4, 2 * NODE_CORES]
     within, ends, apart = (Network(ranks, 1e9, threads).to_neighbors(1e9, 2) - 2 * LATENCY for ranks, threads in (
-        (NODE_RANKS, 1), (2 * NODE_RANKS, 1), (2, NODE_RANKS)))
+        (NODE_CORES, 1), (2 * NODE_CORES, 1), (2, NODE_CORES)))
     assert (within, ends, apart) == pytest.approx((2, 1 + 1e9 / NODE_BANDWIDTH, 2e9 / NODE_BANDWIDTH))
     assert VECTOR == np.zeros(3).nbytes

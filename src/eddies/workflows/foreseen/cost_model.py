@@ -20,13 +20,14 @@ from statistics import median
 import numpy as np
 
 from eddies.clock import Clock
+from eddies.kernels.library import threads
 from eddies.parallel.communicator import Comm
 from eddies.scene.scene import Initial, Scene
 from eddies.spectral.fourier_passes import BLOCK_BYTES
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.time_stepping import STEPPERS
 from eddies.workflows.foreseen.estimates import expected_turbulence, largest_wavenumber
-from eddies.workflows.foreseen.network import LATENCY, NODE_RANKS, RANK_BANDWIDTH, Network
+from eddies.workflows.foreseen.network import LATENCY, RANK_BANDWIDTH, Network
 from eddies.workflows.ground_truth.scene_flow import build_fluid, build_step_limit, initial_state
 
 PROBE_CELLS = 64
@@ -54,7 +55,8 @@ class Speed:
 
 @dataclass(frozen=True)
 class Cost:
-    """What a step of the direct simulation needs on so many ranks; times in seconds, memory of a rank in bytes."""
+    """What a step of the direct simulation needs on so many ranks, of as many threads as those at hand; times in
+    seconds, memory of a rank in bytes."""
 
     ranks: int
     planes: int
@@ -65,7 +67,7 @@ class Cost:
     @property
     def nodes(self) -> int:
         """Nodes that so many ranks fill."""
-        return math.ceil(self.ranks / NODE_RANKS)
+        return Network(self.ranks, RANK_BANDWIDTH, threads()).nodes
 
     @property
     def seconds(self) -> float:
@@ -104,7 +106,7 @@ def sent_bytes(scene: Scene) -> float:
 
 def exchange_seconds(scene: Scene, ranks: int, speed: Speed) -> float:
     """Seconds of the messages of a step."""
-    return EVALUATIONS * Network(ranks, speed.bandwidth).all_to_all(sent_bytes(scene), times=2)
+    return EVALUATIONS * Network(ranks, speed.bandwidth, threads()).all_to_all(sent_bytes(scene), times=2)
 
 
 def real_bytes(scene: Scene) -> int:
@@ -115,7 +117,7 @@ def real_bytes(scene: Scene) -> int:
 def flow_bytes(scene: Scene, ranks: int) -> float:
     """Memory of a rank in the direct simulation."""
     fluid, cells, real = scene.flow.compressible, scene.flow.cells, real_bytes(scene)
-    block = BLOCK_ARRAYS[fluid] * max(BLOCK_BYTES, 2 * cells**2 * real)
+    block = BLOCK_ARRAYS[fluid] * max(threads() * BLOCK_BYTES, 2 * cells**2 * real)
     return PROCESS_BYTES + FLOW_BYTES[fluid] * real / 8 * cells**2 * math.ceil(cells / ranks) + block
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-NODE_RANKS = 64              # cores of a node, each a rank or a thread of one
+NODE_CORES = 64              # cores of a node, each a rank or a thread of one
 NODE_BANDWIDTH = 10e9        # bytes a second into and out of a node while all nodes talk to all: 100 Gbit/s, not quite
 RANK_BANDWIDTH = 2e9         # bytes a second of a rank to others of its node, where one rank at hand cannot tell
 LATENCY = 2e-6               # seconds of a message
@@ -13,7 +13,7 @@ LATENCY = 2e-6               # seconds of a message
 
 @dataclass(frozen=True)
 class Network:
-    """So many ranks of `threads` threads, side by side on nodes of NODE_RANKS cores; within a node a rank sends
+    """So many ranks of `threads` threads, side by side on nodes of NODE_CORES cores; within a node a rank sends
     `bandwidth` bytes a second. One rank sends nothing."""
 
     ranks: int
@@ -23,7 +23,7 @@ class Network:
     @property
     def on_node(self) -> int:
         """Ranks of a node."""
-        return min(self.ranks, max(NODE_RANKS // self.threads, 1))
+        return min(self.ranks, max(NODE_CORES // self.threads, 1))
 
     @property
     def nodes(self) -> int:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from eddies.kernels.library import library
-from eddies.workflows.foreseen.network import NODE_RANKS, Network
+from eddies.workflows.foreseen.network import NODE_CORES, Network
 from eddies.workflows.foreseen.particle_probe import PARTS, THREADED, ParticleSpeed
 from eddies.workflows.foreseen.particle_work import (SUMS_OF_EVALUATION, SUMS_OF_ITERATION, SUMS_OF_SETTLING,
                                                      ParticleWork)
@@ -83,7 +83,7 @@ def particle_costs(work: ParticleWork, speed: ParticleSpeed, most: int, bandwidt
     rows = []
     for cores in (2**m for m in range(MOST_CORES.bit_length())):
         splits = [(ranks, cores // ranks) for ranks in (2**m for m in range(most.bit_length()))
-                  if ranks <= cores <= ranks * NODE_RANKS]
+                  if ranks <= cores <= ranks * NODE_CORES]
         if splits:
             rows.append(min((particle_cost(work, speed, *split, bandwidth) for split in splits),
                             key=lambda row: (row.seconds, row.threads)))

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from eddies.parallel.broadcast import on_all_ranks
 from eddies.parallel.communicator import Comm
 from eddies.parallel.reduction import global_max
 from eddies.parallel.slab import SlabDecomposition
@@ -41,6 +42,10 @@ PARTS = "pairs", "splines", "transforms", "modes", "formulas", "settling"
 THREADED = "pairs", "splines", "transforms", "modes"
 SHARED = "splines", "transforms"  # parts that the iterations call, forth and back, three components each, and others
 BLOCK_COPIES = 3             # of what a term keeps of a pair while it is evaluated
+
+
+class ProbeError(RuntimeError):
+    """The scene's model cannot be evaluated among few particles."""
 
 
 @dataclass(frozen=True)
@@ -207,11 +212,12 @@ class Probe:
         calls = {"splines": watch.calls["splines"], "transforms": watch.calls["transforms"], "modes": ITERATIONS}
         rates = {}
         for part in PARTS:
-            unit = max(many[part] - few[part], 0.0) / (own[part] - units[part]) if own[part] else 0.0
+            more = own[part] - units[part]  # none of a part that is not there, or of modes too few to tell
+            unit = max(many[part] - few[part], 0.0) / more if more > 0 else 0.0
             call = max(few[part] - units[part] * unit, 0.0) / max(calls.get(part, 1), 1)
             rates[part] = Rate(call, unit * (torch.get_num_threads() if part in THREADED else 1))
         iterations = ITERATIONS if self.dynamics.resolution else 0
-        # The positions are sent twice, once for a list of neighbours that somebody may ask for.
+        # Positions, hence a vector, are sent twice: once more for a list of neighbours that somebody may ask for.
         ghosts = (VECTOR, VECTOR, *self.columns) if self.dynamics.neighborhood else ()
         return ParticleSpeed(rates, {part: watch.calls[part] - 2 * iterations for part in SHARED},
                              {part: watch.components[part] - 6 * iterations for part in SHARED},
@@ -250,7 +256,7 @@ def probe_particles(scene: Scene, comm: Comm) -> ParticleSpeed:
     """The speed of the ranks at hand, of the slowest of them; all ranks call it.
 
     A part takes so long a call, as it does with few particles, and so long a unit, as with more of them. Raises
-    TermError where a term cannot be made.
+    ProbeError, on all ranks, where a term cannot be made or evaluated.
     """
     threads = torch.get_num_threads()
     prepare_torch("cpu", comm)
@@ -259,10 +265,18 @@ def probe_particles(scene: Scene, comm: Comm) -> ParticleSpeed:
         # More particles where the radius would not fit into half the box.
         reach = (1 + scene.simulation.skin) * scene.interaction_radius / scene.tracers.spacing
         side = max(LEAST_SIDE, math.ceil(2 * reach) + 1)
-        few, many = Probe(scene, alone, side), Probe(scene, alone, 2 * side)
-        seconds = [[found[part] for part in PARTS] for found in (few.seconds(), many.seconds())]
+        few, many, seconds = on_all_ranks(comm, lambda: _measured(scene, alone, side), ProbeError)
         first, second = (dict(zip(PARTS, row)) for row in global_max(comm, np.array(seconds)).tolist())
         return many.speed(first, few.units(), second)
     finally:
         alone.Free()
         torch.set_num_threads(threads)
+
+
+def _measured(scene: Scene, alone: Comm, side: int) -> tuple[Probe, Probe, list[list[float]]]:
+    """Probes of few particles and of more, and the seconds of their parts."""
+    try:
+        few, many = Probe(scene, alone, side), Probe(scene, alone, 2 * side)
+        return few, many, [[found[part] for part in PARTS] for found in (few.seconds(), many.seconds())]
+    except Exception as error:  # of a term of the user's, anything
+        raise ProbeError(f"{type(error).__name__}: {error}") from error

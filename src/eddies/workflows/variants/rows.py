@@ -15,8 +15,8 @@ from eddies.io.fields import FieldSeries
 from eddies.io.hdf5 import open_product, read_attributes, read_table
 from eddies.io.provenance import environment
 from eddies.io.trajectories import Trajectory
+from eddies.kernels.library import threads
 from eddies.parallel.communicator import Comm
-from eddies.parallel.node import threads
 from eddies.scene.comparison import Comparison
 from eddies.scene.scene import Eulerian
 from eddies.workflows.variants.run import StepSeconds, VariantRun
