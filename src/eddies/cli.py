@@ -37,9 +37,11 @@ def main(arguments: list[str] | None = None) -> int:
     signals = catch_signals()  # first of all: MPI takes a second to start
     from mpi4py import MPI
     comm, exit_comm = MPI.COMM_WORLD, MPI.COMM_WORLD.Dup()
+    from eddies.kernels.library import share_threads
     from eddies.parallel.stop import Stopped
     try:
         configure_logging(comm.rank)
+        share_threads()
         options = parse_arguments(arguments, comm.rank)
         if options.command in (run_command, compare_command):
             options.command(options, comm, signals)
