@@ -5,14 +5,14 @@
 
 Particles at random in a solenoidal velocity of a turbulent spectrum, filtered at two particle spacings, are moved by a
 model of initial weights, but for the damping, which is that learned in hit-small. Steps are as long as a rollout takes
-them. Ten go before those that count. Prints a JSON line
-with medians over the steps: seconds an evaluation, of the slowest rank, and of it each part; iterations of a solve;
-evaluations and seconds for a turnover of the field.
+them. Ten go before those that count. Prints a JSON line with medians over the steps: seconds an evaluation, of the
+slowest rank, and of it each part; iterations of a solve; evaluations and seconds for a turnover of the field.
 """
 
 import argparse
 import json
 import math
+import os
 import time
 from collections import Counter
 from statistics import median
@@ -27,6 +27,7 @@ from eddies.flow.initial_fields import random_velocity
 from eddies.flow.statistics import energy_spectrum, turbulence_scales
 from eddies.flow.tracers import release
 from eddies.import_path import load
+from eddies.kernels.library import library, threads
 from eddies.kernels.modes import CompiledModePasses
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.context import Context
@@ -145,10 +146,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("side", nargs="?", type=int, default=64)
     parser.add_argument("--model", choices=[name for name in PRESETS if "resolved" in name], default=DEFAULT_PRESET)
-    parser.add_argument("--threads", type=int, default=1, help="as many as OMP_NUM_THREADS")
+    parser.add_argument("--threads", type=int, default=threads(), help="a rank; OMP_NUM_THREADS unless given")
     parser.add_argument("--precision", choices=("float32", "float64"), default="float32")
     options, comm = parser.parse_args(), MPI.COMM_WORLD
-    torch.set_num_threads(options.threads)
+    os.environ["OMP_NUM_THREADS"] = str(options.threads)  # for what is loaded and planned from here on
+    for runtime in (torch.set_num_threads, *([] if library() is None else [library().omp_set_num_threads])):
+        runtime(options.threads)
     with torch.no_grad():
         run = Run(comm, options.side, options.model, options.precision)
         found = measure(comm, run)
