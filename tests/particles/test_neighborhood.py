@@ -1,11 +1,12 @@
 import math
 
+import numpy as np
 import pytest
 import torch
 
 from eddies.parallel.halo import HaloError
 from eddies.parallel.slab import SlabDecomposition
-from eddies.particles.neighborhood import Neighborhood
+from eddies.particles.neighborhood import Neighborhood, at_home
 from eddies.particles.particle_set import ParticleSet
 from tests.particles.configurations import LENGTH
 
@@ -51,3 +52,18 @@ def test_a_particle_that_is_nowhere_near_its_slab_is_named_by_all_ranks(comm, z,
         neighborhood.update(particles)
     last = comm.size - 1
     assert f"within the step, rank {last}, particle {10 * last + 1}: {complaint}" in str(told.value)
+
+
+@pytest.mark.mpi(1, 2)
+@pytest.mark.parametrize("unit, cells", [(1, 4), (2**50, 4), (2**56, 1)])
+def test_particles_settle_in_order_of_cells_and_ids(comm, unit, cells):
+    """Also where ids are so large that a cell and an id fit one number only if there are fewer cells."""
+    slab, random = SlabDecomposition(comm, 1.0, 8), np.random.default_rng(3)
+    position, ids = random.random((60, 3)), unit * random.permutation(60)
+    own = slice(comm.rank, None, comm.size)
+    found = at_home(slab, {"id": torch.from_numpy(ids[own]), "position": torch.from_numpy(position[own])}, 1 / 4)
+    here = slab.owner_of(position[:, 2]) == comm.rank
+    x, y, z = (position[here].T * cells).astype(int)
+    assert np.array_equal(found["id"], ids[here][np.lexsort((ids[here], x, y, z))])
+    nothing = at_home(slab, {"id": torch.empty(0, dtype=torch.int64), "position": torch.empty(0, 3)}, 1 / 4)
+    assert len(nothing["id"]) == 0
