@@ -127,9 +127,8 @@ def draw(comm: Comm, sections: Sequence[Section]) -> None:
     # A figure stays where it was made, if there is no rank with fewer: to send one takes a tenth of drawing it.
     free = [rank for rank, count in enumerate(counts) for _ in range(share - count)]
     before = sum(max(count - share, 0) for count in counts[:comm.rank])
-    surplus = len(illustrations) - min(len(illustrations), share)
-    own, rest = illustrations[:len(illustrations) - surplus], illustrations[len(illustrations) - surplus:]
-    places = free[before:before + surplus]
+    own, rest = illustrations[:share], illustrations[share:]
+    places = free[before:before + len(rest)]
     given = comm.alltoall([[illustration.image for illustration, place in zip(rest, places) if place == rank]
                            for rank in range(comm.size)])
     for illustration in own:

@@ -37,7 +37,7 @@ from eddies.scene.scene import Scene
 log = logging.getLogger("eddies")
 
 KINDS = "ground_truth", "kernel", "model", "rollout"  # products, in the order of the page
-FIELDS = "model", "truth", "filtered"  # of a rollout, by what they are made of
+FIELDS = "model", "truth", "filtered"  # of a rollout, as workflows/rollout/frames.py has them, which imports torch
 ROLLOUT_COST = {"seconds_per_step": "rollout, seconds per step", "particles": "particles of the rollout",
                 "ranks": "ranks of the rollout"}
 
