@@ -21,7 +21,9 @@ struct Turns<float> {
     using type = std::uint32_t;
     static constexpr double UNIT = 1.0 / 4294967296.0;
     static type of(double fraction) { return static_cast<type>(static_cast<std::int64_t>(fraction / UNIT)); }
-    static float difference(type a, type b) { return static_cast<float>(static_cast<std::int32_t>(a - b)); }
+    static Vector<float> all(type one) {
+        return (Vector<float>)(BitVector<float>{} + static_cast<std::int32_t>(one));
+    }
     static Vector<float> difference(Vector<float> a, Vector<float> b) {  // of bits
         using Unsigned __attribute__((vector_size(VECTOR_BYTES))) = std::uint32_t;
         return __builtin_convertvector((BitVector<float>)((Unsigned)a - (Unsigned)b), Vector<float>);
@@ -33,13 +35,15 @@ struct Turns<double> {
     using type = double;
     static constexpr double UNIT = 1.0;
     static type of(double fraction) { return fraction; }
-    template <typename One>
-    static One difference(One a, One b) {
+    static Vector<double> all(type one) { return Vector<double>{} + one; }
+    static Vector<double> difference(Vector<double> a, Vector<double> b) {
         constexpr double round = 6755399441055744.0;  // 1.5 2^52, next to which numbers are whole
-        const One d = a - b;
+        const Vector<double> d = a - b;
         return d - ((d + round) - round);
     }
 };
+
+constexpr int CANDIDATES = 64;  // particles that are looked at together, a bit for each
 
 // The first of some positions (count, 3) that is not finite, or -1.
 inline std::int64_t not_finite(const double* position, std::int64_t count) {
@@ -57,6 +61,11 @@ struct Range {
 struct NearRow {
     std::int64_t row;
     int step[2];
+};
+
+// Columns of a row, the last one included.
+struct Columns {
+    std::int32_t first, last;
 };
 
 // How far a point is from rows that lie, along one axis, a step back, no step and a step on.
@@ -117,7 +126,7 @@ class Cells {
         for (std::size_t c = 1; c < start.size(); ++c) start[c] += start[c - 1];
         std::vector<std::int64_t> next(start.begin(), start.end() - 1);
         order.resize(count);
-        for (auto& column : turn) column.resize(count);
+        for (auto& column : turn) column.resize(count + VectorOf<Real>::lanes);  // `nearer` reads beyond the last one
         for (std::int64_t p = 0; p < count; ++p) {
             const std::int64_t at = next[places[p].cell(*this)]++;
             order[at] = static_cast<std::int32_t>(p);
@@ -178,9 +187,13 @@ class Cells {
         }
         if (left <= 0.0) return 0;
         const double half = std::sqrt(left) / period[0] + 1e-9, place = x + 1.0;  // so that it is not negative
-        const std::int64_t* row_start = &start[near.row * columns];
-        const auto low = static_cast<std::int64_t>((place - half) * static_cast<double>(columns));
-        const auto high = static_cast<std::int64_t>((place + half) * static_cast<double>(columns));
+        return pieces(near.row, static_cast<std::int64_t>((place - half) * static_cast<double>(columns)),
+                      static_cast<std::int64_t>((place + half) * static_cast<double>(columns)), ranges);
+    }
+
+    // Particles of a row from one column to another, of which a period has been added: up to two ranges.
+    int pieces(std::int64_t row, std::int64_t low, std::int64_t high, Range* ranges) const {
+        const std::int64_t* row_start = &start[row * columns];
         if (high - low + 1 >= columns) {
             ranges[0] = {row_start[0], row_start[columns]};
             return 1;
@@ -197,6 +210,32 @@ class Cells {
         return 2;
     }
 
+    // For each particle of a row the columns of a row near it, as `pieces` takes them, where others may be within a
+    // distance; the last before the first where there are none.
+    void columns_within(std::int64_t row, const NearRow& near, double distance, Columns* found) const {
+        const std::int64_t cells[2] = {lines, planes}, index[2] = {row % lines, row / lines};
+        double edge[2], slope[2];  // the gap across is the slope times how far a particle is from the edge
+        for (int across = 0; across < 2; ++across) {
+            const int axis = across + 1, step = near.step[across];
+            edge[across] = static_cast<double>(index[across] + (step > 0)) * width[axis];
+            // Where there are only two rows, one is on both sides of the other.
+            slope[across] = wraps[axis] && cells[across] < 3 ? 0.0 : -step * period[axis];
+        }
+        const double square = distance * distance, unit = Turns<Real>::UNIT, number = static_cast<double>(columns);
+        const Range own = of_row(row);
+        const Turn *xs = &turn[0][own.first], *ys = &turn[1][own.first], *zs = &turn[2][own.first];
+#pragma omp simd
+        for (std::int64_t i = 0; i < own.last - own.first; ++i) {
+            const double gap_y = std::max((static_cast<double>(ys[i]) * unit - edge[0]) * slope[0], 0.0),
+                         gap_z = std::max((static_cast<double>(zs[i]) * unit - edge[1]) * slope[1], 0.0);
+            const double left = square - gap_y * gap_y - gap_z * gap_z;
+            const double half = std::sqrt(std::max(left, 0.0)) / period[0] + 1e-9;
+            const double place = static_cast<double>(xs[i]) * unit + 1.0;  // so that it is not negative
+            found[i].first = static_cast<std::int32_t>((place - half) * number);
+            found[i].last = left > 0.0 ? static_cast<std::int32_t>((place + half) * number) : -1;
+        }
+    }
+
     // How far a point is from the rows on both sides of its own.
     void edges(const Place& place, Edges* found) const {
         const std::int64_t cells[2] = {lines, planes};
@@ -209,29 +248,22 @@ class Cells {
         }
     }
 
-    // Of a particle, whose row is known.
-    Place place_of(std::int64_t at, std::int64_t row) const {
-        Place found;
-        for (int axis = 0; axis < 3; ++axis)
-            found.fraction[axis] = static_cast<double>(turn[axis][at]) * Turns<Real>::UNIT;
-        found.index[0] = 0;
-        found.index[1] = row % lines;
-        found.index[2] = row / lines;
-        return found;
-    }
-
-    // Squares of the distances of a point at these turns to particles that follow each other.
-    void squares(const Turn* at, std::int64_t begin, int number, Real* square) const {
+    // Which of up to CANDIDATES particles that follow each other are nearer to a point at these turns than the root of a
+    // limit.
+    std::uint64_t nearer(const Turn* at, std::int64_t begin, int number, Real limit) const {
         using T = Turns<Real>;
-        const Turn x = at[0], y = at[1], z = at[2];
-        const Turn *xs = &turn[0][begin], *ys = &turn[1][begin], *zs = &turn[2][begin];
-        const Real a = scale[0], b = scale[1], c = scale[2];
-#pragma omp simd
-        for (int p = 0; p < number; ++p) {
-            const Real dx = T::difference(x, xs[p]) * a, dy = T::difference(y, ys[p]) * b,
-                       dz = T::difference(z, zs[p]) * c;
-            square[p] = dx * dx + dy * dy + dz * dz;
+        using V = Vector<Real>;
+        constexpr int lanes = VectorOf<Real>::lanes;
+        std::uint64_t found = 0;
+        for (int p = 0; p < number; p += lanes) {
+            V square{};
+            for (int axis = 0; axis < 3; ++axis) {
+                const V d = T::difference(T::all(at[axis]), unaligned(&turn[axis][begin + p])) * scale[axis];
+                square += d * d;
+            }
+            found |= bits(square < limit) << p;
         }
+        return number < CANDIDATES ? found & ((std::uint64_t(1) << number) - 1) : found;
     }
 
    private:

@@ -39,7 +39,6 @@ namespace {
 using namespace eddies;
 
 constexpr std::int64_t RECEIVERS = 512;  // of one thread together
-constexpr std::int64_t CANDIDATES = 64;
 
 using List = std::vector<std::vector<std::int32_t>>;
 
@@ -51,7 +50,6 @@ void find(const Search& search, const Cells<double>& cells, std::int64_t begin, 
     std::int64_t known = -1;
     Edges edges[2];
     Range ranges[2];
-    alignas(64) double square[CANDIDATES];
     for (std::int64_t i = begin; i < end; ++i) {
         const auto place = cells.place(search.receiver + 3 * i);
         if (place.row(cells) != known) cells.near(known = place.row(cells), near);
@@ -61,16 +59,11 @@ void find(const Search& search, const Cells<double>& cells, std::int64_t begin, 
             const int number = cells.within(place.fraction[0], edges, row, search.radius, ranges);
             for (int r = 0; r < number; ++r)
                 for (std::int64_t at = ranges[r].first; at < ranges[r].last; at += CANDIDATES) {
-                    const int some = static_cast<int>(std::min(CANDIDATES, ranges[r].last - at));
-                    cells.squares(place.fraction, at, some, square);
-                    const std::size_t size = found.size();
-                    found.resize(size + some);
-                    std::int32_t* next = &found[size];
-                    for (int c = 0; c < some; ++c) {
-                        *next = cells.order[at + c];
-                        next += (square[c] < limit) & !(search.exclude_self && *next == i);
+                    const int some = static_cast<int>(std::min<std::int64_t>(CANDIDATES, ranges[r].last - at));
+                    for (auto near = cells.nearer(place.fraction, at, some, limit); near; near &= near - 1) {
+                        const std::int32_t j = cells.order[at + __builtin_ctzll(near)];
+                        if (!search.exclude_self || j != i) found.push_back(j);
                     }
-                    found.resize(next - found.data());
                 }
         }
         search.offsets[i + 1] = static_cast<std::int64_t>(found.size() - before);

@@ -43,8 +43,7 @@ namespace {
 
 using namespace eddies;
 
-constexpr int ROWS_TOGETHER = 4;         // of a colour, for one thread
-constexpr std::int64_t CANDIDATES = 64;  // looked at together
+constexpr int ROWS_TOGETHER = 4;  // of a colour, for one thread
 
 // In the order of kernels/pairs.py.
 enum Kind {
@@ -76,6 +75,23 @@ std::unique_ptr<Summand<Real>> make(const Given& given) {
     }
 }
 
+// A bit for each of some things.
+class Bits {
+   public:
+    explicit Bits(std::int64_t count) : words_(count / 64 + 2) {}
+    void set(std::int64_t number) { words_[number / 64] |= std::uint64_t(1) << number % 64; }
+    bool operator[](std::int64_t number) const { return words_[number / 64] >> number % 64 & 1; }
+
+    // The 64 that begin with one of them.
+    std::uint64_t from(std::int64_t number) const {
+        const std::uint64_t *word = &words_[number / 64], shift = number % 64;
+        return word[0] >> shift | (word[1] << 1) << (63 - shift);
+    }
+
+   private:
+    std::vector<std::uint64_t> words_;
+};
+
 // The particles in order of place, each with a record of what it carries in the units of the summands: the bits of its
 // turns, velocity, scalars.
 template <typename Real>
@@ -84,18 +100,17 @@ struct Sorted {
     Cells<Real> cells;
     int width;  // of a record
     Aligned<Real> records;
-    std::vector<std::uint8_t> wanted;
-    bool all_wanted = true;
+    Bits wanted;
     std::vector<std::vector<std::int64_t>> colours;  // rows of each
 
     explicit Sorted(const Particles& given)
-        : given(given), width(padded<Real>(6 + static_cast<int>(given.scalars))), records(given.count * width) {}
+        : given(given), width(padded<Real>(6 + static_cast<int>(given.scalars))), records(given.count * width),
+          wanted(given.count) {}
 
     std::int64_t arrange() {
         const std::int64_t misplaced = not_finite(given.position, given.count);
         if (misplaced >= 0) return misplaced;
         cells.arrange(given.position, given.count, nullptr, 0, given.length, given.periodic_z, given.radius);
-        wanted.resize(given.count);
 #pragma omp parallel for schedule(static)
         for (std::int64_t p = 0; p < given.count; ++p) {
             Real* record = records.data() + p * width;
@@ -106,9 +121,9 @@ struct Sorted {
             }
             for (std::int64_t s = 0; s < given.scalars; ++s)
                 record[6 + s] = static_cast<Real>(given.scalar[s * given.count + row]);
-            wanted[p] = given.wanted[row];
         }
-        all_wanted = std::all_of(wanted.begin(), wanted.end(), [](std::uint8_t one) { return one; });
+        for (std::int64_t p = 0; p < given.count; ++p)
+            if (given.wanted[cells.order[p]]) wanted.set(p);
         colour_rows();
         return -1;
     }
@@ -140,12 +155,15 @@ struct Sorted {
 // Pairs that wait to be evaluated.
 struct Queue {
     int count = 0;
-    std::int32_t first[BLOCK + CANDIDATES], second[BLOCK + CANDIDATES];
+    std::int32_t first[BLOCK + 2 * CANDIDATES], second[BLOCK + 2 * CANDIDATES];
 
-    void add(std::int64_t i, std::int64_t j, int counts) {
-        first[count] = static_cast<std::int32_t>(i);
-        second[count] = static_cast<std::int32_t>(j);
-        count += counts;
+    // Add a particle and those of consecutive others whose bit is set; or them and it.
+    void add(std::int64_t i, std::int64_t begin, std::uint64_t others, bool turned) {
+        if (!others) return;
+        const int number = __builtin_popcountll(others);
+        std::fill_n((turned ? second : first) + count, number, static_cast<std::int32_t>(i));
+        write_numbers(static_cast<std::int32_t>(begin), others, (turned ? first : second) + count);
+        count += number;
     }
 };
 
@@ -183,14 +201,15 @@ class Worker {
     void row(std::int64_t row) {
         const Range own = cells_.of_row(row);
         cells_.near(row, near_);
-        Edges edges[2];
+        columns_.resize(own.last - own.first);
         Range ranges[2];
-        for (std::int64_t i = own.first; i < own.last; ++i) {
-            const auto place = cells_.place_of(i, row);
-            cells_.edges(place, edges);
-            for (const NearRow& other : near_) {
-                if (other.row < row) continue;
-                const int number = cells_.within(place.fraction[0], edges, other, radius_, ranges);
+        for (const NearRow& other : near_) {
+            if (other.row < row) continue;
+            cells_.columns_within(row, other, radius_, columns_.data());
+            for (std::int64_t i = own.first; i < own.last; ++i) {
+                const Columns& columns = columns_[i - own.first];
+                if (columns.last < columns.first) continue;
+                const int number = cells_.pieces(other.row, columns.first, columns.last, ranges);
                 for (int r = 0; r < number; ++r)
                     look(i, other.row == row ? std::max(ranges[r].first, i + 1) : ranges[r].first, ranges[r].last);
             }
@@ -212,6 +231,7 @@ class Worker {
     double radius_;
     Real unit_, inverse_square_;
     std::vector<NearRow> near_;
+    std::vector<Columns> columns_;
     Queue both_, one_;  // pairs whose particles are both wanted, or the first alone
     Block<Real> pairs_, swapped_;
     ByPairs<Real> by_pairs_;
@@ -222,24 +242,17 @@ class Worker {
     // Look for neighbours of a particle among a range.
     void look(std::int64_t i, std::int64_t first, std::int64_t last) {
         const auto limit = static_cast<Real>(radius_ * radius_);
-        const int wanted = sorted_.wanted[i];
+        const bool wanted = sorted_.wanted[i];
         const typename Cells<Real>::Turn at[3] = {cells_.turn[0][i], cells_.turn[1][i], cells_.turn[2][i]};
-        alignas(64) Real square[CANDIDATES];
         for (std::int64_t begin = first; begin < last; begin += CANDIDATES) {
-            const int number = static_cast<int>(std::min(CANDIDATES, last - begin));
-            cells_.squares(at, begin, number, square);
-            if (sorted_.all_wanted) {
-                for (int c = 0; c < number; ++c) both_.add(i, begin + c, square[c] < limit);
-            } else {
-                for (int c = 0; c < number; ++c) {
-                    const std::int64_t j = begin + c;
-                    const int near = square[c] < limit, asked = sorted_.wanted[j];
-                    both_.add(i, j, near & wanted & asked);
-                    one_.add(wanted ? i : j, wanted ? j : i, near & (wanted ^ asked));
-                }
-                take_blocks(one_, false);
-            }
+            const std::uint64_t asked = sorted_.wanted.from(begin);
+            if (!wanted && !asked) continue;
+            const int number = static_cast<int>(std::min<std::int64_t>(CANDIDATES, last - begin));
+            const std::uint64_t near = cells_.nearer(at, begin, number, limit);
+            (wanted ? both_ : one_).add(i, begin, near & asked, !wanted);
+            if (wanted) one_.add(i, begin, near & ~asked, false);
             take_blocks(both_, true);
+            take_blocks(one_, false);
         }
     }
 

@@ -8,6 +8,11 @@
 #include <cstdlib>
 #include <cstring>
 #include <memory>
+#include <type_traits>
+
+#if defined(__AVX512F__) || defined(__AVX2__)
+#include <immintrin.h>
+#endif
 
 namespace eddies {
 
@@ -50,6 +55,45 @@ struct BitVectorOf {
 template <typename Real>
 using BitVector = typename BitVectorOf<Real>::type;
 
+// A vector of what stands anywhere, of numbers or other things of as many bits.
+template <typename Thing>
+inline auto unaligned(const Thing* place) {
+    using Real = std::conditional_t<sizeof(Thing) == 4, float, double>;
+    typedef Real Anywhere __attribute__((vector_size(VECTOR_BYTES), may_alias, aligned(sizeof(Thing))));
+    return (Vector<Real>)*reinterpret_cast<const Anywhere*>(place);
+}
+
+// Bits of lanes, all of whose bits are set or none, the first lane's first.
+template <typename Lanes>
+inline std::uint64_t bits(Lanes lanes) {
+    constexpr bool single = sizeof(lanes[0]) == 4;
+#if defined(__AVX512F__)
+    if constexpr (single) return _mm512_movepi32_mask((__m512i)lanes);
+    return _mm512_movepi64_mask((__m512i)lanes);
+#elif defined(__AVX2__)
+    if constexpr (single) return _mm256_movemask_ps((__m256)lanes);
+    return _mm256_movemask_pd((__m256d)lanes);
+#else
+    std::uint64_t found = 0;
+    for (int lane = 0; lane < int(sizeof(lanes) / sizeof(lanes[0])); ++lane) found |= (lanes[lane] & 1ull) << lane;
+    return found;
+#endif
+}
+
+// Numbers of consecutive things from `begin` on whose bit is set, written one after the other, and up to a vector more.
+inline void write_numbers(std::int32_t begin, std::uint64_t bits, std::int32_t* places) {
+#ifdef __AVX512F__
+    const __m512i lane = _mm512_set_epi32(15, 14, 13, 12, 11, 10, 9, 8, 7, 6, 5, 4, 3, 2, 1, 0);
+    for (; bits; bits >>= 16, begin += 16) {
+        const auto mask = static_cast<__mmask16>(bits);
+        _mm512_storeu_si512(places, _mm512_maskz_compress_epi32(mask, _mm512_add_epi32(lane, _mm512_set1_epi32(begin))));
+        places += __builtin_popcount(mask);
+    }
+#else
+    for (; bits; bits &= bits - 1) *places++ = begin + __builtin_ctzll(bits);
+#endif
+}
+
 // Numbers that begin where a vector may, zero at first.
 template <typename Real>
 class Aligned {
@@ -77,18 +121,46 @@ class Rows {
     Aligned<Real> numbers_;
 };
 
-// One of `lanes` vectors against one lane of all of them: lane `stage` apart after lane changes places.
-template <typename Real, int stage>
+// Numbers of a record that are moved together.
+template <typename Real>
+constexpr int GROUP = 32 / sizeof(Real);
+
+// Numbers of a record, so that it is a whole number of groups.
+template <typename Real>
+constexpr int padded(int numbers) {
+    return (numbers + GROUP<Real> - 1) / GROUP<Real> * GROUP<Real>;
+}
+
+// A vector of groups, one after the other, and back.
+template <typename Real>
+inline Vector<Real> together(const Real* const* groups) {
+#ifdef __AVX512F__
+    const __m256i first = _mm256_loadu_si256(reinterpret_cast<const __m256i*>(groups[0])),
+                  second = _mm256_loadu_si256(reinterpret_cast<const __m256i*>(groups[1]));
+    return (Vector<Real>)_mm512_maskz_inserti64x4(0xff, _mm512_castsi256_si512(first), second, 1);
+#else
+    return *reinterpret_cast<const Vector<Real>*>(groups[0]);
+#endif
+}
+
+template <typename Real>
+inline void add_to(Real* group, const Real* numbers) {
+    typedef Real Group __attribute__((vector_size(32), may_alias, aligned(sizeof(Real))));
+    *reinterpret_cast<Group*>(group) += *reinterpret_cast<const Group*>(numbers);
+}
+
+// Rows of groups against their columns: lane `stage` apart after lane changes places.
+template <typename Real, int stage = 1>
 inline void transpose(Vector<Real>* rows) {
     constexpr int lanes = VectorOf<Real>::lanes;
-    if constexpr (stage < lanes) {
+    if constexpr (stage < GROUP<Real>) {
         BitVector<Real> low, high;
         for (int lane = 0; lane < lanes; ++lane) {
             const bool second = lane & stage;
             low[lane] = second ? lanes + lane - stage : lane;
             high[lane] = second ? lanes + lane : lane + stage;
         }
-        for (int row = 0; row < lanes; ++row) {
+        for (int row = 0; row < GROUP<Real>; ++row) {
             if (row & stage) continue;
             const Vector<Real> a = rows[row], b = rows[row + stage];
             rows[row] = __builtin_shuffle(a, b, low);
@@ -98,18 +170,22 @@ inline void transpose(Vector<Real>* rows) {
     }
 }
 
-// Rows (width, BLOCK) of the records (.., width) of numbered points; the width is a whole number of vectors.
+// Rows (width, BLOCK) of the records (.., width) of numbered points; the width is a whole number of groups.
 template <typename Real>
 inline void gather(const Real* records, int width, const std::int32_t* number, Real* rows) {
     using V = Vector<Real>;
-    constexpr int lanes = VectorOf<Real>::lanes;
-    for (int begin = 0; begin < width; begin += lanes)
+    constexpr int lanes = VectorOf<Real>::lanes, group = GROUP<Real>;
+    for (int begin = 0; begin < width; begin += group)
         for (int p = 0; p < BLOCK; p += lanes) {
-            V part[lanes];
-            for (int q = 0; q < lanes; ++q)
-                part[q] = *reinterpret_cast<const V*>(records + std::int64_t(number[p + q]) * width + begin);
-            transpose<Real, 1>(part);
-            for (int q = 0; q < lanes; ++q) *reinterpret_cast<V*>(rows + (begin + q) * BLOCK + p) = part[q];
+            V part[group];
+            for (int q = 0; q < group; ++q) {
+                const Real* groups[lanes / group];
+                for (int g = 0; g < lanes / group; ++g)
+                    groups[g] = records + std::int64_t(number[p + g * group + q]) * width + begin;
+                part[q] = together(groups);
+            }
+            transpose<Real>(part);
+            for (int q = 0; q < group; ++q) *reinterpret_cast<V*>(rows + (begin + q) * BLOCK + p) = part[q];
         }
 }
 
@@ -117,23 +193,18 @@ inline void gather(const Real* records, int width, const std::int32_t* number, R
 template <typename Real>
 inline void scatter_add(const Real* rows, int width, const std::int32_t* number, int count, Real* records) {
     using V = Vector<Real>;
-    constexpr int lanes = VectorOf<Real>::lanes;
-    for (int begin = 0; begin < width; begin += lanes)
+    constexpr int lanes = VectorOf<Real>::lanes, group = GROUP<Real>;
+    for (int begin = 0; begin < width; begin += group)
         for (int p = 0; p < count; p += lanes) {
-            V part[lanes];
-            for (int q = 0; q < lanes; ++q) part[q] = *reinterpret_cast<const V*>(rows + (begin + q) * BLOCK + p);
-            transpose<Real, 1>(part);
+            V part[group];
+            for (int q = 0; q < group; ++q) part[q] = *reinterpret_cast<const V*>(rows + (begin + q) * BLOCK + p);
+            transpose<Real>(part);
+            const auto* numbers = reinterpret_cast<const Real*>(part);
             const int some = std::min(lanes, count - p);
             for (int q = 0; q < some; ++q)
-                *reinterpret_cast<V*>(records + std::int64_t(number[p + q]) * width + begin) += part[q];
+                add_to(records + std::int64_t(number[p + q]) * width + begin,
+                       numbers + q % group * lanes + q / group * group);
         }
-}
-
-// Numbers of a record, so that it is a whole number of vectors.
-template <typename Real>
-constexpr int padded(int numbers) {
-    constexpr int lanes = VectorOf<Real>::lanes;
-    return (numbers + lanes - 1) / lanes * lanes;
 }
 
 }  // namespace eddies

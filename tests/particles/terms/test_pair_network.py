@@ -14,11 +14,13 @@ from tests.particles.configurations import (
 
 pytestmark = pytest.mark.mpi(1)
 ANTISYMMETRIC = PAIR_MODELS["antisymmetric"]
-#: Between them every term of pairs, both bases and both sets of invariants; the last two evaluate each pair once.
+NO_DENSITY = dict(inputs=("distance", "speed", "approach"))
+#: Between them every term of pairs, both bases and both sets of invariants; all but the first evaluate each pair once.
 MODELS = {
     "corrected": {"pairs": {}, "density-flux": {}, "density-transport": {}, "eddy-viscosity": {}},
     "antisymmetric": ANTISYMMETRIC,
     "summation": {"summation-density": {}, "wcsph": dict(exponent=7.0)},
+    "without density": {"pairs": NO_DENSITY, "density-flux": NO_DENSITY},
 }
 every_model = pytest.mark.parametrize("terms", MODELS.values(), ids=MODELS)
 
@@ -205,7 +207,7 @@ def test_antisymmetric_forces_of_a_pair_are_opposite_to_the_last_bit():
         assert (first + second).norm() > 1e-6
 
 
-@pytest.mark.parametrize("name", ["antisymmetric", "summation"])
+@pytest.mark.parametrize("name", ["antisymmetric", "summation", "without density"])
 def test_one_evaluation_of_a_pair_serves_both_particles(name):
     """All pairs in both orders, and each pair once with its values times their parity for the other one."""
     terms = model(MODELS[name]).terms.values()

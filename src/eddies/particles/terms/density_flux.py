@@ -26,7 +26,7 @@ class DensityFlux(PairTerm):
         super().__init__(settings, flow)
         # Another network than that of the force, so other initial weights.
         self.network = build_network(settings, 1, flow.seed + 1)
-        self.width = max(settings.hidden)
+        self.mutual, self.width = "density" not in settings.inputs, max(settings.hidden)
         if settings.zero_at_first:
             if not isinstance(self.network, DenseNetwork):
                 raise TermError(f'zero_at_first: needs network = "dense", not "{settings.network}", whose last '

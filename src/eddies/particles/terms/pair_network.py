@@ -25,7 +25,8 @@ class PairNetwork(PairTerm):
 
     NN_1 and NN_2 of the invariants of a pair (rho'_i, rho'_j, |x|, |v|, x.v) in the units of `ScaledPairs`, n the
     expected number of neighbours, M_i = sum_j w x x^T. With symmetry "antisymmetric" the first two invariants are
-    rho'_i + rho'_j and (rho'_i - rho'_j)^2: i and j get opposite forces, which keep the total momentum.
+    rho'_i + rho'_j and (rho'_i - rho'_j)^2: i and j get opposite forces, which keep the total momentum. Without the
+    densities all invariants are those of i and j alike: what is summed is opposite, and evaluated once.
     """
 
     Settings = declared.PairNetwork
@@ -35,7 +36,8 @@ class PairNetwork(PairTerm):
     def __init__(self, settings: declared.PairNetwork, flow: FlowUnits) -> None:
         super().__init__(settings, flow)
         self.network = build_network(settings, 2, flow.seed)
-        self.mutual, self.needs_moments = settings.symmetry == "antisymmetric", settings.basis == "corrected"
+        self.mutual = settings.symmetry == "antisymmetric" or "density" not in settings.inputs
+        self.needs_moments = settings.basis == "corrected"
         self.width = max(settings.hidden)
 
     def features(self, pairs: ScaledPairs) -> Tensor:
