@@ -13,7 +13,7 @@ from eddies.io.checkpoint import Checkpoint
 from eddies.io.hdf5 import open_product
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import Stopped
-from eddies.scene.scene import BOX_LENGTH, Model
+from eddies.scene.scene import BOX_LENGTH, Eulerian, Model
 from eddies.workflows import simulate
 from eddies.workflows.ground_truth.truth import GroundTruth
 from tests.workflows.rollout.test_particle_run import OWN_METHOD, prepared, with_method, write_model
@@ -70,7 +70,8 @@ def case_of(comm, products, tmp_path):
                 if path.exists():
                     (tmp_path / path.name).symlink_to(path)
         comm.Barrier()
-        return with_method(with_preset(scene, preset), method, **{"turnovers": 0.11, **keys}), tmp_path
+        coarse = replace(scene, eulerian=Eulerian(cells=12))  # enough for three slabs
+        return with_method(with_preset(coarse, preset), method, **{"turnovers": 0.11, **keys}), tmp_path
 
     return case
 
@@ -121,10 +122,28 @@ def go_on_from(comm, scene, directory, saved, step):
     simulate.run(scene, comm, directory)
 
 
-@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.mpi(1)
 @pytest.mark.parametrize("name", CASES)
 def test_every_split_of_a_rollout_is_the_whole_rollout(comm, case_of, monkeypatch, name):
-    scene, directory = case_of(name)
+    check_splits(comm, *case_of(name), monkeypatch)
+
+
+@pytest.mark.usefixtures("quick_solves")
+@pytest.mark.mpi(2)
+@pytest.mark.parametrize("name", CASES)
+def test_splits_on_two_ranks(comm, case_of, monkeypatch, name):
+    check_splits(comm, *case_of(name), monkeypatch, each=2)
+
+
+@pytest.mark.usefixtures("quick_solves")
+@pytest.mark.mpi(3)
+@pytest.mark.parametrize("name", ["default", "own density", "eulerian, forced"])
+def test_splits_on_three_ranks(comm, case_of, monkeypatch, name):
+    check_splits(comm, *case_of(name), monkeypatch, each=3)
+
+
+def check_splits(comm, scene, directory, monkeypatch, each=1):
+    """Go on from each, or each second, ... of these: the first step, the second, one after a frame, the last."""
     simulate.run(scene, comm, directory)
     whole = product(comm, directory)
     assert whole["status"] == "complete" and len(whole["frames at steps"]) >= 2
@@ -132,9 +151,8 @@ def test_every_split_of_a_rollout_is_the_whole_rollout(comm, case_of, monkeypatc
     assert_same(product(comm, directory), whole, "with checkpoints")
     steps = int(whole["steps"])
     assert len(list(saved.glob("step-*"))) == steps >= 3
-    # The first and the last step, between frames, and at a frame.
     at_frames = sorted(set(whole["frames at steps"].tolist()))
-    for split in sorted({0, 1, at_frames[1], steps - 1} - {steps}):
+    for split in sorted({0, 1, at_frames[1], steps - 1} - {steps})[each - 1::each]:
         go_on_from(comm, scene, directory, saved, split)
         assert_same(product(comm, directory), whole, split)
     assert not (directory / "checkpoints-rollout").exists()
