@@ -13,8 +13,8 @@ from eddies.io.checkpoint import Checkpoint
 from eddies.io.hdf5 import open_product
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import Stopped
-from eddies.scene.scene import BOX_LENGTH, Eulerian, Model
-from eddies.workflows import simulate
+from eddies.scene.scene import BOX_LENGTH, Eulerian, Model, load_scene
+from eddies.workflows import dns, simulate
 from eddies.workflows.ground_truth.truth import GroundTruth
 from tests.workflows.rollout.test_particle_run import OWN_METHOD, prepared, with_method, write_model
 from tests.workflows.stopping import StopAtStep
@@ -223,3 +223,42 @@ def test_a_method_that_tells_no_state_begins_anew(comm, products, tmp_path, own)
     simulate.run(scene, comm, tmp_path)
     assert product(comm, tmp_path)["status"] == "complete"
     assert not (tmp_path / "checkpoints-rollout").exists()
+
+
+FEW = """
+[flow]
+fluid = "incompressible"
+cells = 16
+viscosity = 0.1
+[tracers]
+particles_per_side = 2
+turnovers = 0.14
+frame_interval = 0.02
+field_every = 1
+field_cells = 8
+[model]
+terms = ["pressure", "viscosity"]
+[training]
+window = 1
+frames = 2
+batch = 8
+steps = 2
+[simulation]
+step = 0.03
+turnovers = 0.1
+frame_interval = 0.04
+start = 0.3
+"""
+
+
+@pytest.mark.mpi(1, 2)
+def test_a_few_particles_go_on(comm, tmp_path, monkeypatch):
+    """Of eight, a rank may have one or none."""
+    if comm.rank == 0:
+        (tmp_path / "own.toml").write_text(FEW)
+    comm.Barrier()
+    scene = load_scene(tmp_path / "own.toml")
+    dns.run(scene, comm, tmp_path)
+    with open_product(comm, tmp_path / "ground_truth.h5", "ground_truth") as file:
+        write_model(comm, tmp_path, scene, GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, 4)).scales)
+    check_splits(comm, scene, tmp_path, monkeypatch)
