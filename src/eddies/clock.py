@@ -56,12 +56,18 @@ class ProgressLine:
     """Logs one line every few seconds of wall time: how far, and how long it will still take.
 
     `describe` returns what is worth reading of the state at that moment; it is called where that is logged only, so it
-    must not communicate.
+    must not communicate. `before` are wall seconds of earlier parts of the run, which went on from a checkpoint.
     """
 
-    def __init__(self, stage: str, describe: Callable[[], str], interval: float = 5.0) -> None:
+    def __init__(self, stage: str, describe: Callable[[], str], interval: float = 5.0, before: float = 0.0) -> None:
         self.stage, self.describe, self.interval = stage, describe, interval
-        self._started = self._last = time.perf_counter()
+        self._last = time.perf_counter()
+        self._started = self._last - before
+
+    @property
+    def elapsed(self) -> float:
+        """Wall seconds of the run so far, in all its parts."""
+        return time.perf_counter() - self._started
 
     def __call__(self, done: float, step: int) -> None:
         """Report if it is time; `done` is the finished fraction of the stage in [0, 1], `step` the steps so far."""
@@ -71,7 +77,7 @@ class ProgressLine:
         if now - self._last < self.interval or done <= 0:
             return
         self._last = now
-        elapsed = now - self._started
+        elapsed = self.elapsed
         log.info("%s  step %d  %s  %.3f s/step  %.0f %%  %s left", self.stage, step, self.describe(),
                  elapsed / max(step, 1), 100 * done, duration(elapsed * (1 - done) / done))
 

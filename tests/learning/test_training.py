@@ -80,6 +80,24 @@ def test_a_phase_that_only_does_harm_ends_where_it_began(comm):
     assert np.array_equal(finished(training).model.weight.detach().numpy(), start)
 
 
+@pytest.mark.mpi(1)
+def test_without_validation_a_phase_ends_where_its_last_step_led(comm):
+    training = training_of(comm)
+    seen = []
+
+    def taking(take):
+        def taken(optimizer, step):
+            row = take(optimizer, step)
+            seen.append(training.model.weight.detach().numpy().copy())
+            return row
+        return taken
+
+    training.phases = [Phase(phase.name, phase.work, phase.rates, taking(phase.take)) for phase in training.phases]
+    finished(training)
+    assert not {"start_error", "validation_error"} & set(training.columns())
+    assert len(seen) == 11 and np.array_equal(training.model.weight.detach().numpy(), seen[-1])
+
+
 @pytest.mark.mpi(1, 2)
 def test_a_loss_that_is_not_finite_ends_the_training_on_all_ranks(comm):
     training = training_of(comm)

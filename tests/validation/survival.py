@@ -1,9 +1,9 @@
 """What checkpoints survive, in numbers: kills at random moments, bit flips, truncations. A script, some minutes long.
 
-    python tests/validation/survival.py [--kills 200] [--harms 1000]
+    python tests/validation/survival.py [--kills 200] [--harms 1000] [--stages dns train-kernel simulate]
 
-The simulation that is killed writes a checkpoint before every step, so that most kills fall into a writing. It goes on
-from what it finds; when it has ended, its ground truth must be that of a run that was never killed.
+The stage that is killed writes a checkpoint before every step, so that most kills fall into a writing. It goes on from
+what it finds; when it has ended, its product must be that of a run that was never killed.
 """
 
 import argparse
@@ -16,8 +16,10 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path
 
+import h5py
 import numpy as np
 from mpi4py import MPI
 
@@ -25,56 +27,99 @@ HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE.parent / "io"), str(HERE.parent / "workflows"), str(HERE.parents[1])]
 
 from test_checkpoint import fill, harm  # noqa: E402
-from test_dns_restart import SPLIT, product  # noqa: E402
+from test_dns_restart import SPLIT  # noqa: E402
+from test_train_restart import SHORT  # noqa: E402
 
 from eddies.io.checkpoint import CheckpointDirectory  # noqa: E402
+from eddies.pipeline import STAGES  # noqa: E402
 from eddies.scene.scene import load_scene  # noqa: E402
 
-LONGER = [*SPLIT, "tracers.turnovers=1.5"]
+
+@dataclass(frozen=True)
+class Killed:
+    """A stage to be killed, with what it overrides of the scene "tiny", and the stages before it."""
+
+    stage: str
+    overrides: list[str]
+    before: tuple[str, ...] = ()
+
+    def process(self, directory, *options, stage=None):
+        """A process of the stage, or of another, on one rank, and not a part of this script's MPI job."""
+        overrides = [word for override in self.overrides for word in ("--set", override)]
+        line = [sys.executable, "-m", "eddies", stage or self.stage, "tiny", "--output", str(directory), *overrides,
+                *options]
+        environment = {name: value for name, value in os.environ.items() if not name.startswith(("OMPI_", "PMIX_"))}
+        return subprocess.Popen(line, env=environment, stdout=subprocess.DEVNULL)
+
+    def make(self, directory):
+        """What the stage starts from."""
+        directory.mkdir()
+        for stage in self.before:
+            self.process(directory, stage=stage).wait()
+
+    def checkpoints(self, directory):
+        """Those of the stage in a run directory."""
+        fingerprint = load_scene("tiny", self.overrides).fingerprint(self.stage)
+        return CheckpointDirectory(MPI.COMM_SELF, directory / STAGES[self.stage].checkpoints, fingerprint)
 
 
-def simulation(directory, *options):
-    """A process that simulates, on one rank, and not a part of this script's MPI job."""
-    overrides = [word for override in LONGER for word in ("--set", override)]
-    line = [sys.executable, "-m", "eddies", "dns", "tiny", "--output", str(directory), *overrides, *options]
-    environment = {name: value for name, value in os.environ.items() if not name.startswith(("OMPI_", "PMIX_"))}
-    return subprocess.Popen(line, env=environment, stdout=subprocess.DEVNULL)
+LEARNING = [*SHORT, "kernel.steps=40", "training.steps=3", "training.combined_steps=1", "simulation.turnovers=1.5",
+            "simulation.step=0.025"]
+STAGES_KILLED = {each.stage: each for each in (
+    Killed("dns", [*SPLIT, "tracers.turnovers=1.5"]),
+    Killed("train-kernel", LEARNING, ("dns",)),
+    Killed("simulate", LEARNING, ("dns", "train-kernel", "train")),
+)}
 
 
-def kills(count, directory, chooser):
-    """Kill a simulation so often, at random moments after its first checkpoint; what happened, and how often."""
-    fingerprint, seen = load_scene("tiny", LONGER).fingerprint("dns"), Counter()
-    whole, run = directory / "whole", directory / "run"
-    simulation(whole).wait()
-    truth = product(MPI.COMM_SELF, whole)
+def product(path):
+    """All datasets of a product, but for wall times."""
+    found = {}
+    with h5py.File(path) as file:
+        file.visititems(lambda name, item: found.update({name: item[()]} if isinstance(item, h5py.Dataset) else {}))
+    return {name: values for name, values in found.items() if not name.endswith("seconds_per_step")}
+
+
+def kills(killed, count, directory, chooser):
+    """Kill a stage so often, at random moments after its first checkpoint; what happened, and how often."""
+    seen, file = Counter(), STAGES[killed.stage].file
+    start, whole, run = directory / "start", directory / "whole", directory / "run"
+    killed.make(start)
+    shutil.copytree(start, whole)
+    killed.process(whole).wait()
+    truth = product(whole / file)
     while seen["kills"] < count:
-        newest, job = last_step(run), simulation(run, "--resume", "--checkpoint-minutes", "1e-9")
-        while last_step(run) <= newest and job.poll() is None:
+        if not run.exists():
+            shutil.copytree(start, run)
+        checkpoints = killed.checkpoints(run)
+        newest = last_step(checkpoints.path)
+        job = killed.process(run, "--resume", "--checkpoint-minutes", "1e-9")
+        while last_step(checkpoints.path) <= newest and job.poll() is None:
             time.sleep(0.002)
         time.sleep(chooser.random() / 3)
         if job.poll() is None:
             job.kill()
             job.wait()
             seen["kills"] += 1
-            seen["in the writing of a checkpoint"] += bool(list(run.glob("checkpoints/step-*.partial")))
-            before = last_step(run)
-            if (run / "ground_truth.h5").exists():
-                seen["after the end, ground truth complete"] += 1
+            seen["in the writing of a checkpoint"] += bool(list(checkpoints.path.glob("step-*.partial")))
+            before = last_step(checkpoints.path)
+            if (run / file).exists():
+                seen["after the end, product complete"] += 1
             else:
-                saved = CheckpointDirectory(MPI.COMM_SELF, run / "checkpoints", fingerprint).newest()
+                saved = checkpoints.newest()
                 seen["newest checkpoint complete"] += saved is not None and saved.content["step"] == before
-        if (run / "ground_truth.h5").exists():
-            again = product(MPI.COMM_SELF, run)
+        if (run / file).exists():
+            again = product(run / file)
             seen["runs ended"] += 1
-            equal = all(np.array_equal(again[name], truth[name]) for name in truth)
-            seen["runs equal to the one never killed"] += equal
+            seen["runs equal to the one never killed"] += again.keys() == truth.keys() and all(
+                np.array_equal(again[name], truth[name], equal_nan=True) for name in truth)
             shutil.rmtree(run)
     return seen
 
 
-def last_step(run):
+def last_step(checkpoints):
     """Step of the newest checkpoint that has its name."""
-    names = [path.name for path in run.glob("checkpoints/step-*") if path.suffix != ".partial"]
+    names = [path.name for path in checkpoints.glob("step-*") if path.suffix != ".partial"]
     return max((int(name.removeprefix("step-")) for name in names), default=-1)
 
 
@@ -109,14 +154,24 @@ class Told(logging.Handler):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--kills", type=int, default=200)
+    parser.add_argument("--kills", type=int, default=200, help="of each stage")
     parser.add_argument("--harms", type=int, default=1000)
-    given, chooser = parser.parse_args(), random.Random(1)
-    with tempfile.TemporaryDirectory() as folder:
-        for title, seen in (("SIGKILL", kills(given.kills, Path(folder), chooser)),
-                            ("bit flips", harms("flip", given.harms, Path(folder) / "flip", chooser)),
-                            ("truncations", harms("truncation", given.harms, Path(folder) / "truncation", chooser))):
-            print(title, *(f"  {name:36} {number:6}" for name, number in seen.items()), sep="\n")
+    parser.add_argument("--stages", nargs="*", choices=STAGES_KILLED, default=list(STAGES_KILLED))
+    parser.add_argument("--seed", type=int, default=1)
+    given = parser.parse_args()
+    chooser = random.Random(given.seed)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for stage in given.stages:
+            (folder / stage).mkdir()
+            show(f"SIGKILL, {stage}", kills(STAGES_KILLED[stage], given.kills, folder / stage, chooser))
+        for title, kind in (("bit flips", "flip"), ("truncations", "truncation")):
+            show(title, harms(kind, given.harms, folder / kind, chooser))
+
+
+def show(title, seen):
+    """Print what happened, and how often."""
+    print(title, *(f"  {name:36} {number:6}" for name, number in seen.items()), sep="\n", flush=True)
 
 
 if __name__ == "__main__":

@@ -29,9 +29,9 @@ def last(monkeypatch):
     seen = SimpleNamespace()
 
     class SeeingGuard(dns.Guard):
-        def __call__(self, run):
+        def __call__(self, run, segments=None):
             seen.run, seen.guard = run, self
-            super().__call__(run)
+            super().__call__(run, segments)
 
     monkeypatch.setattr(dns, "Guard", SeeingGuard)
     return seen
@@ -149,7 +149,7 @@ def test_another_number_of_ranks(comm, tmp_path, last, before, after):
         if comm.rank == 0:
             (run / "checkpoints" / name).rename(tmp_path / name)
         groups[after].Barrier()
-        last.guard.save(last.run)
+        last.guard.save(last.run, last.run.tracers.segments)
         saved = [Checkpoint(path / name, {}) for path in (run / "checkpoints", tmp_path)]
         for name in ("modes", "position", "velocity", "history_time", "spectra_of_history"):
             assert np.array_equal(*(checkpoint.read(name) for checkpoint in saved)), name

@@ -1,8 +1,10 @@
 """A training that is stopped and goes on is the one that was never stopped."""
 
+from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
 
+import h5py
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
@@ -39,6 +41,16 @@ def prepared(comm, directory, settings=THROUGH_HORIZONS):
     return scene
 
 
+def datasets(comm, path):
+    """All datasets of a file by name."""
+    comm.Barrier()
+    found = {}
+    with h5py.File(path) as file:
+        file.visititems(lambda name, item: found.update({name: item[()]} if isinstance(item, h5py.Dataset) else {}))
+    comm.Barrier()
+    return found
+
+
 def trained(comm, directory):
     """Weights, learning history and a-priori errors."""
     numbers = load_weights(comm, directory / "model.h5", "model")[1]
@@ -70,6 +82,32 @@ def test_a_stopped_training_is_the_one_never_stopped(comm, tmp_path):
     comm.Barrier()
     assert (tmp_path / "learning.png").read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
     assert {path.name for path in tmp_path.iterdir()} == {"ground_truth.h5", "kernel.h5", "model.h5", "learning.png"}
+
+
+@pytest.mark.mpi(1, 2, 3)
+def test_a_stopped_training_of_the_kernel_is_the_one_never_stopped(comm, tmp_path):
+    scene = prepared(comm, tmp_path, [*SHORT, "tracers.particles_per_side=9", "kernel.steps=3"])
+    whole = datasets(comm, tmp_path / "kernel.h5")
+    assert len(whole["history/loss_learned"]) == len(whole["history/loss_learned_no_gradient"]) == 3
+    # Before the first step, within a form of the kernel, between the two, and before the last step.
+    for before, step in pairwise((0, 0, 1, 3, 5)):
+        with pytest.raises(Stopped, match=f"--resume goes on from step {step} of the training"):
+            train_kernel.run(scene, comm, tmp_path, StopAtStep(comm, step - before))
+    train_kernel.run(scene, comm, tmp_path)
+    parts = datasets(comm, tmp_path / "kernel.h5")
+    assert parts.keys() == whole.keys()
+    for name, values in parts.items():
+        assert np.array_equal(values, whole[name]), name
+    comm.Barrier()
+    assert {path.name for path in tmp_path.iterdir()} == {"ground_truth.h5", "kernel.h5"}
+
+
+@pytest.mark.mpi(1)
+def test_a_kernel_that_diverges_is_told_with_the_remedy(comm, tmp_path):
+    scene = prepared(comm, tmp_path, SHORT)
+    wild = replace(scene, kernel=replace(scene.kernel, learning_rate=1e30, steps=4))
+    with pytest.raises(SceneError, match=r"\[kernel\] step . of the training \(learned\): .*; lower learning_rate"):
+        train_kernel.run(wild, comm, tmp_path)
 
 
 @pytest.mark.mpi(1, 2, timeout=30)

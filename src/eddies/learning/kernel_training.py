@@ -70,7 +70,7 @@ class KernelTrainer:
         self.points, self.seed = min(points, self.total), seed
 
     def step(self, optimizer: Adam, step: int) -> dict[str, float]:
-        """One step; returns the global losses."""
+        """One step; returns the global losses, and the norm of the gradient."""
         random = np.random.default_rng([self.seed, step])
         sample = self.samples[random.integers(len(self.samples))]
         rows = sample.own_rows(np.sort(random.choice(self.total, self.points, replace=False)))
@@ -87,5 +87,5 @@ class KernelTrainer:
         if self.weights.normalization > 0:
             shares["normalization"] = (self.network.integral() - 1) ** 2 / self.comm.size
             total = total + self.weights.normalization * shares["normalization"]
-        optimizer.step(total)
-        return shared_values(self.comm, {"loss": total, **shares})
+        norm = optimizer.step(total)
+        return {**shared_values(self.comm, {"loss": total, **shares}), "gradient_norm": norm}

@@ -26,7 +26,7 @@ class Phase:
     work : cost of each optimiser step, in any unit common to the phases, for the time left.
     rates : learning rate of the first and of the last step.
     take : one step of the optimiser, given the number of the step within the phase; returns losses by name.
-    validate : error on what is not trained on; the state where it was least is kept.
+    validate : error on what is not trained on; the state where it was least is kept. None: the last state is.
     validate_every : steps between two validations. The last step is always followed by one.
     """
 
@@ -34,8 +34,8 @@ class Phase:
     work: np.ndarray
     rates: tuple[float, float]
     take: Callable[[Adam, int], dict[str, float]]
-    validate: Callable[[], float]
-    validate_every: int
+    validate: Callable[[], float] | None = None
+    validate_every: int = 1
 
     @property
     def steps(self) -> int:
@@ -48,8 +48,8 @@ class TrainingDiverged(ValueError):
 
 
 class Training:
-    """Takes a model through phases. It returns at the end of each to the state of least validation error, its start
-    included.
+    """Takes a model through phases. It returns at the end of each that is validated to the state of least error, its
+    start included.
 
     Parameters
     ----------
@@ -83,6 +83,16 @@ class Training:
         return self.phases[self.number]
 
     @property
+    def steps(self) -> int:
+        """Steps taken so far, in all phases."""
+        return len(self.history)
+
+    @property
+    def seconds(self) -> float:
+        """Wall seconds of the training so far, in all its parts."""
+        return self._seconds_before + time.perf_counter() - self._started
+
+    @property
     def done(self) -> float:
         """The fraction of all work that is done."""
         before = [phase.work for phase in self.phases[:self.number]]
@@ -92,22 +102,23 @@ class Training:
     def step(self) -> None:
         """One step of the present phase, and the validation that may be due after it."""
         phase, rate = self.phase, self.optimizer.learning_rate
-        start = {"start_error": self._validate()} if self.optimizer.taken == 0 else {}
-        row = {"phase": float(self.number), "step": float(len(self.history)), "learning_rate": rate, **start,
+        start = {"start_error": self._error_of(phase.validate)} if phase.validate and self.optimizer.taken == 0 else {}
+        row = {"phase": float(self.number), "step": float(self.steps), "learning_rate": rate, **start,
                **phase.take(self.optimizer, self.optimizer.taken)}
-        place = f"step {len(self.history)} of the training ({phase.name})"
+        place = f"step {self.steps} of the training ({phase.name})"
         for name in ("loss", "gradient_norm"):
             if not np.isfinite(row[name]):
                 raise TrainingDiverged(f"{place}: {name} is {row[name]}, at a learning rate of {rate:.3g}")
         last = self.optimizer.taken == phase.steps
-        if last or self.optimizer.taken % phase.validate_every == 0:
-            row["validation_error"] = self._validate()
-        if last and self.best_error == np.inf:
-            raise TrainingDiverged(f"{place}: at no time of this phase was the error on what is held out finite")
-        row["seconds"] = self._seconds_before + time.perf_counter() - self._started
+        if phase.validate and (last or self.optimizer.taken % phase.validate_every == 0):
+            row["validation_error"] = self._error_of(phase.validate)
+        if phase.validate and last:
+            if self.best_error == np.inf:
+                raise TrainingDiverged(f"{place}: at no time of this phase was the error on what is held out finite")
+            self._load(self.best)
+        row["seconds"] = self.seconds
         self.history.append(row)
         if last:
-            self._load(self.best)
             self._begin(self.number + 1)
 
     def columns(self) -> dict[str, np.ndarray]:
@@ -136,10 +147,10 @@ class Training:
                         for row in rows]
         self._seconds_before = self.history[-1]["seconds"] if self.history else 0.0
 
-    def _validate(self) -> float:
+    def _error_of(self, validate: Callable[[], float]) -> float:
         """The error on what is held out; infinite where it is no number, or particles outrun their slabs."""
         try:
-            error = self.phase.validate()
+            error = validate()
         except HaloError:
             error = np.inf
         error = error if np.isfinite(error) else np.inf

@@ -61,6 +61,16 @@ class ParticleDynamics:
         if self.neighborhood is not None:
             self.neighborhood.forget()
 
+    def built_at(self, particles: ParticleSet) -> Tensor | None:
+        """Positions (n, 3) of these particles when halo and list were built for them; None without such."""
+        return None if self.neighborhood is None else self.neighborhood.built_at(particles)
+
+    def rebuild(self, particles: ParticleSet, built_at: Tensor) -> None:
+        """Have halo and list as they were built for these particles at other positions (n, 3); collective."""
+        if self.neighborhood is not None:
+            self.neighborhood.forget()
+            self.neighborhood.update(replace(particles, position=built_at))
+
     def begin(self) -> None:
         """Time 0 of a run of which nothing is known yet."""
         self.time, self.evaluations = 0.0, 0

@@ -69,6 +69,10 @@ class Neighborhood:
         """Build anew at the next occasion."""
         self._ids: Tensor | None = None
 
+    def built_at(self, particles: ParticleSet) -> Tensor | None:
+        """Positions (n, 3) of these particles when they were built; None if that was for others. Sends nothing."""
+        return self._built_at if particles.id is self._ids else None
+
     def outdated(self, particles: ParticleSet) -> bool:
         """Whether, on any rank, these are other particles or one has moved by more than half the skin, or to a
         position that is not a number."""

@@ -11,6 +11,8 @@ from eddies.clock import Clock, ProgressLine
 from eddies.flow.history import FlowHistory
 from eddies.io.checkpoint import Checkpoint
 from eddies.io.fields import FieldWriter
+from eddies.io.frame_segments import FrameSegments
+from eddies.io.guard import Guard
 from eddies.io.hdf5 import File, create_product, write_attributes, write_table
 from eddies.parallel.communicator import Comm
 from eddies.parallel.stop import StopRequest
@@ -18,9 +20,9 @@ from eddies.pipeline import STAGES
 from eddies.scene.scene import Scene
 from eddies.scene.sections import SpinUp
 from eddies.time_stepping import STEPPERS
-from eddies.workflows.ground_truth.flow_run import FlowRun, Guard
-from eddies.workflows.ground_truth.frame_segments import FrameSegments
+from eddies.workflows.ground_truth.flow_run import FlowRun
 from eddies.workflows.ground_truth.scene_flow import build_fluid, build_step_limit, initial_state
+from eddies.workflows.ground_truth.tracer_frames import frame_layout
 from eddies.workflows.ground_truth.tracer_run import TracerRun
 
 log = logging.getLogger("eddies")
@@ -35,7 +37,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     Raises Stopped, after a checkpoint, when `stop` asks for it.
     """
     directory, fingerprint = Path(directory), scene.fingerprint("dns")
-    guard = Guard(comm, directory / STAGES["dns"].checkpoints, fingerprint, stop or StopRequest(comm))
+    guard = Guard(comm, directory / STAGES["dns"].checkpoints, fingerprint, stop)
     saved = guard.checkpoints.newest()
     flow = build_run(scene, comm, guard, saved)
     with create_product(comm, directory / "ground_truth.h5", "ground_truth", scene.provenance("dns")) as file:
@@ -106,7 +108,8 @@ def stationary_span(settings: SpinUp, history: FlowHistory) -> dict[str, float]:
 def follow_tracers(scene: Scene, file: File, flow: FlowRun, saved: Checkpoint | None) -> None:
     """Release tracers into the flow, forcing off, and store their frames, the filtered fields and the scales."""
     comm, names = flow.fluid.grid.decomposition.comm, saved.files if saved is not None else ()
-    with FrameSegments(comm, flow.guard.checkpoints.path, scene.tracers, flow.fluid.compressible, names) as segments:
+    layout = frame_layout(scene.tracers, flow.fluid.compressible)
+    with FrameSegments(comm, flow.guard.checkpoints.path, layout, names) as segments:
         run = TracerRun(scene, flow, segments, saved)
         run.follow()
         segments.assemble(file)

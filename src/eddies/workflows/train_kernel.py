@@ -7,13 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import nn
 
-from eddies.clock import ProgressLine
 from eddies.flow.operators import gradient
+from eddies.io.guard import Guard
 from eddies.io.hdf5 import open_product
 from eddies.io.weights import save_weights
 from eddies.learning.kernel_training import KernelLossWeights, KernelSample, KernelTrainer
-from eddies.learning.optimization import Adam
+from eddies.learning.training import Phase, Training
 from eddies.parallel.communicator import Comm
 from eddies.parallel.migration import id_block, migrate
 from eddies.parallel.reduction import global_sum
@@ -22,20 +23,25 @@ from eddies.parallel.stop import StopRequest
 from eddies.particles.devices import prepare_torch
 from eddies.particles.particle_field import ParticleField
 from eddies.particles.smoothing_kernels import CubicSpline, KernelNetwork, SmoothingKernel, WendlandC2, integral
+from eddies.pipeline import STAGES
 from eddies.scene.scene import BOX_LENGTH, Scene
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.workflows.ground_truth.truth import GroundTruth
+from eddies.workflows.learned.steps import take_all_steps
 
 log = logging.getLogger("eddies")
 
 TRAINING_SAMPLES = 4
 FINAL_RATE_FRACTION = 0.05
+# Of those that a step has.
+LOSSES = "loss", "velocity", "gradient", "normalization"
 
 
 def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | None = None) -> None:
     """Train the kernel of a scene on fields of the training window and write kernel.h5.
 
     The kernel without the gradient loss (the paper's Fig. 1) is trained as well. Errors are those at the last field.
+    A training that is stopped goes on from a checkpoint.
     """
     prepare_torch("cpu", comm)
     settings, directory = scene.kernel, Path(directory)
@@ -47,10 +53,11 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         chosen = np.unique(np.linspace(0, len(seen) - 1, TRAINING_SAMPLES).astype(int))
         samples = [load_sample(truth, index, support) for index in chosen]
         unseen = load_sample(truth, len(truth.fields.times) - 1, support)
-    networks, history = {}, {}
-    for name, weight in (("learned", settings.gradient_weight), ("learned_no_gradient", 0.0)):
-        networks[name], losses = train(scene, samples, name, weight, stop or StopRequest(comm))
-        history |= {"step": losses.pop("step")} | {f"{loss}_{name}": values for loss, values in losses.items()}
+    guard = Guard(comm, directory / STAGES["train-kernel"].checkpoints, scene.fingerprint("train-kernel"), stop,
+                  " of the training")
+    training = training_of(scene, samples)
+    take_all_steps(training, guard, "kernel", "kernel", "lower learning_rate")
+    networks, history = training.model, losses_of(training)
     with torch.no_grad():
         kernels = {name: network.table() for name, network in networks.items()}
         kernels |= {"cubic_spline": CubicSpline(support), "wendland": WendlandC2(support)}
@@ -60,6 +67,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     weights = {name: tensor.numpy() for name, tensor in networks["learned"].state_dict().items()}
     provenance = {"scene": scene.to_toml(), "fingerprint": scene.fingerprint("train-kernel")}
     save_weights(comm, directory / "kernel.h5", "kernel", description, weights, provenance, tables)
+    guard.checkpoints.remove()
     errors = tables["errors"]
     log.info("kernel: velocity error %.3f (cubic spline %.3f), gradient error %.3f (cubic spline %.3f)",
              errors["velocity_error_learned"], errors["velocity_error_cubic_spline"],
@@ -82,23 +90,27 @@ def load_sample(truth: GroundTruth, index: int, support: float) -> KernelSample:
     return KernelSample(ParticleField(slab, support, position, own_velocity), *by_point)
 
 
-def train(scene: Scene, samples: list[KernelSample], name: str, gradient_weight: float,
-          stop: StopRequest) -> tuple[KernelNetwork, dict]:
-    """A trained kernel network and the history of its losses."""
-    settings = scene.kernel
-    support = scene.kernel_support
-    network = KernelNetwork(support, settings.hidden, settings.cutoff, scene.seed).to(samples[0].particles.dtype)
-    weights = KernelLossWeights(gradient_weight, settings.normalization_weight)
-    trainer = KernelTrainer(network, samples, weights, settings.points, scene.seed)
-    optimizer = Adam(trainer.comm, network.parameters(), settings.steps, settings.learning_rate,
-                     FINAL_RATE_FRACTION * settings.learning_rate)
-    history: list[dict[str, float]] = []
-    progress = ProgressLine(f"kernel {name}", lambda: f"loss {history[-1]['loss']:.5f}")
-    for step in range(settings.steps):
-        stop.check()
-        history.append({"step": step, **trainer.step(optimizer, step)})
-        progress((step + 1) / settings.steps, step + 1)
-    return network, {key: np.array([row[key] for row in history]) for key in history[0]}
+def training_of(scene: Scene, samples: list[KernelSample]) -> Training:
+    """The training of both forms of the kernel, by name, one after the other."""
+    settings, support, dtype = scene.kernel, scene.kernel_support, samples[0].particles.dtype
+    rates = (settings.learning_rate, FINAL_RATE_FRACTION * settings.learning_rate)
+    networks, phases = nn.ModuleDict(), []
+    for name, gradient_weight in (("learned", settings.gradient_weight), ("learned_no_gradient", 0.0)):
+        networks[name] = KernelNetwork(support, settings.hidden, settings.cutoff, scene.seed).to(dtype)
+        weights = KernelLossWeights(gradient_weight, settings.normalization_weight)
+        trainer = KernelTrainer(networks[name], samples, weights, settings.points, scene.seed)
+        phases.append(Phase(name, np.ones(settings.steps), rates, trainer.step))
+    return Training(samples[0].decomposition.comm, networks, phases)
+
+
+def losses_of(training: Training) -> dict[str, np.ndarray]:
+    """Steps of a phase, and the losses of each, LOSS_PHASE."""
+    columns = training.columns()
+    table = {"step": np.arange(training.phases[0].steps)}
+    for number, phase in enumerate(training.phases):
+        own = {name: columns[name][columns["phase"] == number] for name in LOSSES if name in columns}
+        table |= {f"{name}_{phase.name}": values for name, values in own.items() if not np.isnan(values).all()}
+    return table
 
 
 def shapes(kernels: dict[str, SmoothingKernel], support: float) -> dict[str, np.ndarray]:

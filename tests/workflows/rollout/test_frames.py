@@ -30,9 +30,10 @@ def test_density_is_stored_where_both_have_one(comm, tmp_path, of_truth, of_mode
         own["density"] = np.full(len(own["id"]), 3.0)
         particles = SimpleNamespace(to_numpy=lambda: {name: column for name, column in own.items()
                                                       if of_model or name != "density"})
-        with create_product(comm, tmp_path / "rollout.h5", "rollout", {}) as file:
-            frames = RolloutFrames(file, truth, CubicSpline(0.9), truth.times[START], of_model)
+        frames = RolloutFrames(tmp_path / "checkpoints", truth, CubicSpline(0.9), truth.times[START], of_model)
+        with frames.segments as segments, create_product(comm, tmp_path / "rollout.h5", "rollout", {}) as file:
             frames.store(0, 0.0, particles, torch.full((len(own["id"]), 3), 2.0))
+            segments.assemble(file)
         true = [truth.trajectory.read(START, name) for name in truth.trajectory.columns]
         names = list(truth.trajectory.columns)
     with open_product(comm, tmp_path / "rollout.h5", "rollout") as file:

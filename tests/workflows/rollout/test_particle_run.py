@@ -101,7 +101,7 @@ class Swept:
 """
 
 
-def prepared(comm, directory, fluid="compressible", model=MODEL, start=0.3, turnovers=0.14, side=6):
+def prepared(comm, directory, fluid="compressible", model=MODEL, start=0.3, turnovers=0.14, side=6, overrides=()):
     """The scene, with its ground truth in a directory, and a kernel with the weights that training starts from."""
     path = directory / "own.toml"
     if comm.rank == 0:
@@ -110,7 +110,7 @@ def prepared(comm, directory, fluid="compressible", model=MODEL, start=0.3, turn
         path.write_text(SCENE.format(fluid=fluid, sound=sound, model=model, start=start, turnovers=turnovers,
                                      side=side))
     comm.Barrier()
-    scene = load_scene(path)
+    scene = load_scene(path, overrides)
     dns.run(scene, comm, directory)
     network = KernelNetwork(scene.kernel_support, [4])
     description = {"form": network.FORM, "support": network.support, "hidden": [4], "cutoff": "smooth"}
@@ -120,10 +120,10 @@ def prepared(comm, directory, fluid="compressible", model=MODEL, start=0.3, turn
     return scene
 
 
-def write_model(comm, directory, scene, scales, bound=1e3):
+def write_model(comm, directory, scene, scales, bound=1e3, features=5):
     """The model as training begins with it, all of whose inputs were seen up to a bound."""
     weights = {name: tensor.float().numpy() for name, tensor in scene_model(scene, scales).state_dict().items()}
-    ranges = {"low": np.full(5, -bound), "high": np.full(5, bound)}
+    ranges = {"low": np.full(features, -bound), "high": np.full(features, bound)}
     save_weights(comm, directory / "model.h5", "model", describe(scene, scales), weights, {}, {"feature_range": ranges})
 
 

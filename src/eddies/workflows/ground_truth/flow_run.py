@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,10 +13,9 @@ from eddies.flow.courant import CourantLimit, FixedStep
 from eddies.flow.history import FlowHistory
 from eddies.flow.navier_stokes import Fluid
 from eddies.flow.stability import StabilityWatch
-from eddies.io.checkpoint import Checkpoint, CheckpointDirectory
+from eddies.io.checkpoint import Checkpoint
 from eddies.io.contiguous import Block
-from eddies.parallel.communicator import Comm
-from eddies.parallel.stop import Stopped, StopRequest
+from eddies.io.guard import Guard
 
 if TYPE_CHECKING:
     from eddies.workflows.ground_truth.tracer_run import TracerRun
@@ -46,6 +44,11 @@ class FlowRun:
     def __post_init__(self) -> None:
         self.watch = StabilityWatch(self.fluid, self.stepper, self.history)
 
+    @property
+    def steps(self) -> int:
+        """Steps taken so far."""
+        return self.clock.steps
+
     def begin_tracers(self, tracers: TracerRun) -> None:
         """Be in the phase in which tracers are followed: nothing forces the flow from here on."""
         self.phase, self.tracers, self.fluid.forcing = "tracers", tracers, None
@@ -56,7 +59,7 @@ class FlowRun:
         Raises FlowDiverged at the step that was unstable.
         """
         while self.clock.running:
-            self.guard(self)
+            self.guard(self, self.tracers.segments if self.tracers else None)
             step = (step_limit or self.step_limit)(self.state, self.clock)
             with np.errstate(over="ignore", invalid="ignore"):  # the watch says it better
                 state = self.stepper(self.state, step)
@@ -83,28 +86,3 @@ class FlowRun:
         self.step_limit.load_state_dict(saved["step_limit"])
         self.watch.load_state_dict(saved["watch"])
         self.history.load_state_dict(saved)
-
-
-class Guard:
-    """Writes checkpoints of a run when they are due, and ends it when it is asked to."""
-
-    def __init__(self, comm: Comm, directory: Path, fingerprint: str, stop: StopRequest) -> None:
-        self.checkpoints = CheckpointDirectory(comm, directory, fingerprint)
-        self.stop = stop
-
-    def __call__(self, run: FlowRun) -> None:
-        """Look whether something is due; raises Stopped once the checkpoint is safe."""
-        stopping = self.stop()
-        if self.stop.checkpoint_due:
-            self.save(run)
-            self.stop.checkpoint_done()
-        if stopping:
-            raise Stopped(self.stop.reason, f"from step {run.clock.steps}")
-
-    def save(self, run: FlowRun) -> None:
-        """Write a checkpoint of now."""
-        files: list[str] = []
-        if run.tracers is not None:
-            run.tracers.segments.close()
-            files = run.tracers.segments.names
-        self.checkpoints.write(run.clock.steps, run.state_dict(), files)

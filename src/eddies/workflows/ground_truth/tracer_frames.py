@@ -10,12 +10,21 @@ import numpy as np
 from eddies.clock import Clock
 from eddies.flow.statistics import energy_spectrum
 from eddies.flow.tracers import TracerParticles
+from eddies.io.frame_segments import FrameLayout, FrameSegments
 from eddies.io.hdf5 import File, write_table
 from eddies.parallel.migration import IdOrder
 from eddies.parallel.slab import SlabDecomposition
-from eddies.scene.scene import Tracers
+from eddies.scene.scene import BOX_LENGTH, Tracers
 from eddies.spectral.spectral_grid import SpectralGrid, restrict
-from eddies.workflows.ground_truth.frame_segments import FrameSegments
+
+
+def frame_layout(settings: Tracers, compressible: bool) -> FrameLayout:
+    """What the ground truth holds of tracers and of the filtered flow."""
+    columns, variables = {"position": (3,), "velocity": (3,)}, {"velocity": 3}
+    if compressible:
+        columns, variables = columns | {"density": ()}, variables | {"density": 1}
+    return FrameLayout(settings.particles, BOX_LENGTH, {"tracers": columns}, np.float64, settings.cells,
+                       {"filtered": variables})
 
 
 class TracerFrames:
@@ -43,7 +52,7 @@ class TracerFrames:
         if self._compressible:
             frame["density"] = order.apply(self.tracers.density(state))
         self.segments.open(clock.steps)
-        self.segments.trajectory.append(clock.steps, time, order.start, frame)
+        self.segments.trajectories["tracers"].append(clock.steps, time, order.start, frame)
         if self._frames % self.settings.field_every == 0:
             self._store_fields(state, time)
         self._frames += 1
@@ -70,7 +79,7 @@ class TracerFrames:
         if self._compressible:
             modes["density"] = field.density_modes(state)
         planes = {name: self.coarse.backward(restrict(field.grid, self.coarse, part)) for name, part in modes.items()}
-        self.segments.fields.append(time, self.coarse.decomposition.start, planes)
+        self.segments.fields["filtered"].append(time, self.coarse.decomposition.start, planes)
         self._spectra["time"].append(time)
         self._spectra["energy"].append(energy_spectrum(field.grid, state[:3])[1])
         self._spectra["filtered"].append(energy_spectrum(field.grid, velocity)[1])

@@ -11,11 +11,11 @@ from eddies.flow.courant import FixedStep
 from eddies.flow.tracers import FilteredField, TracerParticles, release
 from eddies.io.checkpoint import Checkpoint
 from eddies.io.contiguous import Block
+from eddies.io.frame_segments import FrameSegments
 from eddies.parallel.migration import IdOrder, id_block, migrate
 from eddies.scene.scene import Scene
 from eddies.workflows.ground_truth.flow_run import FlowRun
-from eddies.workflows.ground_truth.frame_segments import FrameSegments
-from eddies.workflows.ground_truth.measured_scales import MEAN_DENSITY
+from eddies.workflows.ground_truth.measured_scales import MEAN_DENSITY, measured_scales
 from eddies.workflows.ground_truth.tracer_frames import TracerFrames
 
 
@@ -67,10 +67,12 @@ class TracerRun:
         flow.history.sample(flow.state, flow.clock)
 
     def scales(self) -> dict[str, float]:
-        """Scales of the filtered flow at the release: what the same flow does later does not change them."""
+        """Scales of the filtered flow at the release, with the rates between the first two frames: what the same flow
+        does later does not change them."""
+        (start, first), (end, second) = self.segments.first_frames("tracers", 2)
         return {"released_at": self.released_at, "sound_speed": self.scene.flow.sound_speed or np.inf,
                 "filter_width": self.settings.filter_width, "spacing": self.settings.spacing,
-                "density_mean": MEAN_DENSITY, **self.segments.release_scales()}
+                "density_mean": MEAN_DENSITY, **measured_scales(self.comm, first, first, second, end - start)}
 
     def state_dict(self) -> dict[str, Any]:
         """What a checkpoint keeps beside the flow and the files of `segments`."""

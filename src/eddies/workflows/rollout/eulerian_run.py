@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,6 +19,8 @@ from eddies.flow.operators import gradient
 from eddies.flow.stability import quadratic_energy
 from eddies.flow.subgrid import Smagorinsky
 from eddies.flow.tracers import FilteredField, TracerParticles
+from eddies.io.checkpoint import Checkpoint
+from eddies.io.contiguous import Block
 from eddies.parallel.migration import migrate
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.particle_set import ParticleSet
@@ -26,6 +29,7 @@ from eddies.spectral.spectral_grid import SpectralGrid, restrict
 from eddies.time_stepping import ETDRK4
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.rollout.particle_run import forced_below, injection_rate
+from eddies.workflows.rollout.saved_rows import restored_rows, saved_rows
 
 # Runaway is a flow with this many times the energy of its start.
 RUNAWAY_ENERGY = 100.0
@@ -103,6 +107,23 @@ class EulerianRun:
     def series(self) -> dict[str, dict[str, list[float]]]:
         """None."""
         return {}
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that goes on, for a checkpoint; collective."""
+        grid = self.fluid.grid
+        modes = Block(self.state, int(grid.column_starts[grid.decomposition.rank]), grid.modes, axis=2)
+        return {"modes": modes, "clock": self.clock.state_dict(), "flow_seconds": self.flow_seconds,
+                **saved_rows(grid.decomposition.comm, self.tracers.columns)}
+
+    def load_state_dict(self, saved: Checkpoint) -> None:
+        """Inverse of `state_dict`, bit for bit on the same number of ranks; collective."""
+        grid = self.fluid.grid
+        starts, rank = grid.column_starts, grid.decomposition.rank
+        self.state = saved.read("modes", int(starts[rank]), int(starts[rank + 1]), axis=2)
+        self.clock.load_state_dict(saved["clock"])
+        self.flow_seconds = saved["flow_seconds"]
+        columns, _ = restored_rows(grid.decomposition, saved)
+        self.tracers = TracerParticles(self.tracers.field, columns, self.state)
 
     def description(self) -> dict[str, float | str]:
         """Grid and model; `flow_seconds_per_step` (median) is the flow's share of a step, without the particles."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
+
 import numpy as np
 import torch
 
-from eddies.io.fields import FieldWriter
-from eddies.io.hdf5 import File
-from eddies.io.trajectories import TrajectoryWriter
+from eddies.io.frame_segments import FrameLayout, FrameSegments
 from eddies.parallel.migration import IdOrder, migrate
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.particle_field import ParticleField
@@ -26,11 +27,12 @@ class RolloutFrames:
     Velocity gradients at the particles and velocities on the grid of the filtered fields are averages with the
     learned kernel, for model and truth alike; without a kernel neither
     they nor the filtered fields are stored. `times` are those of the model's frames. `density`: whether the model's
-    particles have one; it is stored where the true ones have one too.
+    particles have one; it is stored where the true ones have one too. `segments` are the files in a directory that
+    take the frames; `names` those that are closed.
     """
 
-    def __init__(self, file: File, truth: GroundTruth, kernel: SmoothingKernel | None, start_time: float,
-                 density: bool) -> None:
+    def __init__(self, directory: Path, truth: GroundTruth, kernel: SmoothingKernel | None, start_time: float,
+                 density: bool, names: Sequence[str] = ()) -> None:
         self.truth, self.kernel, self.start_time = truth, kernel, start_time
         self.times: list[float] = []
         comm, length = truth.decomposition.comm, truth.decomposition.length
@@ -39,23 +41,23 @@ class RolloutFrames:
         self._columns = {name: shape for name, shape in COLUMNS.items()
                          if name != "density" or density and truth.has_density}
         self._stored = self._columns | (GRADIENT if kernel else {})
-        self._trajectories = {name: TrajectoryWriter(file, name, truth.total, length, self._stored, np.float32)
-                              for name in ("model", "truth")}
-        self._fields = {name: FieldWriter(file, name, cells, {"velocity": 3})
-                        for name in (FIELDS if kernel else ())}
+        layout = FrameLayout(truth.total, length, dict.fromkeys(("model", "truth"), self._stored), np.float32, cells,
+                             dict.fromkeys(FIELDS if kernel else (), {"velocity": 3}))
+        self.segments = FrameSegments(comm, directory, layout, names)
 
     def store(self, step: int, time: float, particles: ParticleSet, acceleration: torch.Tensor) -> None:
         """Store the model's particles and what is true at that time; `time` counts from the start of the rollout."""
         self.times.append(time)
+        self.segments.open(step)
         self._store("model", step, time, {**particles.to_numpy(), "acceleration": as_numpy(acceleration)})
         frame = self._true_frame(time)
         if frame is None:
             return
         self._store("truth", step, time, self.truth.particles_with_rates(frame))
         at = int(np.argmin(np.abs(self.truth.fields.times - self.truth.times[frame])))
-        if self._fields and abs(self.truth.fields.times[at] - self.truth.times[frame]) < 1e-9:
+        if self.kernel is not None and abs(self.truth.fields.times[at] - self.truth.times[frame]) < 1e-9:
             planes = self.truth.fields.read(at, "velocity", self._slab.start, self._slab.stop)
-            self._fields["filtered"].append(time, self._slab.start, {"velocity": planes})
+            self.segments.fields["filtered"].append(time, self._slab.start, {"velocity": planes})
 
     def _store(self, name: str, step: int, time: float, columns: dict[str, np.ndarray]) -> None:
         columns = migrate(self._slab, {column: columns[column] for column in ("id", *self._columns)})
@@ -64,10 +66,11 @@ class RolloutFrames:
             particle_field = ParticleField(self._slab, self.kernel.support, position, velocity)
             columns["velocity_gradient"] = as_numpy(particle_field.at_particles(self.kernel)[1])
             field, n = as_numpy(particle_field.velocity_on_whole_grid(self.kernel)).T, self._slab.planes
-            self._fields[name].append(time, self._slab.start, {"velocity": field.reshape(3, self._slab.count, n, n)})
+            planes = field.reshape(3, self._slab.count, n, n)
+            self.segments.fields[name].append(time, self._slab.start, {"velocity": planes})
         order = IdOrder(self._slab.comm, columns["id"], self.truth.total)
         by_id = {column: order.apply(columns[column]) for column in self._stored}
-        self._trajectories[name].append(step, time, order.start, by_id)
+        self.segments.trajectories[name].append(step, time, order.start, by_id)
 
     def _true_frame(self, time: float) -> int | None:
         """The frame of the ground truth at a time of the rollout, if there is one with rates."""

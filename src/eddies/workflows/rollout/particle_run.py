@@ -5,10 +5,12 @@ from __future__ import annotations
 import logging
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
+from eddies.io.checkpoint import Checkpoint
 from eddies.parallel.broadcast import first_complaint
 from eddies.parallel.halo import HaloError
 from eddies.particles.dynamics import ParticleDynamics
@@ -26,6 +28,7 @@ from eddies.particles.terms.settings import WCSPH, SummationDensity
 from eddies.scene.scene import Scene, Wcsph
 from eddies.workflows.ground_truth.truth import GroundTruth, particles_for
 from eddies.workflows.learned.model import load_feature_range, load_model
+from eddies.workflows.rollout.particle_state import particle_state, restored_particles
 
 log = logging.getLogger("eddies")
 
@@ -163,6 +166,16 @@ class ParticleRun:
         largest residual, and how many did not converge."""
         found = {} if self.seen is None else {"outside_training": {"share": self._shares_outside}}
         return found if self.dynamics.resolution is None else {**found, "closure": self._solves}
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that goes on, for a checkpoint between the frames of one step and the next step; collective."""
+        return {**particle_state(self.particles, self.integrator), "series": {
+            "outside_training": self._shares_outside, "closure": self._solves}}
+
+    def load_state_dict(self, saved: Checkpoint) -> None:
+        """Inverse of `state_dict`, bit for bit on the same number of ranks; collective."""
+        self.particles = restored_particles(saved, self.integrator, self.particles.id.device)
+        self._shares_outside, self._solves = (saved["series"][name] for name in ("outside_training", "closure"))
 
     def description(self) -> dict[str, float | str]:
         """Integrator, terms, and how often the rates were evaluated for the steps."""

@@ -94,10 +94,10 @@ class VariantRun:
         """
         self.directory.mkdir(parents=True, exist_ok=True)
         (self.directory / MARK).write_text(MARK_TEXT, encoding="utf-8")
-        checkpoints = self.directory / STAGES["train"].checkpoints
-        if not resume and checkpoints.exists():
-            shutil.rmtree(checkpoints)
         for stage in OWN_STAGES:
+            checkpoints = self.directory / stage.checkpoints
+            if not resume and checkpoints.exists():
+                shutil.rmtree(checkpoints)
             product = self.directory / stage.file
             fits = stage.name in self.stages and product_fingerprint(product) == self.scene.fingerprint(stage.name)
             if not (resume and fits and (stage.name != "simulate" or product_provenance(product)["ranks"] == ranks)):

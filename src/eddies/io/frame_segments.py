@@ -1,0 +1,111 @@
+"""Frames in segments: files that are closed at each checkpoint, so that no later accident harms them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from mpi4py import MPI
+
+from eddies.io.fields import FieldSeries, FieldWriter
+from eddies.io.hdf5 import File, create_product, in_files, open_product
+from eddies.io.trajectories import Trajectory, TrajectoryWriter
+from eddies.parallel.migration import id_block
+from eddies.parallel.slab import SlabDecomposition
+
+
+@dataclass(frozen=True)
+class FrameLayout:
+    """What frames hold, in a segment as in the product.
+
+    Parameters
+    ----------
+    total : number of particles.
+    length : side of the periodic box.
+    trajectories : shape of one particle's value by column, of each trajectory by name.
+    dtype : of the trajectories.
+    cells : grid points of the fields along each side.
+    fields : number of components by variable, of each series of fields by name.
+    """
+
+    total: int
+    length: float
+    trajectories: Mapping[str, Mapping[str, tuple[int, ...]]]
+    dtype: type[np.floating]
+    cells: int
+    fields: Mapping[str, Mapping[str, int]]
+
+    def writers(self, file: File) -> tuple[dict[str, TrajectoryWriter], dict[str, FieldWriter]]:
+        """Of the trajectories and of the fields, by name; collective."""
+        return ({name: TrajectoryWriter(file, name, self.total, self.length, columns, self.dtype)
+                 for name, columns in self.trajectories.items()},
+                {name: FieldWriter(file, name, self.cells, variables) for name, variables in self.fields.items()})
+
+
+class FrameSegments:
+    """The files frames-NNNNNNNN.h5 of a directory, named after their first step; `names` are those that are closed.
+
+    A context manager: leaving it by an exception leaves the open segment unfinished. `assemble` copies all frames into
+    the product at the end.
+    """
+
+    def __init__(self, comm: MPI.Comm, directory: Path, layout: FrameLayout, names: Sequence[str] = ()) -> None:
+        self.comm, self.directory, self.layout, self.names = comm, directory, layout, list(names)
+        self._name, self._file = "", ExitStack()
+
+    def open(self, step: int) -> None:
+        """Begin a segment, unless one is open: `trajectories` and `fields`, by name, take its frames."""
+        if self._name:
+            return
+        in_files(self.comm, self.directory, lambda: self.directory.mkdir(exist_ok=True))
+        self._name = f"frames-{step:08d}.h5"
+        file = self._file.enter_context(create_product(self.comm, self.directory / self._name, "frames", {}))
+        self.trajectories, self.fields = self.layout.writers(file)
+
+    def close(self) -> None:
+        """End the open segment, if there is one."""
+        if self._name:
+            self._file.close()
+            self.names.append(self._name)
+            self._name = ""
+
+    def first_frames(self, name: str, count: int) -> list[tuple[float, dict[str, np.ndarray]]]:
+        """Time and this rank's block of the first frames of a trajectory that every segment has; of closed segments."""
+        frames: list[tuple[float, dict[str, np.ndarray]]] = []
+        for segment in self.names[:count]:  # each may hold one frame alone
+            with open_product(self.comm, self.directory / segment, "frames") as file:
+                stored = Trajectory(file, name)
+                frames += [(time, self._values(stored, frame)) for frame, time in enumerate(stored.times[:count])]
+        return frames[:count]
+
+    def assemble(self, file: File) -> None:
+        """Copy the frames of all segments into a product."""
+        self.close()
+        trajectories, fields = self.layout.writers(file)
+        slab = SlabDecomposition(self.comm, self.layout.length, self.layout.cells)
+        start, _ = id_block(self.comm, self.layout.total)
+        for name in self.names:
+            with open_product(self.comm, self.directory / name, "frames") as segment:
+                for group, trajectory in trajectories.items():
+                    frames = Trajectory(segment, group)
+                    for frame, (step, time) in enumerate(zip(frames.steps, frames.times)):
+                        trajectory.append(step, time, start, self._values(frames, frame))
+                for group, field in fields.items():
+                    series = FieldSeries(segment, group)
+                    for index, time in enumerate(series.times):
+                        field.append(time, slab.start, {variable: series.read(index, variable, slab.start, slab.stop)
+                                                        for variable in series.variables})
+
+    def __enter__(self) -> FrameSegments:
+        return self
+
+    def __exit__(self, *raised) -> None:
+        self._file.__exit__(*raised)
+
+    def _values(self, frames: Trajectory, frame: int) -> dict[str, np.ndarray]:
+        """This rank's block of all columns of a frame."""
+        block = id_block(self.comm, self.layout.total)
+        return {column: frames.read(frame, column, *block) for column in frames.columns}

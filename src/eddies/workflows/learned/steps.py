@@ -1,0 +1,44 @@
+"""All steps of a training, from the newest checkpoint on."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+
+from eddies.clock import ProgressLine
+from eddies.io.guard import Guard
+from eddies.learning.training import Training, TrainingDiverged
+from eddies.parallel.halo import HaloError
+from eddies.scene.scene import SceneError
+
+log = logging.getLogger("eddies")
+
+
+def take_all_steps(training: Training, guard: Guard, stage: str, section: str, remedy: str,
+                   after_each: Callable[[Training], None] = lambda training: None) -> None:
+    """Take a training to its end, from its newest checkpoint if there is one; `stage` begins its lines.
+
+    Raises Stopped, once a checkpoint is safe, where it is asked to; SceneError, of a `section` and with the `remedy`,
+    where the training diverges.
+    """
+    saved = guard.checkpoints.newest()
+    if saved is not None:
+        training.load_state_dict(saved)
+        log.info("%s: goes on from step %d", stage, training.steps)
+
+    def describe() -> str:
+        last = training.history[-1]
+        errors = [row["validation_error"] for row in training.history if "validation_error" in row]
+        shown = f"  validation error {errors[-1]:.3f}" if errors else ""
+        return f"{training.phase.name}  loss {last['loss']:.4f}{shown}"
+
+    progress = ProgressLine(stage, describe, before=training.seconds)
+    while training.running:
+        guard(training)
+        try:
+            training.step()
+        except (TrainingDiverged, HaloError) as error:
+            raise SceneError(f"[{section}] {error}; {remedy}") from None
+        if training.running:
+            progress(training.done, training.steps)
+        after_each(training)

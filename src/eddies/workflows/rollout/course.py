@@ -1,0 +1,113 @@
+"""The course of a rollout: steps and frames, and what a checkpoint must hold of them."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from eddies.clock import Clock, ProgressLine
+from eddies.io.checkpoint import Checkpoint
+from eddies.io.guard import Guard
+from eddies.parallel.reduction import global_sum
+from eddies.workflows.rollout.frames import RolloutFrames
+from eddies.workflows.rollout.method import Method
+
+log = logging.getLogger("eddies")
+
+# The first steps plan, compile and fill caches: they are no measure of the others. So are those after a restart.
+WARM_UP_STEPS = 2
+
+
+class Course:
+    """A method on its way through `count` frame intervals of a length, from the start or from a checkpoint.
+
+    `guard` looks on before each step. A method that cannot tell its state makes no checkpoints.
+    """
+
+    def __init__(self, method: Method, frames: RolloutFrames, count: int, interval: float, guard: Guard,
+                 saved: Checkpoint | None) -> None:
+        self.method, self.frames, self.count, self.interval, self.guard = method, frames, count, interval, guard
+        self.comm = frames.truth.decomposition.comm
+        self.clock, self.seconds, self.energy, before = Clock(end=count * interval), [], 0.0, 0.0
+        self._warm_up = WARM_UP_STEPS
+        if saved is not None:
+            before = self._load(saved)
+            method.load_state_dict(saved)
+            log.info("rollout: goes on from step %d, time %.4g", self.steps, self.clock.time)
+        self.progress = ProgressLine("rollout", self._describe, before=before)
+
+    @property
+    def steps(self) -> int:
+        """Steps taken so far."""
+        return self.clock.steps
+
+    def run(self) -> dict[str, float | str]:
+        """Advance to the last frame, or until the state is at fault; returns status, time, and seconds a step."""
+        complaint: str | None = None
+        if not self.frames.times:
+            self._store(0.0)
+        while complaint is None and (number := len(self.frames.times)) <= self.count:
+            until = number * self.interval
+            while complaint is None and self.method.time < until - 1e-9 * self.interval:
+                self._look()
+                complaint = self._step(until)
+            if complaint is None:
+                self._store(until)
+                self.progress(until / self.clock.end, self.steps)
+        if complaint is not None and self.comm.rank == 0:
+            log.warning("rollout stopped at time %.4g: %s", self.clock.time, complaint)
+        return {"status": "complete" if complaint is None else f"stopped: {complaint}", "time": self.frames.times[-1],
+                "steps": self.steps, "time_step": self.clock.time / self.steps if self.steps else np.nan,
+                **quartiles(self.seconds)}
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that goes on, for a checkpoint, beside the files of the frames."""
+        return {"rollout": {"clock": self.clock.state_dict(), "times": self.frames.times, "energy": self.energy,
+                            "ranks": self.comm.size, "seconds": self.seconds, "elapsed": self.progress.elapsed},
+                **self.method.state_dict()}
+
+    def _load(self, saved: Checkpoint) -> float:
+        """Take what is no part of the method from a checkpoint; returns the wall seconds until then."""
+        known = saved["rollout"]
+        self.clock.load_state_dict(known["clock"])
+        self.frames.times, self.energy = known["times"], known["energy"]
+        if known["ranks"] == self.comm.size:  # else they are no measure of the steps of this run
+            self.seconds = known["seconds"]
+        return known["elapsed"]
+
+    def _look(self) -> None:
+        """Let the guard look on; without a state to keep, only whether the run is to stop."""
+        if hasattr(self.method, "state_dict"):
+            self.guard(self, self.frames.segments)
+        else:
+            self.guard.stop.check()
+
+    def _step(self, until: float) -> str | None:
+        began, before = time.perf_counter(), self.method.time
+        complaint = self.method.advance(until, self.steps + 1)
+        if complaint is None:
+            self.clock.tick(self.method.time - before)
+            self._warm_up -= 1
+            if self._warm_up < 0:
+                self.seconds.append(time.perf_counter() - began)
+        return complaint
+
+    def _store(self, at: float) -> None:
+        """Store the frame of a time, and take down the mean kinetic energy <v.v>/2 of its particles."""
+        particles, acceleration = self.method.frame(at)
+        self.frames.store(self.steps, at, particles, acceleration)
+        energy = 0.5 * float(particles.velocity.double().square().sum())
+        self.energy = float(global_sum(self.comm, energy)) / self.frames.truth.total
+
+    def _describe(self) -> str:
+        return f"t {self.clock.time:.3f}  energy {self.energy:.4f}{self.method.status()}"
+
+
+def quartiles(seconds: Sequence[float]) -> dict[str, float]:
+    """Median and quartiles of the seconds of steps; NaN without any."""
+    low, median, high = np.quantile(seconds or [np.nan], (0.25, 0.5, 0.75))
+    return {"seconds_per_step": median, "seconds_per_step_low": low, "seconds_per_step_high": high}

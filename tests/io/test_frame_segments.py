@@ -1,0 +1,56 @@
+"""Segments of frames."""
+
+import numpy as np
+import pytest
+
+from eddies.io.fields import FieldSeries
+from eddies.io.frame_segments import FrameLayout, FrameSegments
+from eddies.io.hdf5 import ProductError, create_product, open_product
+from eddies.io.trajectories import Trajectory
+from eddies.parallel.migration import id_block
+from eddies.parallel.slab import SlabDecomposition
+
+LAYOUT = FrameLayout(5, 1.0, {"all": {"velocity": (3,), "density": ()}, "some": {"density": ()}}, np.float32, 3,
+                     {"flow": {"velocity": 2}})
+
+
+@pytest.mark.mpi(1, 2, timeout=30)
+def test_a_directory_that_cannot_be_made_is_told_by_all(comm, tmp_path):
+    segments = FrameSegments(comm, tmp_path / "nowhere/checkpoints", FrameLayout(8, 1.0, {}, np.float64, 4, {}))
+    with pytest.raises(ProductError, match="nowhere/checkpoints: No such file or directory; check the file"):
+        segments.open(0)
+
+
+@pytest.mark.mpi(1, 2, 3)
+def test_frames_of_all_segments_are_put_together_in_order(comm, tmp_path):
+    """Also those of a trajectory, or of fields, of which a segment has none."""
+    start, stop = id_block(comm, 5)
+    slab = SlabDecomposition(comm, 1.0, 3)
+    frames = np.random.default_rng(2).random((4, 5, 3)).astype(np.float32)
+    planes = np.random.default_rng(3).random((2, 2, 3, 3, 3)).astype(np.float32)
+    with FrameSegments(comm, tmp_path, LAYOUT) as segments:
+        for step, frame in enumerate(frames):
+            segments.open(step)
+            block = frame[start:stop]
+            segments.trajectories["all"].append(step, step / 4, start, {"velocity": block, "density": block[:, 0]})
+            if step >= 2:
+                segments.trajectories["some"].append(step, step / 4, start, {"density": block[:, 1]})
+                segments.fields["flow"].append(step / 4, slab.start, {
+                    "velocity": planes[step - 2][:, slab.start:slab.stop]})
+            if step in (0, 1):
+                segments.close()
+                segments.close()
+    # As a run finds them that goes on; the last is not yet closed.
+    assert segments.names == ["frames-00000000.h5", "frames-00000001.h5"]
+    again = FrameSegments(comm, tmp_path, LAYOUT, [*segments.names, "frames-00000002.h5"])
+    for (time, columns), step in zip(again.first_frames("all", 2), range(2)):
+        assert time == step / 4 and np.array_equal(columns["velocity"], frames[step][start:stop])
+    with create_product(comm, tmp_path / "all.h5", "rollout", {}) as file:
+        again.assemble(file)
+    with open_product(comm, tmp_path / "all.h5", "rollout") as file:
+        whole, some, flow = Trajectory(file, "all"), Trajectory(file, "some"), FieldSeries(file, "flow")
+        assert whole.steps.tolist() == [0, 1, 2, 3] and some.times.tolist() == flow.times.tolist() == [0.5, 0.75]
+        for frame in range(4):
+            assert np.array_equal(whole.read(frame, "velocity"), frames[frame])
+        assert np.array_equal(some.read(1, "density"), frames[3][:, 1])
+        assert np.array_equal(flow.read(1, "velocity"), planes[1])
