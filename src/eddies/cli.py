@@ -93,6 +93,7 @@ def end_with_error(error: Exception, comm: Comm) -> int:
     or is none of the user's, ends the job by MPI_Abort, because the other ranks may wait for this one for
     ever.
     """
+    from eddies.io.unfinished import leave_broken
     from eddies.parallel.rendezvous import all_arrive
     mistake = isinstance(error, UserError)
     text = f"eddies: error: {error}\n" if mistake else "".join(traceback.format_exception(error))
@@ -105,6 +106,7 @@ def end_with_error(error: Exception, comm: Comm) -> int:
     code = BAD_INPUT if mistake else 1
     if not together:
         comm.Abort(code)
+    leave_broken(code)
     return code
 
 

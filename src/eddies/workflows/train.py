@@ -10,6 +10,7 @@ from eddies.clock import ProgressLine
 from eddies.io.checkpoint import CheckpointDirectory
 from eddies.io.hdf5 import in_files, open_product
 from eddies.io.weights import save_weights
+from eddies.io.whole_files import write_files
 from eddies.learning.training import Training, TrainingDiverged
 from eddies.parallel.communicator import Comm
 from eddies.parallel.halo import HaloError
@@ -126,7 +127,7 @@ class LearningCurves:
         def write() -> None:
             from eddies.report import figures  # matplotlib takes a while to start
             from eddies.report.learning import curves
-            self.path.write_bytes(figures.png(curves(training.columns())))
+            write_files({self.path: figures.png(curves(training.columns()))})
 
         in_files(self.comm, self.path, write)
         self._drawn = time.monotonic()
