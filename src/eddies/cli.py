@@ -91,9 +91,9 @@ def end_with_error(error: Exception, comm: Comm) -> int:
 
     A mistake in the input is met by all ranks: rank 0 says so in a line. An error that stays on some ranks,
     or is none of the user's, ends the job by MPI_Abort, because the other ranks may wait for this one for
-    ever.
+    ever; so does a file that HDF5 could not write, as it crashes in an orderly end.
     """
-    from eddies.io.unfinished import leave_broken
+    from eddies.io.unfinished import writing_failed
     from eddies.parallel.rendezvous import all_arrive
     mistake = isinstance(error, UserError)
     text = f"eddies: error: {error}\n" if mistake else "".join(traceback.format_exception(error))
@@ -104,9 +104,11 @@ def end_with_error(error: Exception, comm: Comm) -> int:
         sys.stderr.write("".join(f"{prefix}{line}" for line in text.splitlines(keepends=True)))
         sys.stderr.flush()
     code = BAD_INPUT if mistake else 1
-    if not together:
+    broken = writing_failed()
+    if broken and together:
+        all_arrive(comm)  # once rank 0 has told it
+    if broken or not together:
         comm.Abort(code)
-    leave_broken(code)
     return code
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import h5py
 from mpi4py import MPI
 
-from eddies.io.errors import NoRoom, ProductError, WriteError, write_error
+from eddies.io.errors import NoRoom, ProductError, WriteError, room, write_error
 from eddies.io.room import MARGIN_BYTES, check_limit, reserve
 from eddies.io.sink import Sink
 from eddies.parallel.broadcast import first_complaint
@@ -111,11 +111,9 @@ class Unfinished:
             raise WriteError(complaint)
 
 
-def leave_broken(code: int) -> None:
-    """End the process here if HDF5 could not write a file, which would crash it when Python ends; all ranks call it."""
-    if any(unfinished.broken for unfinished in _abandoned):
-        MPI.Finalize()
-        os._exit(code)
+def writing_failed() -> bool:
+    """Whether HDF5 could not write a file that it shares with other ranks: it would crash at the end of the process."""
+    return any(unfinished.broken for unfinished in _abandoned)
 
 
 @contextmanager
@@ -133,8 +131,8 @@ def writing(group: h5py.Group | h5py.Dataset, size: int) -> Iterator[None]:
     except (OSError, RuntimeError) as error:
         unfinished.check()
         unfinished.broken = True
-        raise ProductError(f"{unfinished.path}: cannot be written: {error}; check its directory and the space on the "
-                           "disk") from None
+        raise ProductError(f"{unfinished.path}: cannot be written: {error}: {room(unfinished.path, size)}; make room, "
+                           "or check the disk, then run the command again, a stage with --resume") from None
     unfinished.check()
 
 

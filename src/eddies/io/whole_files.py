@@ -16,14 +16,14 @@ def write_files(contents: Mapping[Path, bytes | str]) -> None:
     """
     partials = {path: path.with_name(path.name + ".partial") for path in contents}
     whole = {path: content.encode() if isinstance(content, str) else content for path, content in contents.items()}
+    path = Path()
     try:
         for path, partial in partials.items():
-            try:
-                partial.write_bytes(whole[path])
-            except OSError as error:
-                raise NoRoom.of(error, partial, sum(map(len, whole.values()))) from None
+            partial.write_bytes(whole[path])
         for path, partial in partials.items():
             os.replace(partial, path)
+    except OSError as error:
+        raise NoRoom.of(error, path, sum(map(len, whole.values()))) from None
     finally:
         for partial in partials.values():
             if partial.is_file():
