@@ -143,7 +143,8 @@ def test_a_full_disk_leaves_what_was_there(comm, tmp_path):
         for write in (lambda path: vtkhdf.write_images(path, FieldSeries(file, "filtered"), LENGTH, {}),
                       lambda path: vtkhdf.write_points(path, Trajectory(file, "tracers"), {})):
             (tmp_path / "x.vtkhdf").write_text("older")
-            with largest_file(100_000), pytest.raises(ProductError, match="x.vtkhdf.partial: cannot be written: File too large: .* bytes wanted"):
+            told = "x.vtkhdf.partial: cannot be written: File too large: .* bytes wanted"
+            with largest_file(100_000), pytest.raises(ProductError, match=told):
                 write(tmp_path / "x.vtkhdf")
             assert {path.name for path in tmp_path.iterdir()} == {"p.h5", "x.vtkhdf"}
             assert (tmp_path / "x.vtkhdf").read_text() == "older"

@@ -74,6 +74,7 @@ def create_product(comm: MPI.Comm, path: str | Path, kind: str,
         with writing(unfinished.file, HEADER_BYTES):
             unfinished.file.attrs["complete"] = True
         unfinished.close()
+        unfinished.check()
     except BaseException as error:
         # Several ranks close a file together: only where all of them are here.
         if comm.size > 1 and not isinstance(error, Stopped | WriteError):

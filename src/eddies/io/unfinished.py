@@ -47,7 +47,8 @@ class Unfinished:
             # HDF5 would empty a file that it makes anew, and give back its room.
             self._alike(lambda: self.path.write_bytes(_empty_file()) if comm.rank == 0 else None)
             self._alike(self._open_together)
-        _open[self.file.filename] = self
+        self._name = self.file.filename
+        _open[self._name] = self
 
     def take(self, size: int) -> None:
         """Take room for so many bytes more than were asked for before; the same on all ranks.
@@ -66,14 +67,14 @@ class Unfinished:
 
     def close(self) -> None:
         """Close the file, cutting off the room that it does not need."""
-        _open.pop(self.file.filename, None)
+        _open.pop(self._name, None)
         self.file.close()
         if self._sink is not None:
             self._sink.close()
 
     def abandon(self) -> None:
         """Leave the file open, as other ranks may not know that it is not written any more."""
-        _open.pop(self.file.filename, None)
+        _open.pop(self._name, None)
         _abandoned.append(self)
 
     def _open_sink(self) -> None:
