@@ -1,10 +1,12 @@
 """A disk that fills while a product is written: one error on all ranks, nothing harmed, nothing left, no crash."""
 
+import os
 import resource
 import signal
 import subprocess
 import sys
 from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -122,10 +124,41 @@ def test_hdf5_stays_within_the_room_taken(comm, tmp_path, monkeypatch, shape, fr
         assert size == file.id.get_filesize() and file["values"].shape[0] == frames
 
 
+# On 3 MiB of its own, of which a part is taken: what is left at the end, and the error.
+ON_A_SMALL_DISK = """
+import os, subprocess, sys
+from mpi4py import MPI
+from eddies.io.errors import WriteError
+from tests.io.test_unfinished import write
+from pathlib import Path
+
+disk = Path(sys.argv[1])
+subprocess.run(["mount", "-t", "tmpfs", "-o", "size=3m", "tmpfs", disk], check=True)
+(disk / "older").write_bytes(bytes(int(sys.argv[2])))
+try:
+    write(MPI.COMM_WORLD, disk / "rollout.h5")
+except WriteError as error:
+    print(os.listdir(disk), error)
+"""
+
+
+@pytest.mark.parametrize("taken", [0, MEBIBYTE, 3 * MEBIBYTE])
+def test_a_small_file_system_that_fills(tmp_path, taken):
+    alone = ["unshare", "-m" if os.geteuid() == 0 else "-Urm"]
+    if subprocess.run([*alone, "mount", "-t", "tmpfs", "tmpfs", tmp_path], capture_output=True).returncode:
+        pytest.skip("no file system may be mounted here, not even in a namespace")
+    line = [*alone, sys.executable, "-c", ON_A_SMALL_DISK, str(tmp_path), str(taken)]
+    ended = subprocess.run(line, cwd=Path(__file__).parents[2], env=mpi_environment(1), capture_output=True, text=True,
+                           timeout=50)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert ended.stdout.startswith(f"['older'] {tmp_path}/rollout.h5.partial: cannot be written: No space left on")
+
+
 PROGRAM = """
 import resource, sys
 import numpy as np
 from eddies import cli
+from eddies.parallel import rendezvous
 from eddies.io import unfinished
 from eddies.io.hdf5 import append_frame, create_product, growing_dataset
 from eddies.workflows import dns
@@ -139,7 +172,7 @@ def run(scene, comm, directory, stop):
                 resource.setrlimit(resource.RLIMIT_FSIZE, (5_000_000, -1))
             append_frame(dataset, np.ones((50000, 3)), (50000 * comm.rank, 0))
 
-dns.run = run
+dns.run, rendezvous.PATIENCE = run, 0.5
 sys.exit(cli.main(["dns", "tiny", "--output", sys.argv[1]]))
 """
 

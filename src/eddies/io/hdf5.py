@@ -204,6 +204,18 @@ def append_frame(dataset: h5py.Dataset, block: np.ndarray, offset: tuple[int, ..
         dataset.id.write(in_memory, in_file, block, dxpl=_collective(dataset.file))
 
 
+def read_frame(dataset: h5py.Dataset, frame: int, selection: tuple[slice, ...]) -> np.ndarray:
+    """A part of a frame of floating-point numbers.
+
+    ProductError, on this rank, where one of them is not finite; but a rollout may end with such a state.
+    """
+    values, kind = dataset[frame, *selection], dataset.file.attrs["kind"]
+    if kind != "rollout" and not np.isfinite(values).all():
+        raise ProductError(f"{dataset.file.filename}: {dataset.name}, frame {frame % len(dataset)}: holds values that "
+                           f"are not finite; {_again(kind)}")
+    return values
+
+
 def _collective(file: h5py.File) -> h5py.h5p.PropDXID:
     transfer = h5py.h5p.create(h5py.h5p.DATASET_XFER)
     if file.driver == "mpio":
@@ -236,9 +248,13 @@ def _problem(file: h5py.File, kind: str | None, remedy: str) -> str | None:
         return f"unfinished, its writer was stopped: {remedy}"
     if not _has_this_format(file):
         version = json.loads(file.attrs.get("provenance", "{}")).get("eddies", "of unknown version")
-        again = f"run `eddies {MAKER_OF[found].name}` again" if found in MAKER_OF else "make it again"
-        return f"written by eddies {version}, whose {found.replace('_', ' ')} this version does not read; {again}"
+        what = found.replace("_", " ")
+        return f"written by eddies {version}, whose {what} this version does not read; {_again(found)}"
     return None
+
+
+def _again(kind: str) -> str:
+    return f"run `eddies {MAKER_OF[kind].name}` again" if kind in MAKER_OF else "make it again"
 
 
 def _has_this_format(file: h5py.File) -> bool:

@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 
 import eddies
-from eddies.io.hdf5 import append_frame, find_group, growing_dataset, write_array, write_attributes
+from eddies.io.hdf5 import append_frame, find_group, growing_dataset, read_frame, write_array, write_attributes
 
 
 class TrajectoryWriter:
@@ -85,8 +85,9 @@ class Trajectory:
         return tuple(name for name in self._group if f"{name}/value" in self._group)
 
     def read(self, frame: int, column: str, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Rows start to stop of a column at a frame, (stop - start, ...), in order of id."""
-        return find_group(self._group, column)["value"][frame, start:stop]
+        """Rows start to stop of a column at a frame, (stop - start, ...), in order of id. ProductError where one is not
+        finite."""
+        return read_frame(find_group(self._group, column)["value"], frame, (slice(start, stop),))
 
 
 def _write_header(file: h5py.File) -> None:
