@@ -53,9 +53,10 @@ def main(arguments: list[str] | None = None) -> int:
         return 128 + signal.SIGINT
     except Stopped as stopped:
         if comm.rank == 0:
-            sys.stdout.flush()
-            sys.stderr.write(f"eddies: {stopped}\n")
-            sys.stderr.flush()
+            with contextlib.suppress(OSError):
+                sys.stdout.flush()
+                sys.stderr.write(f"eddies: {stopped}\n")
+                sys.stderr.flush()
         return STOPPED
     except Exception as error:
         return end_with_error(error, exit_comm)
@@ -100,9 +101,10 @@ def end_with_error(error: Exception, comm: Comm) -> int:
     together = (mistake or comm.size == 1) and all_arrive(comm)
     if not together or comm.rank == 0:
         prefix = f"rank {comm.rank}: " if not together else ""
-        sys.stdout.flush()
-        sys.stderr.write("".join(f"{prefix}{line}" for line in text.splitlines(keepends=True)))
-        sys.stderr.flush()
+        with contextlib.suppress(OSError):  # a full disk may hold these too
+            sys.stdout.flush()
+            sys.stderr.write("".join(f"{prefix}{line}" for line in text.splitlines(keepends=True)))
+            sys.stderr.flush()
     code = BAD_INPUT if mistake else 1
     broken = writing_failed()
     if broken and together:
