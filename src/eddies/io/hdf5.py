@@ -73,15 +73,14 @@ def create_product(comm: MPI.Comm, path: str | Path, kind: str,
         yield unfinished.file
         with writing(unfinished.file, HEADER_BYTES):
             unfinished.file.attrs["complete"] = True
-        unfinished.close()
-        unfinished.check()
+            unfinished.close()
     except BaseException as error:
         # Several ranks close a file together: only where all of them are here.
         if comm.size > 1 and not isinstance(error, Stopped | WriteError):
             unfinished.abandon()
         else:
             unfinished.close()
-            in_files(comm, unfinished.path, unfinished.path.unlink)
+            in_files(comm, unfinished.path, lambda: unfinished.path.unlink(missing_ok=True))
             unfinished.check()
         raise
     in_files(comm, path, lambda: os.replace(unfinished.path, path))

@@ -44,8 +44,7 @@ class Unfinished:
         if comm.size == 1:
             self._alike(self._open_sink)
         else:
-            # HDF5 would empty a file that it makes anew, and give back its room.
-            self._alike(lambda: self.path.write_bytes(_empty_file()) if comm.rank == 0 else None)
+            self._alike(self._make)
             self._alike(self._open_together)
         self._name = self.file.filename
         _open[self._name] = self
@@ -80,6 +79,17 @@ class Unfinished:
     def _open_sink(self) -> None:
         self._sink = Sink(self.path)
         self.file = h5py.File(self._sink, "w")
+
+    def _make(self) -> None:
+        """Make a file without content, as HDF5 would empty one that it makes anew, and give back its room."""
+        if self.comm.rank == 0:
+            empty = io.BytesIO()
+            h5py.File(empty, "w").close()
+            try:
+                self.path.write_bytes(empty.getvalue())
+            except OSError:
+                self.path.unlink(missing_ok=True)
+                raise
 
     def _open_together(self) -> None:
         self.file = h5py.File(self.path, "r+", driver="mpio", comm=self.comm)
@@ -143,9 +153,3 @@ def frame_bytes(dataset: h5py.Dataset) -> int:
         return 0
     chunks = math.prod(-(-extent // chunk) for extent, chunk in zip(dataset.shape[1:], dataset.chunks[1:]))
     return chunks * (math.prod(dataset.chunks) * dataset.dtype.itemsize + INDEX_BYTES)
-
-
-def _empty_file() -> bytes:
-    empty = io.BytesIO()
-    h5py.File(empty, "w").close()
-    return empty.getvalue()
