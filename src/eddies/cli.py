@@ -53,9 +53,10 @@ def main(arguments: list[str] | None = None) -> int:
         return 128 + signal.SIGINT
     except Stopped as stopped:
         if comm.rank == 0:
-            sys.stdout.flush()
-            sys.stderr.write(f"eddies: {stopped}\n")
-            sys.stderr.flush()
+            with contextlib.suppress(OSError):
+                sys.stdout.flush()
+                sys.stderr.write(f"eddies: {stopped}\n")
+                sys.stderr.flush()
         return STOPPED
     except Exception as error:
         return end_with_error(error, exit_comm)
@@ -91,19 +92,24 @@ def end_with_error(error: Exception, comm: Comm) -> int:
 
     A mistake in the input is met by all ranks: rank 0 says so in a line. An error that stays on some ranks,
     or is none of the user's, ends the job by MPI_Abort, because the other ranks may wait for this one for
-    ever.
+    ever; so does a file that HDF5 could not write, as it crashes in an orderly end.
     """
+    from eddies.io.unfinished import writing_failed
     from eddies.parallel.rendezvous import all_arrive
     mistake = isinstance(error, UserError)
     text = f"eddies: error: {error}\n" if mistake else "".join(traceback.format_exception(error))
     together = (mistake or comm.size == 1) and all_arrive(comm)
     if not together or comm.rank == 0:
         prefix = f"rank {comm.rank}: " if not together else ""
-        sys.stdout.flush()
-        sys.stderr.write("".join(f"{prefix}{line}" for line in text.splitlines(keepends=True)))
-        sys.stderr.flush()
+        with contextlib.suppress(OSError):  # a full disk may hold these too
+            sys.stdout.flush()
+            sys.stderr.write("".join(f"{prefix}{line}" for line in text.splitlines(keepends=True)))
+            sys.stderr.flush()
     code = BAD_INPUT if mistake else 1
-    if not together:
+    broken = writing_failed()
+    if broken and together:
+        all_arrive(comm)  # once rank 0 has told it
+    if broken or not together:
         comm.Abort(code)
     return code
 

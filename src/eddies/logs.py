@@ -18,11 +18,19 @@ def configure_logging(rank: int) -> None:
     name = os.environ.get("EDDIES_LOG", "info")
     if name not in LEVELS:
         raise SceneError(f"EDDIES_LOG = {name}: must be one of {', '.join(LEVELS)}")
-    handler = logging.StreamHandler(sys.stdout)
+    handler = _Output(sys.stdout)
     handler.setFormatter(_RankFormatter(rank))
     logger = logging.getLogger("eddies")
     logger.handlers, logger.propagate = [handler], False
     logger.setLevel(LEVELS[name] if rank == 0 else max(LEVELS[name], logging.WARNING))
+
+
+class _Output(logging.StreamHandler):
+    """Drops a line that cannot be written, as on a full disk: what else needs that disk tells its lack itself."""
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        if not isinstance(sys.exc_info()[1], OSError):
+            super().handleError(record)
 
 
 class _RankFormatter(logging.Formatter):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import time
 from collections.abc import Sequence
 from importlib import import_module
@@ -12,7 +11,9 @@ from pathlib import Path
 
 from eddies.clock import duration
 from eddies.io.checkpoint import CheckpointDirectory
+from eddies.io.errors import write_error
 from eddies.io.hdf5 import in_files, open_product, product_fingerprint
+from eddies.io.whole_files import write_files
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm
 from eddies.parallel.stop import StopRequest
@@ -34,8 +35,9 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
     Raises:
         Stopped: `stop` found a reason to; the running stage has kept what --resume needs.
         SceneError: a file STOP asks the job to end before it begins, the scene lacks a section that a stage is about,
-            cannot be cut into as many slabs as there are ranks, differs from that of a product the stages start from,
-            or the directory cannot be written.
+            cannot be cut into as many slabs as there are ranks, or differs from that of a product the stages start
+            from.
+        WriteError: the directory cannot be written.
         ProductError: a stage that is not among `stages` has not left the product that they start from.
     """
     check_ranks(stages, scene, comm)
@@ -110,12 +112,13 @@ def prepare_directory(scene: Scene, comm: Comm, directory: Path) -> None:
     """Make the run directory and write the scene as used into it; if rank 0 cannot, all ranks raise."""
     def write() -> None:
         directory.mkdir(parents=True, exist_ok=True)
-        (directory / "scene.toml").write_text(scene.to_toml(), encoding="utf-8")
+        write_files({directory / "scene.toml": scene.to_toml()})
 
     try:
         on_first_rank(comm, write)
     except OSError as error:
-        raise SceneError(f"{directory}: cannot be written ({error.strerror}); choose another --output") from None
+        raise write_error(directory, error, f"{directory}: cannot be written ({error.strerror}); choose another "
+                          "--output") from None
 
 
 def is_done(stage: str, scene: Scene, comm: Comm, directory: Path) -> bool:
@@ -130,13 +133,8 @@ def record_seconds(stage: str, seconds: float, comm: Comm, directory: Path) -> N
     """Log the wall time of a stage and keep it in stage_seconds.json, which holds the last of each stage."""
     log.info("%s: took %s", stage, duration(seconds))
     path = directory / "stage_seconds.json"
-    partial = path.with_name(path.name + ".partial")
-
-    def write() -> None:
-        partial.write_text(json.dumps({**_known_seconds(path), stage: round(seconds, 3)}, indent=2) + "\n")
-        os.replace(partial, path)
-
-    in_files(comm, path, write)
+    in_files(comm, path, lambda: write_files(
+        {path: json.dumps({**_known_seconds(path), stage: round(seconds, 3)}, indent=2) + "\n"}))
 
 
 def _known_seconds(path: Path) -> dict[str, float]:

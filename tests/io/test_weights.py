@@ -65,9 +65,18 @@ def test_damage_is_named(comm, tmp_path, damage):
         load_weights(comm, tmp_path / "m.h5", "model")
 
 
+@pytest.mark.mpi(1, 2)
+def test_values_that_are_not_finite_are_not_written(comm, tmp_path):
+    with pytest.raises(ProductError, match="m.h5: tensor scale is not finite, so nothing is written"):
+        save_weights(comm, tmp_path / "m.h5", "model", {}, {"scale": np.array([1.0, np.nan])}, {})
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.mpi(1)
-def test_values_that_are_not_finite_are_refused(comm, tmp_path):
-    save_weights(comm, tmp_path / "m.h5", "model", {}, {"scale": np.array([1.0, np.nan])}, {})
+def test_values_that_are_not_finite_are_refused(comm, tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(np, "isfinite", lambda _: np.array(True))
+        save_weights(comm, tmp_path / "m.h5", "model", {}, {"scale": np.array([1.0, np.nan])}, {})
     with pytest.raises(ProductError, match="tensor scale holds values that are not finite"):
         load_weights(comm, tmp_path / "m.h5", "model")
 

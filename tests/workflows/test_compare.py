@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from eddies.io.errors import WriteError
 from eddies.io.hdf5 import ProductError
 from eddies.scene.scene import SceneError, load_scene
 from eddies.workflows import compare
@@ -163,7 +164,7 @@ def test_a_table_that_cannot_be_written_is_told_by_all(comm, tmp_path, monkeypat
     comm.Barrier()
     monkeypatch.setattr(compare, "sections", lambda *_: [])
     comparison = SimpleNamespace(subject="learned", turnovers=1.0, base_scene=SimpleNamespace(device="cpu"))
-    with pytest.raises(SceneError, match="comparison.csv: cannot be written .Is a directory.; choose another --output"):
+    with pytest.raises(WriteError, match="comparison.csv: cannot be written .Is a directory.; choose another --output"):
         compare.write(comparison, [], comm, tmp_path)
 
 

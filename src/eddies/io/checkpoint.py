@@ -20,8 +20,9 @@ import h5py
 import numpy as np
 from mpi4py import MPI
 
-from eddies.io.contiguous import Block, lay_out, write_arrays
-from eddies.io.hdf5 import ProductError, in_files
+from eddies.io.contiguous import Block, lay_out, total_bytes, write_arrays
+from eddies.io.errors import WriteError, room
+from eddies.io.hdf5 import in_files
 from eddies.io.manifest import find_damage, hash_file, manifest_text, parse_manifest
 from eddies.kernels.library import in_use, threads
 from eddies.parallel.broadcast import first_complaint, on_all_ranks, on_first_rank
@@ -76,7 +77,7 @@ def _computed_by() -> str:
 
 class CheckpointDirectory:
     """The checkpoints of a run, made with settings of a `fingerprint`. All methods are collective, and all ranks raise
-    a ProductError where rank 0 cannot write or remove a file."""
+    a WriteError where rank 0 cannot write or remove a file."""
 
     def __init__(self, comm: MPI.Comm, path: Path, fingerprint: str) -> None:
         self.comm, self.path, self.fingerprint = comm, path, fingerprint
@@ -87,7 +88,7 @@ class CheckpointDirectory:
         The state holds, by name, arrays, blocks of arrays that are shared by the ranks, and what JSON can hold; all but
         the blocks are equal on all ranks. `files` are names of closed files in this directory that belong to it.
 
-        Raises ProductError if it cannot be written, as on a full disk; those before it are intact.
+        Raises WriteError if it cannot be written, as on a full disk; those before it are intact.
         """
         final, partial = self.path / _name(step), self.path / f"{_name(step)}.partial"
         if self._exists(final):
@@ -107,8 +108,9 @@ class CheckpointDirectory:
         except OSError as error:
             if self.comm.rank == 0:
                 shutil.rmtree(partial, ignore_errors=True)
-            raise ProductError(f"{final}: cannot be written ({error.strerror or error}); the checkpoints before it are "
-                               "intact: once there is room, go on with --resume") from None
+            raise WriteError(f"{final}: cannot be written ({error.strerror or error}; "
+                             f"{room(final, total_bytes(arrays))}); the checkpoints before it are intact: once there "
+                             "is room, go on with --resume") from None
         for name in self._names()[KEPT:]:
             in_files(self.comm, self.path / name, lambda: _delete(self.path / name))
 

@@ -14,7 +14,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-METADATA_BYTES = 2**20  # ample for what HDF5 writes beside the arrays
+from eddies.io.room import reserve
+from eddies.io.sink import Sink
 
 Regions = Mapping[str, Sequence[int]]  # name: offset and number of bytes
 
@@ -40,29 +41,34 @@ def lay_out(path: Path, arrays: Mapping[str, np.ndarray | Block]) -> Regions:
 
     Raises OSError where there is no room.
     """
-    regions = {}
-    _check_room(path, sum(int(np.prod(array.shape)) * _type(array).itemsize for array in arrays.values()))
-    with h5py.File(path, "w") as file:
+    regions, sink = {}, Sink(path)
+    with sink, h5py.File(sink, "w") as file:
         plan = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
         plan.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
         plan.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
         for name, array in arrays.items():
             dataset = h5py.h5d.create(file.id, name.encode(), h5py.h5t.py_create(_type(array)),
                                       h5py.h5s.create_simple(array.shape), plan)
-            size = int(np.prod(array.shape)) * _type(array).itemsize
+            size = _bytes(array)
             if size:
                 regions[name] = (dataset.get_offset(), size)
+    sink.check()
+    with open(path, "r+b") as laid_out:
+        reserve(laid_out.fileno(), 0, path.stat().st_size)
     return regions
+
+
+def total_bytes(arrays: Mapping[str, np.ndarray | Block]) -> int:
+    """Bytes of all arrays, those of the other ranks included."""
+    return sum(map(_bytes, arrays.values()))
+
+
+def _bytes(array: np.ndarray | Block) -> int:
+    return int(np.prod(array.shape)) * _type(array).itemsize
 
 
 def _type(array: np.ndarray | Block) -> np.dtype:
     return array.values.dtype if isinstance(array, Block) else array.dtype
-
-
-def _check_room(path: Path, size: int) -> None:
-    """Raise OSError where so many bytes, and what HDF5 needs beside, cannot be written: HDF5 does not survive that."""
-    with open(path, "wb") as file:
-        os.posix_fallocate(file.fileno(), 0, size + METADATA_BYTES)
 
 
 def write_arrays(rank: int, path: Path, regions: Regions, arrays: Mapping[str, np.ndarray | Block]) -> None:

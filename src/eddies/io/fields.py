@@ -6,7 +6,7 @@ from functools import cached_property
 import h5py
 import numpy as np
 
-from eddies.io.hdf5 import append_frame, find_group, growing_dataset, write_attributes
+from eddies.io.hdf5 import append_frame, find_group, growing_dataset, read_frame, write_attributes
 
 
 class FieldWriter:
@@ -55,5 +55,6 @@ class FieldSeries:
         return tuple(name for name in self._group if name != "time")
 
     def read(self, index: int, variable: str, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Planes start to stop of a variable, (components, stop - start, y, x)."""
-        return self._group[variable][index, :, start:stop]
+        """Planes start to stop of a variable, (components, stop - start, y, x). ProductError where one is not
+        finite."""
+        return read_frame(self._group[variable], index, (slice(None), slice(start, stop)))

@@ -1,8 +1,8 @@
 """Products: HDF5 files that are complete or absent, say what they are, and are written by all ranks together.
 
 A product is written under a temporary name, marked complete, closed, and only then renamed, so a file under
-its final name is never half written. Writing uses parallel HDF5 when there is more than one rank; reading
-opens the file on every rank by itself.
+its final name is never half written. Writing uses parallel HDF5 when there is more than one rank, in room on the disk
+that has been taken before (io/unfinished.py); reading opens the file on every rank by itself.
 """
 
 import json
@@ -17,8 +17,9 @@ import h5py
 import numpy as np
 from mpi4py import MPI
 
-from eddies.errors import UserError
+from eddies.io.errors import ProductError, WriteError, write_error
 from eddies.io.provenance import environment
+from eddies.io.unfinished import HEADER_BYTES, Unfinished, frame_bytes, writing
 from eddies.parallel.broadcast import on_first_rank, share_text
 from eddies.parallel.stop import Stopped
 from eddies.pipeline import MAKER_OF
@@ -32,25 +33,17 @@ CHUNK_BYTES = 2**20
 File = h5py.File
 Result = TypeVar("Result")
 
-# Files whose writing was broken off by an exception. Closing one is collective, so it must not happen when
-# Python drops the last reference on one rank alone; they stay open until the process ends.
-_abandoned: list[h5py.File] = []
-
-
-class ProductError(UserError, RuntimeError):
-    """A product is missing, unfinished, damaged or of the wrong kind: the text says which and what to do."""
-
 
 def in_files(comm: MPI.Comm, path: Path, work: Callable[[], Result]) -> Result:
     """What work with the files at `path` gives that rank 0 does alone, on every rank; all ranks call it.
 
-    Raises on all ranks the UserError of the work, or a ProductError where a file cannot be written, read or removed.
+    Raises on all ranks the UserError of the work, or a WriteError where a file cannot be written, read or removed.
     """
     try:
         return on_first_rank(comm, work)
     except OSError as error:
-        raise ProductError(f"{error.filename or path}: {error.strerror or error}; check the file, its directory and "
-                           "the space on the disk") from None
+        raise write_error(path, error, f"{error.filename or path}: {error.strerror or error}; check the file, its "
+                          "directory and the space on the disk") from None
 
 
 @contextmanager
@@ -60,31 +53,37 @@ def create_product(comm: MPI.Comm, path: str | Path, kind: str,
 
     `provenance` (JSON-able: the scene's text, its fingerprint, ...) is stored with the versions of all
     libraries, the number of ranks and the date. An exception inside the block leaves whatever stood under
-    `path` untouched.
+    `path` untouched, and nothing beside it where all ranks know of it.
 
     Raises:
-        ProductError: the file cannot be made or get its name, or there are several ranks and HDF5 is not parallel.
+        WriteError: the file cannot be made or get its name, or there is no room for it.
+        ProductError: there are several ranks and HDF5 is not parallel.
     """
     path = Path(path)
-    partial = path.with_name(path.name + ".partial")
-    file = _create(comm, partial)
-    origin = json.dumps({**environment(comm.size), **provenance})
-    write_attributes(file, {"kind": kind, "format": FORMAT, "complete": False, "provenance": share_text(comm, origin)})
+    if comm.size > 1 and not h5py.get_config().mpi:
+        raise ProductError(
+            f"{path}: this h5py is built without MPI, so {comm.size} ranks cannot write one file; run on "
+            "one, or build it: `CC=mpicc HDF5_MPI=ON pip install --no-binary=h5py --no-build-isolation h5py`")
+    unfinished = Unfinished(comm, path.with_name(path.name + ".partial"))
+    origin = share_text(comm, json.dumps({**environment(comm.size), **provenance}))
     try:
-        yield file
-    except Stopped:  # on all ranks alike, so that they can close the file together
-        file.close()
-        in_files(comm, partial, partial.unlink)
-        raise
-    except BaseException:
-        if comm.size == 1:
-            file.close()
+        with writing(unfinished.file, len(origin) + HEADER_BYTES):
+            write_attributes(unfinished.file,
+                             {"kind": kind, "format": FORMAT, "complete": False, "provenance": origin})
+        yield unfinished.file
+        with writing(unfinished.file, HEADER_BYTES):
+            unfinished.file.attrs["complete"] = True
+            unfinished.close()
+    except BaseException as error:
+        # Several ranks close a file together: only where all of them are here.
+        if comm.size > 1 and not isinstance(error, Stopped | WriteError):
+            unfinished.abandon()
         else:
-            _abandoned.append(file)
+            unfinished.close()
+            in_files(comm, unfinished.path, lambda: unfinished.path.unlink(missing_ok=True))
+            unfinished.check()
         raise
-    file.attrs["complete"] = True
-    file.close()
-    in_files(comm, path, lambda: os.replace(partial, path))
+    in_files(comm, path, lambda: os.replace(unfinished.path, path))
     comm.Barrier()
 
 
@@ -145,9 +144,16 @@ def read_attributes(file: h5py.Group, name: str) -> dict[str, Any]:
 
 def write_table(file: h5py.Group, name: str, columns: Mapping[str, Any]) -> None:
     """Write small arrays, equal on all ranks, as the datasets of a group; all ranks call it."""
-    group = file.create_group(name)
+    with writing(file, HEADER_BYTES):
+        group = file.create_group(name)
     for column, values in columns.items():
-        group.create_dataset(column, data=np.asarray(values))
+        write_array(group, column, np.asarray(values))
+
+
+def write_array(group: h5py.Group, name: str, values: np.ndarray) -> None:
+    """Write an array, equal on all ranks, as a dataset; all ranks call it."""
+    with writing(group, values.nbytes + HEADER_BYTES):
+        group.create_dataset(name, data=values)
 
 
 def read_table(file: h5py.Group, name: str) -> dict[str, np.ndarray]:
@@ -174,8 +180,9 @@ def growing_dataset(group: h5py.Group, name: str, frame_shape: tuple[int, ...], 
     for axis, extent in enumerate(frame_shape):
         below = math.prod(frame_shape[axis + 1:])
         chunk.append(max(1, min(extent, largest // max(below, 1))))
-    return group.create_dataset(name, (0, *frame_shape), dtype, maxshape=(None, *frame_shape),
-                                chunks=tuple(chunk))
+    with writing(group, HEADER_BYTES):
+        return group.create_dataset(name, (0, *frame_shape), dtype, maxshape=(None, *frame_shape),
+                                    chunks=tuple(chunk))
 
 
 def append_frame(dataset: h5py.Dataset, block: np.ndarray, offset: tuple[int, ...]) -> None:
@@ -184,15 +191,28 @@ def append_frame(dataset: h5py.Dataset, block: np.ndarray, offset: tuple[int, ..
     Collective: every rank calls it, also with an empty block.
     """
     frame = dataset.shape[0]
-    dataset.resize(frame + 1, axis=0)
     block = np.asarray(block, dataset.dtype, order="C")[None]
-    in_file, in_memory = dataset.id.get_space(), h5py.h5s.create_simple(block.shape)
-    if block.size:
-        in_file.select_hyperslab((frame, *offset), block.shape)
-    else:
-        in_file.select_none()
-        in_memory.select_none()
-    dataset.id.write(in_memory, in_file, block, dxpl=_collective(dataset.file))
+    with writing(dataset, frame_bytes(dataset)):
+        dataset.resize(frame + 1, axis=0)
+        in_file, in_memory = dataset.id.get_space(), h5py.h5s.create_simple(block.shape)
+        if block.size:
+            in_file.select_hyperslab((frame, *offset), block.shape)
+        else:
+            in_file.select_none()
+            in_memory.select_none()
+        dataset.id.write(in_memory, in_file, block, dxpl=_collective(dataset.file))
+
+
+def read_frame(dataset: h5py.Dataset, frame: int, selection: tuple[slice, ...]) -> np.ndarray:
+    """A part of a frame of floating-point numbers.
+
+    ProductError, on this rank, where one of them is not finite; but a rollout may end with such a state.
+    """
+    values, kind = dataset[frame, *selection], dataset.file.attrs["kind"]
+    if kind != "rollout" and not np.isfinite(values).all():
+        raise ProductError(f"{dataset.file.filename}: {dataset.name}, frame {frame % len(dataset)}: holds values that "
+                           f"are not finite; {_again(kind)}")
+    return values
 
 
 def _collective(file: h5py.File) -> h5py.h5p.PropDXID:
@@ -200,19 +220,6 @@ def _collective(file: h5py.File) -> h5py.h5p.PropDXID:
     if file.driver == "mpio":
         transfer.set_dxpl_mpio(h5py.h5fd.MPIO_COLLECTIVE)
     return transfer
-
-
-def _create(comm: MPI.Comm, path: Path) -> h5py.File:
-    if comm.size > 1 and not h5py.get_config().mpi:
-        raise ProductError(
-            f"{path}: this h5py is built without MPI, so {comm.size} ranks cannot write one file; run on "
-            "one, or build it: `CC=mpicc HDF5_MPI=ON pip install --no-binary=h5py --no-build-isolation h5py`")
-    try:
-        if comm.size > 1:
-            return h5py.File(path, "w", driver="mpio", comm=comm)
-        return h5py.File(path, "w")
-    except OSError as error:
-        raise ProductError(f"{path}: cannot be written: {error}; check the directory") from None
 
 
 def _open_checked(path: Path, kind: str | None) -> h5py.File:
@@ -240,9 +247,13 @@ def _problem(file: h5py.File, kind: str | None, remedy: str) -> str | None:
         return f"unfinished, its writer was stopped: {remedy}"
     if not _has_this_format(file):
         version = json.loads(file.attrs.get("provenance", "{}")).get("eddies", "of unknown version")
-        again = f"run `eddies {MAKER_OF[found].name}` again" if found in MAKER_OF else "make it again"
-        return f"written by eddies {version}, whose {found.replace('_', ' ')} this version does not read; {again}"
+        what = found.replace("_", " ")
+        return f"written by eddies {version}, whose {what} this version does not read; {_again(found)}"
     return None
+
+
+def _again(kind: str) -> str:
+    return f"run `eddies {MAKER_OF[kind].name}` again" if kind in MAKER_OF else "make it again"
 
 
 def _has_this_format(file: h5py.File) -> bool:

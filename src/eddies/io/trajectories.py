@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 
 import eddies
-from eddies.io.hdf5 import append_frame, find_group, growing_dataset, write_attributes
+from eddies.io.hdf5 import append_frame, find_group, growing_dataset, read_frame, write_array, write_attributes
 
 
 class TrajectoryWriter:
@@ -31,9 +31,9 @@ class TrajectoryWriter:
         _write_header(file)
         self._group = file.create_group(f"particles/{name}")
         box = self._group.create_group("box")
-        box.create_dataset("edges", data=np.full(3, length))
+        write_array(box, "edges", np.full(3, length))
         write_attributes(box, {"dimension": 3, "boundary": np.array([b"periodic"] * 3)})
-        self._group.create_dataset("id", data=np.arange(total))
+        write_array(self._group, "id", np.arange(total))
         self._step = growing_dataset(self._group, "step", (), np.int64)
         self._time = growing_dataset(self._group, "time", (), np.float64)
         self._columns = {column: self._element(column, (total, *shape), dtype)
@@ -85,8 +85,9 @@ class Trajectory:
         return tuple(name for name in self._group if f"{name}/value" in self._group)
 
     def read(self, frame: int, column: str, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Rows start to stop of a column at a frame, (stop - start, ...), in order of id."""
-        return find_group(self._group, column)["value"][frame, start:stop]
+        """Rows start to stop of a column at a frame, (stop - start, ...), in order of id. ProductError where one is not
+        finite."""
+        return read_frame(find_group(self._group, column)["value"], frame, (slice(start, stop),))
 
 
 def _write_header(file: h5py.File) -> None:

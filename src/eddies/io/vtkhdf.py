@@ -7,7 +7,6 @@ The reader takes a file of one step for one without time, and fails on an axis o
 therefore written without steps; its time is the field data `time`.
 """
 
-import io
 import json
 import math
 import os
@@ -19,8 +18,11 @@ from typing import Any
 import h5py
 import numpy as np
 
+from eddies.io.errors import NoRoom, write_error
 from eddies.io.fields import FieldSeries
-from eddies.io.hdf5 import ProductError, write_attributes
+from eddies.io.hdf5 import write_attributes
+from eddies.io.room import reserve
+from eddies.io.sink import Sink
 from eddies.io.trajectories import Trajectory
 
 VERSION = (2, 0)
@@ -100,8 +102,13 @@ def _create(path: Path, kind: str, frames: int, layout: Layout,
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         bulk = sum(math.prod(shape) * np.dtype(dtype).itemsize for shape, dtype in layout.values())
-        _reserve(partial, bulk + OVERHEAD_BYTES + OVERHEAD_BYTES_PER_STEP * frames)
-        with h5py.File(partial, "r+") as file:
+        size = bulk + OVERHEAD_BYTES + OVERHEAD_BYTES_PER_STEP * frames
+        sink = Sink(partial)
+        with sink, h5py.File(sink, "w") as file:
+            try:
+                reserve(sink.fileno(), 0, size)  # HDF5 cuts off what it does not need
+            except OSError as error:
+                raise NoRoom.of(error, partial, size) from None
             write_attributes(file, {"provenance": json.dumps(dict(provenance))})
             root = file.create_group("VTKHDF")
             # The reader wants the type as a string of fixed length.
@@ -109,27 +116,15 @@ def _create(path: Path, kind: str, frames: int, layout: Layout,
             for name, (shape, dtype) in layout.items():
                 root.create_dataset(name, shape, dtype)
             yield root
+        sink.check()
         os.replace(partial, path)
     except OSError as error:
-        raise ProductError(f"{path}: cannot be written: {error}; check its directory, the space on the disk, and "
-                           "whether the product it is made from is whole") from None
+        words = (f"{path}: cannot be written: {error}; check its directory, the space on the disk, and whether the "
+                 "product it is made from is whole")
+        raise write_error(path, error, words) from None
     finally:
         if partial.is_file():
             partial.unlink()
-
-
-def _reserve(path: Path, size: int) -> None:
-    """Make an empty HDF5 file that has `size` bytes of the disk; HDF5 cuts off the rest when it closes the file.
-
-    A full disk thus shows here, as OSError. Met by HDF5 later it would end the process: some versions crash when they
-    close a dataset that they cannot flush.
-    """
-    empty = io.BytesIO()
-    h5py.File(empty, "w").close()
-    with open(path, "wb") as file:
-        file.write(empty.getvalue())
-        file.flush()
-        os.posix_fallocate(file.fileno(), 0, size)
 
 
 def _write_steps(root: h5py.Group, times: np.ndarray, offsets: Mapping[str, np.ndarray]) -> None:

@@ -17,9 +17,12 @@ def save_weights(comm: MPI.Comm, path: str | Path, kind: str, description: Mappi
                  tables: Mapping[str, Mapping[str, np.ndarray]] | None = None) -> None:
     """Write rank 0's tensors, a JSON-able description and small tables as one product; all ranks call it.
 
-    ProductError on all ranks where it cannot be written.
+    ProductError on all ranks where it cannot be written, or a tensor is not finite.
     """
     def write() -> None:
+        for name, tensor in tensors.items():
+            if not np.isfinite(tensor).all():
+                raise ProductError(f"{path}: tensor {name} is not finite, so nothing is written; lower learning_rate")
         with create_product(MPI.COMM_SELF, path, kind, {"ranks": comm.size, **provenance}) as file:
             file.attrs["description"] = json.dumps(dict(description))
             file.attrs["tensors"] = json.dumps({name: _signature(tensor) for name, tensor in tensors.items()})

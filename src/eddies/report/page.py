@@ -4,10 +4,12 @@ import base64
 import html
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+from eddies.io.whole_files import write_files
 
 Number = float | int | bool | str | dict | None
 
@@ -115,13 +117,13 @@ def shown(value: Number) -> str:
     return str(value)
 
 
-def write_page(output: Path, run: RunRecord, sections: Sequence[Section]) -> None:
-    """Write index.html and figures/NAME.png of sections whose figures are drawn."""
+def write_page(output: Path, run: RunRecord, sections: Sequence[Section], beside: Mapping[Path, str]) -> None:
+    """Write index.html, figures/NAME.png of sections whose figures are drawn, and other files `beside`: all, or on a
+    full disk, which is an OSError, none."""
     (output / "figures").mkdir(parents=True, exist_ok=True)
-    for section in sections:
-        for illustration in section.illustrations:
-            (output / "figures" / f"{illustration.name}.png").write_bytes(illustration.image)
-    (output / "index.html").write_text(render_page(run, sections), encoding="utf-8")
+    figures = {output / "figures" / f"{illustration.name}.png": illustration.image
+               for section in sections for illustration in section.illustrations}
+    write_files({**figures, output / "index.html": render_page(run, sections), **beside})
 
 
 def render_page(run: RunRecord, sections: Sequence[Section]) -> str:

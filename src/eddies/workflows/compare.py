@@ -6,6 +6,7 @@ Every variant has a run directory, so that `eddies report` can show each of them
 from __future__ import annotations
 
 import csv
+import io
 import json
 import logging
 from collections.abc import Sequence
@@ -86,7 +87,7 @@ def check_ground_truth(comparison: Comparison, variant: VariantRun, comm: Comm) 
 def write(comparison: Comparison, table: list[dict[str, Any]], comm: Comm, output: Path) -> None:
     """Write the rows and what is drawn of them; all ranks call it.
 
-    Raises SceneError where rank 0 cannot write.
+    Raises WriteError where rank 0 cannot write.
     """
     parts = []
     if comm.rank == 0:
@@ -99,13 +100,14 @@ def write_files(comparison: Comparison, table: list[dict[str, Any]], parts: Sequ
                 output: Path) -> None:
     """Write rows as CSV and JSON, and the page of drawn sections; one rank calls it."""
     computer = machine(comparison.base_scene.device, ranks)
-    with open(output / "comparison.csv", "w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, COLUMNS)
-        writer.writeheader()
-        writer.writerows(table)
+    lines = io.StringIO(newline="")
+    writer = csv.DictWriter(lines, COLUMNS)
+    writer.writeheader()
+    writer.writerows(table)
     record = {"name": comparison.name, "title": comparison.title, "machine": computer, "rows": table}
-    (output / "comparison.json").write_text(json.dumps(record, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     parts[0].notices += notes(comparison)
     page = run_record(comparison.name, comparison.title, comparison.base_scene.to_toml(), computer)
-    write_page(output, page, parts)
+    write_page(output, page, parts, {
+        output / "comparison.csv": lines.getvalue(),
+        output / "comparison.json": json.dumps(record, indent=2, allow_nan=False) + "\n"})
     log.info("compare: %s", output / "index.html")

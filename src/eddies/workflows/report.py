@@ -247,10 +247,11 @@ def _run_record(directory: Path, record: Run) -> RunRecord:
 
 
 def _write_files(output: Path, record: RunRecord, sections: Sequence[Section]) -> None:
+    drawn = {f"{illustration.name}.png" for section in sections for illustration in section.illustrations}
+    write_page(output, record, sections, {output / "metrics.json": metrics_json(sections)})
     for stale in (output / "figures").glob("*.png"):
-        stale.unlink()
-    write_page(output, record, sections)
-    (output / "metrics.json").write_text(metrics_json(sections), encoding="utf-8")
+        if stale.name not in drawn:
+            stale.unlink()
     log.info("report: %s", output / "index.html")
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from eddies.io.guard import Guard
 from eddies.io.hdf5 import in_files, open_product
 from eddies.io.weights import save_weights
+from eddies.io.whole_files import write_files
 from eddies.learning.training import Training
 from eddies.parallel.communicator import Comm
 from eddies.parallel.reduction import any_rank
@@ -93,7 +94,7 @@ class LearningCurves:
         def write() -> None:
             from eddies.report import figures  # matplotlib takes a while to start
             from eddies.report.learning import curves
-            self.path.write_bytes(figures.png(curves(training.columns())))
+            write_files({self.path: figures.png(curves(training.columns()))})
 
         in_files(self.comm, self.path, write)
         self._drawn = time.monotonic()

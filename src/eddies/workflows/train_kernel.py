@@ -16,7 +16,7 @@ from eddies.io.weights import save_weights
 from eddies.learning.kernel_training import KernelLossWeights, KernelSample, KernelTrainer
 from eddies.learning.training import Phase, Training
 from eddies.parallel.communicator import Comm
-from eddies.parallel.migration import id_block, migrate
+from eddies.parallel.migration import migrate
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import StopRequest
@@ -80,10 +80,8 @@ def load_sample(truth: GroundTruth, index: int, support: float) -> KernelSample:
     velocity = truth.field(index, "velocity")
     grid = SpectralGrid(slab, cutoff=(slab.planes - 1) // 2)
     derivatives = np.stack([grid.backward(gradient(grid, component)) for component in grid.forward(velocity)])
-    frame, block = truth.frame_of_field(index), id_block(slab.comm, truth.total)
     # Without the density, which an incompressible ground truth has not.
-    columns = {name: truth.trajectory.read(frame, name, *block) for name in ("position", "velocity")}
-    columns = migrate(slab, {"id": np.arange(*block, dtype=np.int64), **columns})
+    columns = migrate(slab, truth.block(truth.frame_of_field(index), ("position", "velocity")))
     by_point = [torch.from_numpy(np.ascontiguousarray(np.moveaxis(values.reshape(*values.shape[:-3], -1), -1, 0)))
                 for values in (velocity, derivatives)]
     position, own_velocity = (torch.from_numpy(columns[name]) for name in ("position", "velocity"))

@@ -2,10 +2,11 @@
 
 import math
 
+import h5py
 import numpy as np
 import pytest
 
-from eddies.io.hdf5 import open_product
+from eddies.io.hdf5 import ProductError, open_product
 from eddies.io.trajectories import Trajectory
 from eddies.parallel.slab import SlabDecomposition
 from eddies.workflows.ground_truth.truth import GroundTruth
@@ -103,3 +104,22 @@ def test_columns_are_those_that_are_stored(comm, path, density):
         if name in names:
             change = (stored[name][2] - stored[name][0]) / (times[2] - times[0])
             assert np.allclose(rates[rate], change[ids], rtol=1e-13, atol=0)
+
+
+@pytest.mark.parametrize("density", [True])
+@pytest.mark.parametrize("dataset, where, ask", [
+    ("particles/tracers/velocity/value", (2, -1, 0), lambda truth: truth.particles(2)),
+    ("particles/tracers/density/value", (3, 0), lambda truth: truth.scales_at(3)),
+    ("fields/filtered/velocity", (0, 0, -1, 0, 0),
+     lambda truth: truth.field(0, "velocity", SlabDecomposition(truth.decomposition.comm, LENGTH, truth.fields.cells))),
+])
+@pytest.mark.mpi(1, 2, timeout=30)
+def test_a_value_that_is_not_finite_is_refused_by_all_ranks(comm, path, density, dataset, where, ask):
+    """One rank alone reads it, the first or the last."""
+    if comm.rank == 0:
+        with h5py.File(path, "r+") as file:
+            file[dataset][where] = np.nan
+    comm.Barrier()
+    told = f"ground_truth.h5: /{dataset}, frame {where[0]}: holds values that are not finite; run `eddies dns` again"
+    with pytest.raises(ProductError, match=told):
+        read(comm, path, ask)

@@ -13,7 +13,8 @@ from eddies.flow.navier_stokes import FLUIDS, Fluid
 from eddies.flow.operators import project
 from eddies.import_path import is_path, load
 from eddies.io.fields import FieldSeries
-from eddies.io.hdf5 import open_product
+from eddies.io.hdf5 import ProductError, open_product
+from eddies.parallel.broadcast import on_all_ranks
 from eddies.parallel.communicator import Comm
 from eddies.parallel.slab import SlabDecomposition
 from eddies.scene.scene import BOX_LENGTH, Scene, SceneError
@@ -75,10 +76,13 @@ def _state_from_file(path: str, fluid: Fluid) -> np.ndarray:
             raise SceneError(f"[initial] path = {path}: holds fields of {fields.cells} cells a side, [flow] cells is "
                              f"{grid.cells}; make them equal")
         planes = (grid.decomposition.start, grid.decomposition.stop)
-        state = grid.forward(fields.read(-1, "velocity", *planes))
+        names = fields.variables if fluid.compressible else ("velocity",)
+        stored = on_all_ranks(grid.decomposition.comm,
+                              lambda: {name: fields.read(-1, name, *planes) for name in names}, ProductError)
+        state = grid.forward(stored["velocity"])
         if fluid.compressible:
-            if "density" in fields.variables:
-                s = grid.forward(np.log(fields.read(-1, "density", *planes)))
+            if "density" in stored:
+                s = grid.forward(np.log(stored["density"]))
             else:
                 s = balanced_density(grid, state, fluid.sound_speed)[None]
             return np.concatenate([state, s])

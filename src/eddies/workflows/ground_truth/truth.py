@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 import torch
 
 from eddies.io.fields import FieldSeries
-from eddies.io.hdf5 import File, read_attributes
+from eddies.io.hdf5 import File, ProductError, read_attributes
 from eddies.io.trajectories import Trajectory
 from eddies.learning.force_training import TrainingFrame
+from eddies.parallel.broadcast import on_all_ranks
 from eddies.parallel.migration import id_block, migrate
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.dynamics import ParticleDynamics
@@ -23,12 +25,14 @@ from eddies.workflows.ground_truth.measured_scales import RATES, measured_scales
 
 log = logging.getLogger("eddies")
 
+Result = TypeVar("Result")
+
 
 class GroundTruth:
     """An open ground_truth.h5, read by all ranks; particles arrive on the slabs of `decomposition`.
 
     Where the fluid is incompressible no density is stored: then `has_density` is false and the columns of the density
-    are left out.
+    are left out. All ranks raise ProductError where what one of them reads is not finite.
     """
 
     def __init__(self, file: File, decomposition: SlabDecomposition) -> None:
@@ -57,14 +61,14 @@ class GroundTruth:
         """
         if not 0 < frame < len(self.times):
             raise ValueError(f"frame {frame} of {len(self.times)} has no frame before it")
-        before, now = (self._block(other, self._evolving) for other in (frame - 1, frame))
+        before, now = (self.block(other, self._evolving) for other in (frame - 1, frame))
         interval = self.times[frame] - self.times[frame - 1]
         measured = measured_scales(self.decomposition.comm, now, before, now, interval)
         return replace(self.scales, **{name.removesuffix("_rms"): value for name, value in measured.items()})
 
     def particles(self, frame: int) -> dict[str, np.ndarray]:
         """id, position, velocity and, where there is one, density of this rank's particles at a frame."""
-        return migrate(self.decomposition, self._block(frame))
+        return migrate(self.decomposition, self.block(frame))
 
     def particles_with_rates(self, frame: int) -> dict[str, np.ndarray]:
         """The same with `acceleration` (n, 3) and `density_rate` (n,): centred differences along the trajectories.
@@ -73,8 +77,8 @@ class GroundTruth:
         """
         if not 0 < frame < len(self.times) - 1:
             raise ValueError(f"frame {frame} of {len(self.times)} has no frames on both sides")
-        columns = self._block(frame)
-        before, after = (self._block(other, self._evolving) for other in (frame - 1, frame + 1))
+        columns = self.block(frame)
+        before, after = (self.block(other, self._evolving) for other in (frame - 1, frame + 1))
         span = self.times[frame + 1] - self.times[frame - 1]
         for name in self._evolving:
             columns[RATES[name]] = (after[name] - before[name]) / span
@@ -83,16 +87,18 @@ class GroundTruth:
     def window(self, frame: int, length: int) -> dict[str, np.ndarray]:
         """`particles` of a frame, and what is true of them in the frames that follow: `position_later` and
         `velocity_later` (n, length, 3), `density_later` (n, length)."""
-        columns = self._block(frame)
-        later = [self._block(frame + number) for number in range(1, length + 1)]
+        columns = self.block(frame)
+        later = [self.block(frame + number) for number in range(1, length + 1)]
         for name in ("position", *self._evolving):
             columns[f"{name}_later"] = np.stack([block[name] for block in later], axis=1)
         return migrate(self.decomposition, columns)
 
-    def field(self, index: int, variable: str) -> np.ndarray:
-        """This rank's planes of a filtered field, (components, z_local, y, x), in double precision."""
-        planes = (self.decomposition.start, self.decomposition.stop)
-        return self.fields.read(index, variable, *planes).astype(np.float64)
+    def field(self, index: int, variable: str, slab: SlabDecomposition | None = None) -> np.ndarray:
+        """This rank's planes of a filtered field, or those of another slab, (components, z_local, y, x), in double
+        precision."""
+        slab = slab or self.decomposition
+        planes = (slab.start, slab.stop)
+        return self._together(lambda: self.fields.read(index, variable, *planes)).astype(np.float64)
 
     def frame_of_field(self, index: int) -> int:
         """The frame taken at the time of a field."""
@@ -102,12 +108,16 @@ class GroundTruth:
         """The last frame of the training window, a fraction of the ground truth."""
         return max(int(window * (len(self.times) - 1)), 1)
 
-    def _block(self, frame: int, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
+    def block(self, frame: int, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
         """Columns of this rank's ids at a frame: those named, or all."""
         start, stop = id_block(self.decomposition.comm, self.total)
         names = ("position", *self._evolving) if names is None else names
-        columns = {name: self.trajectory.read(frame, name, start, stop) for name in names}
+        columns = self._together(lambda: {name: self.trajectory.read(frame, name, start, stop) for name in names})
         return {"id": np.arange(start, stop, dtype=np.int64), **columns}
+
+    def _together(self, read: Callable[[], Result]) -> Result:
+        """What is read on this rank; what is wrong with the file on any is raised by all."""
+        return on_all_ranks(self.decomposition.comm, read, ProductError)
 
 
 def load_frame(truth: GroundTruth, index: int, model: LagrangianModel, dtype: torch.dtype,

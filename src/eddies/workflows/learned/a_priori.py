@@ -94,7 +94,7 @@ def _pressure_force(truth: GroundTruth, index: int, particles: ParticleSet) -> t
     at = int(np.argmin(np.abs(truth.fields.times - truth.times[index])))
     slab = SlabDecomposition(truth.decomposition.comm, truth.decomposition.length, truth.fields.cells)
     grid = SpectralGrid(slab, cutoff=(slab.planes - 1) // 2)
-    planes = truth.fields.read(at, "density", slab.start, slab.stop).astype(np.float64)
+    planes = truth.field(at, "density", slab)
     force = -truth.scales.sound_speed**2 * gradient(grid, grid.forward(np.log(planes))[0])
     spline = SplineInterpolation(grid, "quintic")
     columns = migrate(slab, {name: as_numpy(getattr(particles, name)) for name in ("id", "position")})

@@ -150,5 +150,5 @@ def resolved_velocity(truth: GroundTruth, grid: SpectralGrid, frame: int) -> np.
                                                    truth.fields.cells)
     index = int(np.argmin(np.abs(fields.times - truth.times[frame])))
     fine = SpectralGrid(slab, grid.precision, (slab.planes - 1) // 2)
-    velocity = fields.read(index, "velocity", slab.start, slab.stop).astype(fine.real)
+    velocity = truth.field(index, "velocity", slab).astype(fine.real)
     return restrict(fine, grid, fine.forward(velocity))

@@ -56,7 +56,7 @@ class RolloutFrames:
         self._store("truth", step, time, self.truth.particles_with_rates(frame))
         at = int(np.argmin(np.abs(self.truth.fields.times - self.truth.times[frame])))
         if self.kernel is not None and abs(self.truth.fields.times[at] - self.truth.times[frame]) < 1e-9:
-            planes = self.truth.fields.read(at, "velocity", self._slab.start, self._slab.stop)
+            planes = self.truth.field(at, "velocity", self._slab)
             self.segments.fields["filtered"].append(time, self._slab.start, {"velocity": planes})
 
     def _store(self, name: str, step: int, time: float, columns: dict[str, np.ndarray]) -> None:

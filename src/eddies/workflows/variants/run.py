@@ -12,7 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from eddies.errors import UserError
+from eddies.io.errors import WriteError, write_error
 from eddies.io.hdf5 import open_product, product_fingerprint, product_provenance, read_attributes
+from eddies.io.whole_files import write_files
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm
 from eddies.parallel.rendezvous import all_arrive
@@ -93,7 +95,7 @@ class VariantRun:
         for times, this number of ranks. Sends nothing: one rank does this.
         """
         self.directory.mkdir(parents=True, exist_ok=True)
-        (self.directory / MARK).write_text(MARK_TEXT, encoding="utf-8")
+        write_files({self.directory / MARK: MARK_TEXT})
         for stage in OWN_STAGES:
             checkpoints = self.directory / stage.checkpoints
             if not resume and checkpoints.exists():
@@ -123,6 +125,8 @@ class VariantRun:
         """
         try:
             work()
+        except WriteError:  # which is not the variant's
+            raise
         except UserError as error:  # of which a variant can fail without ending the comparison
             if not all_arrive(errors):
                 raise
@@ -167,8 +171,10 @@ def link(product: Path, directory: Path) -> None:
 
 
 def in_directories(comm: Comm, work: Callable[[], None]) -> None:
-    """Work in directories that rank 0 does alone; all ranks raise its UserError, or one where it cannot write."""
+    """Work in directories that rank 0 does alone; all ranks raise its UserError, or WriteError where it cannot
+    write."""
     try:
         on_first_rank(comm, work)
     except OSError as error:
-        raise SceneError(f"{error.filename}: cannot be written ({error.strerror}); choose another --output") from None
+        raise write_error(error.filename, error, f"{error.filename}: cannot be written ({error.strerror}); choose "
+                          "another --output") from None

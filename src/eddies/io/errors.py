@@ -1,0 +1,49 @@
+"""What is wrong with a file, for its user."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+
+from eddies.errors import UserError
+
+# A full disk, a used up quota, a file that is longer than it may be.
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+class ProductError(UserError, RuntimeError):
+    """A product is missing, unfinished, damaged or of the wrong kind: the text says which and what to do."""
+
+
+class WriteError(ProductError):
+    """A file cannot be written. All ranks that write it raise this at the same place, so that they can end other files
+    together."""
+
+
+class NoRoom(OSError):
+    """An OSError that knows how many bytes were `wanted`."""
+
+    wanted = 0
+
+    @classmethod
+    def of(cls, error: OSError, path: Path | str, wanted: int) -> NoRoom:
+        """What was met when so many bytes were wanted for a file."""
+        found = cls(error.errno, error.strerror, str(path))
+        found.wanted = wanted
+        return found
+
+
+def write_error(path: Path | str, error: OSError, otherwise: str) -> WriteError:
+    """The error of a file that cannot be written: where room lacks, with the bytes wanted and free, or `otherwise`."""
+    if error.errno not in NO_ROOM:
+        return WriteError(otherwise)
+    path = error.filename or path
+    return WriteError(f"{path}: cannot be written: {error.strerror}: {room(path, getattr(error, 'wanted', 0))}; make "
+                      "room, then run the command again, a stage with --resume")
+
+
+def room(path: Path | str, wanted: int) -> str:
+    """Bytes wanted for a file, and those free where it is."""
+    disk = os.statvfs(next(place for place in Path(path).absolute().parents if place.is_dir()))
+    return f"{wanted} bytes wanted, {disk.f_bavail * disk.f_frsize} free"

@@ -1,0 +1,155 @@
+"""A product while it is written: its HDF5 file under a temporary name, and the room on the disk that it has."""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import h5py
+from mpi4py import MPI
+
+from eddies.io.errors import NoRoom, ProductError, WriteError, room, write_error
+from eddies.io.room import MARGIN_BYTES, check_limit, reserve
+from eddies.io.sink import Sink
+from eddies.parallel.broadcast import first_complaint
+
+# Of the index of a chunked dataset, for each chunk, and of a dataset beside its values: more than HDF5 takes.
+INDEX_BYTES, HEADER_BYTES = 2**8, 2**14
+
+# What is being written, by the name that HDF5 has for the file.
+_open: dict[str, Unfinished] = {}
+# Files whose writing was broken off by an exception. Closing one is collective, so it must not happen when
+# Python drops the last reference on one rank alone; they stay open until the process ends.
+_abandoned: list[Unfinished] = []
+
+
+class Unfinished:
+    """An HDF5 file that is written by all ranks together. All methods are collective.
+
+    HDF5 does not survive a write that fails: it crashes when it closes the file or, with several ranks, those that
+    could write wait for the one that could not. So every write is announced, and blocks of the disk are taken for it
+    beforehand; a margin stays taken for what HDF5 writes when it closes the file, and is cut off then. Where blocks
+    cannot be taken and the disk fills meanwhile, one rank still writes into a `Sink`; of several the one that meets it
+    raises ProductError, upon which the job has to be aborted.
+    """
+
+    def __init__(self, comm: MPI.Comm, path: Path) -> None:
+        self.comm, self.path, self.broken = comm, path, False
+        self._needed, self._held = 0, 0
+        self._sink: Sink | None = None
+        if comm.size == 1:
+            self._alike(self._open_sink)
+        else:
+            self._alike(self._make)
+            self._alike(self._open_together)
+        self._name = self.file.filename
+        _open[self._name] = self
+
+    def take(self, size: int) -> None:
+        """Take room for so many bytes more than were asked for before; the same on all ranks.
+
+        WriteError on all ranks where there is none: the file can still be closed."""
+        self._needed += size
+        if self._needed + MARGIN_BYTES > self._held:
+            stop = self._needed + 2 * MARGIN_BYTES
+            self._alike(lambda: self._reserve(stop))
+            self._held = stop
+
+    def check(self) -> None:
+        """Raise WriteError where something could not be written in spite of the room taken; by one rank alone."""
+        if self._sink is not None and self._sink.failure is not None:
+            raise self._error(self._sink.failure)
+
+    def close(self) -> None:
+        """Close the file, cutting off the room that it does not need."""
+        _open.pop(self._name, None)
+        self.file.close()
+        if self._sink is not None:
+            self._sink.close()
+
+    def abandon(self) -> None:
+        """Leave the file open, as other ranks may not know that it is not written any more."""
+        _open.pop(self._name, None)
+        _abandoned.append(self)
+
+    def _open_sink(self) -> None:
+        self._sink = Sink(self.path)
+        self.file = h5py.File(self._sink, "w")
+
+    def _make(self) -> None:
+        """Make a file without content, as HDF5 would empty one that it makes anew, and give back its room."""
+        if self.comm.rank == 0:
+            empty = io.BytesIO()
+            h5py.File(empty, "w").close()
+            try:
+                self.path.write_bytes(empty.getvalue())
+            except OSError:
+                self.path.unlink(missing_ok=True)
+                raise
+
+    def _open_together(self) -> None:
+        self.file = h5py.File(self.path, "r+", driver="mpio", comm=self.comm)
+
+    def _reserve(self, stop: int) -> None:
+        try:
+            check_limit(stop)
+            if self.comm.rank == 0:
+                descriptor = os.open(self.path, os.O_RDWR)
+                try:
+                    reserve(descriptor, self._held, stop)
+                finally:
+                    os.close(descriptor)
+        except OSError as error:
+            raise NoRoom.of(error, self.path, stop - self._held) from None
+
+    def _error(self, error: OSError) -> WriteError:
+        words = f"{self.path}: cannot be written: {error.strerror or error}; check its directory"
+        return write_error(self.path, error, words)
+
+    def _alike(self, work: Callable[[], object]) -> None:
+        """Do what may fail on a rank: all ranks raise the WriteError of the lowest."""
+        complaint = None
+        try:
+            work()
+        except OSError as error:
+            complaint = str(self._error(error))
+        complaint = first_complaint(self.comm, complaint)
+        if complaint is not None:
+            raise WriteError(complaint)
+
+
+def writing_failed() -> bool:
+    """Whether HDF5 could not write a file that it shares with other ranks: it would crash at the end of the process."""
+    return any(unfinished.broken for unfinished in _abandoned)
+
+
+@contextmanager
+def writing(group: h5py.Group | h5py.Dataset, size: int) -> Iterator[None]:
+    """Write so many bytes to a file inside the block, after having taken room for them; all ranks do.
+
+    Raises:
+        WriteError: on all ranks; there is no room.
+        ProductError: on this rank; HDF5 could not write in spite of that.
+    """
+    unfinished = _open[group.file.filename]
+    unfinished.take(size)
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        unfinished.check()
+        unfinished.broken = True
+        raise ProductError(f"{unfinished.path}: cannot be written: {error}: {room(unfinished.path, size)}; make room, "
+                           "or check the disk, then run the command again, a stage with --resume") from None
+    unfinished.check()
+
+
+def frame_bytes(dataset: h5py.Dataset) -> int:
+    """What HDF5 adds to a file for another row of a chunked dataset: whole chunks, or nothing."""
+    if dataset.shape[0] % dataset.chunks[0]:
+        return 0
+    chunks = math.prod(-(-extent // chunk) for extent, chunk in zip(dataset.shape[1:], dataset.chunks[1:]))
+    return chunks * (math.prod(dataset.chunks) * dataset.dtype.itemsize + INDEX_BYTES)
