@@ -8,6 +8,7 @@ import pytest
 
 from eddies.io.errors import WriteError
 from eddies.io.hdf5 import ProductError
+from eddies.report.page import Section
 from eddies.scene.scene import SceneError, load_scene
 from eddies.workflows import compare
 from eddies.workflows.compare import check_ground_truth
@@ -162,8 +163,9 @@ def test_a_table_that_cannot_be_written_is_told_by_all(comm, tmp_path, monkeypat
     if comm.rank == 0:
         (tmp_path / "comparison.csv").mkdir()
     comm.Barrier()
-    monkeypatch.setattr(compare, "sections", lambda *_: [])
-    comparison = SimpleNamespace(subject="learned", turnovers=1.0, base_scene=SimpleNamespace(device="cpu"))
+    monkeypatch.setattr(compare, "sections", lambda *_: [Section("errors", "Errors")])
+    comparison = SimpleNamespace(name="small", title="small", subject="learned", turnovers=1.0, scenes={},
+                                 base_scene=load_scene("tiny"))
     with pytest.raises(WriteError, match="comparison.csv: cannot be written .Is a directory.; choose another --output"):
         compare.write(comparison, [], comm, tmp_path)
 

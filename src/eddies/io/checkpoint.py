@@ -21,7 +21,7 @@ import numpy as np
 from mpi4py import MPI
 
 from eddies.io.contiguous import Block, lay_out, total_bytes, write_arrays
-from eddies.io.errors import WriteError, room
+from eddies.io.errors import WriteError, wanted_and_free
 from eddies.io.hdf5 import in_files
 from eddies.io.manifest import find_damage, hash_file, manifest_text, parse_manifest
 from eddies.kernels.library import in_use, threads
@@ -108,9 +108,9 @@ class CheckpointDirectory:
         except OSError as error:
             if self.comm.rank == 0:
                 shutil.rmtree(partial, ignore_errors=True)
-            raise WriteError(f"{final}: cannot be written ({error.strerror or error}; "
-                             f"{room(final, total_bytes(arrays))}); the checkpoints before it are intact: once there "
-                             "is room, go on with --resume") from None
+            lack = wanted_and_free(final, total_bytes(arrays))
+            raise WriteError(f"{final}: cannot be written ({error.strerror or error}; {lack}); the checkpoints before "
+                             "it are intact: once there is room, go on with --resume") from None
         for name in self._names()[KEPT:]:
             in_files(self.comm, self.path / name, lambda: _delete(self.path / name))
 

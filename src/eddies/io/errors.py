@@ -39,11 +39,12 @@ def write_error(path: Path | str, error: OSError, otherwise: str) -> WriteError:
     if error.errno not in NO_ROOM:
         return WriteError(otherwise)
     path = error.filename or path
-    return WriteError(f"{path}: cannot be written: {error.strerror}: {room(path, getattr(error, 'wanted', 0))}; make "
-                      "room, then run the command again, a stage with --resume")
+    lack = wanted_and_free(path, getattr(error, "wanted", 0))
+    return WriteError(f"{path}: cannot be written: {error.strerror}: {lack}; make room, then run the command again, a "
+                      "stage with --resume")
 
 
-def room(path: Path | str, wanted: int) -> str:
+def wanted_and_free(path: Path | str, wanted: int) -> str:
     """Bytes wanted for a file, and those free where it is."""
     disk = os.statvfs(next(place for place in Path(path).absolute().parents if place.is_dir()))
     return f"{wanted} bytes wanted, {disk.f_bavail * disk.f_frsize} free"

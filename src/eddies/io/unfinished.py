@@ -12,7 +12,7 @@ from pathlib import Path
 import h5py
 from mpi4py import MPI
 
-from eddies.io.errors import NoRoom, ProductError, WriteError, room, write_error
+from eddies.io.errors import NoRoom, ProductError, WriteError, wanted_and_free, write_error
 from eddies.io.room import MARGIN_BYTES, check_limit, reserve
 from eddies.io.sink import Sink
 from eddies.parallel.broadcast import first_complaint
@@ -142,8 +142,9 @@ def writing(group: h5py.Group | h5py.Dataset, size: int) -> Iterator[None]:
     except (OSError, RuntimeError) as error:
         unfinished.check()
         unfinished.broken = True
-        raise ProductError(f"{unfinished.path}: cannot be written: {error}: {room(unfinished.path, size)}; make room, "
-                           "or check the disk, then run the command again, a stage with --resume") from None
+        lack = wanted_and_free(unfinished.path, size)
+        raise ProductError(f"{unfinished.path}: cannot be written: {error}: {lack}; make room, or check the disk, then "
+                           "run the command again, a stage with --resume") from None
     unfinished.check()
 
 
