@@ -10,11 +10,16 @@ import json
 import math
 import numbers
 import os
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 IMPORT_PATH = 'the import path "module:name" of your own'
+# Numbers of a scene: beyond these squares and cubes of them overflow, or a run has no end.
+SMALLEST, LARGEST, MOST = 1e-15, 1e15, 10**9
+# Characters of a value that an error shows.
+SHOWN = 60
 
 
 @dataclass(frozen=True)
@@ -50,6 +55,8 @@ class Number:
             raise ValueError
         if value not in self.bounds:
             raise ValueError
+        if value and not SMALLEST <= abs(value) <= LARGEST:
+            raise ValueError(f"numbers of a scene that are not 0 lie between {SMALLEST:g} and {LARGEST:g} in size")
         return float(value)
 
     @property
@@ -67,6 +74,8 @@ class Integer:
     def accept(self, value: Any) -> int:
         if isinstance(value, bool) or not isinstance(value, numbers.Integral) or value not in self.bounds:
             raise ValueError
+        if abs(value) > MOST and self.bounds.at_most == math.inf:
+            raise ValueError(f"whole numbers of a scene are at most {MOST:,}")
         return int(value)
 
     @property
@@ -144,6 +153,21 @@ class Text:
 
 
 @dataclass(frozen=True)
+class Name(Text):
+    """The name of a directory: letters, digits, ".", "_" and "-", the first a letter or a digit; 100 at most."""
+
+    def accept(self, value: Any) -> str:
+        name = super().accept(value)
+        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{,99}", name):
+            raise ValueError('choose another, such as "my-run_2"')
+        return name
+
+    @property
+    def allowed(self) -> str:
+        return 'the name of a directory: at most 100 letters, digits, ".", "_" and "-", the first a letter or a digit'
+
+
+@dataclass(frozen=True)
 class Texts:
     """A list of non-empty strings, with `words` of these or, with `paths`, import paths; held as a tuple."""
 
@@ -168,6 +192,11 @@ def nearest(given: str, valid: Iterable[str], cutoff: float = 0.6) -> str:
     """The hint "did you mean ...?" with the valid spelling that is nearest to what was given; empty if none is near."""
     near = difflib.get_close_matches(given, list(valid), n=1, cutoff=cutoff)
     return f"did you mean {near[0]}?" if near else ""
+
+
+def shortened(text: str) -> str:
+    """A text as an error shows it: its beginning, where it is long."""
+    return text if len(text) <= SHOWN else f"{text[:SHOWN]}... ({len(text)} characters)"
 
 
 def quoted(value: Any) -> str:

@@ -1,0 +1,154 @@
+"""What keeps the stages of a scene from their end, as far as the scene, the machine and the run directory tell before
+any work: told then, not hours later."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from eddies.io.hdf5 import open_product
+from eddies.io.trajectories import Trajectory
+from eddies.parallel.broadcast import on_first_rank
+from eddies.parallel.communicator import Comm
+from eddies.parallel.slab import SlabDecomposition
+from eddies.pipeline import STAGES
+from eddies.scene.scene import BOX_LENGTH, Scene, SceneError
+from eddies.workflows.foreseen.estimates import expected_step, expected_turbulence, run_time
+from eddies.workflows.ground_truth.frame_counts import check_frames
+
+# Of the direct simulation, of the rollout, and frames of the tracers: at a microsecond each a quarter of an hour, and
+# no step of a flow takes so little.
+MOST_STEPS = 10**9
+# The turnover time at the release of tracers over the one that is foreseen, at most: the flow may have decayed.
+LATER = 3.0
+# Logarithm of the share of the energy below which nothing is left of a flow but round-off.
+SILENCE = -40.0
+# Energy of a flow over the square of [initial] amplitude; and the share of it that the forcing may put in in one step.
+ENERGY = {"random": 1.5, "taylor-green": 1 / 8, "abc": 1.5, "shear-wave": 1 / 4}
+MOST_FORCED = 50
+
+
+def check_feasible(stages: Sequence[str], scene: Scene, comm: Comm) -> None:
+    """Refuse stages of a scene that cannot come to their end; all ranks call it.
+
+    Raises SceneError for what the scene tells, DeviceError where there is no GPU for one that asks for it.
+    """
+    problem = next(problems(stages, scene), None)
+    if problem is not None:
+        raise SceneError(f"{scene.name}: {problem}")
+    if scene.device != "cpu" and {"train", "simulate"} & set(stages):
+        from eddies.particles.devices import prepare_torch  # torch, only here
+        prepare_torch(scene.device, comm)
+
+
+def check_ground_truth(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path) -> None:
+    """Refuse a ground truth that one of these stages cannot work with: of too few frames, or of a flow whose scales
+    vanish; all ranks call it."""
+    with open_product(comm, directory / STAGES["dns"].file, "ground_truth") as file:
+        check_frames(stages, scene, len(Trajectory(file, "tracers").times))
+        if "train" in stages or "simulate" in stages and "model" in scene.simulation.needs:
+            from eddies.workflows.ground_truth.truth import GroundTruth  # torch, only here
+            GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes)).scales
+
+
+def check_places(stages: Sequence[str], comm: Comm, directory: Path) -> None:
+    """Refuse a run directory that cannot be one, or in which something else stands where a stage writes."""
+    def look() -> None:
+        for stage in [STAGES[name] for name in stages]:
+            product = None if stage.product is None else directory / stage.file
+            if product is not None and product.is_dir():
+                raise SceneError(f"{product}: is a directory, and `eddies {stage.name}` writes a file of this name; move "
+                                 "it away, or choose another --output")
+            folder = directory / (stage.checkpoints or "report")
+            if folder.exists() and not folder.is_dir():
+                raise SceneError(f"{folder}: is a file, and `eddies {stage.name}` makes a directory of this name; move "
+                                 "it away, or choose another --output")
+
+    try:
+        on_first_rank(comm, look)
+    except OSError as error:
+        raise SceneError(f"{directory}: cannot be used ({error.strerror}); choose another --output") from None
+
+
+def problems(stages: Sequence[str], scene: Scene) -> Iterator[str]:
+    """What cannot come to its end, in words."""
+    if "dns" in stages:
+        yield from forcing_problems(scene)
+        yield from decay_problems(scene)
+        yield from step_problems(scene)
+    if "simulate" in stages:
+        yield from rollout_problems(scene)
+    if scene.tracers is not None and expected_turbulence(scene) is not None and "dns" in stages:
+        yield from frame_problems(stages, scene)
+
+
+def forcing_problems(scene: Scene) -> Iterator[str]:
+    """A start so weak that one step of the forcing multiplies it: its power is prescribed."""
+    forcing, initial, step = scene.forcing, scene.initial, expected_step(scene)
+    if forcing is None or initial.kind not in ENERGY or step is None:
+        return
+    step = scene.time.step or scene.time.max_step  # the weaker the flow, the longer its step
+    energy, gained = ENERGY[initial.kind] * initial.amplitude**2, forcing.injection_rate * step
+    if gained > MOST_FORCED * energy:
+        least = math.sqrt(gained / MOST_FORCED / ENERGY[initial.kind])
+        yield (f"[initial] amplitude = {initial.amplitude:g}: an energy of {energy:.2g}, of which [forcing] injection_rate "
+               f"= {forcing.injection_rate:g} makes {gained:.2g} in one step of {step:g}, which is unstable; raise "
+               f"amplitude to {least:.2g} or more, or lower injection_rate or [time] max_step")
+
+
+def decay_problems(scene: Scene) -> Iterator[str]:
+    """A flow of which viscosity leaves nothing while the tracers follow it."""
+    turbulence = expected_turbulence(scene)
+    if scene.tracers is None or turbulence is None:
+        return
+    time = scene.tracers.turnovers * turbulence.turnover_time
+    exponent = -2 * scene.flow.viscosity * time  # of the largest modes, |k| = 1
+    if exponent < SILENCE:
+        yield (f"[flow] viscosity = {scene.flow.viscosity:g}: Re_lambda would be {turbulence.reynolds_lambda:.1g}, and "
+               f"of the flow's energy less than exp({exponent:.3g}) would be left after [tracers] turnovers = "
+               f"{scene.tracers.turnovers:g}, a time of {time:.3g}; lower viscosity or turnovers")
+
+
+def step_problems(scene: Scene) -> Iterator[str]:
+    """More steps of the direct simulation, or frames, than any run can take."""
+    expected, span = expected_step(scene), run_time(scene)
+    if expected is not None and span is not None and span > MOST_STEPS * expected[0]:
+        step, limit = expected
+        yield (f"the direct simulation would take {span / step:.1e} steps of {step:.3g}, {limit}, for a time of "
+               f"{span:.3g}, and {MOST_STEPS:.0e} are the most; raise {_step_key(scene, limit)} or shorten "
+               f"{'[time] duration' if scene.tracers is None else '[tracers] or [spin_up] turnovers'}")
+    turbulence, tracers = expected_turbulence(scene), scene.tracers
+    if tracers is not None and turbulence is not None:
+        span = tracers.turnovers * turbulence.turnover_time
+        if span > MOST_STEPS * tracers.frame_interval:
+            yield (f"[tracers] frame_interval = {tracers.frame_interval:g}: {span / tracers.frame_interval:.1e} frames of "
+                   f"{tracers.turnovers:g} turnovers, and {MOST_STEPS:.0e} are the most; raise frame_interval")
+
+
+def _step_key(scene: Scene, limit: str) -> str:
+    if scene.time.step is not None:
+        return "[time] step"
+    return "[time] max_step" if "max_step" in limit else "[time] courant, lower [flow] cells or the speed of the flow,"
+
+
+def rollout_problems(scene: Scene) -> Iterator[str]:
+    """More steps of a rollout than it can take."""
+    settings, turbulence = scene.simulation, expected_turbulence(scene)
+    span = settings.frame_interval  # at the least
+    if turbulence is not None:
+        span = max(span, settings.turnovers * turbulence.turnover_time)
+    if span > MOST_STEPS * settings.step:
+        yield (f"[simulation] step = {settings.step:g}: {span / settings.step:.1e} steps for a time of {span:.3g}, and "
+               f"{MOST_STEPS:.0e} are the most; raise step or lower turnovers")
+
+
+def frame_problems(stages: Sequence[str], scene: Scene) -> Iterator[str]:
+    """Too few frames of the ground truth for the other stages, even if the flow turns over as slowly as it may."""
+    turnovers, turnover_time = scene.tracers.turnovers, expected_turbulence(scene).turnover_time
+    longest = LATER * turnovers * turnover_time
+    frames = max(math.ceil(longest / scene.tracers.frame_interval), 1) + 1
+    try:
+        check_frames(stages, scene, frames)
+    except SceneError as error:
+        yield f"with at most {frames} frames, as is foreseen of [tracers] turnovers = {turnovers:g}: {error}"
