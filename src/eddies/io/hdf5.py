@@ -151,8 +151,8 @@ def read_json(file: h5py.File, name: str) -> dict[str, Any]:
 
 
 def _damaged(file: h5py.File, name: str) -> ProductError:
-    return ProductError(f"{file.filename}: its attribute {name} is not what was written, the file is damaged; delete it "
-                        "and make it again")
+    return ProductError(f"{file.filename}: its attribute {name} is not what was written, the file is damaged; delete "
+                        "it and make it again")
 
 
 def write_attributes(group: h5py.Group, values: Mapping[str, Any]) -> None:
@@ -249,8 +249,8 @@ def _open_checked(path: Path, kind: str | None) -> h5py.File:
         file = h5py.File(path, "r")
     except OSError as error:
         if error.errno in UNREADABLE:
-            raise ProductError(f"{path}: cannot be read: {os.strerror(error.errno)}; change its permissions or those of "
-                               "its directory, or give another path") from None
+            raise ProductError(f"{path}: cannot be read: {os.strerror(error.errno)}; change its permissions or those "
+                               "of its directory, or give another path") from None
         message = f"{path}: damaged or not an HDF5 file ({error}); delete it and make it again"
         raise ProductError(message) from None
     try:

@@ -25,8 +25,8 @@ def find_document(name_or_path: str, built_in: Path, what: str) -> Path:
             return path
         is_directory = path.is_dir()
     except OSError as error:
-        raise SceneError(f"{shortened(name_or_path)}: cannot be read: {error.strerror}; give the path of a TOML file, "
-                         f"or one of {', '.join(names)}") from None
+        raise SceneError(f"{shortened(name_or_path)}: cannot be read: {error.strerror}; give the path of a TOML "
+                         f"file, or one of {', '.join(names)}") from None
     if is_directory:
         raise SceneError(f"{name_or_path}: is a directory, not a {what}; give the path of a TOML file in it")
     hint = f"{nearest(name_or_path, names)} ".lstrip()
@@ -69,8 +69,8 @@ def apply_overrides(document: dict[str, Any], overrides: list[str]) -> set[str]:
         path, equals, value = (part.strip() for part in override.partition("="))
         *outer, last = names = path.split(".")
         if not equals or not value or len(names) > 3 or not all(names):
-            raise SceneError(f"--set {shortened(override)}: must be section.key=value, or key=value outside sections, or "
-                             "section.name.key=value in a section of a section")
+            raise SceneError(f"--set {shortened(override)}: must be section.key=value, or key=value outside "
+                             "sections, or section.name.key=value in a section of a section")
         table = document
         for name in outer:
             table = table.setdefault(name, {})

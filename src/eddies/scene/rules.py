@@ -55,7 +55,7 @@ class Number:
             raise ValueError
         if value not in self.bounds:
             raise ValueError
-        if value and not SMALLEST <= abs(value) <= LARGEST:
+        if value != 0 and not SMALLEST <= abs(float(value)) <= LARGEST:
             raise ValueError(f"numbers of a scene that are not 0 lie between {SMALLEST:g} and {LARGEST:g} in size")
         return float(value)
 
@@ -74,7 +74,7 @@ class Integer:
     def accept(self, value: Any) -> int:
         if isinstance(value, bool) or not isinstance(value, numbers.Integral) or value not in self.bounds:
             raise ValueError
-        if abs(value) > MOST and self.bounds.at_most == math.inf:
+        if abs(int(value)) > MOST and self.bounds.at_most == math.inf:
             raise ValueError(f"whole numbers of a scene are at most {MOST:,}")
         return int(value)
 

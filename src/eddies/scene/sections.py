@@ -83,10 +83,11 @@ class Tracers(Section):
     Once made it holds the filter width in use.
     """
 
-    particles_per_side: int = integer("the number of particles is the cube of this", at_least=2, at_most=MOST_CELLS)
+    particles_per_side: int = integer("the number of particles is the cube of this", at_least=2,
+                                      at_most=MOST_CELLS)
     placement: str = choice("where the particles start", "random", "lattice", default="random")
-    filter_width: float = number("of the Gaussian filter, whose tails meet beyond half the cube; absent: twice the mean "
-                                 "spacing, or half the cube where that is less",
+    filter_width: float = number("of the Gaussian filter, whose tails meet beyond half the cube; absent: twice the "
+                                 "mean spacing, or half the cube where that is less",
                                  default=None, above=0, at_most=BOX_LENGTH / 2)
     interpolation: str = choice("splines from grid to particles", "cubic", "quintic", default="cubic")
     turnovers: float = number("large-eddy turnovers to follow the particles", above=0)

@@ -58,8 +58,8 @@ def check_places(stages: Sequence[str], comm: Comm, directory: Path) -> None:
         for stage in [STAGES[name] for name in stages]:
             product = None if stage.product is None else directory / stage.file
             if product is not None and product.is_dir():
-                raise SceneError(f"{product}: is a directory, and `eddies {stage.name}` writes a file of this name; move "
-                                 "it away, or choose another --output")
+                raise SceneError(f"{product}: is a directory, and `eddies {stage.name}` writes a file of this name; "
+                                 "move it away, or choose another --output")
             folder = directory / (stage.checkpoints or "report")
             if folder.exists() and not folder.is_dir():
                 raise SceneError(f"{folder}: is a file, and `eddies {stage.name}` makes a directory of this name; move "
@@ -92,9 +92,9 @@ def forcing_problems(scene: Scene) -> Iterator[str]:
     energy, gained = ENERGY[initial.kind] * initial.amplitude**2, forcing.injection_rate * step
     if gained > MOST_FORCED * energy:
         least = math.sqrt(gained / MOST_FORCED / ENERGY[initial.kind])
-        yield (f"[initial] amplitude = {initial.amplitude:g}: an energy of {energy:.2g}, of which [forcing] injection_rate "
-               f"= {forcing.injection_rate:g} makes {gained:.2g} in one step of {step:g}, which is unstable; raise "
-               f"amplitude to {least:.2g} or more, or lower injection_rate or [time] max_step")
+        yield (f"[initial] amplitude = {initial.amplitude:g}: an energy of {energy:.2g}, of which [forcing] "
+               f"injection_rate = {forcing.injection_rate:g} makes {gained:.2g} in one step of {step:g}, which is "
+               f"unstable; raise amplitude to {least:.2g} or more, or lower injection_rate or [time] max_step")
 
 
 def decay_problems(scene: Scene) -> Iterator[str]:
@@ -122,8 +122,8 @@ def step_problems(scene: Scene) -> Iterator[str]:
     if tracers is not None and turbulence is not None:
         span = tracers.turnovers * turbulence.turnover_time
         if span > MOST_STEPS * tracers.frame_interval:
-            yield (f"[tracers] frame_interval = {tracers.frame_interval:g}: {span / tracers.frame_interval:.1e} frames of "
-                   f"{tracers.turnovers:g} turnovers, and {MOST_STEPS:.0e} are the most; raise frame_interval")
+            yield (f"[tracers] frame_interval = {tracers.frame_interval:g}: {span / tracers.frame_interval:.1e} frames "
+                   f"in {tracers.turnovers:g} turnovers, and {MOST_STEPS:.0e} are the most; raise frame_interval")
 
 
 def _step_key(scene: Scene, limit: str) -> str:

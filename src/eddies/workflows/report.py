@@ -20,7 +20,8 @@ from eddies.analysis.isotropic_turbulence import StationarySpan
 from eddies.analysis.spectra import energy_spectrum, vorticity
 from eddies.analysis.tracer_statistics import tracer_statistics
 from eddies.io.fields import FieldSeries
-from eddies.io.hdf5 import File, ProductError, in_files, open_product, read_attributes, read_json, read_provenance, read_table
+from eddies.io.hdf5 import (File, ProductError, in_files, open_product, read_attributes, read_json, read_provenance,
+                            read_table)
 from eddies.io.trajectories import Trajectory
 from eddies.parallel.broadcast import on_all_ranks
 from eddies.parallel.communicator import Comm
