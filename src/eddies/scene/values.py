@@ -1,8 +1,8 @@
 """What a section of a scene is: a frozen dataclass whose fields declare their keys.
 
 Every key of a scene is declared once, beside the dataclass field that holds it, by one of the functions `number`,
-`integer`, `integers`, `boolean`, `choice`, `named`, `text`, `directory_name` and `texts`. The declaration carries a line
-on what the key means, which values it accepts, and its default; the reader, the error messages and the written scene
+`integer`, `integers`, `boolean`, `choice`, `named`, `text`, `directory_name` and `texts`. The declaration carries
+a line on what the key means, which values it accepts, and its default; the reader, the error messages and the written scene
 all use that one declaration. It is applied where an object is made, from a TOML file or in a program.
 """
 

@@ -4,6 +4,7 @@ any work: told then, not hours later."""
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -55,14 +56,17 @@ def check_ground_truth(stages: Sequence[str], scene: Scene, comm: Comm, director
 def check_places(stages: Sequence[str], comm: Comm, directory: Path) -> None:
     """Refuse a run directory that cannot be one, or in which something else stands where a stage writes."""
     def look() -> None:
+        if directory.is_dir() and not os.access(directory, os.W_OK | os.X_OK):
+            raise SceneError(f"{directory}: cannot be written; change its permissions, or choose another directory")
         for stage in [STAGES[name] for name in stages]:
-            product = None if stage.product is None else directory / stage.file
-            if product is not None and product.is_dir():
-                raise SceneError(f"{product}: is a directory, and `eddies {stage.name}` writes a file of this name; "
+            product, folder = stage.product and stage.file, stage.checkpoints
+            if product is None:
+                folder = "report"
+            if product is not None and (directory / product).is_dir():
+                raise SceneError(f"{directory / product}: is a directory, and `eddies {stage.name}` writes a file of this name; "
                                  "move it away, or choose another --output")
-            folder = directory / (stage.checkpoints or "report")
-            if folder.exists() and not folder.is_dir():
-                raise SceneError(f"{folder}: is a file, and `eddies {stage.name}` makes a directory of this name; move "
+            if folder is not None and (directory / folder).exists() and not (directory / folder).is_dir():
+                raise SceneError(f"{directory / folder}: is a file, and `eddies {stage.name}` makes a directory of this name; move "
                                  "it away, or choose another --output")
 
     try:
