@@ -56,7 +56,7 @@ def test_provenance_that_is_none(comm, tmp_path, capfd, value):
 @pytest.mark.parametrize("name, value, told", [
     ("kind", 3, "is of kind 3, expected ground_truth: run `eddies dns SCENE` first"),
     ("kind", [1, 2], "is of kind [1 2], expected ground_truth: run `eddies dns SCENE` first"),
-    ("complete", [True, True], "damaged, its attributes cannot be read"), ("complete", "", "unfinished, its writer was"),
+    ("complete", [True, True], "damaged, its attributes cannot be read"), ("complete", "", "unfinished, its writer"),
     ("format", [3, 3], "whose ground truth this version does not read; run `eddies dns` again"),
     ("format", "three", "whose ground truth this version does not read; run `eddies dns` again")], ids=repr)
 def test_attributes_of_another_type(comm, tmp_path, capfd, name, value, told):
@@ -92,7 +92,8 @@ def test_a_directory_in_place_of_a_product(comm, tmp_path, capfd, name, stage):
         told = refused(capfd, comm, command, "tiny", "--output", tmp_path)
         assert comm.rank > 0 or f"{tmp_path / name}: is a directory, and `eddies {stage}` writes a file" in told
     told = refused(capfd, comm, "report", tmp_path)
-    assert comm.rank > 0 or f"{tmp_path / name}: is a directory, not a file; move it away, then run `eddies {stage}" in told
+    again = f"{tmp_path / name}: is a directory, not a file; move it away, then run `eddies {stage} SCENE` first"
+    assert comm.rank > 0 or again in told
     assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
@@ -126,7 +127,8 @@ LONG = 300 * "o"
 
 @pytest.mark.mpi(1, 2)
 @pytest.mark.parametrize("command, told", [
-    (["run", "tiny", "--output", ""], "an empty text is no directory"), (["report", ""], "an empty text is no directory"),
+    (["run", "tiny", "--output", ""], "an empty text is no directory"),
+    (["report", ""], "an empty text is no directory"),
     (["dns", "tiny", "--output", LONG], "cannot be used as a directory: File name too long; choose another"),
     (["export", "", "--output", "x"], "an empty text is no directory"),
     (["export", "runs", "--output", LONG], "cannot be used as a directory: File name too long"),
@@ -155,7 +157,8 @@ def test_a_run_directory_of_a_program_that_is_too_long(comm, tmp_path):
 @pytest.mark.mpi(1)
 @pytest.mark.parametrize("content, told", [
     (b"\xff\xfe\x00", "cannot be read: 'utf-8' codec can't decode byte 0xff"),
-    (b"\x00", "not TOML: "), (b"", "[flow]: this section is missing"), (b"\x89HDF\r\n\x1a\n", "cannot be read: 'utf-8'")])
+    (b"\x00", "not TOML: "), (b"", "[flow]: this section is missing"),
+    (b"\x89HDF\r\n\x1a\n", "cannot be read: 'utf-8'")])
 def test_files_that_are_no_scenes(comm, tmp_path, capfd, content, told):
     (tmp_path / "case.toml").write_bytes(content)
     assert f"{tmp_path / 'case.toml'}: {told}" in refused(capfd, comm, "check", tmp_path / "case.toml")
@@ -190,8 +193,8 @@ def test_a_rank_may_have_a_particle_or_none(comm, tmp_path):
 
 
 def as_nobody(commands):
-    """Exit codes and the error output of commands that are run by a user without rights of root, who need not be allowed
-    to read this checkout: all modules are loaded before."""
+    """Exit codes and the error output of commands that are run by a user without rights of root, who need not be
+    allowed to read this checkout: all modules are loaded before."""
     code = ("import encodings.utf_8_sig, json, os, sys, numpy.random, eddies.stages, eddies.workflows.dns, "
             "eddies.workflows.export, eddies.workflows.report, eddies.cli\n"
             f"os.getuid() or (os.setgroups([]), os.setgid({NOBODY}), os.setuid({NOBODY}))\n"
@@ -294,7 +297,7 @@ def test_a_flow_that_overflows_is_told_without_the_warnings_of_numpy(comm, tmp_p
 @pytest.mark.mpi(1)
 def test_a_supersonic_flow_is_told_as_such(comm, tmp_path, capfd):
     told = refused(capfd, comm, "dns", "tiny", "--set", "flow.sound_speed=0.5", "--output", tmp_path)
-    assert "The flow is supersonic, its turbulent Mach number was 4.3, and shocks are not resolved: raise sound_" in told
+    assert "The flow is supersonic, its turbulent Mach number was 4.3, and shocks are not resolved: raise" in told
     assert not list(tmp_path.rglob("*.partial"))
 
 

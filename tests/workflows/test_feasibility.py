@@ -66,7 +66,7 @@ def test_a_gpu_that_is_not_there(comm, tmp_path, monkeypatch, capfd, command):
 
 @pytest.mark.mpi(1, 2)
 def test_a_ground_truth_with_too_few_frames_or_without_motion(comm, tmp_path):
-    from eddies.io.hdf5 import ProductError, open_product
+    from eddies.io.hdf5 import ProductError
     from eddies.particles.reference_scales import ScaleError
     from eddies.workflows.feasibility import check_ground_truth
     scene = load_scene("tiny", ["tracers.field_every=5"])
@@ -74,7 +74,7 @@ def test_a_ground_truth_with_too_few_frames_or_without_motion(comm, tmp_path):
         check_ground_truth(["train"], scene, comm, tmp_path)
     write_ground_truth(comm, tmp_path, frames=30)
     check_ground_truth(["train", "simulate"], scene, comm, tmp_path)
-    with pytest.raises(SceneError, match="after frame 14 of 30 no filtered field is followed .*, 0.5 later; lower start"):
+    with pytest.raises(SceneError, match="after frame 14 of 30 no filtered field is followed .*, 0.5 later; lower"):
         coarse = dataclasses.replace(scene.simulation, frame_interval=0.5)
         check_ground_truth(["simulate"], dataclasses.replace(scene, simulation=coarse), comm, tmp_path)
     short = dataclasses.replace(scene, training=dataclasses.replace(scene.training, window=0.1))

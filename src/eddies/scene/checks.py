@@ -115,8 +115,8 @@ def tracer_problems(scene: Scene) -> Iterator[str]:
     """Stored fields no finer than the simulation; a flow that moves, and for a model one that changes."""
     tracers, initial = scene.tracers, scene.initial
     if tracers and initial.kind == "sound-wave":
-        yield ('[initial] kind = "sound-wave": starts from rest, and [tracers] are followed for turnovers of a flow that '
-               "moves; choose another kind, or remove [tracers]")
+        yield ('[initial] kind = "sound-wave": starts from rest, and [tracers] are followed for turnovers of a flow '
+               "that moves; choose another kind, or remove [tracers]")
     if scene.model and initial.kind == "shear-wave" and scene.flow.viscosity == 0 and scene.forcing is None:
         yield ('[initial] kind = "shear-wave": without viscosity nothing in it is accelerated, and a model is made '
                "dimensionless by the acceleration; choose another kind, or raise [flow] viscosity")

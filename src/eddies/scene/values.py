@@ -2,8 +2,8 @@
 
 Every key of a scene is declared once, beside the dataclass field that holds it, by one of the functions `number`,
 `integer`, `integers`, `boolean`, `choice`, `named`, `text`, `directory_name` and `texts`. The declaration carries
-a line on what the key means, which values it accepts, and its default; the reader, the error messages and the written scene
-all use that one declaration. It is applied where an object is made, from a TOML file or in a program.
+a line on what the key means, which values it accepts, and its default; the reader, the error messages and the written
+scene all use that one declaration. It is applied where an object is made, from a TOML file or in a program.
 """
 
 import dataclasses

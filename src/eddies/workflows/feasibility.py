@@ -59,15 +59,13 @@ def check_places(stages: Sequence[str], comm: Comm, directory: Path) -> None:
         if directory.is_dir() and not os.access(directory, os.W_OK | os.X_OK):
             raise SceneError(f"{directory}: cannot be written; change its permissions, or choose another directory")
         for stage in [STAGES[name] for name in stages]:
-            product, folder = stage.product and stage.file, stage.checkpoints
-            if product is None:
-                folder = "report"
-            if product is not None and (directory / product).is_dir():
-                raise SceneError(f"{directory / product}: is a directory, and `eddies {stage.name}` writes a file of this name; "
-                                 "move it away, or choose another --output")
+            file, folder = (stage.file, stage.checkpoints) if stage.product is not None else (None, "report")
+            if file is not None and (directory / file).is_dir():
+                raise SceneError(f"{directory / file}: is a directory, and `eddies {stage.name}` writes a file of this "
+                                 "name; move it away, or choose another --output")
             if folder is not None and (directory / folder).exists() and not (directory / folder).is_dir():
-                raise SceneError(f"{directory / folder}: is a file, and `eddies {stage.name}` makes a directory of this name; move "
-                                 "it away, or choose another --output")
+                raise SceneError(f"{directory / folder}: is a file, and `eddies {stage.name}` makes a directory of "
+                                 "this name; move it away, or choose another --output")
 
     try:
         on_first_rank(comm, look)
