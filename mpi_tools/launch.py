@@ -9,6 +9,7 @@ stay as they are.
 """
 
 import argparse
+import contextlib
 import math
 import os
 import shutil
@@ -108,6 +109,9 @@ class ErrorOutput:
             return line
         self._frame.append(line)
         first, *others = self._frame
+        if len(others) == 1 and line.rstrip() == RULE:  # the end of another frame, and the begin of this
+            self._frame, self._said = [line], True
+            return first
         if first.rstrip() != RULE or others and not others[0].startswith(NOTICES):
             passed, self._frame, self._said = b"".join(self._frame), [], True
             return passed
@@ -119,9 +123,14 @@ class ErrorOutput:
 def pass_errors_on(job: subprocess.Popen) -> None:
     """Write a job's error output to this one's, until it ends."""
     output = ErrorOutput()
-    while content := os.read(job.stderr.fileno(), 2**16):
-        os.write(sys.stderr.fileno(), output.pass_on(content))
-    os.write(sys.stderr.fileno(), output.rest())
+    with os.fdopen(os.dup(sys.stderr.fileno()), "wb", buffering=0) as errors:
+        def write(content: bytes) -> None:
+            with contextlib.suppress(OSError):  # what cannot be written must not keep the job waiting
+                errors.write(content)
+
+        while content := os.read(job.stderr.fileno(), 2**16):
+            write(output.pass_on(content))
+        write(output.rest())
 
 
 def run_job(line: list[str], environment: dict[str, str]) -> int:

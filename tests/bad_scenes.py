@@ -151,6 +151,9 @@ BAD_OVERRIDES = [
     ("flow.viscosity=1e300", "[flow] viscosity = 1e+300: must be a number at least 0 (kinematic viscosity); numbers of "
      "a scene that are not 0 lie between 1e-15 and 1e+15 in size"),
     ("flow.viscosity=1e-300", "lie between 1e-15 and 1e+15"),
+    ("flow.viscosity=1" + 400 * "0", "0... (401 characters): must be a number at least 0 (kinematic viscosity)"),
+    ("flow.cells=0x" + 5000 * "f", "ff... (5002 characters): must be a whole number at least 8 and at most 65536"),
+    ("seed=0x" + 5000 * "f", "ff... (5002 characters): must be a whole number at least 0 and at most 1e+18"),
     ("flow.viscosity=inf", "[flow] viscosity = inf: must be a number at least 0"),
     ("flow.viscosity=[1]", "[flow] viscosity = [1]: must be a number at least 0"),
     ("flow.viscosity={a = 1}", "[flow] viscosity = {a = 1}: must be a number at least 0"),

@@ -250,9 +250,11 @@ def compare_command(options: argparse.Namespace, comm: Comm, signals: list[int])
     from eddies.parallel.stop import StopRequest
     from eddies.scene.comparison import load_comparison
     from eddies.stages import check_ranks, check_stop_file, run_stages
+    from eddies.workflows.feasibility import check_feasible
     comparison = load_comparison(options.comparison, options.run)
     for scene in comparison.scenes.values():
         check_ranks(scene.stages, scene, comm)
+        check_feasible([stage for stage in scene.stages if stage != "dns"], scene, comm)  # the ground truth is there
     directory = options.output or Path("runs") / comparison.name
     check_stop_file(comm, directory)
     stop = StopRequest(comm, signals, directory / "STOP", 60 * options.max_minutes, 60 * options.checkpoint_minutes)
@@ -269,8 +271,9 @@ def export_command(options: argparse.Namespace, comm: Comm) -> None:
 
 def check_command(options: argparse.Namespace, comm: Comm) -> None:
     """Derived numbers and estimates of a scene."""
+    from eddies.workflows.feasibility import check_feasible
     scene = load_scene(options.scene, options.overrides)
-    import_module("eddies.workflows.feasibility").check_feasible(scene.stages, scene, comm)
+    check_feasible(scene.stages, scene, comm)
     import_module("eddies.workflows.check").run(scene, comm, options.json)
 
 

@@ -18,8 +18,8 @@ from typing import Any
 IMPORT_PATH = 'the import path "module:name" of your own'
 # Numbers of a scene: beyond these squares and cubes of them overflow, or a run has no end.
 SMALLEST, LARGEST, MOST = 1e-15, 1e15, 10**9
-# Characters of a value that an error shows.
-SHOWN = 60
+# Characters of a value that an error shows, and bits of a whole number that Python writes with decimals.
+SHOWN, MOST_BITS = 60, 10_000
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,11 @@ class Number:
     def accept(self, value: Any) -> float | str:
         if isinstance(value, str) and value in self.words:
             return value
-        if isinstance(value, bool) or not isinstance(value, numbers.Real) or not math.isfinite(value):
+        try:
+            finite = not isinstance(value, bool) and isinstance(value, numbers.Real) and math.isfinite(value)
+        except OverflowError:  # a whole number of hundreds of digits
+            finite = False
+        if not finite:
             raise ValueError
         if value not in self.bounds:
             raise ValueError
@@ -207,4 +211,6 @@ def quoted(value: Any) -> str:
         return "[" + ", ".join(map(quoted, value)) + "]"
     if isinstance(value, (bool, str)):
         return json.dumps(value, ensure_ascii=False)
+    if isinstance(value, int) and value.bit_length() > MOST_BITS:
+        return hex(value)
     return repr(value) if isinstance(value, (int, float)) else str(value)

@@ -53,7 +53,7 @@ class Section:
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):  # type: ignore[arg-type]
             value = getattr(self, field.name)
-            if value == ABSENT and field.default is None:
+            if isinstance(value, str) and value == ABSENT and field.default is None:
                 object.__setattr__(self, field.name, None)
             elif not (value is None and field.default is None):
                 object.__setattr__(self, field.name, _accepted(type(self), field, value))

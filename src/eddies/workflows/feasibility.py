@@ -23,6 +23,8 @@ from eddies.workflows.ground_truth.frame_counts import check_frames
 MOST_STEPS = 10**9
 # The turnover time at the release of tracers over the one that is foreseen, at most: the flow may have decayed.
 LATER = 3.0
+# Re_lambda from which on the turnover time of a forced flow is as foreseen, but for that factor.
+TURBULENT = 20.0
 # Logarithm of the share of the energy below which nothing is left of a flow but round-off.
 SILENCE = -40.0
 # Energy of a flow over the square of [initial] amplitude; and the share of it that the forcing may put in in one step.
@@ -81,7 +83,7 @@ def problems(stages: Sequence[str], scene: Scene) -> Iterator[str]:
         yield from step_problems(scene)
     if "simulate" in stages:
         yield from rollout_problems(scene)
-    if scene.tracers is not None and expected_turbulence(scene) is not None and "dns" in stages:
+    if "dns" in stages and scene.tracers is not None:
         yield from frame_problems(stages, scene)
 
 
@@ -146,9 +148,15 @@ def rollout_problems(scene: Scene) -> Iterator[str]:
 
 
 def frame_problems(stages: Sequence[str], scene: Scene) -> Iterator[str]:
-    """Too few frames of the ground truth for the other stages, even if the flow turns over as slowly as it may."""
-    turnovers, turnover_time = scene.tracers.turnovers, expected_turbulence(scene).turnover_time
-    longest = LATER * turnovers * turnover_time
+    """Too few frames of the ground truth for the other stages, even if the flow turns over as slowly as it may.
+
+    Not of a flow that decays before the tracers start, or that is hardly turbulent, whose turnover time may be any.
+    """
+    turbulence, turnovers = expected_turbulence(scene), scene.tracers.turnovers
+    decays = scene.spin_up is not None and scene.forcing is None
+    if turbulence is None or decays or turbulence.reynolds_lambda < TURBULENT:
+        return
+    longest = LATER * turnovers * turbulence.turnover_time
     frames = max(math.ceil(longest / scene.tracers.frame_interval), 1) + 1
     try:
         check_frames(stages, scene, frames)
