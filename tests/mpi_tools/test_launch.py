@@ -59,14 +59,14 @@ def test_exit_code_is_that_of_the_ranks():
 
 
 RULE = 74 * "-" + "\n"
-NOTICE = (f"{RULE}Primary job  terminated normally, but 1 process returned\na non-zero exit code. Per user-direction, the "
-          f"job has been aborted.\n{RULE}{RULE}mpirun detected that one or more processes exited with non-zero status, "
+NOTICE = (f"{RULE}Primary job  terminated normally, but 1 process returned\na non-zero exit code. Per user-direction, "
+          f"the job has been aborted.\n{RULE}{RULE}mpirun detected that one or more processes exited with non-zero status, "
           "thus causing\nthe job to be terminated. The first process to do so was:\n\n  Process name: [[1,1],0]\n"
           f"  Exit code:    CODE\n{RULE}")
 
 
 @pytest.mark.parametrize("before, code, after", [
-    ("eddies: error: no such reactor\n", 2, ""), ("eddies: stopped\n", 75, ""), ("rank 1: eddies: interrupted\n", 130, ""),
+    ("eddies: error: no such reactor\n", 2, ""), ("eddies: stopped\n", 75, ""), ("eddies: interrupted\n", 130, ""),
     ("eddies: error: no such reactor\n", 2, "said later\n"), ("no line", 2, ""), (f"{RULE}mine\n{RULE}", 2, "")])
 def test_notices_of_what_ranks_have_said_are_left_out(before, code, after):
     """However the bytes are cut, and all else is passed on as it is."""
