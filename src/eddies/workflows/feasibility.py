@@ -13,6 +13,7 @@ from eddies.io.trajectories import Trajectory
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm
 from eddies.parallel.slab import SlabDecomposition
+from eddies.particles.reference_scales import ScaleError
 from eddies.pipeline import STAGES
 from eddies.scene.scene import BOX_LENGTH, Scene, SceneError
 from eddies.workflows.foreseen.estimates import expected_step, expected_turbulence, run_time
@@ -48,11 +49,15 @@ def check_feasible(stages: Sequence[str], scene: Scene, comm: Comm) -> None:
 def check_ground_truth(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path) -> None:
     """Refuse a ground truth that one of these stages cannot work with: of too few frames, or of a flow whose scales
     vanish; all ranks call it."""
-    with open_product(comm, directory / STAGES["dns"].file, "ground_truth") as file:
+    path = directory / STAGES["dns"].file
+    with open_product(comm, path, "ground_truth") as file:
         check_frames(stages, scene, len(Trajectory(file, "tracers").times))
         if "train" in stages or "simulate" in stages and "model" in scene.simulation.needs:
             from eddies.workflows.ground_truth.truth import GroundTruth  # torch, only here
-            GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes)).scales
+            try:
+                GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes)).scales
+            except ScaleError as error:
+                raise SceneError(f"{path}: {error}") from None
 
 
 def check_places(stages: Sequence[str], comm: Comm, directory: Path) -> None:
@@ -89,8 +94,8 @@ def problems(stages: Sequence[str], scene: Scene) -> Iterator[str]:
 
 def forcing_problems(scene: Scene) -> Iterator[str]:
     """A start so weak that one step of the forcing multiplies it: its power is prescribed."""
-    forcing, initial, step = scene.forcing, scene.initial, expected_step(scene)
-    if forcing is None or initial.kind not in ENERGY or step is None:
+    forcing, initial = scene.forcing, scene.initial
+    if forcing is None or initial.kind not in ENERGY:
         return
     step = scene.time.step or scene.time.max_step  # the weaker the flow, the longer its step
     energy, gained = ENERGY[initial.kind] * initial.amplitude**2, forcing.injection_rate * step

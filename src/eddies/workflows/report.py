@@ -68,8 +68,9 @@ def run(directory: str | Path, comm: Comm) -> None:
 
     Raises ProductError if the directory holds no product, or a damaged one, or the report cannot be written.
     """
-    directory, alone = Path(directory), comm.Split(comm.rank)
+    directory = Path(directory)
     check_places(("report",), comm, directory)
+    alone = comm.Split(comm.rank)
     try:
         record = in_files(comm, directory, lambda: _survey(directory, alone))
         own = on_all_ranks(comm, lambda: in_files(alone, directory,
