@@ -9,14 +9,22 @@ stay as they are.
 """
 
 import argparse
+import contextlib
 import math
 import os
 import shutil
 import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
+# How mpirun frames its notices, how those begin that tell of a rank that has not ended with 0, and the exit codes of
+# which the ranks have said why: bad input, stopped, interrupted.
+RULE = b"-" * 74
+NOTICES = (b"Primary job  terminated normally", b"mpirun detected that one or more processes exited with non-zero",
+           b"prterun detected that one or more processes exited with non-zero")
+EXPLAINED = (2, 75, 130)
 CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")
 
 
@@ -76,12 +84,61 @@ def mpirun_command(ranks: int, command: list[str]) -> list[str]:
     return [mpirun, "-n", str(ranks), *command]
 
 
+class ErrorOutput:
+    """The error output of a job without the notices of mpirun that repeat what the ranks have said themselves."""
+
+    def __init__(self) -> None:
+        self._line, self._frame, self._held, self._said, self._midway = b"", [], b"", False, False
+
+    def pass_on(self, content: bytes) -> bytes:
+        """What of the next bytes is to be written now: all but a line that may frame a notice, and notices."""
+        *lines, self._line = (self._line + content).split(b"\n")
+        passed = b"".join(self._pass_line(line + b"\n") for line in lines)
+        if self._line and not self._frame and not RULE.startswith(self._line):
+            passed, self._line, self._midway, self._said = passed + self._line, b"", True, True
+        return passed
+
+    def rest(self) -> bytes:
+        """What is left at the end: notices too, if the ranks have said nothing or their exit code tells of a fault."""
+        explained = self._said and any(f"Exit code:    {code}\n".encode() in self._held for code in EXPLAINED)
+        return (b"" if explained else self._held) + b"".join(self._frame) + self._line
+
+    def _pass_line(self, line: bytes) -> bytes:
+        if self._midway:  # the end of a line whose beginning has been passed on
+            self._midway = False
+            return line
+        self._frame.append(line)
+        first, *others = self._frame
+        if len(others) == 1 and line.rstrip() == RULE:  # the end of another frame, and the begin of this
+            self._frame, self._said = [line], True
+            return first
+        if first.rstrip() != RULE or others and not others[0].startswith(NOTICES):
+            passed, self._frame, self._said = b"".join(self._frame), [], True
+            return passed
+        if others[1:] and line.rstrip() == RULE:
+            self._held, self._frame = self._held + b"".join(self._frame), []
+        return b""
+
+
+def pass_errors_on(job: subprocess.Popen) -> None:
+    """Write a job's error output to this one's, until it ends."""
+    output = ErrorOutput()
+    with os.fdopen(os.dup(sys.stderr.fileno()), "wb", buffering=0) as errors:
+        def write(content: bytes) -> None:
+            with contextlib.suppress(OSError):  # what cannot be written must not keep the job waiting
+                errors.write(content)
+
+        while content := os.read(job.stderr.fileno(), 2**16):
+            write(output.pass_on(content))
+        write(output.rest())
+
+
 def run_job(line: list[str], environment: dict[str, str]) -> int:
     """Run mpirun to its end; its exit code, or 128 and the number of the signal that ended it.
 
     mpirun kills its ranks soon after a SIGTERM and returns a code of its own; SIGUSR1 it hands on, and no more.
     """
-    terminations = []
+    terminations, interrupts = [], []
 
     def hand_on(number: int, frame: object) -> None:
         terminations.extend([number] if number == signal.SIGTERM else [])
@@ -90,14 +147,20 @@ def run_job(line: list[str], environment: dict[str, str]) -> int:
     signals = {signal.SIGTERM, signal.SIGUSR1}
     # Held back until there is a job to hand them on to.
     signal.pthread_sigmask(signal.SIG_BLOCK, signals)
-    job = subprocess.Popen(line, env=environment,
+    job = subprocess.Popen(line, env=environment, stderr=subprocess.PIPE,
                            preexec_fn=lambda: signal.pthread_sigmask(signal.SIG_UNBLOCK, signals))
     for number in signals:
         signal.signal(number, hand_on)
-    # The keyboard interrupts mpirun as well, and the launcher waits for it.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # The keyboard interrupts mpirun as well, which ends the ranks by SIGTERM, and the launcher waits for it.
+    signal.signal(signal.SIGINT, lambda number, frame: interrupts.append(number))
     signal.pthread_sigmask(signal.SIG_UNBLOCK, signals)
+    errors = threading.Thread(target=pass_errors_on, args=(job,), daemon=True)
+    errors.start()
     code = job.wait()
+    errors.join()
+    if interrupts and code != 0:
+        print("interrupted", file=sys.stderr)
+        return 128 + signal.SIGINT
     return code if code >= 0 else 128 - code
 
 

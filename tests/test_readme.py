@@ -141,7 +141,7 @@ def allowed(rule):
     noun = nouns.get(type(rule), "text")
     symbols = {"above": ">", "at_least": "≥", "below": "<", "at_most": "≤"}
     bounds = getattr(rule, "bounds", Bounds())
-    limits = [f"{symbols[field.name]} {'2π' if value == BOX_LENGTH else format(value, 'g')}"
+    limits = [f"{symbols[field.name]} {'π' if value == BOX_LENGTH / 2 else format(value, 'g')}"
               for field in dataclasses.fields(bounds)
               if (value := getattr(bounds, field.name)) != field.default]
     return " or ".join([" ".join([noun, " and ".join(limits)]).strip(), *words])

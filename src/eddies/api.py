@@ -28,7 +28,9 @@ CHECKPOINT_SECONDS = 600.0
 def check(scene: Scene | str | Path, *, comm: Comm | None = None) -> None:
     """Log what a scene amounts to: resolution, memory, ranks and time. Writes nothing."""
     with _job(comm) as comm:
-        import_module("eddies.workflows.check").run(_scene(scene), comm)
+        scene = _scene(scene)
+        import_module("eddies.workflows.feasibility").check_feasible(scene.stages, scene, comm)
+        import_module("eddies.workflows.check").run(scene, comm)
 
 
 def run(scene: Scene | str | Path, *, output: str | Path | None = None, resume: bool = False,

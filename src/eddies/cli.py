@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 import eddies
 from eddies.errors import UserError
-from eddies.logs import configure_logging
+from eddies.logs import Output, configure_logging, show_warnings
 from eddies.pipeline import STAGES
 from eddies.scene.scene import SceneError, builtin_scenes, load_scene
 
@@ -26,12 +26,37 @@ if TYPE_CHECKING:
     from eddies.parallel.communicator import Comm
 
 BAD_INPUT = 2
+INTERRUPTED = 128 + signal.SIGINT
 STOPPED = 75  # EX_TEMPFAIL: the same command with --resume goes on
 STOP_SIGNALS = (signal.SIGUSR1, signal.SIGTERM)
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run one command; returns the exit code: 0 done, 2 bad input, 75 asked to stop, 1 any other error."""
+    """Run one command; returns the exit code: 0 done, 2 bad input, 75 asked to stop, 130 interrupted, 1 any other
+    error."""
+    output, usage = Output(), False
+    show_warnings()
+    try:
+        code = run(arguments)
+    except SystemExit as ended:  # of the parser, which has shown help or what is wrong
+        code, usage = int(ended.code or 0), True
+    except KeyboardInterrupt:  # so early that no rank waits for another
+        sys.stderr.write("eddies: interrupted\n")
+        code = INTERRUPTED
+    finally:
+        refusal = output.end()
+    if refusal is not None:
+        with contextlib.suppress(OSError):
+            sys.stderr.write(f"eddies: error: {refusal}\n")
+            sys.stderr.flush()
+        code = code or BAD_INPUT
+    if usage:
+        sys.exit(code)
+    return code
+
+
+def run(arguments: list[str] | None) -> int:
+    """Run one command, all ranks together; returns the exit code."""
     # Before numpy and torch are imported: they would start a thread for every core, in every rank.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     signals = catch_signals()  # first of all: MPI takes a second to start
@@ -49,8 +74,6 @@ def main(arguments: list[str] | None = None) -> int:
             release_signals(signals)
             options.command(options, comm)
         return 0
-    except KeyboardInterrupt:
-        return 128 + signal.SIGINT
     except Stopped as stopped:
         if comm.rank == 0:
             with contextlib.suppress(OSError):
@@ -58,7 +81,7 @@ def main(arguments: list[str] | None = None) -> int:
                 sys.stderr.write(f"eddies: {stopped}\n")
                 sys.stderr.flush()
         return STOPPED
-    except Exception as error:
+    except (Exception, KeyboardInterrupt) as error:
         return end_with_error(error, exit_comm)
 
 
@@ -87,17 +110,22 @@ def release_signals(received: list[int]) -> None:
         signal.raise_signal(number)
 
 
-def end_with_error(error: Exception, comm: Comm) -> int:
+def end_with_error(error: BaseException, comm: Comm) -> int:
     """Report an error once and end on all ranks, even those that do not know of it; returns the exit code.
 
     A mistake in the input is met by all ranks: rank 0 says so in a line. An error that stays on some ranks,
     or is none of the user's, ends the job by MPI_Abort, because the other ranks may wait for this one for
-    ever; so does a file that HDF5 could not write, as it crashes in an orderly end.
+    ever; so does a file that HDF5 could not write, as it crashes in an orderly end, and an interrupt that not all ranks
+    get; a second one ends the process at once.
     """
     from eddies.io.unfinished import writing_failed
+    interrupted = isinstance(error, KeyboardInterrupt)
+    if interrupted:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
     from eddies.parallel.rendezvous import all_arrive
-    mistake = isinstance(error, UserError)
-    text = f"eddies: error: {error}\n" if mistake else "".join(traceback.format_exception(error))
+    mistake = isinstance(error, UserError) or interrupted
+    text = "".join(traceback.format_exception(error)) if not mistake else (
+        "eddies: interrupted\n" if interrupted else f"eddies: error: {error}\n")
     together = (mistake or comm.size == 1) and all_arrive(comm)
     if not together or comm.rank == 0:
         prefix = f"rank {comm.rank}: " if not together else ""
@@ -105,7 +133,7 @@ def end_with_error(error: Exception, comm: Comm) -> int:
             sys.stdout.flush()
             sys.stderr.write("".join(f"{prefix}{line}" for line in text.splitlines(keepends=True)))
             sys.stderr.flush()
-    code = BAD_INPUT if mistake else 1
+    code = INTERRUPTED if interrupted else BAD_INPUT if mistake else 1
     broken = writing_failed()
     if broken and together:
         all_arrive(comm)  # once rank 0 has told it
@@ -140,21 +168,21 @@ def build_parser() -> argparse.ArgumentParser:
                         "newest checkpoint of the direct simulation or of the training")
         command.set_defaults(command=run_command, stage=name)
     report = commands.add_parser("report", help=STAGES["report"].about)
-    report.add_argument("run", type=Path, metavar="RUN", help="a run directory, such as runs/tiny")
+    report.add_argument("run", type=directory, metavar="RUN", help="a run directory, such as runs/tiny")
     report.set_defaults(command=report_command)
     compare = commands.add_parser("compare", help="error against run time of variants of a scene")
     compare.add_argument("comparison", metavar="COMPARISON",
                          help="name of a built-in comparison, or path of a TOML file")
-    compare.add_argument("--run", type=Path, metavar="DIR",
+    compare.add_argument("--run", type=directory, metavar="DIR",
                          help="run directory with the ground truth (default: the comparison's, or runs/BASE)")
     add_job_options(compare, "directory of the comparison (default: runs/NAME)",
                     "keep the rollouts that are complete and were made with the same settings on as many ranks, and go "
                     "on from the newest checkpoint of a training")
     compare.set_defaults(command=compare_command)
     export = commands.add_parser("export", help="fields and particles of a run directory, for ParaView")
-    export.add_argument("run", type=Path, metavar="RUN", help="a run directory, such as runs/tiny")
+    export.add_argument("run", type=directory, metavar="RUN", help="a run directory, such as runs/tiny")
     export.add_argument("--format", choices=["vtkhdf"], default="vtkhdf", help="format of the files (default: vtkhdf)")
-    export.add_argument("--output", type=Path, metavar="DIR", help="where the files go (default: RUN/vtkhdf)")
+    export.add_argument("--output", type=directory, metavar="DIR", help="where the files go (default: RUN/vtkhdf)")
     export.set_defaults(command=export_command)
     check = commands.add_parser("check", help="derived numbers, memory, ranks and time; writes nothing")
     add_scene_options(check)
@@ -164,6 +192,22 @@ def build_parser() -> argparse.ArgumentParser:
     scenes.add_argument("scene", nargs="?", metavar="SCENE", help="print this scene, defaults included")
     scenes.set_defaults(command=scenes_command)
     return parser
+
+
+class OptionError(UserError):
+    """An option of the command line that cannot be meant."""
+
+
+def directory(text: str) -> Path:
+    """A directory of the command line, there or not."""
+    if not text:
+        raise OptionError("an empty text is no directory, and would mean the one that you are in; give its name (. for "
+                          "the one that you are in)")
+    try:
+        Path(text).exists()
+    except OSError as error:
+        raise OptionError(f"{text[:60]}...: cannot be used as a directory: {error.strerror}; choose another") from None
+    return Path(text)
 
 
 def positive(text: str) -> float:
@@ -183,7 +227,7 @@ def add_scene_options(parser: argparse.ArgumentParser) -> None:
 
 def add_job_options(parser: argparse.ArgumentParser, output: str, resume: str) -> None:
     """Options of commands that run for long: where the products go, what is kept, and when to stop."""
-    parser.add_argument("--output", type=Path, metavar="DIR", help=output)
+    parser.add_argument("--output", type=directory, metavar="DIR", help=output)
     parser.add_argument("--resume", action="store_true", help=resume)
     parser.add_argument("--checkpoint-minutes", type=positive, default=10.0, metavar="M",
                         help="wall time between two checkpoints of the direct simulation or a training (default: 10)")
@@ -215,9 +259,11 @@ def compare_command(options: argparse.Namespace, comm: Comm, signals: list[int])
     from eddies.parallel.stop import StopRequest
     from eddies.scene.comparison import load_comparison
     from eddies.stages import check_ranks, check_stop_file, run_stages
+    from eddies.workflows.feasibility import check_feasible
     comparison = load_comparison(options.comparison, options.run)
     for scene in comparison.scenes.values():
         check_ranks(scene.stages, scene, comm)
+        check_feasible([stage for stage in scene.stages if stage != "dns"], scene, comm)  # the ground truth is there
     directory = options.output or Path("runs") / comparison.name
     check_stop_file(comm, directory)
     stop = StopRequest(comm, signals, directory / "STOP", 60 * options.max_minutes, 60 * options.checkpoint_minutes)
@@ -234,7 +280,9 @@ def export_command(options: argparse.Namespace, comm: Comm) -> None:
 
 def check_command(options: argparse.Namespace, comm: Comm) -> None:
     """Derived numbers and estimates of a scene."""
+    from eddies.workflows.feasibility import check_feasible
     scene = load_scene(options.scene, options.overrides)
+    check_feasible(scene.stages, scene, comm)
     import_module("eddies.workflows.check").run(scene, comm, options.json)
 
 

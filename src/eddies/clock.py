@@ -9,6 +9,9 @@ from collections.abc import Callable
 
 log = logging.getLogger("eddies")
 
+YEAR = 365.25 * 86400.0  # seconds
+YEARS = 10  # from which on nobody wants to know the minutes
+
 
 class Clock:
     """Counts steps and simulated time, up to `end` or until it is stopped."""
@@ -83,7 +86,9 @@ class ProgressLine:
 
 
 def duration(seconds: float) -> str:
-    """Seconds in words a person reads: 42 s, 3 min 20 s, 2 h 05 min."""
+    """Seconds in words a person reads: 42 s, 3 min 20 s, 2 h 05 min, 1.2e+30 years."""
+    if seconds >= YEARS * YEAR:
+        return f"{seconds / YEAR:.2g} years"
     seconds = max(int(round(seconds)), 0)
     if seconds < 60:
         return f"{seconds} s"

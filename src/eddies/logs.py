@@ -1,8 +1,13 @@
-"""Log lines of a parallel run: rank 0 reports, the other ranks only warn and say which rank they are."""
+"""Log lines of a parallel run: rank 0 reports, the other ranks only warn and say which rank they are. And the streams
+on which all that a command says goes out."""
 
 import logging
 import os
 import sys
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 from eddies.scene.scene import SceneError
 
@@ -18,19 +23,60 @@ def configure_logging(rank: int) -> None:
     name = os.environ.get("EDDIES_LOG", "info")
     if name not in LEVELS:
         raise SceneError(f"EDDIES_LOG = {name}: must be one of {', '.join(LEVELS)}")
-    handler = _Output(sys.stdout)
+    handler = logging.StreamHandler(sys.stdout)
     handler.setFormatter(_RankFormatter(rank))
     logger = logging.getLogger("eddies")
     logger.handlers, logger.propagate = [handler], False
     logger.setLevel(LEVELS[name] if rank == 0 else max(LEVELS[name], logging.WARNING))
 
 
-class _Output(logging.StreamHandler):
-    """Drops a line that cannot be written, as on a full disk: what else needs that disk tells its lack itself."""
+class Output:
+    """Standard output of a command: it takes any text, what its encoding lacks as "\\u2264", and a line that cannot be
+    written, as on a full disk, is no reason to end a run, but for its end to tell. Making one puts it in place."""
 
-    def handleError(self, record: logging.LogRecord) -> None:
-        if not isinstance(sys.exc_info()[1], OSError):
-            super().handleError(record)
+    def __init__(self) -> None:
+        for name in ("stdout", "stderr"):
+            if getattr(sys, name) is None:  # closed: the next file that is opened must not take its place
+                setattr(sys, name, open(os.devnull, "w"))
+            if hasattr(getattr(sys, name), "reconfigure"):
+                getattr(sys, name).reconfigure(errors="backslashreplace")
+        self._stream, self._refusal = sys.stdout, ""
+        sys.stdout = self  # type: ignore[assignment]
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        """Write a text; an error is kept for `end`."""
+        self._try(lambda: self._stream.write(text))
+        return len(text)
+
+    def flush(self) -> None:
+        """Write out what is held back; an error is kept for `end`."""
+        self._try(self._stream.flush)
+
+    def end(self) -> str | None:
+        """Put the stream back; what kept text from being written, in words, or None."""
+        self.flush()
+        sys.stdout = self._stream
+        if not self._refusal:
+            return None
+        os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())  # what is still held back is lost
+        return f"cannot write to standard output: {self._refusal}; make room, or send it elsewhere"
+
+    def _try(self, action: Callable[[], Any]) -> None:
+        try:
+            action()
+        except OSError as error:
+            self._refusal = error.strerror or str(error)
+
+
+def show_warnings() -> None:
+    """Show warnings of libraries in a line each, without the source of who warns."""
+    def show(message, category, filename, lineno, file=None, line=None) -> None:
+        sys.stderr.write(f"eddies: warning: {' '.join(str(message).split())} ({Path(filename).name}, line {lineno})\n")
+
+    warnings.showwarning = show
 
 
 class _RankFormatter(logging.Formatter):

@@ -19,6 +19,7 @@ from eddies.parallel.communicator import Comm
 from eddies.parallel.stop import StopRequest
 from eddies.pipeline import STAGES, Stage, after
 from eddies.scene.scene import Scene, SceneError
+from eddies.workflows.feasibility import check_feasible, check_ground_truth, check_places
 from eddies.workflows.foreseen.estimates import ground_truth_alone, most_ranks
 from eddies.workflows.learned.source import read_source
 
@@ -40,12 +41,15 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
         WriteError: the directory cannot be written.
         ProductError: a stage that is not among `stages` has not left the product that they start from.
     """
+    check_feasible(stages, scene, comm)
     check_ranks(stages, scene, comm)
+    check_places(stages, comm, directory)
     check_inputs(stages, scene, comm, directory)
     check_stop_file(comm, directory)
     prepare_directory(scene, comm, directory)
     if scene.foreign:
         log.info("%s: uses classes that are not of this package: %s", scene.name, ", ".join(scene.foreign))
+    known = False  # that the ground truth is what the other stages need
     for stage in [STAGES[name] for name in stages]:
         goes_on, resume = resume, resume and is_done(stage.name, scene, comm, directory)
         if resume or not goes_on:  # left by another run, or by one killed in its last moment
@@ -55,6 +59,9 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
             continue
         for later in after(stage.name):  # they start from the product that is about to be replaced
             remove_checkpoints(later, comm, directory)
+        if "dns" in stage.depends_on and stage.product is not None and not known:
+            rest, known = stages[stages.index(stage.name):], True
+            check_ground_truth(rest, scene, comm, directory)
         log.info("%s: starts on %d %s", stage.name, comm.size, "rank" if comm.size == 1 else "ranks")
         start = time.perf_counter()
         module, _, function = stage.run.partition(":")

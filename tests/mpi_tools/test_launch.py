@@ -4,6 +4,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from mpi_tools import launch
@@ -55,6 +56,47 @@ def test_environment_of_the_user_wins(monkeypatch):
 
 def test_exit_code_is_that_of_the_ranks():
     assert launched(2, "-c", "raise SystemExit(75)").returncode == 75
+
+
+RULE = 74 * "-" + "\n"
+NOTICE = (f"{RULE}Primary job  terminated normally, but 1 process returned\na non-zero exit code. Per "
+          f"user-direction, the job has been aborted.\n{RULE}{RULE}mpirun detected that one or more processes exited "
+          "with non-zero status, thus causing\nthe job to be terminated. The first process to do so was:\n\n"
+          "  Process name: [[1,1],0]\n"
+          f"  Exit code:    CODE\n{RULE}")
+
+
+@pytest.mark.parametrize("before, code, after", [
+    ("eddies: error: no such reactor\n", 2, ""), ("eddies: stopped\n", 75, ""), ("eddies: interrupted\n", 130, ""),
+    ("eddies: error: no such reactor\n", 2, "said later\n"), ("no line", 2, ""), (f"{RULE}mine\n{RULE}", 2, "")])
+def test_notices_of_what_ranks_have_said_are_left_out(before, code, after):
+    """However the bytes are cut, and all else is passed on as it is."""
+    content = (before + "\n" * (before == "no line") + NOTICE.replace("CODE", str(code)) + after).encode()
+    for seed in range(20):
+        cuts = np.sort(np.random.default_rng(seed).integers(0, len(content), 9))
+        output = launch.ErrorOutput()
+        passed = b"".join(output.pass_on(part.tobytes()) for part in np.split(np.frombuffer(content, np.uint8), cuts))
+        assert (passed + output.rest()).decode() == before + "\n" * (before == "no line") + after
+
+
+@pytest.mark.parametrize("content", [
+    NOTICE.replace("CODE", "2"), "fault\n" + NOTICE.replace("CODE", "1"), RULE, f"{RULE}mpirun det", "half a li",
+    f"a\n{RULE}MPI_ABORT was invoked on rank 1\n{RULE}", f"{RULE}{RULE}b\n", 40 * "-", "50 %\r60 %\r"])
+def test_all_else_is_passed_on(content):
+    output = launch.ErrorOutput()
+    passed = b"".join(output.pass_on(bytes([byte])) for byte in content.encode())
+    assert (passed + output.rest()).decode() == content
+
+
+def test_a_line_that_is_not_ended_is_passed_on_at_once():
+    assert launch.ErrorOutput().pass_on(b"50 %\r") == b"50 %\r"
+
+
+def test_a_refusal_stands_alone():
+    ended = launched(2, "-m", "eddies", "check", "tiny", "--set", "flow.cels=3")
+    assert ended.returncode == 2 and ended.stderr.count("\n") == 1 and "did you mean cells?" in ended.stderr
+    silent = launched(2, "-c", "raise SystemExit(2)")
+    assert silent.returncode == 2 and "non-zero" in silent.stderr
 
 
 def test_doctor_finds_nothing(tmp_path):

@@ -97,6 +97,7 @@ class FlowHistory:
                 f"energy {row['energy']:.4f}  dissipation {row['dissipation_rate']:.4f}  "
                 f"Re_lambda {row['reynolds_lambda']:.1f}")
 
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # what is not finite is told by who takes a sample
     def _measure(self, state: np.ndarray) -> tuple[dict[str, float], np.ndarray]:
         fluid, grid = self.fluid, self.fluid.grid
         velocity = state[:3]

@@ -94,11 +94,15 @@ def step_limits(fluid: Fluid, stepper: Callable, step: float, speed: float) -> l
     return limits
 
 
-def advice(fluid: Fluid, limits: Sequence[StepLimit], kmax_eta: float) -> str:
-    """What an unstable run should change: for the limits that its step broke, or for the resolution if none."""
+def advice(fluid: Fluid, limits: Sequence[StepLimit], kmax_eta: float, mach: float = 0.0) -> str:
+    """What an unstable run should change: for the limits that its step broke, or for the resolution if none; of a
+    supersonic flow, with a turbulent Mach number above 1, the sound speed."""
     broken = [limit for limit in limits if limit.exceeded]
     if broken:
         return "Broken: " + "; ".join(f"{limit}: {REMEDIES[limit.name]}" for limit in broken)
+    if mach > 1:
+        return (f"The flow is supersonic, its turbulent Mach number was {mach:.2g}, and shocks are not resolved: raise "
+                "sound_speed, or lower amplitude or injection_rate")
     resolution = f"k_max eta was {kmax_eta:.2g}, about 1 is needed" if fluid.viscosity > 0 else "there is no viscosity"
     text = ("The step broke no limit (" + "; ".join(map(str, limits)) + f"), so the grid is likely too coarse "
             f"({resolution}): raise cells or viscosity")
@@ -150,8 +154,12 @@ class StabilityWatch:
 
     def _advice(self, before: np.ndarray, step: float) -> str:
         speed = float(global_max(self.fluid.grid.decomposition.comm, advective_speed(self.fluid.grid, before[:3])))
-        kmax_eta = self.history.rows[-1]["kmax_eta"] if self.history.rows else 0.0
-        return advice(self.fluid, step_limits(self.fluid, self.stepper, step, speed), kmax_eta)
+        rows, was = self.history.rows, {"kmax_eta": 0.0}
+        if rows:  # the flow as it was, not what became of it
+            most = GROWTH * max(rows[0]["total_energy"], self._ceiling)
+            was = [row for row in rows if row["total_energy"] <= most][-1]
+        limits = step_limits(self.fluid, self.stepper, step, speed)
+        return advice(self.fluid, limits, was["kmax_eta"], was.get("mach_turbulent", 0.0))
 
     def state_dict(self) -> dict[str, float | None]:
         """The most energy that there may be, for a checkpoint; None before the first step."""

@@ -5,6 +5,7 @@ its final name is never half written. Writing uses parallel HDF5 when there is m
 that has been taken before (io/unfinished.py); reading opens the file on every rank by itself.
 """
 
+import errno
 import json
 import math
 import os
@@ -29,6 +30,8 @@ from eddies.pipeline import MAKER_OF
 # width has its own name.
 FORMAT = 3
 CHUNK_BYTES = 2**20
+# Why the operating system does not let a file be read that may be sound.
+UNREADABLE = (errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.EMFILE, errno.ENFILE, errno.EIO)
 # The type of an open product.
 File = h5py.File
 Result = TypeVar("Result")
@@ -116,7 +119,7 @@ def product_provenance(path: str | Path) -> dict[str, Any]:
         with h5py.File(path, "r") as file:
             sound = file.attrs.get("complete", False) and _has_this_format(file)
             return read_provenance(file) if sound else {}
-    except (OSError, ValueError, KeyError):
+    except (OSError, ValueError, KeyError, ProductError):
         return {}
 
 
@@ -126,8 +129,28 @@ def product_fingerprint(path: str | Path) -> str | None:
 
 
 def read_provenance(file: h5py.File) -> dict[str, Any]:
-    """Where an open product comes from: scene text, fingerprint, versions, ranks, date."""
-    return json.loads(file.attrs["provenance"])
+    """Where an open product comes from: scene text, fingerprint, versions, ranks, date; ProductError where it is not
+    what a product holds."""
+    found = read_json(file, "provenance")
+    if not {"eddies", "commit", "libraries", "ranks", "date"} <= found.keys():
+        raise _damaged(file, "provenance")
+    return found
+
+
+def read_json(file: h5py.File, name: str) -> dict[str, Any]:
+    """The dict that an attribute of an open product holds as JSON; ProductError where it holds none."""
+    try:
+        found = json.loads(file.attrs[name])
+    except (KeyError, TypeError, ValueError, OSError):
+        found = None
+    if not isinstance(found, dict):
+        raise _damaged(file, name)
+    return found
+
+
+def _damaged(file: h5py.File, name: str) -> ProductError:
+    return ProductError(f"{file.filename}: its attribute {name} is not what was written, the file is damaged; delete "
+                        "it and make it again")
 
 
 def write_attributes(group: h5py.Group, values: Mapping[str, Any]) -> None:
@@ -224,29 +247,41 @@ def _collective(file: h5py.File) -> h5py.h5p.PropDXID:
 
 def _open_checked(path: Path, kind: str | None) -> h5py.File:
     remedy = f"run `eddies {MAKER_OF[kind].name} SCENE` first" if kind in MAKER_OF else "make it first"
-    if not path.is_file():
-        raise ProductError(f"{path}: no such file; {remedy}")
     try:
+        if path.is_dir():
+            raise ProductError(f"{path}: is a directory, not a file; move it away, then {remedy}")
+        if not path.is_file():
+            raise ProductError(f"{path}: no such file; {remedy}")
         file = h5py.File(path, "r")
     except OSError as error:
+        if error.errno in UNREADABLE:
+            raise ProductError(f"{path}: cannot be read: {os.strerror(error.errno)}; change its permissions or those "
+                               "of its directory, or give another path") from None
         message = f"{path}: damaged or not an HDF5 file ({error}); delete it and make it again"
         raise ProductError(message) from None
-    problem = _problem(file, kind, remedy)
-    if problem is None:
-        return file
-    file.close()
-    raise ProductError(f"{path}: {problem}")
+    try:
+        problem = _problem(file, kind, remedy)
+        if problem is None:
+            read_provenance(file)
+            return file
+        raise ProductError(f"{path}: {problem}")
+    except BaseException:
+        file.close()
+        raise
 
 
 def _problem(file: h5py.File, kind: str | None, remedy: str) -> str | None:
     """Why an open file is not to be read as a product of a kind, and what to do; None if it may be."""
-    found = file.attrs.get("kind", "unknown")
+    try:
+        found, complete = str(file.attrs.get("kind", "unknown")), bool(file.attrs.get("complete", False))
+    except (OSError, TypeError, ValueError) as error:
+        return f"damaged, its attributes cannot be read ({error}); delete it and make it again"
     if kind not in (None, found):
         return f"is of kind {found}, expected {kind}: {remedy}"
-    if not file.attrs.get("complete", False):
+    if not complete:
         return f"unfinished, its writer was stopped: {remedy}"
     if not _has_this_format(file):
-        version = json.loads(file.attrs.get("provenance", "{}")).get("eddies", "of unknown version")
+        version = read_json(file, "provenance").get("eddies", "of unknown version")
         what = found.replace("_", " ")
         return f"written by eddies {version}, whose {what} this version does not read; {_again(found)}"
     return None
@@ -257,4 +292,4 @@ def _again(kind: str) -> str:
 
 
 def _has_this_format(file: h5py.File) -> bool:
-    return bool(file.attrs.get("format", 1) == FORMAT)
+    return bool(np.array_equal(file.attrs.get("format", 1), FORMAT))

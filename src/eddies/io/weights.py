@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from eddies.io.hdf5 import ProductError, create_product, in_files, open_product, read_table, write_table
+from eddies.io.hdf5 import ProductError, create_product, in_files, open_product, read_json, read_table, write_table
 
 
 def save_weights(comm: MPI.Comm, path: str | Path, kind: str, description: Mapping[str, Any],
@@ -41,7 +41,7 @@ def load_weights(comm: MPI.Comm, path: str | Path, kind: str) -> tuple[dict[str,
             content from what was written, or is not finite.
     """
     with open_product(comm, path, kind) as file:
-        description, expected = json.loads(file.attrs["description"]), json.loads(file.attrs["tensors"])
+        description, expected = read_json(file, "description"), read_json(file, "tensors")
         tensors = read_table(file, "weights")
     for name in sorted(expected.keys() | tensors.keys()):
         if name not in tensors or name not in expected or _signature(tensors[name]) != expected[name]:

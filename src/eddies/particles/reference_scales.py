@@ -5,12 +5,18 @@ from __future__ import annotations
 import math
 from dataclasses import asdict, dataclass
 
+from eddies.errors import UserError
+
 # The highest wavenumber that particles resolve: in units of their Nyquist wavenumber; in units of 1/eta, where
 # turbulence ends; and the least that the filter may leave of a mode, as it is undone. Measured in docs/closure.md.
 BEYOND_NYQUIST, BEYOND_DISSIPATION, LEAST_TRANSFER = 1.5, 1.05, 0.02
 # k_c u' times a step, by integrator, up to which the resolved velocity follows the flow: docs/closure.md.
 ALLOWED_ANGLES = {"verlet": 0.5, "rk2": 1.2, "rk3": 2.0, "rk4": 2.4}
 MAY_VANISH = ("viscosity", "kolmogorov_length")
+
+
+class ScaleError(UserError, ValueError):
+    """A scale vanishes by which a model would divide."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +38,7 @@ class ReferenceScales:
         viscosity.
 
     Those of density and sound are None for a ground truth without density, that of an incompressible fluid. A flow at
-    another Mach number supplies its own scales to the same network. Raises ValueError unless all that are given are
+    another Mach number supplies its own scales to the same network. Raises ScaleError unless all that are given are
     finite and positive.
     """
 
@@ -51,10 +57,12 @@ class ReferenceScales:
         for name in MAY_VANISH:
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0):
-                raise ValueError(f"reference scale {name} = {value}: must be finite and not negative")
+                raise ScaleError(f"reference scale {name} = {value}: must be finite and not negative; start from "
+                                 "another flow ([initial])")
         for name, value in asdict(self).items():
             if name not in MAY_VANISH and value is not None and not (math.isfinite(value) and value > 0):
-                raise ValueError(f"reference scale {name} = {value}: must be finite and positive")
+                raise ScaleError(f"reference scale {name} = {value}: must be finite and positive, as a model is made "
+                                 "dimensionless by it; start from a flow that moves and changes ([initial], [forcing])")
 
     def required(self, name: str) -> float:
         """A scale that must be there; ValueError where the flow has no density, and so none of it or of sound."""

@@ -112,8 +112,14 @@ def time_problems(scene: Scene) -> Iterator[str]:
 
 
 def tracer_problems(scene: Scene) -> Iterator[str]:
-    """Stored fields no finer than the simulation."""
-    tracers = scene.tracers
+    """Stored fields no finer than the simulation; a flow that moves, and for a model one that changes."""
+    tracers, initial = scene.tracers, scene.initial
+    if tracers and initial.kind == "sound-wave":
+        yield ('[initial] kind = "sound-wave": starts from rest, and [tracers] are followed for turnovers of a flow '
+               "that moves; choose another kind, or remove [tracers]")
+    if scene.model and initial.kind == "shear-wave" and scene.flow.viscosity == 0 and scene.forcing is None:
+        yield ('[initial] kind = "shear-wave": without viscosity nothing in it is accelerated, and a model is made '
+               "dimensionless by the acceleration; choose another kind, or raise [flow] viscosity")
     if tracers and tracers.cells > scene.flow.cells:
         given = "" if tracers.field_cells else " (from particles_per_side)"
         yield (f"[tracers] field_cells = {tracers.cells}{given}: must be at most [flow] cells = "

@@ -1,6 +1,5 @@
 """A comparison: variants of one scene that are run from the same moment on one machine, as read from one TOML file."""
 
-import re
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -8,7 +7,7 @@ from pathlib import Path
 from eddies.scene.reader import find_document, parse_document, read_section, read_text
 from eddies.scene.rules import nearest
 from eddies.scene.scene import Scene, SceneError, load_scene
-from eddies.scene.values import Document, Section, integer, number, sections, text, texts
+from eddies.scene.values import Document, Section, directory_name, integer, number, sections, text, texts
 
 __all__ = ["BASELINE", "Comparison", "Variant", "load_comparison"]
 
@@ -21,7 +20,7 @@ RESERVED = ("figures",)
 class Variant(Section):
     """The base scene with some keys changed."""
 
-    name: str = text("its run directory and its label in figures")
+    name: str = directory_name("its run directory and its label in figures")
     set: tuple[str, ...] = texts('changes "section.key=value" of the base scene', default=())
     group: str = text(f'a colour and a marker in figures; "{BASELINE}": what the model is measured against',
                       default="model")
@@ -33,7 +32,7 @@ class Variant(Section):
 class Comparison(Document):
     """A whole comparison; making one loads the scenes of all variants and checks that they can be compared."""
 
-    name: str = text("names the output directory; absent: the file's name", default="comparison")
+    name: str = directory_name("names the output directory; absent: the file's name", default="comparison")
     title: str = text("one line for lists and reports", default="untitled comparison")
     base: str = text("the scene that every variant changes: a built-in name or a path")
     run: str | None = text("run directory that holds the base's ground truth; absent: runs/BASE", default=None)
@@ -97,9 +96,9 @@ class Comparison(Document):
         if not names:
             raise SceneError("[[variant]]: a comparison needs at least one; each has a name and a list `set`")
         for name in names:
-            if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name) or name in RESERVED:
-                raise SceneError(f'variant "{name}": its name is that of a directory: letters, digits, ".", "_" and '
-                                 f'"-", and not {" or ".join(RESERVED)}; choose another')
+            if name in RESERVED:
+                raise SceneError(f'variant "{name}": its name is that of a directory, and there is one of this name '
+                                 "already; choose another")
             if names.count(name) > 1:
                 raise SceneError(f'variant "{name}": {names.count(name)} variants have this name; rename all but one')
         if self.subject not in names:

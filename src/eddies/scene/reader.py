@@ -10,7 +10,7 @@ from dataclasses import MISSING
 from pathlib import Path
 from typing import Any
 
-from eddies.scene.rules import nearest, quoted
+from eddies.scene.rules import nearest, quoted, shortened
 from eddies.scene.values import KeyProblem, SceneError, Section, rule_of
 
 
@@ -19,10 +19,18 @@ def find_document(name_or_path: str, built_in: Path, what: str) -> Path:
     names = sorted(path.stem for path in built_in.glob("*.toml"))
     if name_or_path in names:
         return built_in / f"{name_or_path}.toml"
-    if Path(name_or_path).is_file():
-        return Path(name_or_path)
+    try:
+        path = Path(name_or_path)
+        if path.is_file():
+            return path
+        is_directory = path.is_dir()
+    except OSError as error:
+        raise SceneError(f"{shortened(name_or_path)}: cannot be read: {error.strerror}; give the path of a TOML "
+                         f"file, or one of {', '.join(names)}") from None
+    if is_directory:
+        raise SceneError(f"{name_or_path}: is a directory, not a {what}; give the path of a TOML file in it")
     hint = f"{nearest(name_or_path, names)} ".lstrip()
-    raise SceneError(f"{name_or_path}: no such {what}; {hint}give the path of a TOML file, or one of "
+    raise SceneError(f"{shortened(name_or_path)}: no such {what}; {hint}give the path of a TOML file, or one of "
                      f"{', '.join(names)}")
 
 
@@ -34,14 +42,16 @@ def parse_document(text: str) -> dict[str, Any]:
     """
     try:
         return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except RecursionError:
+        raise SceneError("not TOML of a scene: its brackets are nested too deep; no value has more than two") from None
+    except ValueError as error:  # of TOML, or of a number with thousands of digits
         raise SceneError(f"not TOML: {error}; keys are written `key = value` under a [section]") from None
 
 
 def read_text(path: Path) -> str:
     """The text of a scene file; SceneError if it cannot be read."""
     try:
-        return path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")  # some editors begin a file with a mark of its encoding
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or error
         raise SceneError(f"cannot be read: {reason}; give the path of a scene, a TOML file") from None
@@ -59,13 +69,13 @@ def apply_overrides(document: dict[str, Any], overrides: list[str]) -> set[str]:
         path, equals, value = (part.strip() for part in override.partition("="))
         *outer, last = names = path.split(".")
         if not equals or not value or len(names) > 3 or not all(names):
-            raise SceneError(f"--set {override}: must be section.key=value, or key=value outside sections, or "
-                             "section.name.key=value in a section of a section")
+            raise SceneError(f"--set {shortened(override)}: must be section.key=value, or key=value outside "
+                             "sections, or section.name.key=value in a section of a section")
         table = document
         for name in outer:
             table = table.setdefault(name, {})
             if not isinstance(table, dict):
-                raise SceneError(f"--set {override}: {name} is a value, not a section")
+                raise SceneError(f"--set {shortened(override)}: {name} is a value, not a section")
         table[last] = _override_value(value)
         keys |= {".".join(names[:depth]) for depth in range(1, len(names) + 1)}
     return keys
@@ -78,7 +88,7 @@ def read_section(kind: type[Section], table: Any, name: str = "") -> Any:
         SceneError: for an unknown key, a value that its declaration refuses, or a key that is missing.
     """
     if not isinstance(table, dict):
-        message = f"{name} = {quoted(table)}: must be a section; write [{name}] and its keys below"
+        message = f"{name} = {shortened(quoted(table))}: must be a section; write [{name}] and its keys below"
         raise SceneError(message, name)
     every = {field.name: field for field in dataclasses.fields(kind)}
     fields = {key: field for key, field in every.items() if "sub_sections" not in field.metadata}
@@ -121,7 +131,7 @@ def write_section(section: Section, name: str = "") -> list[str]:
 def _override_value(value: str) -> Any:
     try:
         parsed = tomllib.loads(f"value = {value}")
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):
         return value
     return parsed["value"] if len(parsed) == 1 else value
 

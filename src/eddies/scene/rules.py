@@ -10,11 +10,16 @@ import json
 import math
 import numbers
 import os
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 IMPORT_PATH = 'the import path "module:name" of your own'
+# Numbers of a scene: beyond these squares and cubes of them overflow, or a run has no end.
+SMALLEST, LARGEST, MOST = 1e-15, 1e15, 10**9
+# Characters of a value that an error shows, and bits of a whole number that Python writes with decimals.
+SHOWN, MOST_BITS = 60, 10_000
 
 
 @dataclass(frozen=True)
@@ -46,10 +51,16 @@ class Number:
     def accept(self, value: Any) -> float | str:
         if isinstance(value, str) and value in self.words:
             return value
-        if isinstance(value, bool) or not isinstance(value, numbers.Real) or not math.isfinite(value):
+        try:
+            finite = not isinstance(value, bool) and isinstance(value, numbers.Real) and math.isfinite(value)
+        except OverflowError:  # a whole number of hundreds of digits
+            finite = False
+        if not finite:
             raise ValueError
         if value not in self.bounds:
             raise ValueError
+        if value != 0 and not SMALLEST <= abs(float(value)) <= LARGEST:
+            raise ValueError(f"numbers of a scene that are not 0 lie between {SMALLEST:g} and {LARGEST:g} in size")
         return float(value)
 
     @property
@@ -67,6 +78,8 @@ class Integer:
     def accept(self, value: Any) -> int:
         if isinstance(value, bool) or not isinstance(value, numbers.Integral) or value not in self.bounds:
             raise ValueError
+        if abs(int(value)) > MOST and self.bounds.at_most == math.inf:
+            raise ValueError(f"whole numbers of a scene are at most {MOST:,}")
         return int(value)
 
     @property
@@ -144,6 +157,21 @@ class Text:
 
 
 @dataclass(frozen=True)
+class Name(Text):
+    """The name of a directory: letters, digits, ".", "_" and "-", the first a letter or a digit; 100 at most."""
+
+    def accept(self, value: Any) -> str:
+        name = super().accept(value)
+        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{,99}", name):
+            raise ValueError('choose another, such as "my-run_2"')
+        return name
+
+    @property
+    def allowed(self) -> str:
+        return 'the name of a directory: at most 100 letters, digits, ".", "_" and "-", the first a letter or a digit'
+
+
+@dataclass(frozen=True)
 class Texts:
     """A list of non-empty strings, with `words` of these or, with `paths`, import paths; held as a tuple."""
 
@@ -170,6 +198,11 @@ def nearest(given: str, valid: Iterable[str], cutoff: float = 0.6) -> str:
     return f"did you mean {near[0]}?" if near else ""
 
 
+def shortened(text: str) -> str:
+    """A text as an error shows it: its beginning, where it is long."""
+    return text if len(text) <= SHOWN else f"{text[:SHOWN]}... ({len(text)} characters)"
+
+
 def quoted(value: Any) -> str:
     """The value as TOML writes it: strings in double quotes, tuples as lists, floats to full precision."""
     if isinstance(value, dict):
@@ -178,4 +211,6 @@ def quoted(value: Any) -> str:
         return "[" + ", ".join(map(quoted, value)) + "]"
     if isinstance(value, (bool, str)):
         return json.dumps(value, ensure_ascii=False)
+    if isinstance(value, int) and value.bit_length() > MOST_BITS:
+        return hex(value)
     return repr(value) if isinstance(value, (int, float)) else str(value)

@@ -18,7 +18,7 @@ from eddies.scene.model import Model, replace_terms
 from eddies.scene.reader import apply_overrides, find_document, parse_document, read_section, read_text, write_section
 from eddies.scene.sections import (BOX_LENGTH, DEFAULT_WINDOW, NEIGHBORS, Eulerian, Flow, Forcing, Horizons, Initial,
                                    Kernel, Simulation, SpinUp, Time, Tracers, Training, Wcsph)
-from eddies.scene.values import Document, SceneError, choice, import_paths, integer, section, text
+from eddies.scene.values import Document, SceneError, choice, directory_name, import_paths, integer, section, text
 
 __all__ = ["BOX_LENGTH", "Scene", "SceneError", "builtin_scenes", "load_scene", "Eulerian", "Flow", "Forcing",
            "Horizons", "Initial", "Kernel", "Model", "Simulation", "SpinUp", "Time", "Tracers", "Training", "Wcsph"]
@@ -32,9 +32,9 @@ BUILT_IN = Path(__file__).parents[1] / "scenes"
 class Scene(Document):
     """A whole scene; making one checks its values and that its sections fit together (SceneError)."""
 
-    name: str = text("names the run; absent: the file's name", default="scene")
+    name: str = directory_name("names the run; absent: the file's name", default="scene")
     title: str = text("one line for lists and reports", default="untitled scene")
-    seed: int = integer("of every random number", default=1, at_least=0)
+    seed: int = integer("of every random number", default=1, at_least=0, at_most=10**18)
     device: str = choice("where particles are computed", "cpu", "cuda", default="cpu")
     flow: Flow = section(Flow)
     initial: Initial = section(Initial, default=Initial())

@@ -13,6 +13,8 @@ from eddies.scene.values import Section, choice, integer, integers, named, numbe
 
 BOX_LENGTH = 2 * math.pi
 DEFAULT_WINDOW = 0.5
+# Along a side of the cube: of cells twice those of the largest direct simulations.
+MOST_CELLS = 65536
 # Mean number of particles within a support or a radius of interaction, unless a scene says another: the paper's.
 NEIGHBORS = 60.0
 
@@ -22,7 +24,7 @@ class Flow(Section):
     """The fluid and the grid on which the direct numerical simulation resolves it."""
 
     fluid: str = named("equations of motion", "incompressible", "compressible")
-    cells: int = integer("grid cells along each side of the cube", at_least=8)
+    cells: int = integer("grid cells along each side of the cube", at_least=8, at_most=MOST_CELLS)
     viscosity: float = number("kinematic viscosity", at_least=0)
     sound_speed: float | None = number("speed of sound, compressible fluid only", default=None, above=0)
     precision: str = choice("of the grid arrays", "float64", "float32", default="float64")
@@ -81,10 +83,12 @@ class Tracers(Section):
     Once made it holds the filter width in use.
     """
 
-    particles_per_side: int = integer("the number of particles is the cube of this", at_least=2)
+    particles_per_side: int = integer("the number of particles is the cube of this", at_least=2,
+                                      at_most=MOST_CELLS)
     placement: str = choice("where the particles start", "random", "lattice", default="random")
-    filter_width: float = number("of the Gaussian filter; absent: twice the mean spacing",
-                                 default=None, above=0, below=BOX_LENGTH)
+    filter_width: float = number("of the Gaussian filter, whose tails meet beyond half the cube; absent: twice the "
+                                 "mean spacing, or half the cube where that is less",
+                                 default=None, above=0, at_most=BOX_LENGTH / 2)
     interpolation: str = choice("splines from grid to particles", "cubic", "quintic", default="cubic")
     turnovers: float = number("large-eddy turnovers to follow the particles", above=0)
     frame_interval: float = number("time between stored frames", above=0)
@@ -95,7 +99,7 @@ class Tracers(Section):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.filter_width is None:
-            object.__setattr__(self, "filter_width", 2 * self.spacing)
+            object.__setattr__(self, "filter_width", min(2 * self.spacing, BOX_LENGTH / 2))
 
     @property
     def particles(self) -> int:

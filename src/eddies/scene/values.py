@@ -1,9 +1,9 @@
 """What a section of a scene is: a frozen dataclass whose fields declare their keys.
 
 Every key of a scene is declared once, beside the dataclass field that holds it, by one of the functions `number`,
-`integer`, `integers`, `boolean`, `choice`, `named`, `text` and `texts`. The declaration carries a line on what the key
-means, which values it accepts, and its default; the reader, the error messages and the written scene all use that one
-declaration. It is applied where an object is made, from a TOML file or in a program.
+`integer`, `integers`, `boolean`, `choice`, `named`, `text`, `directory_name` and `texts`. The declaration carries
+a line on what the key means, which values it accepts, and its default; the reader, the error messages and the written
+scene all use that one declaration. It is applied where an object is made, from a TOML file or in a program.
 """
 
 import dataclasses
@@ -14,7 +14,11 @@ from dataclasses import MISSING
 from typing import Any
 
 from eddies.errors import UserError
-from eddies.scene.rules import Boolean, Bounds, Choice, Integer, Integers, Number, Text, Texts, quoted
+from eddies.scene.rules import Boolean, Bounds, Choice, Integer, Integers, Name, Number, Text, Texts, quoted, shortened
+
+
+# Of a key that may be left out, in place of its value: as if it were.
+ABSENT = "none"
 
 
 class SceneError(UserError, ValueError):
@@ -49,7 +53,9 @@ class Section:
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):  # type: ignore[arg-type]
             value = getattr(self, field.name)
-            if not (value is None and field.default is None):
+            if isinstance(value, str) and value == ABSENT and field.default is None:
+                object.__setattr__(self, field.name, None)
+            elif not (value is None and field.default is None):
                 object.__setattr__(self, field.name, _accepted(type(self), field, value))
 
     @classmethod
@@ -99,6 +105,11 @@ def named(about: str, *words: str, default: Any = MISSING) -> Any:
 def text(about: str, default: Any = MISSING) -> Any:
     """Declare a dataclass field that holds a string."""
     return _declare(Text(about), default)
+
+
+def directory_name(about: str, default: Any = MISSING) -> Any:
+    """Declare a dataclass field that holds the name of a directory."""
+    return _declare(Name(about), default)
 
 
 def texts(about: str, *words: str, default: Any = MISSING, paths: bool = False) -> Any:
@@ -166,7 +177,7 @@ def _accepted(kind: type[Section], field: dataclasses.Field, value: Any) -> Any:
     """The value of a field as its rule holds it."""
     def refusal(allowed: str, hint: str = "") -> KeyProblem:
         return KeyProblem(kind.section_name(), field.name,
-                          f" = {quoted(value)}: must be {allowed}" + (f"; {hint}" if hint else ""))
+                          f" = {shortened(quoted(value))}: must be {allowed}" + (f"; {hint}" if hint else ""))
 
     if "sub_sections" in field.metadata:
         return value

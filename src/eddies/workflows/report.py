@@ -20,7 +20,8 @@ from eddies.analysis.isotropic_turbulence import StationarySpan
 from eddies.analysis.spectra import energy_spectrum, vorticity
 from eddies.analysis.tracer_statistics import tracer_statistics
 from eddies.io.fields import FieldSeries
-from eddies.io.hdf5 import File, ProductError, in_files, open_product, read_attributes, read_provenance, read_table
+from eddies.io.hdf5 import (File, ProductError, in_files, open_product, read_attributes, read_json, read_provenance,
+                            read_table)
 from eddies.io.trajectories import Trajectory
 from eddies.parallel.broadcast import on_all_ranks
 from eddies.parallel.communicator import Comm
@@ -33,6 +34,7 @@ from eddies.report.page import Metric, RunRecord, Section, metrics_json, shown, 
 from eddies.report.rollout import Rollout
 from eddies.report.rollout import section as rollout_section
 from eddies.scene.scene import Scene
+from eddies.workflows.feasibility import check_places
 
 log = logging.getLogger("eddies")
 
@@ -66,7 +68,9 @@ def run(directory: str | Path, comm: Comm) -> None:
 
     Raises ProductError if the directory holds no product, or a damaged one, or the report cannot be written.
     """
-    directory, alone = Path(directory), comm.Split(comm.rank)
+    directory = Path(directory)
+    check_places(("report",), comm, directory)
+    alone = comm.Split(comm.rank)
     try:
         record = in_files(comm, directory, lambda: _survey(directory, alone))
         own = on_all_ranks(comm, lambda: in_files(alone, directory,
@@ -184,7 +188,7 @@ def _read_tracers(file: File, record: Run) -> list[Section]:
 
 def _read_kernel(file: File, record: Run) -> list[Section]:
     tables = {name: read_table(file, name) for name in ("kernels", "slices", "errors", "history")}
-    return [kernel.section(json.loads(file.attrs["description"])["support"], **tables)]
+    return [kernel.section(read_json(file, "description")["support"], **tables)]
 
 
 def _read_model(file: File, record: Run) -> list[Section]:
@@ -192,7 +196,7 @@ def _read_model(file: File, record: Run) -> list[Section]:
     provenance, errors = record.provenance["model"], read_table(file, "a_priori")
     source = provenance.get("source")
     history = read_table(file, "history") if "history" in file else None
-    shown = model_section(json.loads(file.attrs["description"]), errors,
+    shown = model_section(read_json(file, "description"), errors,
                           read_table(file, "acceleration_sample"), density_rate, history, source and source["path"])
     if source:
         own = mach.FlowErrors("this flow", provenance["mach_turbulent"], errors)
@@ -228,7 +232,13 @@ def _cost_section(record: Run) -> Section:
 def _stage_seconds(directory: Path) -> dict[str, float]:
     """Wall seconds of the stages that have run, as the command line notes them beside the products."""
     path = directory / "stage_seconds.json"
-    return json.loads(path.read_text()) if path.exists() else {}
+    if not path.exists():
+        return {}
+    try:
+        seconds = json.loads(path.read_text())
+        return {stage: float(value) for stage, value in seconds.items()}
+    except (AttributeError, TypeError, ValueError):
+        raise ProductError(f"{path}: is not what the stages wrote; delete it, the report does without") from None
 
 
 def _run_record(directory: Path, record: Run) -> RunRecord:

@@ -16,7 +16,8 @@ from eddies.parallel.stop import StopRequest
 from eddies.particles.devices import prepare_torch
 from eddies.pipeline import STAGES
 from eddies.scene.methods import method_class
-from eddies.scene.scene import BOX_LENGTH, Scene, SceneError
+from eddies.scene.scene import BOX_LENGTH, Scene
+from eddies.workflows.ground_truth.frame_counts import rollout_start
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.learned.kernel import load_kernel
 from eddies.workflows.rollout.course import Course
@@ -65,13 +66,5 @@ def start_frame(scene: Scene, truth: GroundTruth) -> int:
 
     Raises SceneError if none follows that leaves a frame of the ground truth to compare with.
     """
-    fraction = scene.simulation.start
-    wanted = truth.last_frame_seen(scene.seen) if fraction is None else int(fraction * (len(truth.times) - 1))
     at_fields = [truth.frame_of_field(index) for index in range(len(truth.fields.times))]
-    last = len(truth.times) - 2 - round(scene.simulation.frame_interval / scene.tracers.frame_interval)
-    usable = [frame for frame in at_fields if max(wanted, 1) <= frame <= last]
-    if not usable:
-        raise SceneError(f"[simulation] start: after frame {wanted} of {len(truth.times)} no filtered field is "
-                         "followed by ground truth to compare with; lower start or [training] window, or raise "
-                         "[tracers] turnovers")
-    return usable[0]
+    return rollout_start(scene, len(truth.times), at_fields)

@@ -21,6 +21,7 @@ from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.model import LagrangianModel
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.reference_scales import ReferenceScales
+from eddies.workflows.ground_truth.frame_counts import last_seen
 from eddies.workflows.ground_truth.measured_scales import RATES, measured_scales
 
 log = logging.getLogger("eddies")
@@ -106,7 +107,7 @@ class GroundTruth:
 
     def last_frame_seen(self, window: float) -> int:
         """The last frame of the training window, a fraction of the ground truth."""
-        return max(int(window * (len(self.times) - 1)), 1)
+        return last_seen(window, len(self.times))
 
     def block(self, frame: int, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
         """Columns of this rank's ids at a frame: those named, or all."""

@@ -15,9 +15,9 @@ from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.model import LagrangianModel
 from eddies.particles.particle_set import ParticleSet, as_numpy
-from eddies.scene.scene import SceneError
 from eddies.spectral.interpolation import SplineInterpolation
 from eddies.spectral.spectral_grid import SpectralGrid
+from eddies.workflows.ground_truth.frame_counts import between_frames
 from eddies.workflows.ground_truth.truth import GroundTruth, load_frame, particles_for
 
 EVALUATIONS, SAMPLE = 9, 20000
@@ -28,11 +28,8 @@ def evaluation_frames(truth: GroundTruth) -> np.ndarray:
 
     Raises SceneError if there is none.
     """
-    at_fields = np.array([truth.frame_of_field(index) for index in range(len(truth.fields.times))])
-    usable = at_fields[(at_fields > 0) & (at_fields < len(truth.times) - 1)]
-    if not len(usable):
-        raise SceneError("[tracers] field_every: no filtered field is stored between the first and the last frame; "
-                         "lower it, or raise [tracers] turnovers")
+    at_fields = [truth.frame_of_field(index) for index in range(len(truth.fields.times))]
+    usable = np.array(between_frames(len(truth.times), at_fields))
     return usable[np.unique(np.linspace(0, len(usable) - 1, EVALUATIONS).astype(int))]
 
 

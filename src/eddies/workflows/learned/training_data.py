@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from functools import cached_property
 
@@ -21,8 +20,9 @@ from eddies.particles.particle_set import ParticleSet
 from eddies.particles.periodic_box import PeriodicBox
 from eddies.particles.resolved_velocity import ResolvedVelocity
 from eddies.particles.smoothing_kernels import SmoothingKernel
-from eddies.scene.scene import BOX_LENGTH, Scene, SceneError
+from eddies.scene.scene import BOX_LENGTH, Scene
 from eddies.workflows.foreseen.estimates import ALLOWED_VELOCITY
+from eddies.workflows.ground_truth.frame_counts import last_trained_on
 from eddies.workflows.ground_truth.truth import GroundTruth, load_frame
 from eddies.workflows.learned.model import scene_model
 
@@ -30,8 +30,6 @@ from eddies.workflows.learned.model import scene_model
 VALIDATIONS, HORIZON_VALIDATIONS, VALIDATION_PARTICLES = 25, 4, 8192
 # How many cubes or batches the error of all losses together is measured on.
 COMBINED_DRAWS = 8
-# The share of the training window, at its end, that is held out for validation; no less than the longest horizon.
-HELD_OUT = 0.1
 
 
 class TrainingData:
@@ -47,13 +45,7 @@ class TrainingData:
         self.model = scene_model(scene, truth.scales).to(dtype=self.dtype, device=device)
         self.longest = max(self.settings.horizons.frames) if self.settings.horizons else 0
         self.last = truth.last_frame_seen(self.settings.window)
-        held_out = max(math.ceil(HELD_OUT * self.last), self.longest, 2)  # rates need a frame on both sides
-        self.learned = self.last - held_out
-        if self.learned - self.longest < 2:
-            raise SceneError(
-                f"[training] window = {self.settings.window:g}: holds {self.last} frames of the ground truth, too few "
-                f"with {held_out} held out for validation and horizons of {self.longest}; raise it or [tracers] "
-                "turnovers, or lower [tracers] frame_interval or [training.horizons] frames")
+        self.learned = last_trained_on(self.settings, len(truth.times))
 
     @cached_property
     def frames(self) -> list[TrainingFrame]:

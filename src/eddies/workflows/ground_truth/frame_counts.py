@@ -1,0 +1,71 @@
+"""Whether the frames of a ground truth are enough for what a scene makes of them: counting alone, known before a run.
+
+`frames` is the number of frames, `at_fields` are those at whose time a filtered field is stored.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from eddies.scene.scene import Scene, SceneError, Training
+
+# The share of the training window, at its end, that is held out for validation; no less than the longest horizon.
+HELD_OUT = 0.1
+
+
+def check_frames(stages: Sequence[str], scene: Scene, frames: int) -> None:
+    """Refuse a scene of which one of these stages finds too few frames."""
+    at_fields = range(0, frames, scene.tracers.field_every)
+    if "train" in stages:
+        if scene.model.path is None:
+            last_trained_on(scene.training, frames)
+        between_frames(frames, at_fields)
+    if "simulate" in stages:
+        rollout_start(scene, frames, at_fields)
+
+
+def last_seen(window: float, frames: int) -> int:
+    """The last frame of the training window, a fraction of the ground truth."""
+    return max(int(window * (frames - 1)), 1)
+
+
+def last_trained_on(settings: Training, frames: int) -> int:
+    """The last frame that a model is trained on: those behind it in the window are for validation.
+
+    Raises SceneError where too few are left.
+    """
+    last = last_seen(settings.window, frames)
+    longest = max(settings.horizons.frames) if settings.horizons else 0
+    held_out = max(math.ceil(HELD_OUT * last), longest, 2)  # rates need a frame on both sides
+    if last - held_out - longest < 2:
+        raise SceneError(
+            f"[training] window = {settings.window:g}: holds {last} frames of the ground truth, too few "
+            f"with {held_out} held out for validation and horizons of {longest}; raise it or [tracers] "
+            "turnovers, or lower [tracers] frame_interval or [training.horizons] frames")
+    return last - held_out
+
+
+def between_frames(frames: int, at_fields: Sequence[int]) -> list[int]:
+    """The frames at times of filtered fields that have frames on both sides. Raises SceneError if there is none."""
+    usable = [frame for frame in at_fields if 0 < frame < frames - 1]
+    if not usable:
+        raise SceneError("[tracers] field_every: no filtered field is stored between the first and the last frame; "
+                         "lower it, or raise [tracers] turnovers")
+    return usable
+
+
+def rollout_start(scene: Scene, frames: int, at_fields: Sequence[int]) -> int:
+    """The first frame with a filtered field at or after the moment that the scene asks for.
+
+    Raises SceneError if none follows that leaves a frame of the ground truth to compare with.
+    """
+    fraction = scene.simulation.start
+    wanted = last_seen(scene.seen, frames) if fraction is None else int(fraction * (frames - 1))
+    last = frames - 2 - round(scene.simulation.frame_interval / scene.tracers.frame_interval)
+    usable = [frame for frame in at_fields if max(wanted, 1) <= frame <= last]
+    if not usable:
+        raise SceneError(f"[simulation] start: after frame {wanted} of {frames} no filtered field is followed by "
+                         f"ground truth to compare with, {scene.simulation.frame_interval:g} later; lower start, "
+                         "frame_interval, [training] window or [tracers] field_every, or raise [tracers] turnovers")
+    return usable[0]
