@@ -39,7 +39,7 @@ def told_once(comm, capfd, message):
 
 
 @pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("override, message", BAD_OVERRIDES, ids=[override for override, _ in BAD_OVERRIDES])
+@pytest.mark.parametrize("override, message", BAD_OVERRIDES, ids=[override[:50] for override, _ in BAD_OVERRIDES])
 def test_bad_override_ends_with_2_and_writes_nothing(comm, tmp_path, capfd, override, message):
     assert run_cli("run", "tiny", "--set", override, "--output", tmp_path / "run") == 2
     output, errors = capfd.readouterr()

@@ -61,9 +61,8 @@ def test_exit_code_is_that_of_the_ranks():
 RULE = 74 * "-" + "\n"
 NOTICE = (f"{RULE}Primary job  terminated normally, but 1 process returned\na non-zero exit code. Per "
           f"user-direction, the job has been aborted.\n{RULE}{RULE}mpirun detected that one or more processes exited "
-          "with non-zero status, thus causing\nthe job to be terminated. The first process to do so was:\n\n"
-          "  Process name: [[1,1],0]\n"
-          f"  Exit code:    CODE\n{RULE}")
+          "with non-zero status, thus causing\nthe job to be terminated. The first process to do so was:\n\n  "
+          f"Process name: [[1,1],0]\n  Exit code:    CODE\n{RULE}")
 
 
 @pytest.mark.parametrize("before, code, after", [

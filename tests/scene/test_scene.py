@@ -188,7 +188,7 @@ def test_bad_text(text, message, tmp_path):
     assert message in str(error.value)
 
 
-@pytest.mark.parametrize("override, message", BAD_OVERRIDES, ids=[override for override, _ in BAD_OVERRIDES])
+@pytest.mark.parametrize("override, message", BAD_OVERRIDES, ids=[override[:50] for override, _ in BAD_OVERRIDES])
 def test_bad_override(override, message):
     with pytest.raises(SceneError) as error:
         load_scene("tiny", [override])

@@ -113,13 +113,14 @@ def test_a_product_of_another_version_is_said_in_one_line(comm, tmp_path):
 @pytest.mark.usefixtures("undrawn")
 @pytest.mark.mpi(1, 2, timeout=60)
 def test_a_report_that_cannot_be_written_is_told_in_one_line(comm, tmp_path, capfd):
-    """A file where its directory should be. All ranks end with the exit code of what the user can mend."""
+    """A file where a directory of it should be. All ranks end with the exit code of what the user can mend."""
     write_ground_truth(comm, tmp_path)
     if comm.rank == 0:
-        (tmp_path / "report").write_text("precious")
+        (tmp_path / "report").mkdir()
+        (tmp_path / "report" / "figures").write_text("precious")
     comm.Barrier()
     assert cli.main(["report", str(tmp_path)]) == 2
-    told = "report/figures: Not a directory; check the file, its directory and the space on the disk\n"
+    told = "report/figures: File exists; check the file, its directory and the space on the disk\n"
     assert comm.rank > 0 or capfd.readouterr().err.endswith(told)
 
 

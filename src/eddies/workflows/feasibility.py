@@ -69,10 +69,10 @@ def check_places(stages: Sequence[str], comm: Comm, directory: Path) -> None:
             file, folder = (stage.file, stage.checkpoints) if stage.product is not None else (None, "report")
             if file is not None and (directory / file).is_dir():
                 raise SceneError(f"{directory / file}: is a directory, and `eddies {stage.name}` writes a file of this "
-                                 "name; move it away, or choose another --output")
+                                 "name; move it away, or choose another directory")
             if folder is not None and (directory / folder).exists() and not (directory / folder).is_dir():
                 raise SceneError(f"{directory / folder}: is a file, and `eddies {stage.name}` makes a directory of "
-                                 "this name; move it away, or choose another --output")
+                                 "this name; move it away, or choose another directory")
 
     try:
         on_first_rank(comm, look)
