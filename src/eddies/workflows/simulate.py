@@ -100,10 +100,10 @@ def roll_out(method: Method, frames: RolloutFrames, count: int, interval: float,
             if complaint is None:
                 clock.tick(method.time - before)
                 seconds.append(time.perf_counter() - began)
+                progress(min(clock.time / clock.end, 1.0), clock.steps)
         if complaint is not None:
             break
         energy = store(frames, method, clock, until, truth)
-        progress(until / clock.end, clock.steps)
     if complaint is not None and comm.rank == 0:
         log.warning("rollout stopped at time %.4g: %s", clock.time, complaint)
     step = clock.time / clock.steps if clock.steps else np.nan
