@@ -19,6 +19,7 @@ from eddies.parallel.stop import StopRequest
 from eddies.pipeline import STAGES, Stage, after
 from eddies.scene.scene import Scene, SceneError
 from eddies.workflows.foreseen.estimates import ground_truth_alone, most_ranks
+from eddies.workflows.foreseen.warnings import stage_warnings
 from eddies.workflows.learned.source import read_source
 
 log = logging.getLogger("eddies")
@@ -44,6 +45,9 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
     prepare_directory(scene, comm, directory)
     if scene.foreign:
         log.info("%s: uses classes that are not of this package: %s", scene.name, ", ".join(scene.foreign))
+    if comm.rank == 0:
+        for problem in stage_warnings(scene, stages):
+            log.warning(problem)
     for stage in [STAGES[name] for name in stages]:
         goes_on, resume = resume, resume and is_done(stage.name, scene, comm, directory)
         if resume or not goes_on:  # left by another run, or by one killed in its last moment

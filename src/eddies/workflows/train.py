@@ -90,7 +90,7 @@ def take_all_steps(training: Training, checkpoints: CheckpointDirectory, stop: S
         shown = f"  validation error {errors[-1]:.3f}" if errors else ""
         return f"{training.phase.name}  loss {training.history[-1]['loss']:.4f}{shown}"
 
-    progress = ProgressLine("train", describe, done=training.done, step=len(training.history))
+    progress = ProgressLine("train", describe)
     while training.running:
         stopping = stop()
         if stop.checkpoint_due:
