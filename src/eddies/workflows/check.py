@@ -50,7 +50,7 @@ def run(scene: Scene, comm: Comm, as_json: bool = False) -> None:
         for index, line in enumerate(lines):
             log.info("%-12s%s", "" if index else title, line)
     if comm.rank == 0:
-        for problem in (*doubts, *(f"will be refused: {reason}" for reason in refused)):
+        for problem in (*doubts, *(f"would fail here: {reason}" for reason in refused)):
             log.warning(problem)
 
 

@@ -91,7 +91,8 @@ def test_evaluations_of_frames_are_those_between_steps():
 
 
 def test_what_is_not_foreseen_has_no_course(own):
-    own("own_method", "class Own:\n    has_density = needs = ()\n    advance = frame = status = series = description = 0\n")
+    own("own_method", "class Own:\n    has_density = needs = ()\n"
+                      "    advance = frame = status = series = description = 0\n")
     for changes in (["simulation.method=own_method:Own"], ["flow.viscosity=0"]):
         assert rollout_course(load_scene("hit-small", changes)) is None
     assert rollout_course(load_scene("taylor-green")) is None

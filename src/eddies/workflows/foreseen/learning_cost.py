@@ -6,8 +6,9 @@ from dataclasses import replace
 
 from eddies.kernels.library import library, threads
 from eddies.particles.smoothing_kernels import KNOTS
-from eddies.scene.scene import BOX_LENGTH, Eulerian, Scene
+from eddies.scene.scene import BOX_LENGTH, Eulerian, Initial, Scene
 from eddies.workflows.foreseen.cost_model import busiest_cells, cost, flow_bytes
+from eddies.workflows.foreseen.estimates import ground_truth_alone
 from eddies.workflows.foreseen.particle_cost import NEIGHBOR_BYTES, PROCESS_BYTES, particle_bytes, particle_cost
 from eddies.workflows.foreseen.particle_work import ParticleWork, particle_work
 from eddies.workflows.foreseen.rollout_course import EVALUATIONS, rollout_course
@@ -117,8 +118,9 @@ def rollout_cost(scene: Scene, ranks: int, speeds: Speeds) -> StageCost:
         memory = particle_bytes(work, speeds.particles, ranks)
     parts["steps"] = first + (course.evaluations - 1) * evaluation
     if settings.method == "eulerian":
-        coarse = replace(scene, flow=replace(scene.flow, cells=(scene.eulerian or Eulerian()).cells_for(
-            scene.tracers.filter_width)))
+        cells = (scene.eulerian or Eulerian()).cells_for(scene.tracers.filter_width)
+        coarse = replace(ground_truth_alone(scene), flow=replace(scene.flow, cells=cells), forcing=None, spin_up=None,
+                         tracers=None, time=replace(scene.time, duration=1.0), initial=Initial(peak_wavenumber=1.0))
         moved = speeds.flow.tracers * busiest_cells(scene, ranks)
         parts["steps"] = course.steps * (cost(coarse, ranks, speeds.flow).seconds + moved)
         memory += flow_bytes(coarse, ranks)
