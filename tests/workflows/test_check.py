@@ -289,6 +289,12 @@ def test_warnings(comm, override, warning, caplog, recorded):
 
 
 @pytest.mark.mpi(1)
+def test_what_a_stage_would_refuse_is_told(comm, caplog, recorded):
+    text = lines_of(load_scene("taylor-green", ["initial.kind=file", "initial.path=nowhere.h5"]), comm, caplog)
+    assert "fails here  nowhere.h5" in text
+
+
+@pytest.mark.mpi(1)
 def test_job_with_too_many_ranks_is_told(comm):
     from eddies.workflows.check import warnings
     assert any("this job has 100 ranks" in line for line in warnings(load_scene("tiny"), 100))

@@ -44,13 +44,13 @@ def run(scene: Scene, comm: Comm, as_json: bool = False) -> None:
     subjects = {"grid": grid_lines(scene), "turbulence": turbulence_lines(scene),
                 "particles": particle_lines(scene), "time step": step_lines(scene), "rollout": course_lines(scene),
                 "ranks": rank_lines(scene), "stages": stage_lines(scene, comm.size, speeds, stages),
-                "more ranks": cost_lines(scene, speeds.flow), "": rollout_lines(scene, rollout)}
+                "fails here": refused, "more ranks": cost_lines(scene, speeds.flow), "": rollout_lines(scene, rollout)}
     log.info("%s: %s", scene.name, scene.title)
     for title, lines in subjects.items():
         for index, line in enumerate(lines):
             log.info("%-12s%s", "" if index else title, line)
     if comm.rank == 0:
-        for problem in (*doubts, *(f"would fail here: {reason}" for reason in refused)):
+        for problem in doubts:
             log.warning(problem)
 
 

@@ -84,4 +84,5 @@ def report_cost(scene: Scene, ranks: int, speeds: Speeds) -> StageCost:
 
 def in_units(size: float) -> str:
     """Bytes for people."""
-    return f"{size / 1e9:.3g} GB" if size >= 1e9 else f"{size / 1e6:.{0 if size >= 1e6 else 1}f} MB"
+    unit, name = next(((unit, name) for unit, name in ((1e9, "GB"), (1e6, "MB")) if size >= unit), (1e3, "kB"))
+    return f"{size / unit:.3g} {name}" if name == "GB" else f"{size / unit:.0f} {name}"

@@ -29,7 +29,7 @@ from eddies.particles.smoothing_kernels import KernelNetwork
 from eddies.scene.scene import BOX_LENGTH, Scene, Simulation
 from eddies.workflows.foreseen.particle_probe import ITERATIONS, LEAST_SIDE, ProbeError, probed_model
 
-REPEATS = 3
+REPEATS = 2
 
 
 @dataclass(frozen=True)
