@@ -8,13 +8,14 @@ from eddies.io.checkpoint import KEPT
 from eddies.io.hdf5 import stored_bytes
 from eddies.scene.scene import Scene
 from eddies.workflows.foreseen.cost_model import real_bytes
-from eddies.workflows.foreseen.estimates import flow_steps, largest_wavenumber, time_of, tracer_intervals
+from eddies.workflows.foreseen.estimates import flow_steps, largest_wavenumber, tracer_intervals
 from eddies.workflows.foreseen.rollout_course import RolloutCourse
 
 CHECKPOINTS = KEPT + 1       # with the one that is being written
 # Of the statistics: steps between two samples, numbers in each beside the spectrum.
 SAMPLE_EVERY, SAMPLE_COLUMNS = 4, 25
 SAMPLES = 20_000             # particles of which a model's rates are kept, 48 bytes each
+PRODUCT_BYTES = 30_000       # of a product beside what grows: the scene, headers, small tables
 FIGURE_BYTES = 0.6e6         # of a figure of a report, in its page too
 
 
@@ -55,7 +56,7 @@ def flow_scratch_bytes(scene: Scene) -> int:
 
 def kernel_bytes(scene: Scene) -> int:
     """Of kernel.h5: mostly the planes of five reconstructions, velocity and gradient."""
-    return 8 * (10 * scene.tracers.cells**2 + 8 * scene.kernel.steps)
+    return PRODUCT_BYTES + 8 * (10 * scene.tracers.cells**2 + 8 * scene.kernel.steps)
 
 
 def model_bytes(scene: Scene) -> int:
@@ -64,7 +65,7 @@ def model_bytes(scene: Scene) -> int:
     steps = 0 if training is None else training.steps
     if training and training.horizons:
         steps += training.horizons.steps * len(training.horizons.frames)
-    return 48 * min(scene.tracers.particles, SAMPLES) + 100 * steps
+    return PRODUCT_BYTES + 48 * min(scene.tracers.particles, SAMPLES) + 100 * steps
 
 
 def rollout_bytes(scene: Scene, course: RolloutCourse) -> int:
@@ -88,5 +89,5 @@ def stores_density(scene: Scene) -> bool:
 def true_frames(scene: Scene, course: RolloutCourse) -> int:
     """Frames of a rollout at whose times there is a ground truth."""
     start = scene.seen if scene.simulation.start is None else scene.simulation.start
-    left = (1 - start) * (time_of(scene, scene.tracers.turnovers) or 0.0)
+    left = (1 - start) * scene.tracers.turnovers * course.turnover_time
     return min(course.intervals, int(left / course.interval)) + 1
