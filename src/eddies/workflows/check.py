@@ -81,8 +81,8 @@ def turbulence_lines(scene: Scene) -> Iterator[str]:
            f"{turbulence.reynolds_lambda:.3g}, turnover time {turbulence.turnover_time:.3g}")
     yield (f"Kolmogorov length {eta:.3g}, time {turbulence.kolmogorov_time:.3g}, k_max eta "
            f"{largest_wavenumber(scene) * eta:.3g}")
-    if (number := mach(scene)) is not None:
-        yield f"turbulent Mach number {number:.3g}"
+    if (reached := mach(scene)) is not None:
+        yield f"turbulent Mach number {reached:.3g}"
 
 
 def particle_lines(scene: Scene) -> Iterator[str]:
