@@ -56,33 +56,30 @@ def ladder_step(largest: float, bound: float) -> float:
 
 
 class ProgressLine:
-    """Logs one line every few seconds of wall time: how far, and how long it will still take.
+    """Logs one line every few seconds of wall time: how far, and how long it will still take. It is to be called after
+    every step, so that lines come by time and not by frames.
 
     `describe` returns what is worth reading of the state at that moment; it is called where that is logged only, so it
-    must not communicate. `before` are wall seconds of earlier parts of the run, which went on from a checkpoint.
+    must not communicate. `done` and `step` are those of the checkpoint that a stage goes on from: what was done before
+    is no measure of what is left.
     """
 
-    def __init__(self, stage: str, describe: Callable[[], str], interval: float = 5.0, before: float = 0.0) -> None:
-        self.stage, self.describe, self.interval = stage, describe, interval
-        self._last = time.perf_counter()
-        self._started = self._last - before
-
-    @property
-    def elapsed(self) -> float:
-        """Wall seconds of the run so far, in all its parts."""
-        return time.perf_counter() - self._started
+    def __init__(self, stage: str, describe: Callable[[], str], interval: float = 5.0, done: float = 0.0,
+                 step: int = 0) -> None:
+        self.stage, self.describe, self.interval, self.done, self.step = stage, describe, interval, done, step
+        self._started = self._last = time.perf_counter()
 
     def __call__(self, done: float, step: int) -> None:
         """Report if it is time; `done` is the finished fraction of the stage in [0, 1], `step` the steps so far."""
         if not log.isEnabledFor(logging.INFO):
             return
         now = time.perf_counter()
-        if now - self._last < self.interval or done <= 0:
+        if now - self._last < self.interval or done <= self.done:
             return
         self._last = now
-        elapsed = self.elapsed
+        elapsed = now - self._started
         log.info("%s  step %d  %s  %.3f s/step  %.0f %%  %s left", self.stage, step, self.describe(),
-                 elapsed / max(step, 1), 100 * done, duration(elapsed * (1 - done) / done))
+                 elapsed / max(step - self.step, 1), 100 * done, duration(elapsed * (1 - done) / (done - self.done)))
 
 
 def duration(seconds: float) -> str:

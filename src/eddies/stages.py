@@ -21,6 +21,7 @@ from eddies.pipeline import STAGES, Stage, after
 from eddies.scene.scene import Scene, SceneError
 from eddies.workflows.feasibility import check_feasible, check_ground_truth, check_places
 from eddies.workflows.foreseen.estimates import ground_truth_alone, most_ranks
+from eddies.workflows.foreseen.warnings import stage_warnings
 from eddies.workflows.learned.source import read_source
 
 log = logging.getLogger("eddies")
@@ -49,6 +50,9 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
     prepare_directory(scene, comm, directory)
     if scene.foreign:
         log.info("%s: uses classes that are not of this package: %s", scene.name, ", ".join(scene.foreign))
+    if comm.rank == 0:
+        for problem in stage_warnings(scene, stages):
+            log.warning(problem)
     known = False  # that the ground truth is what the other stages need
     for stage in [STAGES[name] for name in stages]:
         goes_on, resume = resume, resume and is_done(stage.name, scene, comm, directory)

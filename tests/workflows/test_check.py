@@ -4,6 +4,7 @@ import json
 import logging
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -50,12 +51,44 @@ def test_numbers_for_programs(comm, capfd):
     assert (told["particles"], told["largest_wavenumber"], told["most_ranks"]) == (32768, 21, 12)
     assert told["most_ranks"] == min(told["limits"].values()) <= told["most_ranks_dns"] and told["ranks"] == comm.size
     assert told["turbulence"]["reynolds_lambda"] == pytest.approx(50.3, abs=0.05)
-    assert [row["ranks"] for row in told["costs"]][:3] == [1, 2, 4] and told["warnings"] == []
+    assert [row["ranks"] for row in told["costs"]][:3] == [1, 2, 4]
+    assert told["warnings"] == told["refusals"] == [] and told["not_foreseen"] == {}
     rows = told["rollout_costs"]
     assert [row["cores"] for row in rows] == [2**m for m in range(len(rows))] and len(rows) <= 14
     for row in rows:
         assert row["ranks"] <= told["most_ranks"] and row["cores"] == row["ranks"] * row["threads"]
         assert row["seconds_per_step"] == pytest.approx(3 * row["seconds_per_evaluation"]) and row["seconds"] > 0
+    check_sums(told)
+
+
+def check_sums(told):
+    """Stages are those of the scene, their parts add up, and they to the totals."""
+    stages, totals = told["stage_costs"], told["totals"]
+    assert [row["stage"] for row in stages] == [name for name in told["stages"] if name not in told["not_foreseen"]]
+    for row in stages:
+        assert row["seconds"] == pytest.approx(sum(row["parts"].values())) and min(row["parts"].values()) >= 0
+        assert row["memory"] > 1e7 and row["disk"] > 0 and row["scratch"] >= 0
+    assert totals["seconds"] == pytest.approx(sum(row["seconds"] for row in stages))
+    assert totals["disk"] == pytest.approx(sum(row["disk"] for row in stages)) and totals["most_disk"] >= totals["disk"]
+    assert totals["memory"] == max(row["memory"] for row in stages)
+    rollout = told["rollout"]
+    assert rollout["steps_per_frame"] == pytest.approx(rollout["steps"] / rollout["intervals"])
+    assert rollout["evaluations"] == 3 * rollout["steps"] + 1
+
+
+@pytest.mark.mpi(1)
+def test_every_key_is_described(comm, capfd):
+    from eddies.workflows import check
+    described = (Path(__file__).parents[2] / "docs/check.md").read_text(encoding="utf-8")
+    check.run(load_scene("tiny"), comm, as_json=True)
+
+    def keys(value):
+        for part in value if isinstance(value, list) else [value] if isinstance(value, dict) else []:
+            for key, inner in part.items() if isinstance(part, dict) else []:
+                yield key
+                yield from keys(inner) if key not in ("limits", "parts", "not_foreseen") else ()
+
+    assert [key for key in dict.fromkeys(keys(json.loads(capfd.readouterr().out))) if f"`{key}`" not in described] == []
 
 
 @pytest.mark.mpi(1)
@@ -64,7 +97,8 @@ def test_what_is_not_foreseen_is_null(comm, capfd):
     check.run(load_scene("abc"), comm, as_json=True)
     told = json.loads(capfd.readouterr().out)
     assert told["turbulence"] is told["particles"] is told["kernel_support"] is None
-    assert told["rollout_costs"] == []
+    assert told["rollout_costs"] == [] and told["rollout"] is told["mach_turbulent"] is None
+    assert [row["stage"] for row in told["stage_costs"]] == ["dns", "report"]
 
 
 @pytest.mark.mpi(1)
@@ -205,15 +239,20 @@ def test_what_no_term_reads_limits_no_ranks():
 @pytest.mark.mpi(1)
 def test_a_rollout_is_foreseen_where_a_model_moves_the_particles_of_a_cpu(comm):
     from eddies.workflows.check import rollout_costs, rollout_lines
-    from eddies.workflows.foreseen.cost_model import Speed
+    from eddies.workflows.foreseen.stage_costs import probe_scene, stage_costs
     learned = load_scene("tiny")
-    rows = rollout_costs(learned, comm, Speed(1e-6, 1e9))
+    rows = rollout_costs(learned, probe_scene(learned, comm))
     lines = list(rollout_lines(learned, rows))
     assert len(lines) == len(rows) + 2 and "3 evaluations a step, 2.8 iterations each" in lines[0]
     assert all(row.binds in line and f"{row.ranks} x {row.threads}" in line for row, line in zip(rows, lines[2:]))
-    for changes in (["simulation.method=none"], ["simulation.method=wcsph", "simulation.step=0.005"], ["device=cuda"]):
+    for changes, stages in ((["simulation.method=none"], ["dns", "train-kernel", "simulate", "report"]),
+                            (["simulation.method=wcsph", "simulation.step=0.005"], ["dns", "train-kernel", "report"]),
+                            (["device=cuda"], ["dns", "train-kernel", "report"])):
         other = load_scene("tiny", changes)
-        assert rollout_costs(other, comm, Speed(1e-6, 1e9)) == [] == list(rollout_lines(other, []))
+        speeds = probe_scene(other, comm)
+        assert rollout_costs(other, speeds) == [] == list(rollout_lines(other, []))
+        assert [cost.stage for cost in stage_costs(other, 1, speeds)] == stages
+        assert set(speeds.missing) == set(other.stages) - set(stages)
 
 
 @pytest.mark.mpi(1, 2)
@@ -221,7 +260,7 @@ def test_a_term_that_fails_leaves_the_rest_foreseen(comm, own, caplog, recorded)
     own("own_fault", "from eddies.particles.terms.viscosity import Viscosity\nclass Fault(Viscosity):\n"
                      "    def forward(self, context): raise ValueError('not among so few')")
     text = lines_of(load_scene("tiny", ['model.terms=["pressure", "own_fault:Fault"]']), comm, caplog)
-    assert comm.rank > 0 or "particles are not foreseen: ValueError: not among so few" in text
+    assert comm.rank > 0 or "simulate      not foreseen: ValueError: not among so few" in text
 
 
 @pytest.mark.mpi(1)
@@ -243,10 +282,16 @@ def test_ghost_planes_limit_the_ranks():
 
 
 @pytest.mark.mpi(1)
-@pytest.mark.parametrize("override, warning", [("flow.viscosity=0.001", "k_max eta is below 0.9"),
+@pytest.mark.parametrize("override, warning", [("flow.viscosity=0.001", "k_max eta is about 0.047, below 1"),
                                                ("tracers.filter_width=0.1", "narrower than a cell")])
 def test_warnings(comm, override, warning, caplog, recorded):
     assert warning in lines_of(load_scene("tiny", [override]), comm, caplog)
+
+
+@pytest.mark.mpi(1)
+def test_what_a_stage_would_refuse_is_told(comm, caplog, recorded):
+    text = lines_of(load_scene("taylor-green", ["initial.kind=file", "initial.path=nowhere.h5"]), comm, caplog)
+    assert "fails here  nowhere.h5" in text
 
 
 @pytest.mark.mpi(1)

@@ -58,6 +58,24 @@ def test_metrics_are_finite_and_within_bounds(run_directory):
     assert rollout["velocity_error"] < 0.95 * error_of_frozen_velocities(run_directory)
 
 
+def test_what_check_foresees_is_what_was_run(run_directory):
+    from eddies.workflows.foreseen.numbers import mach
+    from eddies.workflows.foreseen.rollout_course import rollout_course
+    from eddies.workflows.foreseen.stored import kernel_bytes, model_bytes, rollout_bytes, trajectory_bytes
+    scene = load_scene("tiny")
+    with h5py.File(run_directory / "rollout.h5") as file:
+        rollout = dict(file["rollout"].attrs)
+    with h5py.File(run_directory / "ground_truth.h5") as file:
+        frames, measured = len(file["particles/tracers/time"]), file["reference"].attrs["mach_turbulent"]
+    course = rollout_course(scene, rollout["eddy_turnover_time"])
+    assert (course.steps, course.evaluations) == (rollout["steps"], rollout["evaluations"]) == (9, 28)
+    assert mach(scene) == pytest.approx(measured, rel=0.5)
+    sizes = {"ground_truth": trajectory_bytes(scene, frames), "rollout": rollout_bytes(scene, course),
+             "kernel": kernel_bytes(scene), "model": model_bytes(scene)}
+    for name, size in sizes.items():
+        assert (run_directory / f"{name}.h5").stat().st_size == pytest.approx(size, rel=0.2), name
+
+
 def error_of_frozen_velocities(directory):
     """Velocity error at the last common frame of particles that keep their first velocity: what no model gives."""
     with h5py.File(directory / "rollout.h5") as file:

@@ -80,17 +80,23 @@ def step_limits(fluid: Fluid, stepper: Callable, step: float, speed: float) -> l
     tenfold, on 12^3 cells with M_t from 0.01 to 0.5.
     """
     grid = fluid.grid
-    k_max = 2 * math.pi / grid.decomposition.length * grid.cutoff
+    return limits_of_step(2 * math.pi / grid.decomposition.length * grid.cutoff, step, speed, fluid.viscosity,
+                          isinstance(stepper, RungeKutta4), fluid.sound_speed if fluid.compressible else None)
+
+
+def limits_of_step(k_max: float, step: float, speed: float, viscosity: float, explicit: bool,
+                   sound_speed: float | None) -> list[StepLimit]:
+    """The same by numbers: `explicit` of RK4, `sound_speed` None without sound."""
     limits = [StepLimit("advection", "step x k_max x max(|u| + |v| + |w|)", step * k_max * speed, IMAGINARY_REACH)]
-    if isinstance(stepper, RungeKutta4):
+    if explicit:
         stretch = 3.0
-        if fluid.compressible:
+        if sound_speed is not None:
             stretch = 4.0
-            number = step * k_max * (speed + math.sqrt(3) * fluid.sound_speed)
+            number = step * k_max * (speed + math.sqrt(3) * sound_speed)
             limits.append(StepLimit("sound", "step x k_max x (max(|u| + |v| + |w|) + sqrt(3) sound_speed)", number,
                                     IMAGINARY_REACH))
         limits.append(StepLimit("viscosity", f"step x {stretch:g} viscosity k_max^2",
-                                step * stretch * fluid.viscosity * k_max**2, REAL_REACH))
+                                step * stretch * viscosity * k_max**2, REAL_REACH))
     return limits
 
 

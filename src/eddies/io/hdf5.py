@@ -199,13 +199,23 @@ def growing_dataset(group: h5py.Group, name: str, frame_shape: tuple[int, ...], 
 
     A chunk holds as much of one frame as fits, or many frames of a single value. All ranks call it.
     """
-    chunk, largest = [1024] if not frame_shape else [1], CHUNK_BYTES // np.dtype(dtype).itemsize
+    chunk = _chunk(frame_shape, dtype) if frame_shape else (1024,)
+    with writing(group, HEADER_BYTES):
+        return group.create_dataset(name, (0, *frame_shape), dtype, maxshape=(None, *frame_shape), chunks=chunk)
+
+
+def stored_bytes(frame_shape: tuple[int, ...], dtype: Any) -> int:
+    """Bytes that a frame of such a dataset takes in a file: whole chunks."""
+    extents = zip(frame_shape, _chunk(frame_shape, dtype)[1:])
+    return math.prod(math.ceil(extent / chunk) * chunk for extent, chunk in extents) * np.dtype(dtype).itemsize
+
+
+def _chunk(frame_shape: tuple[int, ...], dtype: Any) -> tuple[int, ...]:
+    chunk, largest = [1], CHUNK_BYTES // np.dtype(dtype).itemsize
     for axis, extent in enumerate(frame_shape):
         below = math.prod(frame_shape[axis + 1:])
         chunk.append(max(1, min(extent, largest // max(below, 1))))
-    with writing(group, HEADER_BYTES):
-        return group.create_dataset(name, (0, *frame_shape), dtype, maxshape=(None, *frame_shape),
-                                    chunks=tuple(chunk))
+    return tuple(chunk)
 
 
 def append_frame(dataset: h5py.Dataset, block: np.ndarray, offset: tuple[int, ...]) -> None:

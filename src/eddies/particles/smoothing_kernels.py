@@ -18,6 +18,7 @@ from eddies.particles.dense_network import DenseNetwork
 
 # Sharpness C of the paper's sigmoid (Eq. 7): half its value is reached at r = h, a tenth lost at r = 0.89 h.
 SIGMOID_SHARPNESS = 20.0
+KNOTS = 129                  # of a table of the learned kernel
 
 
 class SmoothingKernel(Protocol):
@@ -199,11 +200,11 @@ class KernelNetwork(nn.Module):
             bell_slope = -SIGMOID_SHARPNESS * bell * (1 - bell)
         return HermiteKernel(self.support, (shape * bell)[0], (slope * bell + shape * bell_slope)[0])
 
-    def integral(self, knots: int = 129) -> Tensor:
+    def integral(self, knots: int = KNOTS) -> Tensor:
         """1/alpha, the integral of exp(NN) g over space; the loss of Eq. 11 on it keeps alpha near one."""
         return integral(self._unnormalised(knots))
 
-    def table(self, knots: int = 129) -> HermiteKernel:
+    def table(self, knots: int = KNOTS) -> HermiteKernel:
         """The kernel tabulated at `knots` points, with unit integral; differentiable in the weights."""
         kernel = self._unnormalised(knots)
         alpha = 1 / integral(kernel)

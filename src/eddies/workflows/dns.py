@@ -74,16 +74,19 @@ def build_run(scene: Scene, comm: Comm, guard: Guard, saved: Checkpoint | None) 
 
 def run_for(duration: float, flow: FlowRun) -> None:
     """Run the flow for a time after its start or spin-up."""
-    clock, progress = flow.clock, ProgressLine("dns", flow.history.describe)
+    clock = flow.clock
     if flow.phase == "start":
         clock.end, flow.phase = clock.time + duration, "run"
     start = clock.end - duration
+    progress = ProgressLine("dns", flow.history.describe, done=(clock.time - start) / duration, step=clock.steps)
     flow.advance([flow.history, lambda _, clock: progress((clock.time - start) / duration, clock.steps)])
 
 
 def spin_up(turnovers: float, flow: FlowRun) -> None:
     """Run until the flow has turned over the given number of times."""
-    history, progress = flow.history, ProgressLine("spin-up", flow.history.describe)
+    history = flow.history
+    progress = ProgressLine("spin-up", history.describe, done=history.rows[-1]["turnovers"] / turnovers,
+                            step=flow.clock.steps)
 
     def until_turned_over(_: np.ndarray, clock: Clock) -> None:
         done = history.rows[-1]["turnovers"] / turnovers

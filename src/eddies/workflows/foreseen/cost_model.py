@@ -20,9 +20,13 @@ from statistics import median
 import numpy as np
 
 from eddies.clock import Clock
+from eddies.flow.history import FlowHistory
+from eddies.flow.tracers import FilteredField, TracerParticles, release
 from eddies.kernels.library import threads
 from eddies.parallel.communicator import Comm
-from eddies.scene.scene import Initial, Scene
+from eddies.parallel.reduction import global_max
+from eddies.parallel.slab import SlabDecomposition
+from eddies.scene.scene import BOX_LENGTH, Initial, Scene
 from eddies.spectral.fourier_passes import BLOCK_BYTES
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.time_stepping import STEPPERS
@@ -42,15 +46,18 @@ WORK_GROWTH = {64: 1.0, 128: 1.0, 256: 1.35, 512: 1.7, 1024: 2.75, 2048: 4.8}
 FLOW_BYTES = {True: 320, False: 220}
 BLOCK_ARRAYS = {True: 64, False: 32}
 PROCESS_BYTES = 100e6
+TRACER_BYTES = 300           # of a tracer, copies while it moves and is stored included
 
 
 @dataclass(frozen=True)
 class Speed:
     """The speed of the ranks at hand: `work`, seconds of a step for a cell of 64^3, and `bandwidth`, bytes a second to
-    others."""
+    others; for such a cell the seconds of a sample of the statistics and of moving its tracers by a step as well."""
 
     work: float
     bandwidth: float
+    sample: float = 0.0
+    tracers: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -77,14 +84,19 @@ class Cost:
 
 def cost(scene: Scene, ranks: int, speed: Speed) -> Cost:
     """The cost of a step of a scene's direct simulation on `ranks` ranks, at most as many as it has planes."""
-    cells, planes = scene.flow.cells, busiest_planes(scene.flow.cells, ranks)
-    work = speed.work * work_growth(cells) * cells**2 * planes
-    return Cost(ranks, math.ceil(cells / ranks), flow_bytes(scene, ranks), work, exchange_seconds(scene, ranks, speed))
+    return Cost(ranks, math.ceil(scene.flow.cells / ranks), flow_bytes(scene, ranks),
+                speed.work * busiest_cells(scene, ranks), exchange_seconds(scene, ranks, speed))
 
 
 def costs(scene: Scene, most: int, speed: Speed) -> list[Cost]:
     """Costs on 1, 2, 4, ... ranks up to `most`; the last twelve of these."""
     return [cost(scene, 2**m, speed) for m in range(most.bit_length())][-12:]
+
+
+def busiest_cells(scene: Scene, ranks: int) -> float:
+    """Cells of the busiest rank, as many as they would be of 64^3 by their work."""
+    cells = scene.flow.cells
+    return work_growth(cells) * cells**2 * busiest_planes(cells, ranks)
 
 
 def busiest_planes(cells: int, ranks: int) -> int:
@@ -118,7 +130,11 @@ def flow_bytes(scene: Scene, ranks: int) -> float:
     """Memory of a rank in the direct simulation."""
     fluid, cells, real = scene.flow.compressible, scene.flow.cells, real_bytes(scene)
     block = BLOCK_ARRAYS[fluid] * max(threads() * BLOCK_BYTES, 2 * cells**2 * real)
-    return PROCESS_BYTES + FLOW_BYTES[fluid] * real / 8 * cells**2 * math.ceil(cells / ranks) + block
+    planes = math.ceil(cells / ranks)
+    size = PROCESS_BYTES + FLOW_BYTES[fluid] * real / 8 * cells**2 * planes + block
+    if scene.tracers:
+        size += 3 * real * cells**2 * planes + TRACER_BYTES * scene.tracers.particles / ranks
+    return size
 
 
 def probe(scene: Scene, comm: Comm, steps: int = 5) -> Speed:
@@ -127,9 +143,9 @@ def probe(scene: Scene, comm: Comm, steps: int = 5) -> Speed:
     The grid has no more cells a rank than PROBE_CELLS^3.
     """
     small = small_flow(scene, comm.size)
-    fluid = build_fluid(small, comm)
+    fluid, clock = build_fluid(small, comm), Clock(end=small.time.duration)
     grid, stepper, state = fluid.grid, STEPPERS[scene.time.stepper](fluid), initial_state(small, fluid)
-    step = build_step_limit(small, grid)(state, Clock(end=small.time.duration))
+    step = build_step_limit(small, grid)(state, clock)
     state = stepper(state, step)  # the first step also plans transforms and makes tables
     times = []
     for _ in range(steps):
@@ -145,8 +161,36 @@ def probe(scene: Scene, comm: Comm, steps: int = 5) -> Speed:
         moving = max(exchange - 2 * (comm.size - 1) * LATENCY, exchange / 2)
         bandwidth = sent_bytes(small) * (comm.size - 1) / comm.size**2 / moving
         seconds -= EVALUATIONS * exchange
-    cells = small.flow.cells
-    return Speed(seconds / (cells**2 * busiest_planes(cells, comm.size) * work_growth(cells)), bandwidth)
+    history = FlowHistory(fluid)
+    history.sample(state, clock)
+    clock.tick(step)
+    comm.Barrier()
+    start = time.perf_counter()
+    history.sample(state, clock)
+    sample = global_max(comm, time.perf_counter() - start)
+    cells = busiest_cells(small, comm.size)
+    return Speed(seconds / cells, bandwidth, float(sample) / cells,
+                 tracer_seconds(scene, comm) if scene.tracers else 0.0)
+
+
+def tracer_seconds(scene: Scene, comm: Comm, steps: int = 3) -> float:
+    """Seconds in which the tracers of a cell of 64^3 move by a step, on the slowest of the ranks at hand: each by
+    itself, all at once, with as many tracers a cell as the scene has."""
+    alone, cells = comm.Split(comm.rank), min(scene.flow.cells, PROBE_CELLS)
+    try:
+        grid = SpectralGrid(SlabDecomposition(alone, BOX_LENGTH, cells), scene.flow.precision)
+        state = np.zeros((3, *grid.spectral_shape), grid.complex)
+        side = max(round(scene.tracers.particles_per_side * cells / scene.flow.cells), 2)
+        field = FilteredField(grid, scene.tracers.filter_width, scene.tracers.interpolation)
+        tracers = TracerParticles(field, release(grid.decomposition, scene.seed, side, "random"), state)
+        times = []
+        for _ in range(steps):
+            start = time.perf_counter()
+            tracers.advance(state, 0.0)
+            times.append(time.perf_counter() - start)
+        return float(global_max(comm, min(times))) / cells**3
+    finally:
+        alone.Free()
 
 
 def exchange_once(grid: SpectralGrid, scene: Scene, comm: Comm) -> float:

@@ -8,10 +8,13 @@ from eddies.particles.reference_scales import allowed_step, resolved_wavenumber
 from eddies.scene.scene import BOX_LENGTH, Eulerian, Scene
 
 DISSIPATION_CONSTANT = 0.5   # C_eps = eps L / u'^3 of developed turbulence
+DECAY_EXPONENT = 1.2         # of the energy of turbulence that nothing forces (Saffman 1967)
 PEAK_VELOCITY = 4.0          # largest component of the velocity of a particle over u'
 ALLOWED_VELOCITY = 6.0       # the same, for which there are ghost planes in the training through horizons
 PEAK_SPEED = 7.0             # max(|u| + |v| + |w|) over u' in turbulence: four rms in each component at worst
 EXACT_PEAK_SPEED = {"taylor-green": 1.0, "abc": 3 * math.sqrt(2), "shear-wave": 1.0}  # over the amplitude
+# Root mean square of |u| over the amplitude.
+RMS_SPEED = {"random": math.sqrt(3), "taylor-green": 0.5, "abc": math.sqrt(3), "shear-wave": math.sqrt(0.5)}
 GHOST_PLANES = {"cubic": 3, "quintic": 4}
 
 
@@ -37,6 +40,12 @@ class ExpectedTurbulence:
     def kolmogorov_time(self) -> float:
         """t_eta = (nu / eps)^(1/2)."""
         return math.sqrt(self.viscosity / self.dissipation_rate)
+
+    def decayed(self, time: float) -> float:
+        """u' a time after the forcing has ended: the energy E falls as (1 + eps t / (n E))^-n, n = DECAY_EXPONENT."""
+        energy = 1.5 * self.velocity_rms**2
+        lost = self.dissipation_rate * time / (DECAY_EXPONENT * energy)
+        return self.velocity_rms * (1 + lost) ** (-DECAY_EXPONENT / 2)
 
     @property
     def reynolds_lambda(self) -> float:
@@ -81,28 +90,72 @@ def peak_speed(scene: Scene) -> float | None:
     return EXACT_PEAK_SPEED[initial.kind] * initial.amplitude if initial.kind in EXACT_PEAK_SPEED else None
 
 
+def rms_speed(scene: Scene) -> float | None:
+    """Expected root mean square of the velocity, of all its components; None without forcing for a flow from a file or
+    of the user's, and where sound is all that moves."""
+    initial, turbulence = scene.initial, expected_turbulence(scene)
+    if turbulence:
+        return math.sqrt(3) * turbulence.velocity_rms
+    return RMS_SPEED[initial.kind] * initial.amplitude if initial.kind in RMS_SPEED else None
+
+
 def expected_step(scene: Scene) -> tuple[float, str] | None:
     """The time step of the direct simulation and what limits it; None if the speed cannot be foreseen."""
-    settings, speed = scene.time, peak_speed(scene)
+    settings, bound = scene.time, courant_bound(scene)
     if settings.step is not None:
         return settings.step, "fixed by [time] step"
-    if speed is None:
+    if bound is None:
         return None
-    sound = math.sqrt(3) * scene.flow.sound_speed if settings.stepper == "rk4" and scene.flow.sound_speed else 0.0
-    bound = settings.courant * BOX_LENGTH / scene.flow.cells / (speed + sound)
     if bound >= settings.max_step:
         return settings.max_step, "limited by [time] max_step"
-    limit = "sound, which rk4 must resolve" if sound > speed else "advection"
+    limit = "sound, which rk4 must resolve" if explicit_sound(scene) > peak_speed(scene) else "advection"
     return ladder_step(settings.max_step, bound), f"limited by {limit}: at most {bound:.3g}"
+
+
+def courant_bound(scene: Scene) -> float | None:
+    """The longest step of the direct simulation by its Courant number; None if the speed cannot be foreseen."""
+    speed = peak_speed(scene)
+    return None if speed is None else (
+        scene.time.courant * BOX_LENGTH / scene.flow.cells / (speed + explicit_sound(scene)))
+
+
+def explicit_sound(scene: Scene) -> float:
+    """sqrt(3) c where the stepper must resolve sound, else 0."""
+    return math.sqrt(3) * scene.flow.sound_speed if scene.time.stepper == "rk4" and scene.flow.sound_speed else 0.0
 
 
 def run_time(scene: Scene) -> float | None:
     """Physical time that the direct simulation covers; None where the turnover time cannot be foreseen."""
-    turnovers = sum(part.turnovers for part in (scene.spin_up, scene.tracers) if part)
+    parts = [time_of(scene, part.turnovers) for part in (scene.spin_up, scene.tracers) if part]
+    return None if None in parts else sum(parts) + (scene.time.duration or 0.0)
+
+
+def time_of(scene: Scene, turnovers: float) -> float | None:
+    """Physical time of so many turnovers; None where the turnover time cannot be foreseen."""
     turbulence = expected_turbulence(scene)
-    if turnovers and turbulence is None:
+    return turbulence and turnovers * turbulence.turnover_time
+
+
+def tracer_intervals(scene: Scene) -> int | None:
+    """Frame intervals through which tracers are followed; None where that is not foreseen."""
+    span = time_of(scene, scene.tracers.turnovers)
+    return span and max(math.ceil(span / scene.tracers.frame_interval - 1e-9), 1)
+
+
+def flow_steps(scene: Scene) -> tuple[int, int] | None:
+    """Steps of the direct simulation without tracers and, equal ones within each frame interval, with them; None if
+    they cannot be foreseen."""
+    expected, span = expected_step(scene), run_time(scene)
+    if expected is None or not span:
         return None
-    return (turnovers * turbulence.turnover_time if turnovers else 0.0) + (scene.time.duration or 0.0)
+    step, intervals = expected[0], tracer_intervals(scene) if scene.tracers else 0
+    alone = time_of(scene, scene.spin_up.turnovers) if scene.spin_up else 0.0
+    before = math.ceil((alone + (scene.time.duration or 0.0)) / step - 1e-9)
+    if not intervals:
+        return before, 0
+    interval = scene.tracers.frame_interval
+    longest = min(scene.time.step or courant_bound(scene), scene.time.max_step)
+    return before, intervals * math.ceil(interval / longest - 1e-9)
 
 
 def most_ranks(scene: Scene) -> dict[str, int]:
@@ -177,14 +230,27 @@ def particle_drift(scene: Scene, time: float, peak: float = PEAK_VELOCITY) -> fl
     return peak * turbulence.velocity_rms * time if turbulence else 0.0
 
 
+def resolved_shells(scene: Scene) -> int:
+    """Highest wavenumber, along each axis, of the velocity that the particles resolve."""
+    tracers, turbulence = scene.tracers, expected_turbulence(scene)
+    highest = resolved_wavenumber(tracers.spacing, tracers.filter_width,
+                                  turbulence.kolmogorov_length if turbulence else 0.0)
+    return min(max(int(highest + 1e-9), 1), (tracers.planes - 1) // 2)
+
+
 def foreseen_allowed_step(scene: Scene) -> float | None:
-    """The longest time step that particles with a resolved velocity can take in the turbulence that is expected, which
-    may decay before they start; None where it is not foreseen."""
+    """The longest time step that particles with a resolved velocity can take in the turbulence that is expected, amid
+    their rollout where it decays; None where it is not foreseen."""
     turbulence = expected_turbulence(scene)
     if turbulence is None:
         return None
-    highest = resolved_wavenumber(scene.tracers.spacing, scene.tracers.filter_width, turbulence.kolmogorov_length)
-    return allowed_step(scene.simulation.integrator, highest, turbulence.velocity_rms)
+    settings = scene.simulation
+    speed = turbulence.velocity_rms
+    if settings.injection == "none":
+        start = scene.seen if settings.start is None else settings.start
+        turnovers = start * scene.tracers.turnovers + settings.turnovers / 2
+        speed = turbulence.decayed(turnovers * turbulence.turnover_time)
+    return allowed_step(settings.integrator, resolved_shells(scene), speed)
 
 
 def horizon_time(scene: Scene) -> float:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from eddies.particles.reference_scales import ALLOWED_ANGLES, resolved_wavenumber
+from eddies.particles.reference_scales import ALLOWED_ANGLES
 from eddies.scene.scene import BOX_LENGTH, Scene
 from eddies.workflows.foreseen.cost_model import busiest_planes
-from eddies.workflows.foreseen.estimates import expected_turbulence, foreseen_allowed_step
+from eddies.workflows.foreseen.estimates import expected_turbulence, resolved_shells
+from eddies.workflows.foreseen.rollout_course import EVALUATIONS, rollout_step
 
-EVALUATIONS = {"verlet": 1, "rk2": 2, "rk3": 3, "rk4": 4}  # in a step
 # Of a solve that starts from what is foreseen, at about the longest steps that the flow allows: docs/closure.md.
 ITERATIONS = {"verlet": 1.0, "rk2": 1.2, "rk3": 2.8, "rk4": 5.7}
 # Sums over ranks: of an iteration; of the rest of an evaluation with the built-in terms; of a settling.
@@ -132,9 +132,7 @@ def particle_work(scene: Scene) -> ParticleWork:
     """The work of a scene's own model."""
     tracers, model, settings = scene.tracers, scene.model, scene.simulation
     turbulence = expected_turbulence(scene)
-    resolved, paired = "resolved" in model.reads, "pairs" in model.reads
-    highest = resolved_wavenumber(tracers.spacing, tracers.filter_width,
-                                  turbulence.kolmogorov_length if turbulence else 0.0)
+    resolved, paired, highest = "resolved" in model.reads, "pairs" in model.reads, resolved_shells(scene)
     evaluations, radius = EVALUATIONS[settings.integrator], scene.interaction_radius
     # As far as the flow may carry a particle through the highest wave, where nothing is known of it.
     way = ALLOWED_ANGLES[settings.integrator] / highest
@@ -142,24 +140,7 @@ def particle_work(scene: Scene) -> ParticleWork:
         way = turbulence.velocity_rms * rollout_step(scene)
     return ParticleWork(
         tracers.particles, tracers.planes,
-        min(max(int(highest + 1e-9), 1), (tracers.planes - 1) // 2) if resolved else 0,
+        highest if resolved else 0,
         scene.neighbors if paired else 0.0, radius if paired else 0.0,
         settings.skin * radius if paired or resolved else 0.0, ITERATIONS[settings.integrator] if resolved else 0.0,
         way / evaluations, evaluations, 4 if settings.precision == "float32" else 8, "density_rate" in model.gives)
-
-
-def rollout_step(scene: Scene) -> float:
-    """The time step of the particles: the scene's, or what their resolved velocity can follow where that is less."""
-    allowed = foreseen_allowed_step(scene) if "resolved" in scene.model.reads else None
-    return min(scene.simulation.step, allowed or math.inf)
-
-
-def rollout_evaluations(scene: Scene) -> int | None:
-    """Evaluations of a whole rollout: those of its steps, and one for each frame, which lies between them; None where
-    the turnover time is not foreseen."""
-    turbulence, settings = expected_turbulence(scene), scene.simulation
-    if turbulence is None:
-        return None
-    span = settings.turnovers * turbulence.turnover_time
-    frames = math.ceil(span / settings.frame_interval - 1e-9) + 1
-    return EVALUATIONS[settings.integrator] * math.ceil(span / rollout_step(scene)) + frames

@@ -45,7 +45,7 @@ def initial_state(scene: Scene, fluid: Fluid) -> np.ndarray:
     """The state at time 0: velocity, and for a compressible fluid s = ln(rho / rho_0)."""
     initial, grid = scene.initial, fluid.grid
     if initial.kind == "file":
-        return _state_from_file(initial.path, fluid)
+        return _state_from_file(scene, fluid)
     velocity = _own_velocity(scene, grid) if is_path(initial.kind) else INITIAL_FLOWS[initial.kind](
         grid, initial, scene.seed)
     if not fluid.compressible:
@@ -68,13 +68,18 @@ def _own_velocity(scene: Scene, grid: SpectralGrid) -> np.ndarray:
     return project(grid, velocity.astype(grid.complex))
 
 
-def _state_from_file(path: str, fluid: Fluid) -> np.ndarray:
+def require_cells(scene: Scene, cells: int) -> None:
+    """Raise SceneError unless the fields of the file that a scene starts from have as many cells as its grid."""
+    if cells != scene.flow.cells:
+        raise SceneError(f"[initial] path = {scene.initial.path}: holds fields of {cells} cells a side, [flow] cells "
+                         f"is {scene.flow.cells}; make them equal")
+
+
+def _state_from_file(scene: Scene, fluid: Fluid) -> np.ndarray:
     grid = fluid.grid
-    with open_product(grid.decomposition.comm, path, "ground_truth") as file:
+    with open_product(grid.decomposition.comm, scene.initial.path, "ground_truth") as file:
         fields = FieldSeries(file, "final")
-        if fields.cells != grid.cells:
-            raise SceneError(f"[initial] path = {path}: holds fields of {fields.cells} cells a side, [flow] cells is "
-                             f"{grid.cells}; make them equal")
+        require_cells(scene, fields.cells)
         planes = (grid.decomposition.start, grid.decomposition.stop)
         names = fields.variables if fluid.compressible else ("velocity",)
         stored = on_all_ranks(grid.decomposition.comm,

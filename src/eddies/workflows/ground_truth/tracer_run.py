@@ -55,15 +55,15 @@ class TracerRun:
 
     def follow(self) -> None:
         """Follow the tracers to the end of the last interval."""
-        flow, progress = self.flow, ProgressLine("tracers", self.flow.history.describe)
+        flow = self.flow
+        progress = ProgressLine("tracers", flow.history.describe, done=self._done, step=self._steps)
         if self.interval > 0:
-            self._finish_interval()
+            self._finish_interval(progress)
         while self.interval < self.intervals:
             self.interval += 1
             self.step = self._longest_step()
             flow.clock.end = flow.clock.time + self.settings.frame_interval
-            self._finish_interval()
-            progress(self.interval / self.intervals, flow.clock.steps - self.first_step)
+            self._finish_interval(progress)
         flow.history.sample(flow.state, flow.clock)
 
     def scales(self) -> dict[str, float]:
@@ -87,9 +87,18 @@ class TracerRun:
         longest = min(self.flow.step_limit.bound(self.flow.state, self.flow.clock), self.scene.time.max_step)
         return interval / int(np.ceil(interval / longest - 1e-9))
 
-    def _finish_interval(self) -> None:
+    @property
+    def _done(self) -> float:
+        return (self.flow.clock.time - self.released_at) / (self.intervals * self.settings.frame_interval)
+
+    @property
+    def _steps(self) -> int:
+        return self.flow.clock.steps - self.first_step
+
+    def _finish_interval(self, progress: ProgressLine) -> None:
         flow, step = self.flow, self.step
-        flow.advance([flow.history, lambda state, _: self.tracers.advance(state, step)], FixedStep(step))
+        flow.advance([flow.history, lambda state, _: self.tracers.advance(state, step),
+                      lambda *_: progress(self._done, self._steps)], FixedStep(step))
         self.frames.store(flow.state, flow.clock)
 
     def _saved_columns(self, saved: Checkpoint) -> dict[str, np.ndarray]:

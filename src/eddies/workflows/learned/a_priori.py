@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from eddies.clock import ProgressLine
 from eddies.flow.operators import gradient
 from eddies.learning.force_training import TrainingFrame
 from eddies.learning.losses import relative_error
@@ -44,6 +45,7 @@ def evaluate(truth: GroundTruth, model: LagrangianModel, frames: np.ndarray, las
     -c^2 grad ln(rho) of the filtered field, without any model, of a truth that has a density.
     """
     rows, comm = [], truth.decomposition.comm
+    progress = ProgressLine("train", lambda: "of the a-priori test")
     for index in frames:
         frame = load_frame(truth, index, model, dtype, device)
         errors = frame.errors()
@@ -60,6 +62,7 @@ def evaluate(truth: GroundTruth, model: LagrangianModel, frames: np.ndarray, las
         if "density_rate" in errors:
             row["density_rate_error"] = relative_error(comm, errors["density_rate"], frame.density_rate)
         rows.append(row)
+        progress(len(rows) / len(frames), len(rows))
     tables = {"a_priori": {name: np.array([row[name] for row in rows]) for name in rows[0]},
               "acceleration_sample": _sample(truth, frame, frame.acceleration, errors["acceleration"])}
     if "density_rate" in errors:

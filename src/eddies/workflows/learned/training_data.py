@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 import torch
 
+from eddies.clock import ProgressLine
 from eddies.learning.force_training import ForceTrainer, LossWeights, TrainingFrame
 from eddies.learning.losses import relative_error
 from eddies.learning.optimization import Adam
@@ -51,7 +52,11 @@ class TrainingData:
     def frames(self) -> list[TrainingFrame]:
         """The single frames that are trained on; the first use is collective."""
         seen = np.unique(np.linspace(1, self.learned, self.settings.frames).astype(int))
-        return [self._frame(index) for index in seen]
+        progress, frames = ProgressLine("train", lambda: "of preparing frames"), []
+        for index in seen:
+            frames.append(self._frame(index))
+            progress(len(frames) / len(seen), len(frames))
+        return frames
 
     def feature_range(self) -> FeatureRange:
         """The range of what the networks are given by all pairs of these frames; collective.

@@ -32,13 +32,14 @@ class Course:
                  saved: Checkpoint | None) -> None:
         self.method, self.frames, self.count, self.interval, self.guard = method, frames, count, interval, guard
         self.comm = frames.truth.decomposition.comm
-        self.clock, self.seconds, self.energy, before = Clock(end=count * interval), [], 0.0, 0.0
+        self.clock, self.seconds, self.energy = Clock(end=count * interval), [], 0.0
         self._warm_up = WARM_UP_STEPS
         if saved is not None:
-            before = self._load(saved)
+            self._load(saved)
             method.load_state_dict(saved)
             log.info("rollout: goes on from step %d, time %.4g", self.steps, self.clock.time)
-        self.progress = ProgressLine("rollout", self._describe, before=before)
+        self.progress = ProgressLine("rollout", self._describe, done=self.clock.time / self.clock.end,
+                                     step=self.steps)
 
     @property
     def steps(self) -> int:
@@ -55,9 +56,9 @@ class Course:
             while complaint is None and self.method.time < until - 1e-9 * self.interval:
                 self._look()
                 complaint = self._step(until)
+                self.progress(min(self.clock.time / self.clock.end, 1.0), self.steps)
             if complaint is None:
                 self._store(until)
-                self.progress(until / self.clock.end, self.steps)
         if complaint is not None and self.comm.rank == 0:
             log.warning("rollout stopped at time %.4g: %s", self.clock.time, complaint)
         return {"status": "complete" if complaint is None else f"stopped: {complaint}", "time": self.frames.times[-1],
@@ -67,17 +68,16 @@ class Course:
     def state_dict(self) -> dict[str, Any]:
         """All that goes on, for a checkpoint, beside the files of the frames."""
         return {"rollout": {"clock": self.clock.state_dict(), "times": self.frames.times, "energy": self.energy,
-                            "ranks": self.comm.size, "seconds": self.seconds, "elapsed": self.progress.elapsed},
+                            "ranks": self.comm.size, "seconds": self.seconds},
                 **self.method.state_dict()}
 
-    def _load(self, saved: Checkpoint) -> float:
-        """Take what is no part of the method from a checkpoint; returns the wall seconds until then."""
+    def _load(self, saved: Checkpoint) -> None:
+        """Take what is no part of the method from a checkpoint."""
         known = saved["rollout"]
         self.clock.load_state_dict(known["clock"])
         self.frames.times, self.energy = known["times"], known["energy"]
         if known["ranks"] == self.comm.size:  # else they are no measure of the steps of this run
             self.seconds = known["seconds"]
-        return known["elapsed"]
 
     def _look(self) -> None:
         """Let the guard look on; without a state to keep, only whether the run is to stop."""

@@ -1,0 +1,91 @@
+"""What keeps a stage from its end, as far as files that the scene names and this machine tell it before."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from eddies.errors import UserError
+from eddies.io.fields import FieldSeries
+from eddies.io.hdf5 import open_product
+from eddies.parallel.broadcast import on_first_rank
+from eddies.parallel.communicator import Comm
+from eddies.parallel.node import node_ranks
+from eddies.scene.scene import Scene
+from eddies.workflows.foreseen.stage_cost import StageCost, in_units
+from eddies.workflows.foreseen.stage_costs import totals
+from eddies.workflows.ground_truth.scene_flow import require_cells
+
+# |k| of the initial flows of a few waves, over their wavenumber; sound has no solenoidal velocity to force.
+WAVES = {"taylor-green": 3**0.5, "abc": 1.0, "shear-wave": 1.0, "sound-wave": float("inf")}
+
+
+def refusals(scene: Scene, comm: Comm, costs: Sequence[StageCost]) -> list[str]:
+    """A line for each; all ranks call it and get the same."""
+    found = [*start_file(scene, comm), *forced_modes(scene), *weights(scene, comm), *gpu(scene, comm)]
+    return found + [*memory(comm, costs), *disk(comm, costs)]
+
+
+def start_file(scene: Scene, comm: Comm) -> Iterator[str]:
+    """A file to start from that is not there, or of another grid."""
+    if scene.initial.kind != "file":
+        return
+    try:
+        with open_product(comm, scene.initial.path, "ground_truth") as file:
+            require_cells(scene, FieldSeries(file, "final").cells)
+    except UserError as error:
+        yield str(error)
+
+
+def forced_modes(scene: Scene) -> Iterator[str]:
+    """A start without energy at the modes that linear forcing amplifies."""
+    initial, forcing = scene.initial, scene.forcing
+    if forcing is None or forcing.injection_rate == 0 or initial.kind not in WAVES:
+        return
+    wave = WAVES[initial.kind] * initial.wavenumber
+    if wave >= forcing.wavenumber:
+        yield (f'[forcing] wavenumber = {forcing.wavenumber:g}: [initial] kind = "{initial.kind}" has no energy at '
+               "0 < |k| < wavenumber, which linear forcing could amplify; start from another flow, raise wavenumber, "
+               "or remove [forcing]")
+
+
+def weights(scene: Scene, comm: Comm) -> Iterator[str]:
+    """Trained weights that are there, and of another model."""
+    if scene.model is None or scene.model.path is None or not on_first_rank(comm, scene.model.weights_file.is_file):
+        return
+    from eddies.workflows.learned.source import read_source  # torch, where there is a model
+    try:
+        read_source(scene, comm)
+    except UserError as error:
+        yield str(error)
+
+
+def gpu(scene: Scene, comm: Comm) -> Iterator[str]:
+    """A GPU that is asked for and not there."""
+    if scene.device == "cpu" or not {"train", "simulate"} & set(scene.stages):
+        return
+    from eddies.particles.devices import prepare_torch  # torch, only here
+    try:
+        prepare_torch(scene.device, comm)
+    except UserError as error:
+        yield str(error)
+
+
+def memory(comm: Comm, costs: Sequence[StageCost]) -> Iterator[str]:
+    """More memory than the ranks of this node have together."""
+    ranks, there = node_ranks(comm), os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    for cost in costs:
+        if ranks * cost.memory > there:
+            yield (f"{cost.stage}: {ranks} ranks with about {in_units(cost.memory)} each need more than the "
+                   f"{in_units(there)} of memory here; take more nodes, or fewer cells or particles")
+
+
+def disk(comm: Comm, costs: Sequence[StageCost]) -> Iterator[str]:
+    """More disk than is free where run directories are, unless --output says otherwise."""
+    place = Path("runs") if Path("runs").is_dir() else Path()
+    needed, free = totals(costs)["most_disk"], on_first_rank(comm, lambda: shutil.disk_usage(place).free)
+    if needed > free:
+        yield (f"the stages need about {in_units(needed)} of disk, and {in_units(free)} are free here; choose another "
+               "--output, or raise [tracers] frame_interval or field_every")

@@ -1,0 +1,42 @@
+"""The progress line: by wall time, also between frames, and what it says of the time left."""
+
+import logging
+import re
+
+import pytest
+
+from eddies import clock
+from eddies.clock import ProgressLine
+
+
+@pytest.fixture
+def wall(monkeypatch):
+    """A wall clock that a test moves on: a list of the time now."""
+    now = [100.0]
+    monkeypatch.setattr(clock.time, "perf_counter", lambda: now[0])
+    return now
+
+
+@pytest.fixture
+def lines(caplog, monkeypatch):
+    """The lines so far: seconds a step, percent, and what is left."""
+    monkeypatch.setattr(logging.getLogger("eddies"), "propagate", True)
+    caplog.set_level(logging.INFO, logger="eddies")
+    pattern = re.compile(r"(\S+) s/step  (\d+) %  (.+) left")
+    return lambda: [pattern.search(record.getMessage()).groups() for record in caplog.records]
+
+
+def test_lines_come_by_time_and_not_by_steps(wall, lines):
+    progress = ProgressLine("stage", lambda: "state")
+    for step in range(1, 21):
+        wall[0] += 1
+        progress(step / 40, step)
+    assert lines() == [("1.000", "12", "35 s"), ("1.000", "25", "30 s"), ("1.000", "38", "25 s"),
+                       ("1.000", "50", "20 s")]
+
+
+def test_what_an_earlier_job_did_is_no_measure_of_what_is_left(wall, lines):
+    progress = ProgressLine("stage", lambda: "state", done=0.5, step=1000)
+    wall[0] += 10
+    progress(0.6, 1010)
+    assert lines() == [("1.000", "60", "40 s")]

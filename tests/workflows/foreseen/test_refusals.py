@@ -1,0 +1,83 @@
+"""What a stage would refuse later is told before, in the words of the stage."""
+
+import os
+
+import pytest
+
+from eddies.errors import UserError
+from eddies.flow.forcing import ForcingError
+from eddies.scene.scene import load_scene
+from eddies.workflows.foreseen.refusals import refusals
+from eddies.workflows.foreseen.stage_cost import StageCost
+from eddies.workflows.foreseen.stage_costs import totals
+
+FORCED = ["forcing.injection_rate=0.5"]
+
+
+def told(comm, name, *overrides, costs=()):
+    return refusals(load_scene(name, list(overrides)), comm, costs)
+
+
+@pytest.mark.mpi(1, 2)
+def test_a_start_that_forcing_cannot_amplify_is_told_where_it_is_refused(comm):
+    from eddies.workflows.ground_truth.scene_flow import build_fluid, initial_state
+    for name, changes in (("taylor-green", ["forcing.wavenumber=1.5"]), ("taylor-green", ["forcing.wavenumber=2"]),
+                          ("abc", ["initial.wavenumber=2"]), ("abc", []), ("shear-wave", ["initial.wavenumber=3"])):
+        scene = load_scene(name, [*FORCED, "flow.cells=16", *changes])
+        fluid = build_fluid(scene, comm)
+        try:
+            fluid.nonlinear(initial_state(scene, fluid))
+            refused = False
+        except ForcingError:
+            refused = True
+        lines = refusals(scene, comm, [])
+        assert bool(lines) == refused and all("which linear forcing could amplify" in line for line in lines)
+
+
+@pytest.mark.mpi(1, 2)
+def test_files_that_do_not_fit_are_told_in_the_words_of_the_stage(comm, tmp_path):
+    from eddies.io.fields import FieldWriter
+    from eddies.io.hdf5 import create_product
+    from eddies.workflows.ground_truth.scene_flow import build_fluid, initial_state
+    path = comm.bcast(str(tmp_path / "start.h5"))
+    changes = ["initial.kind=file", f"initial.path={path}", "flow.cells=16"]
+    line, = told(comm, "taylor-green", *changes, "initial.amplitude=1")
+    assert path in line
+    with create_product(comm, path, "ground_truth", {"scene": "", "fingerprint": ""}) as file:
+        FieldWriter(file, "final", 12, {"velocity": 3})
+    scene = load_scene("taylor-green", changes)
+    line, = refusals(scene, comm, [])
+    with pytest.raises(UserError) as error:
+        initial_state(scene, build_fluid(scene, comm))
+    assert line == str(error.value) and "holds fields of 12 cells a side, [flow] cells is 16" in line
+
+
+@pytest.mark.mpi(1, 2)
+def test_weights_that_are_no_model_are_told(comm, tmp_path):
+    path = comm.bcast(str(tmp_path))
+    assert told(comm, "hit-mt008", f"model.path={path}") == []  # yet to be trained: a warning
+    if comm.rank == 0:
+        (tmp_path / "model.h5").write_text("nothing")
+    comm.Barrier()
+    line, = told(comm, "hit-mt008", f"model.path={path}")
+    assert f"{path}/model.h5" in line
+
+
+@pytest.mark.mpi(1)
+def test_a_machine_that_is_too_small_is_told(comm):
+    import torch
+    there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    fits = StageCost("dns", {}, 0.1 * there, 1e3)
+    assert told(comm, "tiny", costs=[fits]) == []
+    large, = told(comm, "tiny", costs=[fits, StageCost("train", {}, 1.1 * there, 1e3)])
+    assert large.startswith("train: 1 ranks with about")
+    full, = told(comm, "tiny", costs=[StageCost("dns", {}, 0.0, 1e3, 1e18)])
+    assert full.startswith("the stages need about 1e+09 GB of disk")
+    assert torch.cuda.is_available() or "torch finds no GPU here" in told(comm, "tiny", "device=cuda")[0]
+
+
+def test_totals_are_sums_and_the_worst_moments():
+    flow = StageCost("dns", {"steps": 3.0, "files": 1.0}, 5.0, 10.0, 20.0)
+    costs = [flow, StageCost("train", {"steps": 2.0}, 7.0, 4.0)]
+    assert totals(costs) == {"seconds": 6.0, "memory": 7.0, "disk": 14.0, "most_disk": 30.0}
+    assert totals([]) == {"seconds": 0, "memory": 0, "disk": 0, "most_disk": 0}

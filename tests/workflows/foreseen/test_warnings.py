@@ -1,0 +1,97 @@
+"""Warnings: each where it is due, with its key, its value and the remedy, after which it is gone; none of built-in
+scenes."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from eddies.scene.scene import builtin_scenes, load_scene
+from eddies.workflows.foreseen.estimates import expected_turbulence, rms_speed
+from eddies.workflows.foreseen.numbers import mach
+from eddies.workflows.foreseen.warnings import stage_warnings, warnings
+
+
+def told(*overrides, scene="tiny"):
+    return list(warnings(load_scene(scene, list(overrides)), 1))
+
+
+@pytest.mark.parametrize("name", [name for name, _ in builtin_scenes()])
+def test_built_in_scenes_give_no_reason(name):
+    # Those that take the weights of another run want that run first.
+    assert [line for line in told(scene=name) if "path" not in line] == []
+
+
+@pytest.mark.parametrize("given, words, remedy", [
+    ("flow.viscosity=0.05", "k_max eta is about 0.88, below 1", "flow.viscosity={viscosity to}"),
+    ("flow.viscosity=0.05", "[flow] cells = 24", "flow.cells={raise cells to}"),
+    ("flow.cells=120", "k_max eta is about 5.6, and 1 to 2 resolve", "flow.cells={lower cells to}"),
+    ("flow.sound_speed=4", "[flow] sound_speed = 4: the turbulent Mach number is about 0.47, above 0.3",
+     "flow.sound_speed={raise sound_speed to}"),
+    ("flow.sound_speed=1.5", "supersonic, with a turbulent Mach number of about 1.2",
+     "flow.sound_speed={raise sound_speed to}"),
+    ("time.step=0.06", "[time] step = 0.06: is unstable by advection, step x k_max x max(|u| + |v| + |w|) = 3.17, "
+     "stable up to 2.83", "time.step=0.05"),
+    ("time.courant=2.5", "[time] courant = 2.5: is unstable by advection", None),
+    ("tracers.filter_width=2", "[tracers] filter_width = 2: passes wavenumbers up to 1.6, less than the 2 of the "
+     "scales that are forced", "tracers.filter_width={lower it to}"),
+    ("tracers.filter_width=0.1", "narrower than a cell", "tracers.filter_width=0.3"),
+])
+def test_a_warning_names_key_and_value_and_its_remedy_helps(given, words, remedy):
+    changes = [given, "time.max_step=1"] if "courant" in given else [given]
+    line, = told(*changes)
+    assert words in line and "\n" not in line
+    assert re.match(r"\[\w+\] \w+ = [\d.e-]+: ", line)
+    if remedy:
+        key, value = remedy.split("=")
+        if value.startswith("{"):
+            value = re.search(value[1:-1] + r" ([\d.e-]*\d)", line).group(1)
+        assert told(*changes, f"{key}={float(value) if 'cells' not in key else int(value)}") == []
+
+
+def test_a_flow_that_is_not_turbulent_is_told():
+    for viscosity, words in ((2, "below 5 eddies decay"), (60, "nothing is turbulent")):
+        line, = (line for line in told(f"flow.viscosity={viscosity}") if "Re_lambda" in line)
+        assert words in line
+        remedy = re.search(r"lower viscosity to ([\d.]+)", line).group(1)
+        assert not any("Re_lambda" in line for line in told(f"flow.viscosity={0.99 * float(remedy):.3g}"))
+
+
+def test_explicit_steps_have_the_limits_of_sound_and_viscosity_too():
+    found = told("time.stepper=rk4", "time.step=0.05")
+    assert len(found) == 1 and "[time] step = 0.05: is unstable by sound" in found[0]
+    assert 'stepper = "etdrk4"' in found[0]
+    free = load_scene("taylor-green", ["time.stepper=rk4", "flow.viscosity=1", "flow.cells=32"])
+    viscous, = warnings(replace(free, time=replace(free.time, step=None, max_step=0.05)), 1)
+    assert "[time] max_step = 0.05: is unstable by viscosity, step x 3 viscosity k_max^2 = 15" in viscous
+
+
+def test_particles_of_a_forced_rollout_are_told_of_shorter_steps():
+    forced = ["simulation.injection=dissipation", "simulation.step=0.3", "simulation.frame_interval=0.3"]
+    line, = told(*forced)
+    step = re.search(r"of about ([\d.]+)", line).group(1)
+    assert line.startswith("[simulation] step = 0.3") and told(*forced, f"simulation.step={step}") == []
+
+
+def test_stages_tell_what_concerns_them():
+    scene = load_scene("tiny", ["flow.sound_speed=4", "model.preset=learned-density"])
+    by_stage = {stage: list(stage_warnings(scene, [stage])) for stage in scene.stages}
+    assert [stage for stage, lines in by_stage.items() if lines] == ["dns", "train"]
+    assert sum(by_stage.values(), []) == list(warnings(scene, 1))
+
+
+@pytest.mark.mpi(1, 2)
+def test_speeds_and_mach_numbers_are_those_of_the_flow(comm):
+    from eddies.flow.statistics import component_energies
+    from eddies.workflows.ground_truth.scene_flow import build_fluid, initial_state
+    sound = ["flow.fluid=compressible", "flow.sound_speed=10", "flow.cells=16"]
+    for name, changes in (("taylor-green", []), ("abc", ["initial.wavenumber=2"]), ("shear-wave", []),
+                          ("tracers-only", ["tracers.particles_per_side=8"])):
+        scene = load_scene(name, [*sound, *changes])
+        fluid = build_fluid(scene, comm)
+        energy = sum(component_energies(fluid.grid, initial_state(scene, fluid)[:3]).values())
+        assert rms_speed(scene) == pytest.approx(np.sqrt(2 * energy), rel=1e-6)
+        assert mach(scene) == pytest.approx(np.sqrt(2 * energy) / 10, rel=1e-6)
+    turbulence = expected_turbulence(load_scene("tiny"))
+    assert mach(load_scene("tiny")) == pytest.approx(np.sqrt(3) * turbulence.velocity_rms / 22.5)
