@@ -33,8 +33,10 @@ def undrawn(monkeypatch):
 def no_figures(monkeypatch, undrawn):
     """Figures are not even made, which is most of the rest: for tests of a report's numbers and words."""
     from matplotlib.figure import Figure
-    for found in pkgutil.iter_modules(eddies.report.__path__, "eddies.report."):
-        module = importlib.import_module(found.name)
+    # All are imported first: one that is imported later would keep what it takes from another as it is now.
+    modules = [importlib.import_module(found.name)
+               for found in pkgutil.iter_modules(eddies.report.__path__, "eddies.report.")]
+    for module in modules:
         for name, function in list(vars(module).items()):
             if getattr(function, "__annotations__", {}).get("return") in (Figure, "Figure"):
                 monkeypatch.setattr(module, name, lambda *given, **named: None)

@@ -224,7 +224,7 @@ def append_frame(dataset: h5py.Dataset, block: np.ndarray, offset: tuple[int, ..
     Collective: every rank calls it, also with an empty block.
     """
     frame = dataset.shape[0]
-    block = np.asarray(block, dataset.dtype, order="C")[None]
+    block, transfer = np.asarray(block, dataset.dtype, order="C")[None], _collective(dataset.file)
     with writing(dataset, frame_bytes(dataset)):
         dataset.resize(frame + 1, axis=0)
         in_file, in_memory = dataset.id.get_space(), h5py.h5s.create_simple(block.shape)
@@ -233,7 +233,7 @@ def append_frame(dataset: h5py.Dataset, block: np.ndarray, offset: tuple[int, ..
         else:
             in_file.select_none()
             in_memory.select_none()
-        dataset.id.write(in_memory, in_file, block, dxpl=_collective(dataset.file))
+        dataset.id.write(in_memory, in_file, block, dxpl=transfer)
 
 
 def read_frame(dataset: h5py.Dataset, frame: int, selection: tuple[slice, ...]) -> np.ndarray:
