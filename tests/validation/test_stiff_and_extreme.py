@@ -39,7 +39,7 @@ def run_at_mach_number(comm, mach):
     """The flow that a watched run of 0.25 time units, with steps after the flow, ends with."""
     fluid, state = turbulence(comm, 24, 0.05, np.sqrt(3) / mach)
     run = FlowRun(fluid, state, ETDRK4(fluid), CourantLimit(fluid.grid, 0.8, 0.05), FlowHistory(fluid, every=1),
-                  lambda run: None, Clock(end=0.25))
+                  lambda run, segments=None: None, Clock(end=0.25))
     run.history.sample(state, run.clock)
     run.advance([run.history])
     return run

@@ -105,7 +105,7 @@ def test_a_stopped_training_of_the_kernel_is_the_one_never_stopped(comm, tmp_pat
 @pytest.mark.mpi(1)
 def test_a_kernel_that_diverges_is_told_with_the_remedy(comm, tmp_path):
     scene = prepared(comm, tmp_path, SHORT)
-    wild = replace(scene, kernel=replace(scene.kernel, learning_rate=1e30, steps=4))
+    wild = replace(scene, kernel=replace(scene.kernel, learning_rate=1e15, steps=4))
     with pytest.raises(SceneError, match=r"\[kernel\] step . of the training \(learned\): .*; lower learning_rate"):
         train_kernel.run(wild, comm, tmp_path)
 

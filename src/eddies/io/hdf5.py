@@ -1,8 +1,7 @@
 """Products: HDF5 files that are complete or absent, say what they are, and are written by all ranks together.
 
-A product is written under a temporary name, marked complete, closed, and only then renamed, so a file under
-its final name is never half written. Writing uses parallel HDF5 when there is more than one rank, in room on the disk
-that has been taken before (io/unfinished.py); reading opens the file on every rank by itself.
+A product is written under a temporary name, marked complete, closed, and only then renamed: never half written. Writing
+uses parallel HDF5 on several ranks, in room taken before (io/unfinished.py); every rank reads by itself.
 """
 
 import errno
@@ -25,9 +24,8 @@ from eddies.parallel.broadcast import on_first_rank, share_text
 from eddies.parallel.stop import Stopped
 from eddies.pipeline import MAKER_OF
 
-# Of the products of this version: no other is read. 1 is that of eddies 0.1, whose files do not say so. Since 2 the
-# scales of a ground truth are those of the release, and a model is a list of terms, since 3 the filter
-# width has its own name.
+# Of the products of this version: no other is read. 1 is that of eddies 0.1, whose files do not say so. Since 2 scales
+# are those of the release, and a model is a list of terms, since 3 the filter width has its own name.
 FORMAT = 3
 CHUNK_BYTES = 2**20
 # Why the operating system does not let a file be read that may be sound.
@@ -189,16 +187,13 @@ def find_group(file: h5py.Group, name: str) -> h5py.Group:
     """The group `name`; ProductError lists its neighbours if there is none."""
     group = file.get(name)
     if not isinstance(group, h5py.Group):
-        present = ", ".join(file) or "nothing"
-        raise ProductError(f"{file.file.filename}: holds no {name}; {file.name} holds: {present}")
+        raise ProductError(f"{file.file.filename}: holds no {name}; {file.name} holds: {', '.join(file) or 'nothing'}")
     return group
 
 
 def growing_dataset(group: h5py.Group, name: str, frame_shape: tuple[int, ...], dtype: Any) -> h5py.Dataset:
-    """An empty dataset (frames, *frame_shape) to which frames are added, in chunks of at most about 1 MiB.
-
-    A chunk holds as much of one frame as fits, or many frames of a single value. All ranks call it.
-    """
+    """An empty dataset (frames, *frame_shape) to which frames are added, in chunks of at most about 1 MiB: as much of
+    one frame as fits, or many frames of a single value. All ranks call it."""
     chunk = _chunk(frame_shape, dtype) if frame_shape else (1024,)
     with writing(group, HEADER_BYTES):
         return group.create_dataset(name, (0, *frame_shape), dtype, maxshape=(None, *frame_shape), chunks=chunk)
@@ -206,15 +201,14 @@ def growing_dataset(group: h5py.Group, name: str, frame_shape: tuple[int, ...], 
 
 def stored_bytes(frame_shape: tuple[int, ...], dtype: Any) -> int:
     """Bytes that a frame of such a dataset takes in a file: whole chunks."""
-    extents = zip(frame_shape, _chunk(frame_shape, dtype)[1:])
-    return math.prod(math.ceil(extent / chunk) * chunk for extent, chunk in extents) * np.dtype(dtype).itemsize
+    return np.dtype(dtype).itemsize * math.prod(
+        math.ceil(extent / chunk) * chunk for extent, chunk in zip(frame_shape, _chunk(frame_shape, dtype)[1:]))
 
 
 def _chunk(frame_shape: tuple[int, ...], dtype: Any) -> tuple[int, ...]:
     chunk, largest = [1], CHUNK_BYTES // np.dtype(dtype).itemsize
     for axis, extent in enumerate(frame_shape):
-        below = math.prod(frame_shape[axis + 1:])
-        chunk.append(max(1, min(extent, largest // max(below, 1))))
+        chunk.append(max(1, min(extent, largest // max(math.prod(frame_shape[axis + 1:]), 1))))
     return tuple(chunk)
 
 
