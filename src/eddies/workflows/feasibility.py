@@ -16,7 +16,7 @@ from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.reference_scales import ScaleError
 from eddies.pipeline import STAGES
 from eddies.scene.scene import BOX_LENGTH, Scene, SceneError
-from eddies.workflows.foreseen.estimates import expected_step, expected_turbulence, run_time
+from eddies.workflows.foreseen.estimates import RMS_SPEED, expected_step, expected_turbulence, run_time
 from eddies.workflows.ground_truth.frame_counts import check_frames
 
 # Of the direct simulation, of the rollout, and frames of the tracers: at a microsecond each a quarter of an hour, and
@@ -28,8 +28,7 @@ LATER = 3.0
 TURBULENT = 20.0
 # Logarithm of the share of the energy below which nothing is left of a flow but round-off.
 SILENCE = -40.0
-# Energy of a flow over the square of [initial] amplitude; and the share of it that the forcing may put in in one step.
-ENERGY = {"random": 1.5, "taylor-green": 1 / 8, "abc": 1.5, "shear-wave": 1 / 4}
+# How many times the energy of a flow the forcing may put in in one step.
 MOST_FORCED = 50
 
 
@@ -95,12 +94,13 @@ def problems(stages: Sequence[str], scene: Scene) -> Iterator[str]:
 def forcing_problems(scene: Scene) -> Iterator[str]:
     """A start so weak that one step of the forcing multiplies it: its power is prescribed."""
     forcing, initial = scene.forcing, scene.initial
-    if forcing is None or initial.kind not in ENERGY:
+    if forcing is None or initial.kind not in RMS_SPEED:
         return
     step = scene.time.step or scene.time.max_step  # the weaker the flow, the longer its step
-    energy, gained = ENERGY[initial.kind] * initial.amplitude**2, forcing.injection_rate * step
+    unit = RMS_SPEED[initial.kind]**2 / 2  # energy over the square of the amplitude
+    energy, gained = unit * initial.amplitude**2, forcing.injection_rate * step
     if gained > MOST_FORCED * energy:
-        least = math.sqrt(gained / MOST_FORCED / ENERGY[initial.kind])
+        least = math.sqrt(gained / MOST_FORCED / unit)
         yield (f"[initial] amplitude = {initial.amplitude:g}: an energy of {energy:.2g}, of which [forcing] "
                f"injection_rate = {forcing.injection_rate:g} makes {gained:.2g} in one step of {step:g}, which is "
                f"unstable; raise amplitude to {least:.2g} or more, or lower injection_rate or [time] max_step")

@@ -212,7 +212,7 @@ def test_one_evaluation_of_a_pair_serves_both_particles(name):
     """All pairs in both orders, and each pair once with its values times their parity for the other one."""
     terms = model(MODELS[name]).terms.values()
     mutual = [term for term in terms if getattr(term, "mutual", False)]
-    assert mutual
+    assert mutual and (name != "without density" or len(mutual) == len(terms))
     both, once = (scaled_pairs(*state(), once=each) for each in (False, True))
     assert 2 * len(once.pairs.sender) == len(both.pairs.sender)
     for term in mutual:

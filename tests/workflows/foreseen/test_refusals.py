@@ -65,7 +65,6 @@ def test_weights_that_are_no_model_are_told(comm, tmp_path):
 
 @pytest.mark.mpi(1)
 def test_a_machine_that_is_too_small_is_told(comm):
-    import torch
     there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     fits = StageCost("dns", {}, 0.1 * there, 1e3)
     assert told(comm, "tiny", costs=[fits]) == []
@@ -73,7 +72,6 @@ def test_a_machine_that_is_too_small_is_told(comm):
     assert large.startswith("train: 1 ranks with about")
     full, = told(comm, "tiny", costs=[StageCost("dns", {}, 0.0, 1e3, 1e18)])
     assert full.startswith("the stages need about 1e+09 GB of disk")
-    assert torch.cuda.is_available() or "torch finds no GPU here" in told(comm, "tiny", "device=cuda")[0]
 
 
 def test_totals_are_sums_and_the_worst_moments():

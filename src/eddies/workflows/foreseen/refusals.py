@@ -24,7 +24,7 @@ WAVES = {"taylor-green": 3**0.5, "abc": 1.0, "shear-wave": 1.0, "sound-wave": fl
 
 def refusals(scene: Scene, comm: Comm, costs: Sequence[StageCost]) -> list[str]:
     """A line for each; all ranks call it and get the same."""
-    found = [*start_file(scene, comm), *forced_modes(scene), *weights(scene, comm), *gpu(scene, comm)]
+    found = [*start_file(scene, comm), *forced_modes(scene), *weights(scene, comm)]
     return found + [*memory(comm, costs), *disk(comm, costs)]
 
 
@@ -58,17 +58,6 @@ def weights(scene: Scene, comm: Comm) -> Iterator[str]:
     from eddies.workflows.learned.source import read_source  # torch, where there is a model
     try:
         read_source(scene, comm)
-    except UserError as error:
-        yield str(error)
-
-
-def gpu(scene: Scene, comm: Comm) -> Iterator[str]:
-    """A GPU that is asked for and not there."""
-    if scene.device == "cpu" or not {"train", "simulate"} & set(scene.stages):
-        return
-    from eddies.particles.devices import prepare_torch  # torch, only here
-    try:
-        prepare_torch(scene.device, comm)
     except UserError as error:
         yield str(error)
 
