@@ -10,7 +10,7 @@
 
 checkout=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 export OMP_NUM_THREADS=${OMP_NUM_THREADS:-${SLURM_CPUS_PER_TASK:-1}}
-arguments=(run "${EDDIES_SCENE:-hit-small}" --resume)
+arguments=(run "${EDDIES_SCENE:-hit-small}")
 if [ -n "${EDDIES_OUTPUT:-}" ]; then arguments+=(--output "$EDDIES_OUTPUT"); fi
 
 trap : USR1  # some schedulers signal this shell too; the ranks end with 75, it waits for them

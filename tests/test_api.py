@@ -36,8 +36,13 @@ def test_a_flow_from_a_program(comm, tmp_path):
     assert (tmp_path / "ground_truth.h5").exists() and (tmp_path / "report/index.html").exists()
     before = (tmp_path / "ground_truth.h5").stat().st_mtime_ns
     comm.Barrier()
-    eddies.run(replace(scene, title="another"), output=tmp_path, resume=True, comm=comm)
+    eddies.run(replace(scene, title="another"), output=tmp_path, comm=comm)
     assert (tmp_path / "ground_truth.h5").stat().st_mtime_ns == before
+    other = eddies.load_scene("abc", ["time.duration=0.2"])
+    with pytest.raises(eddies.SceneError.__mro__[1], match=r"ground_truth.h5 \(took .*; add --overwrite"):
+        eddies.run(other, output=tmp_path, comm=comm)
+    eddies.run(other, output=tmp_path, overwrite=True, comm=comm)
+    assert (tmp_path / "ground_truth.h5").stat().st_mtime_ns > before
 
 
 @pytest.mark.usefixtures("no_figures")

@@ -126,22 +126,28 @@ def test_list_of_scenes(comm, capfd):
 
 
 @pytest.mark.mpi(1, 2)
-def test_resume_skips_what_is_done_with_the_same_settings(comm, tmp_path, capfd):
-    product = tmp_path / "ground_truth.h5"
+def test_what_is_done_is_kept_and_replaced_by_word_alone(comm, tmp_path, capfd):
+    product, thick = tmp_path / "ground_truth.h5", ("--set", "flow.viscosity=0.2")
 
-    def run(*options):
+    def run(*options, code=0):
         before = product.stat().st_mtime_ns if product.exists() else 0
         comm.Barrier()
-        assert run_cli("dns", *ABC, "--output", tmp_path, *options) == 0
-        return product.stat().st_mtime_ns > before, capfd.readouterr().out
+        assert run_cli("dns", *ABC, "--output", tmp_path, *options) == code
+        comm.Barrier()
+        told = capfd.readouterr()
+        return product.stat().st_mtime_ns > before, told.err if code else told.out
 
-    assert run("--resume")[0]
-    ran, output = run("--resume")
-    assert not ran
-    skipped = "dns: skipped, ground_truth.h5 is complete and made with the same settings" in output
-    assert skipped == (comm.rank == 0)
-    assert run("--resume", "--set", "flow.viscosity=0.2")[0]
-    assert run("--set", "flow.viscosity=0.2")[0]
+    assert run()[0]
+    for options in ((), ("--resume",), ("--overwrite",)):
+        ran, output = run(*options)
+        assert not ran
+        skipped = "dns: skipped, ground_truth.h5 is complete and made with the same settings" in output
+        assert skipped == (comm.rank == 0)
+    ran, errors = run(*thick, code=2)
+    assert not ran and "viscosity = 0.1" in (tmp_path / "scene.toml").read_text()
+    assert comm.rank > 0 or ("holds work of other settings (flow.viscosity = 0.1, now 0.2) that would be replaced: "
+                             "ground_truth.h5 (took ") in errors
+    assert run(*thick, "--overwrite")[0]
     assert json.loads((tmp_path / "stage_seconds.json").read_text()).keys() == {"dns"}
     assert "viscosity = 0.2" in (tmp_path / "scene.toml").read_text()
 
@@ -294,7 +300,7 @@ def test_a_signal_ends_the_job_to_be_resumed(tmp_path, number, after):
     job.send_signal(number)
     output += job.communicate(timeout=60)[0]
     assert job.returncode == 75 and time.monotonic() - begin < 10
-    assert output.count("eddies: stopped by SIGUSR1; the same command with --resume goes on") == 1
+    assert output.count("eddies: stopped by SIGUSR1; the same command goes on") == 1
     assert "Traceback" not in output and not list(tmp_path.glob("ground_truth.h5*"))
 
 
@@ -302,7 +308,7 @@ def test_a_signal_ends_the_job_to_be_resumed(tmp_path, number, after):
 def test_a_limit_of_wall_time_or_a_file_stops_the_job(comm, tmp_path, capfd):
     assert run_cli("dns", *ABC, "--output", tmp_path, "--max-minutes", "1e-9") == 75
     errors = capfd.readouterr().err
-    told = "eddies: stopped by its limit of wall time; the same command with --resume goes on "
+    told = "eddies: stopped by its limit of wall time; the same command goes on "
     assert errors.startswith(told) if comm.rank == 0 else errors == ""
     if comm.rank == 0:
         (tmp_path / "STOP").write_text("")
@@ -315,8 +321,8 @@ def test_a_limit_of_wall_time_or_a_file_stops_the_job(comm, tmp_path, capfd):
 @pytest.mark.parametrize("options, seconds", [([], 600), (["--checkpoint-minutes", "3"], 180)])
 def test_a_comparison_makes_checkpoints_of_its_trainings(comm, tmp_path, monkeypatch, options, seconds):
     from eddies.parallel import stop
-    made = []
-    monkeypatch.setattr(stop, "StopRequest", lambda *given: made.append(given))
+    made, StopRequest = [], stop.StopRequest
+    monkeypatch.setattr(stop, "StopRequest", lambda *given: made.append(given) or StopRequest(comm))
     monkeypatch.setattr("eddies.workflows.compare.run", lambda *_: None)
     assert run_cli("compare", "compare-small", "--output", tmp_path, *options) == 0
     assert [given[4] for given in made] == [seconds]

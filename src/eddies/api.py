@@ -33,35 +33,36 @@ def check(scene: Scene | str | Path, *, comm: Comm | None = None) -> None:
         import_module("eddies.workflows.check").run(scene, comm)
 
 
-def run(scene: Scene | str | Path, *, output: str | Path | None = None, resume: bool = False,
+def run(scene: Scene | str | Path, *, output: str | Path | None = None, overwrite: bool = False,
         comm: Comm | None = None) -> Path:
     """Run every stage of a scene, in order, and its report; returns the run directory, `output` or runs/NAME.
 
-    With `resume`, stages whose product is complete and was made with the same settings are skipped.
+    Stages whose product is complete and was made with the same settings are skipped; work of other settings is replaced
+    with `overwrite` alone.
 
     Raises as `stages.run_stages`.
     """
-    return _run(scene, None, output, resume, comm)
+    return _run(scene, None, output, overwrite, comm)
 
 
-def train(scene: Scene | str | Path, *, output: str | Path | None = None, resume: bool = False,
+def train(scene: Scene | str | Path, *, output: str | Path | None = None, overwrite: bool = False,
           comm: Comm | None = None) -> Path:
     """Train the model of a scene, on the ground truth and with the kernel of the run directory, which it returns."""
-    return _run(scene, ("train",), output, resume, comm)
+    return _run(scene, ("train",), output, overwrite, comm)
 
 
-def simulate(scene: Scene | str | Path, *, output: str | Path | None = None, resume: bool = False,
+def simulate(scene: Scene | str | Path, *, output: str | Path | None = None, overwrite: bool = False,
              comm: Comm | None = None) -> Path:
     """Let the particles of a scene go, from its ground truth, with its trained model if its method needs one; returns
     the run directory, with the new rollout.h5."""
-    return _run(scene, ("simulate",), output, resume, comm)
+    return _run(scene, ("simulate",), output, overwrite, comm)
 
 
 def _scene(scene: Scene | str | Path) -> Scene:
     return scene if isinstance(scene, Scene) else load_scene(scene)
 
 
-def _run(scene: Scene | str | Path, stages: Sequence[str] | None, output: str | Path | None, resume: bool,
+def _run(scene: Scene | str | Path, stages: Sequence[str] | None, output: str | Path | None, overwrite: bool,
          comm: Comm | None) -> Path:
     with _job(comm) as comm:
         scene = _scene(scene)
@@ -69,7 +70,7 @@ def _run(scene: Scene | str | Path, stages: Sequence[str] | None, output: str | 
         from eddies.parallel.stop import StopRequest
         from eddies.stages import run_stages
         stop = StopRequest(comm, (), directory / "STOP", math.inf, CHECKPOINT_SECONDS)
-        run_stages(stages or scene.stages, scene, comm, directory, resume, stop)
+        run_stages(stages or scene.stages, scene, comm, directory, stop, overwrite)
     return directory
 
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 BAD_INPUT = 2
 INTERRUPTED = 128 + signal.SIGINT
-STOPPED = 75  # EX_TEMPFAIL: the same command with --resume goes on
+STOPPED = 75  # EX_TEMPFAIL: the same command goes on
 STOP_SIGNALS = (signal.SIGUSR1, signal.SIGTERM)
 
 
@@ -163,9 +163,7 @@ def build_parser() -> argparse.ArgumentParser:
     for name, about in stages.items():
         command = commands.add_parser(name, help=about, description=about)
         add_scene_options(command)
-        add_job_options(command, "run directory (default: runs/NAME)",
-                        "skip stages whose product is complete and was made with the same settings, and go on from the "
-                        "newest checkpoint of the direct simulation or of the training")
+        add_job_options(command, "run directory (default: runs/NAME)")
         command.set_defaults(command=run_command, stage=name)
     report = commands.add_parser("report", help=STAGES["report"].about)
     report.add_argument("run", type=directory, metavar="RUN", help="a run directory, such as runs/tiny")
@@ -175,9 +173,7 @@ def build_parser() -> argparse.ArgumentParser:
                          help="name of a built-in comparison, or path of a TOML file")
     compare.add_argument("--run", type=directory, metavar="DIR",
                          help="run directory with the ground truth (default: the comparison's, or runs/BASE)")
-    add_job_options(compare, "directory of the comparison (default: runs/NAME)",
-                    "keep the rollouts that are complete and were made with the same settings on as many ranks, and go "
-                    "on from the newest checkpoint of a training")
+    add_job_options(compare, "directory of the comparison (default: runs/NAME)")
     compare.set_defaults(command=compare_command)
     export = commands.add_parser("export", help="fields and particles of a run directory, for ParaView")
     export.add_argument("run", type=directory, metavar="RUN", help="a run directory, such as runs/tiny")
@@ -225,14 +221,18 @@ def add_scene_options(parser: argparse.ArgumentParser) -> None:
                         help="change a key of the scene; repeatable")
 
 
-def add_job_options(parser: argparse.ArgumentParser, output: str, resume: str) -> None:
-    """Options of commands that run for long: where the products go, what is kept, and when to stop."""
+def add_job_options(parser: argparse.ArgumentParser, output: str) -> None:
+    """Options of commands that run for long: where the products go, what they may replace, and when to stop."""
     parser.add_argument("--output", type=directory, metavar="DIR", help=output)
-    parser.add_argument("--resume", action="store_true", help=resume)
+    parser.add_argument("--overwrite", action="store_true", help="replace products and checkpoints of other settings; "
+                        "else they are named, and nothing is touched. What fits is kept, or gone on with")
+    parser.add_argument("--take-over", action="store_true",
+                        help="end another job in the same directory, or one that only seems to be there")
+    parser.add_argument("--resume", action="store_true", help=argparse.SUPPRESS)  # of job scripts of eddies 0.1
     parser.add_argument("--checkpoint-minutes", type=positive, default=10.0, metavar="M",
-                        help="wall time between two checkpoints of the direct simulation or a training (default: 10)")
+                        help="wall time between two checkpoints (default: 10)")
     parser.add_argument("--max-minutes", type=positive, default=math.inf, metavar="M",
-                        help="stop after M minutes of wall time, with exit code 75, to be resumed")
+                        help="stop after M minutes of wall time, with exit code 75; the same command goes on")
 
 
 def run_command(options: argparse.Namespace, comm: Comm, signals: list[int]) -> None:
@@ -244,7 +244,7 @@ def run_command(options: argparse.Namespace, comm: Comm, signals: list[int]) -> 
     stop = StopRequest(comm, signals, directory / "STOP", 60 * options.max_minutes,
                        60 * options.checkpoint_minutes)
     stages = scene.stages if options.stage == "run" else (options.stage,)
-    run_stages(stages, scene, comm, directory, options.resume, stop)
+    run_stages(stages, scene, comm, directory, stop, options.overwrite, options.take_over)
 
 
 def report_command(options: argparse.Namespace, comm: Comm) -> None:
@@ -256,6 +256,7 @@ def report_command(options: argparse.Namespace, comm: Comm) -> None:
 
 def compare_command(options: argparse.Namespace, comm: Comm, signals: list[int]) -> None:
     """Variants of a scene, one after the other, until a signal, a file STOP or the limit of wall time ends it."""
+    from eddies.io.run_lock import lock_directory
     from eddies.parallel.stop import StopRequest
     from eddies.scene.comparison import load_comparison
     from eddies.stages import check_ranks, check_stop_file, run_stages
@@ -267,9 +268,10 @@ def compare_command(options: argparse.Namespace, comm: Comm, signals: list[int])
     directory = options.output or Path("runs") / comparison.name
     check_stop_file(comm, directory)
     stop = StopRequest(comm, signals, directory / "STOP", 60 * options.max_minutes, 60 * options.checkpoint_minutes)
-    import_module("eddies.workflows.compare").run(
-        comparison, comm, directory, options.resume,
-        lambda stages, scene, where: run_stages(stages, scene, comm, where, True, stop))
+    with lock_directory(comm, directory, options.take_over) as loss, stop.watching(loss):
+        import_module("eddies.workflows.compare").run(
+            comparison, comm, directory, options.overwrite,
+            lambda stages, scene, where: run_stages(stages, scene, comm, where, stop, True, options.take_over))
 
 
 def export_command(options: argparse.Namespace, comm: Comm) -> None:

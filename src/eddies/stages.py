@@ -6,74 +6,93 @@ import json
 import logging
 import time
 from collections.abc import Sequence
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 
 from eddies.clock import duration
 from eddies.io.checkpoint import CheckpointDirectory
 from eddies.io.errors import write_error
-from eddies.io.hdf5 import in_files, open_product, product_fingerprint
+from eddies.io.hdf5 import in_files, open_product
+from eddies.io.run_lock import lock_directory, refuse_if_held
 from eddies.io.whole_files import write_files
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm
 from eddies.parallel.stop import StopRequest
-from eddies.pipeline import STAGES, Stage, after
+from eddies.pipeline import STAGES, Stage
 from eddies.scene.scene import Scene, SceneError
 from eddies.workflows.feasibility import check_feasible, check_ground_truth, check_places
 from eddies.workflows.foreseen.estimates import ground_truth_alone, most_ranks
 from eddies.workflows.foreseen.warnings import stage_warnings
 from eddies.workflows.learned.source import read_source
+from eddies.workflows.run_directory.work import SECONDS, find_work, is_done, stage_seconds
 
 log = logging.getLogger("eddies")
 
 
-def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path, resume: bool,
-               stop: StopRequest) -> None:
+def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path, stop: StopRequest,
+               overwrite: bool = False, take_over: bool = False) -> None:
     """Run stages of a scene, all ranks together, and record the wall time of each in stage_seconds.json.
 
-    With `resume`, stages whose product is complete and was made with the same settings are skipped, up to
-    the first one that has to run; that one goes on from its newest checkpoint, if it makes any.
+    Stages whose product is complete and was made with the same settings are skipped; one with a checkpoint of the same
+    settings goes on from it. Work of other settings is replaced with `overwrite` alone. Meanwhile no other job works in
+    the directory; one that seems to is ended with `take_over`.
 
     Raises:
-        Stopped: `stop` found a reason to; the running stage has kept what --resume needs.
+        Stopped: `stop` found a reason to; the running stage has kept what the next run needs.
         SceneError: a file STOP asks the job to end before it begins, the scene lacks a section that a stage is about,
             cannot be cut into as many slabs as there are ranks, or differs from that of a product the stages start
             from.
+        RunInUse, RunTakenOver: another job works in the directory, or has taken it over.
+        WorkAtStake: work of other settings would be replaced.
         WriteError: the directory cannot be written.
         ProductError: a stage that is not among `stages` has not left the product that they start from.
     """
     check_feasible(stages, scene, comm)
     check_ranks(stages, scene, comm)
     check_places(stages, comm, directory)
+    if not take_over:
+        refuse_if_held(comm, directory)
     check_inputs(stages, scene, comm, directory)
     check_stop_file(comm, directory)
-    prepare_directory(scene, comm, directory)
+    with lock_directory(comm, directory, take_over) as loss, stop.watching(loss):
+        work = in_files(comm, directory, lambda: find_work(stages, scene, directory))
+        if not overwrite:
+            work.refuse_to_lose()
+        prepare_directory(scene, comm, directory)
+        tell(stages, scene, comm)
+        known = False  # that the ground truth is what the other stages need
+        for stage in [STAGES[name] for name in stages]:
+            if stage.name in work.done | work.outdated:  # killed in its last moment, or of others
+                remove_checkpoints(stage, comm, directory)
+            if stage.name in work.done:
+                log.info("%s: skipped, %s is complete and made with the same settings", stage.name, stage.file)
+                continue
+            if "dns" in stage.depends_on and stage.product is not None and not known:
+                rest, known = stages[stages.index(stage.name):], True
+                check_ground_truth(rest, scene, comm, directory)
+            run_stage(stage, scene, comm, directory, stop)
+
+
+def tell(stages: Sequence[str], scene: Scene, comm: Comm) -> None:
+    """Log what is foreign to the package in a scene, and what its stages give reason to doubt."""
     if scene.foreign:
         log.info("%s: uses classes that are not of this package: %s", scene.name, ", ".join(scene.foreign))
     if comm.rank == 0:
         for problem in stage_warnings(scene, stages):
             log.warning(problem)
-    known = False  # that the ground truth is what the other stages need
-    for stage in [STAGES[name] for name in stages]:
-        goes_on, resume = resume, resume and is_done(stage.name, scene, comm, directory)
-        if resume or not goes_on:  # left by another run, or by one killed in its last moment
-            remove_checkpoints(stage, comm, directory)
-        if resume:
-            log.info("%s: skipped, %s is complete and made with the same settings", stage.name, stage.file)
-            continue
-        for later in after(stage.name):  # they start from the product that is about to be replaced
-            remove_checkpoints(later, comm, directory)
-        if "dns" in stage.depends_on and stage.product is not None and not known:
-            rest, known = stages[stages.index(stage.name):], True
-            check_ground_truth(rest, scene, comm, directory)
-        log.info("%s: starts on %d %s", stage.name, comm.size, "rank" if comm.size == 1 else "ranks")
-        start = time.perf_counter()
-        module, _, function = stage.run.partition(":")
-        run = getattr(import_module(module), function)
-        stop.check()
-        run(scene, comm, directory, stop)
-        comm.Barrier()
-        record_seconds(stage.name, time.perf_counter() - start, comm, directory)
+
+
+def run_stage(stage: Stage, scene: Scene, comm: Comm, directory: Path, stop: StopRequest) -> None:
+    """Run one stage, and record its wall time."""
+    log.info("%s: starts on %d %s", stage.name, comm.size, "rank" if comm.size == 1 else "ranks")
+    start = time.perf_counter()
+    module, _, function = stage.run.partition(":")
+    run = getattr(import_module(module), function)
+    stop.check()
+    run(scene, comm, directory, stop)
+    comm.Barrier()
+    record_seconds(stage.name, time.perf_counter() - start, comm, directory)
 
 
 def remove_checkpoints(stage: Stage, comm: Comm, directory: Path) -> None:
@@ -108,7 +127,7 @@ def check_inputs(stages: Sequence[str], scene: Scene, comm: Comm, directory: Pat
     for needed in [STAGES[name] for name in first.depends_on if name in scene.stages]:
         with open_product(comm, directory / needed.file, needed.product):
             pass
-        if not is_done(needed.name, scene, comm, directory):
+        if not on_first_rank(comm, partial(is_done, needed.name, scene, directory)):
             raise SceneError(f"{directory / needed.file}: was made with other settings than this scene's; run "
                              f"`eddies {needed.name}` again with these, or give `eddies {stages[0]}` the --set of then")
 
@@ -120,9 +139,11 @@ def check_stop_file(comm: Comm, directory: Path) -> None:
 
 
 def prepare_directory(scene: Scene, comm: Comm, directory: Path) -> None:
-    """Make the run directory and write the scene as used into it; if rank 0 cannot, all ranks raise."""
+    """Write the scene as used into the run directory, and remove what jobs that were killed left unfinished there; if
+    rank 0 cannot, all ranks raise."""
     def write() -> None:
-        directory.mkdir(parents=True, exist_ok=True)
+        for leftover in directory.glob("*.partial"):
+            leftover.unlink()
         write_files({directory / "scene.toml": scene.to_toml()})
 
     try:
@@ -132,26 +153,9 @@ def prepare_directory(scene: Scene, comm: Comm, directory: Path) -> None:
                           "--output") from None
 
 
-def is_done(stage: str, scene: Scene, comm: Comm, directory: Path) -> bool:
-    """Whether the product of a stage is complete and was made with the same settings, as rank 0 sees it."""
-    if STAGES[stage].product is None:
-        return False
-    product = directory / STAGES[stage].file
-    return on_first_rank(comm, lambda: product_fingerprint(product) == scene.fingerprint(stage))
-
-
 def record_seconds(stage: str, seconds: float, comm: Comm, directory: Path) -> None:
     """Log the wall time of a stage and keep it in stage_seconds.json, which holds the last of each stage."""
     log.info("%s: took %s", stage, duration(seconds))
-    path = directory / "stage_seconds.json"
+    path = directory / SECONDS
     in_files(comm, path, lambda: write_files(
-        {path: json.dumps({**_known_seconds(path), stage: round(seconds, 3)}, indent=2) + "\n"}))
-
-
-def _known_seconds(path: Path) -> dict[str, float]:
-    """What an earlier run noted; a file that is missing or damaged holds nothing worth an error."""
-    try:
-        known = json.loads(path.read_text())
-    except (OSError, ValueError):
-        return {}
-    return known if isinstance(known, dict) else {}
+        {path: json.dumps({**stage_seconds(directory), stage: round(seconds, 3)}, indent=2) + "\n"}))

@@ -67,7 +67,7 @@ def test_a_full_disk_is_told_and_harms_nothing(comm, tmp_path, size):
     comm.Barrier()
     with largest_file(comm, size, comm.size - 1):
         with pytest.raises(WriteError, match=r"rollout.h5.partial: cannot be written: File too large: \d+ bytes wanted"
-                                             r", \d+ free; make room, then .* --resume"):
+                                             r", \d+ free; make room, then run the command again"):
             write(comm, path)
     assert path.read_text() == "older" and [found.name for found in tmp_path.iterdir()] == ["rollout.h5"]
     comm.Barrier()

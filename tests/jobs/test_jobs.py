@@ -64,7 +64,7 @@ def test_local_runs_on_the_cores_or_fewer(checkout, asked, ranks):
     result = run(checkout, "local.sh", **({"EDDIES_RANKS": asked} if asked else {}))
     assert result.returncode == 0, result.stderr
     assert f"mpirun -n {ranks} " in result.stdout
-    assert "eddies run hit-small --resume; threads 1\n" in result.stdout
+    assert "eddies run hit-small; threads 1\n" in result.stdout
 
 
 def test_local_starts_no_more_ranks_than_the_scene_can_use(checkout):
@@ -80,7 +80,7 @@ def test_local_ends_with_what_is_wrong_with_the_scene(checkout):
 def test_local_passes_scene_and_options_on(checkout):
     for given, scene in ((["abc.toml"], "abc.toml"), ([], "hit-small")):
         result = run(checkout, "local.sh", *given, "--set", "seed=2")
-        assert f"eddies run {scene} --resume --set seed=2; " in result.stdout
+        assert f"eddies run {scene} --set seed=2; " in result.stdout
 
 
 @pytest.mark.parametrize("asked", ["0", "-2", "two"])
@@ -95,7 +95,7 @@ def test_batch_job_is_requeued_after_a_checkpoint(checkout, status, requeued):
     result = run(checkout, "slurm.sh", SLURM_JOB_ID="17", ENDS_WITH=status, EDDIES_SCENE="hit",
                  EDDIES_OUTPUT="there", SLURM_CPUS_PER_TASK="3")
     assert result.returncode == int(status)
-    assert "srun --cpus-per-task=3\neddies run hit --resume --output there; threads 3\n" in result.stdout
+    assert "srun --cpus-per-task=3\neddies run hit --output there; threads 3\n" in result.stdout
     assert ("scontrol requeue 17" in result.stdout) == requeued
 
 
@@ -126,5 +126,5 @@ def test_large_job_fits_the_scene():
 def test_large_job_makes_the_ground_truth_alone(checkout, status, requeued):
     result = run(checkout, "hit-paper.slurm.sh", "--set", "seed=2", SLURM_JOB_ID="17", ENDS_WITH=status)
     assert result.returncode == int(status), result.stderr
-    assert "eddies dns hit-paper --resume --set seed=2; threads 1\n" in result.stdout
+    assert "eddies dns hit-paper --set seed=2; threads 1\n" in result.stdout
     assert ("scontrol requeue 17" in result.stdout) == requeued

@@ -25,7 +25,7 @@ def test_a_signal_of_one_rank_stops_all(comm):
     if comm.rank == comm.size - 1:
         received.append(signal.SIGTERM)
     assert stop() and stop.checkpoint_due and stop.reason == "SIGTERM"
-    with pytest.raises(Stopped, match="stopped by SIGTERM; the same command with --resume goes on after the last"):
+    with pytest.raises(Stopped, match="stopped by SIGTERM; the same command goes on after the last"):
         stop.check()
 
 

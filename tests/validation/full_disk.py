@@ -3,8 +3,8 @@
     python tests/validation/full_disk.py [--commands dns,train,...] [--ranks 1,2] [--levels 0.03,0.5,0.95]
 
 Each command is run with room for a part of what it writes. It has to end with exit code 2 and one line, without a core
-file, and to leave everything as it was; once there is room, it has to come to its end (with --resume, where there is
-that). Linux: the file system is a tmpfs in a mount namespace, for which one has to be root or to have `unshare -Urm`.
+file, and to leave everything as it was; once there is room, the same command has to come to its end. Linux:
+the file system is a tmpfs in a mount namespace, for which one has to be root or to have `unshare -Urm`.
 """
 
 import argparse
@@ -113,9 +113,9 @@ def arguments(command):
     return [command, "comparison.toml", "--output", "out"] if command == "compare" else [command, "run"]
 
 
-def resuming(command):
-    """The same, going on from what there is."""
-    return [*arguments(command), *(["--resume"] if command in STAGES or command == "compare" else [])]
+def replacing(command):
+    """The same, which goes on from its checkpoint and replaces what is old."""
+    return [*arguments(command), *(["--overwrite"] if command in STAGES else [])]
 
 
 def eddies(ranks, place, *words):
@@ -152,7 +152,7 @@ def added_bytes(command, plenty, disk):
     """Bytes that a command adds to the disk where there is room."""
     begin(command, plenty, disk)
     before = shutil.disk_usage(disk).used
-    ended = eddies(1, disk, *arguments(command))
+    ended = eddies(1, disk, *replacing(command))
     assert ended.returncode == 0, ended.stderr
     if command == "report":  # in place of the one that was there, and beside it until all is written
         return sum(path.stat().st_size for path in (disk / "run/report").rglob("*") if path.is_file())
@@ -167,7 +167,7 @@ def trial(command, ranks, free, plenty, disk):
         os.posix_fallocate(file.fileno(), 0, max(shutil.disk_usage(disk).free - free, 1))
     began = time.monotonic()
     try:
-        ended = eddies(ranks, disk, *resuming(command))
+        ended = eddies(ranks, disk, *replacing(command))
     except subprocess.TimeoutExpired:
         return ["hangs"]
     faults = complaints(ended)
@@ -184,7 +184,7 @@ def trial(command, ranks, free, plenty, disk):
 def go_on(command, ranks, disk):
     """Make room after a trial and run the command again; what went wrong."""
     (disk / "filler").unlink()
-    ended = eddies(ranks, disk, *resuming(command))
+    ended = eddies(ranks, disk, *replacing(command))
     whole = ended.returncode == 0 and is_whole(command, disk)
     faults = [] if whole else [f"exit code {ended.returncode}: {ended.stderr}"]
     if command in ("dns", "train") and "goes on from step" not in ended.stdout:

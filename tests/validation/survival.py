@@ -93,7 +93,7 @@ def kills(killed, count, directory, chooser):
             shutil.copytree(start, run)
         checkpoints = killed.checkpoints(run)
         newest = last_step(checkpoints.path)
-        job = killed.process(run, "--resume", "--checkpoint-minutes", "1e-9")
+        job = killed.process(run, "--checkpoint-minutes", "1e-9")
         while last_step(checkpoints.path) <= newest and job.poll() is None:
             time.sleep(0.002)
         time.sleep(chooser.random() / 3)

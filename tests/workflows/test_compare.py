@@ -92,7 +92,7 @@ def test_variants_are_run_measured_and_kept(comm, folder, capfd):
     if comm.rank == 0:
         (out / "no-force/rollout.h5").unlink()
     comm.Barrier()
-    assert run_cli("compare", "small.toml", "--output", "out", "--resume") == 0
+    assert run_cli("compare", "small.toml", "--output", "out") == 0
     comm.Barrier()
     assert [str(path.relative_to(out)) for path, time in before.items() if path.stat().st_mtime_ns != time] == [
         "no-force/rollout.h5"]
@@ -138,7 +138,7 @@ def test_runs_of_others_are_left_as_they_are(comm, folder, capfd, name, change, 
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text("precious")
     comm.Barrier()
-    for options in ([], ["--resume"]):
+    for options in ([], ["--overwrite"]):
         assert run_cli("compare", "small.toml", "--output", "work", *options) == 2
         assert comm.rank > 0 or told in capfd.readouterr().err
     comm.Barrier()

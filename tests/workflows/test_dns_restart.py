@@ -94,7 +94,7 @@ def test_every_split_of_a_run_is_the_whole_run(comm, tmp_path, last, monkeypatch
 def test_a_stopped_run_goes_on_and_leaves_nothing_else(comm, tmp_path, last):
     scene = load_scene("tiny", SPLIT)
     for _ in range(2):  # in spin-up, then with tracers: the second stop is the resumed run's
-        with pytest.raises(Stopped, match="--resume goes on from step"):
+        with pytest.raises(Stopped, match="command goes on from step"):
             dns.run(scene, comm, tmp_path, StopAtStep(comm, 7))
     comm.Barrier()
     assert not (tmp_path / "ground_truth.h5").exists() and not (tmp_path / "ground_truth.h5.partial").exists()

@@ -108,10 +108,14 @@ def test_pairs_outside_the_training_data_are_counted(run_directory):
 
 
 @pytest.mark.usefixtures("no_figures")
-def test_resume_skips_what_is_done_and_redoes_what_changed(comm, run_directory, capfd):
+def test_what_fits_is_kept_and_what_changed_is_redone(comm, run_directory, capfd):
     before = {path: path.stat().st_mtime_ns for path in run_directory.glob("*.h5")}
     comm.Barrier()
-    assert eddies("run", "tiny", "--output", run_directory, "--resume", "--set", "simulation.turnovers=0.2") == 0
+    changed = ("run", "tiny", "--output", run_directory, "--set", "simulation.turnovers=0.2")
+    assert eddies(*changed) == 2
+    told = "that would be replaced: rollout.h5 (took "
+    assert (told in capfd.readouterr().err) == (comm.rank == 0)
+    assert eddies(*changed, "--overwrite") == 0
     comm.Barrier()
     log = capfd.readouterr().out
     assert comm.rank > 0 or log.count("skipped") == 3 and "rollout: complete" in log

@@ -175,7 +175,7 @@ def test_a_stopped_rollout_goes_on_and_leaves_nothing_else(comm, case_of):
     scene, directory = case_of("default")
     names = {path.name for path in directory.iterdir()}
     for number in (1, 2):
-        with pytest.raises(Stopped, match=f"--resume goes on from step {number} of the rollout"):
+        with pytest.raises(Stopped, match=f"command goes on from step {number} of the rollout"):
             simulate.run(scene, comm, directory, StopAtStep(comm, 1))
     comm.Barrier()
     assert {path.name for path in directory.iterdir()} == names | {"checkpoints-rollout"}

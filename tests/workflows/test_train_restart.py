@@ -71,7 +71,7 @@ def test_a_stopped_training_is_the_one_never_stopped(comm, tmp_path):
         (tmp_path / "learning.png").unlink()
     # Before the first step, within the first phase, between two phases, and between two horizons.
     for before, step in pairwise((0, 0, 3, 6, 8)):
-        with pytest.raises(Stopped, match=f"--resume goes on from step {step} of the training"):
+        with pytest.raises(Stopped, match=f"command goes on from step {step} of the training"):
             train.run(scene, comm, tmp_path, StopAtStep(comm, step - before))
     train.run(scene, comm, tmp_path)
     parts = trained(comm, tmp_path)
@@ -91,7 +91,7 @@ def test_a_stopped_training_of_the_kernel_is_the_one_never_stopped(comm, tmp_pat
     assert len(whole["history/loss_learned"]) == len(whole["history/loss_learned_no_gradient"]) == 3
     # Before the first step, within a form of the kernel, between the two, and before the last step.
     for before, step in pairwise((0, 0, 1, 3, 5)):
-        with pytest.raises(Stopped, match=f"--resume goes on from step {step} of the training"):
+        with pytest.raises(Stopped, match=f"command goes on from step {step} of the training"):
             train_kernel.run(scene, comm, tmp_path, StopAtStep(comm, step - before))
     train_kernel.run(scene, comm, tmp_path)
     parts = datasets(comm, tmp_path / "kernel.h5")
@@ -122,32 +122,28 @@ def test_curves_that_cannot_be_written_are_told_by_all(comm, tmp_path, monkeypat
 
 
 @pytest.mark.mpi(2)
-def test_a_training_goes_on_from_products_that_are_still_those_it_began_with(comm, tmp_path):
+def test_a_training_goes_on_from_products_of_the_settings_that_it_began_with(comm, tmp_path):
     scene = prepared(comm, tmp_path, SHORT)
 
-    def stopped(looks, step, resume, names=("train",)):
+    def stopped(looks, step, names=("train",)):
         with pytest.raises(Stopped, match=f"from step {step} of the training"):
-            stages.run_stages(names, scene, comm, tmp_path, resume, StopAtStep(comm, looks))
+            stages.run_stages(names, scene, comm, tmp_path, StopAtStep(comm, looks))
 
     # One look is before the stage begins.
-    stopped(3, 2, resume=False)
-    stopped(2, 3, resume=True)
-    stopped(2, 1, resume=False)
-    stopped(3, 3, resume=True)
+    stopped(3, 2)
+    stopped(2, 3)
     if comm.rank == 0:
         (tmp_path / "kernel.h5").unlink()
-    # The kernel is trained in two forms of two steps each.
-    stopped(1 + 2 * 2 + 2, 1, resume=True, names=("train-kernel", "train"))
-    stages.run_stages(["train-kernel"], scene, comm, tmp_path, False, StopRequest(comm))
-    stopped(2, 1, resume=True)
-    stages.run_stages(["train"], scene, comm, tmp_path, True, StopRequest(comm))
+    # The kernel is trained in two forms of two steps each; made with the same settings, it is the one of before.
+    stopped(1 + 2 * 2 + 2, 4, names=("train-kernel", "train"))
+    stages.run_stages(["train"], scene, comm, tmp_path, StopRequest(comm))
     leftover = tmp_path / "checkpoints-train"
     assert not leftover.exists()
     comm.Barrier()
     if comm.rank == 0:
         leftover.mkdir()
     comm.Barrier()
-    stages.run_stages(["train"], scene, comm, tmp_path, True, StopRequest(comm))
+    stages.run_stages(["train"], scene, comm, tmp_path, StopRequest(comm))
     assert not leftover.exists()
 
 

@@ -41,7 +41,7 @@ def test_a_model_is_trained_run_and_reported(comm, tmp_path):
     comm.Barrier()
     scene = load_scene(tmp_path / "own.toml")
     assert scene.stages == ("dns", "train", "simulate", "report")
-    run_stages(scene.stages, scene, comm, tmp_path, False, StopRequest(comm))
+    run_stages(scene.stages, scene, comm, tmp_path, StopRequest(comm))
     assert not (tmp_path / "kernel.h5").exists()
     with open_product(comm, tmp_path / "rollout.h5", "rollout") as file:
         assert "fields" not in file

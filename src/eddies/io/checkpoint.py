@@ -110,7 +110,7 @@ class CheckpointDirectory:
                 shutil.rmtree(partial, ignore_errors=True)
             lack = wanted_and_free(final, total_bytes(arrays))
             raise WriteError(f"{final}: cannot be written ({error.strerror or error}; {lack}); the checkpoints before "
-                             "it are intact: once there is room, go on with --resume") from None
+                             "it are intact: once there is room, run the command again") from None
         for name in self._names()[KEPT:]:
             in_files(self.comm, self.path / name, lambda: _delete(self.path / name))
 
@@ -176,6 +176,14 @@ class CheckpointDirectory:
                     _delete(path)
 
         in_files(self.comm, self.path, clean)
+
+
+def checkpoints_in(path: Path) -> list[tuple[int, str]]:
+    """Step and fingerprint of the settings of each checkpoint in a directory, the newest first, by the manifests that
+    are as written. One rank calls it."""
+    manifests = [folder / MANIFEST for folder in sorted(path.glob("step-*"), reverse=True) if not folder.suffix]
+    contents = [parse_manifest(manifest.read_bytes()) for manifest in manifests if manifest.is_file()]
+    return [(content["step"], content["fingerprint"]) for content in contents if content is not None]
 
 
 def _name(step: int) -> str:

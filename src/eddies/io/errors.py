@@ -40,8 +40,7 @@ def write_error(path: Path | str, error: OSError, otherwise: str) -> WriteError:
         return WriteError(otherwise)
     path = error.filename or path
     lack = wanted_and_free(path, getattr(error, "wanted", 0))
-    return WriteError(f"{path}: cannot be written: {error.strerror}: {lack}; make room, then run the command again, a "
-                      "stage with --resume")
+    return WriteError(f"{path}: cannot be written: {error.strerror}: {lack}; make room, then run the command again")
 
 
 def wanted_and_free(path: Path | str, wanted: int) -> str:

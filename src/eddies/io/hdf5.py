@@ -19,6 +19,7 @@ from mpi4py import MPI
 
 from eddies.io.errors import ProductError, WriteError, write_error
 from eddies.io.provenance import environment
+from eddies.io.run_lock import RunTakenOver
 from eddies.io.unfinished import HEADER_BYTES, Unfinished, frame_bytes, writing
 from eddies.parallel.broadcast import on_first_rank, share_text
 from eddies.parallel.stop import Stopped
@@ -77,11 +78,11 @@ def create_product(comm: MPI.Comm, path: str | Path, kind: str,
             unfinished.close()
     except BaseException as error:
         # Several ranks close a file together: only where all of them are here.
-        if comm.size > 1 and not isinstance(error, Stopped | WriteError):
+        if comm.size > 1 and not isinstance(error, Stopped | WriteError | RunTakenOver):
             unfinished.abandon()
         else:
             unfinished.close()
-            in_files(comm, unfinished.path, lambda: unfinished.path.unlink(missing_ok=True))
+            in_files(comm, unfinished.path, unfinished.remove)
             unfinished.check()
         raise
     in_files(comm, path, lambda: os.replace(unfinished.path, path))

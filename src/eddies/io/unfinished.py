@@ -46,6 +46,7 @@ class Unfinished:
         else:
             self._alike(self._make)
             self._alike(self._open_together)
+        self._inode = path.stat().st_ino if comm.rank == 0 else 0
         self._name = self.file.filename
         _open[self._name] = self
 
@@ -70,6 +71,11 @@ class Unfinished:
         self.file.close()
         if self._sink is not None:
             self._sink.close()
+
+    def remove(self) -> None:
+        """Remove the closed file, unless another job that has taken the directory over writes under its name."""
+        if self.path.exists() and self.path.stat().st_ino == self._inode:
+            self.path.unlink()
 
     def abandon(self) -> None:
         """Leave the file open, as other ranks may not know that it is not written any more."""
@@ -144,7 +150,7 @@ def writing(group: h5py.Group | h5py.Dataset, size: int) -> Iterator[None]:
         unfinished.broken = True
         lack = wanted_and_free(unfinished.path, size)
         raise ProductError(f"{unfinished.path}: cannot be written: {error}: {lack}; make room, or check the disk, then "
-                           "run the command again, a stage with --resume") from None
+                           "run the command again") from None
     unfinished.check()
 
 

@@ -26,25 +26,28 @@ from eddies.workflows.variants.run import RunStages, VariantRun, in_directories
 log = logging.getLogger("eddies")
 
 
-def run(comparison: Comparison, comm: Comm, output: Path, resume: bool, run_stages: RunStages) -> None:
+def run(comparison: Comparison, comm: Comm, output: Path, overwrite: bool, run_stages: RunStages) -> None:
     """Run every variant and write comparison.csv, comparison.json, figures and index.html; all ranks call it.
 
-    A variant that fails does not end the comparison: its row says when and why. With `resume`, rollouts that are there,
-    made with the same settings on as many ranks, are kept.
+    A variant that fails does not end the comparison: its row says when and why. Rollouts that are there, made with the
+    same settings on as many ranks, are kept.
 
     Raises:
         ProductError, SceneError: a ground truth is missing, or does not fit the comparison; or the run directory of a
             variant holds what no comparison has made. Nothing is written then.
+        WorkAtStake: without `overwrite`, where work of other settings or numbers of ranks would be replaced.
     """
     runs = [VariantRun(scene, output / name, comparison.ground_truth_of(name))
             for name, scene in comparison.scenes.items()]
     in_directories(comm, lambda: check_directories(runs))
     for variant in runs:
         check_ground_truth(comparison, variant, comm)
+    if not overwrite:
+        in_directories(comm, lambda: [variant.work(comm.size).refuse_to_lose() for variant in runs])
     errors = comm.Dup()
     for done, variant in enumerate(runs):
         log.info("compare: %s, %d of %d", variant.name, done + 1, len(runs))
-        in_directories(comm, lambda: variant.prepare(runs[:done], comm.size, resume))
+        in_directories(comm, lambda: variant.prepare(runs[:done], comm.size))
         variant.attempt(errors, lambda: variant.roll_out(run_stages))
     for repeat in range(1, comparison.repeats):
         log.info("compare: timing, round %d of %d", repeat + 1, comparison.repeats)

@@ -120,7 +120,7 @@ def test_a_run_tells_the_warnings_of_its_stages_when_it_starts(comm, tmp_path, m
     monkeypatch.setattr(dns, "run", lambda *given: None)
     scene = load_scene("tiny", ["flow.sound_speed=4", "model.preset=learned-density"])
     with caplog.at_level(logging.WARNING, logger="eddies"):
-        run_stages(["dns"], scene, comm, tmp_path, False, StopRequest(comm))
+        run_stages(["dns"], scene, comm, tmp_path, StopRequest(comm))
     shown = [record.getMessage() for record in caplog.records]
     assert shown == list(stage_warnings(scene, ["dns"])) and len(shown) == 1
 

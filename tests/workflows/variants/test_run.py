@@ -1,4 +1,4 @@
-"""What a variant shares, what it keeps on --resume, what it fails of, and how its steps are timed."""
+"""What a variant shares, what it keeps, what it fails of, and how its steps are timed."""
 
 import pytest
 
@@ -8,6 +8,7 @@ from eddies.pipeline import STAGES
 from eddies.scene.scene import SceneError, load_scene
 from eddies.workflows.variants.rows import step_costs
 from eddies.workflows.variants.run import StepSeconds, VariantRun
+from eddies.workflows.run_directory.work import WorkAtStake
 
 
 def write(comm, directory, stage, scene):
@@ -36,11 +37,11 @@ def names(variant):
 @pytest.mark.mpi(1)
 def test_kernel_is_the_bases_and_a_model_that_of_the_first_variant_with_the_same(comm, variants):
     first, second, other = variants
-    first.prepare([], 1, resume=False)
+    first.prepare([], 1)
     assert names(first) == {"ground_truth.h5", "kernel.h5"}  # what training costs is to be measured
     write(comm, first.directory, "train", first.scene)
-    second.prepare([first], 1, resume=False)
-    other.prepare([first, second], 1, resume=False)
+    second.prepare([first], 1)
+    other.prepare([first, second], 1)
     assert names(second) == {"ground_truth.h5", "kernel.h5", "model.h5"}
     assert names(other) == names(second) - {"model.h5"}
     assert (second.directory / "model.h5").resolve() == first.directory / "model.h5"
@@ -51,39 +52,31 @@ def test_kernel_is_the_bases_and_a_model_that_of_the_first_variant_with_the_same
 def test_a_kernel_of_other_settings_is_shared_among_variants(comm, variants, tmp_path):
     scenes = [load_scene("tiny", ["kernel.steps=7", f"name={name}"]) for name in "ab"]
     one, two = (VariantRun(scene, tmp_path / "out" / scene.name, tmp_path / "base") for scene in scenes)
-    one.prepare([], 1, resume=False)
+    one.prepare([], 1)
     assert names(one) == {"ground_truth.h5"}
     write(comm, one.directory, "train-kernel", one.scene)
-    two.prepare([one], 1, resume=False)
+    two.prepare([one], 1)
     assert (two.directory / "kernel.h5").resolve() == one.directory / "kernel.h5"
 
 
 @pytest.mark.mpi(1)
-def test_resume_keeps_what_fits_and_a_fresh_start_keeps_nothing(comm, variants):
+def test_what_fits_is_kept_and_what_does_not_is_told_before_it_is_replaced(comm, variants):
     variant = variants[0]
-    variant.prepare([], 1, resume=False)
+    variant.prepare([], 1)
     for stage in ("train", "simulate"):
         write(comm, variant.directory, stage, variant.scene)
-    variant.prepare([], 1, resume=True)
+    variant.work(1).refuse_to_lose()
+    variant.prepare([], 1)
     assert {"model.h5", "rollout.h5"} < names(variant)
-    variant.prepare([], 2, resume=True)  # times of another number of ranks would not compare
+    with pytest.raises(WorkAtStake, match=r"would be replaced: rollout.h5 \(made "):
+        variant.work(2).refuse_to_lose()
+    variant.prepare([], 2)  # times of another number of ranks would not compare
     assert "rollout.h5" not in names(variant) and "model.h5" in names(variant)
     changed = VariantRun(variants[2].scene, variant.directory, variant.ground_truth)
-    changed.prepare([], 1, resume=True)
-    assert "model.h5" not in names(changed)
-    write(comm, variant.directory, "simulate", variant.scene)
-    variant.prepare([], 1, resume=False)
-    assert names(variant) == {"ground_truth.h5", "kernel.h5"}
-
-
-@pytest.mark.mpi(1)
-def test_a_training_that_was_stopped_goes_on_with_resume_alone(comm, variants):
-    variant, checkpoint = variants[0], variants[0].directory / STAGES["train"].checkpoints / "step-00000003"
-    checkpoint.mkdir(parents=True)
-    variant.prepare([], 1, resume=True)
-    assert checkpoint.exists()
-    variant.prepare([], 1, resume=False)
-    assert not checkpoint.parent.exists()
+    with pytest.raises(WorkAtStake, match=r"would be replaced: model.h5"):  # not the kernel, a link
+        changed.work(1).refuse_to_lose()
+    changed.prepare([], 1)
+    assert names(changed) == {"ground_truth.h5", "kernel.h5"}
 
 
 @pytest.mark.mpi(1)
@@ -92,7 +85,7 @@ def test_a_directory_that_a_comparison_has_made_is_used_again(comm, variants):
         variant.check_directory([variant.ground_truth])
         variant.directory.mkdir(parents=True)  # empty: nothing is lost
         variant.check_directory([variant.ground_truth])
-        variant.prepare([], 1, resume=False)
+        variant.prepare([], 1)
         variant.check_directory([variant.ground_truth])
 
 
@@ -110,7 +103,7 @@ def test_a_directory_with_files_of_others_is_refused(comm, variants, file):
 @pytest.mark.mpi(1)
 def test_a_ground_truth_put_where_a_link_was_is_refused(comm, variants):
     variant = variants[0]
-    variant.prepare([], 1, resume=False)
+    variant.prepare([], 1)
     (variant.directory / "ground_truth.h5").unlink()
     write(comm, variant.directory, "dns", variant.scene)
     with pytest.raises(SceneError, match="holds files that no comparison has made"):
@@ -121,7 +114,7 @@ def test_a_ground_truth_put_where_a_link_was_is_refused(comm, variants):
 @pytest.mark.parametrize("place", ["first", "first/timing", "alias"])
 def test_a_directory_with_a_ground_truth_in_it_is_refused(comm, variants, tmp_path, place):
     variant = variants[0]
-    variant.prepare([], 1, resume=False)
+    variant.prepare([], 1)
     (tmp_path / "out/alias").symlink_to("first")
     with pytest.raises(SceneError, match="would be that of the ground truth, .*another --output or another name"):
         variant.check_directory([variant.ground_truth, tmp_path / "out" / place])

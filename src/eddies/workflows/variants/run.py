@@ -13,19 +13,21 @@ from typing import Any
 
 from eddies.errors import UserError
 from eddies.io.errors import WriteError, write_error
-from eddies.io.hdf5 import open_product, product_fingerprint, product_provenance, read_attributes
+from eddies.io.hdf5 import open_product, product_fingerprint, read_attributes
+from eddies.io.run_lock import RunInUse, RunTakenOver
 from eddies.io.whole_files import write_files
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm
 from eddies.parallel.rendezvous import all_arrive
 from eddies.pipeline import STAGES, after
 from eddies.scene.scene import Scene, SceneError
+from eddies.workflows.run_directory.work import Work, find_work
 
 log = logging.getLogger("eddies")
 
 # Lies in every run directory that a comparison has made: in no other does it remove anything.
 MARK = "made-by-compare.txt"
-MARK_TEXT = "`eddies compare` replaces the products in this directory when it runs again.\n"
+MARK_TEXT = "`eddies compare --overwrite` replaces the products in this directory that fit it no longer.\n"
 TIMED_STEPS = 6  # at least, in a block that is run for its time alone; a rollout leaves its first two out as warm-up
 
 #: What is run for a variant, where it asks for it: all products but the ground truth.
@@ -88,22 +90,22 @@ class VariantRun:
             raise SceneError(f'variant "{self.name}": its run directory {self.directory} holds files that no '
                              f"comparison has made; {remedy}, or remove the directory")
 
-    def prepare(self, earlier: Sequence[VariantRun], ranks: int, resume: bool) -> None:
+    def work(self, ranks: int) -> Work:
+        """What an earlier comparison left there, for this number of ranks. Sends nothing: one rank calls it."""
+        return find_work([stage.name for stage in OWN_STAGES], self.scene, self.directory, ranks)
+
+    def prepare(self, earlier: Sequence[VariantRun], ranks: int) -> None:
         """Make the run directory with links to what is shared: ground truth, kernel, and a model trained before.
 
-        What an earlier comparison left there is removed; with `resume`, only what does not fit these settings and, as
-        for times, this number of ranks. Sends nothing: one rank does this.
+        What an earlier comparison left there is kept where it fits the settings and, as for times, this number of
+        ranks. Sends nothing: one rank does this.
         """
         self.directory.mkdir(parents=True, exist_ok=True)
         write_files({self.directory / MARK: MARK_TEXT})
+        done = self.work(ranks).done
         for stage in OWN_STAGES:
-            checkpoints = self.directory / stage.checkpoints
-            if not resume and checkpoints.exists():
-                shutil.rmtree(checkpoints)
-            product = self.directory / stage.file
-            fits = stage.name in self.stages and product_fingerprint(product) == self.scene.fingerprint(stage.name)
-            if not (resume and fits and (stage.name != "simulate" or product_provenance(product)["ranks"] == ranks)):
-                product.unlink(missing_ok=True)
+            if stage.name not in done:
+                (self.directory / stage.file).unlink(missing_ok=True)
         link(self.ground_truth / "ground_truth.h5", self.directory)
         before = [other.directory for other in earlier]
         self._share("train-kernel", [self.ground_truth, *before])
@@ -125,7 +127,7 @@ class VariantRun:
         """
         try:
             work()
-        except WriteError:  # which is not the variant's
+        except (WriteError, RunInUse, RunTakenOver):  # which is not the variant's
             raise
         except UserError as error:  # of which a variant can fail without ending the comparison
             if not all_arrive(errors):
@@ -170,7 +172,7 @@ def link(product: Path, directory: Path) -> None:
     path.symlink_to(os.path.relpath(product.resolve(), directory.resolve()))
 
 
-def in_directories(comm: Comm, work: Callable[[], None]) -> None:
+def in_directories(comm: Comm, work: Callable[[], object]) -> None:
     """Work in directories that rank 0 does alone; all ranks raise its UserError, or WriteError where it cannot
     write."""
     try:

@@ -1,0 +1,245 @@
+"""One job at a time in a run directory: a file LOCK says which one, and that it is alive.
+
+The file holds host, process and start as JSON; the time of its last change is the job's last sign of life.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import json
+import logging
+import os
+import socket
+import threading
+import time
+import uuid
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+
+from mpi4py import MPI
+
+from eddies.clock import duration
+from eddies.errors import UserError
+from eddies.io.errors import NoRoom, write_error
+from eddies.parallel.broadcast import on_first_rank
+from eddies.parallel.stop import LOOK_SECONDS, Loss
+
+log = logging.getLogger("eddies")
+
+LOCK = "LOCK"
+SIGN_SECONDS = 30.0
+STALE_SECONDS = 300.0  # without a sign of life: ten that are missed, as on a file system that hangs for a while
+UNREADABLE = "?"
+
+
+class RunInUse(UserError):
+    """Another job works in a run directory."""
+
+
+class RunTakenOver(UserError):
+    """Another job has taken a run directory over from this one, which writes nothing more there; on all ranks."""
+
+
+@dataclass(frozen=True)
+class Holder:
+    """The job in a run directory: its first rank.
+
+    Parameters
+    ----------
+    job : a name that no other job has.
+    host : name of its machine.
+    machine : the machine since its last start, and the processes that see each other there; empty where not known.
+    pid : its process.
+    born : when that process began, in the units of its machine; empty where not known.
+    start : when it took the directory, UTC.
+    """
+
+    job: str
+    host: str
+    machine: str
+    pid: int
+    born: str
+    start: str
+
+    @classmethod
+    def this_job(cls) -> Holder:
+        """The job of this process."""
+        return cls(uuid.uuid4().hex, socket.gethostname(), _machine(), os.getpid(), _born(os.getpid()),
+                   datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"))
+
+    def has_ended(self) -> bool:
+        """Whether this machine knows that the process is gone; another machine cannot know."""
+        return bool(self.machine and self.born) and self.machine == _machine() and self.born != _born(self.pid)
+
+    def __str__(self) -> str:
+        return f"process {self.pid} on {self.host}, since {self.start}"
+
+
+@dataclass(frozen=True)
+class _Found:
+    """A lock that was found: whose it is, and the seconds since the last sign of life."""
+
+    holder: Holder
+    silent: float
+
+    @property
+    def stale(self) -> bool:
+        return self.silent > STALE_SECONDS or self.holder.has_ended()
+
+
+class RunLock:
+    """The lock of a run directory in the hands of this job, on rank 0; a thread gives the signs of life."""
+
+    def __init__(self, directory: Path, holder: Holder) -> None:
+        self.path, self.holder = directory / LOCK, holder
+        self._look_at = 0.0
+        self._lost_to: Holder | None = None
+        self._ended = threading.Event()
+        self._signs = threading.Thread(target=self._give_signs, name="run lock", daemon=True)
+        self._signs.start()
+
+    def loss(self) -> RunTakenOver | None:
+        """What to raise once another job has taken the directory over; looks at most once a second."""
+        now = time.monotonic()
+        if self._lost_to is None and now >= self._look_at:
+            self._look_at = now + LOOK_SECONDS
+            found = find_lock(self.path.parent)
+            if found is not None and found.holder.job not in (self.holder.job, UNREADABLE):
+                self._lost_to = found.holder
+        if self._lost_to is None:
+            return None
+        return RunTakenOver(f"{self.path.parent}: another job has taken this run directory over ({self._lost_to}); "
+                            "this one ends and leaves all as it is")
+
+    def release(self) -> None:
+        """Let others in; the lock of another job stays."""
+        self._ended.set()
+        self._signs.join()
+        if _is_held_by(self.path, self.holder):
+            self.path.unlink(missing_ok=True)
+
+    def _give_signs(self) -> None:
+        while not self._ended.wait(SIGN_SECONDS):
+            with contextlib.suppress(OSError):  # a file system that hangs; the next sign may get through
+                if not self.path.exists():  # somebody has cleaned up
+                    _write(self.path, self.holder)
+                elif _is_held_by(self.path, self.holder):
+                    os.utime(self.path)
+
+
+@contextlib.contextmanager
+def lock_directory(comm: MPI.Comm, directory: Path, take_over: bool = False) -> Iterator[Loss]:
+    """Hold a run directory, which is made if need be; all ranks call it. Gives what rank 0 may ask whether it is lost.
+
+    A lock without a sign of life for five minutes, or whose process is known to have ended, counts for nothing, nor,
+    with `take_over`, any other: its job finds out at its next step and ends.
+
+    Raises:
+        RunInUse: another job works there.
+        WriteError: the directory cannot be written.
+    """
+    lock: list[RunLock] = []  # of rank 0
+    try:
+        on_first_rank(comm, lambda: lock.append(_take(directory, take_over)))
+    except OSError as error:
+        raise write_error(directory, error, f"{directory}: cannot be written ({error.strerror}); choose another "
+                          "--output") from None
+    try:
+        yield lock[0].loss if lock else lambda: None
+    finally:
+        for each in lock:
+            with contextlib.suppress(OSError):  # it goes stale by itself
+                each.release()
+
+
+def refuse_if_held(comm: MPI.Comm, directory: Path) -> None:
+    """Raise RunInUse where another job works in a run directory; touches nothing. All ranks call it."""
+    on_first_rank(comm, lambda: _refuse(directory, find_lock(directory)))
+
+
+def find_lock(directory: Path) -> _Found | None:
+    """The lock in a directory, by whoever holds it."""
+    path = directory / LOCK
+    try:
+        return _Found(_read(path), time.time() - path.stat().st_mtime)
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+
+
+def _refuse(directory: Path, found: _Found | None) -> None:
+    if found is not None and not found.stale:
+        raise RunInUse(f"{directory}: another job works here ({found.holder}; its last sign of life was "
+                       f"{duration(max(found.silent, 0))} ago); wait for its end, or end it by a file STOP there, or "
+                       "choose another --output; if it is dead, add --take-over")
+
+
+def _take(directory: Path, take_over: bool) -> RunLock:
+    holder, found = Holder.this_job(), find_lock(directory)
+    if not take_over:
+        _refuse(directory, found)
+    directory.mkdir(parents=True, exist_ok=True)
+    if found is not None:
+        _remove(directory, found.holder)
+        log.warning("%s: takes over from a job that %s (%s)", directory,
+                    "has ended" if found.stale else "may still work there", found.holder)
+    try:
+        _write(directory / LOCK, holder)
+    except FileExistsError:  # another job was quicker
+        _refuse(directory, find_lock(directory))
+        raise RunInUse(f"{directory}: another job has just been here; run the command again") from None
+    return RunLock(directory, holder)
+
+
+def _write(path: Path, holder: Holder) -> None:
+    """Write a lock where there is none; FileExistsError where there is one."""
+    content = json.dumps(asdict(holder)) + "\n"
+    with open(path, "x", encoding="utf-8") as file:
+        try:
+            file.write(content)
+            file.flush()
+        except OSError as error:
+            path.unlink()
+            raise NoRoom.of(error, path, len(content)) from None
+
+
+def _remove(directory: Path, holder: Holder) -> None:
+    """Remove the lock of a job; if another job was quicker, give it its lock back."""
+    aside = directory / f"{LOCK}.{uuid.uuid4().hex}"
+    with contextlib.suppress(FileNotFoundError):
+        os.replace(directory / LOCK, aside)
+        if not _is_held_by(aside, holder):
+            with contextlib.suppress(OSError):  # of a job that gives itself a new one with its next sign of life
+                os.link(aside, directory / LOCK)
+        aside.unlink()
+
+
+def _is_held_by(path: Path, holder: Holder) -> bool:
+    return path.exists() and _read(path).job == holder.job
+
+
+def _read(path: Path) -> Holder:
+    content = path.read_text(errors="replace")
+    try:
+        known = json.loads(content)
+        return Holder(**{field.name: known[field.name] for field in fields(Holder)})
+    except (ValueError, KeyError, TypeError):  # it is being written, or is no lock of a job
+        return Holder(UNREADABLE, "an unknown machine", "", 0, "", "an unknown time")
+
+
+def _machine() -> str:
+    """This start of this machine and its process numbers, as a container may have its own; empty where not known."""
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text().strip() + " " + os.readlink("/proc/self/ns/pid")
+    except OSError:
+        return ""
+
+
+def _born(pid: int) -> str:
+    """When a process of this machine began; empty if there is none, or where that is not known."""
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return ""
+    return "" if state[0] in "ZX" else state[19]  # a zombie has ended

@@ -1,0 +1,127 @@
+"""What of the stages of a scene is in a run directory: what fits the scene's settings is kept or gone on with, what
+does not would be lost to new work."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from eddies.clock import duration
+from eddies.errors import UserError
+from eddies.io.checkpoint import checkpoints_in
+from eddies.io.hdf5 import product_provenance
+from eddies.pipeline import STAGES, Stage
+from eddies.scene.rules import quoted
+from eddies.scene.scene import Scene
+
+SECONDS = "stage_seconds.json"
+MOST_CHANGES = 3  # that a refusal lists
+
+
+class WorkAtStake(UserError):
+    """A command would replace work that somebody may still want."""
+
+
+@dataclass(frozen=True)
+class Work:
+    """What stages find in a run directory.
+
+    Parameters
+    ----------
+    directory : the run directory.
+    done : the stages whose product is complete and was made with the same settings.
+    outdated : the stages whose checkpoints were all made with other settings.
+    lost : what they would replace, with what it cost, in words.
+    changes : which settings differ from those that this was made with, in words.
+    """
+
+    directory: Path
+    done: frozenset[str]
+    outdated: frozenset[str]
+    lost: tuple[str, ...]
+    changes: tuple[str, ...]
+
+    def refuse_to_lose(self) -> None:
+        """Raise WorkAtStake, which names it, if anything would be replaced."""
+        if self.lost:
+            changes = ", ".join([*self.changes[:MOST_CHANGES], *(["..."] if self.changes[MOST_CHANGES:] else [])])
+            raise WorkAtStake(f"{self.directory}: holds work of other settings{changes and f' ({changes})'} that would "
+                              f"be replaced: {', '.join(self.lost)}; add --overwrite to replace it, or choose another "
+                              "--output")
+
+
+def find_work(stages: Sequence[str], scene: Scene, directory: Path, ranks: int | None = None) -> Work:
+    """What stages of a scene find in a run directory. One rank calls it, the directory being locked.
+
+    With `ranks`, a rollout on another number of them is no longer of use: its times are to be compared.
+    """
+    done, outdated, lost, changes = set(), set(), [], {}
+    seconds = stage_seconds(directory)
+    for stage in [STAGES[name] for name in stages if STAGES[name].product is not None]:
+        product = directory / stage.file
+        checkpoints = checkpoints_in(directory / stage.checkpoints) if stage.checkpoints else []
+        if is_done(stage.name, scene, directory) and not _of_other_ranks(stage, product, ranks):
+            done.add(stage.name)
+            continue
+        if product.is_file() and not product.is_symlink():
+            lost.append(stage.file + _cost(product, seconds.get(stage.name)))
+            changes |= dict.fromkeys(_changes(product, scene, stage))
+        if checkpoints and scene.fingerprint(stage.name) not in [fingerprint for _, fingerprint in checkpoints]:
+            outdated.add(stage.name)
+            lost.append(f"{stage.checkpoints} (step {checkpoints[0][0]})")
+    return Work(directory, frozenset(done), frozenset(outdated), tuple(lost), tuple(changes))
+
+
+def is_done(stage: str, scene: Scene, directory: Path) -> bool:
+    """Whether the product of a stage is complete and was made with the same settings. One rank calls it."""
+    product = STAGES[stage].product
+    return product is not None and product_provenance(directory / STAGES[stage].file).get(
+        "fingerprint") == scene.fingerprint(stage)
+
+
+def stage_seconds(directory: Path) -> dict[str, float]:
+    """Wall time of each stage as an earlier run noted it; a file that is missing or damaged holds nothing worth an
+    error."""
+    try:
+        known = json.loads((directory / SECONDS).read_text())
+    except (OSError, ValueError):
+        return {}
+    return known if isinstance(known, dict) else {}
+
+
+def _of_other_ranks(stage: Stage, product: Path, ranks: int | None) -> bool:
+    return ranks is not None and stage.name == "simulate" and product_provenance(product)["ranks"] != ranks
+
+
+def _cost(product: Path, seconds: Any) -> str:
+    origin = product_provenance(product)
+    if not origin:
+        return " (damaged, unfinished or of another version)"
+    took = f"took {duration(seconds)}" if isinstance(seconds, int | float) else f"made {origin['date']}"
+    return f" ({took})"
+
+
+def _changes(product: Path, scene: Scene, stage: Stage) -> Iterator[str]:
+    """The settings that the product of a stage depends on and that differ, each with its former value."""
+    read = {key for name in {*stage.depends_on, stage.name} for key in STAGES[name].reads}
+    try:
+        before, after = (dict(_leaves(tomllib.loads(text))) for text in (
+            product_provenance(product)["scene"], scene.to_toml()))
+    except (KeyError, TypeError, ValueError):  # of a damaged file, or one that no scene has made
+        return
+    for key in dict.fromkeys([*after, *before]):
+        if key[0] in read and before.get(key) != after.get(key):
+            was, is_now = (quoted(values[key]) if key in values else "absent" for values in (before, after))
+            yield f"{'.'.join(key)} = {was}, now {is_now}"
+
+
+def _leaves(table: Mapping[str, Any], within: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    for key, value in table.items():
+        if isinstance(value, dict):
+            yield from _leaves(value, (*within, key))
+        else:
+            yield (*within, key), value

@@ -1,0 +1,111 @@
+"""What is kept of a run directory, what would be lost, and how that is told."""
+
+import json
+from importlib import import_module
+
+import pytest
+
+from eddies.io.checkpoint import CheckpointDirectory
+from eddies.io.hdf5 import create_product
+from eddies.pipeline import STAGES
+from eddies.scene.scene import load_scene
+from eddies.workflows.run_directory.work import WorkAtStake, find_work
+
+MAKING = ("dns", "train-kernel", "train", "simulate")
+
+
+@pytest.fixture
+def scene():
+    return load_scene("tiny")
+
+
+def leave(comm, directory, scene, stages=MAKING):
+    """The products of some stages of a scene, without content."""
+    for stage in stages:
+        with create_product(comm, directory / STAGES[stage].file, STAGES[stage].product, scene.provenance(stage)):
+            pass
+
+
+def save(comm, directory, scene, stage, step):
+    """A checkpoint of a stage."""
+    CheckpointDirectory(comm, directory / STAGES[stage].checkpoints, scene.fingerprint(stage)).write(step, {"a": 1})
+
+
+@pytest.mark.mpi(1)
+def test_an_empty_directory_loses_nothing(comm, tmp_path, scene):
+    for directory in (tmp_path, tmp_path / "nowhere"):
+        work = find_work(scene.stages, scene, directory)
+        assert not work.done and not work.outdated and not work.lost
+        work.refuse_to_lose()
+
+
+@pytest.mark.mpi(1)
+def test_what_fits_is_done_whatever_is_to_be_made_before_it(comm, tmp_path, scene):
+    leave(comm, tmp_path, scene)
+    assert find_work(scene.stages, scene, tmp_path).done == set(MAKING)
+    (tmp_path / "kernel.h5").unlink()
+    work = find_work(scene.stages, scene, tmp_path)
+    assert work.done == {"dns", "train", "simulate"} and not work.lost
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("change, stages, lost, changes", [
+    ("simulation.turnovers=0.1", MAKING, ["rollout.h5"], "simulation.turnovers = 0.3, now 0.1"),
+    ("training.steps=70", MAKING, ["model.h5", "rollout.h5"], "training.steps = 60, now 70"),
+    ("training.steps=70", ("dns", "train-kernel"), [], None),
+    ("seed=5", MAKING, ["ground_truth.h5", "kernel.h5", "model.h5", "rollout.h5"], "seed = 1, now 5"),
+    ("seed=5", ("dns",), ["ground_truth.h5"], "seed = 1, now 5"),
+    ("title=another", MAKING, [], None),
+])
+def test_what_would_be_replaced_is_named_with_cost_and_reason(comm, tmp_path, scene, change, stages, lost, changes):
+    leave(comm, tmp_path, scene)
+    (tmp_path / "stage_seconds.json").write_text(json.dumps({"dns": 125, "simulate": 3.2}))
+    work = find_work(stages, load_scene("tiny", [change]), tmp_path)
+    assert [each.split()[0] for each in work.lost] == lost and work.done == set(stages) - {
+        stage for stage in stages if STAGES[stage].file in lost}
+    if not lost:
+        return work.refuse_to_lose()
+    with pytest.raises(WorkAtStake) as refused:
+        work.refuse_to_lose()
+    told = str(refused.value)
+    assert changes in told and "add --overwrite to replace it, or choose another --output" in told
+    assert ("ground_truth.h5 (took 2 min 05 s)" in told) == ("ground_truth.h5" in lost)
+    assert ("model.h5 (made 2" in told) == ("model.h5" in lost)
+    assert ("rollout.h5 (took 3 s)" in told) == ("rollout.h5" in lost)
+
+
+@pytest.mark.mpi(1)
+def test_a_file_that_cannot_be_read_is_not_replaced_silently_either(comm, tmp_path, scene):
+    (tmp_path / "model.h5").write_text("precious")
+    with pytest.raises(WorkAtStake, match=r"work of other settings that would .* model.h5 \(damaged, unfinished or of"):
+        find_work(["train"], scene, tmp_path).refuse_to_lose()
+
+
+@pytest.mark.mpi(1)
+def test_checkpoints_of_other_settings_are_work_too(comm, tmp_path, scene):
+    other = load_scene("tiny", ["training.steps=70"])
+    save(comm, tmp_path, other, "train", 5)
+    work = find_work(scene.stages, scene, tmp_path)
+    assert work.outdated == {"train"}
+    with pytest.raises(WorkAtStake, match=r"would be replaced: checkpoints-train \(step 5\); add"):
+        work.refuse_to_lose()
+    assert not find_work(other.stages, other, tmp_path).lost
+    assert not find_work(["dns"], scene, tmp_path).lost
+    save(comm, tmp_path, scene, "train", 3)
+    assert not find_work(scene.stages, scene, tmp_path).lost  # there is one to go on from
+    (tmp_path / "checkpoints-train/step-00000003/manifest.json").write_text("damaged")
+    assert find_work(scene.stages, scene, tmp_path).outdated == {"train"}
+
+
+@pytest.mark.mpi(1)
+def test_a_link_is_no_work(comm, tmp_path, scene):
+    leave(comm, tmp_path, load_scene("tiny", ["kernel.steps=5"]), ["train-kernel"])
+    (tmp_path / "here").mkdir()
+    (tmp_path / "here/kernel.h5").symlink_to("../kernel.h5")
+    assert not find_work(["train-kernel"], scene, tmp_path / "here").lost
+
+
+def test_every_maker_has_checkpoints_of_its_own():
+    folders = [STAGES[stage].checkpoints for stage in MAKING]
+    assert len({*folders}) == len(MAKING) and None not in folders
+    assert all(import_module(STAGES[stage].run.partition(":")[0]) for stage in MAKING)
