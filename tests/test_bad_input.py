@@ -192,14 +192,15 @@ def test_a_rank_may_have_a_particle_or_none(comm, tmp_path):
     assert run_cli("dns", "tracers-only", *options, "--output", tmp_path) == 0
 
 
-def as_nobody(commands):
+def as_nobody(commands, built_in):
     """Exit codes and the error output of commands that are run by a user without rights of root, who need not be
-    allowed to read this checkout: all modules are loaded before."""
-    code = ("import encodings.utf_8_sig, json, os, sys, numpy.random, eddies.stages, eddies.workflows.dns, "
-            "eddies.workflows.export, eddies.workflows.report, eddies.cli\n"
+    allowed to read this checkout: all modules are loaded before, and the folder of the built-in scenes is another."""
+    code = ("import encodings.utf_8_sig, json, os, pathlib, sys, numpy.random, eddies.cli, eddies.parallel.rendezvous, "
+            "eddies.stages, eddies.workflows.dns, eddies.workflows.export, eddies.workflows.report\n"
+            "eddies.scene.scene.BUILT_IN = pathlib.Path(sys.argv[2])\n"
             f"os.getuid() or (os.setgroups([]), os.setgid({NOBODY}), os.setuid({NOBODY}))\n"
             "print([eddies.cli.main(command) for command in json.loads(sys.argv[1])])")
-    ended = subprocess.run([sys.executable, "-c", code, json.dumps(commands)], stdin=subprocess.DEVNULL, text=True,
+    ended = subprocess.run([sys.executable, "-c", code, json.dumps(commands), built_in], stdin=subprocess.DEVNULL, text=True,
                            timeout=60, capture_output=True)
     return json.loads(ended.stdout), ended.stderr.splitlines()
 
@@ -214,7 +215,9 @@ def open_to_all():
 
 
 def test_files_that_may_not_be_read_or_written(open_to_all):
+    from eddies.scene.scene import load_scene
     assert program("dns", "abc", "--set", "time.duration=0.1", "--output", open_to_all).returncode == 0
+    (open_to_all / "abc.toml").write_text(load_scene("abc").to_toml())  # in place of the built-in one
     (open_to_all / "case.toml").write_text(TINY)
     for name in ("ground_truth.h5", "case.toml"):
         (open_to_all / name).chmod(0o600)
@@ -225,7 +228,7 @@ def test_files_that_may_not_be_read_or_written(open_to_all):
         (["check", f"{folder}/case.toml"], "case.toml: cannot be read: Permission denied; give the path"),
         (["dns", "abc", "--output", folder], f"{folder}: cannot be written; change its permissions"),
         (["dns", "abc", "--output", f"{folder}/new"], "new: cannot be written (Permission denied); choose another")]
-    codes, errors = as_nobody([command for command, _ in cases])
+    codes, errors = as_nobody([command for command, _ in cases], open_to_all)
     assert codes == [2] * len(cases) == [2] * len(errors)
     for line, (_, told) in zip(errors, cases):
         assert line.startswith("eddies: error: ") and told in line

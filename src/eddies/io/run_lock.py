@@ -90,10 +90,17 @@ class _Found:
 
 
 class RunLock:
-    """The lock of a run directory in the hands of this job, on rank 0; a thread gives the signs of life."""
+    """The lock of a run directory in the hands of this job, on rank 0; a thread gives the signs of life.
 
-    def __init__(self, directory: Path, holder: Holder) -> None:
-        self.path, self.holder = directory / LOCK, holder
+    Parameters
+    ----------
+    directory : the run directory.
+    holder : this job.
+    made : whether the directory was made for it; if so, it goes again should nothing have come of the job.
+    """
+
+    def __init__(self, directory: Path, holder: Holder, made: bool = False) -> None:
+        self.path, self.holder, self.made = directory / LOCK, holder, made
         self._look_at = 0.0
         self._lost_to: Holder | None = None
         self._ended = threading.Event()
@@ -119,6 +126,9 @@ class RunLock:
         self._signs.join()
         if _is_held_by(self.path, self.holder):
             self.path.unlink(missing_ok=True)
+        if self.made:
+            with contextlib.suppress(OSError):  # it holds work
+                self.path.parent.rmdir()
 
     def _give_signs(self) -> None:
         while not self._ended.wait(SIGN_SECONDS):
@@ -179,6 +189,7 @@ def _take(directory: Path, take_over: bool) -> RunLock:
     holder, found = Holder.this_job(), find_lock(directory)
     if not take_over:
         _refuse(directory, found)
+    made = not directory.exists()
     directory.mkdir(parents=True, exist_ok=True)
     if found is not None:
         _remove(directory, found.holder)
@@ -189,7 +200,7 @@ def _take(directory: Path, take_over: bool) -> RunLock:
     except FileExistsError:  # another job was quicker
         _refuse(directory, find_lock(directory))
         raise RunInUse(f"{directory}: another job has just been here; run the command again") from None
-    return RunLock(directory, holder)
+    return RunLock(directory, holder, made)
 
 
 def _write(path: Path, holder: Holder) -> None:
