@@ -195,13 +195,14 @@ def test_a_rank_may_have_a_particle_or_none(comm, tmp_path):
 def as_nobody(commands, built_in):
     """Exit codes and the error output of commands that are run by a user without rights of root, who need not be
     allowed to read this checkout: all modules are loaded before, and the folder of the built-in scenes is another."""
-    code = ("import encodings.utf_8_sig, json, os, pathlib, sys, numpy.random, eddies.cli, eddies.parallel.rendezvous, "
-            "eddies.stages, eddies.workflows.dns, eddies.workflows.export, eddies.workflows.report\n"
+    code = ("import encodings.utf_8_sig, json, os, pathlib, sys, numpy.random, eddies.cli\n"
+            "import eddies.parallel.rendezvous, eddies.stages, eddies.workflows.dns, eddies.workflows.export\n"
+            "import eddies.workflows.report\n"
             "eddies.scene.scene.BUILT_IN = pathlib.Path(sys.argv[2])\n"
             f"os.getuid() or (os.setgroups([]), os.setgid({NOBODY}), os.setuid({NOBODY}))\n"
             "print([eddies.cli.main(command) for command in json.loads(sys.argv[1])])")
-    ended = subprocess.run([sys.executable, "-c", code, json.dumps(commands), built_in], stdin=subprocess.DEVNULL, text=True,
-                           timeout=60, capture_output=True)
+    ended = subprocess.run([sys.executable, "-c", code, json.dumps(commands), built_in], stdin=subprocess.DEVNULL,
+                           text=True, timeout=60, capture_output=True)
     return json.loads(ended.stdout), ended.stderr.splitlines()
 
 

@@ -304,6 +304,24 @@ def test_a_signal_ends_the_job_to_be_resumed(tmp_path, number, after):
     assert "Traceback" not in output and not list(tmp_path.glob("ground_truth.h5*"))
 
 
+def test_a_second_job_is_refused_and_may_take_over(tmp_path):
+    """Both of them on two ranks; the first one is there before it writes, and ends without a word but why."""
+    line = ("-m", "eddies", "dns", "hit-small", "--output", tmp_path / "run", "--max-minutes", "0.02")
+    first, output = launch(2, *line[:-2]), ""
+    while "dns: starts" not in output:
+        output += first.stdout.readline()
+    begun = (tmp_path / "run/LOCK").read_bytes()
+    second = launch(2, *line)
+    assert "another job works here" in second.communicate(timeout=60)[0] and second.returncode == 2
+    assert (tmp_path / "run/LOCK").read_bytes() == begun
+    third = launch(2, *line, "--take-over")
+    assert "takes over from a job that may still work there" in third.communicate(timeout=60)[0]
+    assert third.returncode == 75
+    output += first.communicate(timeout=60)[0]
+    assert first.returncode == 2 and output.count("another job has taken this run directory over") == 1
+    assert "Traceback" not in output and not (tmp_path / "run/LOCK").exists()
+
+
 @pytest.mark.mpi(1, 2)
 def test_a_limit_of_wall_time_or_a_file_stops_the_job(comm, tmp_path, capfd):
     assert run_cli("dns", *ABC, "--output", tmp_path, "--max-minutes", "1e-9") == 75
