@@ -12,7 +12,8 @@ from pathlib import Path
 from eddies.clock import duration
 from eddies.io.checkpoint import CheckpointDirectory
 from eddies.io.errors import write_error
-from eddies.io.hdf5 import in_files, open_product, product_fingerprint
+from eddies.io.hdf5 import in_files, open_product
+from eddies.io.provenance import product_fingerprint
 from eddies.io.whole_files import write_files
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm
@@ -105,7 +106,7 @@ def check_inputs(stages: Sequence[str], scene: Scene, comm: Comm, directory: Pat
     first = STAGES[stages[0]]
     if first.product is None:  # it works with what there is
         return
-    for needed in [STAGES[name] for name in first.depends_on if name in scene.stages]:
+    for needed in scene.inputs(first.name):
         with open_product(comm, directory / needed.file, needed.product):
             pass
         if not is_done(needed.name, scene, comm, directory):

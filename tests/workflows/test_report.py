@@ -252,7 +252,7 @@ def test_a_dns_alone(comm, tmp_path):
     report.run(tmp_path, comm)
     metrics, page = written(tmp_path)
     assert figures(tmp_path) == {"statistics", "spectra", "fields"}
-    assert metrics.keys() == {"ground_truth", "cost"}
+    assert metrics.keys() == {"warnings", "ground_truth", "cost"} and metrics["warnings"] == []
     assert metrics["cost"]["seconds_per_step"] is None and "there is no rollout.h5" in page
     assert metrics["cost"]["stage_seconds"] is None
     (tmp_path / "stage_seconds.json").write_text('{"dns": 12.5}')

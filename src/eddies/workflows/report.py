@@ -20,8 +20,8 @@ from eddies.analysis.isotropic_turbulence import StationarySpan
 from eddies.analysis.spectra import energy_spectrum, vorticity
 from eddies.analysis.tracer_statistics import tracer_statistics
 from eddies.io.fields import FieldSeries
-from eddies.io.hdf5 import (File, ProductError, in_files, open_product, read_attributes, read_json, read_provenance,
-                            read_table)
+from eddies.io.hdf5 import File, ProductError, in_files, open_product, read_attributes, read_table
+from eddies.io.provenance import read_json, read_provenance
 from eddies.io.trajectories import Trajectory
 from eddies.parallel.broadcast import on_all_ranks
 from eddies.parallel.communicator import Comm
@@ -35,6 +35,7 @@ from eddies.report.rollout import Rollout
 from eddies.report.rollout import section as rollout_section
 from eddies.scene.scene import Scene
 from eddies.workflows.feasibility import check_places
+from eddies.workflows.product_warnings import mixed_products, not_finite
 
 log = logging.getLogger("eddies")
 
@@ -46,10 +47,11 @@ ROLLOUT_COST = {"seconds_per_step": "rollout, seconds per step", "particles": "p
 
 @dataclass
 class Run:
-    """What all products say in short: wall seconds by stage, provenance by product, cost, and what sections need of
-    another product than their own."""
+    """What all products say in short: wall seconds by stage, what is wrong in sentences, provenance by product, cost,
+    and what sections need of another product than their own."""
 
     seconds: dict[str, float]
+    warnings: list[str] = field(default_factory=list)
     provenance: dict[str, dict[str, Any]] = field(default_factory=dict)
     cost: list[Metric] = field(default_factory=list)
     filter_width: float | None = None
@@ -91,6 +93,7 @@ def _survey(directory: Path, alone: Comm) -> Run:
         if path.exists():
             with open_product(alone, path, kind) as file:
                 record.provenance[kind] = read_provenance(file)
+                record.warnings += not_finite(file, kind)
                 if kind == "ground_truth":
                     _survey_ground_truth(file, record)
                 elif kind == "rollout":
@@ -98,6 +101,7 @@ def _survey(directory: Path, alone: Comm) -> Run:
     if not record.provenance:
         raise ProductError(f"{directory}: holds none of {', '.join(f'{kind}.h5' for kind in KINDS)}; "
                            "run `eddies dns SCENE` first")
+    record.warnings = mixed_products(record.provenance) + record.warnings
     return record
 
 
@@ -114,7 +118,8 @@ def _survey_ground_truth(file: File, record: Run) -> None:
 
 def _survey_rollout(file: File, record: Run) -> None:
     attributes = read_attributes(file, "rollout")
-    record.cost += [Metric(key, label, attributes[key]) for key, label in ROLLOUT_COST.items()]
+    record.cost += [Metric(key, label, attributes.get(key), "the first two steps are left out, and it took no more")
+                    for key, label in ROLLOUT_COST.items()]
     if "evaluations" in attributes and attributes["turnovers"] > 0:
         record.cost.append(Metric("evaluations_per_turnover", "evaluations of the forces a turnover",
                                   attributes["evaluations"] / attributes["turnovers"]))
@@ -138,6 +143,8 @@ def _write_report(directory: Path, record: Run, sections: Sequence[Section]) -> 
         log.info("report: %s, %d figures", section.title, len(section.illustrations))
     _write_files(directory / "report", _run_record(directory, record), sections)
     _log_main_numbers(sections)
+    for warning in record.warnings:
+        log.warning("report: %s", warning)
 
 
 def read_stationary_span(file: File) -> StationarySpan:
@@ -253,12 +260,12 @@ def _run_record(directory: Path, record: Run) -> RunRecord:
     newest = list(record.provenance.values())[-1]
     stages = ", ".join(MAKER_OF[kind].name for kind in record.provenance)
     summary = f"Lagrangian large-eddy simulation; stages: {stages}; {newest['date']}"
-    return RunRecord(directory.resolve().name, summary, newest["scene"], rows)
+    return RunRecord(directory.resolve().name, summary, newest["scene"], rows, record.warnings)
 
 
 def _write_files(output: Path, record: RunRecord, sections: Sequence[Section]) -> None:
     drawn = {f"{illustration.name}.png" for section in sections for illustration in section.illustrations}
-    write_page(output, record, sections, {output / "metrics.json": metrics_json(sections)})
+    write_page(output, record, sections, {output / "metrics.json": metrics_json(record, sections)})
     for stale in (output / "figures").glob("*.png"):
         if stale.name not in drawn:
             stale.unlink()
