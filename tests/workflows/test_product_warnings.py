@@ -35,6 +35,12 @@ def test_another_model_of_the_same_settings_and_a_ground_truth_that_is_gone():
                     "2030-02-01 with the same settings" + REMEDY]
 
 
+def test_what_is_gone_may_be_brought_back():
+    assert mixed_products({"model": MODEL}) == [
+        "model.h5 (made 2030-01-02) was made from a ground_truth.h5 that is not here: run `eddies train` again, or "
+        "bring back what is missing"]
+
+
 def test_a_product_of_before_there_were_ids_says_so_beside_one_that_has_one():
     old = {"date": "2029-12-01", "scene": ""}
     assert mixed_products({"ground_truth": old, "model": old, "rollout": old}) == []
@@ -43,7 +49,8 @@ def test_a_product_of_before_there_were_ids_says_so_beside_one_that_has_one():
     assert mixed_products({"ground_truth": TRUTH, "rollout": old}) == [
         "rollout.h5 (made 2029-12-01) does not say what it was made from: whether it belongs to ground_truth.h5 (made "
         "2030-01-01) is not known; run `eddies simulate` again"]
-    assert len(mixed_products({"ground_truth": TRUTH, "rollout": {**ROLLOUT, "made_from": {"ground_truth": None}}})) == 1
+    from_old = {**ROLLOUT, "made_from": {"ground_truth": None}}
+    assert len(mixed_products({"ground_truth": TRUTH, "rollout": from_old})) == 1
 
 
 def said_of(comm, directory, kind, **holes):
@@ -64,19 +71,19 @@ def test_what_is_infinite_or_missing_by_design_is_not_said(comm, tmp_path):
     write_kernel(comm, tmp_path)
     write_model(comm, tmp_path)
     write_rollout(comm, tmp_path)
-    assert said_of(comm, tmp_path, "ground_truth", statistics__taylor_scale=(3, np.inf)) == []
-    assert [said_of(comm, tmp_path, kind) for kind in ("kernel", "model", "rollout")] == [[], [], []]
-    assert said_of(comm, tmp_path, "model", history__loss=(7, np.nan)) == [
-        "model.h5 holds numbers that are not finite (history/loss, row 7): run `eddies train` again"]
+    assert said_of(comm, tmp_path, "ground_truth", statistics__taylor_scale=(3, np.inf)) == ""
+    assert [said_of(comm, tmp_path, kind) for kind in ("kernel", "model", "rollout")] == ["", "", ""]
+    assert said_of(comm, tmp_path, "model", history__loss=(7, np.nan)) == (
+        "model.h5 holds numbers that are not finite (history/loss, row 7): run `eddies train` again")
 
 
 @pytest.mark.mpi(1)
 def test_places_are_named_and_the_last_are_counted(comm, tmp_path):
     write_ground_truth(comm, tmp_path)
     places = [f"statistics__{name}" for name in ("energy", "skewness", "taylor_scale", "time", "turnovers")]
-    assert said_of(comm, tmp_path, "ground_truth", **{place: (5, np.nan) for place in places}) == [
+    assert said_of(comm, tmp_path, "ground_truth", **{place: (5, np.nan) for place in places}) == (
         "ground_truth.h5 holds numbers that are not finite (statistics/energy, row 5; statistics/skewness, row 5; "
-        "statistics/taylor_scale, row 5; statistics/time, row 5 and 1 more): run `eddies dns` again"]
+        "statistics/taylor_scale, row 5; statistics/time, row 5 and 1 more): run `eddies dns` again")
 
 
 @pytest.mark.mpi(1)
@@ -84,6 +91,6 @@ def test_places_are_named_and_the_last_are_counted(comm, tmp_path):
                                             ("stopped: particle 17 is too fast", "the rollout stopped: particle 17")])
 def test_a_rollout_that_was_stopped_says_why(comm, tmp_path, status, remedy):
     write_rollout(comm, tmp_path, status=status, broken=8)
-    said, = said_of(comm, tmp_path, "rollout")
+    said = said_of(comm, tmp_path, "rollout")
     assert said.startswith("rollout.h5 holds numbers that are not finite (particles/model/velocity/value, frame 8): "
                            + remedy)

@@ -85,10 +85,6 @@ class Section:
         """Put a matplotlib Figure after those that are there."""
         self.illustrations.append(Illustration(name, title, figure, caption))
 
-    def value(self, key: str) -> Number:
-        """The value of one metric."""
-        return next(metric.value for metric in self.metrics if metric.key == key)
-
 
 @dataclass(frozen=True)
 class RunRecord:

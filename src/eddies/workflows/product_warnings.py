@@ -30,11 +30,14 @@ def mixed_products(provenance: Mapping[str, Provenance]) -> list[str]:
     for kind, origin in provenance.items():
         stage = MAKER_OF[kind]
         if "made_from" in origin:
-            others = [_other(needed, origin, provenance.get(needed)) for needed, known in origin["made_from"].items()
+            others = [needed for needed, known in origin["made_from"].items()
                       if needed not in provenance or provenance[needed].get("id") != known]
             if others:
-                found.append(f"{_made(kind, origin)} was made from {' and from '.join(others)}: run `eddies "
-                             f"{stage.name}` again, or take what is compared as of different flows or models")
+                named = " and from ".join(_other(needed, origin, provenance.get(needed)) for needed in others)
+                or_else = ("take what is compared as of different flows or models" if provenance.keys() & {*others} else
+                           "bring back what is missing")
+                found.append(f"{_made(kind, origin)} was made from {named}: run `eddies {stage.name}` again, or "
+                             f"{or_else}")
             continue
         beside = [STAGES[name].product for name in stage.depends_on]
         named = [_made(needed, provenance[needed]) for needed in beside if "id" in provenance.get(needed, {})]
@@ -44,8 +47,8 @@ def mixed_products(provenance: Mapping[str, Provenance]) -> list[str]:
     return found
 
 
-def not_finite(file: File, kind: str) -> list[str]:
-    """A sentence on the numbers of an open product that are not finite, or none; of series the last frame counts."""
+def not_finite(file: File, kind: str) -> str:
+    """A sentence on the numbers of an open product that are not finite, or ""; of series the last frame counts."""
     places = []
     for place, frame, values in stored_numbers(file):
         wrong = _wrong(kind, place, values)
@@ -53,11 +56,11 @@ def not_finite(file: File, kind: str) -> list[str]:
             row = "" if not wrong.ndim else f", row {int(np.argwhere(wrong)[0, 0])}"
             places.append(place + (row if frame is None else f", frame {frame}"))
     if not places:
-        return []
+        return ""
     more = f" and {len(places) - NAMED} more" if len(places) > NAMED else ""
     status = read_attributes(file, "rollout")["status"] if kind == "rollout" else "complete"
     remedy = f"run `eddies {MAKER_OF[kind].name}` again" if status == "complete" else f"the rollout {status}"
-    return [f"{MAKER_OF[kind].file} holds numbers that are not finite ({'; '.join(places[:NAMED])}{more}): {remedy}"]
+    return f"{MAKER_OF[kind].file} holds numbers that are not finite ({'; '.join(places[:NAMED])}{more}): {remedy}"
 
 
 def _wrong(kind: str, place: str, values: np.ndarray) -> np.ndarray:

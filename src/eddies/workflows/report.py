@@ -9,7 +9,7 @@ import contextlib
 import json
 import logging
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -47,11 +47,12 @@ ROLLOUT_COST = {"seconds_per_step": "rollout, seconds per step", "particles": "p
 
 @dataclass
 class Run:
-    """What all products say in short: wall seconds by stage, what is wrong in sentences, provenance by product, cost,
-    and what sections need of another product than their own."""
+    """What all products say in short: wall seconds by stage, all that is wrong in sentences, that on numbers that are
+    not finite by product, provenance by product, cost, and what sections need of another product than their own."""
 
     seconds: dict[str, float]
     warnings: list[str] = field(default_factory=list)
+    not_finite: dict[str, str] = field(default_factory=dict)
     provenance: dict[str, dict[str, Any]] = field(default_factory=dict)
     cost: list[Metric] = field(default_factory=list)
     filter_width: float | None = None
@@ -93,7 +94,8 @@ def _survey(directory: Path, alone: Comm) -> Run:
         if path.exists():
             with open_product(alone, path, kind) as file:
                 record.provenance[kind] = read_provenance(file)
-                record.warnings += not_finite(file, kind)
+                if found := not_finite(file, kind):
+                    record.not_finite[kind] = found
                 if kind == "ground_truth":
                     _survey_ground_truth(file, record)
                 elif kind == "rollout":
@@ -101,7 +103,7 @@ def _survey(directory: Path, alone: Comm) -> Run:
     if not record.provenance:
         raise ProductError(f"{directory}: holds none of {', '.join(f'{kind}.h5' for kind in KINDS)}; "
                            "run `eddies dns SCENE` first")
-    record.warnings = mixed_products(record.provenance) + record.warnings
+    record.warnings += [*mixed_products(record.provenance), *record.not_finite.values()]
     return record
 
 
@@ -118,8 +120,8 @@ def _survey_ground_truth(file: File, record: Run) -> None:
 
 def _survey_rollout(file: File, record: Run) -> None:
     attributes = read_attributes(file, "rollout")
-    record.cost += [Metric(key, label, attributes.get(key), "the first two steps are left out, and it took no more")
-                    for key, label in ROLLOUT_COST.items()]
+    untimed = "too few steps to time one: the first two, and the first two after a restart, are left out"
+    record.cost += [Metric(key, label, attributes.get(key), untimed) for key, label in ROLLOUT_COST.items()]
     if "evaluations" in attributes and attributes["turnovers"] > 0:
         record.cost.append(Metric("evaluations_per_turnover", "evaluations of the forces a turnover",
                                   attributes["evaluations"] / attributes["turnovers"]))
@@ -134,8 +136,19 @@ def _read_share(directory: Path, comm: Comm, alone: Comm, record: Run) -> list[S
     for index in np.array_split(np.arange(len(parts)), comm.size)[comm.rank]:
         kind, read = parts[index]
         with open_product(alone, directory / f"{kind}.h5", kind) as file:
-            sections += read(file, record)
+            sections += _read_part(kind, file, record, read)
     return sections
+
+
+def _read_part(kind: str, file: File, record: Run, read: Callable[[File, Run], list[Section]]) -> list[Section]:
+    """Sections on an open product; where its numbers are not finite and forbid them, one that says so."""
+    try:
+        return read(file, record)
+    except (ValueError, OverflowError) as error:  # of a figure's limits, of a PDF, of a number of times
+        if kind not in record.not_finite:
+            raise
+        title = kind.replace("_", " ").capitalize()
+        return [Section(kind, title, notices=[f"Not shown ({error}): {record.not_finite[kind]}"])]
 
 
 def _write_report(directory: Path, record: Run, sections: Sequence[Section]) -> None:
