@@ -137,8 +137,8 @@ def test_a_new_ground_truth_beside_an_old_model_is_said(comm, run_directory, tmp
     comm.Barrier()
     said = json.loads((tmp_path / "report" / "metrics.json").read_text())["warnings"]
     log, made = capfd.readouterr().out, [origin["date"] for origin in provenance_of(tmp_path).values()]
-    for name, stage, date, sentence in zip(("kernel", "model", "rollout"), ("train-kernel", "train", "simulate"), made[1:],
-                                           said, strict=True):
+    stages = {"kernel": "train-kernel", "model": "train", "rollout": "simulate"}
+    for (name, stage), date, sentence in zip(stages.items(), made[1:], said, strict=True):
         assert sentence == (f"{name}.h5 (made {date}) was made from another ground_truth.h5 than the one here, made "
                             f"{made[0]} with another seed: run `eddies {stage}` again, or take what is compared as of "
                             "different flows or models")
