@@ -28,22 +28,21 @@ def mixed_products(provenance: Mapping[str, Provenance]) -> list[str]:
     """
     found = []
     for kind, origin in provenance.items():
-        stage = MAKER_OF[kind]
-        if "made_from" in origin:
-            others = [needed for needed, known in origin["made_from"].items()
-                      if needed not in provenance or provenance[needed].get("id") != known]
-            if others:
-                named = " and from ".join(_other(needed, origin, provenance.get(needed)) for needed in others)
-                or_else = ("take what is compared as of different flows or models" if provenance.keys() & {*others} else
-                           "bring back what is missing")
-                found.append(f"{_made(kind, origin)} was made from {named}: run `eddies {stage.name}` again, or "
-                             f"{or_else}")
+        again = f"run `eddies {MAKER_OF[kind].name}` again"
+        if "made_from" not in origin:
+            beside = [STAGES[name].product for name in MAKER_OF[kind].depends_on]
+            known = [_made(needed, provenance[needed]) for needed in beside if "id" in provenance.get(needed, {})]
+            if known:
+                found.append(f"{_made(kind, origin)} does not say what it was made from: whether it belongs to "
+                             f"{' and '.join(known)} is not known; {again}")
             continue
-        beside = [STAGES[name].product for name in stage.depends_on]
-        named = [_made(needed, provenance[needed]) for needed in beside if "id" in provenance.get(needed, {})]
-        if named:
-            found.append(f"{_made(kind, origin)} does not say what it was made from: whether it belongs to "
-                         f"{' and '.join(named)} is not known; run `eddies {stage.name}` again")
+        others = {needed: provenance.get(needed) for needed, known in origin["made_from"].items()
+                  if needed not in provenance or provenance[needed].get("id") != known}
+        if others:
+            named = " and from ".join(_other(needed, origin, present) for needed, present in others.items())
+            or_else = ("take what is compared as of different flows or models" if any(others.values()) else
+                       "bring back what is missing")
+            found.append(f"{_made(kind, origin)} was made from {named}: {again}, or {or_else}")
     return found
 
 
