@@ -178,6 +178,8 @@ def test_a_trained_model_runs_on_another_flow(comm, run_directory, tmp_path):
     with h5py.File(tmp_path / "run" / "rollout.h5") as file:
         rollout = dict(file["rollout"].attrs)
         assert rollout["start_time"] == pytest.approx(0.1) and rollout["status"] == "complete"
-    shown = json.loads((tmp_path / "run" / "report" / "metrics.json").read_text())["model"]
+    metrics = json.loads((tmp_path / "run" / "report" / "metrics.json").read_text())
+    shown = metrics["model"]
+    assert metrics["warnings"] == []
     assert shown["acceleration_error"] < 0.95 and shown["source_acceleration_error"] < 0.9
     assert shown["mach_turbulent"] == pytest.approx(2 * shown["source_mach_turbulent"], rel=0.2)
