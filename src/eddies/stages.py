@@ -124,7 +124,7 @@ def check_inputs(stages: Sequence[str], scene: Scene, comm: Comm, directory: Pat
     first = STAGES[stages[0]]
     if first.product is None:  # it works with what there is
         return
-    for needed in [STAGES[name] for name in first.depends_on if name in scene.stages]:
+    for needed in scene.inputs(first.name):
         with open_product(comm, directory / needed.file, needed.product):
             pass
         if not on_first_rank(comm, partial(is_done, needed.name, scene, directory)):

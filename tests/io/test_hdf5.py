@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from eddies.io.hdf5 import (CHUNK_BYTES, ProductError, append_frame, create_product, growing_dataset, in_files,
-                            open_product, product_fingerprint, product_provenance, read_provenance, read_table,
-                            write_attributes, write_table)
+                            open_product, read_table, write_attributes, write_table)
+from eddies.io.provenance import product_fingerprint, product_provenance, read_provenance
 from eddies.parallel.stop import Stopped
 
 

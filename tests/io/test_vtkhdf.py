@@ -12,7 +12,8 @@ from vtkmodules.util.numpy_support import vtk_to_numpy
 
 from eddies.io import room, vtkhdf
 from eddies.io.fields import FieldSeries, FieldWriter
-from eddies.io.hdf5 import ProductError, create_product, open_product, read_provenance
+from eddies.io.hdf5 import ProductError, create_product, open_product
+from eddies.io.provenance import read_provenance
 from eddies.io.trajectories import Trajectory, TrajectoryWriter
 
 from tests.vtk_reader import VtkFile

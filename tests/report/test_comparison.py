@@ -78,6 +78,13 @@ def test_page_tells_what_failed_and_what_the_model_is_worth():
     assert cost.metrics[0].value["wall s per T"] == 20.0
 
 
+def test_rows_without_a_time_say_why():
+    untimed = [row("learned", None, 0.1), row("sph", None, None, "baseline", "stopped: step 1", 0.0)]
+    first, *_ = sections(ErrorAgainstTime(untimed, "learned", "baseline"), 1.0)
+    assert first.notices == ["learned: complete; too few steps to time one",
+                             "sph (at 0 T): stopped: step 1; too few steps to time one"]
+
+
 def test_an_unstable_model_is_worth_nothing():
     unstable = [{**ROWS[0], "status": "stopped: step 9", "stopped_at": 0.8}, *ROWS[1:]]
     assert ErrorAgainstTime(unstable, "learned", "baseline").summary[0] == "learned is worth its cost in no measure."

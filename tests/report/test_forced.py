@@ -45,20 +45,21 @@ def stationary(field):
 def test_a_model_that_is_the_stationary_flow_but_for_a_factor():
     run, columns, field = rollout()
     shown = section(run, stationary(field))
+    value = {metric.key: metric.value for metric in shown.metrics}
     energy = 0.5 * np.mean(np.sum(columns["velocity"] ** 2, axis=1))
     # The second half are the last three of five frames, all with the factor 1.1.
-    found = shown.value("energy")
+    found = value["energy"]
     assert (found["model"], found["deviation"]) == pytest.approx((1.21 * energy, 0), abs=1e-12)
     # The samples count a quarter, a half and a quarter.
     _, spectrum = energy_spectrum(field)
     whole = spectrum.sum()
     assert found["stationary flow"] == pytest.approx(whole, rel=1e-12)
     assert found["its deviation"] == pytest.approx(whole * 0.2 / np.sqrt(2), rel=1e-12)
-    assert shown.value("spectrum_error") == pytest.approx(0.21, rel=1e-12)
-    rms = shown.value("acceleration_rms")
+    assert value["spectrum_error"] == pytest.approx(0.21, rel=1e-12)
+    rms = value["acceleration_rms"]
     assert rms["model"] == pytest.approx(1.1 * rms["flow at the start"], rel=1e-12)
     for name in ("velocity_kl", "acceleration_kl", "qr_kl"):
-        assert shown.value(name) == pytest.approx(0, abs=1e-9)
+        assert value[name] == pytest.approx(0, abs=1e-9)
     assert png(shown.illustrations[0].image).startswith(b"\x89PNG")
 
 

@@ -220,7 +220,8 @@ class Run:
 
 def test_provenance_names_no_classes_where_there_are_none():
     scene = load_scene("tiny")
-    assert scene.provenance("train") == {"scene": scene.to_toml(), "fingerprint": scene.fingerprint("train")}
+    assert scene.provenance("train") == {"scene": scene.to_toml(), "fingerprint": scene.fingerprint("train"),
+                                         "made_from": ["ground_truth", "kernel"]}
 
 
 def test_who_reads_no_density_needs_none(tmp_path):

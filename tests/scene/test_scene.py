@@ -224,3 +224,10 @@ def test_every_key_is_explained():
         for field in dataclasses.fields(section):
             rule = rule_of(type(section), field)
             assert rule is None or rule.about
+
+
+@pytest.mark.parametrize("overrides, kinds", [
+    ([], ["ground_truth", "kernel", "model"]), (["simulation.method=none"], ["ground_truth", "kernel"])])
+def test_a_rollout_is_made_from_what_its_scene_asks_for(overrides, kinds):
+    """A model that lies beside a rollout without one is none of its business."""
+    assert load_scene("tiny", overrides).provenance("simulate")["made_from"] == kinds

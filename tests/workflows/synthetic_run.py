@@ -54,15 +54,15 @@ class RandomFlow:
         return self.velocity(position, time).T.reshape(3, cells, cells, cells)
 
 
-def provenance(forcing="", fingerprint="0" * 64):
-    return {"scene": f'title = "synthetic"\nseed = 1\n{forcing}', "fingerprint": fingerprint}
+def provenance(*made_from, seed=1, forcing=""):
+    return {"scene": f'title = "synthetic"\nseed = {seed}\n{forcing}', "fingerprint": "0" * 64, "made_from": made_from}
 
 
-def write_ground_truth(comm, directory, tracers=True, cells=16, frames=0, stationary=False, density=True):
+def write_ground_truth(comm, directory, tracers=True, cells=16, frames=0, stationary=False, density=True, seed=1):
     """With `frames` of the tracers, and with a span over which the stationary state is averaged; without `density` as
     of an incompressible fluid."""
-    flow, forced = RandomFlow(1), '[forcing]\nwavenumber = 2.0\n' if stationary else ""
-    with create_product(comm, directory / "ground_truth.h5", "ground_truth", provenance(forcing=forced)) as file:
+    flow, origin = RandomFlow(seed), provenance(seed=seed, forcing='[forcing]\nwavenumber = 2.0\n' * stationary)
+    with create_product(comm, directory / "ground_truth.h5", "ground_truth", origin) as file:
         time = np.linspace(0, 4, 81)
         wiggle = 1 + 0.1 * np.sin(3 * time)
         scales = {name: value for name, value in SCALES.items() if density or name not in COMPRESSIBLE}
@@ -124,7 +124,7 @@ def write_kernel(comm, directory, cells=32):
                "loss_learned_no_gradient": np.exp(-step / 40)}
     tables = {"kernels": kernels, "slices": slices, "errors": errors, "history": history}
     save_weights(comm, directory / "kernel.h5", "kernel", {"support": 0.9}, {"weight": np.ones(3)},
-                 provenance(), tables)
+                 provenance("ground_truth"), tables)
 
 
 def write_model(comm, directory, terms=("pressure", "pairs"), source=None):
@@ -147,7 +147,7 @@ def write_model(comm, directory, terms=("pressure", "pairs"), source=None):
     if "density-flux" in terms:
         tables["a_priori"]["density_rate_error"] = 0.6 + 0.05 * delay
         tables["density_rate_sample"] = {"truth": truth[:, 0], "predicted": 0.8 * truth[:, 0]}
-    origin = provenance()
+    origin = provenance("ground_truth", "kernel")
     if source:
         tables["source_a_priori"] = {name: 0.9 * errors for name, errors in tables["a_priori"].items()}
         origin |= {"mach_turbulent": 0.16, "source": source}
@@ -184,7 +184,8 @@ def write_rollout(comm, directory, status="complete", total=600, cells=16, frame
                   "method": "learned", "terms": "pressure, pairs", "turnovers": times[-1] / TURNOVER,
                   "seconds_per_step": 0.031, "particles": total, "ranks": 1, "eddy_turnover_time": TURNOVER,
                   "injection_rate": injection_rate}
-    with create_product(comm, directory / "rollout.h5", "rollout", provenance()) as file:
+    origin = provenance("ground_truth", "kernel", "model")
+    with create_product(comm, directory / "rollout.h5", "rollout", origin) as file:
         write_attributes(file.create_group("rollout"), attributes)
         write_table(file, "outside_training", {"time": times, "share": 1e-3 * times * (0.9 - times)})
         late = times > 0

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from eddies.io.fields import FieldSeries
-from eddies.io.hdf5 import open_product, read_attributes, read_provenance, read_table
+from eddies.io.hdf5 import open_product, read_attributes, read_table
+from eddies.io.provenance import read_provenance
 from eddies.io.trajectories import Trajectory
 from eddies.parallel.slab import SlabDecomposition
 from eddies.scene.scene import BOX_LENGTH, SceneError, load_scene

@@ -1,6 +1,7 @@
 """The tiny scene from DNS to report through the command line, as a user runs it, on two ranks."""
 
 import dataclasses
+import html
 import json
 import math
 import shutil
@@ -107,6 +108,44 @@ def test_pairs_outside_the_training_data_are_counted(run_directory):
     assert shown["rollout"]["outside_training"] == share.max()
 
 
+def provenance_of(directory):
+    found = {}
+    for name in ("ground_truth", "kernel", "model", "rollout"):
+        with h5py.File(directory / f"{name}.h5") as file:
+            found[name] = json.loads(file.attrs["provenance"])
+    return found
+
+
+def test_products_say_what_they_were_made_from(run_directory):
+    found = provenance_of(run_directory)
+    ids = {name: origin["id"] for name, origin in found.items()}
+    assert len({*ids.values()}) == 4 and json.loads((run_directory / "report" / "metrics.json").read_text())[
+        "warnings"] == []
+    for number, origin in enumerate(found.values()):
+        assert origin["made_from"] == dict(list(ids.items())[:number])
+
+
+@pytest.mark.usefixtures("no_figures")
+def test_a_new_ground_truth_beside_an_old_model_is_said(comm, run_directory, tmp_path, capfd):
+    assert eddies("dns", "tiny", "--set", "seed=2", "--output", tmp_path) == 0
+    if comm.rank == 0:
+        for name in ("kernel", "model", "rollout"):
+            shutil.copy(run_directory / f"{name}.h5", tmp_path)
+    comm.Barrier()
+    capfd.readouterr()
+    assert eddies("report", tmp_path) == 0
+    comm.Barrier()
+    said = json.loads((tmp_path / "report" / "metrics.json").read_text())["warnings"]
+    log, made = capfd.readouterr().out, [origin["date"] for origin in provenance_of(tmp_path).values()]
+    stages = {"kernel": "train-kernel", "model": "train", "rollout": "simulate"}
+    for (name, stage), date, sentence in zip(stages.items(), made[1:], said, strict=True):
+        assert sentence == (f"{name}.h5 (made {date}) was made from another ground_truth.h5 than the one here, made "
+                            f"{made[0]} with another seed: run `eddies {stage}` again, or take what is compared as of "
+                            "different flows or models")
+        assert log.count(f"warning: report: {sentence}\n") == (comm.rank == 0)
+        assert html.escape(sentence) in (tmp_path / "report" / "index.html").read_text()
+
+
 @pytest.mark.usefixtures("no_figures")
 def test_what_fits_is_kept_and_what_changed_is_redone(comm, run_directory, capfd):
     before = {path: path.stat().st_mtime_ns for path in run_directory.glob("*.h5")}
@@ -143,6 +182,8 @@ def test_a_trained_model_runs_on_another_flow(comm, run_directory, tmp_path):
     with h5py.File(tmp_path / "run" / "rollout.h5") as file:
         rollout = dict(file["rollout"].attrs)
         assert rollout["start_time"] == pytest.approx(0.1) and rollout["status"] == "complete"
-    shown = json.loads((tmp_path / "run" / "report" / "metrics.json").read_text())["model"]
+    metrics = json.loads((tmp_path / "run" / "report" / "metrics.json").read_text())
+    shown = metrics["model"]
+    assert metrics["warnings"] == []
     assert shown["acceleration_error"] < 0.95 and shown["source_acceleration_error"] < 0.9
     assert shown["mach_turbulent"] == pytest.approx(2 * shown["source_mach_turbulent"], rel=0.2)

@@ -1,3 +1,4 @@
+import html
 import json
 import math
 import re
@@ -252,7 +253,7 @@ def test_a_dns_alone(comm, tmp_path):
     report.run(tmp_path, comm)
     metrics, page = written(tmp_path)
     assert figures(tmp_path) == {"statistics", "spectra", "fields"}
-    assert metrics.keys() == {"ground_truth", "cost"}
+    assert metrics.keys() == {"warnings", "ground_truth", "cost"} and metrics["warnings"] == []
     assert metrics["cost"]["seconds_per_step"] is None and "there is no rollout.h5" in page
     assert metrics["cost"]["stage_seconds"] is None
     (tmp_path / "stage_seconds.json").write_text('{"dns": 12.5}')
@@ -281,6 +282,89 @@ def test_figures_of_an_earlier_report_do_not_stay(comm, tmp_path):
     write_ground_truth(comm, tmp_path)
     report.run(tmp_path, comm)
     assert figures(tmp_path) == {"statistics", "spectra", "fields"}
+
+
+def told_at_the_top(directory, output):
+    """The warnings of a report by its command: the same in metrics.json, above all else on the page, and in the log."""
+    assert cli.main(["report", str(directory)]) == 0
+    metrics, page = written(directory)
+    said = metrics["warnings"]
+    shown = [html.unescape(text) for text in re.findall('<div class="notice">(.*?)</div>', top_of(page))]
+    logged = [line for line in output.readouterr().out.splitlines() if line.startswith("warning: ")]
+    assert shown == said and logged == [f"warning: report: {sentence}" for sentence in said]
+    return said
+
+
+def top_of(page):
+    """What the page has before the first section of its own."""
+    return page[page.index("<main>"):page.index('<section id="ground_truth"')]
+
+
+@pytest.mark.usefixtures("no_figures")
+@pytest.mark.mpi(1)
+def test_a_ground_truth_that_others_were_not_made_from_is_said_at_the_top(comm, tmp_path, capfd):
+    """Of the next seed, and so another flow; nothing else tells in the numbers of the model."""
+    write_run(comm, tmp_path)
+    assert told_at_the_top(tmp_path, capfd) == [] and "Warnings" not in top_of(written(tmp_path)[1])
+    write_ground_truth(comm, tmp_path, seed=2)
+    said = told_at_the_top(tmp_path, capfd)
+    assert [sentence.partition(" ")[0] for sentence in said] == ["kernel.h5", "model.h5", "rollout.h5"]
+    assert all("was made from another ground_truth.h5 than the one here" in sentence and "with another seed: run" in
+               sentence for sentence in said)
+    write_run(comm, tmp_path)
+    assert told_at_the_top(tmp_path, capfd) == []
+
+
+@pytest.mark.usefixtures("no_figures")
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("kind, place, index", [
+    ("model", "a_priori/acceleration_error", 12), ("model", "history/seconds", 3),
+    ("kernel", "errors/integral_learned", ()),
+    ("rollout", "closure/not_converged", 2), ("rollout", "particles/model/velocity/value", (8, 0, 0))])
+def test_numbers_that_are_not_finite_are_said_at_the_top(comm, tmp_path, capfd, kind, place, index):
+    write_run(comm, tmp_path)
+    with h5py.File(tmp_path / f"{kind}.h5", "r+") as file:
+        file[place][index] = math.nan
+    said, = told_at_the_top(tmp_path, capfd)
+    assert said.startswith(f"{kind}.h5 holds numbers that are not finite ({place}")
+
+
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.mpi(1)
+def test_a_section_that_cannot_be_made_of_such_numbers_says_so(comm, tmp_path, capfd):
+    """There is no PDF of them; the other sections are there."""
+    write_ground_truth(comm, tmp_path)
+    write_kernel(comm, tmp_path)
+    write_model(comm, tmp_path)
+    with h5py.File(tmp_path / "model.h5", "r+") as file:
+        file["acceleration_sample/truth"][5, 1] = math.nan
+    said, = told_at_the_top(tmp_path, capfd)
+    metrics, page = written(tmp_path)
+    assert metrics["model"] == {} and f"Not shown (a PDF needs at least one value, and finite ones only): {said}" in (
+        html.unescape(page))
+    assert metrics["kernel"]["integral"] == 1
+
+
+@pytest.mark.mpi(1)
+def test_a_ground_truth_that_is_not_finite_is_refused(comm, tmp_path):
+    write_ground_truth(comm, tmp_path)
+    with h5py.File(tmp_path / "ground_truth.h5", "r+") as file:
+        file["fields/filtered/velocity"][0, 0, 0, 0, 0] = math.nan
+    with pytest.raises(ProductError, match="ground_truth.h5: /fields/filtered/velocity, frame 0: holds values that are "
+                                           "not finite; run `eddies dns` again"):
+        report.run(tmp_path, comm)
+
+
+@pytest.mark.usefixtures("no_figures")
+@pytest.mark.mpi(1)
+def test_a_rollout_of_too_few_steps_says_why_it_has_no_time_of_a_step(comm, tmp_path):
+    write_rollout(comm, tmp_path)
+    with h5py.File(tmp_path / "rollout.h5", "r+") as file:
+        del file["rollout"].attrs["seconds_per_step"], file["rollout"].attrs["time_step"]
+    report.run(tmp_path, comm)
+    metrics, page = written(tmp_path)
+    assert metrics["cost"]["seconds_per_step"] is None and metrics["cost"]["particles"] == 600
+    assert "not available: too few steps to time one: the first two" in page and "without a step" in page
 
 
 @pytest.mark.mpi(1)

@@ -18,16 +18,13 @@ import numpy as np
 from mpi4py import MPI
 
 from eddies.io.errors import ProductError, WriteError, write_error
-from eddies.io.provenance import environment
+from eddies.io.provenance import FORMAT, environment, has_this_format, identity, read_json, read_provenance
 from eddies.io.run_lock import RunTakenOver
 from eddies.io.unfinished import HEADER_BYTES, Unfinished, frame_bytes, writing
 from eddies.parallel.broadcast import on_first_rank, share_text
 from eddies.parallel.stop import Stopped
 from eddies.pipeline import MAKER_OF
 
-# Of the products of this version: no other is read. 1 is that of eddies 0.1, whose files do not say so. Since 2 scales
-# are those of the release, and a model is a list of terms, since 3 the filter width has its own name.
-FORMAT = 3
 CHUNK_BYTES = 2**20
 # Why the operating system does not let a file be read that may be sound.
 UNREADABLE = (errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.EMFILE, errno.ENFILE, errno.EIO)
@@ -54,8 +51,9 @@ def create_product(comm: MPI.Comm, path: str | Path, kind: str,
     """Write a product, all ranks together; the file appears under `path` once the block ends well.
 
     `provenance` (JSON-able: the scene's text, its fingerprint, ...) is stored with the versions of all
-    libraries, the number of ranks and the date. An exception inside the block leaves whatever stood under
-    `path` untouched, and nothing beside it where all ranks know of it.
+    libraries, the number of ranks, the date and an id; of the kinds in its `made_from` those that lie beside the file,
+    with their ids. An exception inside the block leaves whatever stood under `path` untouched, and nothing beside it
+    where all ranks know of it.
 
     Raises:
         WriteError: the file cannot be made or get its name, or there is no room for it.
@@ -67,7 +65,8 @@ def create_product(comm: MPI.Comm, path: str | Path, kind: str,
             f"{path}: this h5py is built without MPI, so {comm.size} ranks cannot write one file; run on "
             "one, or build it: `CC=mpicc HDF5_MPI=ON pip install --no-binary=h5py --no-build-isolation h5py`")
     unfinished = Unfinished(comm, path.with_name(path.name + ".partial"))
-    origin = share_text(comm, json.dumps({**environment(comm.size), **provenance}))
+    origin = share_text(comm, "" if comm.rank else json.dumps({
+        **environment(comm.size), **provenance, **identity(path.parent, provenance.get("made_from", ()))}))
     try:
         with writing(unfinished.file, len(origin) + HEADER_BYTES):
             write_attributes(unfinished.file,
@@ -110,46 +109,6 @@ def open_product(comm: MPI.Comm, path: str | Path, kind: str | None) -> Iterator
         raise ProductError(problem or f"{path}: {failures[0]} of {comm.size} ranks cannot open this file")
     with file:
         yield file
-
-
-def product_provenance(path: str | Path) -> dict[str, Any]:
-    """Where a complete product of this format comes from, as `read_provenance`; empty if there is none."""
-    try:
-        with h5py.File(path, "r") as file:
-            sound = file.attrs.get("complete", False) and _has_this_format(file)
-            return read_provenance(file) if sound else {}
-    except (OSError, ValueError, KeyError, ProductError):
-        return {}
-
-
-def product_fingerprint(path: str | Path) -> str | None:
-    """The scene's fingerprint stored in a complete product of this format; None if there is none."""
-    return product_provenance(path).get("fingerprint")
-
-
-def read_provenance(file: h5py.File) -> dict[str, Any]:
-    """Where an open product comes from: scene text, fingerprint, versions, ranks, date; ProductError where it is not
-    what a product holds."""
-    found = read_json(file, "provenance")
-    if not {"eddies", "commit", "libraries", "ranks", "date"} <= found.keys():
-        raise _damaged(file, "provenance")
-    return found
-
-
-def read_json(file: h5py.File, name: str) -> dict[str, Any]:
-    """The dict that an attribute of an open product holds as JSON; ProductError where it holds none."""
-    try:
-        found = json.loads(file.attrs[name])
-    except (KeyError, TypeError, ValueError, OSError):
-        found = None
-    if not isinstance(found, dict):
-        raise _damaged(file, name)
-    return found
-
-
-def _damaged(file: h5py.File, name: str) -> ProductError:
-    return ProductError(f"{file.filename}: its attribute {name} is not what was written, the file is damaged; delete "
-                        "it and make it again")
 
 
 def write_attributes(group: h5py.Group, values: Mapping[str, Any]) -> None:
@@ -285,7 +244,7 @@ def _problem(file: h5py.File, kind: str | None, remedy: str) -> str | None:
         return f"is of kind {found}, expected {kind}: {remedy}"
     if not complete:
         return f"unfinished, its writer was stopped: {remedy}"
-    if not _has_this_format(file):
+    if not has_this_format(file):
         version = read_json(file, "provenance").get("eddies", "of unknown version")
         what = found.replace("_", " ")
         return f"written by eddies {version}, whose {what} this version does not read; {_again(found)}"
@@ -294,7 +253,3 @@ def _problem(file: h5py.File, kind: str | None, remedy: str) -> str | None:
 
 def _again(kind: str) -> str:
     return f"run `eddies {MAKER_OF[kind].name}` again" if kind in MAKER_OF else "make it again"
-
-
-def _has_this_format(file: h5py.File) -> bool:
-    return bool(np.array_equal(file.attrs.get("format", 1), FORMAT))

@@ -1,16 +1,26 @@
-"""Where a product comes from: versions, commit, ranks and date, stored as JSON in every file."""
+"""Where a product comes from: id, versions, commit, ranks, date and what it was made from, as JSON in every file."""
 
 import datetime
+import json
 import platform
+import uuid
+from collections.abc import Iterable
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import h5py
+import numpy as np
 from mpi4py import MPI
 
 import eddies
+from eddies.io.errors import ProductError
 from eddies.kernels.library import in_use
+from eddies.pipeline import MAKER_OF
 
+# Of the products of this version: no other is read. 1 is that of eddies 0.1, whose files do not say so. Since 2 scales
+# are those of the release, and a model is a list of terms, since 3 the filter width has its own name.
+FORMAT = 3
 LIBRARIES = ("numpy", "mpi4py", "h5py", "pyfftw", "torch")
 
 
@@ -41,3 +51,56 @@ def commit() -> str | None:
     except OSError:
         return None
     return next((line.split()[0] for line in packed if line.endswith(f" {reference}")), None)
+
+
+def identity(directory: Path, kinds: Iterable[str]) -> dict[str, Any]:
+    """A new `id`, and `made_from`: of the products of these kinds those that lie in a directory, with their ids; None
+    is that of one made before there were ids."""
+    beside = {kind: product_provenance(directory / MAKER_OF[kind].file) for kind in kinds}
+    return {"id": uuid.uuid4().hex, "made_from": {kind: origin.get("id") for kind, origin in beside.items() if origin}}
+
+
+def product_provenance(path: str | Path) -> dict[str, Any]:
+    """Where a complete product of this format comes from, as `read_provenance`; empty if there is none."""
+    try:
+        with h5py.File(path, "r") as file:
+            sound = file.attrs.get("complete", False) and has_this_format(file)
+            return read_provenance(file) if sound else {}
+    except (OSError, ValueError, KeyError, ProductError):
+        return {}
+
+
+def product_fingerprint(path: str | Path) -> str | None:
+    """The scene's fingerprint stored in a complete product of this format; None if there is none."""
+    return product_provenance(path).get("fingerprint")
+
+
+def read_provenance(file: h5py.File) -> dict[str, Any]:
+    """Where an open product comes from: scene text, fingerprint, versions, ranks, date, and but for those made before
+    there were ids `id` and `made_from`; ProductError where it is not what a product holds."""
+    found = read_json(file, "provenance")
+    whole = {"eddies", "commit", "libraries", "ranks", "date"} <= found.keys()
+    if not whole or not isinstance(found.get("made_from", {}), dict):
+        raise _damaged(file, "provenance")
+    return found
+
+
+def read_json(file: h5py.File, name: str) -> dict[str, Any]:
+    """The dict that an attribute of an open product holds as JSON; ProductError where it holds none."""
+    try:
+        found = json.loads(file.attrs[name])
+    except (KeyError, TypeError, ValueError, OSError):
+        found = None
+    if not isinstance(found, dict):
+        raise _damaged(file, name)
+    return found
+
+
+def _damaged(file: h5py.File, name: str) -> ProductError:
+    return ProductError(f"{file.filename}: its attribute {name} is not what was written, the file is damaged; delete "
+                        "it and make it again")
+
+
+def has_this_format(file: h5py.File) -> bool:
+    """Whether an open product is of the format that this version reads."""
+    return bool(np.array_equal(file.attrs.get("format", 1), FORMAT))

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from eddies.io.hdf5 import ProductError, create_product, in_files, open_product, read_json, read_table, write_table
+from eddies.io.hdf5 import ProductError, create_product, in_files, open_product, read_table, write_table
+from eddies.io.provenance import read_json
 
 
 def save_weights(comm: MPI.Comm, path: str | Path, kind: str, description: Mapping[str, Any],

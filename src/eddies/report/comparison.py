@@ -70,7 +70,7 @@ def sections(table: ErrorAgainstTime, turnovers: float) -> list[Section]:
     """The parts of the page: figures with the summary, then tables."""
     first = Section(
         "error-against-time", "Error against run time", " ".join(table.summary),
-        notices=[_notice(row) for row in table.rows if not is_stable(row)])
+        notices=[_notice(row) for row in table.rows if not is_stable(row) or row[COST] is None])
     note = ("Wall seconds of a turnover T, with quartiles of the time of a step as bars. Line: what nothing else beats "
             "in both. Crosses at the top: became unstable, at the time given. ")
     for measure in DRAWN:
@@ -96,7 +96,8 @@ def run_record(name: str, title: str, text: str, machine: Mapping[str, Any]) -> 
 
 def _notice(row: Row) -> str:
     when = "" if row["stopped_at"] is None else f" (at {row['stopped_at']:.3g} T)"
-    return f"{row['name']}{when}: {row['status']}"
+    untimed = "; too few steps to time one" if row[COST] is None and not row["status"].startswith("failed") else ""
+    return f"{row['name']}{when}: {row['status']}{untimed}"
 
 
 def _caption(table: ErrorAgainstTime, measure: str) -> str:

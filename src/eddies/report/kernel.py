@@ -96,15 +96,15 @@ def section(support: float, kernels: Mapping[str, np.ndarray], slices: Mapping[s
         metrics.append(Metric(key, label, value, "this kernel was not compared"))
     shown = Section("kernel", "Smoothing kernel", "Errors: normalised L2 over a whole unseen field.",
                     metrics=metrics, main=("velocity_error", "gradient_error"))
-    value = shown.value
     shown.add_figure(
         "figure-1-kernels", "Kernels and their derivatives (the paper's Fig. 1)", shapes(kernels),
-        f"Support h = {support:.3g}; the learned kernel integrates to {value('integral'):.6f}.")
+        f"Support h = {support:.3g}; the learned kernel integrates to {errors['integral_learned']:.6f}.")
     shown.add_figure(
         "figure-2-reconstruction", "Fields reconstructed from particles (the paper's Fig. 2)",
         reconstructed_planes(slices, errors),
         "Plane z = π of an unseen frame. Numbers in titles: normalised error over the whole field; "
-        f"velocity {value('velocity_error'):.3f}, gradient {value('gradient_error'):.3f} when learned.")
+        f"velocity {errors['velocity_error_learned']:.3f}, gradient {errors['gradient_error_learned']:.3f} when "
+        "learned.")
     shown.add_figure("kernel-training", "Training of the kernels", training_history(history),
                      f"{int(history['step'][-1])} steps.")
     return shown

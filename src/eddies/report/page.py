@@ -85,24 +85,23 @@ class Section:
         """Put a matplotlib Figure after those that are there."""
         self.illustrations.append(Illustration(name, title, figure, caption))
 
-    def value(self, key: str) -> Number:
-        """The value of one metric."""
-        return next(metric.value for metric in self.metrics if metric.key == key)
-
 
 @dataclass(frozen=True)
 class RunRecord:
-    """What the run was: name, one line on it, the scene's text, and a row per product (header first)."""
+    """What the run was: name, one line on it, the scene's text, a row per product (header first), and what is wrong
+    with these, in sentences."""
 
     name: str
     summary: str
     scene: str
     products: Sequence[Sequence[str]]
+    warnings: Sequence[str] = ()
 
 
-def metrics_json(sections: Sequence[Section]) -> str:
-    """All metrics by section, as strict JSON: what is missing is null."""
-    table = {section.key: {metric.key: metric.value for metric in section.metrics} for section in sections}
+def metrics_json(run: RunRecord, sections: Sequence[Section]) -> str:
+    """All warnings, then all metrics by section, as strict JSON: what is missing is null."""
+    table = {"warnings": list(run.warnings),
+             **{section.key: {metric.key: metric.value for metric in section.metrics} for section in sections}}
     return json.dumps(table, indent=2, allow_nan=False) + "\n"
 
 
@@ -135,7 +134,7 @@ def render_page(run: RunRecord, sections: Sequence[Section]) -> str:
         '<meta name="viewport" content="width=device-width,initial-scale=1">'
         f"<title>{_text(run.name)}</title><style>{CSS}</style></head><body>"
         f'<header><h1>{_text(run.name)}</h1><div class="soft">{_text(run.summary)}</div><nav>{links}'
-        f'<a href="#run">The run</a></nav></header><main>{_tiles(sections)}{body}{_run(run)}</main>'
+        f'<a href="#run">The run</a></nav></header><main>{_warnings(run)}{_tiles(sections)}{body}{_run(run)}</main>'
         "</body></html>\n"
     )
 
@@ -153,11 +152,19 @@ def _tiles(sections: Sequence[Section]) -> str:
     return f'<section class="tiles">{tiles}</section>' if tiles else ""
 
 
+def _warnings(run: RunRecord) -> str:
+    shown = _notices(run.warnings)
+    return f'<section id="warnings"><h2>Warnings</h2>{shown}</section>' if shown else ""
+
+
+def _notices(notices: Sequence[str]) -> str:
+    return "".join(f'<div class="notice">{_text(notice)}</div>' for notice in notices)
+
+
 def _section(section: Section) -> str:
-    notices = "".join(f'<div class="notice">{_text(notice)}</div>' for notice in section.notices)
     figures = "".join(_illustration(illustration) for illustration in section.illustrations)
     text = f"<p>{_text(section.text)}</p>" if section.text else ""
-    return (f'<section id="{section.key}"><h2>{_text(section.title)}</h2>{text}{notices}{figures}'
+    return (f'<section id="{section.key}"><h2>{_text(section.title)}</h2>{text}{_notices(section.notices)}{figures}'
             f"{_metric_table(section.metrics)}</section>")
 
 

@@ -78,8 +78,9 @@ class Rollout:
 def section(run: Rollout) -> Section:
     """The rollout: figures 4 to 9 and Lagrangian statistics; `run` is read frame by frame."""
     broken = against_truth.first_broken_time(run.model)
-    text = (f"Moved by: {run.method}; integrator {run.attributes['integrator']}, time step "
-            f"{float(run.attributes['time_step']):.3g}. T = {run.turnover:.3g} is the eddy turnover time. ")
+    steps = f"time step {float(run.attributes['time_step']):.3g}" if "time_step" in run.attributes else "without a step"
+    text = (f"Moved by: {run.method}; integrator {run.attributes['integrator']}, {steps}. "
+            f"T = {run.turnover:.3g} is the eddy turnover time. ")
     shown = Section("rollout", "Rollout against the truth", text, main=MAIN, metrics=[
         Metric("method", "what moved the particles", run.method),
         Metric("status", "status", run.status),

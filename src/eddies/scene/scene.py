@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from eddies.import_path import origins, search_in
-from eddies.pipeline import STAGES
+from eddies.pipeline import STAGES, Stage
 from eddies.scene.checks import first_inconsistency
 from eddies.scene.model import Model, replace_terms
 from eddies.scene.reader import apply_overrides, find_document, parse_document, read_section, read_text, write_section
@@ -61,6 +61,10 @@ class Scene(Document):
         learned = self.simulation is None or "model" in self.simulation.needs
         return tuple(stage.name for stage in STAGES.values() if (learned or stage.name != "train")
                      and (stage.section is None or getattr(self, stage.section) is not None))
+
+    def inputs(self, stage: str) -> tuple[Stage, ...]:
+        """The stages from whose products a stage makes its own: of those that it depends on the ones the scene has."""
+        return tuple(STAGES[name] for name in STAGES[stage].depends_on if name in self.stages)
 
     @property
     def window(self) -> float:
@@ -112,10 +116,11 @@ class Scene(Document):
         return hashlib.sha256(json.dumps([[key, settings[key]] for key in keys]).encode()).hexdigest()
 
     def provenance(self, stage: str) -> dict[str, Any]:
-        """What the product of a stage keeps of the scene: its text, the stage's fingerprint and, if the scene names
-        any, where foreign classes come from."""
+        """What the product of a stage keeps of the scene: its text, the stage's fingerprint, the kinds of the products
+        that it is made from and, if the scene names any, where foreign classes come from."""
         foreign = {"foreign": origins(self.foreign)} if self.foreign else {}
-        return {"scene": self.to_toml(), "fingerprint": self.fingerprint(stage), **foreign}
+        return {"scene": self.to_toml(), "fingerprint": self.fingerprint(stage),
+                "made_from": [each.product for each in self.inputs(stage)], **foreign}
 
     def _foreign_in(self, name: str) -> Iterator[str]:
         part = getattr(self, name)

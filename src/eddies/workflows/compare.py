@@ -13,7 +13,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from eddies.io.hdf5 import ProductError, in_files, open_product, read_attributes, read_provenance
+from eddies.io.hdf5 import ProductError, in_files, open_product, read_attributes
+from eddies.io.provenance import read_provenance
 from eddies.parallel.communicator import Comm
 from eddies.report.comparison import ErrorAgainstTime, run_record, sections
 from eddies.report.figures import draw

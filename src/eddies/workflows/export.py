@@ -6,7 +6,8 @@ import logging
 from pathlib import Path
 
 from eddies.io.fields import FieldSeries
-from eddies.io.hdf5 import File, ProductError, open_product, read_provenance
+from eddies.io.hdf5 import File, ProductError, open_product
+from eddies.io.provenance import read_provenance
 from eddies.io.trajectories import Trajectory
 from eddies.io.vtkhdf import write_images, write_points
 from eddies.parallel.broadcast import on_first_rank

@@ -9,7 +9,7 @@ import contextlib
 import json
 import logging
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,8 +20,8 @@ from eddies.analysis.isotropic_turbulence import StationarySpan
 from eddies.analysis.spectra import energy_spectrum, vorticity
 from eddies.analysis.tracer_statistics import tracer_statistics
 from eddies.io.fields import FieldSeries
-from eddies.io.hdf5 import (File, ProductError, in_files, open_product, read_attributes, read_json, read_provenance,
-                            read_table)
+from eddies.io.hdf5 import File, ProductError, in_files, open_product, read_attributes, read_table
+from eddies.io.provenance import read_json, read_provenance
 from eddies.io.trajectories import Trajectory
 from eddies.parallel.broadcast import on_all_ranks
 from eddies.parallel.communicator import Comm
@@ -35,6 +35,7 @@ from eddies.report.rollout import Rollout
 from eddies.report.rollout import section as rollout_section
 from eddies.scene.scene import Scene
 from eddies.workflows.feasibility import check_places
+from eddies.workflows.product_warnings import mixed_products, not_finite
 
 log = logging.getLogger("eddies")
 
@@ -46,10 +47,12 @@ ROLLOUT_COST = {"seconds_per_step": "rollout, seconds per step", "particles": "p
 
 @dataclass
 class Run:
-    """What all products say in short: wall seconds by stage, provenance by product, cost, and what sections need of
-    another product than their own."""
+    """What all products say in short: wall seconds by stage, all that is wrong in sentences, that on numbers that are
+    not finite by product, provenance by product, cost, and what sections need of another product than their own."""
 
     seconds: dict[str, float]
+    warnings: list[str] = field(default_factory=list)
+    not_finite: dict[str, str] = field(default_factory=dict)
     provenance: dict[str, dict[str, Any]] = field(default_factory=dict)
     cost: list[Metric] = field(default_factory=list)
     filter_width: float | None = None
@@ -91,6 +94,8 @@ def _survey(directory: Path, alone: Comm) -> Run:
         if path.exists():
             with open_product(alone, path, kind) as file:
                 record.provenance[kind] = read_provenance(file)
+                if found := not_finite(file, kind):
+                    record.not_finite[kind] = found
                 if kind == "ground_truth":
                     _survey_ground_truth(file, record)
                 elif kind == "rollout":
@@ -98,6 +103,7 @@ def _survey(directory: Path, alone: Comm) -> Run:
     if not record.provenance:
         raise ProductError(f"{directory}: holds none of {', '.join(f'{kind}.h5' for kind in KINDS)}; "
                            "run `eddies dns SCENE` first")
+    record.warnings += [*mixed_products(record.provenance), *record.not_finite.values()]
     return record
 
 
@@ -114,7 +120,8 @@ def _survey_ground_truth(file: File, record: Run) -> None:
 
 def _survey_rollout(file: File, record: Run) -> None:
     attributes = read_attributes(file, "rollout")
-    record.cost += [Metric(key, label, attributes[key]) for key, label in ROLLOUT_COST.items()]
+    untimed = "too few steps to time one: the first two, and the first two after a restart, are left out"
+    record.cost += [Metric(key, label, attributes.get(key), untimed) for key, label in ROLLOUT_COST.items()]
     if "evaluations" in attributes and attributes["turnovers"] > 0:
         record.cost.append(Metric("evaluations_per_turnover", "evaluations of the forces a turnover",
                                   attributes["evaluations"] / attributes["turnovers"]))
@@ -129,8 +136,19 @@ def _read_share(directory: Path, comm: Comm, alone: Comm, record: Run) -> list[S
     for index in np.array_split(np.arange(len(parts)), comm.size)[comm.rank]:
         kind, read = parts[index]
         with open_product(alone, directory / f"{kind}.h5", kind) as file:
-            sections += read(file, record)
+            sections += _read_part(kind, file, record, read)
     return sections
+
+
+def _read_part(kind: str, file: File, record: Run, read: Callable[[File, Run], list[Section]]) -> list[Section]:
+    """Sections on an open product; where its numbers are not finite and forbid them, one that says so."""
+    try:
+        return read(file, record)
+    except (ValueError, OverflowError) as error:  # of a figure's limits, of a PDF, of a number of times
+        if kind not in record.not_finite:
+            raise
+        title = kind.replace("_", " ").capitalize()
+        return [Section(kind, title, notices=[f"Not shown ({error}): {record.not_finite[kind]}"])]
 
 
 def _write_report(directory: Path, record: Run, sections: Sequence[Section]) -> None:
@@ -138,6 +156,8 @@ def _write_report(directory: Path, record: Run, sections: Sequence[Section]) -> 
         log.info("report: %s, %d figures", section.title, len(section.illustrations))
     _write_files(directory / "report", _run_record(directory, record), sections)
     _log_main_numbers(sections)
+    for warning in record.warnings:
+        log.warning("report: %s", warning)
 
 
 def read_stationary_span(file: File) -> StationarySpan:
@@ -253,12 +273,12 @@ def _run_record(directory: Path, record: Run) -> RunRecord:
     newest = list(record.provenance.values())[-1]
     stages = ", ".join(MAKER_OF[kind].name for kind in record.provenance)
     summary = f"Lagrangian large-eddy simulation; stages: {stages}; {newest['date']}"
-    return RunRecord(directory.resolve().name, summary, newest["scene"], rows)
+    return RunRecord(directory.resolve().name, summary, newest["scene"], rows, record.warnings)
 
 
 def _write_files(output: Path, record: RunRecord, sections: Sequence[Section]) -> None:
     drawn = {f"{illustration.name}.png" for section in sections for illustration in section.illustrations}
-    write_page(output, record, sections, {output / "metrics.json": metrics_json(sections)})
+    write_page(output, record, sections, {output / "metrics.json": metrics_json(record, sections)})
     for stale in (output / "figures").glob("*.png"):
         if stale.name not in drawn:
             stale.unlink()

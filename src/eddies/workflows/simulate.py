@@ -57,8 +57,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                 for name, columns in method.series().items():
                     write_table(file, name, {"time": frames.times, **columns})
     guard.checkpoints.remove()
-    log.info("rollout: %s after %.2f turnovers, %.3f s/step", outcome["status"], outcome["time"] / turnover,
-             outcome["seconds_per_step"])
+    pace = f"{outcome['seconds_per_step']:.3f} s/step" if "seconds_per_step" in outcome else "too few steps to time one"
+    log.info("rollout: %s after %.2f turnovers, %s", outcome["status"], outcome["time"] / turnover, pace)
 
 
 def start_frame(scene: Scene, truth: GroundTruth) -> int:

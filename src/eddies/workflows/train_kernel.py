@@ -65,8 +65,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     description = {"form": KernelNetwork.FORM, "support": support, "neighbors": settings.neighbors,
                    "hidden": list(settings.hidden), "cutoff": settings.cutoff}
     weights = {name: tensor.numpy() for name, tensor in networks["learned"].state_dict().items()}
-    provenance = {"scene": scene.to_toml(), "fingerprint": scene.fingerprint("train-kernel")}
-    save_weights(comm, directory / "kernel.h5", "kernel", description, weights, provenance, tables)
+    save_weights(comm, directory / "kernel.h5", "kernel", description, weights, scene.provenance("train-kernel"),
+                 tables)
     guard.checkpoints.remove()
     errors = tables["errors"]
     log.info("kernel: velocity error %.3f (cubic spline %.3f), gradient error %.3f (cubic spline %.3f)",

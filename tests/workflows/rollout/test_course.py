@@ -46,9 +46,9 @@ class Frames:
         self.steps.append(step)
 
 
-def course_of(comm, directory, looks=10**9):
+def course_of(comm, directory, looks=10**9, method=Standing, count=4, interval=0.25):
     guard = Guard(comm, directory, "settings", StopAtStep(comm, looks))
-    return Course(Standing(), Frames(comm), 4, 0.25, guard, guard.checkpoints.newest())
+    return Course(method(), Frames(comm), count, interval, guard, guard.checkpoints.newest())
 
 
 @pytest.mark.mpi(1)
@@ -64,6 +64,24 @@ def test_parts_of_a_run_leave_out_a_warm_up_each(comm, tmp_path):
     assert second.progress.step == 5 and second.seconds == first.seconds and len(first.seconds) == 3
     assert second.run()["steps"] == 10 and len(second.seconds) == 3 + 3
     assert second.frames.times == whole.frames.times and second.frames.steps == [8, 10]
+
+
+class Falling(Standing):
+    """Particles of which the first step goes wrong."""
+
+    def advance(self, until, number):
+        return "fell"
+
+
+@pytest.mark.mpi(1)
+def test_what_was_not_measured_is_not_there(comm, tmp_path):
+    """The first two steps are a warm-up; of one that goes wrong there is neither time nor length."""
+    timed = {"seconds_per_step", "seconds_per_step_low", "seconds_per_step_high"}
+    found = [course_of(comm, tmp_path, count=1, interval=interval).run() for interval in (0.25, 0.2)]
+    assert [outcome["steps"] for outcome in found] == [3, 2]
+    assert timed < found[0].keys() and not timed & found[1].keys() and found[1]["time_step"] == pytest.approx(0.1)
+    fallen = course_of(comm, tmp_path, method=Falling).run()
+    assert fallen == {"status": "stopped: fell", "time": 0.0, "steps": 0}
 
 
 @pytest.mark.mpi(2)

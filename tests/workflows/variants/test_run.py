@@ -173,3 +173,7 @@ def test_costs_of_a_turnover_are_medians_with_the_widest_quartiles():
     assert costs["seconds_per_step"] == 0.3 and costs["wall_seconds"] == pytest.approx(15)
     assert (costs["wall_seconds_low"], costs["wall_seconds_high"]) == (pytest.approx(5), pytest.approx(45))
     assert costs["core_seconds"] == pytest.approx(30)
+
+
+def test_a_rollout_of_too_few_steps_has_no_seconds():
+    assert StepSeconds.of_rollout({"status": "complete", "time_step": 0.1}) == []

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from eddies.io.hdf5 import ProductError, open_product, read_provenance
+from eddies.io.hdf5 import ProductError, open_product
+from eddies.io.provenance import read_provenance
 from eddies.io.weights import load_tables, load_weights
 from eddies.parallel.communicator import Comm
 from eddies.scene.rules import quoted

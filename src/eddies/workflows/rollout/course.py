@@ -47,7 +47,8 @@ class Course:
         return self.clock.steps
 
     def run(self) -> dict[str, float | str]:
-        """Advance to the last frame, or until the state is at fault; returns status, time, and seconds a step."""
+        """Advance to the last frame, or until the state is at fault; returns status, time, steps and, where there are
+        any, their mean length and the seconds of those that were timed."""
         complaint: str | None = None
         if not self.frames.times:
             self._store(0.0)
@@ -61,9 +62,9 @@ class Course:
                 self._store(until)
         if complaint is not None and self.comm.rank == 0:
             log.warning("rollout stopped at time %.4g: %s", self.clock.time, complaint)
+        step = {"time_step": self.clock.time / self.steps} if self.steps else {}
         return {"status": "complete" if complaint is None else f"stopped: {complaint}", "time": self.frames.times[-1],
-                "steps": self.steps, "time_step": self.clock.time / self.steps if self.steps else np.nan,
-                **quartiles(self.seconds)}
+                "steps": self.steps, **step, **quartiles(self.seconds)}
 
     def state_dict(self) -> dict[str, Any]:
         """All that goes on, for a checkpoint, beside the files of the frames."""
@@ -108,6 +109,8 @@ class Course:
 
 
 def quartiles(seconds: Sequence[float]) -> dict[str, float]:
-    """Median and quartiles of the seconds of steps; NaN without any."""
-    low, median, high = np.quantile(seconds or [np.nan], (0.25, 0.5, 0.75))
+    """Median and quartiles of the seconds of steps; nothing without any."""
+    if not seconds:
+        return {}
+    low, median, high = np.quantile(seconds, (0.25, 0.5, 0.75))
     return {"seconds_per_step": median, "seconds_per_step_low": low, "seconds_per_step_high": high}

@@ -126,11 +126,12 @@ class EulerianRun:
         self.tracers = TracerParticles(self.tracers.field, columns, self.state)
 
     def description(self) -> dict[str, float | str]:
-        """Grid and model; `flow_seconds_per_step` (median) is the flow's share of a step, without the particles."""
+        """Grid and model; where there were steps, `flow_seconds_per_step` (median) is the flow's share of one, without
+        the particles."""
         grid = self.fluid.grid
+        seconds = {"flow_seconds_per_step": float(np.median(self.flow_seconds))} if self.flow_seconds else {}
         return {"integrator": "etdrk4", "cells": grid.cells, "largest_wavenumber": grid.cutoff,
-                "smagorinsky": self.settings.smagorinsky,
-                "flow_seconds_per_step": float(np.median(self.flow_seconds or [np.nan]))}
+                "smagorinsky": self.settings.smagorinsky, **seconds}
 
 
 def coarse_fluid(scene: Scene, truth: GroundTruth, grid: SpectralGrid) -> CompressibleFluid:

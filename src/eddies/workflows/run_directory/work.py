@@ -13,7 +13,7 @@ from typing import Any
 from eddies.clock import duration
 from eddies.errors import UserError
 from eddies.io.checkpoint import checkpoints_in
-from eddies.io.hdf5 import product_provenance
+from eddies.io.provenance import product_provenance
 from eddies.pipeline import STAGES, Stage
 from eddies.scene.rules import quoted
 from eddies.scene.scene import Scene

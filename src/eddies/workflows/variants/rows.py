@@ -80,7 +80,9 @@ def measured(run: VariantRun, alone: Comm, ranks: int) -> dict[str, Any]:
         complete = rollout["status"] == "complete"
         row = {"status": rollout["status"], "stopped_at": None if complete else rollout["turnovers"],
                **accuracy(stored, complete)}
-    row |= step_costs([StepSeconds.of_rollout(rollout), *run.blocks], rollout["time_step"], stored.turnover, ranks)
+    row["time_step"] = rollout.get("time_step")  # missing where the first step went wrong
+    if samples := [*StepSeconds.of_rollout(rollout), *run.blocks]:
+        row |= step_costs(samples, rollout["time_step"], stored.turnover, ranks)
     if "train" in run.stages:
         with open_product(alone, run.directory / "model.h5", "model") as file:
             if "history" in file:
@@ -92,7 +94,7 @@ def step_costs(samples: list[StepSeconds], step: float, turnover: float, ranks: 
     """Seconds a step, the median over all samples, and wall and core seconds a turnover with the widest quartiles."""
     seconds = float(np.median([sample.median for sample in samples]))
     steps = turnover / step
-    return {"seconds_per_step": seconds, "time_step": step, "wall_seconds": seconds * steps,
+    return {"seconds_per_step": seconds, "wall_seconds": seconds * steps,
             "wall_seconds_low": min(sample.low for sample in samples) * steps,
             "wall_seconds_high": max(sample.high for sample in samples) * steps,
             "core_seconds": seconds * steps * ranks * threads()}

@@ -13,7 +13,8 @@ from typing import Any
 
 from eddies.errors import UserError
 from eddies.io.errors import WriteError, write_error
-from eddies.io.hdf5 import open_product, product_fingerprint, read_attributes
+from eddies.io.hdf5 import open_product, read_attributes
+from eddies.io.provenance import product_fingerprint
 from eddies.io.run_lock import RunInUse, RunTakenOver
 from eddies.io.whole_files import write_files
 from eddies.parallel.broadcast import on_first_rank
@@ -46,9 +47,11 @@ class StepSeconds:
     high: float
 
     @classmethod
-    def of_rollout(cls, attributes: Mapping[str, Any]) -> StepSeconds:
-        """The seconds that a rollout has measured of itself."""
-        return cls(*(attributes[f"seconds_per_step{end}"] for end in ("", "_low", "_high")))
+    def of_rollout(cls, attributes: Mapping[str, Any]) -> list[StepSeconds]:
+        """The seconds that a rollout has measured of itself; none where it took too few steps."""
+        if "seconds_per_step" not in attributes:
+            return []
+        return [cls(*(attributes[f"seconds_per_step{end}"] for end in ("", "_low", "_high")))]
 
 
 @dataclass
@@ -154,7 +157,7 @@ class VariantRun:
         block = replace(self.scene, simulation=replace(settings, turnovers=turnovers))
         run_stages(("simulate",), block, directory)
         with open_product(comm, directory / "rollout.h5", "rollout") as file:
-            self.blocks.append(StepSeconds.of_rollout(read_attributes(file, "rollout")))
+            self.blocks += StepSeconds.of_rollout(read_attributes(file, "rollout"))
         in_directories(comm, lambda: shutil.rmtree(directory))
 
     def _share_all(self, directory: Path) -> None:

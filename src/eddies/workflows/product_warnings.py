@@ -1,0 +1,93 @@
+"""What a report must not show without a word: products that do not belong together, numbers that are not finite."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from eddies.io.hdf5 import File, read_attributes
+from eddies.io.stored_numbers import stored_numbers
+from eddies.pipeline import MAKER_OF, STAGES
+
+Provenance = Mapping[str, Any]
+
+# Columns of a model's training that every step has; others are NaN where a step had no such number.
+OF_EVERY_STEP = "step", "phase", "seconds", "loss", "learning_rate", "gradient_norm"
+NAMED = 4  # places that a sentence names
+
+
+def mixed_products(provenance: Mapping[str, Provenance]) -> list[str]:
+    """A sentence for each product that was made from others than lie beside it, or does not say from which.
+
+    Parameters
+    ----------
+    provenance : of the products of a run directory, by kind.
+    """
+    found = []
+    for kind, origin in provenance.items():
+        again = f"run `eddies {MAKER_OF[kind].name}` again"
+        if "made_from" not in origin:
+            beside = [STAGES[name].product for name in MAKER_OF[kind].depends_on]
+            known = [_made(needed, provenance[needed]) for needed in beside if "id" in provenance.get(needed, {})]
+            if known:
+                found.append(f"{_made(kind, origin)} does not say what it was made from: whether it belongs to "
+                             f"{' and '.join(known)} is not known; {again}")
+            continue
+        others = {needed: provenance.get(needed) for needed, known in origin["made_from"].items()
+                  if needed not in provenance or provenance[needed].get("id") != known}
+        if others:
+            named = " and from ".join(_other(needed, origin, present) for needed, present in others.items())
+            or_else = ("take what is compared as of different flows or models" if any(others.values()) else
+                       "bring back what is missing")
+            found.append(f"{_made(kind, origin)} was made from {named}: {again}, or {or_else}")
+    return found
+
+
+def not_finite(file: File, kind: str) -> str:
+    """A sentence on the numbers of an open product that are not finite, or ""; of series the last frame counts."""
+    places = []
+    for place, frame, values in stored_numbers(file):
+        wrong = _wrong(kind, place, values)
+        if wrong.any():
+            row = "" if not wrong.ndim else f", row {int(np.argwhere(wrong)[0, 0])}"
+            places.append(place + (row if frame is None else f", frame {frame}"))
+    if not places:
+        return ""
+    more = f" and {len(places) - NAMED} more" if len(places) > NAMED else ""
+    status = read_attributes(file, "rollout")["status"] if kind == "rollout" else "complete"
+    remedy = f"run `eddies {MAKER_OF[kind].name}` again" if status == "complete" else f"the rollout {status}"
+    return f"{MAKER_OF[kind].file} holds numbers that are not finite ({'; '.join(places[:NAMED])}{more}): {remedy}"
+
+
+def _wrong(kind: str, place: str, values: np.ndarray) -> np.ndarray:
+    """Which values are not finite and should be."""
+    if kind == "ground_truth":
+        return np.isnan(values)  # scales without viscosity and the sound speed of an incompressible fluid are infinite
+    table, _, column = place.partition("/")
+    gaps = kind == "model" and table == "history" and column not in OF_EVERY_STEP
+    return ~np.isfinite(values) & (not gaps)
+
+
+def _made(kind: str, origin: Provenance) -> str:
+    return f"{MAKER_OF[kind].file} (made {origin['date']})"
+
+
+def _other(kind: str, origin: Provenance, present: Provenance | None) -> str:
+    """The product that one was made from, beside what is here in its place."""
+    if present is None:
+        return f"a {MAKER_OF[kind].file} that is not here"
+    differing = _differing(kind, origin, present)
+    settings = f"with another {', '.join(differing)}" if differing else "with the same settings"
+    return f"another {MAKER_OF[kind].file} than the one here, made {present['date']} {settings}"
+
+
+def _differing(kind: str, origin: Provenance, present: Provenance) -> list[str]:
+    """The sections and keys of a scene that a product depends on in which two provenances differ."""
+    scenes = [tomllib.loads(each.get("scene", "")) for each in (origin, present)]
+    stage = MAKER_OF[kind]
+    keys = [key for name in (*stage.depends_on, stage.name) for key in STAGES[name].reads]
+    differing = [key for key in keys if scenes[0].get(key) != scenes[1].get(key)]
+    return [key if key in ("seed", "device") else f"[{key}]" for key in differing]
