@@ -1,9 +1,10 @@
 """What checkpoints survive, in numbers: kills at random moments, bit flips, truncations. A script, some minutes long.
 
-    python tests/validation/survival.py [--kills 200] [--harms 1000] [--stages dns train-kernel simulate]
+    python tests/validation/survival.py [--kills 200] [--harms 1000] [--stages dns train-kernel simulate] [--ranks 1]
 
-The stage that is killed writes a checkpoint before every step, so that most kills fall into a writing. It goes on from
-what it finds; when it has ended, its product must be that of a run that was never killed.
+The stage that is killed writes a checkpoint before every step, so that most kills fall into a writing. On several ranks
+one of them is killed. The same command goes on from what it finds; when it has ended, its product must be that of a run
+that was never killed.
 """
 
 import argparse
@@ -11,12 +12,13 @@ import logging
 import os
 import random
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
 import time
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import h5py
@@ -33,6 +35,7 @@ from test_train_restart import SHORT  # noqa: E402
 from eddies.io.checkpoint import CheckpointDirectory  # noqa: E402
 from eddies.pipeline import STAGES  # noqa: E402
 from eddies.scene.scene import load_scene  # noqa: E402
+from mpi_tools.launch import mpi_environment, mpirun_command  # noqa: E402
 
 
 @dataclass(frozen=True)
@@ -42,14 +45,25 @@ class Killed:
     stage: str
     overrides: list[str]
     before: tuple[str, ...] = ()
+    ranks: int = 1
 
     def process(self, directory, *options, stage=None):
-        """A process of the stage, or of another, on one rank, and not a part of this script's MPI job."""
+        """A process of the stage, or of another, or the mpirun of several; not a part of this script's MPI job."""
         overrides = [word for override in self.overrides for word in ("--set", override)]
         line = [sys.executable, "-m", "eddies", stage or self.stage, "tiny", "--output", str(directory), *overrides,
                 *options]
-        environment = {name: value for name, value in os.environ.items() if not name.startswith(("OMPI_", "PMIX_"))}
-        return subprocess.Popen(line, env=environment, stdout=subprocess.DEVNULL)
+        environment = {name: value for name, value in mpi_environment(self.ranks).items()
+                       if not name.startswith(("OMPI_COMM", "PMIX_"))}
+        return subprocess.Popen(line if self.ranks == 1 else mpirun_command(self.ranks, line), env=environment,
+                                stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL if self.ranks > 1 else None)
+
+    def kill(self, job, chooser):
+        """Kill a process of the stage, of several ranks any one, and wait for the end of all."""
+        ranks = [job.pid] if self.ranks == 1 else list(map(
+            int, Path(f"/proc/{job.pid}/task/{job.pid}/children").read_text().split()))
+        if ranks:
+            os.kill(chooser.choice(ranks), signal.SIGKILL)
+        job.wait()
 
     def make(self, directory):
         """What the stage starts from."""
@@ -98,8 +112,7 @@ def kills(killed, count, directory, chooser):
             time.sleep(0.002)
         time.sleep(chooser.random() / 3)
         if job.poll() is None:
-            job.kill()
-            job.wait()
+            killed.kill(job, chooser)
             seen["kills"] += 1
             seen["in the writing of a checkpoint"] += bool(list(checkpoints.path.glob("step-*.partial")))
             before = last_step(checkpoints.path)
@@ -157,6 +170,7 @@ def main():
     parser.add_argument("--kills", type=int, default=200, help="of each stage")
     parser.add_argument("--harms", type=int, default=1000)
     parser.add_argument("--stages", nargs="*", choices=STAGES_KILLED, default=list(STAGES_KILLED))
+    parser.add_argument("--ranks", type=int, default=1, help="of the jobs that are killed")
     parser.add_argument("--seed", type=int, default=1)
     given = parser.parse_args()
     chooser = random.Random(given.seed)
@@ -164,7 +178,8 @@ def main():
         folder = Path(name)
         for stage in given.stages:
             (folder / stage).mkdir()
-            show(f"SIGKILL, {stage}", kills(STAGES_KILLED[stage], given.kills, folder / stage, chooser))
+            killed = replace(STAGES_KILLED[stage], ranks=given.ranks)
+            show(f"SIGKILL, {stage}", kills(killed, given.kills, folder / stage, chooser))
         for title, kind in (("bit flips", "flip"), ("truncations", "truncation")):
             show(title, harms(kind, given.harms, folder / kind, chooser))
 
