@@ -22,7 +22,7 @@ BAD_TEXTS = [
     (FLOW + LEARNING + '[simulation]\nmethod = "wcsph"\nstep = 1\nturnovers = 1\nframe_interval = 1\n',
      '[simulation] method = "wcsph": starts from the density, which an incompressible flow does not have; choose '
      'another, or set [flow] fluid = "compressible" and sound_speed'),
-    (FLOW + LEARNING + MODEL + 'preset = "resolved + pairs"\n', '[model.pairs]: reads the density, which an '
+    (FLOW + LEARNING + MODEL + 'terms = ["pressure", "pairs"]\n', '[model.pairs]: reads the density, which an '
      'incompressible flow does not have; leave "density" out of [model.pairs] inputs, or set [flow] fluid = '
      '"compressible" and sound_speed'),
     (FLOW + LEARNING + MODEL + 'terms = ["eddy-viscosity", "density-transport"]\n',

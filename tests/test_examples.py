@@ -78,7 +78,7 @@ def test_a_network_of_the_users(example):
     run = example("own_network")
     _, terms, weights = results(run)
     assert terms["pairs"]["network"] == "own_network:Waves"
-    assert weights["terms.pairs.network.wavevectors"].shape == (16, 5)
+    assert weights["terms.pairs.network.wavevectors"].shape == (16, 3)  # distance, speed and approach of a pair
     assert "own_network:" in (run / "scene.toml").read_text()
 
 

@@ -41,7 +41,7 @@ def pairs_of_calls(comm) -> dict[str, tuple[Call, Call]]:
     everything = {"field": 1.0, "velocity_kl": 0.1, "acceleration_kl": 0.1}
     without = {name: {key: weight for key, weight in everything.items() if key != name} for name in everything}
     pressure, resolved, learned = {"pressure": {}, "pairs": {}}, PRESETS["resolved"], PRESETS["learned-density"]
-    stress = PRESETS["resolved + pairs"]
+    stress = {**resolved, "pairs": {}}  # told the densities, as beside the pressure alone
     steps = {
         "pair force": (learned, {}),
         "pressure and its force": (pressure, learned),

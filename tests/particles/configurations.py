@@ -51,6 +51,7 @@ PAIR_MODELS = {
 RESOLVED_MODELS = {
     "pressure for the density": {"pressure": dict(force=False), "pairs": {}},
     "pressure": {"pressure": {}, "pairs": {}},
+    "told densities": {**PRESETS["resolved"], "pairs": {}},
     **{name: PRESETS[name] for name in ("resolved + pairs", "resolved")},
 }
 MODELS = PAIR_MODELS | RESOLVED_MODELS

@@ -64,7 +64,7 @@ def assert_same_on_all_ranks(comm, force, columns):
 
 @pytest.mark.mpi(2, 3)
 @pytest.mark.parametrize("integrator, name", [("verlet", "paper"), ("rk4", "corrected"), ("rk4", "antisymmetric"),
-                                              ("verlet", "resolved + pairs")])
+                                              ("verlet", "told densities"), ("rk3", "resolved + pairs")])
 def test_gradients_through_several_steps_do_not_depend_on_the_ranks(comm, integrator, name):
     """Steps long enough for particles to leave their slabs and for lists to be built anew on the way."""
     columns = state(120)
@@ -96,8 +96,8 @@ def test_gradients_through_several_steps_do_not_depend_on_the_ranks(comm, integr
 
 
 @pytest.mark.mpi(2, 3)
-@pytest.mark.parametrize("name, integrator, steps", [("pairs", "verlet", 25), ("resolved + pairs", "verlet", 25),
-                                                     ("resolved", "rk3", 8)])
+@pytest.mark.parametrize("name, integrator, steps", [("pairs", "verlet", 25), ("told densities", "verlet", 25),
+                                                     ("resolved + pairs", "rk3", 8), ("resolved", "rk3", 8)])
 def test_particles_that_cross_slabs_go_on_as_on_one_rank(comm, name, integrator, steps):
     position, velocity, density = state(150)
     columns = position, velocity + torch.tensor([0.0, 0.0, 2.0]), density
@@ -297,7 +297,7 @@ def test_a_density_that_is_at_hand_stands_for_the_one_that_terms_would_give(comm
 
 
 @pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("name", ["pairs", "corrected", "resolved + pairs"])
+@pytest.mark.parametrize("name", ["pairs", "corrected", "told densities", "resolved + pairs"])
 def test_pairs_and_resolved_velocity_in_single_precision(comm, name):
     slab, particles = distributed(comm, *state())
     double = dynamics_of(slab, model(MODELS[name]), iterations=ITERATIONS).rates(particles)

@@ -126,7 +126,7 @@ def assert_rates_between_steps(comm, name, terms, strayed):
 
 @pytest.mark.mpi(1, 2)
 @pytest.mark.parametrize("name", ["verlet", "rk3"])
-@pytest.mark.parametrize("terms", ["paper", "resolved + pairs", "resolved", "without density"])
+@pytest.mark.parametrize("terms", ["paper", "pressure", "resolved", "without density"])
 def test_a_run_goes_on_bitwise_from_a_checkpoint(comm, name, terms):
     """Of particles, memory, and the state of the dynamics; also where terms give the density, and where there is
     none."""
@@ -152,7 +152,7 @@ def test_a_run_goes_on_bitwise_from_a_checkpoint(comm, name, terms):
         resumed.restore(saved, memory)
         for _ in range(3):
             particles, saved = stepper.step(particles, 0.05), resumed.step(saved, 0.05)
-        given = {"paper": ["density_rate"], "resolved + pairs": ["density"]}.get(terms, [])
+        given = {"paper": ["density_rate"], "pressure": ["density"]}.get(terms, [])
         assert set(memory) == {"acceleration", *given} and again.time == dynamics.time
     assert all(torch.equal(getattr(particles, name), column) for name, column in saved.columns().items())
 

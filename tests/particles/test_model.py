@@ -63,7 +63,7 @@ def test_what_is_kept_of_a_linear_term_is_what_it_gives(comm, word):
 
 
 @pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("name", ["resolved + pairs", "pressure for the density", "resolved"])
+@pytest.mark.parametrize("name", ["resolved + pairs", "told densities", "pressure for the density", "resolved"])
 def test_rates_and_gradients_with_what_is_kept_are_those_without(comm, name):
     slab, particles = distributed(comm, *state())
     lagrangian = model({**MODELS[name], **SETTINGS})

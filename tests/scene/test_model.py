@@ -226,17 +226,17 @@ def test_provenance_names_no_classes_where_there_are_none():
 
 def test_who_reads_no_density_needs_none(tmp_path):
     simulation = "[simulation]\nstep = 0.02\nframe_interval = 0.1\nturnovers = 0.2\n"
-    pairs = '[model]\npreset = "resolved + pairs"\n[model.pairs]\ninputs = ["distance", "speed"]\n'
-    free = INCOMPRESSIBLE + pairs + simulation
+    free = INCOMPRESSIBLE + '[model]\npreset = "resolved + pairs"\n' + simulation
     assert read(tmp_path, free).stages == STAGES
     assert "density" not in read(tmp_path, free).model.reads
     bare = INCOMPRESSIBLE.replace("[training]\nframes = 2\nbatch = 9\nsteps = 3\n", "") + simulation
     assert read(tmp_path, bare, "simulation.method=none").stages == ("dns", "train-kernel", "simulate", "report")
     refused('[model.pairs]: reads the density, which an incompressible flow does not have; leave "density" out of '
-            '[model.pairs] inputs, or set [flow] fluid = "compressible"', lambda: read(tmp_path, free.replace(
-                '["distance", "speed"]', '["distance", "density"]')))
+            '[model.pairs] inputs, or set [flow] fluid = "compressible"', lambda: read(
+                tmp_path, free, 'model.pairs.inputs=["distance", "density"]'))
     refused('"density-flux" gives the density alone, which no term reads; remove it', lambda: read(
-        tmp_path, free, 'model.terms=["pairs", "density-flux"]', 'model.density-flux.inputs=["speed"]'))
+        tmp_path, free, 'model.terms=["pairs", "density-flux"]', 'model.pairs.inputs=["speed"]',
+        'model.density-flux.inputs=["speed"]'))
 
 
 def test_a_density_is_given_once(tmp_path):

@@ -96,9 +96,9 @@ def test_pairs_outside_the_training_data_are_counted(run_directory):
         description = json.loads(file.attrs["description"])
     scene, length = load_scene("tiny"), description["scales"]["filter_width"]
     support = scene.kernel_support / length
-    # rho'_i, rho'_j, |x|, |v|, x.v
-    assert low.shape == high.shape == (5,) and np.all(low < high)
-    assert low[0] == low[1] and high[0] == high[1] and 0 < low[2] < 0.1 * support < 0.99 * support < high[2] <= support
+    # |x|, |v|, x.v
+    assert low.shape == high.shape == (3,) and np.all(low < high)
+    assert 0 < low[0] < 0.1 * support < 0.99 * support < high[0] <= support and 0 < low[1] and low[2] < 0 < high[2]
     with h5py.File(run_directory / "rollout.h5") as file:
         share = file["outside_training/share"][()]
         assert np.array_equal(file["outside_training/time"], file["particles/model/position/time"])

@@ -19,14 +19,22 @@ from eddies.workflows.ground_truth.truth import GroundTruth
 from tests.workflows.rollout.test_particle_run import OWN_METHOD, prepared, with_method, write_model
 from tests.workflows.stopping import StopAtStep
 
+MODELS = {
+    "default": Model(preset="resolved + pairs"),
+    "told densities": Model(preset="resolved + pairs", settings={"pairs": {
+        "inputs": ("density", "distance", "speed", "approach")}}),
+    "own density": Model(preset="learned-density"),
+}
+FEATURES = {"default": 3, "told densities": 5, "own density": 10}  # of all networks; of each two densities, if any
 DENSITY = {"step": 0.015, "turnovers": 0.06}
 # Frames at every 0.04: between steps that may go beyond them, or at the ends of steps.
 CASES = {
-    "default": ("resolved + pairs", "learned", {"step": 0.03, "skin": 0.3}),
-    "default, forced, Verlet": ("resolved + pairs", "learned", {
+    "default": ("default", "learned", {"step": 0.03, "skin": 0.3}),
+    "told densities": ("told densities", "learned", {"step": 0.03, "skin": 0.3}),
+    "told densities, forced, Verlet": ("told densities", "learned", {
         "step": 0.02, "injection": "dissipation", "integrator": "verlet", "skin": 0.3}),
-    "own density": ("learned-density", "learned", {**DENSITY, "precision": "float64"}),
-    "own density, forced, Verlet": ("learned-density", "learned", {
+    "own density": ("own density", "learned", {**DENSITY, "precision": "float64"}),
+    "own density, forced, Verlet": ("own density", "learned", {
         **DENSITY, "step": 0.02, "injection": 0.5, "integrator": "verlet"}),
     "wcsph": (None, "wcsph", {"step": 0.008, "turnovers": 0.06}),
     "eulerian": (None, "eulerian", {"step": 0.02}),
@@ -37,25 +45,21 @@ CASES = {
 
 @pytest.fixture(scope="module")
 def products(comm):
-    """A directory with a ground truth, a kernel, and a model for each preset; the same on all ranks, and its scene."""
+    """A directory with a ground truth, a kernel, and each of the models; the same on all ranks, and its scene."""
     folder = Path(comm.bcast(tempfile.mkdtemp() if comm.rank == 0 else None))
     scene = prepared(comm, folder / "run", side=9, overrides=["tracers.field_cells=12"])  # enough for three slabs
     with open_product(comm, folder / "run" / "ground_truth.h5", "ground_truth") as file:
         scales = GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, 9)).scales
-    for preset, features in (("resolved + pairs", 5), ("learned-density", 10)):
+    for name, model in MODELS.items():
         if comm.rank == 0:
-            (folder / preset).mkdir()
+            (folder / name).mkdir()
         comm.Barrier()
-        write_model(comm, folder / preset, with_preset(scene, preset), scales, 0.5, features)
+        write_model(comm, folder / name, replace(scene, model=model), scales, 0.5, FEATURES[name])
     comm.Barrier()
     yield folder, scene
     comm.Barrier()
     if comm.rank == 0:
         shutil.rmtree(folder)
-
-
-def with_preset(scene, preset):
-    return scene if preset is None else replace(scene, model=Model(preset=preset))
 
 
 @pytest.fixture
@@ -64,15 +68,15 @@ def case_of(comm, products, tmp_path):
     folder, scene = products
 
     def case(name):
-        preset, method, keys = CASES[name]
+        model, method, keys = CASES[name]
         if comm.rank == 0:
-            for path in (folder / "run/ground_truth.h5", folder / "run/kernel.h5", folder / f"{preset}/model.h5"):
+            for path in (folder / "run/ground_truth.h5", folder / "run/kernel.h5", folder / f"{model}/model.h5"):
                 if path.exists():
                     (tmp_path / path.name).symlink_to(path)
         comm.Barrier()
         simulation = replace(scene.simulation, method=method, **{"turnovers": 0.11, **keys})
         coarse = {"eulerian": Eulerian(cells=12)} if method == "eulerian" else {}
-        return replace(with_preset(scene, preset), simulation=simulation, **coarse), tmp_path
+        return replace(scene, model=MODELS.get(model, scene.model), simulation=simulation, **coarse), tmp_path
 
     return case
 

@@ -33,9 +33,18 @@ def test_every_preset_is_probed(comm, preset):
     assert speed.listed is (library() is None and "pairs" in PRESETS[preset])
     # The residual that a solve starts from and the products are two transforms each, the stress two, what it misses of
     # the velocities one, the force one.
-    expected = {"resolved": (8, 30), "resolved + pairs": (8, 31)}.get(preset, (0, 0))
+    expected = (8, 30) if "pressure" in PRESETS[preset] else (0, 0)
     assert (speed.calls["transforms"], speed.components["transforms"]) == expected
     assert bool(speed.ghost_columns) == ("pairs" in PRESETS[preset])
+
+
+@pytest.mark.mpi(1, 2)
+def test_pairs_that_are_told_the_densities_want_the_pressure_at_particles_and_ghosts(comm):
+    preset = "model.preset=resolved + pairs"
+    told = probe_particles(scene_of(preset, 'model.pairs.inputs=["density", "distance", "speed", "approach"]'), comm)
+    without = probe_particles(scene_of(preset), comm)
+    assert (told.calls["transforms"], told.components["transforms"]) == (8, 31)
+    assert sorted(told.ghost_columns) == sorted([*without.ghost_columns, 8])
 
 
 @pytest.mark.mpi(1, 2)
@@ -65,7 +74,7 @@ def test_a_flow_of_a_single_resolved_shell_is_probed(comm):
 @pytest.mark.mpi(1)
 def test_forcing_is_probed_too(comm):
     forced = probe_particles(scene_of("simulation.injection=0.5"), comm)
-    assert forced.components["transforms"] == 31
+    assert forced.components["transforms"] == 30
 
 
 @pytest.mark.mpi(1, 2)

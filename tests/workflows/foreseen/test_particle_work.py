@@ -26,6 +26,7 @@ from eddies.workflows.foreseen.particle_work import (SUMS_OF_EVALUATION, SUMS_OF
 from eddies.workflows.foreseen.rollout_course import EVALUATIONS, rollout_step
 
 SIDE, ITERATIONS = 18, 2
+TOLD_DENSITIES = 'model.pairs.inputs=["density", "distance", "speed", "approach"]'
 
 
 class CountingSums:
@@ -81,11 +82,12 @@ def counted(monkeypatch):
 
 
 @pytest.mark.mpi(2, 3)
-@pytest.mark.parametrize("preset", ["resolved", "resolved + pairs", "learned-density"])
+@pytest.mark.parametrize("changes", [["resolved"], ["resolved + pairs"], ["resolved + pairs", TOLD_DENSITIES],
+                                     ["learned-density"]])
 @torch.no_grad()
-def test_messages_and_bytes_are_those_of_an_evaluation(comm, preset, counted):
+def test_messages_and_bytes_are_those_of_an_evaluation(comm, changes, counted):
     messages, sizes = counted
-    scene = scene_of(preset)
+    scene = scene_of(*changes)
     speed = probe_particles(scene, comm)
     dynamics, particles = run_of(scene, comm)
     work = replace(particle_work(scene), iterations=ITERATIONS if dynamics.resolution else 0)

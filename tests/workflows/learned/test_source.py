@@ -63,7 +63,8 @@ def test_a_run_directory_or_its_file_gives_description_weights_and_tables(comm, 
 @pytest.mark.parametrize("override, message", [
     ("model.pairs.hidden=[8, 9]", "[model.pairs] hidden = [8, 9], but {} was trained with [8, 8]; set it to that"),
     ("model.pairs.basis=paper", '[model.pairs] basis = "paper", but {} was trained with "corrected"'),
-    ('model.pairs.inputs=["distance"]', '[model.pairs] inputs = ["distance"], but {} was trained with ["density", '),
+    ('model.pairs.inputs=["distance"]', '[model.pairs] inputs = ["distance"], but {} was trained with ["distance", '
+                                        '"speed", "approach"]; set it to that'),
     ("model.pairs.network=own_networks:Net", '[model.pairs] network = "own_networks:Net", but {} was trained with '
                                              '"dense"'),
     ("model.neighbors=50", "[model] neighbors = 50.0, but {} was trained with 56.0"),
@@ -75,6 +76,18 @@ def test_another_form_is_refused_with_both_values(comm, tmp_path, own, override,
     with pytest.raises(SceneError) as error:
         read_source(scene(f"model.path={tmp_path}", override), comm)
     assert message.format(tmp_path / "model.h5") in str(error.value)
+
+
+@pytest.mark.mpi(1)
+def test_a_network_that_was_told_the_densities_is_read_by_a_scene_that_says_so(comm, tmp_path):
+    """As that of the preset was once; the preset alone does not read it."""
+    told = 'model.pairs.inputs=["density", "distance", "speed", "approach"]'
+    write_source(comm, tmp_path, described(told))
+    with pytest.raises(SceneError) as error:
+        read_source(scene(f"model.path={tmp_path}"), comm)
+    assert (f'[model.pairs] inputs = ["distance", "speed", "approach"], but {tmp_path}/model.h5 was trained with '
+            '["density", "distance", "speed", "approach"]; set it to that') in str(error.value)
+    assert read_source(scene(f"model.path={tmp_path}", told), comm).description == described(told)
 
 
 @pytest.mark.mpi(1)

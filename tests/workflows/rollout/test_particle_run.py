@@ -55,10 +55,10 @@ turnovers = 0.05
 frame_interval = 0.04
 start = {start}
 """
-MODEL = '[model]\npreset = "resolved + pairs"'
+MODEL = '[model]\npreset = "resolved + pairs"\n[model.pairs]\ninputs = ["density", "distance", "speed", "approach"]'
 WITHOUT_DENSITY = {
     "resolved": '[model]\nterms = ["pressure", "stress", "damping", "relaxation"]',
-    "pairs": '[model]\nterms = ["pressure", "pairs"]\n[model.pairs]\nhidden = [4]\ninputs = ["distance", "approach"]',
+    "pairs": '[model]\npreset = "resolved + pairs"\n[model.pairs]\nhidden = [4]',
 }
 OWN_METHOD = """
 import torch

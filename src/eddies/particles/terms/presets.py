@@ -29,7 +29,9 @@ RESOLVED = ("pressure", "stress", "viscosity", "damping", "relaxation")
 #: Of each preset the settings that differ from the terms' own, by term, in the order of the terms.
 PRESETS: dict[str, dict[str, Mapping[str, Any]]] = {
     "resolved": dict.fromkeys(RESOLVED, {}),
-    "resolved + pairs": dict.fromkeys((*RESOLVED, "pairs"), {}),
+    # The density there is that of the pressure, whose force is given: a network that is told of it learns no more, and
+    # costs twice as much, as pairs then are not opposite.
+    "resolved + pairs": {**dict.fromkeys(RESOLVED, {}), "pairs": {"inputs": ("distance", "speed", "approach")}},
     "learned-density": {"pairs": {}, "density-flux": {"zero_at_first": True}, "density-transport": {}},
     "paper": {"pairs": {"basis": "paper", "hidden": (20, 100, 20)}, "density-flux": {"hidden": (20, 100, 20)}},
     "wcsph": {"summation-density": {}, "wcsph": {}},
