@@ -57,8 +57,8 @@ def test_provenance_that_is_none(comm, tmp_path, capfd, value):
     ("kind", 3, "is of kind 3, expected ground_truth: run `eddies dns SCENE` first"),
     ("kind", [1, 2], "is of kind [1 2], expected ground_truth: run `eddies dns SCENE` first"),
     ("complete", [True, True], "damaged, its attributes cannot be read"), ("complete", "", "unfinished, its writer"),
-    ("format", [3, 3], "whose ground truth this version does not read; run `eddies dns` again"),
-    ("format", "three", "whose ground truth this version does not read; run `eddies dns` again")], ids=repr)
+    ("format", [3, 3], "whose ground truth this version does not read; remove it and run `eddies dns` again"),
+    ("format", "three", "whose ground truth this version does not read; remove it and run `eddies dns`")], ids=repr)
 def test_attributes_of_another_type(comm, tmp_path, capfd, name, value, told):
     write_ground_truth(comm, tmp_path)
     with h5py.File(tmp_path / "ground_truth.h5", "a") as file:

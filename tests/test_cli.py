@@ -87,7 +87,7 @@ def test_input_of_another_version_is_one_line(comm, tmp_path, capfd):
     if comm.rank == 0:
         assert capfd.readouterr().err == (
             f"eddies: error: {tmp_path / 'ground_truth.h5'}: written by eddies 0.1.0, whose ground truth this version "
-            "does not read; run `eddies dns` again\n")
+            "does not read; remove it and run `eddies dns` again\n")
 
 
 @pytest.mark.mpi(1, 2)

@@ -11,6 +11,7 @@ from eddies.io.hdf5 import (CHUNK_BYTES, ProductError, append_frame, create_prod
                             open_product, read_table, write_attributes, write_table)
 from eddies.io.provenance import product_fingerprint, product_provenance, read_provenance
 from eddies.parallel.stop import Stopped
+from eddies.pipeline import MAKER_OF
 
 
 def write(comm, path, kind="kernel"):
@@ -89,8 +90,8 @@ def change_format(comm, path, number):
 @pytest.mark.mpi(1, 2)
 @pytest.mark.parametrize("number", [None, 1, 4])
 @pytest.mark.parametrize("kind, remedy", [
-    ("ground_truth", "run `eddies dns` again"), ("kernel", "run `eddies train-kernel` again"),
-    ("model", "run `eddies train` again"), ("rollout", "run `eddies simulate` again"), ("frames", "make it again")])
+    *((kind, f"remove it and run `eddies {stage.name}` again") for kind, stage in MAKER_OF.items()),
+    ("frames", "make it again")])
 def test_another_format_is_refused_and_is_no_result(comm, tmp_path, kind, remedy, number):
     path = write(comm, tmp_path / "a.h5", kind)
     assert product_fingerprint(path) == "abc"

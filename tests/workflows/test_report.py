@@ -107,7 +107,7 @@ def test_a_product_of_another_version_is_said_in_one_line(comm, tmp_path):
     write_run(comm, tmp_path)
     with h5py.File(tmp_path / "kernel.h5", "r+") as file:
         del file.attrs["format"]
-    with pytest.raises(ProductError, match="kernel.h5: written by eddies .* run `eddies train-kernel` again$"):
+    with pytest.raises(ProductError, match="kernel.h5: written by eddies .* remove it and run `eddies train-kernel` "):
         report.run(tmp_path, comm)
 
 
@@ -309,8 +309,8 @@ def test_a_ground_truth_that_others_were_not_made_from_is_said_at_the_top(comm, 
     write_ground_truth(comm, tmp_path, seed=2)
     said = told_at_the_top(tmp_path, capfd)
     assert [sentence.partition(" ")[0] for sentence in said] == ["kernel.h5", "model.h5", "rollout.h5"]
-    assert all("was made from another ground_truth.h5 than the one here" in sentence and "with another seed: run" in
-               sentence for sentence in said)
+    assert all("was made from another ground_truth.h5 than the one here" in sentence
+               and "with other settings (seed = 1, now 2): remove it and run" in sentence for sentence in said)
     write_run(comm, tmp_path)
     assert told_at_the_top(tmp_path, capfd) == []
 
@@ -351,7 +351,7 @@ def test_a_ground_truth_that_is_not_finite_is_refused(comm, tmp_path):
     with h5py.File(tmp_path / "ground_truth.h5", "r+") as file:
         file["fields/filtered/velocity"][0, 0, 0, 0, 0] = math.nan
     with pytest.raises(ProductError, match="ground_truth.h5: /fields/filtered/velocity, frame 0: holds values that are "
-                                           "not finite; run `eddies dns` again"):
+                                           "not finite; remove it and run `eddies dns` again"):
         report.run(tmp_path, comm)
 
 

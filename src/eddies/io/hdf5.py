@@ -198,7 +198,7 @@ def read_frame(dataset: h5py.Dataset, frame: int, selection: tuple[slice, ...]) 
     values, kind = dataset[frame, *selection], dataset.file.attrs["kind"]
     if kind != "rollout" and not np.isfinite(values).all():
         raise ProductError(f"{dataset.file.filename}: {dataset.name}, frame {frame % len(dataset)}: holds values that "
-                           f"are not finite; {_again(kind)}")
+                           f"are not finite; {make_again(kind)}")
     return values
 
 
@@ -247,9 +247,10 @@ def _problem(file: h5py.File, kind: str | None, remedy: str) -> str | None:
     if not has_this_format(file):
         version = read_json(file, "provenance").get("eddies", "of unknown version")
         what = found.replace("_", " ")
-        return f"written by eddies {version}, whose {what} this version does not read; {_again(found)}"
+        return f"written by eddies {version}, whose {what} this version does not read; {make_again(found)}"
     return None
 
 
-def _again(kind: str) -> str:
-    return f"run `eddies {MAKER_OF[kind].name}` again" if kind in MAKER_OF else "make it again"
+def make_again(kind: str) -> str:
+    """What to do with a product that is of no use; as it is there, its stage would keep it."""
+    return f"remove it and run `eddies {MAKER_OF[kind].name}` again" if kind in MAKER_OF else "make it again"

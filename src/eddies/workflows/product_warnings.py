@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from eddies.io.hdf5 import File, read_attributes
+from eddies.io.hdf5 import File, make_again, read_attributes
 from eddies.io.stored_numbers import stored_numbers
 from eddies.pipeline import MAKER_OF, STAGES
+from eddies.workflows.run_directory.work import changed_settings, of_other_settings
 
 Provenance = Mapping[str, Any]
 
@@ -28,7 +28,7 @@ def mixed_products(provenance: Mapping[str, Provenance]) -> list[str]:
     """
     found = []
     for kind, origin in provenance.items():
-        again = f"run `eddies {MAKER_OF[kind].name}` again"
+        again = make_again(kind)
         if "made_from" not in origin:
             beside = [STAGES[name].product for name in MAKER_OF[kind].depends_on]
             known = [_made(needed, provenance[needed]) for needed in beside if "id" in provenance.get(needed, {})]
@@ -58,7 +58,7 @@ def not_finite(file: File, kind: str) -> str:
         return ""
     more = f" and {len(places) - NAMED} more" if len(places) > NAMED else ""
     status = read_attributes(file, "rollout")["status"] if kind == "rollout" else "complete"
-    remedy = f"run `eddies {MAKER_OF[kind].name}` again" if status == "complete" else f"the rollout {status}"
+    remedy = make_again(kind) if status == "complete" else f"the rollout {status}"
     return f"{MAKER_OF[kind].file} holds numbers that are not finite ({'; '.join(places[:NAMED])}{more}): {remedy}"
 
 
@@ -79,15 +79,6 @@ def _other(kind: str, origin: Provenance, present: Provenance | None) -> str:
     """The product that one was made from, beside what is here in its place."""
     if present is None:
         return f"a {MAKER_OF[kind].file} that is not here"
-    differing = _differing(kind, origin, present)
-    settings = f"with another {', '.join(differing)}" if differing else "with the same settings"
-    return f"another {MAKER_OF[kind].file} than the one here, made {present['date']} {settings}"
-
-
-def _differing(kind: str, origin: Provenance, present: Provenance) -> list[str]:
-    """The sections and keys of a scene that a product depends on in which two provenances differ."""
-    scenes = [tomllib.loads(each.get("scene", "")) for each in (origin, present)]
-    stage = MAKER_OF[kind]
-    keys = [key for name in (*stage.depends_on, stage.name) for key in STAGES[name].reads]
-    differing = [key for key in keys if scenes[0].get(key) != scenes[1].get(key)]
-    return [key if key in ("seed", "device") else f"[{key}]" for key in differing]
+    changes = changed_settings(MAKER_OF[kind], origin.get("scene", ""), present.get("scene", ""))
+    settings = of_other_settings(changes) if changes else "the same settings"
+    return f"another {MAKER_OF[kind].file} than the one here, made {present['date']} with {settings}"

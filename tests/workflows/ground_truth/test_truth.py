@@ -120,6 +120,7 @@ def test_a_value_that_is_not_finite_is_refused_by_all_ranks(comm, path, density,
         with h5py.File(path, "r+") as file:
             file[dataset][where] = np.nan
     comm.Barrier()
-    told = f"ground_truth.h5: /{dataset}, frame {where[0]}: holds values that are not finite; run `eddies dns` again"
+    told = (f"ground_truth.h5: /{dataset}, frame {where[0]}: holds values that are not finite; remove it and run "
+            "`eddies dns` again")
     with pytest.raises(ProductError, match=told):
         read(comm, path, ask)

@@ -26,5 +26,5 @@ def test_the_kernel_is_read_as_it_was_trained(comm, tmp_path):
 def test_weights_of_the_form_that_could_be_negative_are_refused(comm, tmp_path):
     """Files older than the form do not name it."""
     write(comm, tmp_path)
-    with pytest.raises(ProductError, match=r'kernel.h5: form = "NN g", .*run `eddies train-kernel` again'):
+    with pytest.raises(ProductError, match=r'kernel.h5: form = "NN g", .*remove it and run `eddies train-kernel`'):
         load_kernel(comm, tmp_path / "kernel.h5")

@@ -21,7 +21,7 @@ def load_kernel(comm: Comm, path: str | Path, device: torch.device | str = "cpu"
     form = description.get("form", "NN g")
     if form != KernelNetwork.FORM:
         raise ProductError(f'{path}: form = "{form}", which may be negative; the kernel is now "{KernelNetwork.FORM}": '
-                           "run `eddies train-kernel` again")
+                           "remove it and run `eddies train-kernel` again")
     network = KernelNetwork(description["support"], description["hidden"], description["cutoff"])
     network = network.to(dtype=torch.float32, device=device)
     network.load_state_dict({name: torch.from_numpy(tensor) for name, tensor in tensors.items()})

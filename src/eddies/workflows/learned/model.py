@@ -50,8 +50,8 @@ def with_weights(scene: Scene, description: Mapping[str, Any], weights: Mapping[
     model = scene_model(scene, scales)
     expected = {name: tuple(tensor.shape) for name, tensor in model.state_dict().items()}
     if expected != {name: tensor.shape for name, tensor in weights.items()}:
-        raise ProductError(f"{path}: its terms have other parameters now than when this was written; run "
-                           "`eddies train` again")
+        raise ProductError(f"{path}: its terms have other parameters now than when this was written; "
+                           "remove it and run `eddies train` again")
     precision = next((tensor.dtype.name for tensor in weights.values()), "float64")
     model.to(getattr(torch, precision))
     model.load_state_dict({name: torch.from_numpy(np.asarray(tensor)) for name, tensor in weights.items()})

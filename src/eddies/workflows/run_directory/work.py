@@ -48,9 +48,8 @@ class Work:
     def refuse_to_lose(self) -> None:
         """Raise WorkAtStake, which names it, if anything would be replaced."""
         if self.lost:
-            changes = ", ".join([*self.changes[:MOST_CHANGES], *(["..."] if self.changes[MOST_CHANGES:] else [])])
-            raise WorkAtStake(f"{self.directory}: holds work of other settings{changes and f' ({changes})'} that would "
-                              f"be replaced: {', '.join(self.lost)}; add --overwrite to replace it, or choose another "
+            raise WorkAtStake(f"{self.directory}: holds work of {of_other_settings(self.changes)} that would be "
+                              f"replaced: {', '.join(self.lost)}; add --overwrite to replace it, or choose another "
                               "--output")
 
 
@@ -69,7 +68,8 @@ def find_work(stages: Sequence[str], scene: Scene, directory: Path, ranks: int |
             continue
         if product.is_file() and not product.is_symlink():
             lost.append(stage.file + _cost(product, seconds.get(stage.name)))
-            changes |= dict.fromkeys(_changes(product, scene, stage))
+            then = product_provenance(product).get("scene", "")
+            changes |= dict.fromkeys(changed_settings(stage, then, scene.to_toml()))
         if checkpoints and scene.fingerprint(stage.name) not in [fingerprint for _, fingerprint in checkpoints]:
             outdated.add(stage.name)
             lost.append(f"{stage.checkpoints} (step {checkpoints[0][0]})")
@@ -93,6 +93,23 @@ def stage_seconds(directory: Path) -> dict[str, float]:
     return known if isinstance(known, dict) else {}
 
 
+def changed_settings(stage: Stage, then: str, now: str) -> list[str]:
+    """The settings that the product of a stage depends on and that differ between the texts of two scenes, each with
+    both values; none where a text is missing."""
+    if not then or not now:
+        return []
+    read = {key for name in (*stage.depends_on, stage.name) for key in STAGES[name].reads}
+    before, after = (dict(_leaves(tomllib.loads(text))) for text in (then, now))
+    return [f"{'.'.join(key)} = {_value(before, key)}, now {_value(after, key)}"
+            for key in dict.fromkeys([*after, *before]) if key[0] in read and before.get(key) != after.get(key)]
+
+
+def of_other_settings(changes: Sequence[str]) -> str:
+    """That settings have changed, and the first of those that did, in words."""
+    listed = [*changes[:MOST_CHANGES], *(["..."] if changes[MOST_CHANGES:] else [])]
+    return "other settings" + (f" ({', '.join(listed)})" if listed else "")
+
+
 def _of_other_ranks(stage: Stage, product: Path, ranks: int | None) -> bool:
     return ranks is not None and stage.name == "simulate" and product_provenance(product)["ranks"] != ranks
 
@@ -105,18 +122,8 @@ def _cost(product: Path, seconds: Any) -> str:
     return f" ({took})"
 
 
-def _changes(product: Path, scene: Scene, stage: Stage) -> Iterator[str]:
-    """The settings that the product of a stage depends on and that differ, each with its former value."""
-    read = {key for name in {*stage.depends_on, stage.name} for key in STAGES[name].reads}
-    try:
-        before, after = (dict(_leaves(tomllib.loads(text))) for text in (
-            product_provenance(product)["scene"], scene.to_toml()))
-    except (KeyError, TypeError, ValueError):  # of a damaged file, or one that no scene has made
-        return
-    for key in dict.fromkeys([*after, *before]):
-        if key[0] in read and before.get(key) != after.get(key):
-            was, is_now = (quoted(values[key]) if key in values else "absent" for values in (before, after))
-            yield f"{'.'.join(key)} = {was}, now {is_now}"
+def _value(settings: Mapping[tuple[str, ...], Any], key: tuple[str, ...]) -> str:
+    return quoted(settings[key]) if key in settings else "absent"
 
 
 def _leaves(table: Mapping[str, Any], within: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
