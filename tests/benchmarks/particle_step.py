@@ -48,6 +48,7 @@ from eddies.spectral.spectral_grid import SpectralGrid
 
 WARM_UP, STEPS, INTEGRATOR, NEIGHBORS = 10, 6, "rk3", 60.0
 DAMPING = (0.0, 0.0, 0.01, 0.14, 1.0, 1.6)
+PAIR_SHARE = 0.03  # of the acceleration, about what a trained network adds: one that is as large blows the flow up
 ETA = 1.5
 PARTS = {
     "transforms": [(SpectralGrid, "forward"), (SpectralGrid, "backward")],
@@ -93,6 +94,8 @@ class Run:
         settings = {word: load(TERMS[word][1])(**chosen) for word, chosen in terms.items()}
         built = build_model(settings, terms, flow).to(dtype)
         built.terms["damping"].rates.copy_(torch.tensor(DAMPING))
+        if "pairs" in built.terms:
+            built.terms["pairs"].network.weights[-1].mul_(PAIR_SHARE)
         self.dynamics = ParticleDynamics(slab, built, 0.0, dtype)
         self.integrator = INTEGRATORS[INTEGRATOR](self.dynamics)
 

@@ -81,6 +81,13 @@ def test_a_job_of_this_machine_that_has_ended_holds_nothing(comm, tmp_path):
 
 
 @pytest.mark.mpi(1)
+def test_a_lock_that_may_not_be_read_holds(comm, tmp_path):
+    (tmp_path / "LOCK").mkdir()
+    with pytest.raises(RunInUse, match="an unknown machine"):
+        refuse_if_held(comm, tmp_path)
+
+
+@pytest.mark.mpi(1)
 @pytest.mark.parametrize("content", ["", "[]", '{"job": 3}', "\xff"])
 def test_a_lock_that_cannot_be_read_holds_as_long_as_it_is_new(comm, tmp_path, content):
     (tmp_path / "LOCK").write_text(content, encoding="latin-1")

@@ -231,11 +231,12 @@ def _is_held_by(path: Path, holder: Holder) -> bool:
 
 
 def _read(path: Path) -> Holder:
-    content = path.read_text(errors="replace")
     try:
-        known = json.loads(content)
+        known = json.loads(path.read_text(errors="replace"))
         return Holder(**{field.name: known[field.name] for field in fields(Holder)})
-    except (ValueError, KeyError, TypeError):  # it is being written, or is no lock of a job
+    except (FileNotFoundError, NotADirectoryError):
+        raise
+    except (OSError, ValueError, KeyError, TypeError):  # another user's, being written, or no lock of a job
         return Holder(UNREADABLE, "an unknown machine", "", 0, "", "an unknown time")
 
 
