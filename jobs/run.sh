@@ -12,8 +12,6 @@ checkout=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 export OMP_NUM_THREADS=${OMP_NUM_THREADS:-${SLURM_CPUS_PER_TASK:-1}}
 arguments=(run "${EDDIES_SCENE:-hit-small}")
 if [ -n "${EDDIES_OUTPUT:-}" ]; then arguments+=(--output "$EDDIES_OUTPUT"); fi
-# Queued again, as after a node that failed: the job that may still seem to work there is this one, on another node.
-if [ "${SLURM_RESTART_COUNT:-0}" -gt 0 ]; then arguments+=(--take-over); fi
 
 trap : USR1  # some schedulers signal this shell too; the ranks end with 75, it waits for them
 status=0

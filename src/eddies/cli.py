@@ -256,10 +256,9 @@ def report_command(options: argparse.Namespace, comm: Comm) -> None:
 
 def compare_command(options: argparse.Namespace, comm: Comm, signals: list[int]) -> None:
     """Variants of a scene, one after the other, until a signal, a file STOP or the limit of wall time ends it."""
-    from eddies.io.run_lock import lock_directory
     from eddies.parallel.stop import StopRequest
     from eddies.scene.comparison import load_comparison
-    from eddies.stages import check_ranks, check_stop_file, run_stages
+    from eddies.stages import check_ranks, check_stop_file, run_stages, working_in
     from eddies.workflows.feasibility import check_feasible
     comparison = load_comparison(options.comparison, options.run)
     for scene in comparison.scenes.values():
@@ -268,10 +267,10 @@ def compare_command(options: argparse.Namespace, comm: Comm, signals: list[int])
     directory = options.output or Path("runs") / comparison.name
     check_stop_file(comm, directory)
     stop = StopRequest(comm, signals, directory / "STOP", 60 * options.max_minutes, 60 * options.checkpoint_minutes)
-    with lock_directory(comm, directory, options.take_over) as loss, stop.watching(loss):
-        import_module("eddies.workflows.compare").run(
-            comparison, comm, directory, options.overwrite,
-            lambda stages, scene, where: run_stages(stages, scene, comm, where, stop, True, options.take_over))
+    import_module("eddies.workflows.compare").run(
+        comparison, comm, directory, options.overwrite,
+        lambda: working_in(comm, directory, stop, options.take_over),
+        lambda stages, scene, where: run_stages(stages, scene, comm, where, stop, True))
 
 
 def export_command(options: argparse.Namespace, comm: Comm) -> None:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -25,7 +27,7 @@ from eddies.workflows.feasibility import check_feasible, check_ground_truth, che
 from eddies.workflows.foreseen.estimates import ground_truth_alone, most_ranks
 from eddies.workflows.foreseen.warnings import stage_warnings
 from eddies.workflows.learned.source import read_source
-from eddies.workflows.run_directory.work import SECONDS, find_work, is_done, stage_seconds
+from eddies.workflows.run_directory.work import SECONDS, Work, find_work, is_done, stage_seconds
 
 log = logging.getLogger("eddies")
 
@@ -55,15 +57,14 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
         refuse_if_held(comm, directory)
     check_inputs(stages, scene, comm, directory)
     check_stop_file(comm, directory)
-    with lock_directory(comm, directory, take_over) as loss, stop.watching(loss):
-        work = in_files(comm, directory, lambda: find_work(stages, scene, directory))
-        if not overwrite:
-            work.refuse_to_lose()
+    look_at_work(stages, scene, comm, directory, overwrite)  # before another job is ended, and once it has
+    with working_in(comm, directory, stop, take_over):
+        work = look_at_work(stages, scene, comm, directory, overwrite)
         prepare_directory(scene, comm, directory)
         tell(stages, scene, comm)
         known = False  # that the ground truth is what the other stages need
         for stage in [STAGES[name] for name in stages]:
-            if stage.name in work.done | work.outdated:  # killed in its last moment, or of others
+            if stage.name in work.useless:
                 remove_checkpoints(stage, comm, directory)
             if stage.name in work.done:
                 log.info("%s: skipped, %s is complete and made with the same settings", stage.name, stage.file)
@@ -72,6 +73,21 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
                 rest, known = stages[stages.index(stage.name):], True
                 check_ground_truth(rest, scene, comm, directory)
             run_stage(stage, scene, comm, directory, stop)
+
+
+def look_at_work(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path, overwrite: bool) -> Work:
+    """What the stages find in the run directory; WorkAtStake where they would replace it and may not `overwrite`."""
+    work = in_files(comm, directory, lambda: find_work(stages, scene, directory))
+    if not overwrite:
+        work.refuse_to_lose()
+    return work
+
+
+@contextmanager
+def working_in(comm: Comm, directory: Path, stop: StopRequest, take_over: bool) -> Iterator[None]:
+    """Hold a directory, so that no other job works there, and end with the next look of `stop` if one takes it over."""
+    with lock_directory(comm, directory, take_over) as loss, stop.watching(loss):
+        yield
 
 
 def tell(stages: Sequence[str], scene: Scene, comm: Comm) -> None:
@@ -129,12 +145,13 @@ def check_inputs(stages: Sequence[str], scene: Scene, comm: Comm, directory: Pat
             pass
         if not on_first_rank(comm, partial(is_done, needed.name, scene, directory)):
             raise SceneError(f"{directory / needed.file}: was made with other settings than this scene's; run "
-                             f"`eddies {needed.name}` again with these, or give `eddies {stages[0]}` the --set of then")
+                             f"`eddies {needed.name} --overwrite` with these, or give `eddies {stages[0]}` the --set "
+                             "of then")
 
 
 def check_stop_file(comm: Comm, directory: Path) -> None:
     """Refuse to start where a file STOP lies: put there between two jobs, it ends a chain that queues itself again."""
-    if on_first_rank(comm, (directory / "STOP").exists):
+    if on_first_rank(comm, lambda: os.path.exists(directory / "STOP")):
         raise SceneError(f"{directory / 'STOP'}: asks the job to stop before it begins; remove the file to go on")
 
 

@@ -28,7 +28,7 @@ def put(directory, holder, silent=0.0):
 @pytest.fixture
 def elsewhere():
     """A job on another machine, of which nothing is known here but its signs of life."""
-    return Holder("another", "node7", "another boot", 4242, "17", "2026-01-01T00:00:00+00:00")
+    return Holder("another", "node7", "another boot", 4242, "17", "", 0, "2026-01-01T00:00:00+00:00")
 
 
 @pytest.mark.mpi(1, 2)
@@ -119,6 +119,57 @@ def test_a_job_that_lost_its_directory_ends_and_touches_nothing(comm, tmp_path, 
 
 
 @pytest.mark.mpi(1)
+def test_a_job_that_slept_while_another_came_and_went_has_lost_its_directory(comm, tmp_path, monkeypatch):
+    monkeypatch.setattr(run_lock, "LOOK_SECONDS", 0.0)
+    with lock_directory(comm, tmp_path) as loss:
+        with lock_directory(comm, tmp_path, take_over=True):
+            pass
+        assert "taken this run directory over, and has ended; this" in str(loss())
+        with pytest.raises(RunTakenOver, match="kernel.h5: another job has taken"):
+            with create_product(comm, tmp_path / "kernel.h5", "kernel", {}):
+                (tmp_path / "kernel.h5.partial").unlink()  # as the other has
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.mpi(1)
+def test_a_file_system_that_does_not_answer_is_no_loss(comm, tmp_path, monkeypatch):
+    monkeypatch.setattr(run_lock, "LOOK_SECONDS", 0.0)
+    with lock_directory(comm, tmp_path) as loss:
+        def fail(directory):
+            raise OSError(116, "Stale file handle")
+
+        with monkeypatch.context() as patched:
+            patched.setattr(run_lock, "find_lock", fail)
+            assert loss() is None
+
+
+@pytest.mark.mpi(1)
+def test_a_batch_job_that_was_queued_again_knows_that_it_has_ended(comm, tmp_path, elsewhere, monkeypatch):
+    put(tmp_path, replace(elsewhere, batch="17"))
+    for job, restarts, free in (("18", "1", False), ("17", "0", False), ("17", "1", True)):
+        with monkeypatch.context() as patched:
+            patched.setenv("SLURM_JOB_ID", job)
+            patched.setenv("SLURM_RESTART_COUNT", restarts)
+            if not free:
+                with pytest.raises(RunInUse):
+                    refuse_if_held(comm, tmp_path)
+            else:
+                refuse_if_held(comm, tmp_path)
+
+
+@pytest.mark.mpi(1)
+def test_a_process_of_another_user_is_alive_though_nothing_is_told_of_it(comm, tmp_path, monkeypatch):
+    put(tmp_path, replace(Holder.this_job(), job="another", pid=4242, born="17"))
+
+    def refuse(pid, number):
+        raise PermissionError
+
+    monkeypatch.setattr(os, "kill", refuse)
+    with pytest.raises(RunInUse):
+        refuse_if_held(comm, tmp_path)
+
+
+@pytest.mark.mpi(1)
 def test_signs_of_life(comm, tmp_path, monkeypatch, elsewhere):
     monkeypatch.setattr(run_lock, "SIGN_SECONDS", 0.01)
     path = tmp_path / "LOCK"
@@ -180,7 +231,7 @@ def test_of_jobs_that_start_together_one_gets_in(tmp_path):
         place = tmp_path / str(trial)
         place.mkdir()
         if trial % 2:
-            put(place / "run", Holder("dead", "node7", "", 1, "", ""), silent=1000)
+            put(place / "run", Holder("dead", "node7", "", 1, "", "", 0, ""), silent=1000)
         jobs = [subprocess.Popen([sys.executable, "-c", START, str(place / "go")], stdin=subprocess.PIPE,
                                  stdout=subprocess.PIPE, text=True) for _ in range(2)]
         for job in jobs:
@@ -190,7 +241,7 @@ def test_of_jobs_that_start_together_one_gets_in(tmp_path):
         for job in jobs:
             job.communicate("\n", timeout=60)
         assert answers == ["in\n", "out\n"]
-        assert not [path for path in place.rglob("*") if path.is_file() and path.name != "go"]
+        assert {path.name for path in place.rglob("*") if path.is_file()} <= {"go", "LOCK.dead"}
 
 
 @pytest.mark.mpi(1, 2)

@@ -99,13 +99,6 @@ def test_batch_job_is_requeued_after_a_checkpoint(checkout, status, requeued):
     assert ("scontrol requeue 17" in result.stdout) == requeued
 
 
-def test_batch_job_that_was_requeued_takes_over_from_itself(checkout):
-    """A node that fails leaves the lock of the run directory behind."""
-    for count, taken in ((None, False), ("0", False), ("1", True)):
-        result = run(checkout, "slurm.sh", SLURM_JOB_ID="17", **({"SLURM_RESTART_COUNT": count} if count else {}))
-        assert ("eddies run hit-small --take-over; " in result.stdout) == taken
-
-
 def asked_of_slurm(script):
     """What the header of a job script asks for."""
     return dict(re.findall(r"^#SBATCH --([a-z-]+)=(\S+)", (CHECKOUT / "jobs" / script).read_text(), re.MULTILINE))

@@ -180,10 +180,11 @@ class CheckpointDirectory:
 
 def checkpoints_in(path: Path) -> list[tuple[int, str]]:
     """Step and fingerprint of the settings of each checkpoint in a directory, the newest first, by the manifests that
-    are as written. One rank calls it."""
+    are as written; "" of one of another format. One rank calls it."""
     manifests = [folder / MANIFEST for folder in sorted(path.glob("step-*"), reverse=True) if not folder.suffix]
     contents = [parse_manifest(manifest.read_bytes()) for manifest in manifests if manifest.is_file()]
-    return [(content["step"], content["fingerprint"]) for content in contents if content is not None]
+    return [(content["step"], content["fingerprint"] if content.get("format") == FORMAT else "")
+            for content in contents if content is not None]
 
 
 def _name(step: int) -> str:

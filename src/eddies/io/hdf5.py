@@ -84,7 +84,7 @@ def create_product(comm: MPI.Comm, path: str | Path, kind: str,
             in_files(comm, unfinished.path, unfinished.remove)
             unfinished.check()
         raise
-    in_files(comm, path, lambda: os.replace(unfinished.path, path))
+    in_files(comm, path, lambda: unfinished.publish(path))
     comm.Barrier()
 
 

@@ -66,7 +66,7 @@ def product_provenance(path: str | Path) -> dict[str, Any]:
         with h5py.File(path, "r") as file:
             sound = file.attrs.get("complete", False) and has_this_format(file)
             return read_provenance(file) if sound else {}
-    except (OSError, ValueError, KeyError, ProductError):
+    except (OSError, ValueError, KeyError, TypeError, RuntimeError):  # ProductError is one of the last
         return {}
 
 

@@ -31,7 +31,7 @@ log = logging.getLogger("eddies")
 LOCK = "LOCK"
 SIGN_SECONDS = 30.0
 STALE_SECONDS = 300.0  # without a sign of life: ten that are missed, as on a file system that hangs for a while
-UNREADABLE = "?"
+UNREADABLE = "unknown"
 
 
 class RunInUse(UserError):
@@ -53,6 +53,8 @@ class Holder:
     machine : the machine since its last start, and the processes that see each other there; empty where not known.
     pid : its process.
     born : when that process began, in the units of its machine; empty where not known.
+    batch : number of its Slurm job; empty without.
+    restarts : how often that job had been queued again.
     start : when it took the directory, UTC.
     """
 
@@ -61,17 +63,33 @@ class Holder:
     machine: str
     pid: int
     born: str
+    batch: str
+    restarts: int
     start: str
 
     @classmethod
     def this_job(cls) -> Holder:
         """The job of this process."""
+        restarts = os.environ.get("SLURM_RESTART_COUNT", "")
         return cls(uuid.uuid4().hex, socket.gethostname(), _machine(), os.getpid(), _born(os.getpid()),
+                   os.environ.get("SLURM_JOB_ID", ""), int(restarts) if restarts.isdecimal() else 0,
                    datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"))
 
     def has_ended(self) -> bool:
-        """Whether this machine knows that the process is gone; another machine cannot know."""
-        return bool(self.machine and self.born) and self.machine == _machine() and self.born != _born(self.pid)
+        """Whether it is known that the job is gone: to a later life of the same batch job, as after a node that failed,
+        and to its own machine."""
+        own = self.this_job()
+        if self.batch and self.batch == own.batch and self.restarts < own.restarts:
+            return True
+        if not self.machine or self.machine != own.machine:
+            return False
+        try:
+            os.kill(self.pid, 0)
+        except ProcessLookupError:
+            return True
+        except PermissionError:  # another user's
+            return False
+        return bool(self.born) and _born(self.pid) != self.born
 
     def __str__(self) -> str:
         return f"process {self.pid} on {self.host}, since {self.start}"
@@ -101,8 +119,7 @@ class RunLock:
 
     def __init__(self, directory: Path, holder: Holder, made: bool = False) -> None:
         self.path, self.holder, self.made = directory / LOCK, holder, made
-        self._look_at = 0.0
-        self._lost_to: Holder | None = None
+        self._look_at, self._lost_to = 0.0, ""
         self._ended = threading.Event()
         self._signs = threading.Thread(target=self._give_signs, name="run lock", daemon=True)
         self._signs.start()
@@ -110,15 +127,18 @@ class RunLock:
     def loss(self) -> RunTakenOver | None:
         """What to raise once another job has taken the directory over; looks at most once a second."""
         now = time.monotonic()
-        if self._lost_to is None and now >= self._look_at:
+        if not self._lost_to and now >= self._look_at:
             self._look_at = now + LOOK_SECONDS
-            found = find_lock(self.path.parent)
-            if found is not None and found.holder.job not in (self.holder.job, UNREADABLE):
-                self._lost_to = found.holder
-        if self._lost_to is None:
+            with contextlib.suppress(OSError):  # a file system that hangs: nothing is known, and other ranks wait
+                found = find_lock(self.path.parent)
+                if found is not None and found.holder.job not in (self.holder.job, UNREADABLE):
+                    self._lost_to = f" ({found.holder})"
+                elif _aside(self.path.parent, self.holder).exists():
+                    self._lost_to = ", and has ended"
+        if not self._lost_to:
             return None
-        return RunTakenOver(f"{self.path.parent}: another job has taken this run directory over ({self._lost_to}); "
-                            "this one ends and leaves all as it is")
+        return RunTakenOver(f"{self.path.parent}: another job has taken this run directory over{self._lost_to}; this "
+                            "one ends and leaves all as it is")
 
     def release(self) -> None:
         """Let others in; the lock of another job stays."""
@@ -126,6 +146,7 @@ class RunLock:
         self._signs.join()
         if _is_held_by(self.path, self.holder):
             self.path.unlink(missing_ok=True)
+        _aside(self.path.parent, self.holder).unlink(missing_ok=True)
         if self.made:
             with contextlib.suppress(OSError):  # it holds work
                 self.path.parent.rmdir()
@@ -133,8 +154,8 @@ class RunLock:
     def _give_signs(self) -> None:
         while not self._ended.wait(SIGN_SECONDS):
             with contextlib.suppress(OSError):  # a file system that hangs; the next sign may get through
-                if not self.path.exists():  # somebody has cleaned up
-                    _write(self.path, self.holder)
+                if not self.path.exists() and not _aside(self.path.parent, self.holder).exists():
+                    _write(self.path, self.holder)  # somebody has cleaned up
                 elif _is_held_by(self.path, self.holder):
                     os.utime(self.path)
 
@@ -170,7 +191,7 @@ def refuse_if_held(comm: MPI.Comm, directory: Path) -> None:
 
 
 def find_lock(directory: Path) -> _Found | None:
-    """The lock in a directory, by whoever holds it."""
+    """The lock in a directory, by whoever holds it; OSError where the file system does not tell."""
     path = directory / LOCK
     try:
         return _Found(_read(path), time.time() - path.stat().st_mtime)
@@ -216,14 +237,22 @@ def _write(path: Path, holder: Holder) -> None:
 
 
 def _remove(directory: Path, holder: Holder) -> None:
-    """Remove the lock of a job; if another job was quicker, give it its lock back."""
-    aside = directory / f"{LOCK}.{uuid.uuid4().hex}"
+    """Put the lock of a job aside, where the job finds it should it be alive; if another was quicker, give it its lock
+    back."""
+    aside = _aside(directory, holder)
     with contextlib.suppress(FileNotFoundError):
         os.replace(directory / LOCK, aside)
-        if not _is_held_by(aside, holder):
+        mine = _is_held_by(aside, holder)
+        if not mine:
             with contextlib.suppress(OSError):  # of a job that gives itself a new one with its next sign of life
                 os.link(aside, directory / LOCK)
-        aside.unlink()
+        if not mine or holder.job == UNREADABLE or holder.has_ended():
+            aside.unlink()
+
+
+def _aside(directory: Path, holder: Holder) -> Path:
+    """Where the lock of a job lies once another has taken the directory over."""
+    return directory / f"{LOCK}.{holder.job}"
 
 
 def _is_held_by(path: Path, holder: Holder) -> bool:
@@ -237,7 +266,7 @@ def _read(path: Path) -> Holder:
     except (FileNotFoundError, NotADirectoryError):
         raise
     except (OSError, ValueError, KeyError, TypeError):  # another user's, being written, or no lock of a job
-        return Holder(UNREADABLE, "an unknown machine", "", 0, "", "an unknown time")
+        return Holder(UNREADABLE, "an unknown machine", "", 0, "", "", 0, "an unknown time")
 
 
 def _machine() -> str:

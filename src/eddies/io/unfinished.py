@@ -14,6 +14,7 @@ from mpi4py import MPI
 
 from eddies.io.errors import NoRoom, ProductError, WriteError, wanted_and_free, write_error
 from eddies.io.room import MARGIN_BYTES, check_limit, reserve
+from eddies.io.run_lock import RunTakenOver
 from eddies.io.sink import Sink
 from eddies.parallel.broadcast import first_complaint
 
@@ -73,9 +74,20 @@ class Unfinished:
             self._sink.close()
 
     def remove(self) -> None:
-        """Remove the closed file, unless another job that has taken the directory over writes under its name."""
-        if self.path.exists() and self.path.stat().st_ino == self._inode:
+        """Remove the closed file, unless it is that of another job. Rank 0 alone calls it."""
+        if self._is_own():
             self.path.unlink()
+
+    def publish(self, path: Path) -> None:
+        """Give the closed file its name; RunTakenOver where its former one is another job's, which has taken the
+        directory over. Rank 0 alone calls it."""
+        if not self._is_own():
+            raise RunTakenOver(f"{path}: another job has taken this run directory over; this one ends and leaves all "
+                               "as it is")
+        os.replace(self.path, path)
+
+    def _is_own(self) -> bool:
+        return self.path.exists() and self.path.stat().st_ino == self._inode
 
     def abandon(self) -> None:
         """Leave the file open, as other ranks may not know that it is not written any more."""

@@ -9,12 +9,14 @@ import csv
 import io
 import json
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 from eddies.io.hdf5 import ProductError, in_files, open_product, read_attributes
 from eddies.io.provenance import read_provenance
+from eddies.io.run_lock import refuse_if_held
 from eddies.parallel.communicator import Comm
 from eddies.report.comparison import ErrorAgainstTime, run_record, sections
 from eddies.report.figures import draw
@@ -27,27 +29,50 @@ from eddies.workflows.variants.run import RunStages, VariantRun, in_directories
 log = logging.getLogger("eddies")
 
 
-def run(comparison: Comparison, comm: Comm, output: Path, overwrite: bool, run_stages: RunStages) -> None:
+def run(comparison: Comparison, comm: Comm, output: Path, overwrite: bool,
+        hold: Callable[[], AbstractContextManager[None]], run_stages: RunStages) -> None:
     """Run every variant and write comparison.csv, comparison.json, figures and index.html; all ranks call it.
 
     A variant that fails does not end the comparison: its row says when and why. Rollouts that are there, made with the
-    same settings on as many ranks, are kept.
+    same settings on as many ranks, are kept. `hold` keeps other jobs out of the directory.
 
     Raises:
         ProductError, SceneError: a ground truth is missing, or does not fit the comparison; or the run directory of a
             variant holds what no comparison has made. Nothing is written then.
         WorkAtStake: without `overwrite`, where work of other settings or numbers of ranks would be replaced.
+        RunInUse: another job works in the directory, or in that of a variant.
     """
     runs = [VariantRun(scene, output / name, comparison.ground_truth_of(name))
             for name, scene in comparison.scenes.items()]
     in_directories(comm, lambda: check_directories(runs))
     for variant in runs:
         check_ground_truth(comparison, variant, comm)
+    for variant in runs:
+        look_at(variant, comm, overwrite)
+    with hold():
+        run_all(comparison, runs, comm, overwrite, run_stages)
+        alone = comm.Split(comm.rank)
+        try:
+            table = in_files(comm, output, lambda: rows(comparison, runs, alone, comm.size))
+        finally:
+            alone.Free()
+        write(comparison, table, comm, output)
+
+
+def look_at(variant: VariantRun, comm: Comm, overwrite: bool) -> None:
+    """Refuse a variant's directory in which another job works, or work would be replaced that may not be."""
+    refuse_if_held(comm, variant.directory)
     if not overwrite:
-        in_directories(comm, lambda: [variant.work(comm.size).refuse_to_lose() for variant in runs])
+        in_directories(comm, lambda: variant.work(comm.size).refuse_to_lose())
+
+
+def run_all(comparison: Comparison, runs: Sequence[VariantRun], comm: Comm, overwrite: bool,
+            run_stages: RunStages) -> None:
+    """Roll all variants out, then time them in rounds."""
     errors = comm.Dup()
     for done, variant in enumerate(runs):
         log.info("compare: %s, %d of %d", variant.name, done + 1, len(runs))
+        look_at(variant, comm, overwrite)  # once more: hours may have passed
         in_directories(comm, lambda: variant.prepare(runs[:done], comm.size))
         variant.attempt(errors, lambda: variant.roll_out(run_stages))
     for repeat in range(1, comparison.repeats):
@@ -56,12 +81,6 @@ def run(comparison: Comparison, comm: Comm, output: Path, overwrite: bool, run_s
             if variant.failure is None:
                 variant.attempt(errors, lambda: variant.time_block(comm, run_stages))
     errors.Free()
-    alone = comm.Split(comm.rank)
-    try:
-        table = in_files(comm, output, lambda: rows(comparison, runs, alone, comm.size))
-    finally:
-        alone.Free()
-    write(comparison, table, comm, output)
 
 
 def check_directories(runs: Sequence[VariantRun]) -> None:

@@ -79,6 +79,6 @@ def _other(kind: str, origin: Provenance, present: Provenance | None) -> str:
     """The product that one was made from, beside what is here in its place."""
     if present is None:
         return f"a {MAKER_OF[kind].file} that is not here"
-    changes = changed_settings(MAKER_OF[kind], origin.get("scene", ""), present.get("scene", ""))
+    changes = changed_settings(MAKER_OF[kind], origin.get("scene"), present.get("scene"))
     settings = of_other_settings(changes) if changes else "the same settings"
     return f"another {MAKER_OF[kind].file} than the one here, made {present['date']} with {settings}"

@@ -145,10 +145,10 @@ def _read_part(kind: str, file: File, record: Run, read: Callable[[File, Run], l
     try:
         return read(file, record)
     except (ValueError, OverflowError) as error:  # of a figure's limits, of a PDF, of a number of times
-        if kind not in record.not_finite:
+        if not record.not_finite:  # of this product, or of the ground truth, which sections on others take from
             raise
         title = kind.replace("_", " ").capitalize()
-        return [Section(kind, title, notices=[f"Not shown ({error}): {record.not_finite[kind]}"])]
+        return [Section(kind, title, notices=[f"Not shown ({error}): {'; '.join(record.not_finite.values())}"])]
 
 
 def _write_report(directory: Path, record: Run, sections: Sequence[Section]) -> None:

@@ -35,7 +35,7 @@ def save(comm, directory, scene, stage, step):
 def test_an_empty_directory_loses_nothing(comm, tmp_path, scene):
     for directory in (tmp_path, tmp_path / "nowhere"):
         work = find_work(scene.stages, scene, directory)
-        assert not work.done and not work.outdated and not work.lost
+        assert not work.done and not work.useless and not work.lost
         work.refuse_to_lose()
 
 
@@ -86,7 +86,7 @@ def test_checkpoints_of_other_settings_are_work_too(comm, tmp_path, scene):
     other = load_scene("tiny", ["training.steps=70"])
     save(comm, tmp_path, other, "train", 5)
     work = find_work(scene.stages, scene, tmp_path)
-    assert work.outdated == {"train"}
+    assert work.useless == {"train"}
     with pytest.raises(WorkAtStake, match=r"would be replaced: checkpoints-train \(step 5\); add"):
         work.refuse_to_lose()
     assert not find_work(other.stages, other, tmp_path).lost
@@ -94,7 +94,27 @@ def test_checkpoints_of_other_settings_are_work_too(comm, tmp_path, scene):
     save(comm, tmp_path, scene, "train", 3)
     assert not find_work(scene.stages, scene, tmp_path).lost  # there is one to go on from
     (tmp_path / "checkpoints-train/step-00000003/manifest.json").write_text("damaged")
-    assert find_work(scene.stages, scene, tmp_path).outdated == {"train"}
+    assert find_work(scene.stages, scene, tmp_path).useless == {"train"}
+
+
+@pytest.mark.mpi(1)
+def test_checkpoints_beside_a_product_that_fits_are_for_whoever_replaces_it(comm, tmp_path, scene):
+    leave(comm, tmp_path, scene, ["train"])
+    other = load_scene("tiny", ["training.steps=70"])
+    save(comm, tmp_path, other, "train", 5)
+    work = find_work(["train"], scene, tmp_path)
+    assert work.done == {"train"} and not work.useless and not work.lost
+    assert [each.split()[0] for each in find_work(["train"], other, tmp_path).lost] == ["model.h5"]
+    save(comm, tmp_path, scene, "train", 7)  # left behind, as the product is complete
+    assert find_work(["train"], scene, tmp_path).useless == {"train"}
+
+
+@pytest.mark.mpi(1)
+def test_checkpoints_of_another_format_are_work_that_nobody_goes_on_with(comm, tmp_path, scene, monkeypatch):
+    monkeypatch.setattr("eddies.io.checkpoint.FORMAT", 4)
+    save(comm, tmp_path, scene, "train", 5)
+    monkeypatch.undo()
+    assert find_work(["train"], scene, tmp_path).lost == ("checkpoints-train (step 5)",)
 
 
 @pytest.mark.mpi(1)

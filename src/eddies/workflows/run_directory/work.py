@@ -34,14 +34,15 @@ class Work:
     ----------
     directory : the run directory.
     done : the stages whose product is complete and was made with the same settings.
-    outdated : the stages whose checkpoints were all made with other settings.
+    useless : the stages whose checkpoints are of no use: left behind by a run that came to its end, or of other
+        settings and to be replaced.
     lost : what they would replace, with what it cost, in words.
     changes : which settings differ from those that this was made with, in words.
     """
 
     directory: Path
     done: frozenset[str]
-    outdated: frozenset[str]
+    useless: frozenset[str]
     lost: tuple[str, ...]
     changes: tuple[str, ...]
 
@@ -58,29 +59,35 @@ def find_work(stages: Sequence[str], scene: Scene, directory: Path, ranks: int |
 
     With `ranks`, a rollout on another number of them is no longer of use: its times are to be compared.
     """
-    done, outdated, lost, changes = set(), set(), [], {}
+    done, useless, lost, changes = set(), set(), [], {}
     seconds = stage_seconds(directory)
     for stage in [STAGES[name] for name in stages if STAGES[name].product is not None]:
         product = directory / stage.file
         checkpoints = checkpoints_in(directory / stage.checkpoints) if stage.checkpoints else []
-        if is_done(stage.name, scene, directory) and not _of_other_ranks(stage, product, ranks):
+        of_others = checkpoints and scene.fingerprint(stage.name) not in [fingerprint for _, fingerprint in checkpoints]
+        origin = product_provenance(product)
+        other_ranks = stage.name == "simulate" and ranks not in (None, origin.get("ranks"))
+        if _fits(origin, stage.name, scene) and not other_ranks:
             done.add(stage.name)
+            if not of_others:  # those may be gone on with by whoever wants to replace the product
+                useless.add(stage.name)
             continue
         if product.is_file() and not product.is_symlink():
-            lost.append(stage.file + _cost(product, seconds.get(stage.name)))
-            then = product_provenance(product).get("scene", "")
-            changes |= dict.fromkeys(changed_settings(stage, then, scene.to_toml()))
-        if checkpoints and scene.fingerprint(stage.name) not in [fingerprint for _, fingerprint in checkpoints]:
-            outdated.add(stage.name)
+            lost.append(stage.file + _cost(origin, seconds.get(stage.name)))
+            differ = changed_settings(stage, origin.get("scene"), scene.to_toml())
+            if origin and other_ranks:
+                differ.append(f"ranks = {origin['ranks']}, now {ranks}")
+            changes |= dict.fromkeys(differ)
+        if of_others:
+            useless.add(stage.name)
             lost.append(f"{stage.checkpoints} (step {checkpoints[0][0]})")
-    return Work(directory, frozenset(done), frozenset(outdated), tuple(lost), tuple(changes))
+    return Work(directory, frozenset(done), frozenset(useless), tuple(lost), tuple(changes))
 
 
 def is_done(stage: str, scene: Scene, directory: Path) -> bool:
     """Whether the product of a stage is complete and was made with the same settings. One rank calls it."""
-    product = STAGES[stage].product
-    return product is not None and product_provenance(directory / STAGES[stage].file).get(
-        "fingerprint") == scene.fingerprint(stage)
+    return STAGES[stage].product is not None and _fits(
+        product_provenance(directory / STAGES[stage].file), stage, scene)
 
 
 def stage_seconds(directory: Path) -> dict[str, float]:
@@ -93,13 +100,16 @@ def stage_seconds(directory: Path) -> dict[str, float]:
     return known if isinstance(known, dict) else {}
 
 
-def changed_settings(stage: Stage, then: str, now: str) -> list[str]:
+def changed_settings(stage: Stage, then: str | None, now: str | None) -> list[str]:
     """The settings that the product of a stage depends on and that differ between the texts of two scenes, each with
-    both values; none where a text is missing."""
-    if not then or not now:
-        return []
+    both values; none where a text is missing or damaged."""
     read = {key for name in (*stage.depends_on, stage.name) for key in STAGES[name].reads}
-    before, after = (dict(_leaves(tomllib.loads(text))) for text in (then, now))
+    try:
+        before, after = (dict(_leaves(tomllib.loads(text or ""))) for text in (then, now))
+    except (TypeError, ValueError):
+        return []
+    if not before or not after:
+        return []
     return [f"{'.'.join(key)} = {_value(before, key)}, now {_value(after, key)}"
             for key in dict.fromkeys([*after, *before]) if key[0] in read and before.get(key) != after.get(key)]
 
@@ -110,12 +120,11 @@ def of_other_settings(changes: Sequence[str]) -> str:
     return "other settings" + (f" ({', '.join(listed)})" if listed else "")
 
 
-def _of_other_ranks(stage: Stage, product: Path, ranks: int | None) -> bool:
-    return ranks is not None and stage.name == "simulate" and product_provenance(product)["ranks"] != ranks
+def _fits(origin: Mapping[str, Any], stage: str, scene: Scene) -> bool:
+    return origin.get("fingerprint") == scene.fingerprint(stage)
 
 
-def _cost(product: Path, seconds: Any) -> str:
-    origin = product_provenance(product)
+def _cost(origin: Mapping[str, Any], seconds: Any) -> str:
     if not origin:
         return " (damaged, unfinished or of another version)"
     took = f"took {duration(seconds)}" if isinstance(seconds, int | float) else f"made {origin['date']}"
