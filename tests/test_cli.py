@@ -181,7 +181,7 @@ def test_input_of_other_settings_is_refused(comm, tmp_path, capfd):
     check_inputs(["train-kernel"], scene, comm, tmp_path)
     assert run_cli("train-kernel", "tiny", "--set", "seed=2", "--output", tmp_path) == 2
     errors = capfd.readouterr().err
-    assert comm.rank > 0 or "ground_truth.h5: was made with other settings" in errors and "`eddies dns`" in errors
+    assert comm.rank > 0 or "ground_truth.h5: was made with other settings" in errors and "run `eddies dns --overwrite`" in errors
     assert not (tmp_path / "kernel.h5").exists() and not (tmp_path / "scene.toml").exists()
 
 
