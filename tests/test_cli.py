@@ -181,7 +181,8 @@ def test_input_of_other_settings_is_refused(comm, tmp_path, capfd):
     check_inputs(["train-kernel"], scene, comm, tmp_path)
     assert run_cli("train-kernel", "tiny", "--set", "seed=2", "--output", tmp_path) == 2
     errors = capfd.readouterr().err
-    assert comm.rank > 0 or "ground_truth.h5: was made with other settings" in errors and "run `eddies dns --overwrite`" in errors
+    assert comm.rank > 0 or "ground_truth.h5: was made with other settings" in errors
+    assert comm.rank > 0 or "run `eddies dns --overwrite` with these" in errors
     assert not (tmp_path / "kernel.h5").exists() and not (tmp_path / "scene.toml").exists()
 
 
@@ -211,7 +212,8 @@ def test_limit_of_ranks_is_that_of_the_stages(comm):
 def test_seconds_of_stages_are_kept(comm, tmp_path, before, kept):
     from eddies.stages import record_seconds
     (tmp_path / "stage_seconds.json").write_text(before)
-    record_seconds("train", 2.0, comm, tmp_path)
+    assert record_seconds("train", 2.0, comm, tmp_path, begun=False) == 2
+    assert record_seconds("train", 3.0, comm, tmp_path, begun=True) == 5
     assert json.loads((tmp_path / "stage_seconds.json").read_text()).keys() == kept
     assert len(list(tmp_path.iterdir())) == 1
 
@@ -221,7 +223,7 @@ def test_seconds_that_cannot_be_written_are_told_by_all(comm, tmp_path):
     from eddies.io.hdf5 import ProductError
     from eddies.stages import record_seconds
     with pytest.raises(ProductError, match="nowhere/stage_seconds.json: No such file or directory; check"):
-        record_seconds("train", 2.0, comm, tmp_path / "nowhere")
+        record_seconds("train", 2.0, comm, tmp_path / "nowhere", begun=False)
 
 
 @pytest.mark.mpi(1, 2)

@@ -20,7 +20,7 @@ from eddies.io.run_lock import lock_directory, refuse_if_held
 from eddies.io.whole_files import write_files
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm
-from eddies.parallel.stop import StopRequest
+from eddies.parallel.stop import Stopped, StopRequest
 from eddies.pipeline import STAGES, Stage
 from eddies.scene.scene import Scene, SceneError
 from eddies.workflows.feasibility import check_feasible, check_ground_truth, check_places
@@ -72,7 +72,7 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
             if "dns" in stage.depends_on and stage.product is not None and not known:
                 rest, known = stages[stages.index(stage.name):], True
                 check_ground_truth(rest, scene, comm, directory)
-            run_stage(stage, scene, comm, directory, stop)
+            run_stage(stage, scene, comm, directory, stop, stage.name in work.begun)
 
 
 def look_at_work(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path, overwrite: bool) -> Work:
@@ -99,16 +99,21 @@ def tell(stages: Sequence[str], scene: Scene, comm: Comm) -> None:
             log.warning(problem)
 
 
-def run_stage(stage: Stage, scene: Scene, comm: Comm, directory: Path, stop: StopRequest) -> None:
-    """Run one stage, and record its wall time."""
+def run_stage(stage: Stage, scene: Scene, comm: Comm, directory: Path, stop: StopRequest, begun: bool) -> None:
+    """Run one stage, and record its wall time, also when it is stopped: if it was `begun` before, that is added."""
     log.info("%s: starts on %d %s", stage.name, comm.size, "rank" if comm.size == 1 else "ranks")
     start = time.perf_counter()
     module, _, function = stage.run.partition(":")
     run = getattr(import_module(module), function)
     stop.check()
-    run(scene, comm, directory, stop)
-    comm.Barrier()
-    record_seconds(stage.name, time.perf_counter() - start, comm, directory)
+    try:
+        run(scene, comm, directory, stop)
+        comm.Barrier()
+    except Stopped:
+        record_seconds(stage.name, time.perf_counter() - start, comm, directory, begun)
+        raise
+    seconds = record_seconds(stage.name, time.perf_counter() - start, comm, directory, begun)
+    log.info("%s: took %s", stage.name, duration(seconds))
 
 
 def remove_checkpoints(stage: Stage, comm: Comm, directory: Path) -> None:
@@ -170,9 +175,15 @@ def prepare_directory(scene: Scene, comm: Comm, directory: Path) -> None:
                           "--output") from None
 
 
-def record_seconds(stage: str, seconds: float, comm: Comm, directory: Path) -> None:
-    """Log the wall time of a stage and keep it in stage_seconds.json, which holds the last of each stage."""
-    log.info("%s: took %s", stage, duration(seconds))
+def record_seconds(stage: str, seconds: float, comm: Comm, directory: Path, begun: bool) -> float:
+    """Keep the wall time of a stage in stage_seconds.json, which holds that of each, and give it: of all its runs, as
+    far as they were not killed, if it was `begun` before."""
     path = directory / SECONDS
-    in_files(comm, path, lambda: write_files(
-        {path: json.dumps({**stage_seconds(directory), stage: round(seconds, 3)}, indent=2) + "\n"}))
+
+    def record() -> float:
+        known = stage_seconds(directory)
+        whole = seconds + (known.get(stage, 0.0) if begun else 0.0)
+        write_files({path: json.dumps({**known, stage: round(whole, 3)}, indent=2) + "\n"})
+        return whole
+
+    return in_files(comm, path, record)

@@ -15,6 +15,7 @@ from eddies.io.weights import load_weights
 from eddies.parallel.stop import Stopped, StopRequest
 from eddies.scene.scene import SceneError, load_scene
 from eddies.workflows import dns, train, train_kernel
+from eddies.workflows.run_directory.work import stage_seconds
 from tests.workflows.stopping import StopAtStep
 
 # Ten frame intervals, all of them for training: six steps on single frames, two of them with every loss; and then, or
@@ -131,7 +132,9 @@ def test_a_training_goes_on_from_products_of_the_settings_that_it_began_with(com
 
     # One look is before the stage begins.
     stopped(3, 2)
+    first = stage_seconds(tmp_path)["train"]
     stopped(2, 3)
+    assert stage_seconds(tmp_path)["train"] > first > 0
     if comm.rank == 0:
         (tmp_path / "kernel.h5").unlink()
     # The kernel is trained in two forms of two steps each; made with the same settings, it is the one of before.

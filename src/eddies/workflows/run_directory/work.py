@@ -34,6 +34,7 @@ class Work:
     ----------
     directory : the run directory.
     done : the stages whose product is complete and was made with the same settings.
+    begun : the stages that go on from a checkpoint.
     useless : the stages whose checkpoints are of no use: left behind by a run that came to its end, or of other
         settings and to be replaced.
     lost : what they would replace, with what it cost, in words.
@@ -42,6 +43,7 @@ class Work:
 
     directory: Path
     done: frozenset[str]
+    begun: frozenset[str]
     useless: frozenset[str]
     lost: tuple[str, ...]
     changes: tuple[str, ...]
@@ -59,7 +61,7 @@ def find_work(stages: Sequence[str], scene: Scene, directory: Path, ranks: int |
 
     With `ranks`, a rollout on another number of them is no longer of use: its times are to be compared.
     """
-    done, useless, lost, changes = set(), set(), [], {}
+    done, begun, useless, lost, changes = set(), set(), set(), [], {}
     seconds = stage_seconds(directory)
     for stage in [STAGES[name] for name in stages if STAGES[name].product is not None]:
         product = directory / stage.file
@@ -78,10 +80,12 @@ def find_work(stages: Sequence[str], scene: Scene, directory: Path, ranks: int |
             if origin and other_ranks:
                 differ.append(f"ranks = {origin['ranks']}, now {ranks}")
             changes |= dict.fromkeys(differ)
+        if checkpoints and not of_others:
+            begun.add(stage.name)
         if of_others:
             useless.add(stage.name)
             lost.append(f"{stage.checkpoints} (step {checkpoints[0][0]})")
-    return Work(directory, frozenset(done), frozenset(useless), tuple(lost), tuple(changes))
+    return Work(directory, frozenset(done), frozenset(begun), frozenset(useless), tuple(lost), tuple(changes))
 
 
 def is_done(stage: str, scene: Scene, directory: Path) -> bool:
@@ -91,13 +95,14 @@ def is_done(stage: str, scene: Scene, directory: Path) -> bool:
 
 
 def stage_seconds(directory: Path) -> dict[str, float]:
-    """Wall time of each stage as an earlier run noted it; a file that is missing or damaged holds nothing worth an
+    """Wall time of each stage as earlier runs noted it; a file that is missing or damaged holds nothing worth an
     error."""
     try:
         known = json.loads((directory / SECONDS).read_text())
     except (OSError, ValueError):
         return {}
-    return known if isinstance(known, dict) else {}
+    return {stage: seconds for stage, seconds in known.items() if isinstance(seconds, int | float)} if isinstance(
+        known, dict) else {}
 
 
 def changed_settings(stage: Stage, then: str | None, now: str | None) -> list[str]:
@@ -124,11 +129,10 @@ def _fits(origin: Mapping[str, Any], stage: str, scene: Scene) -> bool:
     return origin.get("fingerprint") == scene.fingerprint(stage)
 
 
-def _cost(origin: Mapping[str, Any], seconds: Any) -> str:
+def _cost(origin: Mapping[str, Any], seconds: float | None) -> str:
     if not origin:
         return " (damaged, unfinished or of another version)"
-    took = f"took {duration(seconds)}" if isinstance(seconds, int | float) else f"made {origin['date']}"
-    return f" ({took})"
+    return f" (made {origin['date']})" if seconds is None else f" (took {duration(seconds)})"
 
 
 def _value(settings: Mapping[tuple[str, ...], Any], key: tuple[str, ...]) -> str:
