@@ -207,41 +207,44 @@ def test_of_two_that_find_a_dead_job_one_gets_in(comm, tmp_path, elsewhere, monk
     assert not list(tmp_path.iterdir())
 
 
-START = """
+STARTS = """
 import sys, time
 from pathlib import Path
 from mpi4py import MPI
 from eddies.io.run_lock import RunInUse, lock_directory
-go = Path(sys.argv[1])
 print("ready", flush=True)
-while not go.exists():
-    time.sleep(1e-4)
-try:
-    with lock_directory(MPI.COMM_SELF, go.parent / "run"):
-        print("in", flush=True)
+for place in sorted(Path(sys.argv[1]).iterdir()):
+    while not (place / "go").exists():
+        time.sleep(1e-4)
+    try:
+        with lock_directory(MPI.COMM_SELF, place / "run"):
+            print("in", flush=True)
+            input()
+    except RunInUse:
+        print("out", flush=True)
         input()
-except RunInUse:
-    print("out", flush=True)
 """
 
 
 def test_of_jobs_that_start_together_one_gets_in(tmp_path):
     """Twenty times, without a lock and with that of a job that was killed."""
-    for trial in range(20):
-        place = tmp_path / str(trial)
+    places = [tmp_path / f"{trial:02d}" for trial in range(20)]
+    for trial, place in enumerate(places):
         place.mkdir()
         if trial % 2:
             put(place / "run", Holder("dead", "node7", "", 1, "", "", 0, ""), silent=1000)
-        jobs = [subprocess.Popen([sys.executable, "-c", START, str(place / "go")], stdin=subprocess.PIPE,
-                                 stdout=subprocess.PIPE, text=True) for _ in range(2)]
-        for job in jobs:
-            assert job.stdout.readline() == "ready\n"
+    jobs = [subprocess.Popen([sys.executable, "-c", STARTS, str(tmp_path)], stdin=subprocess.PIPE,
+                             stdout=subprocess.PIPE, text=True) for _ in range(2)]
+    for job in jobs:
+        assert job.stdout.readline() == "ready\n"
+    for place in places:
         (place / "go").write_text("")
-        answers = sorted(job.stdout.readline() for job in jobs)
+        assert sorted(job.stdout.readline() for job in jobs) == ["in\n", "out\n"]
         for job in jobs:
-            job.communicate("\n", timeout=60)
-        assert answers == ["in\n", "out\n"]
-        assert {path.name for path in place.rglob("*") if path.is_file()} <= {"go", "LOCK.dead"}
+            job.stdin.write("\n")
+            job.stdin.flush()
+    assert [job.wait(timeout=60) for job in jobs] == [0, 0]
+    assert {path.name for path in tmp_path.rglob("*") if path.is_file()} == {"go", "LOCK.dead"}
 
 
 @pytest.mark.mpi(1, 2)
