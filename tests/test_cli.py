@@ -325,6 +325,25 @@ def test_a_second_job_is_refused_and_may_take_over(tmp_path):
 
 
 @pytest.mark.mpi(1, 2)
+def test_a_command_that_would_replace_work_ends_no_other_job(comm, tmp_path, capfd):
+    from eddies.io.run_lock import lock_directory
+    assert run_cli("dns", *ABC, "--output", tmp_path) == 0
+    comm.Barrier()
+    with lock_directory(comm, tmp_path) as loss:
+        assert run_cli("dns", *ABC, "--output", tmp_path, "--set", "flow.viscosity=0.2", "--take-over") == 2
+        assert comm.rank > 0 or "would be replaced: ground_truth.h5" in capfd.readouterr().err
+        assert loss() is None
+
+
+@pytest.mark.mpi(1)
+def test_what_a_killed_job_left_unfinished_is_removed(comm, tmp_path):
+    (tmp_path / "ground_truth.h5.partial").write_text("half")
+    (tmp_path / "kernel.h5.partial").write_text("half")
+    assert run_cli("dns", *ABC, "--output", tmp_path) == 0
+    assert not list(tmp_path.glob("*.partial"))
+
+
+@pytest.mark.mpi(1, 2)
 def test_a_limit_of_wall_time_or_a_file_stops_the_job(comm, tmp_path, capfd):
     assert run_cli("dns", *ABC, "--output", tmp_path, "--max-minutes", "1e-9") == 75
     errors = capfd.readouterr().err

@@ -268,9 +268,9 @@ def compare_command(options: argparse.Namespace, comm: Comm, signals: list[int])
     check_stop_file(comm, directory)
     stop = StopRequest(comm, signals, directory / "STOP", 60 * options.max_minutes, 60 * options.checkpoint_minutes)
     import_module("eddies.workflows.compare").run(
-        comparison, comm, directory, options.overwrite,
+        comparison, comm, directory, options.overwrite, options.take_over,
         lambda: working_in(comm, directory, stop, options.take_over),
-        lambda stages, scene, where: run_stages(stages, scene, comm, where, stop, True))
+        lambda stages, scene, where: run_stages(stages, scene, comm, where, stop, True, options.take_over))
 
 
 def export_command(options: argparse.Namespace, comm: Comm) -> None:

@@ -14,7 +14,6 @@ from pathlib import Path
 
 from eddies.clock import duration
 from eddies.io.checkpoint import CheckpointDirectory
-from eddies.io.errors import write_error
 from eddies.io.hdf5 import in_files, open_product
 from eddies.io.run_lock import lock_directory, refuse_if_held
 from eddies.io.whole_files import write_files
@@ -53,11 +52,12 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
     check_feasible(stages, scene, comm)
     check_ranks(stages, scene, comm)
     check_places(stages, comm, directory)
-    if not take_over:
+    if take_over:
+        look_at_work(stages, scene, comm, directory, overwrite)  # a command that is refused ends no other job
+    else:
         refuse_if_held(comm, directory)
     check_inputs(stages, scene, comm, directory)
     check_stop_file(comm, directory)
-    look_at_work(stages, scene, comm, directory, overwrite)  # before another job is ended, and once it has
     with working_in(comm, directory, stop, take_over):
         work = look_at_work(stages, scene, comm, directory, overwrite)
         prepare_directory(scene, comm, directory)
@@ -168,11 +168,7 @@ def prepare_directory(scene: Scene, comm: Comm, directory: Path) -> None:
             leftover.unlink()
         write_files({directory / "scene.toml": scene.to_toml()})
 
-    try:
-        on_first_rank(comm, write)
-    except OSError as error:
-        raise write_error(directory, error, f"{directory}: cannot be written ({error.strerror}); choose another "
-                          "--output") from None
+    in_files(comm, directory, write)
 
 
 def record_seconds(stage: str, seconds: float, comm: Comm, directory: Path, begun: bool) -> float:

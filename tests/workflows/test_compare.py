@@ -92,6 +92,14 @@ def test_variants_are_run_measured_and_kept(comm, folder, capfd):
     if comm.rank == 0:
         (out / "no-force/rollout.h5").unlink()
     comm.Barrier()
+    if comm.rank == 0:
+        (folder / "changed.toml").write_text(FILE.replace("simulation.step=0.1", "simulation.step=0.12"))
+    comm.Barrier()
+    assert run_cli("compare", "changed.toml", "--output", "out") == 2
+    told = "longer-steps: holds work of other settings (simulation.step = 0.1, now 0.12) that would be replaced"
+    assert comm.rank > 0 or told in capfd.readouterr().err
+    comm.Barrier()
+    assert {path: path.stat().st_mtime_ns for path in out.glob("*/*.h5")}.items() <= before.items()
     assert run_cli("compare", "small.toml", "--output", "out") == 0
     comm.Barrier()
     assert [str(path.relative_to(out)) for path, time in before.items() if path.stat().st_mtime_ns != time] == [

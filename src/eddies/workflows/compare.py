@@ -29,7 +29,7 @@ from eddies.workflows.variants.run import RunStages, VariantRun, in_directories
 log = logging.getLogger("eddies")
 
 
-def run(comparison: Comparison, comm: Comm, output: Path, overwrite: bool,
+def run(comparison: Comparison, comm: Comm, output: Path, overwrite: bool, take_over: bool,
         hold: Callable[[], AbstractContextManager[None]], run_stages: RunStages) -> None:
     """Run every variant and write comparison.csv, comparison.json, figures and index.html; all ranks call it.
 
@@ -48,9 +48,9 @@ def run(comparison: Comparison, comm: Comm, output: Path, overwrite: bool,
     for variant in runs:
         check_ground_truth(comparison, variant, comm)
     for variant in runs:
-        look_at(variant, comm, overwrite)
+        look_at(variant, comm, overwrite, take_over)
     with hold():
-        run_all(comparison, runs, comm, overwrite, run_stages)
+        run_all(comparison, runs, comm, overwrite, take_over, run_stages)
         alone = comm.Split(comm.rank)
         try:
             table = in_files(comm, output, lambda: rows(comparison, runs, alone, comm.size))
@@ -59,20 +59,21 @@ def run(comparison: Comparison, comm: Comm, output: Path, overwrite: bool,
         write(comparison, table, comm, output)
 
 
-def look_at(variant: VariantRun, comm: Comm, overwrite: bool) -> None:
-    """Refuse a variant's directory in which another job works, or work would be replaced that may not be."""
-    refuse_if_held(comm, variant.directory)
+def look_at(variant: VariantRun, comm: Comm, overwrite: bool, take_over: bool) -> None:
+    """Refuse a variant's directory in which another job works, or work would be replaced, where that may not be."""
+    if not take_over:
+        refuse_if_held(comm, variant.directory)
     if not overwrite:
         in_directories(comm, lambda: variant.work(comm.size).refuse_to_lose())
 
 
-def run_all(comparison: Comparison, runs: Sequence[VariantRun], comm: Comm, overwrite: bool,
+def run_all(comparison: Comparison, runs: Sequence[VariantRun], comm: Comm, overwrite: bool, take_over: bool,
             run_stages: RunStages) -> None:
     """Roll all variants out, then time them in rounds."""
     errors = comm.Dup()
     for done, variant in enumerate(runs):
         log.info("compare: %s, %d of %d", variant.name, done + 1, len(runs))
-        look_at(variant, comm, overwrite)  # once more: hours may have passed
+        look_at(variant, comm, overwrite, take_over)  # once more: hours may have passed
         in_directories(comm, lambda: variant.prepare(runs[:done], comm.size))
         variant.attempt(errors, lambda: variant.roll_out(run_stages))
     for repeat in range(1, comparison.repeats):

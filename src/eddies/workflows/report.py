@@ -36,6 +36,7 @@ from eddies.report.rollout import section as rollout_section
 from eddies.scene.scene import Scene
 from eddies.workflows.feasibility import check_places
 from eddies.workflows.product_warnings import mixed_products, not_finite
+from eddies.workflows.run_directory.work import SECONDS
 
 log = logging.getLogger("eddies")
 
@@ -251,7 +252,7 @@ def _cost_section(record: Run) -> Section:
 
 def _stage_seconds(directory: Path) -> dict[str, float]:
     """Wall seconds of the stages that have run, as the command line notes them beside the products."""
-    path = directory / "stage_seconds.json"
+    path = directory / SECONDS
     if not path.exists():
         return {}
     try:
