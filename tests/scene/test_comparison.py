@@ -52,6 +52,7 @@ BAD = [
     (HEAD, "[[variant]]: a comparison needs at least one"),
     ('title = "x"\n' + variant("a"), "base: this key is missing"),
     (HEAD + 'repets = 3\n' + variant("a"), "repets: no such key; did you mean repeats?"),
+    (HEAD + 'realisations = [3, 1]\n' + variant("a"), "realisations = [3, 1]: 1 is the seed of the base, on whose"),
     (HEAD + 'repeats = 0\n' + variant("a"), "repeats = 0: must be a whole number at least 1"),
     (HEAD + 'set = "training.steps=3"\n' + variant("a"), "must be a list of texts"),
     (HEAD + 'model = "lerned"\n' + variant("learned"), "did you mean learned?"),

@@ -70,7 +70,7 @@ def test_without_a_learned_force_nothing_is_trained():
 
 
 @pytest.mark.parametrize("first, second", [("wcsph.alpha=1", "wcsph.alpha=2"),
-                                           ("eulerian.smagorinsky=0", "eulerian.smagorinsky=0.1")])
+                                           ("eulerian.closure=none", "eulerian.closure=spectral")])
 def test_the_form_of_a_baseline_counts_for_its_rollout_alone(first, second):
     force = first.partition(".")[0]
     scene, changed = (load_scene("tiny", [f"simulation.method={force}", "simulation.step=0.0025", override])
@@ -84,8 +84,8 @@ def test_coarse_grid_of_the_filter():
     assert Eulerian().cells_for(widths["hit"]) == 16  # Nyquist wavenumber 8 = pi / d
     assert Eulerian().cells_for(widths["tiny"]) == 8
     assert Eulerian(cells=24).cells_for(widths["hit"]) == 24
-    with pytest.raises(SceneError, match=r"\[eulerian\] cells = 20: must be at most the 18 of the filtered fields"):
-        load_scene("tiny", ["simulation.method=eulerian", "eulerian.cells=20"])
+    with pytest.raises(SceneError, match=r"\[eulerian\] cells = 50: must be at most the 24 of the flow that it"):
+        load_scene("tiny", ["simulation.method=eulerian", "eulerian.cells=50"])
 
 
 def test_rates_of_the_horizons_fall():

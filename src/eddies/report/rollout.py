@@ -20,8 +20,8 @@ METHODS = {
     "learned": "the trained model, terms {terms}",
     "none": "no force: every particle keeps its velocity",
     "wcsph": "WCSPH, {kernel} kernel, density by summation, α = {alpha:g}, β = {beta:g}, γ = {exponent:g}",
-    "eulerian": "Eulerian large-eddy simulation on {cells}³ cells, |kᵢ| ≤ {largest_wavenumber}, Smagorinsky constant "
-                "{smagorinsky:g}",
+    "eulerian": "Eulerian large-eddy simulation on {cells}³ cells, |kᵢ| ≤ {largest_wavenumber}, {fluid}, {equations} "
+                "velocity, closure: {closure}",
 }
 WITHOUT_KERNEL = "measured through the smoothing kernel, and the scene has none"
 TRUTH_NAMES = {"filtered": "filtered DNS", "truth": "true tracers"}

@@ -264,10 +264,14 @@ def baseline_problems(scene: Scene) -> Iterator[str]:
                f"0.4 h / (c (1 + 0.6 alpha)) = {acoustic_step(scene):.3g}, h half the support of {scene.neighbors:g} "
                "neighbors and c [flow] sound_speed; lower step")
     if simulation and simulation.method == "eulerian":
-        cells = (scene.eulerian or Eulerian()).cells_for(scene.tracers.filter_width)
-        if cells > scene.tracers.cells:
-            yield (f"[eulerian] cells = {cells}: must be at most the {scene.tracers.cells} of the filtered fields that "
-                   "it starts from; lower cells or raise [tracers] field_cells")
+        eulerian = scene.eulerian or Eulerian()
+        cells = eulerian.cells_for(scene.tracers.filter_width)
+        if cells > scene.flow.cells:
+            yield (f"[eulerian] cells = {cells}: must be at most the {scene.flow.cells} of the flow that it starts "
+                   "from; lower cells")
+        if eulerian.fluid == "compressible" and not scene.flow.compressible:
+            yield ('[eulerian] fluid = "compressible": [flow] fluid is incompressible and has no sound speed; set both '
+                   "to the same")
 
 
 def acoustic_step(scene: Scene) -> float:

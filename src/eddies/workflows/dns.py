@@ -111,7 +111,7 @@ def stationary_span(settings: SpinUp, history: FlowHistory) -> dict[str, float]:
 def follow_tracers(scene: Scene, file: File, flow: FlowRun, saved: Checkpoint | None) -> None:
     """Release tracers into the flow, forcing off, and store their frames, the filtered fields and the scales."""
     comm, names = flow.fluid.grid.decomposition.comm, saved.files if saved is not None else ()
-    layout = frame_layout(scene.tracers, flow.fluid.compressible)
+    layout = frame_layout(scene.tracers, flow.fluid.compressible, flow.fluid.grid.cutoff)
     with FrameSegments(comm, flow.guard.checkpoints.path, layout, names) as segments:
         run = TracerRun(scene, flow, segments, saved)
         run.follow()

@@ -118,8 +118,11 @@ def rollout_cost(scene: Scene, ranks: int, speeds: Speeds) -> StageCost:
         memory = particle_bytes(work, speeds.particles, ranks)
     parts["steps"] = first + (course.evaluations - 1) * evaluation
     if settings.method == "eulerian":
-        cells = (scene.eulerian or Eulerian()).cells_for(scene.tracers.filter_width)
-        coarse = replace(ground_truth_alone(scene), flow=replace(scene.flow, cells=cells), forcing=None, spin_up=None,
+        eulerian = scene.eulerian or Eulerian()
+        sound_speed = scene.flow.sound_speed if eulerian.fluid == "compressible" else None
+        flow = replace(scene.flow, cells=eulerian.cells_for(scene.tracers.filter_width), fluid=eulerian.fluid,
+                       sound_speed=sound_speed, precision=settings.precision)
+        coarse = replace(ground_truth_alone(scene), flow=flow, forcing=None, spin_up=None,
                          tracers=None, time=replace(scene.time, duration=1.0), initial=Initial(peak_wavenumber=1.0))
         moved = speeds.flow.tracers * busiest_cells(scene, ranks)
         parts["steps"] = course.steps * (cost(coarse, ranks, speeds.flow).seconds + moved)

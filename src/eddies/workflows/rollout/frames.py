@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from eddies.io.frame_segments import FrameLayout, FrameSegments
+from eddies.io.frame_segments import FieldLayout, FrameLayout, FrameSegments
 from eddies.parallel.migration import IdOrder, migrate
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.particle_field import ParticleField
@@ -41,8 +41,8 @@ class RolloutFrames:
         self._columns = {name: shape for name, shape in COLUMNS.items()
                          if name != "density" or density and truth.has_density}
         self._stored = self._columns | (GRADIENT if kernel else {})
-        layout = FrameLayout(truth.total, length, dict.fromkeys(("model", "truth"), self._stored), np.float32, cells,
-                             dict.fromkeys(FIELDS if kernel else (), {"velocity": 3}))
+        layout = FrameLayout(truth.total, length, dict.fromkeys(("model", "truth"), self._stored), np.float32,
+                             dict.fromkeys(FIELDS if kernel else (), FieldLayout(cells, {"velocity": 3})))
         self.segments = FrameSegments(comm, directory, layout, names)
 
     def store(self, step: int, time: float, particles: ParticleSet, acceleration: torch.Tensor) -> None:
