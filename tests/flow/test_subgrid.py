@@ -1,13 +1,19 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+import torch
 
 from eddies.flow import initial_fields
 from eddies.flow.filtering import gaussian_transfer
 from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid
 from eddies.flow.operators import gradient, project
 from eddies.flow.statistics import energy_spectrum
-from eddies.flow.subgrid import DynamicStress, SpectralViscosity, StressModel
+from eddies.flow.subgrid import DynamicStress, EddyDamping, SpectralViscosity, StressModel
 from eddies.parallel.slab import SlabDecomposition
+from eddies.particles.fourier_grid import FourierGrid
+from eddies.particles.resolved_flow import ResolvedFlow
+from eddies.particles.terms.damping import Damping
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.time_stepping import ETDRK4
 
@@ -154,6 +160,24 @@ def test_spectral_viscosity_drains_what_an_inertial_range_brings(comm):
     model.begin_step(velocity)
     model.add(velocity, force)
     assert -power(grid, velocity, force) == pytest.approx(dissipation, rel=0.1)
+
+
+@pytest.mark.mpi(1, 2)
+def test_learned_damping_is_that_of_the_particle_model(comm):
+    """Of the same flow, resolved by particles up to as high a wavenumber."""
+    grid = coarse_grid(comm, 24)
+    velocity = turbulent_velocity(grid)
+    velocity[:, grid.index_squared > grid.cutoff**2] = 0  # particles resolve a ball of modes
+    rates, force = np.array([0.1, 0.3, 0.2, 0.5, 0.4, 0.9]), np.zeros_like(velocity)
+    model = EddyDamping(grid, rates)
+    model.begin_step(velocity)
+    model.add(velocity, force)
+    flow = ResolvedFlow(FourierGrid(grid.decomposition, grid.cutoff), torch.from_numpy(velocity), None, None, 0.0)
+    term = Damping(Damping.Settings(), None)
+    term.load_state_dict({"rates": torch.from_numpy(rates)})
+    found = term(SimpleNamespace(resolved=flow, decomposition=grid.decomposition)).force_modes
+    assert np.abs(force).max(initial=0) > 1e-3 or not force.size
+    assert np.abs(found.detach().numpy() - force).max(initial=0) < 1e-15
 
 
 @pytest.mark.mpi(1)

@@ -88,6 +88,14 @@ def test_coarse_grid_of_the_filter():
         load_scene("tiny", ["simulation.method=eulerian", "eulerian.cells=50"])
 
 
+def test_a_coarse_grid_that_takes_what_is_learned_needs_the_training():
+    learned = ["simulation.method=eulerian", "eulerian.closure=learned"]
+    assert "train" in load_scene("tiny", learned).stages
+    assert "train" not in load_scene("tiny", learned[:1]).stages
+    with pytest.raises(SceneError, match='closure = "learned": takes the rates of the term "damping", which'):
+        load_scene("tiny", [*learned, 'model.terms=["pressure", "stress"]'])
+
+
 def test_rates_of_the_horizons_fall():
     with pytest.raises(SceneError, match=r"\[training\] final_learning_rate = 0.0001: must be at most "
                                          r"\[training.horizons\] learning_rate = 1e-05"):

@@ -155,6 +155,28 @@ class SpectralViscosity:
         tendency -= (self._rate * self._shape).astype(self.grid.real) * velocity
 
 
+class EddyDamping:
+    """-D(k) u,  D = k_c u_c times rates at wavenumbers equally spaced up to k_c, linear between them and from D(0) = 0.
+
+    The particle model learns such rates. u_c is the rms of a component of the modes above k_c/2, as they are at the
+    start of a step, k_c the highest wavenumber of the grid.
+    """
+
+    def __init__(self, grid: SpectralGrid, rates: np.ndarray) -> None:
+        self.grid, self._small = grid, grid.index_squared > (grid.cutoff / 2) ** 2
+        place = np.sqrt(grid.index_squared) / grid.cutoff
+        self._shape = grid.cutoff * np.interp(place, np.linspace(0, 1, len(rates) + 1), [0.0, *rates])
+        self._speed = 0.0
+
+    def begin_step(self, velocity: np.ndarray) -> None:
+        """Find u_c; collective."""
+        self._speed = np.sqrt(self.grid.sum_modes(self._small * (np.abs(velocity) ** 2).sum(axis=0)) / 3)
+
+    def add(self, velocity: np.ndarray, tendency: np.ndarray) -> None:
+        """Add the force to the velocity's tendency in place."""
+        tendency -= (self._speed * self._shape).astype(self.grid.real) * velocity
+
+
 def strain_product(gradients: np.ndarray) -> np.ndarray:
     """|S| S (6, ...) of velocity gradients (9, ...), components within directions."""
     d_dx, d_dy, d_dz = gradients.reshape(3, 3, *gradients.shape[1:])

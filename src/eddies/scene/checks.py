@@ -129,7 +129,7 @@ def tracer_problems(scene: Scene) -> Iterator[str]:
 def section_problems(scene: Scene) -> Iterator[str]:
     """Which sections need which others."""
     needs = {"kernel": ("tracers",), "model": ("tracers",), "training": ("model",), "simulation": ("tracers",)}
-    if scene.simulation and "model" in scene.simulation.needs:
+    if scene.needs_model:
         needs["simulation"] = ("model",)
     for name, others in needs.items():
         for other in others:
@@ -269,6 +269,9 @@ def baseline_problems(scene: Scene) -> Iterator[str]:
         if cells > scene.flow.cells:
             yield (f"[eulerian] cells = {cells}: must be at most the {scene.flow.cells} of the flow that it starts "
                    "from; lower cells")
+        if eulerian.closure == "learned" and "damping" not in scene.model.settings:
+            yield ('[eulerian] closure = "learned": takes the rates of the term "damping", which [model] has not; add '
+                   "it to its terms, or choose another closure")
         if eulerian.fluid == "compressible" and not scene.flow.compressible:
             yield ('[eulerian] fluid = "compressible": [flow] fluid is incompressible and has no sound speed; set both '
                    "to the same")

@@ -221,7 +221,7 @@ class Wcsph(Section):
 
 #: The closures of a coarse grid by what its equations are of.
 CLOSURES = {
-    "unfiltered": ("none", "smagorinsky", "dynamic-smagorinsky", "spectral"),
+    "unfiltered": ("none", "smagorinsky", "dynamic-smagorinsky", "spectral", "learned"),
     "filtered": ("none", "smagorinsky", "dynamic-smagorinsky", "gradient", "dynamic-mixed"),
 }
 

@@ -51,12 +51,16 @@ def test_what_a_kernel_of_its_own_shows_is_left_out(tmp_path, monkeypatch, chang
     for name, row in table.items():
         blank = {measure for measure in MEASURES if row[measure] is None}
         assert blank == (set(THROUGH_KERNEL) if name == "own" else set())
-    (note,) = notes(read)
+    _, note = notes(read)
     assert note.startswith("own: no spectrum error, k ≤ k_d/2 and KL Q–R. ")
 
 
-def test_nothing_is_said_where_all_compares(tmp_path):
-    assert notes(comparison(tmp_path, variant("none", "simulation.method=none"))) == []
+def test_it_is_told_of_how_many_flows_the_numbers_are(tmp_path):
+    none = variant("none", "simulation.method=none")
+    (one,) = notes(comparison(tmp_path, none))
+    assert one.startswith("Of one realisation: ")
+    (several,) = notes(comparison(tmp_path, "realisations = [2, 5]\n", none))
+    assert several.startswith("Mean and standard deviation over 2 realisations, seeds 2, 5, that no training")
 
 
 def test_wavenumbers_that_grids_keep_are_told(tmp_path):
@@ -64,5 +68,5 @@ def test_wavenumbers_that_grids_keep_are_told(tmp_path):
     read = comparison(tmp_path, variant("grid-18", grid, "eulerian.cells=18"),
                       variant("grid-16", grid, "eulerian.cells=16"), variant("grid", grid))
     # Of 18 cells the mode 18/3 = 6 is not kept; by default there are 8, the fewest.
-    assert notes(read) == ["Of a grid the 2/3 rule leaves the wavenumbers |k_i| < cells/3, at most: 5 in grid-18, "
+    assert notes(read)[1:] == ["Of a grid the 2/3 rule leaves the wavenumbers |k_i| < cells/3, at most: 5 in grid-18, "
                            "5 in grid-16, 2 in grid; k_d = 3."]

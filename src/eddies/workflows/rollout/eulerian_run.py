@@ -18,10 +18,12 @@ from eddies.flow.initial_fields import balanced_density
 from eddies.flow.navier_stokes import FLUIDS, Fluid
 from eddies.flow.operators import gradient, project
 from eddies.flow.stability import quadratic_energy
-from eddies.flow.subgrid import Closure, DynamicStress, SpectralViscosity, StressModel
+from eddies.flow.subgrid import Closure, DynamicStress, EddyDamping, SpectralViscosity, StressModel
 from eddies.flow.tracers import FilteredField, TracerParticles
 from eddies.io.checkpoint import Checkpoint
 from eddies.io.contiguous import Block
+from eddies.io.weights import load_weights
+from eddies.parallel.communicator import Comm
 from eddies.parallel.migration import migrate
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.particle_set import ParticleSet
@@ -50,7 +52,7 @@ class EulerianRun:
         grid = SpectralGrid(SlabDecomposition(comm, length, cells), scene.simulation.precision)
         # What is left for the filter to do to the fluid's velocity, and what it has done to it.
         self.filter_left, filter_passed = (0.0, width) if self.settings.equations == "filtered" else (width, 0.0)
-        self.fluid = coarse_fluid(scene, truth, grid, filter_passed)
+        self.fluid = coarse_fluid(scene, truth, grid, filter_passed, directory)
         self.stepper, self.clock = ETDRK4(self.fluid), Clock()
         self.step_limit = CourantLimit(grid, scene.time.courant, math.inf)
         self.state = initial_state(truth, self.fluid, filter_passed, start)
@@ -147,7 +149,8 @@ class EulerianRun:
                 "closure": self.settings.closure + constant, **seconds}
 
 
-def coarse_fluid(scene: Scene, truth: GroundTruth, grid: SpectralGrid, filter_passed: float) -> Fluid:
+def coarse_fluid(scene: Scene, truth: GroundTruth, grid: SpectralGrid, filter_passed: float,
+                 directory: Path) -> Fluid:
     """The fluid of a coarse grid, whose velocity has passed a filter of some width or 0, with the forcing of the
     scene's particles and the closure of the scales that the grid or the filter leaves out."""
     settings, forcing = scene.eulerian or Eulerian(), None
@@ -155,22 +158,29 @@ def coarse_fluid(scene: Scene, truth: GroundTruth, grid: SpectralGrid, filter_pa
         forcing = LinearForcing(grid, injection_rate(scene, truth), forced_below(scene), filter_passed)
     sound_speed = scene.flow.sound_speed if settings.fluid == "compressible" else math.inf
     return FLUIDS[settings.fluid](grid, scene.flow.viscosity, sound_speed, forcing,
-                                  closure_of(settings, grid, filter_passed))
+                                  closure_of(settings, grid, filter_passed, directory))
 
 
-def closure_of(settings: Eulerian, grid: SpectralGrid, filter_width: float) -> Closure | None:
+def closure_of(settings: Eulerian, grid: SpectralGrid, filter_width: float, directory: Path) -> Closure | None:
     """The closure of the filtered equations, or, without a filter width, of the velocity that the grid cuts off at its
-    highest wavenumber k_c; Delta is d, or pi/k_c."""
+    highest wavenumber k_c; Delta is d, or pi/k_c. What is learned is read from model.h5 in the directory."""
     width = filter_width or math.pi / grid.cutoff
     made = {
         "none": lambda: None,
         "smagorinsky": lambda: StressModel(grid, mixing_length=settings.smagorinsky * width),
         "dynamic-smagorinsky": lambda: DynamicStress(grid, filter_width),
         "spectral": lambda: SpectralViscosity(grid),
+        "learned": lambda: EddyDamping(grid, learned_rates(grid.decomposition.comm, directory)),
         "gradient": lambda: StressModel(grid, filter_width=filter_width),
         "dynamic-mixed": lambda: DynamicStress(grid, filter_width, with_gradient=True),
     }
     return made[settings.closure]()
+
+
+def learned_rates(comm: Comm, directory: Path) -> np.ndarray:
+    """The rates of eddy damping that a model has learned."""
+    _, weights = load_weights(comm, directory / "model.h5", "model")
+    return weights["terms.damping.rates"]
 
 
 def initial_state(truth: GroundTruth, fluid: Fluid, filter_passed: float, frame: int) -> np.ndarray:

@@ -88,10 +88,14 @@ def has_own_kernel(comparison: Comparison, name: str) -> bool:
 
 
 def notes(comparison: Comparison) -> list[str]:
-    """What a reader of the numbers has to know of single variants."""
+    """What a reader has to know of the numbers: of how many flows they are, and what is special of single variants."""
+    seeds = comparison.realisations
+    found = [f"Mean and standard deviation over {len(seeds)} realisations, seeds {', '.join(map(str, seeds))}, that no "
+             "training has seen." if seeds and len(seeds) > 1 else
+             "Of one realisation: what differs less than from one flow to another is no difference."]
     own = [name for name in comparison.scenes if has_own_kernel(comparison, name)]
     blank = " and ".join(MEASURES[measure] for measure in THROUGH_KERNEL)
-    found = [f"{', '.join(own)}: no {blank}. These are measured on what the smoothing kernel makes of the particles; "
+    found += [f"{', '.join(own)}: no {blank}. These are measured on what the smoothing kernel makes of the particles; "
              "one of other settings than the base's shows another part of the flow."] if own else []
     grids = {name: (scene.eulerian or Eulerian()).cells_for(scene.tracers.filter_width)
              for name, scene in comparison.scenes.items() if scene.simulation.method == "eulerian"}
