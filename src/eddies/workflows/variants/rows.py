@@ -95,8 +95,9 @@ def notes(comparison: Comparison) -> list[str]:
              "Of one realisation: what differs less than from one flow to another is no difference."]
     own = [name for name in comparison.scenes if has_own_kernel(comparison, name)]
     blank = " and ".join(MEASURES[measure] for measure in THROUGH_KERNEL)
-    found += [f"{', '.join(own)}: no {blank}. These are measured on what the smoothing kernel makes of the particles; "
-             "one of other settings than the base's shows another part of the flow."] if own else []
+    if own:
+        found.append(f"{', '.join(own)}: no {blank}. These are measured on what the smoothing kernel makes of the "
+                     "particles; one of other settings than the base's shows another part of the flow.")
     grids = {name: (scene.eulerian or Eulerian()).cells_for(scene.tracers.filter_width)
              for name, scene in comparison.scenes.items() if scene.simulation.method == "eulerian"}
     if grids:
