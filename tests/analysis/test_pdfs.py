@@ -66,7 +66,7 @@ def test_divergence_of_samples_of_one_distribution():
 
 
 def test_the_floor_of_a_joint_pdf_is_what_two_samples_have():
-    """Of normal pairs in 20 x 20 bins, most of them empty, as of Q and R: there one over n holds no longer for each bin,
+    """Of normal pairs in 20 x 20 bins, most of them empty, as of Q and R: there one over n does not hold for each bin,
     but nearly so for their sum. Means over 30 draws, good to 3 %."""
     random, edges = np.random.default_rng(7), np.linspace(-4, 4, 21)
 

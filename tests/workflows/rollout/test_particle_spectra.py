@@ -9,7 +9,7 @@ from eddies.io.hdf5 import create_product, open_product, read_table
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.reference_scales import ReferenceScales
 from eddies.workflows.rollout.particle_spectra import ParticleSpectra
-from tests.particles.configurations import distributed, positions
+from tests.particles.configurations import positions
 from tests.validation import filtered_fields
 
 SIDE, PLANES, LENGTH = 12, 22, 2 * np.pi
@@ -32,21 +32,18 @@ def spectra_on(slab):
 
 
 def sampled(comm, modes, kind="even"):
-    """Slabs, and the columns of particles in a field, each moved to a slab where it does not belong."""
-    import torch
-    position = positions(kind, SIDE**3)
-    slab, particles = distributed(comm, position, torch.from_numpy(filtered_fields.at(modes, position.numpy())),
-                                  planes=PLANES)
-    columns = particles.to_numpy()
-    return slab, {name: np.concatenate(comm.allgather(columns[name]))[comm.rank::comm.size]
-                  for name in ("id", "position", "velocity")}
+    """Slabs, and the columns of particles in a field, dealt out to the ranks wherever they are."""
+    own = np.arange(SIDE**3) % comm.size == comm.rank
+    position = positions(kind, SIDE**3).numpy()[own]
+    return SlabDecomposition(comm, LENGTH, PLANES), {
+        "id": np.flatnonzero(own), "position": position, "velocity": filtered_fields.at(modes, position)}
 
 
 @pytest.mark.mpi(1, 2, 3)
 def test_the_spectrum_of_a_known_field_is_found_on_any_number_of_ranks(comm, tmp_path):
-    """Each shell up to k_d = pi/d = 3 within half a per cent: 3 x 1728 numbers tell the 122 modes of these shells nearly
-    without the prior. In the shell 4, the last with any energy, regularisation takes and its neighbours without energy
-    give: 5 %. A uniform motion has no part in it."""
+    """Each shell up to k_d = pi/d = 3 within half a per cent: 3 x 1728 numbers tell the 122 modes of these shells
+    nearly without the prior. In the shell 4, the last with any energy, regularisation takes and its neighbours without
+    energy give: 5 %. A uniform motion has no part in it."""
     modes, energy = known_field()
     slab, columns = sampled(comm, modes)
     spectra = spectra_on(slab)
