@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from eddies.analysis.accuracy import MEASURES
-from eddies.report.comparison import DRAWN, ErrorAgainstTime, in_symbols, scatter, sections
+from eddies.measures import DRAWN, MEASURES, SHOWN
+from eddies.report.comparison import ErrorAgainstTime, in_symbols, scatter, sections
 from eddies.report.figures import panels, styled
 from eddies.report.labels import fix_layout, place_labels
 
@@ -76,6 +76,17 @@ def test_page_tells_what_failed_and_what_the_model_is_worth():
     assert "learned is worth its cost in velocity error at t_η (0.1, 3 of 3 baselines beaten" in first.text
     assert [metric.label for metric in errors.metrics] == [r["name"] for r in ROWS]
     assert cost.metrics[0].value["wall s per T"] == 20.0
+    assert list(errors.metrics[0].value)[:-2] == [MEASURES[name] for name in SHOWN]
+
+
+def test_measures_that_are_asked_for_are_shown_and_of_them_errors_drawn():
+    asked = ["tetrad_size_error", "count_variance_ratio", "qr_kl", "qr_kl_floor", "velocity_kl"]
+    first, overview, errors, _ = sections(ErrorAgainstTime(ROWS, "learned", "baseline", asked), 1.0)
+    assert list(errors.metrics[0].value)[:-2] == [MEASURES[name] for name in asked]
+    assert [figure.name for figure in first.illustrations] == ["tetrad-size-error", "qr-kl", "velocity-kl"]
+    assert len(overview.illustrations[0].image.axes) == 3 and "in size of tetrads" in first.text
+    first, overview, *_ = sections(ErrorAgainstTime(ROWS, "learned", "baseline", ["energy_ratio"]), 1.0)
+    assert not first.illustrations and not overview.illustrations
 
 
 def test_rows_without_a_time_say_why():

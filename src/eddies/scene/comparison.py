@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
+from eddies.measures import MEASURES
 from eddies.scene.reader import find_document, parse_document, read_section, read_text
 from eddies.scene.rules import nearest
 from eddies.scene.scene import Scene, SceneError, load_scene
@@ -56,11 +57,15 @@ class Comparison(Document):
         "training window", default=None, at_least=0)
     repeats: int = integer("how often every rollout is timed, in rounds over all of them", default=3, at_least=1)
     model: str | None = text("the variant that the summary is about; absent: the first", default=None)
+    columns: tuple[str, ...] | None = texts("measures that its table and figures show; absent: the main ones",
+                                            *MEASURES, default=None)
     variant: tuple[Variant, ...] = sections(Variant)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self._check_names()
+        if self.columns == ():
+            raise SceneError(f"columns = []: name at least one of {', '.join(MEASURES)}, or leave the key out")
         base = load_scene(self.base)
         for section, why in (("simulation", "of which errors are compared"),
                              ("kernel", "through which fields are compared")):

@@ -118,7 +118,8 @@ def write(comparison: Comparison, table: list[dict[str, Any]], comm: Comm, outpu
     """
     parts = []
     if comm.rank == 0:
-        parts = sections(ErrorAgainstTime(table, comparison.subject, BASELINE), comparison.turnovers)
+        parts = sections(ErrorAgainstTime(table, comparison.subject, BASELINE, comparison.columns),
+                         comparison.turnovers)
     draw(comm, parts)
     in_directories(comm, lambda: write_files(comparison, table, parts, comm.size, output))
 

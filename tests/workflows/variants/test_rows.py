@@ -2,7 +2,7 @@
 
 import pytest
 
-from eddies.analysis.accuracy import MEASURES
+from eddies.measures import MEASURES
 from eddies.scene.comparison import load_comparison
 from eddies.workflows.variants import rows as module
 from eddies.workflows.variants.rows import THROUGH_KERNEL, notes, rows, together
@@ -52,7 +52,7 @@ def test_what_a_kernel_of_its_own_shows_is_left_out(tmp_path, monkeypatch, chang
         blank = {measure for measure in MEASURES if row[measure] is None}
         assert blank == (set(THROUGH_KERNEL) if name == "own" else set())
     _, note = notes(read)
-    assert note.startswith("own: no spectrum error, k ≤ k_d/2 and KL Q–R. ")
+    assert note.startswith("own: no KL Q–R and KL Q–R, two samples of the truth. ")
 
 
 def test_it_is_told_of_how_many_flows_the_numbers_are(tmp_path):

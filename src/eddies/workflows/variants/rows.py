@@ -11,20 +11,21 @@ from typing import Any
 import numpy as np
 import torch
 
-from eddies.analysis.accuracy import MEASURES, StoredRollout, accuracy
-from eddies.io.fields import FieldSeries
+from eddies.analysis.accuracy import StoredRollout, accuracy
 from eddies.io.hdf5 import open_product, read_attributes, read_table
 from eddies.io.provenance import environment
 from eddies.io.trajectories import Trajectory
 from eddies.kernels.library import threads
+from eddies.measures import MEASURES
 from eddies.parallel.communicator import Comm
 from eddies.scene.comparison import Comparison
 from eddies.scene.scene import Eulerian
+from eddies.workflows.rollout.stored_spectra import read_spectra
 from eddies.workflows.variants.run import StepSeconds, VariantRun
 
 COST = ("seconds_per_step", "time_step", "wall_seconds", "wall_seconds_low", "wall_seconds_high", "core_seconds")
-# Measured on fields and gradients that the kernel makes of the particles, of the model and of the truth.
-THROUGH_KERNEL = ("spectrum_error", "qr_kl")
+# Measured on gradients that the kernel makes of the particles, of the model and of the truth.
+THROUGH_KERNEL = ("qr_kl", "qr_kl_floor")
 COLUMNS = ("name", "group", "status", "stopped_at", "realisations", *MEASURES, "end", *COST, "training_seconds",
            *(f"{measure}_spread" for measure in MEASURES), "settings")
 
@@ -112,10 +113,11 @@ def measured(run: VariantRun, alone: Comm, ranks: int) -> dict[str, Any]:
     with (open_product(alone, run.directory / "ground_truth.h5", "ground_truth") as truth_file,
           open_product(alone, run.directory / "rollout.h5", "rollout") as file):
         reference, rollout = read_attributes(truth_file, "reference"), read_attributes(file, "rollout")
+        model, truth = (Trajectory(file, name) for name in ("model", "truth"))
         stored = StoredRollout(
-            *(Trajectory(file, name) for name in ("model", "truth")),
-            *(FieldSeries(file, name) for name in ("model", "truth")), turnover=rollout["eddy_turnover_time"],
-            kolmogorov_time=reference["kolmogorov_time"], filter_wavenumber=np.pi / reference["filter_width"])
+            model, truth, read_spectra(file, read_table(truth_file, "spectra")), model.length,
+            turnover=rollout["eddy_turnover_time"], kolmogorov_time=reference["kolmogorov_time"],
+            filter_wavenumber=np.pi / reference["filter_width"])
         complete = rollout["status"] == "complete"
         row = {"status": rollout["status"], "stopped_at": None if complete else rollout["turnovers"],
                **accuracy(stored, complete)}
