@@ -104,3 +104,14 @@ def test_an_unstable_model_is_worth_nothing():
 @pytest.mark.parametrize("measure", DRAWN)
 def test_symbols_are_drawn_as_formulas(measure):
     assert "_" not in in_symbols(MEASURES[measure]).replace(r"$t_\eta$", "").replace("$k_d$", "")
+
+
+def test_spreads_are_bars_and_stand_in_the_table():
+    rows = [{**ROWS[0], "velocity_error_early_spread": 0.04}, ROWS[1]]
+    table = ErrorAgainstTime(rows, "learned", "baseline")
+    bars = [bar.get_segments()[0][:, 1] for container in scatter(table, ["velocity_error_early"]).axes[0].containers
+            for bar in container.lines[2][1:]]
+    assert bars[0].tolist() == pytest.approx([0.06, 0.14]) and bars[1].tolist() == pytest.approx([0.5, 0.5])
+    (errors,) = (part for part in sections(table, 1.0) if part.key == "errors")
+    shown = [metric.value["velocity error at t_η"] for metric in errors.metrics]
+    assert shown == ["0.1 ± 0.04", 0.5]

@@ -82,8 +82,9 @@ def sections(table: ErrorAgainstTime, turnovers: float) -> list[Section]:
     first = Section(
         "error-against-time", "Error against run time", " ".join(table.summary),
         notices=[_notice(row) for row in table.rows if not is_stable(row) or row[COST] is None])
-    note = ("Wall seconds of a turnover T, with quartiles of the time of a step as bars. Line: what nothing else beats "
-            "in both. Crosses at the top: became unstable, at the time given. ")
+    note = ("Wall seconds of a turnover T, with quartiles of the time of a step as bars; errors with their standard "
+            "deviation over realisations, if there are several. Line: what nothing else beats in both. Crosses at the "
+            "top: became unstable, at the time given. ")
     for measure in table.drawn:
         first.add_figure(measure.replace("_", "-"), f"Run time and {MEASURES[measure]}",
                          scatter(table, [measure]), note + _caption(table, measure))
@@ -121,9 +122,15 @@ def _caption(table: ErrorAgainstTime, measure: str) -> str:
 
 
 def _table(key: str, title: str, rows: Sequence[Row], columns: Mapping[str, str], text: str) -> Section:
-    metrics = [Metric(row["name"], row["name"], {words: row[column] for column, words in columns.items()})
+    metrics = [Metric(row["name"], row["name"], {words: _with_spread(row, column) for column, words in columns.items()})
                for row in rows]
     return Section(key, title, text, metrics=metrics)
+
+
+def _with_spread(row: Row, column: str) -> Any:
+    """A number of a row, with its standard deviation over realisations where there are several."""
+    spread = row.get(f"{column}_spread")
+    return row[column] if spread is None else f"{row[column]:.3g} ± {spread:.2g}"
 
 
 @styled
@@ -158,8 +165,11 @@ def _draw_panel(axis: Axes, table: ErrorAgainstTime, measure: str) -> None:
         colour, marker = table.looks[row["group"]]
         chosen = row["name"] == table.subject
         bars = [[row[COST] - row["wall_seconds_low"]], [row["wall_seconds_high"] - row[COST]]]
-        axis.errorbar(row[COST], row[measure], xerr=np.maximum(bars, 0), color=colour, marker=marker, elinewidth=1,
-                      markersize=9 if chosen else 6, markeredgecolor=DNS if chosen else colour, zorder=4)
+        spread = row.get(f"{measure}_spread") or 0.0
+        # On an axis of logarithms no bar reaches 0.
+        down = min(spread, 0.9 * row[measure])
+        axis.errorbar(row[COST], row[measure], [[down], [spread]], np.maximum(bars, 0), color=colour, marker=marker,
+                      elinewidth=1, markersize=9 if chosen else 6, markeredgecolor=DNS if chosen else colour, zorder=4)
     for row in stopped:
         axis.plot(row[COST], _top(axis), color=table.looks[row["group"]][0], marker="x", markersize=7,
                   markeredgewidth=1.8, zorder=4)
