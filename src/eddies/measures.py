@@ -5,7 +5,7 @@ MEASURES = {
     "velocity_error_early": "velocity error at t_η",
     "velocity_error_half": "velocity error at T/2",
     "spectrum_error": "spectrum error, k ≤ k_d (rms of logarithms)",
-    "spectrum_error_floor": "the same of the true particles",
+    "spectrum_error_floor": "spectrum error of the true tracers",
     "energy_ratio": "energy, model / truth",
     "velocity_kl": "KL velocity",
     "velocity_kl_floor": "KL velocity, two samples of the truth",

@@ -66,9 +66,10 @@ def test_increments_of_normal_velocities_have_flatness_three():
 
 @pytest.mark.parametrize("spread", [LENGTH, 0.3], ids=["even", "in a corner"])
 def test_nearest_rows_are_those_of_all_distances(spread):
+    """Two in one place, and one that may be far from all others."""
     position = np.random.default_rng(4).uniform(0, spread, (200, 3))
-    position[7] = position[3]
-    chosen = np.array([3, 0, 199])
+    position[7], position[0] = position[3], 3.0
+    chosen = np.array([7, 0, 199])
     apart = np.linalg.norm(minimum_image(position[chosen][:, None] - position[None], LENGTH), axis=-1)
     apart[np.arange(3), chosen] = np.inf
     assert np.array_equal(nearest_rows(position, LENGTH, chosen, 3), np.argsort(apart, axis=1)[:, :3].T)

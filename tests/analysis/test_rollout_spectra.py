@@ -24,11 +24,11 @@ def test_all_are_those_of_the_moment_nearest_to_a_time():
     assert at.truth == pytest.approx(0.9 * np.e * 0.5**SHELLS) and at.model == pytest.approx(1.2 * np.e * 0.5**SHELLS)
     assert at.filtered == pytest.approx(np.e**2 * 0.5**SHELLS)
     assert at.error("truth", 4.0) == pytest.approx(1 - np.log(0.9))
-    assert at.bands("model", 4.0) == pytest.approx(dict.fromkeys(("1–2", "3–4"), 1.2 / np.e))
+    assert at.bands("model", 4.0) == pytest.approx(dict.fromkeys(("1-2", "3-4"), 1.2 / np.e))
 
 
 def test_no_shell_counts_that_one_of_them_has_not():
     flow = table([0.0], 5, name="filtered")
     at = RolloutSpectra(table([0.0], 6), table([0.0], 6), flow, 0.0).at(0.0)
-    assert list(at.bands("model", 20.0)) == ["1–2", "3–4"] and at.error("model", 20.0) == 0
+    assert list(at.bands("model", 20.0)) == ["1-2", "3-4"] and at.error("model", 20.0) == 0
     assert RolloutSpectra(table([0.0], 6), table([0.0], 6), None, 0.0).at(0.0).filtered is None

@@ -43,9 +43,9 @@ def test_bands_double_and_the_last_ends_at_the_largest_wavenumber():
     reference = 1 / np.arange(1, 40.0) ** 2
     energy = reference * np.where(np.arange(39) < 9, 1.0, 2.0)
     found = band_ratios(energy, reference, 20.3)
-    assert list(found) == ["1–2", "3–4", "5–8", "9–16", "17–20"]
+    assert list(found) == ["1-2", "3-4", "5-8", "9-16", "17-20"]
     assert list(found.values()) == pytest.approx([1, 1, 1, 2, 2])
-    assert list(band_ratios(energy, reference, 5.0)) == ["1–2", "3–4", "5"]
+    assert list(band_ratios(energy, reference, 5.0)) == ["1-2", "3-4", "5"]
     assert list(band_ratios(energy, reference, 0.7)) == ["1"]
 
 

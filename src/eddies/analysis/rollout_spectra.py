@@ -44,7 +44,7 @@ class RolloutSpectra:
 
     Parameters
     ----------
-    model, truth : tables with `energy`; the model's times are those of the truth and perhaps more.
+    model, truth : tables with `energy`, from the start on; the model's times are those of the truth and perhaps more.
     flow : the table of the ground truth, with `filtered`, or None; its times count from the release of the tracers.
     start_time : of the rollout, in that time.
     """
@@ -59,7 +59,7 @@ class RolloutSpectra:
         return self.truth["time"][self.truth["time"] < until]
 
     def at(self, time: float) -> SpectraAt:
-        """Those at the moment nearest to a time; there must be one with a truth."""
+        """Those at the moment nearest to a time at which there is a truth."""
         truth = int(np.argmin(np.abs(self.truth["time"] - time)))
         found = float(self.truth["time"][truth])
         model = int(np.argmin(np.abs(self.model["time"] - found)))

@@ -42,7 +42,7 @@ def band_ratios(energy: np.ndarray, reference: np.ndarray, largest_wavenumber: f
         end = min(end, last)
         band = slice(first, end + 1)
         with np.errstate(divide="ignore", invalid="ignore"):
-            ratios[f"{first}–{end}" if end > first else f"{first}"] = float(energy[band].sum() / reference[band].sum())
+            ratios[f"{first}-{end}" if end > first else f"{first}"] = float(energy[band].sum() / reference[band].sum())
         first, end = end + 1, 2 * end
     return ratios
 

@@ -40,7 +40,7 @@ def draw(model: PathStatistics, truth: PathStatistics, turnover: float) -> Figur
         variance.plot(time, run.acceleration_variance, **line)
         flatness.semilogx(lags, run.flatness, marker="o", markersize=3, **line)
         pairs.loglog(time[1:], run.pair_dispersion[1:], **line)
-        sizes.semilogy(time, run.tetrad_size, **line)
+        sizes.plot(time, run.tetrad_size, **line)
         for eigenvalue in run.tetrad_shape.T:
             shapes.plot(time, eigenvalue, **line)
     memory.set(title="Velocity correlation", ylabel=r"$\rho_v(t)$")
@@ -51,7 +51,7 @@ def draw(model: PathStatistics, truth: PathStatistics, turnover: float) -> Figur
     flatness.set(title="Flatness of increments", ylabel=r"$\langle\Delta v^4\rangle/\langle\Delta v^2\rangle^2$")
     flatness.axhline(3, color=GUIDE, linestyle=":")
     pairs.set(title="Pair dispersion", ylabel=r"$\langle|r-r_0|^2\rangle/\langle r_0^2\rangle$")
-    sizes.set(title="Size of tetrads", ylabel=r"$\langle R^2\rangle/\langle R_0^2\rangle$")
+    sizes.set(title="Size of tetrads", ylabel=r"$\langle R^2\rangle/\langle R_0^2\rangle$", ylim=(0, None))
     shapes.set(title="Shape of tetrads", ylabel=r"$\langle\lambda_i/R^2\rangle$", ylim=(0, 1))
     shapes.axhline(1 / 3, color=GUIDE, linestyle=":")
     for axis in (memory, variance, pairs, sizes, shapes):

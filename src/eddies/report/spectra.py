@@ -1,6 +1,7 @@
 """Energy spectra of a rollout (the paper's Fig. 8): one figure and its numbers."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,6 +14,12 @@ from eddies.report.page import Metric, Section
 
 PANELS = 3
 UNKNOWN = "the filtered flow is in ground_truth.h5, which is not here"
+LABELS = {
+    "spectrum_error": "spectrum error, rms of ln(E/E_filtered) over 1 ≤ k ≤ k_d",
+    "spectrum_error_floor": "the same of the true tracers, found alike",
+    "band_energy_ratios": "energy of bands of wavenumbers, model / filtered flow",
+    "band_energy_ratios_floor": "the same of the true tracers",
+}
 
 
 def add(shown: Section, spectra: RolloutSpectra, until: float, turnover: float, cutoff: float | None) -> None:
@@ -20,39 +27,27 @@ def add(shown: Section, spectra: RolloutSpectra, until: float, turnover: float, 
     filter wavenumber k_d, or None."""
     times = spectra.times(until)
     shown.metrics.append(Metric("filter_wavenumber", "filter wavenumber k_d = π/d", cutoff, UNKNOWN))
-    if not times.size:
-        shown.metrics += [Metric(key, label, None, "no frame is at the time of a filtered field")
-                          for key, label in LABELS.items()]
-        return
     chosen = np.unique(np.rint(np.linspace(0, times.size - 1, PANELS)).astype(int))
     series = [spectra.at(time) for time in times[chosen]]
     last = series[-1]
     caption = ("Of the solenoidal modes that least squares find in the velocities of the model's particles and, alike, "
-               "of the true ones; lines: the DNS itself.")
-    values: Mapping[str, object] = dict.fromkeys(LABELS)
+               "of the true tracers; black and grey: the DNS itself.")
+    values: dict[str, Any] = dict.fromkeys(LABELS)
     if cutoff is not None and last.filtered is not None:
         values = {"spectrum_error": last.error("model", cutoff), "spectrum_error_floor": last.error("truth", cutoff),
                   "band_energy_ratios": last.bands("model", cutoff),
                   "band_energy_ratios_floor": last.bands("truth", cutoff)}
         caption += (f" Rms of ln(E/E_filtered) at t = {last.time / turnover:.2f} T up to k_d = π/d = {cutoff:.3g}: "
-                    f"model {values['spectrum_error']:.3f}, true particles {values['spectrum_error_floor']:.3f}.")
+                    f"model {values['spectrum_error']:.3f}, true tracers {values['spectrum_error_floor']:.3f}.")
     shown.metrics += [Metric(key, label, values[key], UNKNOWN) for key, label in LABELS.items()]
     shown.add_figure("figure-8-spectra", "Energy spectra over time (the paper's Fig. 8)",
                      energy_spectra(series, spectra.flow, spectra.start_time, turnover, cutoff), caption)
 
 
-LABELS = {
-    "spectrum_error": "spectrum error, rms of ln(E/E_filtered) over 1 ≤ k ≤ k_d",
-    "spectrum_error_floor": "the same of the true particles, found alike",
-    "band_energy_ratios": "energy of bands of wavenumbers, model / filtered flow",
-    "band_energy_ratios_floor": "the same of the true particles",
-}
-
-
 @styled
 def energy_spectra(series: Sequence[SpectraAt], eulerian: Mapping[str, np.ndarray] | None, start_time: float,
                    turnover: float, filter_wavenumber: float | None) -> Figure:
-    """Spectra of model and true particles over time with those of the DNS at the nearest time.
+    """Spectra of model and true tracers over time with those of the DNS at the nearest time.
 
     `eulerian`: table with time (m,), wavenumber (k,), energy and filtered (m, k); model times count from
     start_time.
@@ -62,7 +57,7 @@ def energy_spectra(series: Sequence[SpectraAt], eulerian: Mapping[str, np.ndarra
         if eulerian is not None:
             _eulerian_lines(axis, eulerian, start_time + at.time)
         shells = at.wavenumber >= 1
-        axis.loglog(at.wavenumber[shells], at.truth[shells], color=TRUTH, label="true particles")
+        axis.loglog(at.wavenumber[shells], at.truth[shells], color=TRUTH, label="true tracers")
         axis.loglog(at.wavenumber[shells], at.model[shells], color=MODEL, linestyle="none", marker="o",
                     markersize=4, markerfacecolor="none", label="model")
         if filter_wavenumber is not None:
