@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,8 @@ log = logging.getLogger("eddies")
 def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | None = None) -> None:
     """Simulate the flow of a scene and write ground_truth.h5: statistics, and with tracers their frames and fields.
 
-    Forced turbulence is first brought to a stationary state ([spin_up]). Tracers are released with the forcing off.
+    Forced turbulence is first brought to a stationary state ([spin_up]). Tracers are released with the forcing off,
+    unless [tracers] forced.
     Goes on from the newest checkpoint in the directory, if there is one of the same settings.
 
     Raises Stopped, after a checkpoint, when `stop` asks for it.
@@ -109,7 +111,8 @@ def stationary_span(settings: SpinUp, history: FlowHistory) -> dict[str, float]:
 
 
 def follow_tracers(scene: Scene, file: File, flow: FlowRun, saved: Checkpoint | None) -> None:
-    """Release tracers into the flow, forcing off, and store their frames, the filtered fields and the scales."""
+    """Release tracers into the flow, and store their frames, the filtered fields, the scales, and the forcing that
+    stays on."""
     comm, names = flow.fluid.grid.decomposition.comm, saved.files if saved is not None else ()
     layout = frame_layout(scene.tracers, flow.fluid.compressible)
     with FrameSegments(comm, flow.guard.checkpoints.path, layout, names) as segments:
@@ -119,6 +122,8 @@ def follow_tracers(scene: Scene, file: File, flow: FlowRun, saved: Checkpoint | 
     write_attributes(file.create_group("reference"), {
         **scales_of(run.released), "energy_budget_error": flow.history.budget_error, "viscosity": flow.fluid.viscosity,
         **run.scales()})
+    if flow.fluid.forcing is not None:
+        write_attributes(file.create_group("forcing"), asdict(scene.forcing))
     run.frames.write_spectra(file)
 
 

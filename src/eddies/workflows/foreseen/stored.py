@@ -88,6 +88,6 @@ def stores_density(scene: Scene) -> bool:
 
 def true_frames(scene: Scene, course: RolloutCourse) -> int:
     """Frames of a rollout at whose times there is a ground truth."""
-    start = scene.seen if scene.simulation.start is None else scene.simulation.start
+    start = scene.seen_in(scene.directory) if scene.simulation.start is None else scene.simulation.start
     left = (1 - start) * scene.tracers.turnovers * course.turnover_time
     return min(course.intervals, int(left / course.interval)) + 1

@@ -14,15 +14,16 @@ from eddies.scene.scene import Scene, SceneError, Training
 HELD_OUT = 0.1
 
 
-def check_frames(stages: Sequence[str], scene: Scene, frames: int) -> None:
-    """Refuse a scene of which one of these stages finds too few frames."""
+def check_frames(stages: Sequence[str], scene: Scene, seen: float, frames: int) -> None:
+    """Refuse a scene of which one of these stages finds too few frames; `seen` is the fraction that the model is
+    trained on."""
     at_fields = range(0, frames, scene.tracers.field_every)
     if "train" in stages:
-        if scene.model.path is None:
+        if scene.model.path is None and seen > 0:
             last_trained_on(scene.training, frames)
         between_frames(frames, at_fields)
     if "simulate" in stages:
-        rollout_start(scene, frames, at_fields)
+        rollout_start(scene, seen, frames, at_fields)
 
 
 def last_seen(window: float, frames: int) -> int:
@@ -55,13 +56,14 @@ def between_frames(frames: int, at_fields: Sequence[int]) -> list[int]:
     return usable
 
 
-def rollout_start(scene: Scene, frames: int, at_fields: Sequence[int]) -> int:
-    """The first frame with a filtered field at or after the moment that the scene asks for.
+def rollout_start(scene: Scene, seen: float, frames: int, at_fields: Sequence[int]) -> int:
+    """The first frame with a filtered field at or after the moment that the scene asks for, or else after what the
+    model has `seen`, a fraction of them.
 
     Raises SceneError if none follows that leaves a frame of the ground truth to compare with.
     """
     fraction = scene.simulation.start
-    wanted = last_seen(scene.seen, frames) if fraction is None else int(fraction * (frames - 1))
+    wanted = last_seen(seen, frames) if fraction is None else int(fraction * (frames - 1))
     last = frames - 2 - round(scene.simulation.frame_interval / scene.tracers.frame_interval)
     usable = [frame for frame in at_fields if max(wanted, 1) <= frame <= last]
     if not usable:

@@ -1,4 +1,4 @@
-"""Tracers in a flow without forcing, one frame interval after the other."""
+"""Tracers in a flow, one frame interval after the other."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from eddies.workflows.ground_truth.tracer_frames import TracerFrames
 
 
 class TracerRun:
-    """Releases tracers into a flow, forcing off, or takes them from a checkpoint, and follows them.
+    """Releases tracers into a flow, its forcing off unless [tracers] forced, or takes them from a checkpoint, and
+    follows them.
 
     `released` is the sample of the flow at the release. Within a frame interval all steps are equal: the longest
     allowed ones that divide it, so that frames are equally spaced.
@@ -28,7 +29,7 @@ class TracerRun:
 
     def __init__(self, scene: Scene, flow: FlowRun, segments: FrameSegments, saved: Checkpoint | None) -> None:
         self.scene, self.flow, self.segments, self.settings = scene, flow, segments, scene.tracers
-        flow.begin_tracers(self)
+        flow.begin_tracers(self, self.settings.forced)
         compressible = flow.fluid.compressible
         field = FilteredField(flow.fluid.grid, self.settings.filter_width, self.settings.interpolation)
         self.comm = flow.fluid.grid.decomposition.comm

@@ -28,7 +28,7 @@ from eddies.scene.scene import Eulerian, Scene
 from eddies.spectral.spectral_grid import SpectralGrid, restrict
 from eddies.time_stepping import ETDRK4
 from eddies.workflows.ground_truth.truth import GroundTruth
-from eddies.workflows.rollout.particle_run import forced_below, injection_rate
+from eddies.workflows.rollout.particle_run import injection
 from eddies.workflows.rollout.saved_rows import restored_rows, saved_rows
 
 # Runaway is a flow with this many times the energy of its start.
@@ -138,8 +138,8 @@ def coarse_fluid(scene: Scene, truth: GroundTruth, grid: SpectralGrid) -> Compre
     """The fluid of a scene with the forcing of its particles and the model of what a coarse grid does not resolve."""
     flow, constant = scene.flow, (scene.eulerian or Eulerian()).smagorinsky
     forcing, subgrid = None, None
-    if scene.simulation.injection != "none":
-        forcing = LinearForcing(grid, injection_rate(scene, truth), forced_below(scene))
+    if (forced := injection(scene, truth)) is not None:
+        forcing = LinearForcing(grid, forced.injection_rate, forced.wavenumber)
     if constant > 0:
         subgrid = Smagorinsky(grid, constant, truth.scales.filter_width)
     return CompressibleFluid(grid, flow.viscosity, flow.sound_speed, forcing, subgrid)
