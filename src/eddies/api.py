@@ -66,7 +66,7 @@ def _run(scene: Scene | str | Path, stages: Sequence[str] | None, output: str | 
          comm: Comm | None) -> Path:
     with _job(comm) as comm:
         scene = _scene(scene)
-        directory = Path(output) if output is not None else Path("runs") / scene.name
+        directory = Path(output) if output is not None else scene.directory
         from eddies.parallel.stop import StopRequest
         from eddies.stages import run_stages
         stop = StopRequest(comm, (), directory / "STOP", math.inf, CHECKPOINT_SECONDS)

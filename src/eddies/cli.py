@@ -240,7 +240,7 @@ def run_command(options: argparse.Namespace, comm: Comm, signals: list[int]) -> 
     from eddies.parallel.stop import StopRequest
     from eddies.stages import run_stages
     scene = load_scene(options.scene, options.overrides)
-    directory = options.output or Path("runs") / scene.name
+    directory = options.output or scene.directory
     stop = StopRequest(comm, signals, directory / "STOP", 60 * options.max_minutes,
                        60 * options.checkpoint_minutes)
     stages = scene.stages if options.stage == "run" else (options.stage,)

@@ -43,7 +43,7 @@ STAGES = {stage.name: stage for stage in (
     Stage("train-kernel", "the smoothing kernel", "kernel", "kernel", ("kernel", "window"),
           ("dns",), "checkpoints-kernel", "eddies.workflows.train_kernel:run"),
     Stage("train", "the model of the particles", "model", "model",
-          ("device", "model", "weights", "training", "own_model"),
+          ("device", "model", "weights", "training", "truths", "own_model"),
           ("dns", "train-kernel"), "checkpoints-train", "eddies.workflows.train:run"),
     Stage("simulate", "the trained model, without the direct simulation", "simulation", "rollout",
           ("device", "simulation", "wcsph", "eulerian", "own_simulation"),

@@ -49,7 +49,7 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
         WriteError: the directory cannot be written.
         ProductError: a stage that is not among `stages` has not left the product that they start from.
     """
-    check_feasible(stages, scene, comm)
+    check_feasible(stages, scene, comm, directory)
     check_ranks(stages, scene, comm)
     check_places(stages, comm, directory)
     if take_over:
@@ -142,6 +142,10 @@ def check_inputs(stages: Sequence[str], scene: Scene, comm: Comm, directory: Pat
             raise SceneError(f"{scene.name}: has no [{STAGES[stage].section}], which `eddies {stage}` is about; add it")
     if "train" in stages and scene.model is not None and scene.model.path is not None:
         read_source(scene, comm)
+    if "train" in stages and scene.training is not None and scene.training.truths is not None:
+        from eddies.workflows.learned.truths import truth_problems  # torch, only here
+        for problem in truth_problems(scene, comm, directory):
+            raise SceneError(f"{scene.name}: {problem}")
     first = STAGES[stages[0]]
     if first.product is None:  # it works with what there is
         return

@@ -201,15 +201,14 @@ def test_only_columns_that_are_read_travel(comm, monkeypatch, name, shapes):
 
 
 @pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("terms", [{}, {"forcing": dict(injection_rate=0.0)}], ids=["nothing", "forcing"])
-def test_without_terms_that_look_at_others_there_is_no_list_no_halo_and_no_migration(comm, monkeypatch, terms):
+def test_without_terms_that_look_at_others_there_is_no_list_no_halo_and_no_migration(comm, monkeypatch):
     def forbidden(*arguments):
         raise AssertionError("nothing of this is needed")
 
     slab, particles = distributed(comm, *state())
     for name in ("HaloExchange", "NeighborList", "migrate", "any_rank", "global_max"):
         monkeypatch.setattr(neighborhood, name, forbidden)
-    dynamics = dynamics_of(slab, model(terms))
+    dynamics = dynamics_of(slab, model({}))
     moved = INTEGRATORS["verlet"](dynamics).step(particles, 0.5)
     assert torch.equal(moved.position, dynamics.box.wrap(particles.position + 0.5 * particles.velocity))
     assert dynamics.neighborhood is None and dynamics.resolution is None

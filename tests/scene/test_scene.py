@@ -4,8 +4,9 @@ import dataclasses
 
 import pytest
 
+from eddies.io.hdf5 import create_product
 from eddies.pipeline import STAGES as TABLE
-from eddies.scene.scene import Eulerian, Flow, Horizons, Scene, SceneError, Time, builtin_scenes, load_scene
+from eddies.scene.scene import Eulerian, Flow, Horizons, Model, Scene, SceneError, Time, builtin_scenes, load_scene
 from eddies.scene.values import rule_of
 from tests.bad_scenes import BAD_OVERRIDES, BAD_TEXTS
 
@@ -173,10 +174,49 @@ def test_fingerprint_of_training_changes_with_the_weights_that_it_starts_from(tm
 def test_trained_weights_need_no_training_and_have_seen_nothing():
     scene = load_scene("tiny", ["model.path=runs/other"])
     alone = dataclasses.replace(scene, training=None)
-    assert (scene.seen, alone.seen, alone.window) == (0.5, 0.0, 0.5)
+    assert (scene.seen_in(scene.directory), alone.seen_in(alone.directory), alone.window) == (0.5, 0.0, 0.5)
     assert alone.stages == STAGES
     assert str(alone.model.weights_file) == "runs/other/model.h5"
     assert str(load_scene("tiny", ["model.path=a/b.h5"]).model.weights_file) == "a/b.h5"
+
+
+def test_of_a_ground_truth_that_is_not_trained_on_nothing_is_seen(tmp_path):
+    own, other, linked = (tmp_path / name for name in ("own", "other", "linked"))
+    for directory in (own, other, linked):
+        directory.mkdir()
+    (linked / "ground_truth.h5").symlink_to(own / "ground_truth.h5")  # as variants of a comparison have it
+    alone, both, others = (load_scene("tiny", [f"training.truths={[str(path) for path in paths]}"])
+                           for paths in ([own / "ground_truth.h5"], [other, own], [other]))
+    assert [scene.seen_in(own) for scene in (load_scene("tiny"), alone, both, others)] == [0.5, 0.5, 0.5, 0.0]
+    assert [scene.seen_in(linked) for scene in (alone, others)] == [0.5, 0.0]
+    # Then a rollout may start even though the window is the whole of what is trained on.
+    assert load_scene("tiny", [f'training.truths=["{other}"]', "training.window=1"]).seen_in(own) == 0
+
+
+@pytest.mark.mpi(1)
+def test_fingerprint_of_training_is_that_of_the_ground_truths_too(comm, tmp_path):
+    scene = load_scene("tiny", [f'training.truths=["{tmp_path}"]'])
+    prints = [scene.fingerprint("train")]
+    for seed in (2, 3):
+        other = load_scene("tiny", [f"seed={seed}"])
+        with create_product(comm, tmp_path / "ground_truth.h5", "ground_truth", other.provenance("dns")):
+            pass
+        prints.append(scene.fingerprint("train"))
+    assert len(set(prints)) == 3
+    assert scene.fingerprint("train-kernel") == load_scene("tiny").fingerprint("train-kernel")
+
+
+def test_the_forcing_that_stays_on_needs_one_and_no_other(tmp_path):
+    scene = load_scene("tiny", ["tracers.forced=true"])
+    assert scene.injects and not load_scene("tiny").injects
+    assert not load_scene("tiny", ["tracers.forced=true", "simulation.injection=none"]).injects
+    dataclasses.replace(scene, spin_up=None)  # the forcing acts while tracers are followed
+    with pytest.raises(SceneError, match=r"\[tracers\] forced = true: there is no \[forcing\] that could stay on"):
+        dataclasses.replace(scene, forcing=None)
+    terms = Model(terms=("pressure", "forcing"), settings={"forcing": {"injection_rate": 0.5}})
+    dataclasses.replace(load_scene("tiny"), model=terms)
+    with pytest.raises(SceneError, match=r'\[model\] terms: "forcing": .* is added by itself.*remove the term'):
+        dataclasses.replace(scene, model=terms)
 
 
 def test_window_without_training_is_the_default_of_training():

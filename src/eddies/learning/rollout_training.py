@@ -61,16 +61,18 @@ class RolloutTrainer:
     frame_interval : time between frames. steps_per_frame : time steps in it.
     energy_weight : of the energies beside the velocity; if it is zero, neither windows nor `energies` give any.
     energies : gives those of particles.
+    stationary : whether the flow is kept up, so that a band loses as much as it gains; then what its energy changes by
+        counts, its rms, instead of what it loses on average.
     """
 
     def __init__(self, comm: Comm, integrator: Integrator, windows: Sequence[TrainingWindow], frame_interval: float,
                  steps_per_frame: int, energy_weight: float, energies: Callable[[ParticleSet], Tensor] | None,
-                 seed: int) -> None:
+                 seed: int, stationary: bool = False) -> None:
         self.comm, self.integrator, self.windows = comm, integrator, windows
         self.steps_per_frame, self.time_step = steps_per_frame, frame_interval / steps_per_frame
         self.energy_weight, self.energies, self.seed = energy_weight, energies, seed
         self.total = int(global_sum(comm, len(windows[0].particles)))
-        self.losses = mean_losses(windows) if energy_weight > 0 else None
+        self.losses = mean_losses(windows, stationary) if energy_weight > 0 else None
 
     def step(self, optimizer: Adam, step: int, horizon: int) -> dict[str, float]:
         """One optimiser step on windows of `horizon` frames; returns the losses."""
@@ -157,8 +159,10 @@ class RolloutTrainer:
         return float(np.sqrt(squares / (self.total * math.prod(true.shape[1:]))))
 
 
-def mean_losses(windows: Sequence[TrainingWindow]) -> Tensor:
-    """The share of its energy that each band loses or gains in a frame interval, on average over windows: (bands,)."""
-    ratios = torch.stack([window.energies[-1] / window.energies[0] for window in windows])
-    losses = (ratios.log().mean(0) / (len(windows[0].energies) - 1)).abs()
+def mean_losses(windows: Sequence[TrainingWindow], stationary: bool = False) -> Tensor:
+    """The share of its energy that each band loses or gains in a frame interval, on average over windows, in a
+    `stationary` flow its rms: (bands,)."""
+    changes = torch.stack([window.energies[-1] / window.energies[0] for window in windows]).log()
+    change = changes.square().mean(0).sqrt() if stationary else changes.mean(0)
+    losses = (change / (len(windows[0].energies) - 1)).abs()
     return losses.clamp_min(SLOWEST * float(losses.max()))

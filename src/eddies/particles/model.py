@@ -16,9 +16,15 @@ from eddies.parallel.reduction import any_rank
 from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.rates import Rates, total
+from eddies.particles.terms import settings as declared
+from eddies.particles.terms.forcing import Forcing
 from eddies.particles.terms.presets import TERMS
 from eddies.particles.terms.settings import TermSettings
 from eddies.particles.terms.term import PairTerm, Term, TermError
+
+
+# The name of the forcing that is added to the terms of a model.
+FORCING = "injection"
 
 
 class LagrangianModel(nn.Module):
@@ -41,6 +47,18 @@ class LagrangianModel(nn.Module):
         for name, term in self.terms.items():
             if "density" in term.reads and "density" in term.gives:
                 raise TermError(f'term "{name}": reads the density and gives a part of it; it can do only one of both')
+
+    def forced(self, settings: declared.Forcing | None) -> LagrangianModel:
+        """The same terms, not copies of them, and the known forcing of a flow, if it has one."""
+        if settings is None:
+            return self
+        return LagrangianModel({**self.terms, FORCING: Forcing(settings, self.flow)}, self.flow)
+
+    def share_parameters(self, other: LagrangianModel) -> None:
+        """Take the parameters of the same terms in the units of another flow for one's own: one set for both."""
+        for name, parameter in other.named_parameters():
+            module, _, own = name.rpartition(".")
+            self.get_submodule(module).register_parameter(own, parameter)
 
     @property
     def reads(self) -> set[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -74,15 +75,21 @@ class ResolvedFlow:
     @cached_property
     def rms(self) -> Tensor:
         """Root mean square of a component of the resolved velocity; collective, differentiable."""
-        return self._rms_of(self.velocity, 0.0)
+        return self._rms_of(self.velocity, 0)
 
     @cached_property
     def smallest_rms(self) -> Tensor:
         """The same of the smallest scales, of the modes of u* with |k| > k_c/2."""
         return self._rms_of(self.unfiltered, self.grid.resolved / 2)
 
-    def _rms_of(self, modes: Tensor, above: float) -> Tensor:
+    def mean_square(self, modes: Tensor, above: float, below: float = math.inf) -> Tensor:
+        """Mean of u.u of those modes of a vector with `above` < |k| < `below`, in units of the smallest wavenumber;
+        collective, differentiable."""
         square = (modes.real.square() + modes.imag.square()).sum(0) * self.grid.multiplicity
-        square = torch.where(self.grid.shell > above, square, 0.0).sum(dtype=torch.float64)
+        inside = (self.grid.shell > above) & (self.grid.shell < below)
+        return sum_over_ranks(self.grid.decomposition.comm,
+                              torch.where(inside, square, 0.0).sum(dtype=torch.float64))
+
+    def _rms_of(self, modes: Tensor, above: float) -> Tensor:
         # Where nothing moves the slope of the root is taken for zero.
-        return (sum_over_ranks(self.grid.decomposition.comm, square) / 3).clamp_min(1e-300).sqrt()
+        return (self.mean_square(modes, above) / 3).clamp_min(1e-300).sqrt()

@@ -1,6 +1,6 @@
 """Figures of the trained model: a-priori errors and PDFs (the paper's Fig. 3) and its training."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -84,11 +84,13 @@ def _pdf_panel(axis: Axes, sample: Mapping[str, np.ndarray], title: str, symbol:
 
 def section(description: Mapping[str, object], table: Mapping[str, np.ndarray],
             acceleration: Mapping[str, np.ndarray], density_rate: Mapping[str, np.ndarray] | None,
-            history: Mapping[str, np.ndarray] | None, source: str | None = None) -> Section:
+            history: Mapping[str, np.ndarray] | None, source: str | None = None,
+            others: Sequence[str] = ()) -> Section:
     """The model: a-priori figures and the errors at the last frame, from the tables.
 
     `source` names the run that the weights come from, if it is another; the history is that run's, and None where
-    there was nothing to learn.
+    there was nothing to learn. `others` are ground truths that it was trained on, where that of this flow is none of
+    them.
     """
     last = int(np.argmax(table["delay"]))
     at = {name: float(values[last]) for name, values in table.items()}
@@ -97,8 +99,11 @@ def section(description: Mapping[str, object], table: Mapping[str, np.ndarray],
     metrics = [Metric(key, label, at.get(column), missing) for key, (column, label) in METRICS.items()]
     metrics.append(Metric("delay", "delay of these errors after what the model was trained on", at["delay"]))
     since = "training window" if source is None else "release of the tracers, or the training window"
-    text = (f"Terms: {terms}. A-priori: the model sees the true particles of a frame. Numbers are of the last frame, "
-            f"{at['delay']:.3g} after the {since}.")
+    trained = ""
+    if others:
+        since, trained = "release of the tracers", f" Trained on {', '.join(others)}, and on nothing of this flow."
+    text = (f"Terms: {terms}.{trained} A-priori: the model sees the true particles of a frame. Numbers are of the last "
+            f"frame, {at['delay']:.3g} after the {since}.")
     shown = Section("model", "Model", text, metrics=metrics,
                     main=("acceleration_error", "filtered_pressure_gradient_error"))
     truth, predicted = acceleration["truth"], acceleration["predicted"]

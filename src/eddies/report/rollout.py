@@ -62,8 +62,14 @@ class Rollout:
 
     @property
     def forced(self) -> bool:
-        """Whether its large scales were forced, as the truth's are not."""
-        return float(self.attributes.get("injection_rate", 0.0)) > 0
+        """Whether its large scales were forced."""
+        return self.powers[0] > 0
+
+    @property
+    def powers(self) -> tuple[float, float]:
+        """With which its large scales were forced and those of the true tracers, a mass."""
+        model, truth = (float(self.attributes.get(name, 0.0)) for name in ("injection_rate", "truth_injection_rate"))
+        return model, truth
 
     @property
     def method(self) -> str:
@@ -83,6 +89,8 @@ def section(run: Rollout) -> Section:
     steps = f"time step {float(run.attributes['time_step']):.3g}" if "time_step" in run.attributes else "without a step"
     text = (f"Moved by: {run.method}; integrator {run.attributes['integrator']}, {steps}. "
             f"T = {run.turnover:.3g} is the eddy turnover time. ")
+    if run.forced and len(set(run.powers)) == 1:
+        text += f"Model and truth are forced alike, with a power of {run.powers[0]:.3g} a mass. "
     shown = Section("rollout", "Rollout against the truth", text, main=MAIN, metrics=[
         Metric("method", "what moved the particles", run.method),
         Metric("status", "status", run.status),
@@ -138,10 +146,13 @@ def _add_closure(shown: Section, solves: Mapping[str, np.ndarray]) -> None:
 def _notices(run: Rollout, last: float, broken: float) -> list[str]:
     end, turnover = run.model.times[-1], run.turnover
     notices = []
-    if run.forced:
-        notices.append("The model is forced and the true tracers decay: from the start on they are two flows, and what "
-                       "is compared here says little of the model. Where the ground truth has a stationary state "
-                       "([spin_up] stationary), the next section compares the model with that.")
+    ours, theirs = run.powers
+    if ours != theirs:
+        told = [f"forced with a power of {power:.3g} a mass" if power > 0 else "not forced" for power in (ours, theirs)]
+        notices.append(f"The model is {told[0]}, and the flow of the true tracers is {told[1]}: from the start on they "
+                       "are two flows, and what is compared here says little of the model." + (
+                           " Where the ground truth has a stationary state ([spin_up] stationary), the next section "
+                           "compares the model with that." if run.forced else ""))
     if run.status != "complete":
         notices.append(f"The rollout {run.status} (last frame at {end / turnover:.3g} T).")
     if np.isfinite(broken):

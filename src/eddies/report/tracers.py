@@ -64,8 +64,9 @@ def tracers(found: TracerStatistics, scales: Mapping[str, float]) -> Figure:
     return figure
 
 
-def section(found: TracerStatistics, scales: Mapping[str, float]) -> Section:
-    """Statistics of the tracers; scales: of the flow when they start, as a ground truth's `reference`."""
+def section(found: TracerStatistics, scales: Mapping[str, float], power: float) -> Section:
+    """Statistics of the tracers; scales: of the flow when they start, as a ground truth's `reference`; power: a mass,
+    with which it is forced meanwhile."""
     kurtosis, (first, last) = found.kurtosis, found.energy_ratio[[0, -1]]
     metrics = [
         Metric("tracer_energy_ratio_first", "⟨v·v⟩ of tracers / filtered field, when the tracers start", float(first)),
@@ -80,7 +81,8 @@ def section(found: TracerStatistics, scales: Mapping[str, float]) -> Section:
                found.ballistic_exponent, TOO_FEW),
         Metric("ballistic_prefactor", "⟨|r − r₀|²⟩ / S₂(r₀) t² at the first frame", found.ballistic_prefactor, TOO_FEW),
     ]
-    text = ("Tracers follow the filtered flow, without forcing: their accelerations are those of the eddies that the "
+    forcing = f"which stays forced with a power of {power:.3g} a mass" if power > 0 else "without forcing"
+    text = (f"Tracers follow the filtered flow, {forcing}: their accelerations are those of the eddies that the "
             "filter leaves, and fall below the literature's of the whole flow.")
     shown = Section("tracers", "Tracers", text, metrics=metrics)
     shown.add_figure(

@@ -12,6 +12,7 @@ from itertools import chain
 from typing import TYPE_CHECKING
 
 from eddies.import_path import ImportPathError, is_path, load
+from eddies.particles.terms.settings import Forcing
 from eddies.scene.rules import quoted
 from eddies.scene.sections import Eulerian, Wcsph
 from eddies.scene.values import import_paths
@@ -106,14 +107,21 @@ def time_problems(scene: Scene) -> Iterator[str]:
     if scene.spin_up and scene.spin_up.stationary and scene.spin_up.stationary >= scene.spin_up.turnovers:
         yield (f"[spin_up] stationary = {scene.spin_up.stationary:g}: must be less than turnovers = "
                f"{scene.spin_up.turnovers:g}, of which they are the last")
-    if scene.forcing and scene.tracers and scene.spin_up is None:
+    if scene.forcing and scene.tracers and not scene.tracers.forced and scene.spin_up is None:
         yield ("[forcing]: acts only before the tracers start, and there is no [spin_up]; add [spin_up] "
-               "turnovers or remove [forcing]")
+               "turnovers, set [tracers] forced = true, or remove [forcing]")
 
 
 def tracer_problems(scene: Scene) -> Iterator[str]:
     """Stored fields no finer than the simulation; a flow that moves, and for a model one that changes."""
     tracers, initial = scene.tracers, scene.initial
+    if tracers and tracers.forced and scene.forcing is None:
+        yield ("[tracers] forced = true: there is no [forcing] that could stay on; add it with an injection_rate, or "
+               "remove the key")
+    if tracers and tracers.forced and scene.model and any(
+            isinstance(settings, Forcing) for settings in scene.model.settings.values()):
+        yield ('[model] terms: "forcing": with [tracers] forced = true the forcing of the ground truth is added by '
+               "itself, and this would be another; remove the term")
     if tracers and initial.kind == "sound-wave":
         yield ('[initial] kind = "sound-wave": starts from rest, and [tracers] are followed for turnovers of a flow '
                "that moves; choose another kind, or remove [tracers]")
@@ -222,6 +230,11 @@ def training_problems(scene: Scene) -> Iterator[str]:
         if training.final_learning_rate > horizons.learning_rate:
             yield (f"[training] final_learning_rate = {training.final_learning_rate:g}: must be at most "
                    f"[training.horizons] learning_rate = {horizons.learning_rate:g}")
+    if training.truths is not None and not training.truths:
+        yield "[training] truths = []: must name one or more run directories; name them, or remove the key"
+    if training.frames < 2 * len(training.truths or ()):
+        yield (f"[training] frames = {training.frames}: the {len(training.truths)} truths need 2 each, "
+               f"{2 * len(training.truths)} in all; raise it")
     if scene.tracers and training.batch > scene.tracers.particles:
         yield (f"[training] batch = {training.batch}: must be at most the number of particles, "
                f"{scene.tracers.particles}; lower it or raise [tracers] particles_per_side")
@@ -248,7 +261,7 @@ def simulation_problems(scene: Scene) -> Iterator[str]:
         yield (f"[simulation] frame_interval = {frame:g}: must be a whole multiple of [tracers] "
                f"frame_interval = {scene.tracers.frame_interval:g}, so that truth and model are stored at "
                "the same times")
-    if simulation.start is None and scene.training and scene.training.window == 1:
+    if simulation.start is None and scene.seen_in(scene.directory) == 1:
         yield ("[simulation] start: this key is missing; the training window is the whole ground truth, so "
                "there is nothing after it; give start, or a smaller [training] window")
 

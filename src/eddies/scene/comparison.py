@@ -8,7 +8,7 @@ from pathlib import Path
 
 from eddies.measures import MEASURES
 from eddies.scene.reader import find_document, parse_document, read_section, read_text
-from eddies.scene.rules import nearest
+from eddies.scene.rules import nearest, quoted
 from eddies.scene.scene import Scene, SceneError, load_scene
 from eddies.scene.values import (Document, Section, directory_name, integer, integers, number, sections, text,
                                  texts)
@@ -159,6 +159,10 @@ class Comparison(Document):
         if self.realisations is None and scene.simulation.start is None and scene.window != base.window:
             return (f"[training] window = {scene.window:g} where the base has {base.window:g}: rollouts start where it "
                     "ends, and all must start at the same moment; give [simulation] start for all of them")
+        ours, theirs = (other.training and other.training.truths for other in (scene, base))
+        if scene.simulation.start is None and ours != theirs:
+            return (f"[training] truths = {quoted(ours)} where the base has {quoted(theirs)}: where rollouts start "
+                    "depends on them, and all must start at the same moment; give [simulation] start for all of them")
         return None
 
 

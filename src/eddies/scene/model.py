@@ -11,7 +11,8 @@ from eddies.particles.terms.presets import DEFAULT_PRESET, PRESETS, TERMS
 from eddies.particles.terms.settings import GIVES, READS, TermSettings
 from eddies.scene.reader import read_section
 from eddies.scene.rules import nearest, quoted
-from eddies.scene.values import KeyProblem, SceneError, Section, choice, import_paths, number, sub_sections, text, texts
+from eddies.scene.values import (KeyProblem, SceneError, Section, choice, import_paths, number, product_file,
+                                 sub_sections, text, texts)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,10 +59,8 @@ class Model(Section):
 
     @property
     def weights_file(self) -> Path | None:
-        """The file of the weights: `path` where it ends in .h5, model.h5 within it otherwise; None without it."""
-        if self.path is None:
-            return None
-        return Path(self.path) if self.path.endswith(".h5") else Path(self.path) / "model.h5"
+        """The file of the weights, which `path` names; None without it."""
+        return None if self.path is None else product_file(self.path, "model.h5")
 
     @property
     def reads(self) -> frozenset[str]:

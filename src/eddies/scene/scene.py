@@ -5,13 +5,13 @@ A section that is optional and absent is None, and then nothing is built for it.
 
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from eddies.import_path import origins, search_in
+from eddies.import_path import load, origins, search_in
 from eddies.pipeline import STAGES, Stage
 from eddies.scene.checks import first_inconsistency
 from eddies.scene.model import Model, replace_terms
@@ -78,9 +78,31 @@ class Scene(Document):
         return self.training.window if self.training else DEFAULT_WINDOW
 
     @property
-    def seen(self) -> float:
-        """Fraction of the ground truth that the model was trained on; 0 without [training], as with [model] path."""
-        return self.training.window if self.training else 0.0
+    def directory(self) -> Path:
+        """The run directory, unless another is given."""
+        return Path("runs") / self.name
+
+    def seen_in(self, directory: Path) -> float:
+        """Fraction of the ground truth of a run directory that the model was trained on; 0 without [training], as with
+        [model] path, and where other ground truths are."""
+        if self.training is None:
+            return 0.0
+        own = (directory / STAGES["dns"].file).resolve()
+        others = self.training.truths is not None and own not in [path.resolve() for path in self.training.truth_files]
+        return 0.0 if others else self.training.window
+
+    @property
+    def injects(self) -> bool:
+        """Whether there is a rollout whose particles are forced."""
+        injection = self.simulation.injection if self.simulation else "none"
+        return bool(self.tracers and self.tracers.forced) if injection == "truth" else injection != "none"
+
+    @property
+    def resolves(self) -> bool:
+        """Whether the model is evaluated with what a grid resolves of the velocity: its terms read that, or it is
+        forced."""
+        return bool(self.model and "resolved" in self.model.reads or self.tracers and self.tracers.forced
+                    or self.injects)
 
     @property
     def kernel_support(self) -> float | None:
@@ -113,9 +135,10 @@ class Scene(Document):
     def fingerprint(self, stage: str) -> str:
         """SHA-256 over what a stage's product depends on: its own settings and those of the earlier stages that
         the scene has, and the content of the files that the flow starts from, that trained weights come from, and that
-        hold the source of foreign classes."""
+        hold the source of foreign classes; of the ground truths that a model is trained on their own fingerprints."""
         settings = asdict(self) | {"window": self.window, "start": _digest(self.initial.path),
-                                   "weights": _digest(self.model.weights_file if self.model else None)}
+                                   "weights": _digest(self.model.weights_file if self.model else None),
+                                   "truths": _fingerprints(self.training.truth_files if self.training else ())}
         settings |= {f"own_{name}": origins(self._foreign_in(name)) for name in FOREIGN_IN}
         of_these = {*STAGES[stage].depends_on, stage} & {*self.stages}
         keys = [key for each in STAGES.values() if each.name in of_these for key in each.reads]
@@ -163,6 +186,12 @@ def load_scene(name_or_path: str | Path, overrides: list[str] | tuple[str, ...] 
 def builtin_scenes() -> list[tuple[str, str]]:
     """Name and title of every scene that comes with the package, by name."""
     return [(path.stem, parse_document(read_text(path))["title"]) for path in sorted(BUILT_IN.glob("*.toml"))]
+
+
+def _fingerprints(paths: Sequence[Path]) -> list[str | None]:
+    """Those of the scenes that ground truths were made from, which may be too large to read; None of what is none."""
+    # What knows files of products is loaded where there are any.
+    return [load("eddies.io.provenance:product_fingerprint")(path) for path in paths]
 
 
 def _digest(path: str | Path | None) -> str | None:

@@ -7,10 +7,12 @@ cube [0, 2 pi)^3, the mean density is 1, and times are in the unit that follows 
 import math
 from dataclasses import dataclass
 from itertools import chain
+from pathlib import Path
 
 from eddies.import_path import is_path, load
 from eddies.scene.methods import METHODS, needs_of
-from eddies.scene.values import KeyProblem, Section, choice, integer, integers, named, number, numbers, section, text
+from eddies.scene.values import (KeyProblem, Section, boolean, choice, integer, integers, named, number, numbers,
+                                 product_file, section, text, texts)
 
 BOX_LENGTH = 2 * math.pi
 DEFAULT_WINDOW = 0.5
@@ -92,6 +94,7 @@ class Tracers(Section):
                                  default=None, above=0, at_most=BOX_LENGTH / 2)
     interpolation: str = choice("splines from grid to particles", "cubic", "quintic", default="cubic")
     turnovers: float = number("large-eddy turnovers to follow the particles", above=0)
+    forced: bool = boolean("whether [forcing] stays on meanwhile, so that the flow is stationary", default=False)
     frame_interval: float = number("time between stored frames", above=0)
     field_cells: int | None = integer("grid of the stored fields; absent: 1.5 x particles_per_side, even",
                                       default=None, at_least=4)
@@ -169,9 +172,11 @@ class Horizons(Section):
 class Training(Section):
     """How the force is fitted to the tracers: to trajectories, to all losses together, to what the simulation does."""
 
-    window: float = number("fraction of the ground truth that is used, the rest stays unseen",
+    truths: tuple[str, ...] | None = texts("run directories or files of the ground truths that are used, each with its "
+                                           "own scales; absent: the run's own", default=None)
+    window: float = number("fraction of each ground truth that is used, the rest stays unseen",
                            default=DEFAULT_WINDOW, above=0, at_most=1)
-    frames: int = integer("frames of the window to draw from", at_least=2)
+    frames: int = integer("frames to draw from, in all, evenly shared by the ground truths", at_least=2)
     batch: int = integer("particles per step", at_least=1)
     steps: int = integer("optimiser steps", at_least=1)
     learning_rate: float = number("of the optimiser, at the start", default=5e-3, above=0)
@@ -183,6 +188,11 @@ class Training(Section):
     combined_steps: int = integer("steps at the end that use every loss", default=0, at_least=0)
     horizons: Horizons | None = section(Horizons, default=None)
 
+    @property
+    def truth_files(self) -> tuple[Path, ...]:
+        """The files of `truths`; none without the key."""
+        return tuple(product_file(path, "ground_truth.h5") for path in self.truths or ())
+
 
 @dataclass(frozen=True, kw_only=True)
 class Simulation(Section):
@@ -192,13 +202,15 @@ class Simulation(Section):
     integrator: str = choice("time stepping of the particles", "verlet", "rk2", "rk3", "rk4", default="rk3")
     step: float = number("longest time step; see docs/closure.md", above=0)
     turnovers: float = number("large-eddy turnovers to simulate", above=0)
-    start: float | None = number("as a fraction of the ground truth; absent: where the training window ends",
-                                 default=None, at_least=0, below=1)
+    start: float | None = number("as a fraction of the ground truth; absent: where the training window ends, or at the "
+                                 "first field of a ground truth that is not trained on", default=None, at_least=0,
+                                 below=1)
     frame_interval: float = number("time between stored frames", above=0)
     skin: float = number("extra reach of the neighbour list, in supports", default=0.1, at_least=0, at_most=1)
     precision: str = choice("of the forces", "float32", "float64", default="float32")
-    injection: float | str = number("large-scale forcing power per mass; dissipation: as the flow loses",
-                                    default="none", words=("none", "dissipation"), above=0)
+    injection: float | str = number("large-scale forcing power per mass; truth: as the ground truth was forced while "
+                                    "its tracers were followed; dissipation: as the flow loses", default="truth",
+                                    words=("truth", "none", "dissipation"), above=0)
 
     @property
     def needs(self) -> tuple[str, ...]:

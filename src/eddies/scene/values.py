@@ -11,6 +11,7 @@ import inspect
 import re
 from collections.abc import Iterator
 from dataclasses import MISSING
+from pathlib import Path
 from typing import Any
 
 from eddies.errors import UserError
@@ -172,6 +173,11 @@ def import_paths(part: Section) -> Iterator[tuple[str, str]]:
             for name in (value,) if isinstance(value, str) else value or ():
                 if ":" in name:
                     yield field.name, name
+
+
+def product_file(path: str, name: str) -> Path:
+    """The file of a product that a key names: the path itself where it ends in .h5, else NAME in that directory."""
+    return Path(path) if path.endswith(".h5") else Path(path) / name
 
 
 def place(key: str, section: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,8 @@ log = logging.getLogger("eddies")
 def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | None = None) -> None:
     """Simulate the flow of a scene and write ground_truth.h5: statistics, and with tracers their frames and fields.
 
-    Forced turbulence is first brought to a stationary state ([spin_up]). Tracers are released with the forcing off.
+    Forced turbulence is first brought to a stationary state ([spin_up]). Tracers are released with the forcing off,
+    unless [tracers] forced.
     Goes on from the newest checkpoint in the directory, if there is one of the same settings.
 
     Raises Stopped, after a checkpoint, when `stop` asks for it.
@@ -46,7 +48,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         if flow.phase == "spin-up":
             spin_up(scene.spin_up.turnovers, flow)
         if scene.tracers is not None:
-            follow_tracers(scene, file, flow, saved if flow.phase == "tracers" else None)
+            follow_tracers(scene, scene.seen_in(directory), file, flow, saved if flow.phase == "tracers" else None)
         else:
             run_for(scene.time.duration, flow)
             write_final_fields(file, flow)
@@ -108,17 +110,20 @@ def stationary_span(settings: SpinUp, history: FlowHistory) -> dict[str, float]:
     return {"start": times[first], "end": times[last]}
 
 
-def follow_tracers(scene: Scene, file: File, flow: FlowRun, saved: Checkpoint | None) -> None:
-    """Release tracers into the flow, forcing off, and store their frames, the filtered fields and the scales."""
+def follow_tracers(scene: Scene, seen: float, file: File, flow: FlowRun, saved: Checkpoint | None) -> None:
+    """Release tracers into the flow, and store their frames, the filtered fields, the scales, and the forcing that
+    stays on."""
     comm, names = flow.fluid.grid.decomposition.comm, saved.files if saved is not None else ()
     layout = frame_layout(scene.tracers, flow.fluid.compressible, flow.fluid.grid.cutoff)
     with FrameSegments(comm, flow.guard.checkpoints.path, layout, names) as segments:
-        run = TracerRun(scene, flow, segments, saved)
+        run = TracerRun(scene, seen, flow, segments, saved)
         run.follow()
         segments.assemble(file)
     write_attributes(file.create_group("reference"), {
         **scales_of(run.released), "energy_budget_error": flow.history.budget_error, "viscosity": flow.fluid.viscosity,
         **run.scales()})
+    if flow.fluid.forcing is not None:
+        write_attributes(file.create_group("forcing"), asdict(scene.forcing))
     run.frames.write_spectra(file)
 
 

@@ -32,12 +32,12 @@ SILENCE = -40.0
 MOST_FORCED = 50
 
 
-def check_feasible(stages: Sequence[str], scene: Scene, comm: Comm) -> None:
-    """Refuse stages of a scene that cannot come to their end; all ranks call it.
+def check_feasible(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path | None = None) -> None:
+    """Refuse stages of a scene that cannot come to their end in a directory, or in runs/NAME; all ranks call it.
 
     Raises SceneError for what the scene tells, DeviceError where there is no GPU for one that asks for it.
     """
-    problem = next(problems(stages, scene), None)
+    problem = next(problems(stages, scene, scene.seen_in(directory or scene.directory)), None)
     if problem is not None:
         raise SceneError(f"{scene.name}: {problem}")
     if scene.device != "cpu" and {"train", "simulate"} & set(stages):
@@ -50,7 +50,7 @@ def check_ground_truth(stages: Sequence[str], scene: Scene, comm: Comm, director
     vanish; all ranks call it."""
     path = directory / STAGES["dns"].file
     with open_product(comm, path, "ground_truth") as file:
-        check_frames(stages, scene, len(Trajectory(file, "tracers").times))
+        check_frames(stages, scene, scene.seen_in(directory), len(Trajectory(file, "tracers").times))
         if {"train", "simulate"} & set(stages):
             from eddies.workflows.ground_truth.truth import GroundTruth  # torch, only here
             try:
@@ -79,8 +79,8 @@ def check_places(stages: Sequence[str], comm: Comm, directory: Path) -> None:
         raise SceneError(f"{directory}: cannot be used ({error.strerror}); choose another --output") from None
 
 
-def problems(stages: Sequence[str], scene: Scene) -> Iterator[str]:
-    """What cannot come to its end, in words."""
+def problems(stages: Sequence[str], scene: Scene, seen: float) -> Iterator[str]:
+    """What cannot come to its end, in words, where the model is trained on a fraction `seen` of the ground truth."""
     if "dns" in stages:
         yield from forcing_problems(scene)
         yield from decay_problems(scene)
@@ -88,7 +88,7 @@ def problems(stages: Sequence[str], scene: Scene) -> Iterator[str]:
     if "simulate" in stages:
         yield from rollout_problems(scene)
     if "dns" in stages and scene.tracers is not None:
-        yield from frame_problems(stages, scene)
+        yield from frame_problems(stages, scene, seen)
 
 
 def forcing_problems(scene: Scene) -> Iterator[str]:
@@ -109,7 +109,7 @@ def forcing_problems(scene: Scene) -> Iterator[str]:
 def decay_problems(scene: Scene) -> Iterator[str]:
     """A flow of which viscosity leaves nothing while the tracers follow it."""
     turbulence = expected_turbulence(scene)
-    if scene.tracers is None or turbulence is None:
+    if scene.tracers is None or turbulence is None or scene.tracers.forced:
         return
     time = scene.tracers.turnovers * turbulence.turnover_time
     exponent = -2 * scene.flow.viscosity * time  # of the largest modes, |k| = 1
@@ -152,7 +152,7 @@ def rollout_problems(scene: Scene) -> Iterator[str]:
                f"{MOST_STEPS:.0e} are the most; raise step or lower turnovers")
 
 
-def frame_problems(stages: Sequence[str], scene: Scene) -> Iterator[str]:
+def frame_problems(stages: Sequence[str], scene: Scene, seen: float) -> Iterator[str]:
     """Too few frames of the ground truth for the other stages, even if the flow turns over as slowly as it may.
 
     Not of a flow that decays before the tracers start, or that is hardly turbulent, whose turnover time may be any.
@@ -164,6 +164,6 @@ def frame_problems(stages: Sequence[str], scene: Scene) -> Iterator[str]:
     longest = LATER * turnovers * turbulence.turnover_time
     frames = max(math.ceil(longest / scene.tracers.frame_interval), 1) + 1
     try:
-        check_frames(stages, scene, frames)
+        check_frames(stages, scene, seen, frames)
     except SceneError as error:
         yield f"with at most {frames} frames, as is foreseen of [tracers] turnovers = {turnovers:g}: {error}"

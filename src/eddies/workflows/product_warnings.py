@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from eddies.io.hdf5 import File, make_again, read_attributes
+from eddies.io.provenance import product_provenance
 from eddies.io.stored_numbers import stored_numbers
 from eddies.pipeline import MAKER_OF, STAGES
 from eddies.workflows.run_directory.work import changed_settings, of_other_settings
@@ -44,6 +45,22 @@ def mixed_products(provenance: Mapping[str, Provenance]) -> list[str]:
                        "bring back what is missing")
             found.append(f"{_made(kind, origin)} was made from {named}: {again}, or {or_else}")
     return found
+
+
+def changed_truths(origin: Provenance) -> list[str]:
+    """A sentence for each ground truth of another run that a model was trained on and that is another now; `origin` is
+    the provenance of the model. Nothing is said of what is no longer there."""
+    truths = origin.get("truths", {})
+    now = {path: product_provenance(path).get("id") for path in truths}
+    return [f"{_made('model', origin)} was trained on another {path} than is there now; {make_again('model')}, or take "
+            "it as of another flow" for path, known in truths.items() if now[path] not in (None, known)]
+
+
+def others_trained_on(origin: Provenance) -> list[str]:
+    """The ground truths that a model was trained on where that of its own run is none of them; `origin` is the
+    provenance of the model."""
+    truths = origin.get("truths", {})
+    return [] if origin.get("made_from", {}).get("ground_truth") in truths.values() else list(truths)
 
 
 def not_finite(file: File, kind: str) -> str:

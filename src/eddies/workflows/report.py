@@ -35,7 +35,7 @@ from eddies.report.rollout import Rollout
 from eddies.report.rollout import section as rollout_section
 from eddies.scene.scene import Scene
 from eddies.workflows.feasibility import check_places
-from eddies.workflows.product_warnings import mixed_products, not_finite
+from eddies.workflows.product_warnings import changed_truths, mixed_products, not_finite, others_trained_on
 from eddies.workflows.rollout.stored_spectra import read_spectra
 from eddies.workflows.run_directory.work import SECONDS
 
@@ -105,7 +105,8 @@ def _survey(directory: Path, alone: Comm) -> Run:
     if not record.provenance:
         raise ProductError(f"{directory}: holds none of {', '.join(f'{kind}.h5' for kind in KINDS)}; "
                            "run `eddies dns SCENE` first")
-    record.warnings += [*mixed_products(record.provenance), *record.not_finite.values()]
+    record.warnings += [*mixed_products(record.provenance), *changed_truths(record.provenance.get("model", {})),
+                        *record.not_finite.values()]
     return record
 
 
@@ -205,7 +206,8 @@ def _read_tracers(file: File, record: Run) -> list[Section]:
         return []
     reference = read_attributes(file, "reference")
     found = tracer_statistics(Trajectory(file, "tracers"), record.eulerian, reference["spacing"])
-    return [tracers.section(found, reference)]
+    power = read_attributes(file, "forcing")["injection_rate"] if "forcing" in file else 0.0
+    return [tracers.section(found, reference, power)]
 
 
 def _read_kernel(file: File, record: Run) -> list[Section]:
@@ -219,7 +221,8 @@ def _read_model(file: File, record: Run) -> list[Section]:
     source = provenance.get("source")
     history = read_table(file, "history") if "history" in file else None
     shown = model_section(read_json(file, "description"), errors,
-                          read_table(file, "acceleration_sample"), density_rate, history, source and source["path"])
+                          read_table(file, "acceleration_sample"), density_rate, history, source and source["path"],
+                          others_trained_on(provenance))
     if source:
         own = mach.FlowErrors("this flow", provenance["mach_turbulent"], errors)
         mach.add(shown, own, mach.FlowErrors(source["path"], source["mach_turbulent"],

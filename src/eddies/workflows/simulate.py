@@ -14,6 +14,7 @@ from eddies.parallel.communicator import Comm
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import StopRequest
 from eddies.particles.devices import prepare_torch
+from eddies.particles.terms.settings import Forcing
 from eddies.pipeline import STAGES
 from eddies.scene.methods import method_class
 from eddies.scene.scene import BOX_LENGTH, Scene
@@ -22,7 +23,7 @@ from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.learned.kernel import load_kernel
 from eddies.workflows.rollout.course import Course
 from eddies.workflows.rollout.frames import RolloutFrames
-from eddies.workflows.rollout.particle_run import injection_rate
+from eddies.workflows.rollout.particle_run import injection
 
 log = logging.getLogger("eddies")
 
@@ -37,7 +38,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                   " of the rollout")
     with open_product(comm, directory / "ground_truth.h5", "ground_truth") as truth_file, torch.no_grad():
         truth = GroundTruth(truth_file, slab)
-        start = start_frame(scene, truth)
+        start = start_frame(scene, truth, directory)
         method = method_class(settings.method)(scene, truth, start, directory, device)
         kernel = load_kernel(comm, directory / "kernel.h5") if scene.kernel else None
         saved = guard.checkpoints.newest()
@@ -51,7 +52,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                 frames.write(file)
                 write_attributes(file.create_group("rollout"), {
                     **outcome, **method.description(), "method": settings.method,
-                    "turnovers": outcome["time"] / turnover, "injection_rate": injection_rate(scene, truth),
+                    "turnovers": outcome["time"] / turnover, "injection_rate": forcing_rate(injection(scene, truth)),
+                    "truth_injection_rate": forcing_rate(truth.forcing),
                     "eddy_turnover_time": turnover, "start_time": float(truth.times[start]),
                     "particles": truth.total, "ranks": comm.size})
                 for name, columns in method.series().items():
@@ -61,10 +63,12 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     log.info("rollout: %s after %.2f turnovers, %s", outcome["status"], outcome["time"] / turnover, pace)
 
 
-def start_frame(scene: Scene, truth: GroundTruth) -> int:
-    """The first frame with a filtered field at or after the moment that the scene asks for.
+def forcing_rate(forcing: Forcing | None) -> float:
+    """Power per mass of a forcing, 0 without one."""
+    return 0.0 if forcing is None else forcing.injection_rate
 
-    Raises SceneError if none follows that leaves a frame of the ground truth to compare with.
-    """
+
+def start_frame(scene: Scene, truth: GroundTruth, directory: Path) -> int:
+    """The frame from which the rollout of a run directory starts: see `rollout_start`."""
     at_fields = [truth.frame_of_field(index) for index in range(len(truth.fields.times))]
-    return rollout_start(scene, len(truth.times), at_fields)
+    return rollout_start(scene, scene.seen_in(directory), len(truth.times), at_fields)

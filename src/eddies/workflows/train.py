@@ -7,24 +7,24 @@ import time
 from pathlib import Path
 
 from eddies.io.guard import Guard
-from eddies.io.hdf5 import in_files, open_product
+from eddies.io.hdf5 import in_files
 from eddies.io.weights import save_weights
 from eddies.io.whole_files import write_files
 from eddies.learning.training import Training
 from eddies.parallel.communicator import Comm
 from eddies.parallel.reduction import any_rank
-from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import StopRequest
 from eddies.particles.devices import prepare_torch
 from eddies.pipeline import STAGES
-from eddies.scene.scene import BOX_LENGTH, Scene
-from eddies.workflows.ground_truth.truth import GroundTruth
+from eddies.scene.scene import Scene
 from eddies.workflows.learned import transfer
 from eddies.workflows.learned.a_priori import evaluate, evaluation_frames
 from eddies.workflows.learned.description import describe
 from eddies.workflows.learned.kernel import load_kernel
 from eddies.workflows.learned.steps import take_all_steps
-from eddies.workflows.learned.training_data import TrainingData
+from eddies.workflows.learned.training_data import model_of
+from eddies.workflows.learned.training_phases import feature_range, horizon_phases, one_step_phases
+from eddies.workflows.learned.truths import open_truths, training_data, truth_ids
 
 log = logging.getLogger("eddies")
 
@@ -42,39 +42,45 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         transfer.run(scene, comm, directory)
         return
     device, directory = prepare_torch(scene.device, comm), Path(directory)
-    with open_product(comm, directory / "ground_truth.h5", "ground_truth") as file:
-        truth = GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes))
+    with open_truths(scene, comm, directory) as (truth, trained_on):
         # Only the field loss averages with it.
         kernel = load_kernel(comm, directory / "kernel.h5", device) if scene.training.field_weight > 0 else None
-        data = TrainingData(scene, truth, kernel, device)
-        model, last, tests = data.model, data.last, evaluation_frames(truth)
-        log.info("train: frames up to %d of the times up to %.3g of %.3g, %d held out; %d weights", data.learned,
-                 truth.times[last], truth.times[-1], last - data.learned, sum(p.numel() for p in model.parameters()))
+        data, tests = training_data(scene, trained_on, device), evaluation_frames(truth)
+        model = data[0].model
+        for each in data:
+            log.info("train: frames up to %d of the times up to %.3g of %.3g, %d held out; %d weights", each.learned,
+                     each.truth.times[each.last], each.truth.times[-1], each.last - each.learned,
+                     sum(p.numel() for p in model.parameters()))
+        own = next((each.model for each in data if each.truth is truth), None)
+        # Nothing of the run's own ground truth is seen where others are trained on.
+        last = truth.last_frame_seen(scene.training.window if own is not None else 0.0)
         guard = Guard(comm, directory / STAGES["train"].checkpoints, scene.fingerprint("train"), stop,
                       " of the training")
         history = {}
         if next(model.parameters(), None) is None:
             log.info("train: the terms have no parameters, nothing is learned")
         else:
-            phases = [*data.one_step_phases(), *data.horizon_phases()]
+            phases = [*one_step_phases(scene, data, kernel), *horizon_phases(scene, data)]
             training, curves = Training(comm, model, phases), LearningCurves(comm, directory / "learning.png")
             take_all_steps(training, guard, "train", "training", "lower learning_rate here or in [training.horizons], "
                            "or shorten time_step there", curves)
             curves.draw(training)
             history = {"history": training.columns()}
-        tables = history | evaluate(truth, model, tests, last, data.dtype, device)
+        tested = model_of(scene, truth, device, model) if own is None else own
+        tables = history | evaluate(truth, tested, tests, last, data[0].dtype, device)
         if model.networks:
-            tables["feature_range"] = vars(data.feature_range())
+            tables["feature_range"] = vars(feature_range(data))
         mach, description = truth.reference.get("mach_turbulent"), describe(scene, truth.scales)
     weights = {name: tensor.cpu().numpy() for name, tensor in model.state_dict().items()}
     save_weights(comm, directory / "model.h5", "model", description, weights,
-                 {**scene.provenance("train"), "mach_turbulent": mach}, tables)
+                 {**scene.provenance("train"), "mach_turbulent": mach, "truths": truth_ids(scene)}, tables)
     guard.checkpoints.remove()
     errors = tables["a_priori"]
     beside = (f" (exact filtered pressure gradient {errors['pressure_gradient_error'][-1]:.3f})"
               if "pressure_gradient_error" in errors else "")
-    log.info("model: acceleration error %.3f at a time %.3g after the training window%s",
-             errors["acceleration_error"][-1], errors["delay"][-1], beside)
+    since = "training window" if own is not None else "release of tracers that were not trained on"
+    log.info("model: acceleration error %.3f at a time %.3g after the %s%s", errors["acceleration_error"][-1],
+             errors["delay"][-1], since, beside)
 
 
 class LearningCurves:

@@ -158,8 +158,10 @@ class Relaxation(TermSettings):
 class Forcing(TermSettings):
     """Linear forcing of the large scales at a prescribed power."""
 
-    injection_rate: float = number("power injected per unit mass", at_least=0)
+    injection_rate: float = number("power injected per unit mass of the flow, before the filter", at_least=0)
     wavenumber: float = number("modes with 0 < |k| < this are forced", default=2.0, above=1)
+
+    reads = ("resolved",)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -186,7 +186,7 @@ def most_training_ranks(scene: Scene) -> dict[str, int]:
     # The a-priori test interpolates filtered fields to the particles, terms what they make of the resolved velocity.
     limits = {"ghost planes of the filtered fields": max(scene.tracers.cells // GHOST_PLANES["quintic"], 1)}
     radius, simulation = scene.interaction_radius, scene.simulation
-    if "resolved" in scene.model.reads:
+    if scene.resolves:
         skin = simulation.skin * radius if simulation else 0.0
         limits["ghost planes of the resolved velocity"] = ranks_of_resolved_grid(scene, skin / 2)
     time = horizon_time(scene)
@@ -195,7 +195,7 @@ def most_training_ranks(scene: Scene) -> dict[str, int]:
             reach = radius + 2 * particle_drift(scene, time)
             limits[f"slabs no thinner than the particles' reach {reach:.3g} in the training through horizons"] = (
                 thick_slabs(scene.tracers.planes, reach))
-        if scene.training.horizons.energy_weight > 0 or "resolved" in scene.model.reads:
+        if scene.training.horizons.energy_weight > 0 or scene.resolves:
             limits["ghost planes of the grid in the training through horizons"] = ranks_of_resolved_grid(
                 scene, particle_drift(scene, time, ALLOWED_VELOCITY))
     return limits
@@ -248,8 +248,8 @@ def foreseen_allowed_step(scene: Scene) -> float | None:
         return None
     settings = scene.simulation
     speed = turbulence.velocity_rms
-    if settings.injection == "none":
-        start = scene.seen if settings.start is None else settings.start
+    if not scene.injects:
+        start = scene.seen_in(scene.directory) if settings.start is None else settings.start
         turnovers = start * scene.tracers.turnovers + settings.turnovers / 2
         speed = turbulence.decayed(turnovers * turbulence.turnover_time)
     return allowed_step(settings.integrator, resolved_shells(scene), speed)

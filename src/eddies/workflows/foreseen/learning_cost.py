@@ -18,8 +18,8 @@ from eddies.workflows.foreseen.stage_cost import FILE_BYTES_PER_SECOND, START_SE
 from eddies.workflows.foreseen.stored import kernel_bytes, model_bytes, rollout_bytes, true_frames
 from eddies.workflows.foreseen.training_probe import cube_rows, evaluated_scene, trained_scene
 from eddies.workflows.learned.a_priori import EVALUATIONS as TESTED_FRAMES
-from eddies.workflows.learned.training_data import (COMBINED_DRAWS, HORIZON_VALIDATIONS, VALIDATION_PARTICLES,
-                                                    VALIDATIONS)
+from eddies.workflows.learned.training_data import COMBINED_DRAWS, VALIDATION_PARTICLES
+from eddies.workflows.learned.training_phases import HORIZON_VALIDATIONS, VALIDATIONS
 
 SAMPLES = 4                  # fields that a kernel is trained on, one more is compared with
 # Seconds in which torch is loaded, what draws the curves, and torch's checkpointing; of tiny on one idle rank.

@@ -28,7 +28,7 @@ from eddies.particles.model import LagrangianModel, build_model
 from eddies.particles.neighborhood import at_home
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.reference_scales import ReferenceScales
-from eddies.particles.terms.forcing import Forcing
+from eddies.particles.terms.settings import Forcing
 from eddies.particles.terms.term import PairTerm
 from eddies.scene.scene import BOX_LENGTH, Scene
 from eddies.workflows.foreseen.estimates import expected_turbulence
@@ -239,7 +239,7 @@ class Probe:
 def probed_model(scene: Scene, side: int) -> LagrangianModel:
     """The scene's model with initial weights and forcing, for `side`^3 particles: lengths as many of their spacings as
     in the scene, all else of order one."""
-    tracers, turbulence, settings = scene.tracers, expected_turbulence(scene), scene.simulation
+    tracers, turbulence = scene.tracers, expected_turbulence(scene)
     scale = tracers.particles_per_side / side
     flow = FlowUnits(ReferenceScales(
         filter_width=scale * tracers.filter_width, spacing=scale * tracers.spacing, velocity=1.0, acceleration=1.0,
@@ -247,9 +247,7 @@ def probed_model(scene: Scene, side: int) -> LagrangianModel:
         kolmogorov_length=scale * turbulence.kolmogorov_length if turbulence else 0.0),
         scale * scene.interaction_radius, scene.neighbors, scene.seed)
     model = build_model(scene.model.settings, scene.model.terms, flow)
-    if settings.injection == "none":
-        return model
-    return LagrangianModel({**model.terms, "injection": Forcing(Forcing.Settings(injection_rate=1.0), flow)}, flow)
+    return model.forced(Forcing(injection_rate=1.0) if scene.injects else None)
 
 
 def probe_particles(scene: Scene, comm: Comm) -> ParticleSpeed:

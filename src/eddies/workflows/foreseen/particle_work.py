@@ -132,7 +132,7 @@ def particle_work(scene: Scene) -> ParticleWork:
     """The work of a scene's own model."""
     tracers, model, settings = scene.tracers, scene.model, scene.simulation
     turbulence = expected_turbulence(scene)
-    resolved, paired, highest = "resolved" in model.reads, "pairs" in model.reads, resolved_shells(scene)
+    resolved, paired, highest = scene.resolves, "pairs" in model.reads, resolved_shells(scene)
     evaluations, radius = EVALUATIONS[settings.integrator], scene.interaction_radius
     # As far as the flow may carry a particle through the highest wave, where nothing is known of it.
     way = ALLOWED_ANGLES[settings.integrator] / highest

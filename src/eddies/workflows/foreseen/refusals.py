@@ -24,7 +24,7 @@ WAVES = {"taylor-green": 3**0.5, "abc": 1.0, "shear-wave": 1.0, "sound-wave": fl
 
 def refusals(scene: Scene, comm: Comm, costs: Sequence[StageCost]) -> list[str]:
     """A line for each; all ranks call it and get the same."""
-    found = [*start_file(scene, comm), *forced_modes(scene), *weights(scene, comm)]
+    found = [*start_file(scene, comm), *forced_modes(scene), *weights(scene, comm), *truths(scene, comm)]
     return found + [*memory(comm, costs), *disk(comm, costs)]
 
 
@@ -60,6 +60,14 @@ def weights(scene: Scene, comm: Comm) -> Iterator[str]:
         read_source(scene, comm)
     except UserError as error:
         yield str(error)
+
+
+def truths(scene: Scene, comm: Comm) -> list[str]:
+    """Ground truths that the model cannot be trained on."""
+    if scene.training is None or scene.training.truths is None:
+        return []
+    from eddies.workflows.learned.truths import truth_problems  # torch, where there is a model
+    return truth_problems(scene, comm, scene.directory)
 
 
 def memory(comm: Comm, costs: Sequence[StageCost]) -> Iterator[str]:

@@ -103,6 +103,6 @@ def rollout_step(scene: Scene) -> float:
     if settings.method == "eulerian":
         cells, speed = (scene.eulerian or Eulerian()).cells_for(scene.tracers.filter_width), peak_speed(scene)
         allowed = speed and scene.time.courant * BOX_LENGTH / cells / speed
-    elif "model" in settings.needs and "resolved" in scene.model.reads:
+    elif "model" in settings.needs and scene.resolves:
         allowed = foreseen_allowed_step(scene)
     return min(settings.step, allowed or math.inf)

@@ -40,7 +40,7 @@ def trajectory_bytes(scene: Scene, frames: int) -> int:
     field, whole = (stored_bytes((3, *grid), "f4") + density * stored_bytes((1, *grid), "f4")
                     for grid in (points, [whole_cells(largest_wavenumber(scene))] * 3))
     return (8 * particles + frames * frame + math.ceil(frames / tracers.field_every) * field
-            + len(whole_frames(scene, frames)) * whole)
+            + len(whole_frames(scene, scene.seen_in(scene.directory), frames)) * whole)
 
 
 def statistics_bytes(scene: Scene) -> int:
@@ -93,6 +93,6 @@ def stores_density(scene: Scene) -> bool:
 
 def true_frames(scene: Scene, course: RolloutCourse) -> int:
     """Frames of a rollout at whose times there is a ground truth."""
-    start = scene.seen if scene.simulation.start is None else scene.simulation.start
+    start = scene.seen_in(scene.directory) if scene.simulation.start is None else scene.simulation.start
     left = (1 - start) * scene.tracers.turnovers * course.turnover_time
     return min(course.intervals, int(left / course.interval)) + 1

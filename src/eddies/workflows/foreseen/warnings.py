@@ -121,7 +121,7 @@ def learning(scene: Scene) -> Iterator[str]:
 def rollout_steps(scene: Scene) -> Iterator[str]:
     """Steps of particles that forcing keeps too fast for them."""
     settings = scene.simulation
-    if "model" not in settings.needs or "resolved" not in scene.model.reads or settings.injection == "none":
+    if "model" not in settings.needs or not scene.injects:
         return
     allowed = foreseen_allowed_step(scene)
     if allowed and settings.step > allowed * (1 + 1e-9):

@@ -49,9 +49,12 @@ class FlowRun:
         """Steps taken so far."""
         return self.clock.steps
 
-    def begin_tracers(self, tracers: TracerRun) -> None:
-        """Be in the phase in which tracers are followed: nothing forces the flow from here on."""
-        self.phase, self.tracers, self.fluid.forcing = "tracers", tracers, None
+    def begin_tracers(self, tracers: TracerRun, forced: bool) -> None:
+        """Be in the phase in which tracers are followed: unless it stays `forced`, nothing forces the flow from here
+        on."""
+        self.phase, self.tracers = "tracers", tracers
+        if not forced:
+            self.fluid.forcing = None
 
     def advance(self, observers: Sequence[Callable], step_limit: Callable | None = None) -> None:
         """Take steps, of another limit if one is given, until the clock ends; every observer sees every step.

@@ -14,15 +14,16 @@ from eddies.scene.scene import Scene, SceneError, Training
 HELD_OUT = 0.1
 
 
-def check_frames(stages: Sequence[str], scene: Scene, frames: int) -> None:
-    """Refuse a scene of which one of these stages finds too few frames."""
+def check_frames(stages: Sequence[str], scene: Scene, seen: float, frames: int) -> None:
+    """Refuse a scene of which one of these stages finds too few frames; `seen` is the fraction that the model is
+    trained on."""
     at_fields = range(0, frames, scene.tracers.field_every)
     if "train" in stages:
-        if scene.model.path is None:
+        if scene.model.path is None and seen > 0:
             last_trained_on(scene.training, frames)
         between_frames(frames, at_fields)
     if "simulate" in stages:
-        rollout_start(scene, frames, at_fields)
+        rollout_start(scene, seen, frames, at_fields)
 
 
 def last_seen(window: float, frames: int) -> int:
@@ -55,12 +56,13 @@ def between_frames(frames: int, at_fields: Sequence[int]) -> list[int]:
     return usable
 
 
-def rollout_start(scene: Scene, frames: int, at_fields: Sequence[int]) -> int:
-    """The first frame with a filtered field at or after the moment that the scene asks for.
+def rollout_start(scene: Scene, seen: float, frames: int, at_fields: Sequence[int]) -> int:
+    """The first frame with a filtered field at or after the moment that the scene asks for, or else after what the
+    model has `seen`, a fraction of them.
 
     Raises SceneError if none follows that leaves a frame of the ground truth to compare with.
     """
-    wanted = _frame_at(scene.simulation.start, scene, frames)
+    wanted = _frame_at(scene.simulation.start, seen, frames)
     last = frames - 2 - round(scene.simulation.frame_interval / scene.tracers.frame_interval)
     usable = [frame for frame in at_fields if wanted <= frame <= last]
     if not usable:
@@ -70,14 +72,14 @@ def rollout_start(scene: Scene, frames: int, at_fields: Sequence[int]) -> int:
     return usable[0]
 
 
-def whole_frames(scene: Scene, frames: int) -> set[int]:
+def whole_frames(scene: Scene, seen: float, frames: int) -> set[int]:
     """The frames at which the unfiltered state is stored: the first with filtered fields at or after each of the
     fractions that a scene names; without any, where its rollouts start, and where they start earliest."""
     fractions: Sequence[float | None] = scene.tracers.states
     if fractions is None:
         fractions = () if scene.simulation is None else (0.0, scene.simulation.start)
     every = scene.tracers.field_every
-    return {math.ceil(_frame_at(fraction, scene, frames) / every) * every for fraction in fractions}
+    return {math.ceil(_frame_at(fraction, seen, frames) / every) * every for fraction in fractions}
 
 
 def whole_cells(cutoff: int) -> int:
@@ -85,6 +87,6 @@ def whole_cells(cutoff: int) -> int:
     return 2 * cutoff + 2
 
 
-def _frame_at(fraction: float | None, scene: Scene, frames: int) -> int:
+def _frame_at(fraction: float | None, seen: float, frames: int) -> int:
     """The frame, not the first, at a fraction of the ground truth; the end of what is trained on for None."""
-    return max(last_seen(scene.seen, frames) if fraction is None else int(fraction * (frames - 1)), 1)
+    return max(last_seen(seen, frames) if fraction is None else int(fraction * (frames - 1)), 1)

@@ -22,6 +22,7 @@ from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.model import LagrangianModel
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.reference_scales import ReferenceScales
+from eddies.particles.terms.settings import Forcing
 from eddies.workflows.ground_truth.frame_counts import last_seen
 from eddies.workflows.ground_truth.measured_scales import RATES, measured_scales
 
@@ -42,6 +43,8 @@ class GroundTruth:
         self.trajectory, self.fields = Trajectory(file, "tracers"), FieldSeries(file, "filtered")
         self.times, self.total = self.trajectory.times, self.trajectory.total
         self.reference = read_attributes(file, "reference")
+        #: that stayed on while the tracers were followed; None if nothing forced the flow then
+        self.forcing = Forcing(**read_attributes(file, "forcing")) if "forcing" in file else None
         self.has_density = "density" in self.trajectory.columns
         self._evolving = ("velocity", "density") if self.has_density else ("velocity",)
 
@@ -114,8 +117,8 @@ class GroundTruth:
         return int(np.argmin(np.abs(self.times - self.fields.times[index])))
 
     def last_frame_seen(self, window: float) -> int:
-        """The last frame of the training window, a fraction of the ground truth."""
-        return last_seen(window, len(self.times))
+        """The last frame of the training window, a fraction of the ground truth; 0 where nothing of it was seen."""
+        return last_seen(window, len(self.times)) if window > 0 else 0
 
     def block(self, frame: int, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
         """Columns of this rank's ids at a frame: those named, or all."""

@@ -14,7 +14,7 @@ from eddies.parallel.migration import IdOrder, migrate
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.dynamics import ParticleDynamics
-from eddies.particles.model import LagrangianModel
+from eddies.particles.model import FORCING, LagrangianModel
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.spectral.interpolation import SplineInterpolation
 from eddies.spectral.spectral_grid import SpectralGrid
@@ -42,7 +42,8 @@ def evaluate(truth: GroundTruth, model: LagrangianModel, frames: np.ndarray, las
     `acceleration_error` is that of the model as it runs: with the density that its terms give.
     `density_rate_error` is that of the learned rate, or of the rate at which a given density changes.
     `true_density_acceleration_error` is that with the true density, `pressure_gradient_error` that of
-    -c^2 grad ln(rho) of the filtered field, without any model, of a truth that has a density.
+    -c^2 grad ln(rho) of the filtered field, with the forcing of a flow that stays forced, without any model, of a
+    truth that has a density.
     """
     rows, comm = [], truth.decomposition.comm
     progress = ProgressLine("train", lambda: "of the a-priori test")
@@ -53,6 +54,8 @@ def evaluate(truth: GroundTruth, model: LagrangianModel, frames: np.ndarray, las
                "acceleration_error": relative_error(comm, errors["acceleration"], frame.acceleration)}
         if truth.has_density:
             exact = _pressure_force(truth, int(index), frame.particles).to(frame.acceleration)
+            if FORCING in frame.kept:
+                exact = exact + frame.kept[FORCING].at(None).acceleration
             row["pressure_gradient_error"] = relative_error(comm, exact - frame.acceleration, frame.acceleration)
         if model.density_is_given:
             true = torch.from_numpy(truth.particles(int(index))["density"]).to(device)

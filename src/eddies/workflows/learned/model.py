@@ -26,7 +26,9 @@ def scene_model(scene: Scene, scales: ReferenceScales) -> LagrangianModel:
 
     Raises SceneError where a class of the user's is no term, or cannot be made.
     """
-    flow = FlowUnits(scales, scene.interaction_radius, scene.neighbors, scene.seed)
+    # As many neighbours among particles of another mean distance than the scene's.
+    radius = scene.interaction_radius * (scales.spacing / scene.tracers.spacing)
+    flow = FlowUnits(scales, radius, scene.neighbors, scene.seed)
     try:
         return build_model(scene.model.settings, scene.model.terms, flow)
     except TermError as error:

@@ -1,4 +1,4 @@
-"""What a scene's model is trained and validated on: frames and windows of the ground truth, in phases of training."""
+"""What a scene's model is trained and validated on: frames and windows of a ground truth, in the units of its flow."""
 
 from __future__ import annotations
 
@@ -11,12 +11,10 @@ import torch
 from eddies.clock import ProgressLine
 from eddies.learning.force_training import ForceTrainer, LossWeights, TrainingFrame
 from eddies.learning.losses import relative_error
-from eddies.learning.optimization import Adam
 from eddies.learning.rollout_training import RolloutTrainer, TrainingWindow
-from eddies.learning.training import Phase
 from eddies.particles.dynamics import ParticleDynamics
-from eddies.particles.feature_range import FeatureRange, pair_features
 from eddies.particles.integrators import INTEGRATORS
+from eddies.particles.model import LagrangianModel
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.periodic_box import PeriodicBox
 from eddies.particles.resolved_velocity import ResolvedVelocity
@@ -27,23 +25,29 @@ from eddies.workflows.ground_truth.frame_counts import last_trained_on
 from eddies.workflows.ground_truth.truth import GroundTruth, load_frame
 from eddies.workflows.learned.model import scene_model
 
-# How many validations a phase has, and on how many particles the error of the acceleration is measured.
-VALIDATIONS, HORIZON_VALIDATIONS, VALIDATION_PARTICLES = 25, 4, 8192
-# How many cubes or batches the error of all losses together is measured on.
-COMBINED_DRAWS = 8
+# On how many particles the error of the acceleration is measured; on how many cubes or batches that of all losses.
+VALIDATION_PARTICLES, COMBINED_DRAWS = 8192, 8
 
 
 class TrainingData:
-    """The model of a scene with the frames and windows of the ground truth that it is trained and validated on.
+    """The model of a scene in the units of a ground truth, with the frames and windows of this that it is trained and
+    validated on, so many of each.
 
     `last` is the last frame of the training window, `learned` the last that is trained on; what lies between is for
     validation.
+
+    Parameters
+    ----------
+    truth : which may be that of another flow.
+    count : of the frames, and of the windows.
+    like : model whose parameters this one shares; None: it has new ones.
     """
 
-    def __init__(self, scene: Scene, truth: GroundTruth, kernel: SmoothingKernel | None, device: torch.device) -> None:
-        self.scene, self.settings, self.truth, self.kernel, self.device = scene, scene.training, truth, kernel, device
+    def __init__(self, scene: Scene, truth: GroundTruth, count: int, device: torch.device,
+                 like: LagrangianModel | None = None) -> None:
+        self.scene, self.settings, self.truth, self.count, self.device = scene, scene.training, truth, count, device
         self.dtype = getattr(torch, self.settings.precision)
-        self.model = scene_model(scene, truth.scales).to(dtype=self.dtype, device=device)
+        self.model = model_of(scene, truth, device, like)
         self.longest = max(self.settings.horizons.frames) if self.settings.horizons else 0
         self.last = truth.last_frame_seen(self.settings.window)
         self.learned = last_trained_on(self.settings, len(truth.times))
@@ -51,50 +55,26 @@ class TrainingData:
     @cached_property
     def frames(self) -> list[TrainingFrame]:
         """The single frames that are trained on; the first use is collective."""
-        seen = np.unique(np.linspace(1, self.learned, self.settings.frames).astype(int))
+        seen = np.unique(np.linspace(1, self.learned, self.count).astype(int))
         progress, frames = ProgressLine("train", lambda: "of preparing frames"), []
         for index in seen:
             frames.append(self._frame(index))
             progress(len(frames) / len(seen), len(frames))
         return frames
 
-    def feature_range(self) -> FeatureRange:
-        """The range of what the networks are given by all pairs of these frames; collective.
-
-        Where the simulation leads within the horizons is left out, as it is not the truth.
-        """
-        blocks = (block for frame in self.frames for block in pair_features(frame.dynamics, frame.seen()))
-        return FeatureRange.of(self.truth.decomposition.comm, blocks)
-
-    def one_step_phases(self) -> list[Phase]:
-        """Steps on the rates of single frames: on trajectories, then on all losses, as far as the scene has them."""
+    def force_trainer(self, kernel: SmoothingKernel | None) -> ForceTrainer:
+        """What trains the model on single frames."""
         settings = self.settings
-        if self.scene.model.foreign:
-            first = self.frames[0]
-            self.model.require_linear(first.dynamics.context(first.particles))
-        validation = self._frame(self.last - 1)
         weights = LossWeights(settings.field_weight, settings.velocity_kl_weight, settings.acceleration_kl_weight)
-        trainer = ForceTrainer(self.model, self.frames, self.kernel, weights, settings.batch, self.scene.seed)
-        alone = settings.steps - settings.combined_steps
-        fall = settings.final_learning_rate / settings.learning_rate
-        between = settings.learning_rate * fall ** (alone / settings.steps)
+        return ForceTrainer(self.model, self.frames, kernel, weights, settings.batch, self.scene.seed)
 
-        def phase(name: str, steps: int, rates: tuple[float, float], take, validate) -> Phase:
-            # Work in evaluations of the force of a particle.
-            work = np.full(steps, float(trainer.batch))
-            return Phase(name, work, rates, take, validate, max(steps // VALIDATIONS, 1))
+    def validation_frame(self) -> TrainingFrame:
+        """The frame at the end of the training window; collective."""
+        return self._frame(self.last - 1)
 
-        phases = [phase("one step", alone, (settings.learning_rate, between), trainer.trajectory_step,
-                        lambda: acceleration_error(trainer, validation)),
-                  phase("all losses", settings.combined_steps, (between, settings.final_learning_rate),
-                        trainer.combined_step, lambda: trainer.combined_error(validation, COMBINED_DRAWS))]
-        return [phase for phase in phases if phase.steps]
-
-    def horizon_phases(self) -> list[Phase]:
-        """Steps through windows of frames, one phase for each horizon of the scene."""
+    def rollout_trainer(self) -> tuple[RolloutTrainer, TrainingWindow]:
+        """What trains the model on windows of frames, and the window for validation; collective."""
         settings, scene = self.settings.horizons, self.scene
-        if settings is None:
-            return []
         interval, slab = scene.tracers.frame_interval, self.truth.decomposition
         drift = ALLOWED_VELOCITY * self.model.flow.scales.velocity * interval * self.longest
         dynamics = ParticleDynamics(slab, self.model, 0.0, self.dtype, fixed_ranks=True, drift=drift)
@@ -104,26 +84,13 @@ class TrainingData:
         resolution = None
         if settings.energy_weight > 0:
             resolution = dynamics.resolution or ResolvedVelocity.on_slabs(slab, self.model.flow, drift, self.dtype)
-        starts = np.unique(np.linspace(0, self.learned - self.longest, self.settings.frames).astype(int))
+        starts = np.unique(np.linspace(0, self.learned - self.longest, self.count).astype(int))
         windows = [self._window(start, resolution) for start in starts]
-        validation = self._window(self.last - self.longest, resolution)
         substeps = round(interval / (settings.time_step or interval))
         trainer = RolloutTrainer(slab.comm, INTEGRATORS[settings.integrator](dynamics), windows, interval,
-                                 substeps, settings.energy_weight, resolution and resolution.band_energies, scene.seed)
-        rates = settings.learning_rate, self.settings.final_learning_rate
-        every = max(settings.steps // HORIZON_VALIDATIONS, 1)
-
-        def phase(number: int, horizon: int) -> Phase:
-            def take(optimizer: Adam, step: int) -> dict[str, float]:
-                return trainer.step(optimizer, number * settings.steps + step, horizon)
-
-            # Each step through a window is evaluated, evaluated again on the way back, and differentiated.
-            work = np.full(settings.steps, 3.0 * substeps * horizon * trainer.total)
-            # All horizons are measured by the longest: a shorter one is a way to it.
-            return Phase(f"horizon {horizon}", work, rates, take,
-                         lambda: trainer.validation_error(validation, self.longest), every)
-
-        return [phase(number, horizon) for number, horizon in enumerate(settings.frames)]
+                                 substeps, settings.energy_weight, resolution and resolution.band_energies, scene.seed,
+                                 stationary=self.truth.forcing is not None)
+        return trainer, self._window(self.last - self.longest, resolution)
 
     def _frame(self, index: int) -> TrainingFrame:
         return load_frame(self.truth, index, self.model, self.dtype, self.device)
@@ -144,6 +111,16 @@ class TrainingData:
             with torch.no_grad():
                 energies = torch.stack([resolution.band_energies(moment) for moment in moments])
         return TrainingWindow(particles, later["velocity"], later.get("density"), energies)
+
+
+def model_of(scene: Scene, truth: GroundTruth, device: torch.device,
+             like: LagrangianModel | None = None) -> LagrangianModel:
+    """The scene's model in the units of a ground truth and with the forcing that stayed on there, in the precision of
+    the training; with new parameters, or those of the same terms in the units of another."""
+    model = scene_model(scene, truth.scales).to(dtype=getattr(torch, scene.training.precision), device=device)
+    if like is not None:
+        model.share_parameters(like)
+    return model.forced(truth.forcing)
 
 
 @torch.no_grad()

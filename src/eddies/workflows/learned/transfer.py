@@ -36,8 +36,9 @@ def run(scene: Scene, comm: Comm, directory: str | Path) -> None:
     with open_product(comm, Path(directory) / "ground_truth.h5", "ground_truth") as file:
         truth = GroundTruth(file, slab)
         model = with_weights(scene, source.description, source.weights, source.path, truth.scales).to(device)
+        model = model.forced(truth.forcing)
         dtype = next((parameter.dtype for parameter in model.parameters()), torch.float64)
-        last = truth.last_frame_seen(scene.seen) if scene.seen else 0
+        last = truth.last_frame_seen(scene.seen_in(Path(directory)))
         tables = evaluate(truth, model, evaluation_frames(truth), last, dtype, device)
         mach, description = truth.reference.get("mach_turbulent"), describe(scene, truth.scales)
     origin, own_errors = trained_on(scene, source)

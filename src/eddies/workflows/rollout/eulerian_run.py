@@ -31,7 +31,7 @@ from eddies.scene.scene import Eulerian, Scene, SceneError
 from eddies.spectral.spectral_grid import SpectralGrid, restrict
 from eddies.time_stepping import ETDRK4
 from eddies.workflows.ground_truth.truth import GroundTruth
-from eddies.workflows.rollout.particle_run import forced_below, injection_rate
+from eddies.workflows.rollout.particle_run import injection
 from eddies.workflows.rollout.saved_rows import restored_rows, saved_rows
 
 # Runaway is a flow with this many times the energy of its start.
@@ -154,8 +154,8 @@ def coarse_fluid(scene: Scene, truth: GroundTruth, grid: SpectralGrid, filter_pa
     """The fluid of a coarse grid, whose velocity has passed a filter of some width or 0, with the forcing of the
     scene's particles and the closure of the scales that the grid or the filter leaves out."""
     settings, forcing = scene.eulerian or Eulerian(), None
-    if scene.simulation.injection != "none":
-        forcing = LinearForcing(grid, injection_rate(scene, truth), forced_below(scene), filter_passed)
+    if (forced := injection(scene, truth)) is not None:
+        forcing = LinearForcing(grid, forced.injection_rate, forced.wavenumber, filter_passed)
     sound_speed = scene.flow.sound_speed if settings.fluid == "compressible" else math.inf
     return FLUIDS[settings.fluid](grid, scene.flow.viscosity, sound_speed, forcing,
                                   closure_of(settings, grid, filter_passed, directory))

@@ -22,9 +22,8 @@ from eddies.particles.model import LagrangianModel, build_model
 from eddies.particles.moment import Moment, between
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.reference_scales import allowed_step
-from eddies.particles.terms.forcing import Forcing
 from eddies.particles.terms.presets import PRESETS
-from eddies.particles.terms.settings import WCSPH, SummationDensity
+from eddies.particles.terms.settings import WCSPH, Forcing, SummationDensity
 from eddies.scene.scene import Scene, Wcsph
 from eddies.workflows.ground_truth.truth import GroundTruth, particles_for
 from eddies.workflows.learned.model import load_feature_range, load_model
@@ -53,7 +52,7 @@ class ParticleRun:
         self.settings, self.comm, self.scales = scene.simulation, truth.decomposition.comm, truth.scales_at(start)
         self.flow = FlowUnits(self.scales, scene.interaction_radius, scene.neighbors, scene.seed)
         dtype = getattr(torch, self.settings.precision)
-        self.model = self.with_forcing(self.build(scene, directory), scene, truth).to(dtype=dtype, device=device)
+        self.model = self.build(scene, directory).forced(injection(scene, truth)).to(dtype=dtype, device=device)
         self.dynamics = ParticleDynamics(truth.decomposition, self.model, self.settings.skin * self.flow.cutoff, dtype)
         self.integrator = INTEGRATORS[self.settings.integrator](self.dynamics)
         self.particles, self.total = particles_for(self.model, truth.particles(start), device), truth.total
@@ -65,13 +64,6 @@ class ParticleRun:
     def build(self, scene: Scene, directory: Path) -> LagrangianModel:
         """The model, without forcing; collective."""
         raise NotImplementedError
-
-    def with_forcing(self, model: LagrangianModel, scene: Scene, truth: GroundTruth) -> LagrangianModel:
-        """The model with the forcing of the large scales that a simulation asks for, if it asks for any."""
-        if self.settings.injection == "none":
-            return model
-        settings = Forcing.Settings(injection_rate=injection_rate(scene, truth), wavenumber=forced_below(scene))
-        return LagrangianModel({**model.terms, "injection": Forcing(settings, self.flow)}, self.flow)
 
     @property
     def has_density(self) -> bool:
@@ -218,13 +210,13 @@ class SmoothedRun(ParticleRun):
         return {**super().description(), **asdict(self.model.terms["wcsph"].settings)}
 
 
-def injection_rate(scene: Scene, truth: GroundTruth) -> float:
-    """Power per mass of the forcing: as given, the dissipation rate of the ground truth, or zero."""
-    named = {"none": 0.0, "dissipation": truth.reference["dissipation_rate"]}
-    injection = scene.simulation.injection
-    return named.get(injection, injection)
-
-
-def forced_below(scene: Scene) -> float:
-    """Modes with 0 < |k| < this are forced."""
-    return scene.forcing.wavenumber if scene.forcing else 2.0
+def injection(scene: Scene, truth: GroundTruth) -> Forcing | None:
+    """The forcing of a rollout: that of the ground truth; or at a power per mass as given, or the dissipation rate of
+    the ground truth, at the wavenumbers of [forcing]; or none."""
+    power = scene.simulation.injection
+    if power == "truth":
+        return truth.forcing
+    if power == "none":
+        return None
+    return Forcing(injection_rate=truth.reference["dissipation_rate"] if power == "dissipation" else power,
+                   wavenumber=scene.forcing.wavenumber if scene.forcing else 2.0)

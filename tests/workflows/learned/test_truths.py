@@ -1,0 +1,247 @@
+"""Training on the ground truths of other runs, alone and together, forced and unforced."""
+
+import shutil
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from mpi4py import MPI
+
+from eddies.io.hdf5 import open_product, read_table
+from eddies.io.weights import load_weights
+from eddies.learning.losses import relative_error
+from eddies.parallel.reduction import global_sum
+from eddies.particles.model import FORCING
+from eddies.scene.scene import SceneError, load_scene
+from eddies.stages import check_inputs
+from eddies.workflows import dns, train
+from eddies.workflows.ground_truth.truth import load_frame
+from eddies.workflows.learned.training_data import model_of
+from eddies.workflows.learned.truths import open_truths, training_data, truth_problems
+from eddies.workflows.rollout.eulerian_run import EulerianRun
+from eddies.workflows.rollout.particle_run import injection
+from eddies.workflows.simulate import start_frame
+
+CPU = torch.device("cpu")
+SCENE = """
+[flow]
+fluid = "compressible"
+cells = 12
+viscosity = 0.1
+sound_speed = 15.0
+[initial]
+peak_wavenumber = 2
+[forcing]
+injection_rate = 1.0
+[spin_up]
+turnovers = 0.1
+[tracers]
+particles_per_side = 6
+turnovers = 0.2
+frame_interval = 0.02
+field_every = 1
+field_cells = 12
+[model]
+terms = ["pressure", "stress", "viscosity", "damping", "relaxation"]
+[training]
+frames = 4
+batch = 100
+steps = 6
+combined_steps = 2
+acceleration_kl_weight = 0.1
+precision = "float64"
+[training.horizons]
+steps = 2
+frames = [1]
+[simulation]
+step = 0.1
+turnovers = 0.05
+frame_interval = 0.02
+"""
+
+
+def scene_of(directory, *overrides):
+    return load_scene(directory / "own.toml", overrides)
+
+
+def made(comm, directory, *overrides, runs=("own",)):
+    """A scene, with the ground truths of some run directories in `directory`, of a seed each."""
+    if comm.rank == 0:
+        (directory / "own.toml").write_text(SCENE)
+    comm.Barrier()
+    for seed, name in enumerate(runs, 1):
+        if comm.rank == 0:
+            (directory / name).mkdir()
+        comm.Barrier()
+        dns.run(scene_of(directory, *overrides, f"seed={seed}"), comm, directory / name)
+    return scene_of(directory, *overrides)
+
+
+def trained_on(scene, *directories):
+    return replace(scene, training=replace(scene.training, truths=tuple(map(str, directories))))
+
+
+def weights_and_errors(scene, comm, directory):
+    train.run(scene, comm, directory)
+    path = directory / "model.h5"
+    with open_product(comm, path, "model") as file:
+        tables = {name: read_table(file, name) for name in ("history", "a_priori")}
+    return load_weights(comm, path, "model")[1], tables
+
+
+def copied(source, target):
+    """The ground truth of a run in another run directory."""
+    target.mkdir()
+    return shutil.copy(source / "ground_truth.h5", target)
+
+
+@pytest.mark.mpi(1, 2, 3)
+def test_training_on_two_flows_takes_the_same_steps_on_any_number_of_ranks(comm, tmp_path, quick_solves):
+    scene = trained_on(made(comm, tmp_path, runs=("one", "two")), tmp_path / "one", tmp_path / "two")
+    weights, tables = weights_and_errors(scene, comm, tmp_path / "one")
+    if comm.rank == 0:
+        copied(tmp_path / "one", tmp_path / "alone")
+        scene = trained_on(scene, tmp_path / "alone", tmp_path / "two")
+        expected, expected_tables = weights_and_errors(scene, MPI.COMM_SELF, tmp_path / "alone")
+        for name, tensor in expected.items():
+            assert np.abs(weights[name] - tensor).max() < 1e-9 * np.abs(tensor).max()
+        for name in ("loss", "validation_error"):
+            assert np.allclose(tables["history"][name], expected_tables["history"][name], rtol=1e-9, equal_nan=True)
+        # They take turns: neighbouring losses are of different flows, and each phase is measured on both.
+        assert len(tables["history"]["loss"]) == 6 + 2
+
+
+@pytest.mark.mpi(1)
+def test_the_own_ground_truth_named_is_that_of_a_scene_that_names_none(comm, tmp_path, quick_solves):
+    scene = made(comm, tmp_path, "tracers.forced=true")
+    found = [weights_and_errors(each, comm, tmp_path / "own")
+             for each in (scene, trained_on(scene, tmp_path / "own" / "ground_truth.h5"))]
+    (weights, tables), (expected, expected_tables) = found
+    assert all(np.array_equal(weights[name], expected[name]) for name in expected)
+    for name, columns in expected_tables.items():
+        assert all(np.array_equal(tables[name][column], values, equal_nan=True)
+                   for column, values in columns.items() if column != "seconds")
+
+
+def twice_as_fast(source, target):
+    """The same flow in another unit of time, half as long."""
+    powers = {"velocity_rms": 1, "acceleration_rms": 2, "sound_speed": 1, "viscosity": 1, "density_rate_rms": 1}
+    with h5py.File(copied(source, target), "r+") as file:
+        reference, tracers = file["reference"].attrs, file["particles/tracers"]
+        for name, power in powers.items():
+            reference[name] *= 2.0**power
+        tracers["velocity/value"][...] *= 2
+        tracers["position/time"][...] /= 2  # which all columns share
+        file["fields/filtered/velocity"][...] *= 2
+
+
+@pytest.mark.mpi(1)
+def test_the_same_is_learned_of_the_same_flow_in_other_units(comm, tmp_path):
+    """Each flow is seen in its own scales; then nothing of the run's own is trained on."""
+    scene = made(comm, tmp_path, "training.steps=4", "training.combined_steps=0", "training.acceleration_kl_weight=0",
+                 "simulation.start=0.1")
+    scene = replace(scene, training=replace(scene.training, horizons=None, window=1.0))
+    own = tmp_path / "own"
+    expected, seen = weights_and_errors(scene, comm, own)
+    twice_as_fast(own, tmp_path / "fast")
+    weights, unseen = weights_and_errors(trained_on(scene, tmp_path / "fast"), comm, own)
+    for name, tensor in expected.items():
+        assert np.allclose(weights[name], tensor, rtol=1e-9)
+    assert np.allclose(unseen["history"]["loss"], seen["history"]["loss"], rtol=1e-9)
+    assert np.allclose(unseen["a_priori"]["acceleration_error"], seen["a_priori"]["acceleration_error"], rtol=1e-9)
+    # The delay is that since the end of what was seen: here all, or nothing.
+    assert seen["a_priori"]["delay"].max() < 0 < unseen["a_priori"]["delay"].min()
+
+
+@pytest.mark.mpi(1, 2)
+def test_a_forced_truth_is_matched_with_its_forcing_alone(comm, tmp_path):
+    """By the known forces, none of which is learned; each flow with the power of its own file."""
+    scene = made(comm, tmp_path, "tracers.forced=true", "tracers.particles_per_side=10",
+                 'model.terms=["pressure", "stress", "viscosity"]')
+    with open_truths(scene, comm, tmp_path / "own") as (truth, _):
+        assert (truth.forcing.injection_rate, truth.forcing.wavenumber) == (1.0, 2.0)
+        forced = model_of(scene, truth, CPU)
+        truth.forcing = None
+        frames = [load_frame(truth, 4, model, torch.float64, CPU) for model in (forced, model_of(scene, truth, CPU))]
+        force = frames[0].kept[FORCING].at(None).acceleration
+        missed = [frame.errors()["acceleration"] for frame in frames]
+        with_it, without = (relative_error(comm, error, force) for error in missed)
+        share = global_sum(comm, float((-missed[1] * force).sum())) / global_sum(comm, float(force.square().sum()))
+    # What else is missed is the same with the force and without: it is a third of it, and has nothing to do with it.
+    assert with_it < 0.4 * without and share == pytest.approx(1, abs=0.02)
+
+
+@pytest.mark.mpi(1)
+def test_every_flow_is_trained_on_with_the_forcing_of_its_own_and_one_set_of_parameters(comm, tmp_path):
+    free = made(comm, tmp_path)
+    forced = scene_of(tmp_path, "tracers.forced=true", "forcing.injection_rate=0.7", "seed=4")
+    (tmp_path / "forced").mkdir()
+    dns.run(forced, comm, tmp_path / "forced")
+    scene = trained_on(free, tmp_path / "own", tmp_path / "forced")
+    with open_truths(scene, comm, tmp_path / "own") as (own, truths):
+        assert truths[0] is own
+        first, second = training_data(scene, truths, CPU)
+        assert FORCING not in first.model.terms
+        assert second.model.terms[FORCING].settings.injection_rate == 0.7
+        assert first.model.flow.scales == truths[0].scales != second.model.flow.scales == truths[1].scales
+        assert list(map(id, first.model.parameters())) == list(map(id, second.model.parameters()))
+        assert len(first.frames) == len(second.frames) == 2
+
+
+@pytest.mark.mpi(1)
+def test_a_rollout_is_forced_as_its_truth_was_and_starts_after_what_was_seen(comm, tmp_path):
+    scene = made(comm, tmp_path, "tracers.forced=true")
+    other = tmp_path / "other"
+    copied(tmp_path / "own", other)
+    with open_truths(scene, comm, tmp_path / "own") as (truth, _):
+        for word, rate in (("truth", 1.0), ("none", None), ("dissipation", truth.reference["dissipation_rate"]),
+                           (0.3, 0.3)):
+            found = injection(replace(scene, simulation=replace(scene.simulation, injection=word)), truth)
+            assert (found and found.injection_rate) == rate
+        coarse = EulerianRun(scene, truth, 3, tmp_path, CPU)
+        assert coarse.fluid.forcing.injection_rate == 1.0 and coarse.fluid.forcing.wavenumber == 2.0
+        ends = truth.last_frame_seen(scene.training.window)
+        # Every frame has a field; at the first there are no rates.
+        assert start_frame(scene, truth, tmp_path / "own") == ends > 2
+        assert start_frame(trained_on(scene, other), truth, tmp_path / "own") == 1
+
+
+REFUSED = {
+    "no such file": ([], "nowhere", "nowhere/ground_truth.h5: no such file; run `eddies dns SCENE` first"),
+    "twice": ([], "own", "is named before; name each ground truth once"),
+    "another filter": (["tracers.filter_width=1.2"], "other",
+                       "its filter is 1.14591559 mean spacings wide, and [tracers] filter_width = 2.0943951 is 2; "),
+    "no density": (["flow.fluid=incompressible", "flow.sound_speed=none", 'model.terms=["pressure"]'], "other",
+                   "holds no density, which the terms of [model] read; give one of a compressible flow"),
+    "other frames": (["tracers.frame_interval=0.01"], "other",
+                     "its frames are 0.01 apart, and [training.horizons] counts frames of [tracers] frame_interval"),
+    "fewer particles": (["tracers.particles_per_side=4", "training.batch=9"], "other",
+                        "holds 64 particles, fewer than [training] batch = 100; lower batch"),
+    "too short": (["tracers.turnovers=0.01"], "other", "[training] window = 0.5: holds 1 frames of the ground truth"),
+    "no tracers": (["tracers", "model", "training", "simulation"], "other", "holds no tracers to learn from; give the"),
+}
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("overrides, name, message", REFUSED.values(), ids=REFUSED)
+def test_truths_that_do_not_fit_are_refused_before_any_work(comm, tmp_path, overrides, name, message):
+    read_density = 'model={preset = "learned-density"}' if "no density" in message else "seed=1"
+    scene = trained_on(made(comm, tmp_path, read_density, runs=()), tmp_path / "own", tmp_path / name)
+    other = scene_of(tmp_path)
+    if overrides[:1] == ["tracers"]:
+        other = replace(other, **dict.fromkeys(overrides), spin_up=None, time=replace(other.time, duration=0.01))
+    elif overrides:
+        other = scene_of(tmp_path, *overrides)
+    if name == "other":
+        if comm.rank == 0:
+            (tmp_path / "other").mkdir()
+        comm.Barrier()
+        dns.run(replace(other, spin_up=None, forcing=None), comm, tmp_path / "other")
+    problems = truth_problems(scene, comm, tmp_path / "own")
+    assert len(problems) == 1 and message in problems[0]
+    assert problems[0].startswith(f'[training] truths: "{tmp_path / name}": ')
+    # The own ground truth, which is named too, is made by the run itself.
+    with pytest.raises(SceneError, match=r"own: \[training\] truths: "):
+        check_inputs(("train",), scene, comm, tmp_path / "own")
