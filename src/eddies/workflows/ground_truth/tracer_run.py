@@ -31,7 +31,7 @@ class TracerRun:
 
     def __init__(self, scene: Scene, seen: float, flow: FlowRun, segments: FrameSegments,
                  saved: Checkpoint | None) -> None:
-        self._seen, self.scene, self.flow, self.segments, self.settings = scene, flow, segments, scene.tracers
+        self.scene, self._seen, self.flow, self.segments, self.settings = scene, seen, flow, segments, scene.tracers
         flow.begin_tracers(self, self.settings.forced)
         field = FilteredField(flow.fluid.grid, self.settings.filter_width, self.settings.interpolation)
         self.comm = flow.fluid.grid.decomposition.comm
