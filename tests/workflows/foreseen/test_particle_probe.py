@@ -25,7 +25,7 @@ def scene_of(*changes):
 
 
 @pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("preset", [name for name in PRESETS if name != "wcsph"])
+@pytest.mark.parametrize("preset", PRESETS)
 def test_every_preset_is_probed(comm, preset):
     speed = probe_particles(scene_of(f"model.preset={preset}"), comm)
     assert set(speed.rates) == set(PARTS)
