@@ -24,9 +24,8 @@ TERMS = PAIR_MODELS | {
     "two-sided": {"eddy-viscosity": dict(form="two-sided", basis="paper")},
     "cubic spline": {"summation-density": dict(kernel="cubic-spline"), "wcsph": dict(kernel="cubic-spline")},
     "wendland": {"summation-density": dict(kernel="wendland"), "wcsph": dict(kernel="wendland")},
-    "continuity": {"continuity": dict(diffusion=0.1), "wcsph": dict(form="difference")},
-    "transport velocity": {"continuity": dict(kernel="wendland"), "wcsph": dict(form="difference", kernel="wendland"),
-                           "transport-velocity": dict(kernel="wendland")},
+    "continuity": {"continuity": dict(diffusion=0.1), "wcsph": {}},
+    "transport velocity": {word: dict(kernel="wendland") for word in ("continuity", "wcsph", "transport-velocity")},
     "transport velocity alone": {"transport-velocity": {}},
 }
 # Of at most 1, 2 or 3 rows of cells across, and of many.

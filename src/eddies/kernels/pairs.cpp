@@ -77,8 +77,7 @@ std::unique_ptr<Summand<Real>> make(const Given& given) {
         case KERNEL_AVERAGE:
             return std::make_unique<KernelAverage<Real>>(scalar, given.constants);
         default:
-            return std::make_unique<Wcsph<Real>>(options[0], options[1], scalar, given.constants,
-                                                 given.parameters);
+            return std::make_unique<Wcsph<Real>>(options[0], scalar, given.constants, given.parameters);
     }
 }
 

@@ -404,71 +404,57 @@ class SummationDensity : public Summand<Real> {
 };
 
 // -(P_i/rho_i^2 + P_j/rho_j^2 + Pi) W'/r x of weakly compressible smoothed particle hydrodynamics, in filter widths and
-// units of the velocity; or, as a `difference`, -(P_j - P_i)/(rho_i rho_j) W'/r x, and -Pi W'/r x by itself. Parameters:
-// alpha c and beta of Pi. Constants: the distance at which W ends, the unit of the result, and the softening. Two
-// scalars: P/rho^2, or P, and rho.
+// units of the velocity. Parameters: alpha c and beta of Pi. Constants: the distance at which W ends, the unit of the
+// result, and the softening. Two scalars: P/rho^2 and rho.
 template <typename Real>
 class Wcsph : public Summand<Real> {
    public:
-    Wcsph(bool wendland, bool difference, int scalar, const double* constants, const double* parameters)
-        : Summand<Real>(difference ? 6 : 3, Real(-1)), kernel_{wendland}, difference_(difference), push_(scalar),
-          density_(scalar + 1), support_(constants[0]), unit_(constants[1]), softening_(constants[2]),
-          linear_(parameters[0]), quadratic_(parameters[1]) {
-        for (int c = 0; difference && c < 3; ++c) this->parity[c] = 1;
-    }
+    Wcsph(bool wendland, int scalar, const double* constants, const double* parameters)
+        : Summand<Real>(3, Real(-1)), kernel_{wendland}, push_(scalar), density_(scalar + 1),
+          support_(constants[0]), unit_(constants[1]), softening_(constants[2]),
+          linear_(parameters[0]), quadratic_(parameters[1]) {}
 
     void values(const Block<Real>& pairs, Components<Real> found) override {
         EDDIES_PAIRS {
-            const Real slope = kernel_.slope_over_q(pairs.distance[p] / support_);
-            const Real strength = -unit_ * (difference_ ? pressure(pairs, p) : total(pairs, p)) * slope;
+            const Real strength = -unit_ * total(pairs, p) * kernel_.slope_over_q(pairs.distance[p] / support_);
             for (int c = 0; c < 3; ++c) found[c][p] = strength * pairs.x[c][p];
-        }
-        if (!difference_) return;
-        EDDIES_PAIRS {
-            const Real strength = -unit_ * viscous(pairs, p) * kernel_.slope_over_q(pairs.distance[p] / support_);
-            for (int c = 0; c < 3; ++c) found[3 + c][p] = strength * pairs.x[c][p];
         }
     }
 
     void gradients(const Block<Real>& pairs, GivenComponents<Real> given, ByPairs<Real>* by,
                    Real* by_parameters) override {
-        alignas(64) Real by_linear[BLOCK], by_quadratic[BLOCK], by_pressure[BLOCK], by_viscous[BLOCK];
-        const GivenComponents<Real> viscously = given + (difference_ ? 3 : 0);
+        alignas(64) Real by_linear[BLOCK], by_quadratic[BLOCK], by_total[BLOCK];
         EDDIES_PAIRS {
             const Real slope = -unit_ * kernel_.slope_over_q(pairs.distance[p] / support_), mu = rate(pairs, p);
-            by_pressure[p] = dot(given, pairs.x, p) * slope;
-            by_viscous[p] = dot(viscously, pairs.x, p) * slope;
-            by_linear[p] = -by_viscous[p] * mu / mean(pairs, p);
-            by_quadratic[p] = by_viscous[p] * mu * mu / mean(pairs, p);
+            const Real along = dot(given, pairs.x, p);
+            by_total[p] = along * slope;
+            by_linear[p] = -by_total[p] * mu / mean(pairs, p);
+            by_quadratic[p] = by_total[p] * mu * mu / mean(pairs, p);
         }
         add_lanes(by_linear, by_parameters);
         add_lanes(by_quadratic, by_parameters + VectorOf<Real>::lanes);
         if (!by) return;
         EDDIES_PAIRS {
             const Real r = pairs.distance[p], q = r / support_, mu = rate(pairs, p), average = mean(pairs, p);
-            const Real slope = -unit_ * kernel_.slope_over_q(q), push = pressure(pairs, p), drag = viscous(pairs, p);
+            const Real along = dot(given, pairs.x, p);
+            const Real slope = -unit_ * kernel_.slope_over_q(q), strength = total(pairs, p);
+            const Real viscous = mu * (quadratic_ * mu - linear_) / average;
             const Real below = 1 / (r * r + softening_);
-            const Real by_mu = mu >= 0 ? Real(0) : by_viscous[p] * (2 * quadratic_ * mu - linear_) / average;
-            by->distance[p] -= unit_ * (dot(given, pairs.x, p) * push + dot(viscously, pairs.x, p) * drag) *
-                                   kernel_.bend(q) / support_ + by_mu * mu * 2 * r * below;
+            const Real by_mu = mu >= 0 ? Real(0) : by_total[p] * (2 * quadratic_ * mu - linear_) / average;
+            by->distance[p] += -along * unit_ * strength * kernel_.bend(q) / support_ - by_mu * mu * 2 * r * below;
             for (int c = 0; c < 3; ++c) {
-                by->x[c][p] += slope * (push * given[c][p] + drag * viscously[c][p]) +
-                               by_mu * half_support() * below * pairs.v[c][p];
+                by->x[c][p] += slope * strength * given[c][p] + by_mu * half_support() * below * pairs.v[c][p];
                 by->v[c][p] += by_mu * half_support() * below * pairs.x[c][p];
             }
             for (int side = 0; side < 2; ++side) {
-                const Real density = pairs.scalar[side][density_][p];
-                by->scalar[side][push_][p] +=
-                    difference_ ? (side ? by_pressure[p] : -by_pressure[p]) * over_densities(pairs, p) : by_pressure[p];
-                by->scalar[side][density_][p] -= by_viscous[p] * drag / (2 * average) +
-                                                 (difference_ ? by_pressure[p] * push / density : Real(0));
+                by->scalar[side][push_][p] += by_total[p];
+                by->scalar[side][density_][p] -= by_total[p] * viscous / (2 * average);
             }
         }
     }
 
    private:
     SmoothingKernel<Real> kernel_;
-    bool difference_;
     int push_, density_;
     Real support_, unit_, softening_, linear_, quadratic_;
 
@@ -485,21 +471,11 @@ class Wcsph : public Summand<Real> {
         return mu > 0 ? Real(0) : mu;
     }
 
-    Real over_densities(const Block<Real>& pairs, int p) const {
-        return 1 / (pairs.scalar[0][density_][p] * pairs.scalar[1][density_][p]);
-    }
-
-    Real pressure(const Block<Real>& pairs, int p) const {
-        const Real own = pairs.scalar[0][push_][p], other = pairs.scalar[1][push_][p];
-        return difference_ ? (other - own) * over_densities(pairs, p) : own + other;
-    }
-
-    Real viscous(const Block<Real>& pairs, int p) const {
+    Real total(const Block<Real>& pairs, int p) const {
         const Real mu = rate(pairs, p);
-        return mu * (quadratic_ * mu - linear_) / mean(pairs, p);
+        return pairs.scalar[0][push_][p] + pairs.scalar[1][push_][p] +
+               mu * (quadratic_ * mu - linear_) / mean(pairs, p);
     }
-
-    Real total(const Block<Real>& pairs, int p) const { return pressure(pairs, p) + viscous(pairs, p); }
 };
 
 // What makes the rate of density of smoothed particle hydrodynamics: v.x W'/r, and, with two components, (rho_j - rho_i)

@@ -20,8 +20,7 @@ MODELS = {
     "corrected": {"pairs": {}, "density-flux": {}, "density-transport": {}, "eddy-viscosity": {}},
     "antisymmetric": ANTISYMMETRIC,
     "summation": {"summation-density": {}, "wcsph": dict(exponent=7.0)},
-    "transport velocity": {"continuity": dict(diffusion=0.1), "wcsph": dict(form="difference"),
-                           "transport-velocity": {}},
+    "transport velocity": {"continuity": dict(diffusion=0.1), "wcsph": {}, "transport-velocity": {}},
     "without density": {"pairs": NO_DENSITY, "density-flux": NO_DENSITY},
 }
 every_model = pytest.mark.parametrize("terms", MODELS.values(), ids=MODELS)

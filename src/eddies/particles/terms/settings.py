@@ -195,8 +195,6 @@ class Continuity(TermSettings):
 class WCSPH(TermSettings):
     """Pressure and artificial viscosity of weakly compressible smoothed particle hydrodynamics."""
 
-    form: str = choice("of the pressure's force; sum: opposite for the particles of a pair; difference: none where the "
-                       "pressure is uniform", "sum", "difference", default="sum")
     kernel: str = choice("smoothing kernel", "cubic-spline", "wendland", default="cubic-spline")
     alpha: float = number("linear coefficient of the artificial viscosity", default=1.0, at_least=0)
     beta: float = number("quadratic coefficient of the artificial viscosity", default=2.0, at_least=0)

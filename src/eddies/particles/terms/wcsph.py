@@ -28,25 +28,23 @@ class WCSPH(PairTerm):
 
     Pi only for approaching pairs, x.v < 0. The smoothing length h is half the support of W, which is the radius of
     interaction. Forces of a pair are opposite and central, so momentum and angular momentum are kept. In three
-    dimensions Pi acts like a viscosity of about alpha c h / 10. With form "difference" the pressure acts by
+    dimensions Pi acts like a viscosity of about alpha c h / 10. The sound speed c in units of the flow's, alpha, beta
+    and gamma are parameters; of the first three the size counts, so that pressure pushes and friction takes energy.
 
-        -sum_j m (P_j - P_i)/(rho_i rho_j) grad W,
-
-    which a uniform pressure does not make, wherever the particles are, and which does not keep the momentum. The sound
-    speed c in units of the flow's, alpha, beta and gamma are parameters; of the first three the size counts, so that
-    pressure pushes and friction takes energy.
+    Particles at random do not see a gradient by that sum: the differences (P_j - P_i)/(rho_i rho_j) in its place have
+    half its error at single moments, but lose the balance of pressure and density, and energy grows until a rollout
+    ends, unless particles are kept in place by a shift; then they are no better.
     """
 
     Settings = declared.WCSPH
     settings: declared.WCSPH
-    mutual = True
+    # The forces of a pair are opposite, so each pair is evaluated once.
+    parity, mutual = -torch.ones(3), True
 
     def __init__(self, settings: declared.WCSPH, flow: FlowUnits) -> None:
         super().__init__(settings, flow)
         self.kernel, self.mass = KERNELS[settings.kernel](flow.cutoff), particle_mass(flow)
         self.density = flow.scales.density_mean
-        # The forces of a pair are opposite, and differences of the pressure the same for both.
-        self.parity = -torch.ones(3) if settings.form == "sum" else torch.tensor([1.0] * 3 + [-1.0] * 3)
         self.sound_speed, self.alpha, self.beta, self.exponent = (
             nn.Parameter(torch.tensor(value, dtype=torch.float64))
             for value in (1.0, settings.alpha, settings.beta, settings.exponent))
@@ -58,41 +56,31 @@ class WCSPH(PairTerm):
         return self.fluid_sound_speed * self.sound_speed.abs()
 
     def pair_values(self, pairs: ScaledPairs) -> Tensor:
-        """What each pair (i, j) accelerates i by, (3, m); of a difference pressure and viscosity apart, (6, m)."""
+        """What each pair (i, j) accelerates i by, (3, m)."""
         listed = pairs.pairs
         x = listed.displacement.T
         density = pairs.column("density").to(x.dtype)
-        push, viscosity = self._push(density), self._viscosity(pairs, density)
-        slope = -self.mass * over_distance(self.kernel.derivative(listed.distance), listed.distance)
-        if self.settings.form == "sum":
-            return (listed.at_receivers(push) + listed.at_senders(push) + viscosity) * slope * x
-        below = listed.at_receivers(density) * listed.at_senders(density)
-        difference = (listed.at_senders(push) - listed.at_receivers(push)) / below
-        return torch.cat([difference * slope * x, viscosity * slope * x])
+        push = self.pressure(density) / density**2
+        strength = listed.at_receivers(push) + listed.at_senders(push) + self._viscosity(pairs, density)
+        return -self.mass * strength * over_distance(self.kernel.derivative(listed.distance), listed.distance) * x
 
     def compiled(self, context: Context) -> CompiledSum:
         """The same for the compiled library."""
         scales, density, support = context.flow.scales, context.column("density"), self.kernel.support
         width = scales.filter_width
-        options = Summand("wcsph", len(self.parity),
-                          (self.settings.kernel == "wendland", self.settings.form == "difference"),
+        options = Summand("wcsph", 3, (self.settings.kernel == "wendland",),
                           (support / width, self.mass * width / support**5, SOFTENING * (support / (2 * width)) ** 2))
         viscosity = torch.stack([scales.velocity * self.alpha.abs() * self.c, scales.velocity**2 * self.beta.abs()])
-        return CompiledSum(options, viscosity, (self._push(density), density))
+        return CompiledSum(options, viscosity, (self.pressure(density) / density**2, density))
 
     def rates_of(self, sums: Tensor, context: Context) -> Rates:
         """The acceleration."""
-        return Rates(acceleration=sums.unflatten(0, (-1, 3)).sum(0).T.to(context.particles.velocity.dtype))
+        return Rates(acceleration=sums.T.to(context.particles.velocity.dtype))
 
     def pressure(self, density: Tensor) -> Tensor:
         """P of densities of any shape."""
         c, gamma, rho_0 = self.c, self.exponent, self.density
         return c**2 * rho_0 / gamma * ((density / rho_0) ** gamma - 1)
-
-    def _push(self, density: Tensor) -> Tensor:
-        """What is taken of each particle: P/rho^2, or P where differences count."""
-        pressure = self.pressure(density)
-        return pressure / density**2 if self.settings.form == "sum" else pressure
 
     def _viscosity(self, pairs: ScaledPairs, density: Tensor) -> Tensor:
         """Pi (m,) of the pairs."""
