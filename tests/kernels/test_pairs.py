@@ -24,6 +24,9 @@ TERMS = PAIR_MODELS | {
     "two-sided": {"eddy-viscosity": dict(form="two-sided", basis="paper")},
     "cubic spline": {"summation-density": dict(kernel="cubic-spline"), "wcsph": dict(kernel="cubic-spline")},
     "wendland": {"summation-density": dict(kernel="wendland"), "wcsph": dict(kernel="wendland")},
+    "continuity": {"continuity": dict(diffusion=0.1), "wcsph": {}},
+    "transport velocity": {word: dict(kernel="wendland") for word in ("continuity", "wcsph", "transport-velocity")},
+    "transport velocity alone": {"transport-velocity": {}},
 }
 # Of at most 1, 2 or 3 rows of cells across, and of many.
 CUTOFFS = {"large": 3.0, "half": 2.2, "third": CUTOFF, "small": 0.7}
@@ -71,7 +74,7 @@ def compare(monkeypatch, dynamics, particles, relative, rows=None):
 
 # The gradient of a force of particles in one place, W'(r)/r x, is what torch's quotient 0/0 does not tell.
 CASES = [(name, kind) for name in TERMS for kind in CONFIGURATIONS
-         if not (kind == "coincident" and "wcsph" in TERMS[name])]
+         if not (kind == "coincident" and {"wcsph", "transport-velocity"} & set(TERMS[name]))]
 
 
 @pytest.mark.mpi(1)

@@ -30,6 +30,17 @@ def test_motion_of_fifth_degree_is_met_exactly_across_the_faces_of_the_box():
     assert np.allclose(found.velocity, rows(1)(0.23), rtol=0, atol=1e-12)
 
 
+def test_motion_beside_the_fluid_is_met_where_the_shift_changes_evenly():
+    """Positions go with velocity and shift, velocities with their own rate."""
+    shift, velocity = (np.polynomial.Polynomial(np.random.default_rng(2).normal(size=size)) for size in (2, 4))
+    position = (velocity + shift).integ()
+    ends = [Moment(time, 0, np.full((1, 3), position(time)) % LENGTH, np.full((1, 3), velocity(time)),
+                   np.full((1, 3), velocity.deriv()(time)), shift=np.full((1, 3), shift(time))) for time in (0.1, 0.6)]
+    found = between(*ends, 0.4, PeriodicBox(LENGTH))
+    assert np.allclose(found.position, position(0.4) % LENGTH, rtol=0, atol=1e-12)
+    assert np.allclose(found.velocity, velocity(0.4), rtol=0, atol=1e-12)
+
+
 @pytest.mark.parametrize("speed", [0.0, 40.0, 1e4])
 def test_uniform_motion_at_any_speed_and_a_density_of_third_degree(speed):
     """Also many times through the box within a step."""

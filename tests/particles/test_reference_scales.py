@@ -4,7 +4,6 @@ import pytest
 
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.reference_scales import ReferenceScales
-from eddies.particles.terms.presets import PRESETS
 from eddies.particles.terms.term import TermError
 from tests.particles.configurations import CUTOFF, NEIGHBORS, SCALES, model
 
@@ -25,4 +24,4 @@ def test_a_scale_of_the_density_is_wanted_where_there_is_none():
     with pytest.raises(ValueError, match="sound_speed: a flow without density has none"):
         incompressible.required("sound_speed")
     with pytest.raises(TermError, match='term "wcsph": cannot be made: .* sound_speed: a flow without density'):
-        model(PRESETS["wcsph"], FlowUnits(incompressible, CUTOFF, NEIGHBORS))
+        model({"summation-density": {}, "wcsph": {}}, FlowUnits(incompressible, CUTOFF, NEIGHBORS))

@@ -106,7 +106,7 @@ def test_what_terms_read_and_give():
 @pytest.mark.parametrize("changes, message", [
     (dict(terms=("pressure", "pressure")), 'terms = ["pressure", "pressure"]: must be one or more terms, each once'),
     (dict(terms=()), "[model] terms = []: must be one or more terms"),
-    (dict(terms=("presure",)), '"wcsph", or the import path "module:name" of your own (what accelerates'),
+    (dict(terms=("presure",)), '"transport-velocity", or the import path "module:name" of your own (what accelerates'),
     (dict(terms=("presure",)), "did you mean pressure?"),
     (dict(terms="pressure"), '[model] terms = "pressure": must be a list of any of "pairs", "eddy-viscosity"'),
     (dict(terms=("pressure",), preset="wcsph"), "the list is given twice; remove one of the two"),

@@ -26,7 +26,7 @@ CLOSURES = {
     "pairs without density": {"pairs": dict(inputs=("distance", "speed", "approach"))},
     "learned-density": {**PRESETS["learned-density"], "eddy-viscosity": dict(form="monaghan")},
     "paper": PAPER,
-    "wcsph": PRESETS["wcsph"],
+    "wcsph": {"summation-density": {}, "wcsph": {}},
 }
 every_closure = pytest.mark.parametrize("kind", CLOSURES)
 every_integrator = pytest.mark.parametrize("integrator", INTEGRATORS)

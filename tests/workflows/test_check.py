@@ -236,6 +236,16 @@ def test_what_no_term_reads_limits_no_ranks():
         "add [training.horizons]"]}
 
 
+def test_steps_that_sound_outruns_are_told():
+    """Of terms of SPH, as of the method, which refuses them."""
+    from eddies.workflows.foreseen.warnings import warnings
+    told = {changes: [line for line in warnings(load_scene("tiny", changes), 1) if "resolve sound" in line]
+            for changes in (("model.preset=wcsph",), ("model.preset=wcsph", "simulation.step=0.001"), ())}
+    (line,) = told.pop(("model.preset=wcsph",))
+    assert line.startswith('[simulation] step = 0.08: the term "wcsph" has to resolve sound, with a step of at most')
+    assert list(told.values()) == [[], []]
+
+
 @pytest.mark.mpi(1)
 def test_a_rollout_is_foreseen_where_a_model_moves_the_particles_of_a_cpu(comm):
     from eddies.workflows.check import rollout_costs, rollout_lines

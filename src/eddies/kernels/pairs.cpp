@@ -47,7 +47,8 @@ constexpr int ROWS_TOGETHER = 4;  // of a colour, for one thread
 
 // In the order of kernels/pairs.py.
 enum Kind {
-    PAIR_NETWORK, MOMENTS, EDDY_VISCOSITY, DENSITY_TRANSPORT, SUMMATION_DENSITY, WCSPH, KERNEL_SUM, KERNEL_AVERAGE
+    PAIR_NETWORK, MOMENTS, EDDY_VISCOSITY, DENSITY_TRANSPORT, SUMMATION_DENSITY, CONTINUITY, TRANSPORT_VELOCITY, WCSPH,
+    KERNEL_SUM, KERNEL_AVERAGE
 };
 
 template <typename Real>
@@ -66,6 +67,11 @@ std::unique_ptr<Summand<Real>> make(const Given& given) {
             return std::make_unique<DensityTransport<Real>>(scalar);
         case SUMMATION_DENSITY:
             return std::make_unique<SummationDensity<Real>>(options[0], given.constants);
+        case CONTINUITY:
+            return std::make_unique<Continuity<Real>>(options[0], static_cast<int>(given.components), scalar,
+                                                      given.constants);
+        case TRANSPORT_VELOCITY:
+            return std::make_unique<TransportVelocity<Real>>(options[0], scalar, given.constants);
         case KERNEL_SUM:
             return std::make_unique<KernelSum<Real>>(given.constants);
         case KERNEL_AVERAGE:

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 #: What is summed, as pairs.cpp numbers it; the terms of eddies.particles are the definitions.
-KINDS = ("pair-network", "moments", "eddy-viscosity", "density-transport", "summation-density", "wcsph",
-         "kernel-sum", "kernel-average")
+KINDS = ("pair-network", "moments", "eddy-viscosity", "density-transport", "summation-density", "continuity",
+         "transport-velocity", "wcsph", "kernel-sum", "kernel-average")
 MOST_SCALARS = 4
 
 

@@ -478,6 +478,111 @@ class Wcsph : public Summand<Real> {
     }
 };
 
+// What makes the rate of density of smoothed particle hydrodynamics: v.x W'/r, and, with two components, (rho_j - rho_i)
+// W'/r, both over rho_i rho_j. Constants: the distance at which W ends, in filter widths, and the units of both. The
+// scalar: rho.
+template <typename Real>
+class Continuity : public Summand<Real> {
+   public:
+    Continuity(bool wendland, int components, int density, const double* constants)
+        : Summand<Real>(components, Real(1)), kernel_{wendland}, density_(density), support_(constants[0]),
+          units_{static_cast<Real>(constants[1]), static_cast<Real>(constants[2])} {
+        this->parity[1] = -1;
+    }
+
+    void values(const Block<Real>& pairs, Components<Real> found) override {
+        const Real *own = pairs.scalar[0][density_], *other = pairs.scalar[1][density_];
+        EDDIES_PAIRS found[0][p] = units_[0] * slope(pairs, p) * dot(pairs.x, pairs.v, p);
+        if (this->components == 2)
+            EDDIES_PAIRS found[1][p] = units_[1] * slope(pairs, p) * (other[p] - own[p]);
+    }
+
+    void gradients(const Block<Real>& pairs, GivenComponents<Real> given, ByPairs<Real>* by, Real*) override {
+        if (!by) return;
+        const Real *own = pairs.scalar[0][density_], *other = pairs.scalar[1][density_];
+        const bool diffusive = this->components == 2;
+        EDDIES_PAIRS {
+            const Real q = pairs.distance[p] / support_, below = 1 / (own[p] * other[p]);
+            const Real first = units_[0] * given[0][p], second = diffusive ? units_[1] * given[1][p] : Real(0);
+            const Real by_slope = first * dot(pairs.x, pairs.v, p) + second * (other[p] - own[p]);
+            const Real steep = slope(pairs, p), along = first * steep, across = second * steep;
+            by->distance[p] += by_slope * below * kernel_.bend(q) / support_;
+            for (int c = 0; c < 3; ++c) {
+                by->x[c][p] += along * pairs.v[c][p];
+                by->v[c][p] += along * pairs.x[c][p];
+            }
+            by->scalar[0][density_][p] -= across + by_slope * steep / own[p];
+            by->scalar[1][density_][p] += across - by_slope * steep / other[p];
+        }
+    }
+
+   private:
+    SmoothingKernel<Real> kernel_;
+    int density_;
+    Real support_, units_[2];
+
+    // W'/r over both densities.
+    Real slope(const Block<Real>& pairs, int p) const {
+        return kernel_.slope_over_q(pairs.distance[p] / support_) /
+               (pairs.scalar[0][density_][p] * pairs.scalar[1][density_][p]);
+    }
+};
+
+// -(1/rho_i^2 + 1/rho_j^2) W'/r x, and the entries of -v x^T W'/r over rho_i rho_j. Constants: the distance at which W
+// ends, in filter widths, and the units of both. The scalar: rho.
+template <typename Real>
+class TransportVelocity : public Summand<Real> {
+   public:
+    TransportVelocity(bool wendland, int density, const double* constants)
+        : Summand<Real>(12, Real(1)), kernel_{wendland}, density_(density), support_(constants[0]),
+          push_(constants[1]), carry_(constants[2]) {
+        for (int c = 0; c < 3; ++c) this->parity[c] = -1;
+    }
+
+    void values(const Block<Real>& pairs, Components<Real> found) override {
+        const Real *own = pairs.scalar[0][density_], *other = pairs.scalar[1][density_];
+        EDDIES_PAIRS {
+            const Real slope = -kernel_.slope_over_q(pairs.distance[p] / support_);
+            const Real first = 1 / own[p], second = 1 / other[p];
+            const Real push = push_ * slope * (first * first + second * second), carry = carry_ * slope * first * second;
+            for (int c = 0; c < 3; ++c) {
+                found[c][p] = push * pairs.x[c][p];
+                for (int a = 0; a < 3; ++a) found[3 + 3 * a + c][p] = carry * pairs.v[a][p] * pairs.x[c][p];
+            }
+        }
+    }
+
+    void gradients(const Block<Real>& pairs, GivenComponents<Real> given, ByPairs<Real>* by, Real*) override {
+        if (!by) return;
+        const Real *own = pairs.scalar[0][density_], *other = pairs.scalar[1][density_];
+        EDDIES_PAIRS {
+            const Real q = pairs.distance[p] / support_, slope = -kernel_.slope_over_q(q);
+            const Real first = 1 / own[p], second = 1 / other[p];
+            const Real push = push_ * (first * first + second * second), carry = carry_ * first * second;
+            Real along = 0, across = 0;  // the gradients of the two by the slope, over push and carry
+            for (int c = 0; c < 3; ++c) {
+                along += given[c][p] * pairs.x[c][p];
+                Real by_x = push * given[c][p];
+                for (int a = 0; a < 3; ++a) {
+                    const Real one = given[3 + 3 * a + c][p];
+                    across += one * pairs.v[a][p] * pairs.x[c][p];
+                    by_x += carry * one * pairs.v[a][p];
+                    by->v[a][p] += slope * carry * one * pairs.x[c][p];
+                }
+                by->x[c][p] += slope * by_x;
+            }
+            by->distance[p] -= (push * along + carry * across) * kernel_.bend(q) / support_;
+            by->scalar[0][density_][p] -= slope * first * (2 * push_ * along * first * first + carry * across);
+            by->scalar[1][density_][p] -= slope * second * (2 * push_ * along * second * second + carry * across);
+        }
+    }
+
+   private:
+    SmoothingKernel<Real> kernel_;
+    int density_;
+    Real support_, push_, carry_;
+};
+
 // W of the distance, in units of length.
 template <typename Real>
 class KernelSum : public Summand<Real> {

@@ -45,8 +45,8 @@ class RolloutTrainer:
 
     Every step draws a window from (seed, step), advances all its particles by the integrator of the simulation, and
     takes for each frame k that is reached the mean of |v - v_true|^2 / |v_true - v_start|^2: the velocity error in
-    units of that of particles without acceleration, so that all frames count alike. A density that has a rate of its
-    own counts in the same way. Added with a weight is the mean over bands of wavenumbers of the squared error of their
+    units of that of particles without acceleration, so that all frames count alike. A density whose rate is learned
+    counts in the same way. Added with a weight is the mean over bands of wavenumbers of the squared error of their
     kinetic energy, in units of what the band loses in that time on average over all windows: fitted forces are
     attenuated where what they are fitted to is noisy, they take too much from some scales and too little from others,
     and an energy off by little at every step is hardly seen in the error of the velocity.
@@ -148,9 +148,9 @@ class RolloutTrainer:
 
     def _errors(self, window: TrainingWindow, frame: int,
                 particles: ParticleSet) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-        """Error, truth, and value at the start of each column that has a rate."""
+        """Error, truth, and value at the start of the velocity, and of a density whose rate is learned."""
         yield particles.velocity - window.velocity[frame], window.velocity[frame], window.particles.velocity
-        if self.integrator.dynamics.model.integrates_density:
+        if self.integrator.dynamics.model.learns_density:
             yield particles.density - window.density[frame], window.density[frame], window.particles.density
 
     def _scale(self, true: Tensor, start: Tensor) -> float:

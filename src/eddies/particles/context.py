@@ -114,6 +114,12 @@ class Context:
         return self._columns[name]
 
     @property
+    def own_density(self) -> Tensor:
+        """The density (k,) of the particles that are asked for."""
+        density = self.column("density")[: len(self.particles)]
+        return density if self.rows is None else density[self.rows]
+
+    @property
     def density_fluctuation(self) -> Tensor:
         """rho' = (rho - rho_0)/rho_rms of the particles that this rank sees, (s,); collective."""
         name, scales = "density fluctuation", self.flow.scales

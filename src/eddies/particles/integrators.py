@@ -10,7 +10,7 @@ from torch import Tensor
 
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.particle_set import ParticleSet
-from eddies.particles.rates import Rates
+from eddies.particles.rates import BY_PARTICLE, Rates
 
 
 class Integrator:
@@ -43,7 +43,7 @@ class VelocityVerlet(Integrator):
     Rates may depend on velocity and density: they are evaluated at the velocity and density predicted for the
     end of the step by an Euler step, v + dt a (Groot and Warren 1997, with lambda = 1), and serve the next
     step's first half kick as well. A density with a rate is integrated by the trapezoidal rule; one that terms give
-    is left as last evaluated.
+    is left as last evaluated. A shift velocity is that of the step's start, of first order.
 
     `memory` holds those rates. They are evaluated anew for any other particles than those last returned.
     """
@@ -60,7 +60,7 @@ class VelocityVerlet(Integrator):
         else:
             particles, _ = self.dynamics.settle(particles)
             start = self.dynamics.rates_after(0.0, particles)
-        position = particles.position + time_step * (particles.velocity + 0.5 * time_step * start.acceleration)
+        position = particles.position + time_step * (_pace(particles, start) + 0.5 * time_step * start.velocity_rate)
         predicted = replace(_kicked(particles, start, time_step), position=position)
         kicked = _kicked(particles, start, 0.5 * time_step)
         columns = {name: column for name, column in kicked.columns().items() if name not in ("id", "position")}
@@ -123,7 +123,7 @@ class RungeKutta(Integrator):
         return [stage, *(ParticleSet(**columns) for columns in found)]
 
 
-REMEMBERED = ("acceleration", "density_rate", "density")
+REMEMBERED = (*BY_PARTICLE, "density")
 INTEGRATORS = {
     "verlet": VelocityVerlet,
     "rk2": partial(RungeKutta, nodes=(0, 1 / 2), weights=(0, 1)),
@@ -147,9 +147,14 @@ def _kicked(particles: ParticleSet, rates: Rates, time_step: float) -> ParticleS
         density = rates.density
     elif rates.density_rate is not None:
         density = density + time_step * rates.density_rate
-    return replace(particles, velocity=particles.velocity + time_step * rates.acceleration, density=density)
+    return replace(particles, velocity=particles.velocity + time_step * rates.velocity_rate, density=density)
 
 
 def _advanced(particles: ParticleSet, stage: ParticleSet, rates: Rates, time_step: float) -> ParticleSet:
     """All columns moved on by one Euler step with the velocity and the rates of a stage."""
-    return replace(_kicked(particles, rates, time_step), position=particles.position + time_step * stage.velocity)
+    return replace(_kicked(particles, rates, time_step), position=particles.position + time_step * _pace(stage, rates))
+
+
+def _pace(particles: ParticleSet, rates: Rates) -> Tensor:
+    """dx/dt."""
+    return particles.velocity if rates.shift_velocity is None else particles.velocity + rates.shift_velocity

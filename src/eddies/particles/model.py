@@ -15,7 +15,7 @@ from eddies.import_path import is_path, load, short_name
 from eddies.parallel.reduction import any_rank
 from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
-from eddies.particles.rates import Rates, total
+from eddies.particles.rates import BY_PARTICLE, Rates, total
 from eddies.particles.terms import settings as declared
 from eddies.particles.terms.forcing import Forcing
 from eddies.particles.terms.presets import TERMS
@@ -88,8 +88,16 @@ class LagrangianModel(nn.Module):
     @property
     def regresses_density(self) -> bool:
         """Whether a rate of density is learned from the rates of single moments."""
-        giving = [term for term in self.terms.values() if "density_rate" in term.gives]
-        return bool(giving) and not any(term.settings.learns_through_horizons for term in giving)
+        return self.learns_density and not any(term.settings.learns_through_horizons for term in self._giving_rate)
+
+    @property
+    def learns_density(self) -> bool:
+        """Whether a rate of density has something to learn."""
+        return any(True for term in self._giving_rate for _ in term.parameters())
+
+    @property
+    def _giving_rate(self) -> list[Term]:
+        return [term for term in self.terms.values() if "density_rate" in term.gives]
 
     @property
     def networks(self) -> list[PairTerm]:
@@ -97,9 +105,9 @@ class LagrangianModel(nn.Module):
         return [term for term in self.terms.values() if isinstance(term, PairTerm) and hasattr(term, "features")]
 
     def rates(self, context: Context, kept: Mapping[str, LinearRates] | None = None) -> Rates:
-        """The sum of the terms: `acceleration` (k, 3), `density_rate` (k,) if some term gives one, and the `density`
-        (n,) itself, not its deviation, if terms give it; beside the acceleration the `force_modes` that are in it.
-        Differentiable; collective.
+        """The sum of the terms: `acceleration` (k, 3), `density_rate` (k,) and what belongs to a shift if some term
+        gives it, and the `density` (n,) itself, not its deviation, if terms give it; beside the acceleration the
+        `force_modes` that are in it. Differentiable; collective.
 
         `kept` stands for terms at these very particles: see `linear_rates`.
         """
@@ -153,7 +161,7 @@ class LagrangianModel(nn.Module):
         unevenly."""
         pressure = rates.pressure_modes if self.density_is_given else None
         modes = [part for part in (rates.force_modes, None if pressure is None else pressure[None]) if part is not None]
-        local = Rates(rates.acceleration, rates.density_rate, rates.density, rates.force_modes)
+        local = replace(rates, pressure_modes=None)
         if not modes:
             return local
         values = context.resolved.at_particles(torch.cat(modes)).to(context.particles.velocity)
@@ -184,7 +192,7 @@ class LagrangianModel(nn.Module):
                            list(parameters.values()))
 
 
-_GIVEN = ("acceleration", "density_rate", "density")
+_GIVEN = (*BY_PARTICLE, "density")
 
 
 @dataclass(frozen=True)

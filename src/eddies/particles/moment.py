@@ -22,8 +22,9 @@ class Moment:
     ----------
     time : of the moment.
     first : the id that the block begins with.
-    position, velocity, acceleration : (n, 3).
+    position, velocity, acceleration : (n, 3), the latter the velocity's rate of change.
     density, density_rate : (n,), of particles that have a density, else None.
+    shift : (n, 3), of particles that move beside the fluid, with velocity + shift; else None.
     """
 
     time: float
@@ -33,16 +34,18 @@ class Moment:
     acceleration: np.ndarray
     density: np.ndarray | None = None
     density_rate: np.ndarray | None = None
+    shift: np.ndarray | None = None
 
     @classmethod
     def of(cls, comm: Comm, total: int, time: float, particles: ParticleSet, rates: Rates) -> Moment:
         """That of particles on any ranks, `total` in all; collective."""
         order = IdOrder(comm, as_numpy(particles.id), total)
-        columns = [particles.position, particles.velocity, rates.acceleration]
-        if particles.density is not None:
-            still = torch.zeros_like(particles.density)
-            columns += [particles.density, still if rates.density_rate is None else rates.density_rate]
-        return cls(time, order.start, *(order.apply(as_numpy(column)) for column in columns))
+        columns = {"position": particles.position, "velocity": particles.velocity, "acceleration": rates.velocity_rate,
+                   "density": particles.density, "density_rate": rates.density_rate, "shift": rates.shift_velocity}
+        if particles.density is not None and rates.density_rate is None:
+            columns["density_rate"] = torch.zeros_like(particles.density)
+        return cls(time, order.start, **{name: order.apply(as_numpy(column)) for name, column in columns.items()
+                                         if column is not None})
 
 
 def between(before: Moment, after: Moment, time: float, box: PeriodicBox) -> ParticleSet:
@@ -51,17 +54,21 @@ def between(before: Moment, after: Moment, time: float, box: PeriodicBox) -> Par
     of sixth and of fourth order in the time between."""
     step = after.time - before.time
     theta = (time - before.time) / step
-    kick, drift = step * before.acceleration, step * before.velocity
+    first, last, pull, last_pull = before.velocity, after.velocity, before.acceleration, after.acceleration
+    if before.shift is not None:  # whose rate is not known, but its change
+        first, last, turning = first + before.shift, last + after.shift, (after.shift - before.shift) / step
+        pull, last_pull = pull + turning, last_pull + turning
+    kick, drift = step * pull, step * first
     # The nearest image is told of what the velocities leave open: particles may cross the box within a step.
-    way = step * (before.velocity + after.velocity) / 2
+    way = step * (first + last) / 2
     moved = way + box.displacement(torch.from_numpy(after.position - way), torch.from_numpy(before.position)).numpy()
     # What remains at the end of the expansion about the first moment.
-    jump, turn = step * (after.velocity - before.velocity) - step * kick, step * (step * after.acceleration - kick)
+    jump, turn = step * (last - first) - step * kick, step * (step * last_pull - kick)
     miss = moved - drift - step * kick / 2
     position = before.position + theta * (drift + theta * (step * kick / 2 + theta * (
         10 * miss - 4 * jump + turn / 2 + theta * (-15 * miss + 7 * jump - turn + theta * (
             6 * miss - 3 * jump + turn / 2)))))
-    velocity = _cubic(before.velocity, after.velocity, kick, step * after.acceleration, theta)
+    velocity = _cubic(before.velocity, after.velocity, step * before.acceleration, step * after.acceleration, theta)
     density = None if before.density is None else torch.from_numpy(_cubic(
         before.density, after.density, step * before.density_rate, step * after.density_rate, theta))
     ids = torch.arange(before.first, before.first + len(position))

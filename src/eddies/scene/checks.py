@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from itertools import chain
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from eddies.import_path import ImportPathError, is_path, load
 from eddies.particles.terms.settings import Forcing
@@ -290,9 +290,10 @@ def baseline_problems(scene: Scene) -> Iterator[str]:
                    "to the same")
 
 
-def acoustic_step(scene: Scene) -> float:
-    """The longest step of WCSPH, 0.4 h / (c (1 + 0.6 alpha)) (Monaghan 1992), h half the kernel's support."""
-    h, alpha = scene.interaction_radius / 2, (scene.wcsph or Wcsph()).alpha
+def acoustic_step(scene: Scene, form: Any = None) -> float:
+    """The longest step of WCSPH, 0.4 h / (c (1 + 0.6 alpha)) (Monaghan 1992), h half the kernel's support; of the
+    method, or of a term with settings of that `form`."""
+    h, alpha = scene.interaction_radius / 2, (form or scene.wcsph or Wcsph()).alpha
     return 0.4 * h / (scene.flow.sound_speed * (1 + 0.6 * alpha))
 
 

@@ -25,17 +25,18 @@ def scene_of(*changes):
 
 
 @pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("preset", [name for name in PRESETS if name != "wcsph"])
+@pytest.mark.parametrize("preset", PRESETS)
 def test_every_preset_is_probed(comm, preset):
-    speed = probe_particles(scene_of(f"model.preset={preset}"), comm)
+    scene = scene_of(f"model.preset={preset}")
+    speed, pairs = probe_particles(scene, comm), "pairs" in scene.model.reads
     assert set(speed.rates) == set(PARTS)
     assert all(rate.call >= 0 and rate.unit >= 0 for rate in speed.rates.values())
-    assert speed.listed is (library() is None and "pairs" in PRESETS[preset])
+    assert speed.listed is (library() is None and pairs)
     # The residual that a solve starts from and the products are two transforms each, the stress two, what it misses of
     # the velocities one, the force one.
     expected = (8, 30) if "pressure" in PRESETS[preset] else (0, 0)
     assert (speed.calls["transforms"], speed.components["transforms"]) == expected
-    assert bool(speed.ghost_columns) == ("pairs" in PRESETS[preset])
+    assert bool(speed.ghost_columns) == pairs
 
 
 @pytest.mark.mpi(1, 2)

@@ -80,7 +80,7 @@ def test_weights_of_another_scene_are_refused_with_the_key(comm, tmp_path):
         load_model(load_scene("tiny", ["model.pairs.hidden=[5]"]), comm, path, SCALES)
 
 
-@pytest.mark.parametrize("preset", ["resolved + pairs", "resolved", "learned-density", "paper", "wcsph"])
+@pytest.mark.parametrize("preset", PRESETS)
 def test_a_description_is_json_and_differs_from_its_own_scene_in_nothing(preset):
     scene = load_scene("tiny", [f"model.preset={preset}"])
     stored = json.loads(json.dumps(describe(scene, SCALES)))

@@ -20,7 +20,9 @@ TERMS = {
         ("relaxation", "relaxation", "Relaxation"),
         ("forcing", "forcing", "Forcing"),
         ("summation-density", "summation_density", "SummationDensity"),
+        ("continuity", "continuity", "Continuity"),
         ("wcsph", "wcsph", "WCSPH"),
+        ("transport-velocity", "transport_velocity", "TransportVelocity"),
     )
 }
 
@@ -34,6 +36,7 @@ PRESETS: dict[str, dict[str, Mapping[str, Any]]] = {
     "resolved + pairs": {**dict.fromkeys(RESOLVED, {}), "pairs": {"inputs": ("distance", "speed", "approach")}},
     "learned-density": {"pairs": {}, "density-flux": {"zero_at_first": True}, "density-transport": {}},
     "paper": {"pairs": {"basis": "paper", "hidden": (20, 100, 20)}, "density-flux": {"hidden": (20, 100, 20)}},
-    "wcsph": {"summation-density": {}, "wcsph": {}},
+    "wcsph": {"continuity": {}, "wcsph": {}},
+    "transport-velocity": {"continuity": {}, "wcsph": {}, "transport-velocity": {}},
 }
 DEFAULT_PRESET = "resolved"

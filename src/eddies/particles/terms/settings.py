@@ -12,7 +12,7 @@ from typing import ClassVar
 from eddies.scene.values import KeyProblem, Section, boolean, choice, integers, named, number, texts
 
 READS = ("pairs", "resolved", "density")
-GIVES = ("acceleration", "density", "density_rate")
+GIVES = ("acceleration", "density", "density_rate", "shift_velocity")
 #: What a network can be told of a pair, in units of the flow: the densities of both, |x|, |v| and x.v.
 INPUTS = ("density", "distance", "speed", "approach")
 BASES = ("corrected", "paper")
@@ -25,7 +25,7 @@ class TermSettings(Section):
     reads : of "pairs" (neighbours within the interaction radius), "resolved" (the velocity that a grid resolves of the
         particles'), "density" (so that it is computed, stored, and wanted of the ground truth). What no term reads is
         not built.
-    gives : of "acceleration", "density" (a part of it) and "density_rate".
+    gives : of "acceleration", "density" (a part of it), "density_rate" and "shift_velocity".
     learns_through_horizons : its parameters are trained through several steps of the simulation alone.
     numbers_per_pair : how many numbers it keeps of each pair while it is evaluated, for an estimate of the memory.
     """
@@ -176,6 +176,24 @@ class SummationDensity(TermSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Continuity(TermSettings):
+    """The continuity equation of smoothed particle hydrodynamics, from the true density on."""
+
+    kernel: str = choice("smoothing kernel", "cubic-spline", "wendland", default="cubic-spline")
+    diffusion: float = number("delta of the density's diffusion (Molteni & Colagrossi 2009), at first; 0: without",
+                              default=0.0, at_least=0)
+
+    numbers_per_pair = 8
+    reads = ("pairs", "density")
+    gives = ("density_rate",)
+
+    @property
+    def learns_through_horizons(self) -> bool:  # type: ignore[override]
+        """Where there is something to learn."""
+        return self.diffusion > 0
+
+
+@dataclass(frozen=True, kw_only=True)
 class WCSPH(TermSettings):
     """Pressure and artificial viscosity of weakly compressible smoothed particle hydrodynamics."""
 
@@ -187,3 +205,17 @@ class WCSPH(TermSettings):
 
     numbers_per_pair = 8
     reads = ("pairs", "density")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TransportVelocity(TermSettings):
+    """Particles that a constant background pressure shifts to where there are fewer (Adami, Hu & Adams 2013)."""
+
+    kernel: str = choice("smoothing kernel", "cubic-spline", "wendland", default="cubic-spline")
+    background: float = number("background pressure times the time that it acts for, over rho_0 c h, at first",
+                               default=0.25, above=0)
+
+    numbers_per_pair = 16
+    reads = ("pairs", "density")
+    gives = ("shift_velocity",)
+    learns_through_horizons = True

@@ -25,6 +25,11 @@ def particle_mass(flow: FlowUnits) -> float:
     return flow.scales.density_mean * flow.scales.spacing**3
 
 
+def over_distance(slope: Tensor, distance: Tensor) -> Tensor:
+    """W'/r: the slope vanishes at r = 0, so that the quotient is 0 for coincident particles."""
+    return slope / distance.clamp(min=torch.finfo(distance.dtype).tiny)
+
+
 class SummationDensity(PairTerm):
     """rho_i = sum_j m W(x_i - x_j), the particle itself counted once; W with the radius of interaction as its
     support."""

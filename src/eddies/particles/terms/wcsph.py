@@ -12,7 +12,7 @@ from eddies.particles.flow_units import FlowUnits
 from eddies.particles.rates import Rates
 from eddies.particles.scaled_pairs import ScaledPairs
 from eddies.particles.terms import settings as declared
-from eddies.particles.terms.summation_density import KERNELS, particle_mass
+from eddies.particles.terms.summation_density import KERNELS, over_distance, particle_mass
 from eddies.particles.terms.term import PairTerm
 
 # Softens the approach rate at small distances, in squared smoothing lengths (Monaghan 1992).
@@ -28,8 +28,12 @@ class WCSPH(PairTerm):
 
     Pi only for approaching pairs, x.v < 0. The smoothing length h is half the support of W, which is the radius of
     interaction. Forces of a pair are opposite and central, so momentum and angular momentum are kept. In three
-    dimensions Pi acts like a viscosity of about alpha c h / 10. The sound speed c, at first that of the flow, alpha,
-    beta and gamma are parameters.
+    dimensions Pi acts like a viscosity of about alpha c h / 10. The sound speed c in units of the flow's, alpha, beta
+    and gamma are parameters; of the first three the size counts, so that pressure pushes and friction takes energy.
+
+    Particles at random do not see a gradient by that sum: the differences (P_j - P_i)/(rho_i rho_j) in its place have
+    half its error at single moments, but lose the balance of pressure and density, and energy grows until a rollout
+    ends, unless particles are kept in place by a shift; then they are no better.
     """
 
     Settings = declared.WCSPH
@@ -43,7 +47,13 @@ class WCSPH(PairTerm):
         self.density = flow.scales.density_mean
         self.sound_speed, self.alpha, self.beta, self.exponent = (
             nn.Parameter(torch.tensor(value, dtype=torch.float64))
-            for value in (flow.scales.required("sound_speed"), settings.alpha, settings.beta, settings.exponent))
+            for value in (1.0, settings.alpha, settings.beta, settings.exponent))
+        self.fluid_sound_speed = flow.scales.required("sound_speed")
+
+    @property
+    def c(self) -> Tensor:
+        """The sound speed c."""
+        return self.fluid_sound_speed * self.sound_speed.abs()
 
     def pair_values(self, pairs: ScaledPairs) -> Tensor:
         """What each pair (i, j) accelerates i by, (3, m)."""
@@ -52,9 +62,7 @@ class WCSPH(PairTerm):
         density = pairs.column("density").to(x.dtype)
         push = self.pressure(density) / density**2
         strength = listed.at_receivers(push) + listed.at_senders(push) + self._viscosity(pairs, density)
-        # The slope of W vanishes at r = 0, so that the quotient is 0 for coincident particles.
-        slope = self.kernel.derivative(listed.distance) / listed.distance.clamp(min=torch.finfo(x.dtype).tiny)
-        return -self.mass * strength * slope * x
+        return -self.mass * strength * over_distance(self.kernel.derivative(listed.distance), listed.distance) * x
 
     def compiled(self, context: Context) -> CompiledSum:
         """The same for the compiled library."""
@@ -62,7 +70,7 @@ class WCSPH(PairTerm):
         width = scales.filter_width
         options = Summand("wcsph", 3, (self.settings.kernel == "wendland",),
                           (support / width, self.mass * width / support**5, SOFTENING * (support / (2 * width)) ** 2))
-        viscosity = torch.stack([scales.velocity * self.alpha * self.sound_speed, scales.velocity**2 * self.beta])
+        viscosity = torch.stack([scales.velocity * self.alpha.abs() * self.c, scales.velocity**2 * self.beta.abs()])
         return CompiledSum(options, viscosity, (self.pressure(density) / density**2, density))
 
     def rates_of(self, sums: Tensor, context: Context) -> Rates:
@@ -71,7 +79,7 @@ class WCSPH(PairTerm):
 
     def pressure(self, density: Tensor) -> Tensor:
         """P of densities of any shape."""
-        c, gamma, rho_0 = self.sound_speed, self.exponent, self.density
+        c, gamma, rho_0 = self.c, self.exponent, self.density
         return c**2 * rho_0 / gamma * ((density / rho_0) ** gamma - 1)
 
     def _viscosity(self, pairs: ScaledPairs, density: Tensor) -> Tensor:
@@ -80,4 +88,4 @@ class WCSPH(PairTerm):
         approach = (listed.displacement.T * pairs.velocity_difference).sum(0)
         mu = torch.clamp(h * approach / (listed.distance**2 + SOFTENING * h**2), max=0)
         mean = (listed.at_receivers(density) + listed.at_senders(density)) / 2
-        return mu * (self.beta * mu - self.alpha * self.sound_speed) / mean
+        return mu * (self.beta.abs() * mu - self.alpha.abs() * self.c) / mean

@@ -7,6 +7,8 @@ import math
 from collections.abc import Callable, Iterable, Iterator
 
 from eddies.flow.stability import REMEDIES, limits_of_step
+from eddies.particles.terms.settings import WCSPH
+from eddies.scene.checks import acoustic_step
 from eddies.scene.scene import BOX_LENGTH, Scene
 from eddies.workflows.foreseen.estimates import (courant_bound, expected_turbulence, foreseen_allowed_step,
                                                  largest_wavenumber, most_ranks, peak_speed, rms_speed)
@@ -129,6 +131,18 @@ def rollout_steps(scene: Scene) -> Iterator[str]:
                f"{at_most(allowed)}, in which their resolved velocity can follow the flow; lower it to that")
 
 
+def sound_steps(scene: Scene) -> Iterator[str]:
+    """Steps of smoothed particles that sound outruns."""
+    settings = scene.simulation
+    if "model" not in settings.needs:
+        return
+    for name, form in scene.model.settings.items():
+        if isinstance(form, WCSPH) and settings.step > acoustic_step(scene, form):
+            yield (f'[simulation] step = {settings.step:g}: the term "{name}" has to resolve sound, with a step of at '
+                   f"most {at_most(acoustic_step(scene, form))} unless it learns a slower one; lower step, and use "
+                   'integrator = "verlet"')
+
+
 def at_least(value: float) -> str:
     """Two digits, rounded up."""
     return f"{math.ceil(value / _second_digit(value) - 1e-9) * _second_digit(value):.2g}"
@@ -145,4 +159,4 @@ def _second_digit(value: float) -> float:
 
 SUBJECTS: dict[str, tuple[Callable[[Scene], Iterator[str]], ...]] = {
     "dns": (resolution, compressibility, turbulence_at_all, stability, filter_width),
-    "train": (learning,), "simulate": (rollout_steps,)}
+    "train": (learning,), "simulate": (rollout_steps, sound_steps)}

@@ -22,7 +22,6 @@ from eddies.particles.model import LagrangianModel, build_model
 from eddies.particles.moment import Moment, between
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.reference_scales import allowed_step
-from eddies.particles.terms.presets import PRESETS
 from eddies.particles.terms.settings import WCSPH, Forcing, SummationDensity
 from eddies.scene.scene import Scene, Wcsph
 from eddies.workflows.ground_truth.truth import GroundTruth, particles_for
@@ -203,7 +202,7 @@ class SmoothedRun(ParticleRun):
         form = asdict(scene.wcsph or Wcsph())
         del form["neighbors"]  # which are in the units
         settings = {"summation-density": SummationDensity(kernel=form["kernel"]), "wcsph": WCSPH(**form)}
-        return build_model(settings, PRESETS["wcsph"], self.flow)
+        return build_model(settings, settings, self.flow)
 
     def description(self) -> dict[str, float | str]:
         """The coefficients too."""

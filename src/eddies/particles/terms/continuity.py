@@ -1,0 +1,63 @@
+"""The density equation of smoothed particle hydrodynamics."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from eddies.kernels.pairs import Summand
+from eddies.particles.compiled_pairs import CompiledSum
+from eddies.particles.context import Context
+from eddies.particles.flow_units import FlowUnits
+from eddies.particles.rates import Rates
+from eddies.particles.scaled_pairs import ScaledPairs
+from eddies.particles.terms import settings as declared
+from eddies.particles.terms.summation_density import KERNELS, over_distance, particle_mass
+from eddies.particles.terms.term import PairTerm
+
+
+class Continuity(PairTerm):
+    """d rho_i/dt = rho_i sum_j (m/rho_j) (v_i - v_j).grad W  (Monaghan 2005), and with `diffusion` that of delta-SPH
+    (Molteni & Colagrossi 2009),
+
+        + 2 delta h c sum_j (m/rho_j) (rho_j - rho_i) (-W'/r)
+
+    with the radius of interaction as the support of W, h half of it, and the sound speed c of the flow. delta is a
+    parameter, of which |delta| counts: a negative one would sharpen what it should smooth. Nothing else is.
+    """
+
+    Settings = declared.Continuity
+    settings: declared.Continuity
+    mutual = True
+
+    def __init__(self, settings: declared.Continuity, flow: FlowUnits) -> None:
+        super().__init__(settings, flow)
+        self.kernel, self.mass = KERNELS[settings.kernel](flow.cutoff), particle_mass(flow)
+        self.diffusivity = flow.cutoff * flow.scales.required("sound_speed")  # 2 h c
+        self.delta = nn.Parameter(torch.tensor(settings.diffusion, dtype=torch.float64)) if settings.diffusion else None
+        self.parity = torch.tensor([1.0] if self.delta is None else [1.0, -1.0])
+
+    def pair_values(self, pairs: ScaledPairs) -> Tensor:
+        """m v.grad W and, with diffusion, m (rho_j - rho_i) W'/r, both over rho_i rho_j: (components, m)."""
+        listed = pairs.pairs
+        density = pairs.column("density").to(listed.distance)
+        own, other = listed.at_receivers(density), listed.at_senders(density)
+        slope = self.mass * over_distance(self.kernel.derivative(listed.distance), listed.distance) / (own * other)
+        found = [slope * (listed.displacement.T * pairs.velocity_difference).sum(0)]
+        return torch.stack(found if self.delta is None else [*found, slope * (other - own)])
+
+    def compiled(self, context: Context) -> CompiledSum:
+        """The same for the compiled library."""
+        scales, support = context.flow.scales, self.kernel.support
+        width, unit = scales.filter_width, self.mass / support**5
+        told = Summand("continuity", len(self.parity), (self.settings.kernel == "wendland",),
+                       (support / width, unit * width * scales.velocity, unit))
+        return CompiledSum(told, torch.empty(0), (context.column("density"),))
+
+    def rates_of(self, sums: Tensor, context: Context) -> Rates:
+        """The rate of density."""
+        density = context.own_density.to(sums)
+        rate = density**2 * sums[0]
+        if self.delta is not None:
+            rate = rate - self.delta.abs() * self.diffusivity * density * sums[1]
+        return Rates(density_rate=rate.to(context.particles.velocity.dtype))
