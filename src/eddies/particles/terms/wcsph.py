@@ -30,8 +30,8 @@ class WCSPH(PairTerm):
     interaction. Forces of a pair are opposite and central, so momentum and angular momentum are kept. In three
     dimensions Pi acts like a viscosity of about alpha c h / 10. The sound speed of P in units of the flow's, alpha and
     beta are parameters, of which the size counts, so that pressure pushes and friction takes energy. That of Pi is the
-    flow's: a force that is off with large alpha would else teach the pressure to vanish. gamma stays as it is set; where
-    the density hardly varies nothing tells it.
+    flow's: too large an alpha would else teach the pressure to vanish. gamma stays as it is set, as nothing tells it
+    where the density hardly varies.
 
     Particles at random do not see a gradient by that sum: the differences (P_j - P_i)/(rho_i rho_j) in its place have
     half its error at single moments, but lose the balance of pressure and density, and energy grows until a rollout
