@@ -28,8 +28,10 @@ class WCSPH(PairTerm):
 
     Pi only for approaching pairs, x.v < 0. The smoothing length h is half the support of W, which is the radius of
     interaction. Forces of a pair are opposite and central, so momentum and angular momentum are kept. In three
-    dimensions Pi acts like a viscosity of about alpha c h / 10. The sound speed c in units of the flow's, alpha, beta
-    and gamma are parameters; of the first three the size counts, so that pressure pushes and friction takes energy.
+    dimensions Pi acts like a viscosity of about alpha c h / 10. The sound speed of P in units of the flow's, alpha and
+    beta are parameters, of which the size counts, so that pressure pushes and friction takes energy. That of Pi is the
+    flow's: too large an alpha would else teach the pressure to vanish. gamma stays as it is set, as nothing tells it
+    where the density hardly varies.
 
     Particles at random do not see a gradient by that sum: the differences (P_j - P_i)/(rho_i rho_j) in its place have
     half its error at single moments, but lose the balance of pressure and density, and energy grows until a rollout
@@ -45,15 +47,9 @@ class WCSPH(PairTerm):
         super().__init__(settings, flow)
         self.kernel, self.mass = KERNELS[settings.kernel](flow.cutoff), particle_mass(flow)
         self.density = flow.scales.density_mean
-        self.sound_speed, self.alpha, self.beta, self.exponent = (
-            nn.Parameter(torch.tensor(value, dtype=torch.float64))
-            for value in (1.0, settings.alpha, settings.beta, settings.exponent))
-        self.fluid_sound_speed = flow.scales.required("sound_speed")
-
-    @property
-    def c(self) -> Tensor:
-        """The sound speed c."""
-        return self.fluid_sound_speed * self.sound_speed.abs()
+        self.sound_speed, self.alpha, self.beta = (nn.Parameter(torch.tensor(value, dtype=torch.float64))
+                                                   for value in (1.0, settings.alpha, settings.beta))
+        self.c = flow.scales.required("sound_speed")
 
     def pair_values(self, pairs: ScaledPairs) -> Tensor:
         """What each pair (i, j) accelerates i by, (3, m)."""
@@ -79,7 +75,7 @@ class WCSPH(PairTerm):
 
     def pressure(self, density: Tensor) -> Tensor:
         """P of densities of any shape."""
-        c, gamma, rho_0 = self.c, self.exponent, self.density
+        c, gamma, rho_0 = self.c * self.sound_speed, self.settings.exponent, self.density
         return c**2 * rho_0 / gamma * ((density / rho_0) ** gamma - 1)
 
     def _viscosity(self, pairs: ScaledPairs, density: Tensor) -> Tensor:
