@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 
 from eddies.flow.stability import REMEDIES, limits_of_step
 from eddies.particles.terms.settings import WCSPH
-from eddies.scene.checks import acoustic_step
+from eddies.scene.baseline_checks import acoustic_step
 from eddies.scene.scene import BOX_LENGTH, Scene
 from eddies.workflows.foreseen.estimates import (courant_bound, expected_turbulence, foreseen_allowed_step,
                                                  largest_wavenumber, most_ranks, peak_speed, rms_speed)
