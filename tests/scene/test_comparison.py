@@ -51,7 +51,7 @@ def test_built_in_comparison(name):
     groups = {one.name: one.group for one in comparison.variant}
     assert groups[comparison.subject] != "baseline" and "baseline" in groups.values()
     methods = {scene.simulation.method for scene in comparison.scenes.values()}
-    assert methods == {"learned", "none", "wcsph", "eulerian"}
+    assert methods == {"learned", "none", "eulerian"}
 
 
 BAD = [
