@@ -17,7 +17,7 @@ ROOMS = tuple(f"workflows.{path.parent.name}*" for path in (CHECKOUT / "src/eddi
 # Modules below eddies, by layer. Imports go down, or stay within a group.
 LAYERS = (
     (("__init__", "__version__"), ("errors*",)),
-    (("pipeline*",), ("import_path*",), ("clock*",), ("time_stepping*",)),
+    (("pipeline*",), ("import_path*",), ("clock*",), ("time_stepping*",), ("measures*",)),
     (("scene*", "particles.terms.settings*", "particles.terms.presets*"),),
     (("parallel*",), ("kernels*",)),
     (("io*",),),

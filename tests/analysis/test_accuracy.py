@@ -3,40 +3,61 @@
 import numpy as np
 import pytest
 
-from eddies.analysis.accuracy import MEASURES, StoredRollout, accuracy
+from eddies.analysis.accuracy import StoredRollout, accuracy
+from eddies.analysis.rollout_spectra import RolloutSpectra
+from eddies.measures import MEASURES
 
 TURNOVER, TIMES = 1.2, np.linspace(0, 1.2, 7)
-CELLS, RNG = 8, np.random.default_rng(4)
+LENGTH, RNG = 2 * np.pi, np.random.default_rng(4)
 VELOCITY, ACCELERATION, GRADIENT = (RNG.normal(size=(4000, *shape)) for shape in ((3,), (3,), (3, 3)))
-FIELD = RNG.normal(size=(3, CELLS, CELLS, CELLS))
+START = RNG.uniform(0, LENGTH, (4000, 3))
+SPECTRUM = np.exp(-np.arange(9.0))
+# What is the truth's own, or a ratio.
+OF_THE_TRUTH = {"spectrum_error_floor", "velocity_kl_floor", "acceleration_kl_floor", "qr_kl_floor"}
+RATIOS = {"energy_ratio", "count_variance_ratio"}
 
 
 class Stored:
-    """The same particles or field at all times, times 1 + growth * time."""
+    """The same particles at all times, times 1 + growth * time; they move, and change their velocity alike."""
 
     def __init__(self, columns, growth=0.0, times=TIMES, broken=None):
         self.columns, self.growth, self.times, self.broken = columns, growth, times, broken
 
     def read(self, frame, column, start=0, stop=None):
-        factor = np.nan if frame == self.broken else 1 + self.growth * self.times[frame]
+        time = self.times[frame]
+        factor = np.nan if frame == self.broken else 1 + self.growth * time
+        if column == "position":
+            return (START + (factor - 1 + 0.2 * time) * VELOCITY)[start:stop] % LENGTH
+        if column == "velocity":
+            return factor * (VELOCITY + time * ACCELERATION)[start:stop]
         return factor * self.columns[column][start:stop]
 
 
-PARTICLES = {"velocity": VELOCITY, "acceleration": ACCELERATION, "velocity_gradient": GRADIENT}
+PARTICLES = {"acceleration": ACCELERATION, "velocity_gradient": GRADIENT}
+
+
+def spectra(growth, times):
+    """Of truth and flow alike, at every other time; of a model whose velocities grow."""
+    def table(times, growth, name="energy"):
+        energies = np.outer((1 + growth * times) ** 2, SPECTRUM)
+        return {"time": times, "wavenumber": np.arange(9), name: energies}
+
+    return RolloutSpectra(table(times[::2], growth), table(TIMES[::2], 0.0), table(TIMES + 3.0, 0.0, "filtered"), 3.0)
 
 
 def measured(growth, complete=True, model_times=TIMES, broken=None):
-    model = Stored(PARTICLES, growth, model_times, broken), Stored({"velocity": FIELD}, growth, model_times)
-    truth = Stored(PARTICLES), Stored({"velocity": FIELD})
-    run = StoredRollout(model[0], truth[0], model[1], truth[1], TURNOVER, 0.15, filter_wavenumber=6.0)
+    run = StoredRollout(Stored(PARTICLES, growth, model_times, broken), Stored(PARTICLES), spectra(growth, model_times),
+                        LENGTH, TURNOVER, 0.15, filter_wavenumber=6.0)
     return accuracy(run, complete)
 
 
 def test_the_truth_itself_has_no_error():
     found = measured(0.0)
-    assert found.pop("energy_ratio") == 1 and found.pop("end") == 1
-    assert set(found) == set(MEASURES) - {"energy_ratio"}
-    assert all(value == pytest.approx(0, abs=1e-12) for value in found.values())
+    assert found.pop("end") == 1 and list(found) == list(MEASURES)
+    assert all(found[name] == 1 for name in RATIOS)
+    assert all(found[name] == pytest.approx(0, abs=1e-12) for name in found.keys() - RATIOS - OF_THE_TRUTH)
+    assert found["spectrum_error_floor"] == 0
+    assert all(1e-4 < found[name] < 0.1 for name in OF_THE_TRUTH - {"spectrum_error_floor"})
 
 
 def test_an_error_that_grows_in_time_is_found_between_frames():
@@ -46,7 +67,12 @@ def test_an_error_that_grows_in_time_is_found_between_frames():
     assert found["velocity_error_half"] == pytest.approx(0.06)
     assert found["acceleration_error"] == 0
     assert found["energy_ratio"] == pytest.approx(1.12**2)
-    assert found["spectrum_error"] == pytest.approx(1.12**2 - 1)
+    assert found["spectrum_error"] == pytest.approx(2 * np.log(1.12)) and found["spectrum_error_floor"] == 0
+    # Of accelerations that grow by a factor f the variance does by f^2.
+    assert found["acceleration_variance_error"] == pytest.approx(2 * np.sqrt(np.mean(np.log(1 + 0.1 * TIMES) ** 2)))
+    assert found["acceleration_correlation_error"] == pytest.approx(0, abs=1e-12)
+    # Half as far again: ln 1.5^2.
+    assert found["pair_dispersion_error"] == pytest.approx(2 * np.log(1.5))
     assert all(found[name] > 1e-4 for name in ("velocity_kl", "acceleration_kl", "qr_kl"))
 
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from eddies.analysis.errors import normalized_l2
+from eddies.analysis.errors import normalized_l2, rms_log_ratio
 
 
 def test_zero_prediction_scores_one():
@@ -16,3 +16,10 @@ def test_unlike_shapes_and_zero_truth_are_refused():
         normalized_l2(np.ones(3), np.ones(4))
     with pytest.raises(ValueError, match="zero"):
         normalized_l2(np.ones(3), np.zeros(3))
+
+
+def test_a_factor_counts_alike_both_ways_and_nothing_is_no_number():
+    truth = np.array([1e-9, 1.0, 40.0])
+    assert rms_log_ratio(truth * np.exp([0.3, -0.3, 0.3]), truth) == pytest.approx(0.3)
+    assert rms_log_ratio(truth, truth) == 0 and rms_log_ratio(truth * [0, 1, 1], truth) == np.inf
+    assert np.isnan(rms_log_ratio(np.empty(0), np.empty(0)))

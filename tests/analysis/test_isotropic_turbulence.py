@@ -58,7 +58,9 @@ def test_averages_are_over_time_and_not_over_samples():
 def test_energy_budget_and_trend():
     span = span_of(columns(UNEVEN))
     assert span.energy_imbalance == pytest.approx(0, abs=1e-12)  # injected 0.75, dissipated 0.5, grows by 0.25
-    assert span.energy_trend == pytest.approx(0.15 * 1.25 / (1.5 * 1.45))
+    # Four turnovers of a straight line: four blocks, none off it.
+    assert span.energy_trend.value == pytest.approx(0.15 * 1.25 / (1.5 * 1.45))
+    assert span.energy_trend.error == pytest.approx(0, abs=1e-12)
     lossy = {**columns(UNEVEN), "injection_rate": np.full(UNEVEN.size, 0.8)}
     assert span_of(lossy).energy_imbalance == pytest.approx(0.1)
 

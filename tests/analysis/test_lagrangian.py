@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from eddies.analysis.lagrangian import (
-    minimum_image, pair_dispersion, pairs_at, separations, structure_function, velocity_correlation,
+    correlation, increment_flatness, minimum_image, nearest_rows, pair_dispersion, pairs_at, separations,
+    structure_function,
 )
 
 LENGTH = 2 * np.pi
@@ -13,9 +14,9 @@ def test_turning_velocities_are_forgotten_as_a_cosine():
     phase = np.random.default_rng(9).uniform(0, LENGTH, 200)
     angle = phase[None, :] + 1.7 * time[:, None]
     velocity = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=-1)
-    correlation = [velocity_correlation(velocity[0], frame) for frame in velocity]
-    assert correlation == pytest.approx(np.cos(1.7 * time))
-    assert velocity_correlation(velocity[0], 5 * velocity[0]) == pytest.approx(1)
+    found = [correlation(velocity[0], frame) for frame in velocity]
+    assert found == pytest.approx(np.cos(1.7 * time))
+    assert correlation(velocity[0], 5 * velocity[0]) == pytest.approx(1)
     lags = np.array([0, 1, 4])
     assert structure_function(velocity, lags) == pytest.approx(2 * (1 - np.cos(1.7 * time[lags])) / 3)
 
@@ -50,6 +51,30 @@ def test_pairs_that_part_at_constant_velocity():
     position = np.array([[1.0, 2.0, 3.0]] * 3) + time[:, None, None] * velocity
     dispersion, = pair_dispersion(position % LENGTH, [np.array([[0, 1], [1, 2]])], LENGTH)
     assert np.allclose(dispersion, 2 * time**2)
+
+
+def test_increments_of_normal_velocities_have_flatness_three():
+    """Of a random walk at every lag; the deviation of a flatness of 60000 values is sqrt(96 / 60000) = 0.04. Waves of
+    one amplitude, whose increments are sines, have 3/2."""
+    walk = np.cumsum(np.random.default_rng(5).normal(size=(6, 20000, 3)), axis=0)
+    assert increment_flatness(walk, np.array([1, 3, 5])) == pytest.approx(3, abs=0.12)
+    phase = LENGTH * np.arange(1000) / 1000
+    waves = np.stack([np.sin(phase + 0.4 * step) for step in range(4)])[..., None]
+    assert increment_flatness(waves, np.array([1, 2])) == pytest.approx(1.5)
+    assert np.isnan(increment_flatness(np.ones((2, 5, 3)), np.array([1]))).all()
+
+
+@pytest.mark.parametrize("spread", [LENGTH, 0.3], ids=["even", "in a corner"])
+def test_nearest_rows_are_those_of_all_distances(spread):
+    """Two in one place, and one that may be far from all others."""
+    position = np.random.default_rng(4).uniform(0, spread, (200, 3))
+    position[7], position[0] = position[3], 3.0
+    chosen = np.array([7, 0, 199])
+    apart = np.linalg.norm(minimum_image(position[chosen][:, None] - position[None], LENGTH), axis=-1)
+    apart[np.arange(3), chosen] = np.inf
+    assert np.array_equal(nearest_rows(position, LENGTH, chosen, 3), np.argsort(apart, axis=1)[:, :3].T)
+    with pytest.raises(ValueError, match="none has 3 neighbours"):
+        nearest_rows(position[:3], LENGTH, np.array([0]), 3)
 
 
 def test_minimum_image():

@@ -58,3 +58,12 @@ def test_a_model_without_numbers_is_worth_its_cost_in_nothing():
     worth, not_worth = verdict(row("learned", 2, None, None), BASELINES, "seconds", WORDS)
     assert worth == "learned is worth its cost in no measure."
     assert not_worth == "It is not in early error (no number), late error (no number)."
+
+
+def test_what_differs_by_less_than_the_spread_of_realisations_is_as_accurate():
+    learned = row("learned", 8, 0.1, 0.2) | {"early_spread": 0.02}
+    close, far = (row(name, 4, error, 0.5) for name, error in (("close", 0.115), ("far", 0.125)))
+    worth, not_worth = verdict(learned, [close, far], "seconds", WORDS)
+    assert "early error (0.1, 1 of 2 baselines beaten; as accurate and no slower: close, 0.115" in not_worth
+    worth, not_worth = verdict(learned, [close, far | {"early_spread": 0.03}], "seconds", WORDS)
+    assert "0 of 2 baselines beaten" in not_worth and "late error" in worth

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from eddies.analysis.spectra import energy_spectrum, spectrum_error, vorticity
+from eddies.analysis.spectra import band_ratios, energy_spectrum, spectrum_error, vorticity
 
 
 def grid(cells):
@@ -29,14 +29,24 @@ def test_parseval(cells):
     assert energy.sum() == pytest.approx(0.5 * np.mean(np.sum(velocity**2, axis=0)), rel=1e-13)
 
 
-def test_spectrum_error_looks_only_at_the_range():
-    wavenumber = np.arange(6.0)
-    reference = np.array([9.0, 3.0, 4.0, 1.0, 1.0, 1.0])
-    energy = np.array([0.0, 3.0, 4.5, 7.0, 7.0, 7.0])
-    assert spectrum_error(wavenumber, energy, reference, 2) == pytest.approx(0.5 / 5)
-    assert spectrum_error(wavenumber, reference, reference, 5) == 0
-    with pytest.raises(ValueError, match="shells"):
-        spectrum_error(wavenumber, energy, reference, 0.5)
+def test_a_factor_in_every_shell_is_an_error_of_its_logarithm():
+    reference = np.array([9.0, 3.0, 0.4, 1e-3, 1e-5, 1e-8])
+    for factor in (0.2, -0.2):
+        assert spectrum_error(reference * np.exp(factor), reference, 4.7) == pytest.approx(0.2)
+    # Shells 1 to 3 alone count: one off by a factor e^3 among three.
+    energy = reference * [5, 1, 1, np.exp(3), 0, 7]
+    assert spectrum_error(energy, reference, 3.9) == pytest.approx(3 / np.sqrt(3))
+    assert spectrum_error(energy, reference, 0.5) == 0 and spectrum_error(energy, reference, 4) == np.inf
+
+
+def test_bands_double_and_the_last_ends_at_the_largest_wavenumber():
+    reference = 1 / np.arange(1, 40.0) ** 2
+    energy = reference * np.where(np.arange(39) < 9, 1.0, 2.0)
+    found = band_ratios(energy, reference, 20.3)
+    assert list(found) == ["1-2", "3-4", "5-8", "9-16", "17-20"]
+    assert list(found.values()) == pytest.approx([1, 1, 1, 2, 2])
+    assert list(band_ratios(energy, reference, 5.0)) == ["1-2", "3-4", "5"]
+    assert list(band_ratios(energy, reference, 0.7)) == ["1"]
 
 
 @pytest.mark.parametrize("cells", [9, 12])

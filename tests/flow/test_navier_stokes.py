@@ -3,6 +3,7 @@ import pytest
 
 from eddies.clock import Clock
 from eddies.flow import initial_fields
+from eddies.flow.filtering import gaussian_transfer
 from eddies.flow.forcing import ForcingError, LinearForcing
 from eddies.flow.history import FlowHistory
 from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid
@@ -113,6 +114,17 @@ def test_forcing_injects_its_rate_and_none_of_it_at_zero_amplitude(comm):
     silent, _ = forced_fluid(comm, rate=0.0)
     without = CompressibleFluid(silent.grid, silent.viscosity, silent.sound_speed)
     assert np.array_equal(march(silent, state, 0.02, 3), march(without, state, 0.02, 3))
+
+
+@pytest.mark.mpi(1, 2)
+def test_a_filtered_flow_is_forced_by_the_filtered_force(comm):
+    fluid, state = forced_fluid(comm)
+    grid, width = fluid.grid, 0.8
+    transfer = gaussian_transfer(grid.wavenumber_squared, width)
+    force, filtered = np.zeros_like(state[:3]), np.zeros_like(state[:3])
+    fluid.forcing.add(state[:3], force)
+    LinearForcing(grid, 0.5, 2.0, width).add(transfer * state[:3], filtered)
+    assert np.abs(filtered - transfer * force).max(initial=0) < 1e-15
 
 
 @pytest.mark.mpi(1)

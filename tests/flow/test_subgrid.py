@@ -1,12 +1,21 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+import torch
 
 from eddies.flow import initial_fields
-from eddies.flow.navier_stokes import CompressibleFluid
-from eddies.flow.operators import gradient
-from eddies.flow.subgrid import Smagorinsky
+from eddies.flow.filtering import gaussian_transfer
+from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid
+from eddies.flow.operators import gradient, project
+from eddies.flow.statistics import energy_spectrum
+from eddies.flow.subgrid import DynamicStress, EddyDamping, SpectralViscosity, StressModel
 from eddies.parallel.slab import SlabDecomposition
+from eddies.particles.fourier_grid import FourierGrid
+from eddies.particles.resolved_flow import ResolvedFlow
+from eddies.particles.terms.damping import Damping
 from eddies.spectral.spectral_grid import SpectralGrid
+from eddies.time_stepping import ETDRK4
 
 CONSTANT, WIDTH = 0.2, 0.7
 
@@ -37,7 +46,7 @@ def test_force_on_a_sine_is_its_fourier_series(comm, component, direction):
     velocity = np.zeros((3, *grid.physical_shape))
     velocity[component] = np.sin(grid.coordinates()[direction])
     velocity, force = grid.forward(velocity), np.zeros((3, *grid.spectral_shape), complex)
-    Smagorinsky(grid, CONSTANT, WIDTH).add(velocity, force)
+    StressModel(grid, CONSTANT * WIDTH).add(velocity, force)
     physical = grid.backward(force)
     amplitude = (CONSTANT * WIDTH) ** 2 * (2 * np.sqrt(2) if component == direction else 1)
     for k in (1, 3):
@@ -52,7 +61,7 @@ def test_force_on_a_sine_is_its_fourier_series(comm, component, direction):
 def test_it_takes_the_energy_that_the_stress_dissipates(comm):
     grid = coarse_grid(comm)
     velocity, force = turbulent_velocity(grid), np.zeros((3, *grid.spectral_shape), complex)
-    Smagorinsky(grid, CONSTANT, WIDTH).add(velocity, force)
+    StressModel(grid, CONSTANT * WIDTH).add(velocity, force)
     A = np.array([grid.backward(gradient(grid, component)) for component in velocity])
     S = (A + A.transpose(1, 0, 2, 3, 4)) / 2
     squared = np.einsum("ijzyx,ijzyx->zyx", S, S)
@@ -63,13 +72,119 @@ def test_it_takes_the_energy_that_the_stress_dissipates(comm):
 
 
 @pytest.mark.mpi(1)
-def test_it_is_added_to_the_velocity_of_the_fluid_alone(comm):
+def test_a_closure_acts_on_the_velocity_alone_and_keeps_an_incompressible_one_solenoidal(comm):
     grid = coarse_grid(comm)
     velocity = turbulent_velocity(grid)
     state = np.concatenate([velocity, initial_fields.balanced_density(grid, velocity, 8.0)[None]])
-    model, force = Smagorinsky(grid, CONSTANT, WIDTH), np.zeros_like(velocity)
+    model, force = StressModel(grid, CONSTANT * WIDTH), np.zeros_like(velocity)
     model.add(velocity, force)
-    with_model, without = (CompressibleFluid(grid, 0.05, 8.0, None, subgrid).nonlinear(state)
-                           for subgrid in (model, None))
+    with_model, without = (CompressibleFluid(grid, 0.05, 8.0, None, closure).nonlinear(state)
+                           for closure in (model, None))
     assert np.abs(with_model[:3] - without[:3] - force).max() < 1e-14
     assert np.array_equal(with_model[3], without[3])
+    with_model, without = (IncompressibleFluid(grid, 0.05, closure=closure).nonlinear(velocity)
+                           for closure in (model, None))
+    assert np.abs(with_model - without - project(grid, force)).max() < 1e-14
+
+
+def hidden_stress(grid, velocity, width):
+    """What a filter hides of the velocity that has passed it: G(uu) - (Gu)(Gu), six rows."""
+    transfer = gaussian_transfer(grid.wavenumber_squared, width)
+    u, filtered = grid.backward(velocity), grid.backward(transfer * velocity)
+    pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+    whole, seen = (grid.forward(np.stack([a[i] * a[j] for i, j in pairs])) for a in (u, filtered))
+    return transfer * whole - seen
+
+
+@pytest.mark.mpi(1, 2)
+def test_gradient_stress_is_the_hidden_one_to_fourth_order_in_the_filter_width(comm):
+    grid = coarse_grid(comm, 24)
+    velocity = initial_fields.random_velocity(grid, 5, 1.0, 2.0)
+    # Products of these modes fit on the grid, so that nothing but the expansion in the width is left.
+    velocity[:, grid.index_squared > 12] = 0
+    errors = []
+    for width in (0.2, 0.1):
+        filtered = gaussian_transfer(grid.wavenumber_squared, width) * velocity
+        exact = hidden_stress(grid, velocity, width)
+        difference = StressModel(grid, filter_width=width).stress(filtered) - exact
+        squares = [grid.sum_modes((np.abs(stress) ** 2).sum(axis=0)) for stress in (difference, exact)]
+        errors.append(np.sqrt(squares[0] / squares[1]))
+    # The stress is of second order, what is left of it of fourth.
+    assert errors[0] < 0.02 and errors[0] / errors[1] == pytest.approx(4, rel=0.1)
+
+
+def developed_velocity(comm, cells=24):
+    """Of a flow that has had time to send energy to its smallest scales."""
+    fluid = IncompressibleFluid(coarse_grid(comm, cells), 0.02)
+    velocity, stepper = initial_fields.random_velocity(fluid.grid, 5, 1.0, 2.0), ETDRK4(fluid)
+    for _ in range(40):
+        velocity = stepper(velocity, 0.03)
+    return fluid.grid, velocity
+
+
+@pytest.mark.mpi(1, 2)
+@pytest.mark.parametrize("width, with_gradient", [(0.0, False), (0.8, False), (0.8, True)])
+def test_a_dynamic_coefficient_follows_the_way_that_energy_goes(comm, width, with_gradient):
+    """It is positive where energy goes to smaller scales, and 0 in the same flow run backwards, in a flow of random
+    modes between whose scales nothing passes, and in a laminar shear."""
+    grid, velocity = developed_velocity(comm)
+    model, lengths = DynamicStress(grid, width, with_gradient), []
+    y = grid.coordinates()[1]
+    shear = np.zeros((3, *grid.physical_shape))
+    shear[0] = np.sin(y)
+    shear = grid.forward(shear)
+    for flow in (velocity, -velocity, turbulent_velocity(grid), shear):
+        model.begin_step(transfer_of(grid, width) * flow)
+        lengths.append(np.sqrt(model.squared_length))
+    constant = lengths[0] / (width or np.pi / grid.cutoff)
+    # The gradient part takes over most of what a viscosity would do.
+    assert (0.02 if with_gradient else 0.08) < constant < 0.25
+    assert lengths[1] == 0 and lengths[2] < 0.4 * lengths[0] and lengths[3] < 1e-3 * lengths[0]
+
+
+def transfer_of(grid, width):
+    return gaussian_transfer(grid.wavenumber_squared, width)
+
+
+@pytest.mark.mpi(1, 2)
+def test_spectral_viscosity_drains_what_an_inertial_range_brings(comm):
+    """With E = 1.4 eps^(2/3) k^(-5/3) up to the cut-off it dissipates eps, but for what a sum over shells is not an
+    integral."""
+    grid, dissipation = coarse_grid(comm, 48), 0.7
+    velocity = initial_fields.random_velocity(grid, 5, 1.0, 6.0)
+    k, energy = energy_spectrum(grid, velocity)
+    wanted = 1.4 * dissipation ** (2 / 3) * np.maximum(k, 1.0) ** (-5 / 3) * (k <= grid.cutoff) * (k > 0)
+    scale = np.sqrt(np.divide(wanted, energy, out=np.zeros_like(energy), where=energy > 0))
+    velocity *= scale[np.rint(np.sqrt(grid.index_squared)).astype(int)]
+    model, force = SpectralViscosity(grid), np.zeros_like(velocity)
+    model.begin_step(velocity)
+    model.add(velocity, force)
+    assert -power(grid, velocity, force) == pytest.approx(dissipation, rel=0.1)
+
+
+@pytest.mark.mpi(1, 2)
+def test_learned_damping_is_that_of_the_particle_model(comm):
+    """Of the same flow, resolved by particles up to as high a wavenumber."""
+    grid = coarse_grid(comm, 24)
+    velocity = turbulent_velocity(grid)
+    velocity[:, grid.index_squared > grid.cutoff**2] = 0  # particles resolve a ball of modes
+    rates, force = np.array([0.1, 0.3, 0.2, 0.5, 0.4, 0.9]), np.zeros_like(velocity)
+    model = EddyDamping(grid, rates)
+    model.begin_step(velocity)
+    model.add(velocity, force)
+    flow = ResolvedFlow(FourierGrid(grid.decomposition, grid.cutoff), torch.from_numpy(velocity), None, None, 0.0)
+    term = Damping(Damping.Settings(), None)
+    term.load_state_dict({"rates": torch.from_numpy(rates)})
+    found = term(SimpleNamespace(resolved=flow, decomposition=grid.decomposition)).force_modes
+    assert np.abs(force).max(initial=0) > 1e-3 or not force.size
+    assert np.abs(found.detach().numpy() - force).max(initial=0) < 1e-15
+
+
+@pytest.mark.mpi(1)
+def test_a_flow_that_is_resolved_has_no_spectral_viscosity(comm):
+    grid = coarse_grid(comm, 24)
+    velocity = initial_fields.random_velocity(grid, 5, 1.0, 1.0)
+    model, force = SpectralViscosity(grid), np.zeros_like(velocity)
+    model.begin_step(velocity)
+    model.add(velocity, force)
+    assert abs(power(grid, velocity, force)) < 1e-12

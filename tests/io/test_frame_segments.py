@@ -4,19 +4,19 @@ import numpy as np
 import pytest
 
 from eddies.io.fields import FieldSeries
-from eddies.io.frame_segments import FrameLayout, FrameSegments
+from eddies.io.frame_segments import FieldLayout, FrameLayout, FrameSegments
 from eddies.io.hdf5 import ProductError, create_product, open_product
 from eddies.io.trajectories import Trajectory
 from eddies.parallel.migration import id_block
 from eddies.parallel.slab import SlabDecomposition
 
-LAYOUT = FrameLayout(5, 1.0, {"all": {"velocity": (3,), "density": ()}, "some": {"density": ()}}, np.float32, 3,
-                     {"flow": {"velocity": 2}})
+LAYOUT = FrameLayout(5, 1.0, {"all": {"velocity": (3,), "density": ()}, "some": {"density": ()}}, np.float32,
+                     {"flow": FieldLayout(3, {"velocity": 2}), "finer": FieldLayout(4, {"density": 1})})
 
 
 @pytest.mark.mpi(1, 2, timeout=30)
 def test_a_directory_that_cannot_be_made_is_told_by_all(comm, tmp_path):
-    segments = FrameSegments(comm, tmp_path / "nowhere/checkpoints", FrameLayout(8, 1.0, {}, np.float64, 4, {}))
+    segments = FrameSegments(comm, tmp_path / "nowhere/checkpoints", FrameLayout(8, 1.0, {}, np.float64, {}))
     with pytest.raises(ProductError, match="nowhere/checkpoints: No such file or directory; check the file"):
         segments.open(0)
 
@@ -25,7 +25,7 @@ def test_a_directory_that_cannot_be_made_is_told_by_all(comm, tmp_path):
 def test_frames_of_all_segments_are_put_together_in_order(comm, tmp_path):
     """Also those of a trajectory, or of fields, of which a segment has none."""
     start, stop = id_block(comm, 5)
-    slab = SlabDecomposition(comm, 1.0, 3)
+    slab, finer = SlabDecomposition(comm, 1.0, 3), SlabDecomposition(comm, 1.0, 4)
     frames = np.random.default_rng(2).random((4, 5, 3)).astype(np.float32)
     planes = np.random.default_rng(3).random((2, 2, 3, 3, 3)).astype(np.float32)
     with FrameSegments(comm, tmp_path, LAYOUT) as segments:
@@ -37,6 +37,9 @@ def test_frames_of_all_segments_are_put_together_in_order(comm, tmp_path):
                 segments.trajectories["some"].append(step, step / 4, start, {"density": block[:, 1]})
                 segments.fields["flow"].append(step / 4, slab.start, {
                     "velocity": planes[step - 2][:, slab.start:slab.stop]})
+            if step == 3:
+                points = np.arange(64.0).reshape(1, 4, 4, 4)
+                segments.fields["finer"].append(0.75, finer.start, {"density": points[:, finer.start:finer.stop]})
             if step in (0, 1):
                 segments.close()
                 segments.close()
@@ -54,3 +57,4 @@ def test_frames_of_all_segments_are_put_together_in_order(comm, tmp_path):
             assert np.array_equal(whole.read(frame, "velocity"), frames[frame])
         assert np.array_equal(some.read(1, "density"), frames[3][:, 1])
         assert np.array_equal(flow.read(1, "velocity"), planes[1])
+        assert np.array_equal(FieldSeries(file, "finer").read(0, "density"), points)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from eddies.analysis.accuracy import MEASURES
-from eddies.report.comparison import DRAWN, ErrorAgainstTime, in_symbols, scatter, sections
+from eddies.measures import DRAWN, MEASURES, SHOWN
+from eddies.report.comparison import ErrorAgainstTime, in_symbols, scatter, sections
 from eddies.report.figures import panels, styled
 from eddies.report.labels import fix_layout, place_labels
 
@@ -76,6 +76,17 @@ def test_page_tells_what_failed_and_what_the_model_is_worth():
     assert "learned is worth its cost in velocity error at t_η (0.1, 3 of 3 baselines beaten" in first.text
     assert [metric.label for metric in errors.metrics] == [r["name"] for r in ROWS]
     assert cost.metrics[0].value["wall s per T"] == 20.0
+    assert list(errors.metrics[0].value)[:-2] == [MEASURES[name] for name in SHOWN]
+
+
+def test_measures_that_are_asked_for_are_shown_and_of_them_errors_drawn():
+    asked = ["tetrad_size_error", "count_variance_ratio", "qr_kl", "qr_kl_floor", "velocity_kl"]
+    first, overview, errors, _ = sections(ErrorAgainstTime(ROWS, "learned", "baseline", asked), 1.0)
+    assert list(errors.metrics[0].value)[:-2] == [MEASURES[name] for name in asked]
+    assert [figure.name for figure in first.illustrations] == ["tetrad-size-error", "qr-kl", "velocity-kl"]
+    assert len(overview.illustrations[0].image.axes) == 3 and "in size of tetrads" in first.text
+    first, overview, *_ = sections(ErrorAgainstTime(ROWS, "learned", "baseline", ["energy_ratio"]), 1.0)
+    assert not first.illustrations and not overview.illustrations
 
 
 def test_rows_without_a_time_say_why():
@@ -93,3 +104,14 @@ def test_an_unstable_model_is_worth_nothing():
 @pytest.mark.parametrize("measure", DRAWN)
 def test_symbols_are_drawn_as_formulas(measure):
     assert "_" not in in_symbols(MEASURES[measure]).replace(r"$t_\eta$", "").replace("$k_d$", "")
+
+
+def test_spreads_are_bars_and_stand_in_the_table():
+    rows = [{**ROWS[0], "velocity_error_early_spread": 0.04}, ROWS[1]]
+    table = ErrorAgainstTime(rows, "learned", "baseline")
+    bars = [bar.get_segments()[0][:, 1] for container in scatter(table, ["velocity_error_early"]).axes[0].containers
+            for bar in container.lines[2][1:]]
+    assert bars[0].tolist() == pytest.approx([0.06, 0.14]) and bars[1].tolist() == pytest.approx([0.5, 0.5])
+    (errors,) = (part for part in sections(table, 1.0) if part.key == "errors")
+    shown = [metric.value["velocity error at t_η"] for metric in errors.metrics]
+    assert shown == ["0.1 ± 0.04", 0.5]

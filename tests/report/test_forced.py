@@ -2,13 +2,14 @@ import numpy as np
 import pytest
 
 from eddies.analysis.isotropic_turbulence import StationarySpan
-from eddies.analysis.spectra import energy_spectrum
+from eddies.analysis.rollout_spectra import RolloutSpectra
 from eddies.report.figures import png
 from eddies.report.forced import ForcedStatistics, section
 from eddies.report.rollout import Rollout
 
-CELLS, WIDTH, ATTENUATED = 12, np.pi / 4, 0.9
-FACTORS = np.array([1.0, 1.3, 1.1, 1.1, 1.1])  # of the model's velocity over that of the flow, by frame
+WIDTH, SPECTRUM = np.pi / 4, np.exp(-0.5 * np.arange(10))
+# Of the model's velocity over that of the flow, by frame, two frames a turnover: late ones are the last seven.
+FACTORS = np.array([1.0] + 6 * [1.3] + [1.0, 1.2] + 5 * [1.1])
 
 
 class Stored:
@@ -22,40 +23,46 @@ class Stored:
 
 
 def rollout(factors=FACTORS):
-    """A model that is the flow at its start times factors, and fields that a kernel attenuates evenly."""
+    """A model that is the flow at its start times factors, and so are its spectra."""
     random = np.random.default_rng(3)
     columns = {name: random.standard_normal((500, *shape)) for name, shape in
                (("velocity", (3,)), ("acceleration", (3,)), ("velocity_gradient", (3, 3)))}
-    field = {"velocity": random.standard_normal((3, CELLS, CELLS, CELLS))}
-    fields = {"model": Stored(field, ATTENUATED * factors), "truth": Stored(field, np.array([ATTENUATED])),
-              "filtered": Stored(field, np.ones(1))}
     attributes = {"eddy_turnover_time": 1.0, "injection_rate": 0.5}
-    run = Rollout(attributes, Stored(columns, factors), Stored(columns, np.ones(1)), fields, 2 * np.pi, WIDTH, None)
-    return run, columns, field["velocity"]
+    model = Stored(columns, factors)
+    spectra = [{"time": times, "wavenumber": np.arange(8), "energy": np.outer(amplitudes**2, SPECTRUM[:8])}
+               for times, amplitudes in ((model.times, factors), (model.times[:1], np.ones(1)))]
+    return Rollout(attributes, model, Stored(columns, np.ones(1)), RolloutSpectra(*spectra, None, 0.0), {}, 2 * np.pi,
+                   WIDTH), columns
 
 
-def stationary(field):
-    """A span whose filtered spectrum is that of a field, times 0.8, 1 and 1.2 at three times."""
-    wavenumber, energy = energy_spectrum(field)
-    unfiltered = energy * np.exp((wavenumber * WIDTH) ** 2 / 12)
+def stationary():
+    """A span whose filtered spectrum is SPECTRUM times 0.8, 1 and 1.2 at three times."""
+    unfiltered = SPECTRUM * np.exp((np.arange(10) * WIDTH) ** 2 / 12)
     statistics = {"time": np.array([0.0, 1.0, 2.0]), "turnovers": np.array([0.0, 1.0, 2.0])}
     return StationarySpan(statistics, np.outer([0.8, 1.0, 1.2], unfiltered), 0.01, 0.0, 2.0, 2.0)
 
 
 def test_a_model_that_is_the_stationary_flow_but_for_a_factor():
-    run, columns, field = rollout()
-    shown = section(run, stationary(field))
+    run, columns = rollout()
+    shown = section(run, stationary())
     value = {metric.key: metric.value for metric in shown.metrics}
     energy = 0.5 * np.mean(np.sum(columns["velocity"] ** 2, axis=1))
-    # The second half are the last three of five frames, all with the factor 1.1.
+    # The second half, three turnovers, are three blocks: with the factors 1 and 1.2, twice 1.1, three times 1.1.
     found = value["energy"]
-    assert (found["model"], found["deviation"]) == pytest.approx((1.21 * energy, 0), abs=1e-12)
+    blocks = np.array([(1 + 1.2**2) / 2, 1.1**2, 1.1**2])
+    assert found["model"] == pytest.approx(energy * blocks.mean())
+    assert found["standard error"] == pytest.approx(energy * np.std(blocks, ddof=1) / np.sqrt(3))
+    assert found["deviation"] == pytest.approx(energy * np.std(FACTORS[7:] ** 2))
+    assert abs(found["trend per turnover"]) < found["its error"]
     # The samples count a quarter, a half and a quarter.
-    _, spectrum = energy_spectrum(field)
-    whole = spectrum.sum()
+    whole = SPECTRUM.sum()
     assert found["stationary flow"] == pytest.approx(whole, rel=1e-12)
     assert found["its deviation"] == pytest.approx(whole * 0.2 / np.sqrt(2), rel=1e-12)
-    assert value["spectrum_error"] == pytest.approx(0.21, rel=1e-12)
+    assert found["its standard error"] == pytest.approx(whole * 0.15)  # of two blocks, 0.8 and (1 + 1.2) / 2
+    error = value["spectrum_error"]
+    assert error["model"] == pytest.approx(np.log(blocks.mean()))
+    # Of a logarithm, so nearly of the energy over itself.
+    assert error["standard error"] == pytest.approx(found["standard error"] / found["model"], rel=0.01)
     rms = value["acceleration_rms"]
     assert rms["model"] == pytest.approx(1.1 * rms["flow at the start"], rel=1e-12)
     for name in ("velocity_kl", "acceleration_kl", "qr_kl"):
@@ -64,14 +71,15 @@ def test_a_model_that_is_the_stationary_flow_but_for_a_factor():
 
 
 def test_frames_after_the_first_broken_one_do_not_count():
-    run, _, field = rollout(np.array([1.0, 1.2, 1.2, np.nan, 1.2]))
-    found = ForcedStatistics.of(run, stationary(field))
+    run, _ = rollout(np.array([1.0, 1.2, 1.2, np.nan, 1.2]))
+    found = ForcedStatistics.of(run, stationary())
     assert found.times.tolist() == [0, 0.5, 1.0] and found.late.tolist() == [1, 2]
+    assert found.spectrum_error.value == pytest.approx(2 * np.log(1.2)) and found.spectrum_error.known_error is None
 
 
 def test_a_rollout_that_broke_at_once_is_not_compared():
-    run, _, field = rollout(np.array([np.nan, 1.0]))
-    shown = section(run, stationary(field))
+    run, _ = rollout(np.array([np.nan, 1.0]))
+    shown = section(run, stationary())
     assert shown.notices == ["It is not compared: the model has no finite frame."] and not shown.metrics
 
 

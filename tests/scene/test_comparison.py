@@ -30,6 +30,12 @@ def test_variants_are_the_base_with_changes(tmp_path):
     assert wide.simulation == plain.simulation
     assert [one.group for one in comparison.variant] == ["model", "size"]
     assert (comparison.name, comparison.subject, comparison.repeats) == ("case", "plain", 3)
+    assert comparison.columns is None
+
+
+def test_measures_are_shown_in_the_order_in_which_they_are_asked_for(tmp_path):
+    comparison = load_comparison(written(tmp_path, HEAD + 'columns = ["qr_kl", "energy_ratio"]\n' + variant("a")))
+    assert comparison.columns == ("qr_kl", "energy_ratio")
 
 
 def test_ground_truth_is_the_bases_unless_a_variant_has_its_own(tmp_path):
@@ -52,6 +58,7 @@ BAD = [
     (HEAD, "[[variant]]: a comparison needs at least one"),
     ('title = "x"\n' + variant("a"), "base: this key is missing"),
     (HEAD + 'repets = 3\n' + variant("a"), "repets: no such key; did you mean repeats?"),
+    (HEAD + 'realisations = [3, 1]\n' + variant("a"), "realisations = [3, 1]: 1 is the seed of the base, on whose"),
     (HEAD + 'repeats = 0\n' + variant("a"), "repeats = 0: must be a whole number at least 1"),
     (HEAD + 'set = "training.steps=3"\n' + variant("a"), "must be a list of texts"),
     (HEAD + 'model = "lerned"\n' + variant("learned"), "did you mean learned?"),
@@ -59,6 +66,8 @@ BAD = [
     (HEAD + variant("a", grup="y"), '[[variant]] number 1 ("a"): [variant] grup: no such key; did you mean group?'),
     (HEAD + '[[variant]]\nset = []\n', "[[variant]] number 1: [variant] name: this key is missing"),
     (HEAD + variant("a") + variant("a"), 'variant "a": 2 variants have this name'),
+    (HEAD + 'columns = ["qr_kl", "tetrad_error"]\n' + variant("a"), "did you mean tetrad_size_error?"),
+    (HEAD + 'columns = []\n' + variant("a"), "columns = []: name at least one of velocity_error_early, "),
     (HEAD + variant("a/b"), '[[variant]] number 1 ("a/b"): [variant] name = "a/b": must be the name of a directory'),
     (HEAD + variant(".."), '[variant] name = "..": must be the name of a directory'),
     (HEAD + 'name = "a/b"\n' + variant("a"), 'name = "a/b": must be the name of a directory'),

@@ -71,7 +71,7 @@ def test_without_a_learned_force_nothing_is_trained():
 
 
 @pytest.mark.parametrize("first, second", [("wcsph.alpha=1", "wcsph.alpha=2"),
-                                           ("eulerian.smagorinsky=0", "eulerian.smagorinsky=0.1")])
+                                           ("eulerian.closure=none", "eulerian.closure=spectral")])
 def test_the_form_of_a_baseline_counts_for_its_rollout_alone(first, second):
     force = first.partition(".")[0]
     scene, changed = (load_scene("tiny", [f"simulation.method={force}", "simulation.step=0.0025", override])
@@ -85,8 +85,16 @@ def test_coarse_grid_of_the_filter():
     assert Eulerian().cells_for(widths["hit"]) == 16  # Nyquist wavenumber 8 = pi / d
     assert Eulerian().cells_for(widths["tiny"]) == 8
     assert Eulerian(cells=24).cells_for(widths["hit"]) == 24
-    with pytest.raises(SceneError, match=r"\[eulerian\] cells = 20: must be at most the 18 of the filtered fields"):
-        load_scene("tiny", ["simulation.method=eulerian", "eulerian.cells=20"])
+    with pytest.raises(SceneError, match=r"\[eulerian\] cells = 50: must be at most the 24 of the flow that it"):
+        load_scene("tiny", ["simulation.method=eulerian", "eulerian.cells=50"])
+
+
+def test_a_coarse_grid_that_takes_what_is_learned_needs_the_training():
+    learned = ["simulation.method=eulerian", "eulerian.closure=learned"]
+    assert "train" in load_scene("tiny", learned).stages
+    assert "train" not in load_scene("tiny", learned[:1]).stages
+    with pytest.raises(SceneError, match='closure = "learned": takes the rates of the term "damping", which'):
+        load_scene("tiny", [*learned, 'model.terms=["pressure", "stress"]'])
 
 
 def test_rates_of_the_horizons_fall():

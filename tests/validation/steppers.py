@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from mpi4py import MPI
 
-from eddies.analysis.spectra import spectrum_error
+from eddies.analysis.errors import normalized_l2
 from eddies.clock import ProgressLine
 from eddies.flow import initial_fields
 from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid, advective_speed
@@ -150,14 +150,14 @@ def study(flow, number, progress):
 def errors(fluid, state, reference):
     """Relative L2 differences of density fluctuation, its part that is no sound, energy spectrum and velocity."""
     grid = fluid.grid
-    wavenumber, spectrum = energy_spectrum(grid, state[:3])
+    spectra = [energy_spectrum(grid, velocity[:3])[1][1:grid.cutoff + 1] for velocity in (state, reference)]
     found, true = (np.exp(grid.backward(values[3:])) for values in (state, reference))
     fluctuation = grid.mean((true - grid.mean(true)) ** 2)
     pressure = power(grid, vortex_density(fluid, state) - vortex_density(fluid, reference)) / fluctuation
     velocity = kinetic_energy(grid, state - reference) / kinetic_energy(grid, reference)
     return {"density": float(np.sqrt(grid.mean((found - true) ** 2) / fluctuation)[0]),
             "pressure": float(np.sqrt(pressure)[0]), "velocity": float(np.sqrt(velocity)),
-            "spectrum": spectrum_error(wavenumber, spectrum, energy_spectrum(grid, reference[:3])[1], grid.cutoff)}
+            "spectrum": normalized_l2(*spectra)}
 
 
 def measure_cost(flows, repeats=9, steps=3):

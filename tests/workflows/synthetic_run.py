@@ -203,9 +203,19 @@ def write_rollout(comm, directory, status="complete", total=600, cells=16, frame
                 writer.append(step, time, 0, columns)
                 if step % 2 == 0:
                     fields.append(time, 0, {"velocity": flow.field(cells, time)})
+        write_spectra(file, times, attributes["start_time"])
         filtered = FieldWriter(file, "filtered", cells, {"velocity": 3})
         for time in times[:-3:2]:
             filtered.append(time, 0, {"velocity": 1.02 * RandomFlow(1).field(cells, time)})
+
+
+def write_spectra(file, times, start, shells=12, excess=0.1):
+    """Of true particles that show the filtered flow as it is, and of a model with e^`excess` times its energies."""
+    known = decaying_spectra()
+    for name, own, factor in (("truth", times[:-3], 1.0), ("model", times, np.exp(excess))):
+        nearest = [np.argmin(np.abs(known["time"] - start - time)) for time in own[::2]]
+        write_table(file, f"spectra_of_{name}", {"time": own[::2], "wavenumber": np.arange(shells),
+                                                 "energy": factor * known["filtered"][nearest, :shells]})
 
 
 def write_run(comm, directory, truth=None, **rollout):

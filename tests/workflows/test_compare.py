@@ -4,10 +4,13 @@ import csv
 import json
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from eddies.io.errors import WriteError
-from eddies.io.hdf5 import ProductError
+from eddies.io.hdf5 import ProductError, open_product, read_attributes
+from eddies.io.trajectories import Trajectory
+from eddies.io.weights import load_weights
 from eddies.report.page import Section
 from eddies.scene.scene import SceneError, load_scene
 from eddies.workflows import compare
@@ -123,6 +126,52 @@ def check_rows(rows):
     assert (learned["time_step"], longer["time_step"]) == (pytest.approx(0.05), pytest.approx(0.1))
 
 
+UNSEEN = FILE[:FILE.index("[[variant]]")].replace("repeats = 2", "repeats = 1\nrealisations = [5, 6]") + """
+[[variant]]
+name = "learned"
+[[variant]]
+name = "grid"
+set = ["simulation.method=eulerian", "eulerian.cells=12"]
+group = "baseline"
+"""
+
+
+@pytest.mark.mpi(1, timeout=240)
+@pytest.mark.usefixtures("undrawn")
+def test_realisations_that_no_training_has_seen(comm, folder, capfd):
+    """One training, a rollout on each; mean and spread of two numbers are half of their sum and difference."""
+    (folder / "small.toml").write_text(UNSEEN)
+    assert run_cli("dns", "base.toml", "--output", "base") == 0
+    capfd.readouterr()
+    assert run_cli("compare", "small.toml", "--output", "out") == 2
+    assert "make it with `eddies dns base.toml --set seed=5 --output base-seed-5`" in capfd.readouterr().err
+    for seed in (5, 6):
+        assert run_cli("dns", "base.toml", "--set", f"seed={seed}", "--output", f"base-seed-{seed}") == 0
+    assert run_cli("compare", "small.toml", "--output", "out") == 0
+    out = folder / "out"
+    assert sorted(str(path.relative_to(out)) for path in out.glob("**/model.h5")) == [
+        "learned/model.h5", "learned/seed-5/model.h5", "learned/seed-6/model.h5"]
+    assert not (out / "learned/rollout.h5").exists() and not (out / "grid/seed-5/model.h5").exists()
+    weights = [load_weights(comm, path, "model")[1] for path in out.glob("**/model.h5")]
+    assert all(np.array_equal(one[name], values) for one in weights for name, values in weights[0].items())
+    rows = rows_of(out)[1]
+    assert rows["learned"]["training_seconds"] > 0 and rows["grid"]["training_seconds"] is None
+    for name, row in rows.items():
+        assert row["realisations"] == 2 and row["status"] == "complete"
+        both = []
+        for seed in (5, 6):
+            with open_product(comm, out / name / f"seed-{seed}/rollout.h5", "rollout") as file:
+                model, truth = (Trajectory(file, which).read(-1, "velocity") for which in ("model", "truth"))
+                # From the first frame with a filtered field on.
+                assert read_attributes(file, "rollout")["start_time"] == pytest.approx(0.1)
+            both.append(np.sum(model**2, dtype=float) / np.sum(truth**2, dtype=float))
+        assert row["energy_ratio"] == pytest.approx(np.mean(both), rel=1e-6)
+        assert row["energy_ratio_spread"] == pytest.approx(abs(both[0] - both[1]) / 2**0.5, rel=1e-4)
+        assert both[0] != both[1]
+    assert run_cli("compare", "small.toml", "--output", "out") == 0  # nothing is to be done again
+    assert rows_of(out)[1]["learned"]["energy_ratio"] == rows["learned"]["energy_ratio"]
+
+
 @pytest.mark.mpi(1, 2)
 def test_a_comparison_without_its_ground_truth_writes_nothing(comm, folder, capfd):
     assert run_cli("compare", "small.toml", "--output", "out") == 2
@@ -184,7 +233,7 @@ def variant_of(scene, directory):
 
 @pytest.mark.mpi(1)
 def test_ground_truth_that_does_not_fit_is_refused(comm, tmp_path):
-    comparison, scene = type("File", (), {"base": "tiny", "name": "case"})(), load_scene("tiny", ["name=mine"])
+    comparison, scene = SimpleNamespace(base="tiny", base_scene=load_scene("tiny")), load_scene("tiny", ["name=mine"])
     with pytest.raises(ProductError, match=r"ground_truth.h5: no such file; .*`eddies dns tiny --output"):
         check_ground_truth(comparison, variant_of(scene, tmp_path), comm)
     write_ground_truth(comm, tmp_path)
@@ -194,7 +243,7 @@ def test_ground_truth_that_does_not_fit_is_refused(comm, tmp_path):
 
 @pytest.mark.mpi(1)
 def test_frames_must_come_before_the_first_comparison(comm, tmp_path, monkeypatch):
-    comparison, scene = type("File", (), {"base": "tiny", "name": "case"})(), load_scene("tiny", ["name=mine"])
+    comparison, scene = SimpleNamespace(base="tiny", base_scene=load_scene("tiny")), load_scene("tiny", ["name=mine"])
     write_ground_truth(comm, tmp_path)  # t_eta = 0.17
     monkeypatch.setattr("eddies.workflows.compare.read_provenance", lambda _: {"fingerprint": scene.fingerprint("dns")})
     check_ground_truth(comparison, variant_of(scene, tmp_path), comm)

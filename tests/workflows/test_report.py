@@ -12,8 +12,7 @@ from eddies.io.hdf5 import ProductError, open_product
 from eddies.io.trajectories import Trajectory
 from eddies.report.rollout_figures import errors_over_time
 from eddies.workflows import report
-from tests.workflows.synthetic_run import (LENGTH, write_ground_truth, write_kernel, write_model, write_rollout,
-                                           write_run)
+from tests.workflows.synthetic_run import write_ground_truth, write_kernel, write_model, write_rollout, write_run
 
 FIGURES = {
     "statistics", "spectra", "fields", "stationary", "tracers", "figure-1-kernels", "figure-2-reconstruction",
@@ -32,7 +31,10 @@ METRICS = {
               "true_density_acceleration_error", "delay"},
     "rollout": {"turnovers", "stable", "energy_ratio", "velocity_error", "spectrum_error", "velocity_kl",
                 "acceleration_kl", "qr_kl", "outside_training", "nearest_distance_kl", "count_variance_ratio",
-                "high_wavenumber_energy_ratio", "acceleration_rms_ratio", "velocity_kl_floor", "acceleration_kl_floor"},
+                "high_wavenumber_energy_ratio", "acceleration_rms_ratio", "velocity_kl_floor", "acceleration_kl_floor",
+                "qr_kl_floor", "spectrum_error_floor", "band_energy_ratios", "band_energy_ratios_floor",
+                "flatness_error", "acceleration_correlation_error", "acceleration_variance_error",
+                "pair_dispersion_error", "tetrad_size_error", "tetrad_shape_error"},
     "cost": {"seconds_per_step", "particles", "ranks", "stage_seconds"},
 }
 
@@ -91,7 +93,7 @@ def test_the_series_of_a_rollout_have_the_density_that_is_stored(comm, tmp_path,
     write_rollout(comm, tmp_path, density=density)
     with open_product(comm, tmp_path / "rollout.h5", "rollout") as file:
         model, truth = Trajectory(file, "model"), Trajectory(file, "truth")
-        series = [particle_series(run, range(6), LENGTH) for run in (model, truth)]
+        series = [particle_series(run, range(6)) for run in (model, truth)]
         errors = error_series(model, truth, CommonFrames.of(model, truth))
         spread = model.read(2, "density").std() if density else None
     assert all(("density_rms" in run) == density for run in series)
@@ -168,6 +170,10 @@ def test_numbers_of_a_known_rollout(comm, tmp_path):
     assert rollout["velocity_error"] == pytest.approx(0.2, rel=0.15)
     assert rollout["energy_ratio"] == pytest.approx(1.04, abs=0.05)
     assert rollout["filter_wavenumber"] == pytest.approx(4)
+    # Of the spectra as they are written.
+    assert rollout["spectrum_error"] == pytest.approx(0.1) and rollout["spectrum_error_floor"] == 0
+    assert rollout["band_energy_ratios"] == pytest.approx({"1-2": math.exp(0.1), "3-4": math.exp(0.1)})
+    assert rollout["band_energy_ratios_floor"] == {"1-2": 1, "3-4": 1}
     assert rollout["outside_training"] == pytest.approx(0.2e-3)  # at t = 0.4 or 0.5
     assert (rollout["closure_iterations"], rollout["closure_most_iterations"]) == (2.5, 40)
     assert "Solves for the resolved velocity that did not converge: 1; the worst left 1.0e-03" in page
@@ -267,10 +273,20 @@ def test_a_rollout_without_its_ground_truth(comm, tmp_path):
     write_rollout(comm, tmp_path)
     report.run(tmp_path, comm)
     metrics, page = written(tmp_path)
-    assert metrics["rollout"]["spectrum_error"] is None
+    assert metrics["rollout"]["spectrum_error"] is metrics["rollout"]["band_energy_ratios"] is None
     assert metrics["rollout"]["high_wavenumber_energy_ratio"] is None
     assert "the filter width is in ground_truth.h5" in page
     assert "figure-8-spectra" in figures(tmp_path)
+
+
+@pytest.mark.usefixtures("no_figures")
+@pytest.mark.mpi(1)
+def test_a_rollout_of_an_earlier_version_without_spectra_is_refused(comm, tmp_path):
+    write_rollout(comm, tmp_path)
+    with h5py.File(tmp_path / "rollout.h5", "r+") as file:
+        del file["spectra_of_truth"]
+    with pytest.raises(ProductError, match="holds no spectra_of_truth, .* remove it and run `eddies simulate` again"):
+        report.run(tmp_path, comm)
 
 
 @pytest.mark.usefixtures("undrawn")

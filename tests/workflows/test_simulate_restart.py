@@ -37,8 +37,8 @@ CASES = {
     "own density, forced, Verlet": ("own density", "learned", {
         **DENSITY, "step": 0.02, "injection": 0.5, "integrator": "verlet"}),
     "wcsph": (None, "wcsph", {"step": 0.008, "turnovers": 0.06}),
-    "eulerian": (None, "eulerian", {"step": 0.02}),
-    "eulerian, forced": (None, "eulerian", {"step": 0.02, "injection": 1.0}),
+    "eulerian": (None, "eulerian", {"step": 0.02}, {"fluid": "compressible"}),
+    "eulerian, forced": (None, "eulerian", {"step": 0.02, "injection": 1.0}, {"closure": "dynamic-smagorinsky"}),
     "none": (None, "none", {"step": 0.015}),
 }
 
@@ -68,14 +68,14 @@ def case_of(comm, products, tmp_path):
     folder, scene = products
 
     def case(name):
-        model, method, keys = CASES[name]
+        model, method, keys, *form = CASES[name]
         if comm.rank == 0:
             for path in (folder / "run/ground_truth.h5", folder / "run/kernel.h5", folder / f"{model}/model.h5"):
                 if path.exists():
                     (tmp_path / path.name).symlink_to(path)
         comm.Barrier()
         simulation = replace(scene.simulation, method=method, **{"turnovers": 0.11, **keys})
-        coarse = {"eulerian": Eulerian(cells=12)} if method == "eulerian" else {}
+        coarse = {"eulerian": Eulerian(cells=12, **form[0])} if method == "eulerian" else {}
         return replace(scene, model=MODELS.get(model, scene.model), simulation=simulation, **coarse), tmp_path
 
     return case

@@ -5,35 +5,26 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from eddies.analysis.against_truth import (EDGES, CommonFrames, Frames, first_broken_time, invariant_statistics,
-                                           particle_pair, pdf_divergence, spectra_pair)
+from eddies.analysis.against_truth import (EDGES, CommonFrames, ParticleFrames, first_broken_time,
+                                           invariant_statistics, particle_pair, pdf_divergence, sampling_floor)
+from eddies.analysis.disorder import count_variance
 from eddies.analysis.errors import normalized_l2
-from eddies.analysis.spectra import spectrum_error
-
-# Name of each measure and what it is; zero is perfect but for the energy ratio. In the order of tables and figures.
-MEASURES = {
-    "velocity_error_early": "velocity error at t_η",
-    "velocity_error_half": "velocity error at T/2",
-    "spectrum_error": "spectrum error, k ≤ k_d/2",
-    "energy_ratio": "energy, model / truth",
-    "velocity_kl": "KL velocity",
-    "acceleration_kl": "KL acceleration",
-    "qr_kl": "KL Q–R",
-    "acceleration_error": "acceleration error at the start",
-}
+from eddies.analysis.path_statistics import differences, of_both
+from eddies.analysis.rollout_spectra import RolloutSpectra
+from eddies.measures import MEASURES
 
 
 @dataclass(frozen=True)
 class StoredRollout:
-    """A rollout as stored: trajectories and field series of model and truth, and the flow's scales.
+    """A rollout as stored: trajectories of model and truth, spectra, the side of the box, and the flow's scales.
 
     turnover: T; kolmogorov_time: t_eta when the tracers start; filter_wavenumber: k_d = pi/d.
     """
 
-    model: Frames
-    truth: Frames
-    model_field: Frames
-    truth_field: Frames
+    model: ParticleFrames
+    truth: ParticleFrames
+    spectra: RolloutSpectra
+    length: float
     turnover: float
     kolmogorov_time: float
     filter_wavenumber: float
@@ -42,9 +33,9 @@ class StoredRollout:
 def accuracy(run: StoredRollout, complete: bool) -> dict[str, float | None]:
     """All MEASURES and `end`, the last common time over T; None for what the rollout or the truth does not reach.
 
-    The velocity error, the normalised L2 norm by particle, is interpolated linearly between frames. Spectrum, energy
-    and divergences are those at the end, and of a rollout that is `complete` alone: at an earlier time than the others'
-    they would not be comparable.
+    The velocity error, the normalised L2 norm by particle, is interpolated linearly between frames. Spectrum, energy,
+    divergences and counts are those at the end, Lagrangian statistics those until then, and of a rollout that is
+    `complete` alone: at an earlier time than the others' they would not be comparable.
     """
     broken = first_broken_time(run.model)
     measures: dict[str, float | None] = dict.fromkeys(MEASURES)
@@ -80,15 +71,21 @@ def _at_the_end(run: StoredRollout, common: CommonFrames) -> Mapping[str, float]
     last = common.times.size - 1
     velocity = particle_pair(run.model, run.truth, common, last, "velocity")
     acceleration = particle_pair(run.model, run.truth, common, last, "acceleration")
-    until = float(common.times[last]) + 1e-6 * max(1.0, float(common.times[last]))
-    fields = CommonFrames.of(run.model_field, run.truth_field, until)
-    spectra = spectra_pair(run.model_field, run.truth_field, fields, fields.times.size - 1)
+    position = particle_pair(run.model, run.truth, common, last, "position")
+    spectra = run.spectra.at(float(common.times[last]))
     final = CommonFrames(common.model[-1:], common.truth[-1:], common.times[-1:])
+    invariants = invariant_statistics(run.model, run.truth, final)
     return {
-        "spectrum_error": spectrum_error(spectra.wavenumber, spectra.model, spectra.truth,
-                                         max(1.0, run.filter_wavenumber / 2)),
+        "spectrum_error": spectra.error("model", run.filter_wavenumber),
+        "spectrum_error_floor": spectra.error("truth", run.filter_wavenumber),
         "energy_ratio": float(np.sum(velocity.model**2, dtype=float) / np.sum(velocity.truth**2, dtype=float)),
         "velocity_kl": pdf_divergence(velocity, EDGES["velocity"]),
+        "velocity_kl_floor": sampling_floor(velocity, EDGES["velocity"]),
         "acceleration_kl": pdf_divergence(acceleration, EDGES["acceleration"]),
-        "qr_kl": invariant_statistics(run.model, run.truth, final).divergence,
+        "acceleration_kl_floor": sampling_floor(acceleration, EDGES["acceleration"]),
+        "qr_kl": invariants.divergence,
+        "qr_kl_floor": invariants.floor,
+        "count_variance_ratio": (count_variance(position.model, run.length)
+                                 / count_variance(position.truth, run.length)),
+        **differences(*of_both(run.model, run.truth, common, run.length)),
     }

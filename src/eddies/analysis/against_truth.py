@@ -1,4 +1,4 @@
-"""A rollout of the particle model compared with the true tracers: time series, PDFs, invariants, spectra.
+"""A rollout of the particle model compared with the true tracers: time series, PDFs, invariants.
 
 Trajectories and field series are objects with `.times` and `.read(frame, column)`, so frames are read one by
 one and never all held at once. `CommonFrames` pairs the frames of model and truth; the truth may end earlier.
@@ -11,14 +11,11 @@ from typing import Protocol
 import numpy as np
 
 from eddies.analysis.errors import normalized_l2
-from eddies.analysis.lagrangian import neighbor_dispersion, velocity_correlation
 from eddies.analysis.pdfs import bin_edges, bin_probabilities, kl_divergence, sampling_divergence, standardized
-from eddies.analysis.spectra import energy_spectrum
 from eddies.analysis.velocity_gradients import ConditionalVelocity, InvariantBins, enstrophy_scale, invariants
 
 # Bins of the PDFs, in standard deviations of the truth.
 EDGES = {"velocity": bin_edges(5, 60), "acceleration": bin_edges(8, 80)}
-FOLLOWED = 1500  # particles whose neighbours are searched and whose pairs are followed
 
 
 class Frames(Protocol):
@@ -82,23 +79,12 @@ def particle_pair(model: Frames, truth: Frames, common: CommonFrames, index: int
                 truth.read(int(common.truth[index]), column))
 
 
-def particle_series(frames: ParticleFrames, chosen: Sequence[int], length: float) -> dict[str, np.ndarray]:
-    """Columns over the chosen frames of one run: time, energy 1/2 <v.v>, density_rms where a density is stored, and two
-    Lagrangian statistics.
-
-    correlation: of v with the first frame. dispersion: of pairs of neighbours among the first particles, in
-    units of their mean-square separation.
-    """
-    first = frames.read(int(chosen[0]), "velocity")
-    rows = []
-    for frame in map(int, chosen):
-        velocity = frames.read(frame, "velocity")
-        rows.append((0.5 * np.mean(np.sum(velocity**2, axis=1)), velocity_correlation(first, velocity)))
-    columns = dict(zip(("energy", "correlation"), np.array(rows).T))
+def particle_series(frames: ParticleFrames, chosen: Sequence[int]) -> dict[str, np.ndarray]:
+    """Columns over the chosen frames of one run: time, energy 1/2 <v.v>, density_rms where a density is stored."""
+    columns = {"energy": np.array([0.5 * np.mean(np.sum(frames.read(int(frame), "velocity") ** 2, axis=1))
+                                   for frame in chosen])}
     if "density" in frames.columns:
         columns["density_rms"] = np.array([np.std(frames.read(int(frame), "density")) for frame in chosen])
-    followed = np.stack([frames.read(int(frame), "position", 0, FOLLOWED) for frame in chosen])
-    columns["dispersion"] = neighbor_dispersion(followed, length)
     return {"time": frames.times[np.asarray(chosen)], **columns}
 
 
@@ -124,34 +110,19 @@ def pdf_divergence(pair: Pair, edges: np.ndarray) -> float:
 def sampling_floor(pair: Pair, edges: np.ndarray) -> float:
     """The divergence of that PDF between two independent samples of the truth; that of a model whose particles are
     still where those of the truth are can be smaller."""
-    return sampling_divergence(standardized(pair.truth), edges)
-
-
-@dataclass(frozen=True)
-class SpectraAt:
-    """Reconstructed energy spectra at one time: wavenumber and energies, all (shells,)."""
-
-    time: float
-    wavenumber: np.ndarray
-    model: np.ndarray
-    truth: np.ndarray
-
-
-def spectra_pair(model: Frames, truth: Frames, common: CommonFrames, index: int) -> SpectraAt:
-    """Spectra of both reconstructed velocity fields at a common field frame."""
-    fields = particle_pair(model, truth, common, index, "velocity")
-    wavenumber, energy = energy_spectrum(np.asarray(fields.model, dtype=float))
-    _, reference = energy_spectrum(np.asarray(fields.truth, dtype=float))
-    return SpectraAt(fields.time, wavenumber, energy, reference)
+    values = standardized(pair.truth)
+    return sampling_divergence(len(values), lambda rows: bin_probabilities(values[rows], edges))
 
 
 @dataclass(frozen=True)
 class InvariantStatistics:
-    """Q-R statistics of both runs: cell probabilities at one time, and the mean motion until then."""
+    """Q-R statistics of both runs: cell probabilities at one time, with the divergence between two samples of the truth
+    (`sampling_floor`), and the mean motion until then."""
 
     bins: InvariantBins
     model: np.ndarray
     truth: np.ndarray
+    floor: float
     model_flow: ConditionalVelocity | None
     truth_flow: ConditionalVelocity | None
 
@@ -174,7 +145,8 @@ def invariant_statistics(model: Frames, truth: Frames, common: CommonFrames) -> 
     bins = InvariantBins.covering(*truth_plane)
     flows = _conditional_flows(model, truth, common, bins) if common.times.size > 1 else (None, None)
     probabilities = bins.probabilities(*model_plane), bins.probabilities(*truth_plane)
-    return InvariantStatistics(bins, *probabilities, *flows)
+    floor = sampling_divergence(len(last.truth), lambda rows: bins.probabilities(*(part[rows] for part in truth_plane)))
+    return InvariantStatistics(bins, *probabilities, floor, *flows)
 
 
 def normalized_invariants(gradient: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:

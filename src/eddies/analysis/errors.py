@@ -17,3 +17,13 @@ def normalized_l2(prediction: np.ndarray, truth: np.ndarray) -> float:
     if norm == 0:
         raise ValueError("the truth is zero everywhere: a normalised error has no meaning")
     return float(np.linalg.norm((prediction - truth).ravel()) / norm)
+
+
+def rms_log_ratio(prediction: np.ndarray, truth: np.ndarray) -> float:
+    """Root mean square of ln(prediction / truth) over all entries, of one shape: a is an error by a factor e^a or e^-a
+    everywhere. Not finite where one of either is not positive, or where there is none."""
+    prediction, truth = np.asarray(prediction, dtype=float), np.asarray(truth, dtype=float)
+    if prediction.size == 0:
+        return np.nan
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return float(np.sqrt(np.mean(np.log(prediction / truth) ** 2)))

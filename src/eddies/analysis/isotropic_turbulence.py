@@ -4,9 +4,11 @@ u' is the rms of a velocity component, L the integral scale, eps the dissipation
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+
+from eddies.analysis.block_averages import Blocks, Estimate
 
 # Sreenivasan, Phys. Fluids 7, 2778 (1995); Yeung & Zhou, Phys. Rev. E 56, 1746 (1997).
 KOLMOGOROV_CONSTANT = (1.5, 1.64)
@@ -58,7 +60,8 @@ def modes_per_shell(largest: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Row:
-    """A quantity of this flow, its standard deviation in time (None: it is no average), the literature's value."""
+    """A quantity of this flow, its standard deviation in time (None: it is no average), the literature's value, and its
+    standard error (None: not known, as of an average over less than two turnovers)."""
 
     key: str
     label: str
@@ -66,6 +69,7 @@ class Row:
     deviation: float | None = None
     literature: float | str | None = None
     source: str = ""
+    error: float | None = None
 
 
 class StationarySpan:
@@ -119,12 +123,19 @@ class StationarySpan:
         mean = float(self._weights @ values)
         return mean, float(np.sqrt(self._weights @ (values - mean) ** 2))
 
+    def block_mean(self, values: np.ndarray) -> Estimate:
+        """Time average of values (samples,) with its standard error, that of blocks of a turnover or more."""
+        return Estimate(self.average(values)[0], self._blocks.mean(values).error)
+
     @property
-    def energy_trend(self) -> float:
-        """Slope of a straight line through the energy, relative to its mean, per turnover."""
-        time = self.columns["time"] - self.columns["time"].mean()
-        slope = np.sum(time * self.columns["energy"]) / np.sum(time**2)
-        return float(slope * self.duration / self.turnovers / self.mean("energy"))
+    def energy_trend(self) -> Estimate:
+        """Slope of a straight line through the energy, relative to its mean, per turnover, from blocks of a turnover or
+        more."""
+        return self._blocks.trend(self.columns["energy"] / self.mean("energy"))
+
+    @property
+    def _blocks(self) -> Blocks:
+        return Blocks.of(self.columns["turnovers"], 1.0)
 
     @property
     def energy_imbalance(self) -> float:
@@ -176,10 +187,11 @@ class StationarySpan:
 def comparison(span: StationarySpan) -> list[Row]:
     """What is known of isotropic turbulence, as it is in this flow and as it should be at its Re_lambda."""
     def averaged(key: str, label: str, values: np.ndarray, *literature) -> Row:
-        return Row(key, label, *span.average(values), *literature)
+        error = span.block_mean(values).known_error
+        return replace(Row(key, label, *span.average(values), *literature), error=error)
 
     c = span.columns
-    reynolds = span.mean("reynolds_lambda")
+    reynolds, trend = span.mean("reynolds_lambda"), span.energy_trend
     dissipation = c["dissipation_rate"] * c["integral_scale"] / c["velocity_rms"] ** 3
     gradients = "Ishihara et al. 2007, fit at Re_λ > 200"
     rows = [
@@ -197,7 +209,8 @@ def comparison(span: StationarySpan) -> list[Row]:
         *_spectrum_rows(span),
         *(averaged(f"share_{name[-1]}", f"energy of u_{name[-1]} over the mean of the components", values, 1.0,
                    "isotropy") for name, values in zip(COMPONENTS, span.component_shares())),
-        Row("energy_trend", "trend of the energy, per turnover", span.energy_trend, None, 0.0, "stationarity"),
+        Row("energy_trend", "trend of the energy, per turnover", trend.value, None, 0.0, "stationarity",
+            trend.known_error),
         Row("energy_imbalance", "(injection − dissipation − dE/dt) / dissipation", span.energy_imbalance, None, 0.0,
             "energy budget"),
         Row("time_step", "time step", span.mean("time_step")),

@@ -5,9 +5,10 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 
 
-def velocity_correlation(initial: np.ndarray, later: np.ndarray) -> float:
-    """Lagrangian velocity correlation <v(0).v(t)> / sqrt(<v(0)^2> <v(t)^2>): both (n, 3), by particle."""
-    return float(np.sum(initial * later) / np.sqrt(np.sum(initial**2) * np.sum(later**2)))
+def correlation(initial: np.ndarray, later: np.ndarray) -> float:
+    """Lagrangian correlation <v(0).v(t)> / sqrt(<v(0)^2> <v(t)^2>): both (n, 3), by particle; not a number at rest."""
+    with np.errstate(invalid="ignore"):
+        return float(np.sum(initial * later) / np.sqrt(np.sum(initial**2) * np.sum(later**2)))
 
 
 def structure_function(velocity: Sequence[np.ndarray], lags: np.ndarray) -> np.ndarray:
@@ -18,6 +19,22 @@ def structure_function(velocity: Sequence[np.ndarray], lags: np.ndarray) -> np.n
     """
     return np.array([np.mean([np.mean((velocity[start + lag] - velocity[start]) ** 2)
                               for start in range(len(velocity) - lag)]) for lag in lags])
+
+
+def increment_flatness(velocity: Sequence[np.ndarray], lags: np.ndarray) -> np.ndarray:
+    """Flatness <dv^4> / <dv^2>^2 of the increments dv = v_i(t + lag) - v_i(t) of a component, 3 of normal ones.
+
+    As for `structure_function`; a mean over start frames, so that the decay of a flow does not widen the tails. Not a
+    number of a velocity that does not change.
+    """
+    with np.errstate(invalid="ignore"):
+        return np.array([np.mean([_flatness(velocity[start + lag] - velocity[start])
+                                  for start in range(len(velocity) - lag)]) for lag in lags])
+
+
+def _flatness(values: np.ndarray) -> float:
+    square = np.square(values, dtype=float)
+    return np.mean(square**2) / np.mean(square) ** 2
 
 
 def minimum_image(displacement: np.ndarray, length: float) -> np.ndarray:
@@ -70,19 +87,21 @@ def pairs_at(position: np.ndarray, length: float, distances: Sequence[float], to
     return [np.concatenate(found, axis=1) for found in pairs]
 
 
-def nearest_neighbors(position: np.ndarray, length: float) -> np.ndarray:
-    """Row of the nearest other particle, (n, 3) -> (n,). Compares all pairs: for a few thousand particles."""
-    squared = np.zeros((len(position), len(position)))
-    for component in position.T:
-        squared += minimum_image(component[:, None] - component[None, :], length) ** 2
-    np.fill_diagonal(squared, np.inf)
-    return np.argmin(squared, axis=1)
+def nearest_rows(position: np.ndarray, length: float, chosen: np.ndarray, count: int) -> np.ndarray:
+    """Rows of the `count` nearest others of each chosen row (m,) of positions (n, 3), the nearest first: (count, m).
 
-
-def neighbor_dispersion(position: np.ndarray, length: float) -> np.ndarray:
-    """Pair dispersion of nearest neighbours over their first mean-square separation, (frames,)."""
-    first = np.arange(position.shape[1])
-    second = nearest_neighbors(position[0], length)
-    separation = minimum_image(position[0][first] - position[0][second], length)
-    spread, = pair_dispersion(position, [np.stack([first, second])], length)
-    return spread / np.mean(np.sum(separation**2, axis=1))
+    Raises ValueError where there are no so many others.
+    """
+    if len(position) <= count:
+        raise ValueError(f"{len(position)} particles: none has {count} neighbours")
+    components, mean_distance = np.ascontiguousarray(position.T), length / len(position) ** (1 / 3)
+    found = np.empty((count, chosen.size), int)
+    for number, row in enumerate(chosen):
+        reach, near, squared = mean_distance, np.empty(0, int), np.empty(0)
+        while np.count_nonzero(squared <= reach**2) <= count and near.size < len(position):
+            reach *= 2
+            near = np.flatnonzero(np.abs(minimum_image(components[0] - position[row, 0], length)) <= reach)
+            squared = np.sum(minimum_image(components[:, near] - position[row][:, None], length) ** 2, axis=0)
+        squared[near == row] = -1.0  # before any other in the same place
+        found[:, number] = near[np.argsort(squared, kind="stable")[1:count + 1]]
+    return found

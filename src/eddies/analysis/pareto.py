@@ -27,8 +27,9 @@ def verdict(model: Mapping[str, Any], baselines: Sequence[Mapping[str, Any]], co
     """Two sentences: in which measures a model is worth its cost beside its baselines, and in which it is not.
 
     It is worth it where no baseline that costs no more is as accurate. Rows hold `name`, `cost` and the measures by
-    key, None where there is no number; `measures` gives their names in words. A baseline without a number counts as
-    beaten.
+    key, None where there is no number, and may hold their standard deviations over realisations as `KEY_spread`: what
+    differs by less than the larger of two is as accurate. `measures` gives their names in words. A baseline without a
+    number counts as beaten.
     """
     worth, not_worth = [], []
     for key, words in measures.items():
@@ -36,8 +37,8 @@ def verdict(model: Mapping[str, Any], baselines: Sequence[Mapping[str, Any]], co
             not_worth.append(f"{words} (no number)")
             continue
         known = [row for row in baselines if None not in (row[key], row[cost])]
-        rivals = [row for row in known if row[cost] <= model[cost] and row[key] <= model[key]]
-        beaten = sum(row not in known or row[key] > model[key] for row in baselines)
+        rivals = [row for row in known if row[cost] <= model[cost] and not _worse(row, model, key)]
+        beaten = sum(row not in known or _worse(row, model, key) for row in baselines)
         score = f"{words} ({model[key]:.3g}, {beaten} of {len(baselines)} baselines beaten; "
         if rivals:
             named = ", ".join(_compared(row, model, key, cost) for row in rivals)
@@ -52,6 +53,12 @@ def verdict(model: Mapping[str, Any], baselines: Sequence[Mapping[str, Any]], co
             f"{name} is worth its cost in no measure.",
             f"It is not in {', '.join(not_worth)}." if not_worth else
             "There is no measure in which a baseline is as accurate and no slower."]
+
+
+def _worse(row: Mapping[str, Any], model: Mapping[str, Any], key: str) -> bool:
+    """Whether the error of a row is larger, by more than either's spread."""
+    spread = max(one.get(f"{key}_spread") or 0.0 for one in (row, model))
+    return row[key] > model[key] + spread
 
 
 def _compared(row: Mapping[str, Any], model: Mapping[str, Any], key: str, cost: str) -> str:

@@ -1,5 +1,7 @@
 """Histogram PDFs that keep their mass, and the divergence between two of them."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 FLOOR = 1e-6  # added to every bin's probability before a divergence: an empty bin must not make it infinite
@@ -52,15 +54,15 @@ def kl_divergence(truth: np.ndarray, prediction: np.ndarray, floor: float = FLOO
     return float(np.sum(p * np.log(p / q)))
 
 
-def sampling_divergence(values: np.ndarray, edges: np.ndarray) -> float:
-    """The divergence to expect of two samples of one distribution, each of as many rows as `values` (n, ...) has: what
-    a perfect model is found to have whose particles are others than those of the truth.
+def sampling_divergence(rows: int, probabilities: Callable[[np.ndarray], np.ndarray]) -> float:
+    """The divergence to expect of two samples of one distribution, each of so many `rows`: what a perfect model is
+    found to have whose particles are others than those of the truth.
 
-    Half of what two halves, drawn from a fixed seed, have: it falls as one over the number of rows.
+    Half of what two halves, drawn from a fixed seed, have: it falls as one over the number of rows. `probabilities` of
+    the bins are those of the rows that it is given.
     """
-    rows = np.random.default_rng(0).permutation(len(values))
-    halves = (bin_probabilities(values[half], edges) for half in np.array_split(rows, 2))
-    return kl_divergence(*halves) / 2
+    shuffled = np.random.default_rng(0).permutation(rows)
+    return kl_divergence(*(probabilities(half) for half in np.array_split(shuffled, 2))) / 2
 
 
 def standardized(values: np.ndarray, reference: np.ndarray | None = None) -> np.ndarray:

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from eddies.analysis.errors import rms_log_ratio
+
 
 def energy_spectrum(velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Shell-summed kinetic energy spectrum: E(k) = 1/2 sum |u_hat|^2 over k - 1/2 <= |k| < k + 1/2.
@@ -21,19 +23,32 @@ def energy_spectrum(velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.arange(energy.size, dtype=float), energy
 
 
-def spectrum_error(
-    wavenumber: np.ndarray, energy: np.ndarray, reference: np.ndarray, largest_wavenumber: float
-) -> float:
-    """Relative L2 difference of two spectra over the shells 1 <= k <= largest_wavenumber.
+def spectrum_error(energy: np.ndarray, reference: np.ndarray, largest_wavenumber: float) -> float:
+    """Root mean square of ln(E(k) / E_reference(k)) over the shells k = 1, 2, ... <= largest_wavenumber, at least the
+    first: every scale counts alike, and a factor e^a in all of them is an error of a.
 
-    All arrays (shells,). Raises ValueError if no shell lies in the range or the reference has no energy
-    there.
+    energy and reference: (shells,) from k = 0 on, as many of one as of the other. Not finite where a shell of either is
+    empty.
     """
-    resolved = (wavenumber >= 1) & (wavenumber <= largest_wavenumber)
-    norm = np.linalg.norm(reference[resolved])
-    if norm == 0:
-        raise ValueError(f"no energy in the shells 1 <= k <= {largest_wavenumber:g}: nothing to compare")
-    return float(np.linalg.norm(energy[resolved] - reference[resolved]) / norm)
+    shells = _shells(largest_wavenumber)
+    return rms_log_ratio(energy[shells], reference[shells])
+
+
+def band_ratios(energy: np.ndarray, reference: np.ndarray, largest_wavenumber: float) -> dict[str, float]:
+    """Energy over that of the reference by bands of shells, 1-2, 3-4, 5-8, 9-16, ... <= largest_wavenumber, the last
+    one cut off there; spectra as for `spectrum_error`."""
+    last, ratios, first, end = _shells(largest_wavenumber).stop - 1, {}, 1, 2
+    while first <= last:
+        end = min(end, last)
+        band = slice(first, end + 1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratios[f"{first}-{end}" if end > first else f"{first}"] = float(energy[band].sum() / reference[band].sum())
+        first, end = end + 1, 2 * end
+    return ratios
+
+
+def _shells(largest_wavenumber: float) -> slice:
+    return slice(1, max(int(largest_wavenumber), 1) + 1)
 
 
 def vorticity(velocity: np.ndarray) -> np.ndarray:

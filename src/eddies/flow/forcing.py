@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from eddies.errors import UserError
+from eddies.flow.filtering import gaussian_transfer
 from eddies.parallel.reduction import global_sum
 from eddies.spectral.spectral_grid import SpectralGrid
 
@@ -19,15 +20,17 @@ class ForcingError(UserError, ValueError):
 class LinearForcing:
     """f(k) = A u_s(k) for 0 < |k| < k_f with A = rate / sum |u_s|^2, so that the mean of u.f is `injection_rate`.
 
-    u_s is the solenoidal part of the velocity. Its form is that of Lundgren (2003) and Petersen and
-    Livescu (2010), with the amplitude set at every evaluation. `wavenumber` is k_f.
+    u_s is the solenoidal part of the velocity. Where that is what a filter of `filter_width` has left, the sum is that
+    of the modes with the filter undone: then f is the filtered forcing of the flow. Its form is that of Lundgren (2003)
+    and Petersen and Livescu (2010), with the amplitude set at every evaluation. `wavenumber` is k_f.
 
     The few forced modes are collected on all ranks in one message. Their mirror images in the plane kx = 0 are made
     exact conjugates there: otherwise round-off in the part that no real field has would be amplified by the forcing.
     Raises ForcingError at the first evaluation if the velocity has no energy, but round-off, at the forced modes.
     """
 
-    def __init__(self, grid: SpectralGrid, injection_rate: float, wavenumber: float) -> None:
+    def __init__(self, grid: SpectralGrid, injection_rate: float, wavenumber: float,
+                 filter_width: float = 0.0) -> None:
         self.grid, self.injection_rate, self.wavenumber = grid, injection_rate, wavenumber
         self._checked = False
         self.reach = reach = min(int(np.ceil(wavenumber)) - 1, grid.cutoff)
@@ -37,7 +40,8 @@ class LinearForcing:
         squared = kx**2 + ky**2 + kz**2
         self._forced = (squared > 0) & (squared < wavenumber**2)
         self._inverse_squared = 1.0 / np.where(squared > 0, squared, 1)
-        self._multiplicity = np.where(kx == 0, 1, 2)
+        unit = 2 * np.pi / grid.decomposition.length
+        self._weights = np.where(kx == 0, 1, 2) / gaussian_transfer(unit**2 * squared, filter_width) ** 2
         # Where the forced modes of this rank stand in its spectral array, and in the small block.
         own_ky = grid.index[1].ravel()
         self._own_rows = np.flatnonzero(np.abs(own_ky) <= reach)
@@ -49,7 +53,7 @@ class LinearForcing:
         if self.injection_rate == 0:
             return
         block = self._forced_modes(velocity)
-        energy = float(np.sum(self._multiplicity * np.abs(block) ** 2))
+        energy = float(np.sum(self._weights * np.abs(block) ** 2))
         if not self._checked:
             self._require_energy(energy, velocity)
         force = self.injection_rate / energy * block

@@ -11,7 +11,7 @@ from eddies.flow.forcing import LinearForcing
 from eddies.flow.formulas import formulas
 from eddies.flow.linear_operators import AcousticBlock, Decay
 from eddies.flow.operators import divergence, dot_wavevector
-from eddies.flow.subgrid import Smagorinsky
+from eddies.flow.subgrid import Closure
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.time_stepping import ScalarFunction, divided_difference
 
@@ -47,20 +47,23 @@ class Fluid(Protocol):
 class IncompressibleFluid:
     """u_t = P[u x omega + f] + nu laplacian u,  P the projection on solenoidal fields (it absorbs p + |u|^2 / 2).
 
-    The state is the velocity, (3, kz, ky, kx). Nine transforms an evaluation, of which eight are sent.
+    A large-eddy simulation adds the force of a `closure`, within the projection. The state is the velocity,
+    (3, kz, ky, kx). Nine transforms an evaluation, of which eight are sent.
     """
 
     compressible = False
 
     def __init__(self, grid: SpectralGrid, viscosity: float, sound_speed: float = math.inf,
-                 forcing: LinearForcing | None = None) -> None:
-        self.grid, self.viscosity, self.sound_speed, self.forcing = grid, viscosity, sound_speed, forcing
-        self._formulas = formulas(grid)
+                 forcing: LinearForcing | None = None, closure: Closure | None = None) -> None:
+        self.grid, self.viscosity, self.sound_speed = grid, viscosity, sound_speed
+        self.forcing, self.closure, self._formulas = forcing, closure, formulas(grid)
 
     def nonlinear(self, state: np.ndarray) -> np.ndarray:
         """P[u x omega + f]."""
         products = self.grid.multiply(state, self._formulas.cross, 3, fields=6, expand=self._with_vorticity,
                                       z_derivatives=2)
+        if self.closure is not None:
+            self.closure.add(state, products)
         tendency = self._formulas.project(products)
         if self.forcing is not None:
             self.forcing.add(state, tendency)
@@ -91,7 +94,7 @@ class CompressibleFluid:
         s_t = -div u - u.grad s
         u_t = -c^2 grad s + nu (laplacian u + 1/3 grad div u) - u.grad u + 2 nu (S - 1/3 div u).grad s + f
 
-    S is the rate of strain; a large-eddy simulation adds the divergence of the `subgrid` stress. Everything else
+    S is the rate of strain; a large-eddy simulation adds the force of a `closure`. Everything else
     nonlinear is quadratic, so the 2/3 rule dealiases it exactly. The state is (u, v, w, s), (4, kz, ky, kx). Fifteen
     transforms back (u and the gradients of u and s), four forth; of the first eight are sent, because derivatives along
     x and y are taken after the transform along z.
@@ -100,9 +103,9 @@ class CompressibleFluid:
     compressible = True
 
     def __init__(self, grid: SpectralGrid, viscosity: float, sound_speed: float,
-                 forcing: LinearForcing | None = None, subgrid: Smagorinsky | None = None) -> None:
+                 forcing: LinearForcing | None = None, closure: Closure | None = None) -> None:
         self.grid, self.viscosity, self.sound_speed = grid, viscosity, sound_speed
-        self.forcing, self.subgrid, self._formulas = forcing, subgrid, formulas(grid)
+        self.forcing, self.closure, self._formulas = forcing, closure, formulas(grid)
 
     def nonlinear(self, state: np.ndarray) -> np.ndarray:
         """-u.grad u + 2 nu (S - 1/3 div u).grad s + f, and -u.grad s."""
@@ -110,8 +113,8 @@ class CompressibleFluid:
                                       z_derivatives=4)
         if self.forcing is not None:
             self.forcing.add(state[:3], tendency[:3])
-        if self.subgrid is not None:
-            self.subgrid.add(state[:3], tendency[:3])
+        if self.closure is not None:
+            self.closure.add(state[:3], tendency[:3])
         return tendency
 
     def _with_gradients(self, modes: np.ndarray) -> list[np.ndarray]:

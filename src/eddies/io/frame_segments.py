@@ -18,6 +18,14 @@ from eddies.parallel.slab import SlabDecomposition
 
 
 @dataclass(frozen=True)
+class FieldLayout:
+    """A series of fields: grid points along each side, and the number of components by variable."""
+
+    cells: int
+    variables: Mapping[str, int]
+
+
+@dataclass(frozen=True)
 class FrameLayout:
     """What frames hold, in a segment as in the product.
 
@@ -27,22 +35,20 @@ class FrameLayout:
     length : side of the periodic box.
     trajectories : shape of one particle's value by column, of each trajectory by name.
     dtype : of the trajectories.
-    cells : grid points of the fields along each side.
-    fields : number of components by variable, of each series of fields by name.
+    fields : each series of fields by name; not all need to have a field at the same times.
     """
 
     total: int
     length: float
     trajectories: Mapping[str, Mapping[str, tuple[int, ...]]]
     dtype: type[np.floating]
-    cells: int
-    fields: Mapping[str, Mapping[str, int]]
+    fields: Mapping[str, FieldLayout]
 
     def writers(self, file: File) -> tuple[dict[str, TrajectoryWriter], dict[str, FieldWriter]]:
         """Of the trajectories and of the fields, by name; collective."""
         return ({name: TrajectoryWriter(file, name, self.total, self.length, columns, self.dtype)
                  for name, columns in self.trajectories.items()},
-                {name: FieldWriter(file, name, self.cells, variables) for name, variables in self.fields.items()})
+                {name: FieldWriter(file, name, series.cells, series.variables) for name, series in self.fields.items()})
 
 
 class FrameSegments:
@@ -85,7 +91,8 @@ class FrameSegments:
         """Copy the frames of all segments into a product."""
         self.close()
         trajectories, fields = self.layout.writers(file)
-        slab = SlabDecomposition(self.comm, self.layout.length, self.layout.cells)
+        slabs = {name: SlabDecomposition(self.comm, self.layout.length, series.cells)
+                 for name, series in self.layout.fields.items()}
         start, _ = id_block(self.comm, self.layout.total)
         for name in self.names:
             with open_product(self.comm, self.directory / name, "frames") as segment:
@@ -94,7 +101,7 @@ class FrameSegments:
                     for frame, (step, time) in enumerate(zip(frames.steps, frames.times)):
                         trajectory.append(step, time, start, self._values(frames, frame))
                 for group, field in fields.items():
-                    series = FieldSeries(segment, group)
+                    series, slab = FieldSeries(segment, group), slabs[group]
                     for index, time in enumerate(series.times):
                         field.append(time, slab.start, {variable: series.read(index, variable, slab.start, slab.stop)
                                                         for variable in series.variables})

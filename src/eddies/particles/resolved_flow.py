@@ -46,6 +46,18 @@ class ResolvedFlow:
         return self.relative_velocity - self.at_particles(self.velocity).to(self.relative_velocity)
 
     @cached_property
+    def spectrum(self) -> Tensor:
+        """E(k), the energy of the modes with |k| rounding to k = 0, 1, ..., k_c, of which the last shell holds only
+        those up to k_c; sum E = <u.u>/2 of the resolved velocity. (k_c + 1,), over all ranks; collective,
+        differentiable."""
+        grid = self.grid
+        energy = 0.5 * grid.multiplicity * (self.velocity.real.square() + self.velocity.imag.square()).sum(0)
+        shell = torch.round(grid.shell).long()
+        inside = shell <= grid.resolved
+        spectrum = energy.new_zeros(grid.resolved + 1, dtype=torch.float64)
+        return sum_over_ranks(grid.decomposition.comm, spectrum.index_add(0, shell[inside], energy[inside].double()))
+
+    @cached_property
     def products(self) -> Tensor:
         """Modes (6, kz, ky, kx) of u_i u_j; collective, differentiable."""
         return self.grid.squares(self.velocity)

@@ -17,7 +17,7 @@ from eddies.particles.flow_units import FlowUnits
 from eddies.particles.fourier_grid import FourierGrid
 from eddies.particles.least_squares import LeastSquares
 from eddies.particles.particle_set import ParticleSet, as_numpy
-from eddies.particles.rank_sums import mean_over_ranks, sum_over_ranks
+from eddies.particles.rank_sums import mean_over_ranks
 from eddies.particles.reference_scales import resolved_wavenumber
 from eddies.particles.resolved_flow import ResolvedFlow
 
@@ -111,13 +111,8 @@ class ResolvedVelocity:
     def band_energies(self, particles: ParticleSet) -> Tensor:
         """Mean kinetic energy <u.u>/2 of the resolved velocity by bands of `BAND` wavenumber shells, from shell 1 on:
         (bands,), over all ranks; collective, differentiable."""
-        grid, modes = self.grid, self.of(particles).velocity
-        energy = 0.5 * grid.multiplicity * (modes.real.square() + modes.imag.square()).sum(0)
-        shell = torch.round(grid.shell).long()
-        inside = (shell > 0) & (shell <= grid.resolved)
-        bands = energy.new_zeros((grid.resolved - 1) // BAND + 1, dtype=torch.float64)
-        return sum_over_ranks(grid.decomposition.comm,
-                              bands.index_add(0, (shell[inside] - 1) // BAND, energy[inside].double()))
+        spectrum = self.of(particles).spectrum[1:]
+        return torch.nn.functional.pad(spectrum, (0, -len(spectrum) % BAND)).view(-1, BAND).sum(1)
 
     # ---- from one evaluation to the next
 

@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
-from eddies.analysis.accuracy import MEASURES
 from eddies.analysis.pareto import pareto_front, verdict
+from eddies.measures import DRAWN, MEASURES, SHOWN, is_error
 from eddies.report.figures import DNS, FILTERED, FOURTH, GUIDE, MODEL, SECOND, THIRD, TRUTH, letter, panels, styled
 from eddies.report.labels import fix_layout, place_labels
 from eddies.report.page import Metric, RunRecord, Section
@@ -19,7 +19,6 @@ from eddies.report.page import Metric, RunRecord, Section
 Row = Mapping[str, Any]
 
 COST = "wall_seconds"
-DRAWN = ("velocity_error_early", "velocity_error_half", "spectrum_error", "acceleration_kl")
 LOOKS = list(zip((MODEL, TRUTH, SECOND, FOURTH, THIRD, DNS, FILTERED), "os^DvPX"))
 # Columns of the tables of the page: key in the rows, words. Measures come before them.
 COSTS = {"wall_seconds": "wall s per T", "wall_seconds_low": "lower quartile", "wall_seconds_high": "upper quartile",
@@ -31,12 +30,24 @@ COSTS = {"wall_seconds": "wall s per T", "wall_seconds_low": "lower quartile", "
 class ErrorAgainstTime:
     """What is drawn: a row of numbers by key for every variant, None where there is none.
 
-    subject: name of the variant that the summary is about; baselines: the group that it is measured against.
+    subject: name of the variant that the summary is about; baselines: the group that it is measured against; columns:
+    the measures that are asked for, if any are.
     """
 
     rows: Sequence[Row]
     subject: str
     baselines: str
+    columns: Sequence[str] | None = None
+
+    @property
+    def measures(self) -> dict[str, str]:
+        """Those of the table, with their words."""
+        return {name: MEASURES[name] for name in self.columns or SHOWN}
+
+    @property
+    def drawn(self) -> list[str]:
+        """Those of the figures: what is asked for and an error."""
+        return [name for name in self.columns or DRAWN if is_error(name)]
 
     @property
     def looks(self) -> dict[str, tuple[str, str]]:
@@ -47,10 +58,10 @@ class ErrorAgainstTime:
     @property
     def summary(self) -> list[str]:
         """Where the subject is worth its cost and where it is not; what became unstable counts as without numbers."""
-        numbers = [row if is_stable(row) else {**row, **dict.fromkeys(DRAWN)} for row in self.rows]
+        numbers = [row if is_stable(row) else {**row, **dict.fromkeys(self.drawn)} for row in self.rows]
         subject = next(row for row in numbers if row["name"] == self.subject)
         others = [row for row in numbers if row["group"] == self.baselines and row is not subject]
-        return verdict(subject, others, COST, {key: MEASURES[key] for key in DRAWN})
+        return verdict(subject, others, COST, {key: MEASURES[key] for key in self.drawn})
 
     def finished(self, measure: str) -> list[Row]:
         """Rows of stable variants that have this measure and a time."""
@@ -71,17 +82,20 @@ def sections(table: ErrorAgainstTime, turnovers: float) -> list[Section]:
     first = Section(
         "error-against-time", "Error against run time", " ".join(table.summary),
         notices=[_notice(row) for row in table.rows if not is_stable(row) or row[COST] is None])
-    note = ("Wall seconds of a turnover T, with quartiles of the time of a step as bars. Line: what nothing else beats "
-            "in both. Crosses at the top: became unstable, at the time given. ")
-    for measure in DRAWN:
+    note = ("Wall seconds of a turnover T, with quartiles of the time of a step as bars; errors with their standard "
+            "deviation over realisations, if there are several. Line: what nothing else beats in both. Crosses at the "
+            "top: became unstable, at the time given. ")
+    for measure in table.drawn:
         first.add_figure(measure.replace("_", "-"), f"Run time and {MEASURES[measure]}",
                          scatter(table, [measure]), note + _caption(table, measure))
-    overview = Section("overview", "All four measures")
-    overview.add_figure("error-against-run-time", "Error against run time", scatter(table, DRAWN), note)
-    errors = {**MEASURES, "end": "time of the end (T)", "stopped_at": "unstable at (T)"}
+    overview = Section("overview", "All of these measures")
+    if table.drawn:
+        overview.add_figure("error-against-run-time", "Error against run time", scatter(table, table.drawn), note)
+    errors = {**table.measures, "end": "time of the end (T)", "stopped_at": "unstable at (T)"}
     return [first, overview, _table("errors", "Errors", table.rows, errors,
-                                    "Spectrum, energy and KL divergences (nats) are those at the end, of the stable "
-                                    f"variants alone; {turnovers:g} turnovers were asked for."),
+                                    "Spectrum, energy, counts and KL divergences (nats) are those at the end, "
+                                    "Lagrangian statistics those until then, of the stable variants alone; "
+                                    f"{turnovers:g} turnovers were asked for."),
             _table("cost", "Cost", table.rows, COSTS, "T is the eddy turnover time when the tracers start.")]
 
 
@@ -108,9 +122,15 @@ def _caption(table: ErrorAgainstTime, measure: str) -> str:
 
 
 def _table(key: str, title: str, rows: Sequence[Row], columns: Mapping[str, str], text: str) -> Section:
-    metrics = [Metric(row["name"], row["name"], {words: row[column] for column, words in columns.items()})
+    metrics = [Metric(row["name"], row["name"], {words: _with_spread(row, column) for column, words in columns.items()})
                for row in rows]
     return Section(key, title, text, metrics=metrics)
+
+
+def _with_spread(row: Row, column: str) -> Any:
+    """A number of a row, with its standard deviation over realisations where there are several."""
+    spread = row.get(f"{column}_spread")
+    return row[column] if spread is None else f"{row[column]:.3g} ± {spread:.2g}"
 
 
 @styled
@@ -119,9 +139,11 @@ def scatter(table: ErrorAgainstTime, measures: Sequence[str]) -> Figure:
     columns = min(len(measures), 2)
     size = (6.7, 5.0) if columns == 2 else (9.3, 6.0)
     figure, axes = panels(-(-len(measures) // columns), columns, size)
+    for axis in axes.flat[len(measures):]:
+        axis.remove()
     for axis, measure in zip(axes.flat, measures):
         _draw_panel(axis, table, measure)
-    letter(list(axes.flat))
+    letter(axes.flat[:len(measures)])
     styles = [Line2D([], [], color=colour, marker=marker, linestyle="", label=group)
               for group, (colour, marker) in table.looks.items()]
     if table.stopped():
@@ -143,8 +165,11 @@ def _draw_panel(axis: Axes, table: ErrorAgainstTime, measure: str) -> None:
         colour, marker = table.looks[row["group"]]
         chosen = row["name"] == table.subject
         bars = [[row[COST] - row["wall_seconds_low"]], [row["wall_seconds_high"] - row[COST]]]
-        axis.errorbar(row[COST], row[measure], xerr=np.maximum(bars, 0), color=colour, marker=marker, elinewidth=1,
-                      markersize=9 if chosen else 6, markeredgecolor=DNS if chosen else colour, zorder=4)
+        spread = row.get(f"{measure}_spread") or 0.0
+        # On an axis of logarithms no bar reaches 0.
+        down = min(spread, 0.9 * row[measure])
+        axis.errorbar(row[COST], row[measure], [[down], [spread]], np.maximum(bars, 0), color=colour, marker=marker,
+                      elinewidth=1, markersize=9 if chosen else 6, markeredgecolor=DNS if chosen else colour, zorder=4)
     for row in stopped:
         axis.plot(row[COST], _top(axis), color=table.looks[row["group"]][0], marker="x", markersize=7,
                   markeredgewidth=1.8, zorder=4)

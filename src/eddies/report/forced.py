@@ -7,14 +7,15 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from eddies.analysis.against_truth import EDGES, Frames, first_broken_time, normalized_invariants
+from eddies.analysis.against_truth import EDGES, first_broken_time, normalized_invariants
+from eddies.analysis.block_averages import Blocks, Estimate
 from eddies.analysis.isotropic_turbulence import StationarySpan
 from eddies.analysis.pdfs import bin_probabilities, gaussian, kl_divergence, pdf, standardized
-from eddies.analysis.spectra import energy_spectrum, spectrum_error
+from eddies.analysis.spectra import spectrum_error
 from eddies.analysis.velocity_gradients import InvariantBins, enstrophy_scale
 from eddies.report.figures import GUIDE, MODEL, TRUTH, letter, number_wavenumbers, panels, styled
 from eddies.report.page import Metric, Section
-from eddies.report.rollout import Rollout
+from eddies.report.rollout import WITHOUT_KERNEL, Rollout
 
 
 @dataclass(frozen=True)
@@ -24,29 +25,35 @@ class ForcedStatistics:
     Parameters
     ----------
     times, energy : of the model, (frames,), <v.v>/2.
-    late : its frames in the second half, over which it is averaged.
-    flow_energy : mean and standard deviation of the filtered flow's energy over its stationary span.
-    wavenumber, spectrum, flow_spectrum : mean spectra (shells,) through the kernel.
+    late : its frames in the second half, over which it is averaged. blocks : of these, at least a turnover each.
+    flow_energy : mean of the filtered flow's energy over its stationary span, by blocks too; flow_deviation : its
+        standard deviation in time.
+    wavenumber, flow_spectrum : the flow's mean filtered spectrum, (shells,). spectra : of the model, at times
+        `spectra_times`, (m, shells). cutoff : k_d, or the last of these shells.
     velocity, acceleration : of the model's late frames, divided by the standard deviation of their frame.
     flow_velocity, flow_acceleration : the same of the true tracers at the start, when they had just been forced.
     acceleration_rms, flow_acceleration_rms : of one component, (late frames,) and at the start.
-    qr_kl : divergence of the Q-R joint PDFs, each in units of its own enstrophy.
+    qr_kl : divergence of the Q-R joint PDFs, each in units of its own enstrophy; None without a kernel.
     """
 
     times: np.ndarray
     energy: np.ndarray
     late: np.ndarray
-    flow_energy: tuple[float, float]
+    blocks: Blocks
+    flow_energy: Estimate
+    flow_deviation: float
     wavenumber: np.ndarray
-    spectrum: np.ndarray
     flow_spectrum: np.ndarray
+    spectra_blocks: Blocks
+    spectra: np.ndarray
+    cutoff: float
     velocity: np.ndarray
     flow_velocity: np.ndarray
     acceleration: np.ndarray
     flow_acceleration: np.ndarray
     acceleration_rms: np.ndarray
     flow_acceleration_rms: float
-    qr_kl: float
+    qr_kl: float | None
 
     @classmethod
     def of(cls, run: Rollout, span: StationarySpan) -> "ForcedStatistics":
@@ -62,31 +69,41 @@ class ForcedStatistics:
         energy = np.array([0.5 * np.mean(np.sum(run.model.read(frame, "velocity") ** 2, axis=1)) for frame in frames])
         shells = np.arange(span.spectra.shape[1])
         transfer = np.exp(-((shells * run.filter_width) ** 2) / 12)
-        wavenumber, spectrum = mean_spectrum(run.fields["model"], times[len(times) - len(late):])
-        start = run.model.times[:1]
-        # What the kernel makes of a filtered field, shell by shell: both reconstructions are attenuated alike.
-        _, through_kernel = mean_spectrum(run.fields["truth"], start)
-        _, unsmoothed = mean_spectrum(run.fields["filtered"], start)
-        resolved = slice(0, min(len(wavenumber), len(shells)))
-        attenuation = np.divide(through_kernel, unsmoothed, out=np.zeros_like(unsmoothed), where=unsmoothed > 0)
+        flow_energy = span.spectra @ transfer
+        measured = run.spectra.model
+        known, chosen = min(measured["wavenumber"].size, len(shells)), _between(measured["time"], times[-1])
         accelerations = [run.model.read(frame, "acceleration") for frame in late]
-        flow = {name: run.truth.read(0, name) for name in ("velocity", "acceleration", "velocity_gradient")}
+        flow = {name: run.truth.read(0, name) for name in ("velocity", "acceleration")}
         return cls(
-            times, energy, late, span.average(span.spectra @ transfer), wavenumber[resolved], spectrum[resolved],
-            attenuation[resolved] * (transfer * span.spectrum)[resolved],
+            times, energy, late, Blocks.of(run.model.times[late], run.turnover),
+            span.block_mean(flow_energy), span.average(flow_energy)[1],
+            shells[:known], (transfer * span.spectrum)[:known],
+            Blocks.of(measured["time"][chosen], run.turnover), measured["energy"][chosen, :known],
+            min(np.pi / run.filter_width, known - 1.0),
             np.concatenate([standardized(run.model.read(frame, "velocity")) for frame in late]),
             standardized(flow["velocity"]),
             np.concatenate([standardized(acceleration) for acceleration in accelerations]),
             standardized(flow["acceleration"]),
             np.array([np.std(acceleration) for acceleration in accelerations]), float(np.std(flow["acceleration"])),
-            invariant_divergence([run.model.read(frame, "velocity_gradient") for frame in late],
-                                 flow["velocity_gradient"]))
+            None if run.fields is None else invariant_divergence(
+                [run.model.read(frame, "velocity_gradient") for frame in late],
+                run.truth.read(0, "velocity_gradient")))
 
     @property
-    def late_energy(self) -> tuple[float, float]:
-        """Mean and standard deviation of the model's energy over its second half."""
-        chosen = self.energy[len(self.energy) - len(self.late):]
-        return float(chosen.mean()), float(chosen.std())
+    def late_energy(self) -> np.ndarray:
+        """Energy of the late frames."""
+        return self.energy[len(self.energy) - len(self.late):]
+
+    @property
+    def spectrum(self) -> np.ndarray:
+        """The model's mean spectrum."""
+        return self.spectra_blocks.means(self.spectra).mean(axis=0)
+
+    @property
+    def spectrum_error(self) -> Estimate:
+        """Of the mean spectrum, not the mean of errors."""
+        return self.spectra_blocks.of_mean(
+            self.spectra, lambda mean: spectrum_error(mean, self.flow_spectrum, self.cutoff))
 
     def divergence(self, column: str) -> float:
         """Forward KL divergence of the standardised PDFs of "velocity" or "acceleration", flow to model."""
@@ -95,11 +112,10 @@ class ForcedStatistics:
         return kl_divergence(flow, model)
 
 
-def mean_spectrum(fields: Frames, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Wavenumbers and mean energy spectrum (shells,) of a field series at the stored times nearest to `times`."""
-    frames = {int(np.argmin(np.abs(fields.times - time))) for time in times}
-    spectra = [energy_spectrum(np.asarray(fields.read(frame, "velocity"), dtype=float)) for frame in sorted(frames)]
-    return spectra[0][0], np.mean([energy for _, energy in spectra], axis=0)
+def _between(times: np.ndarray, end: float) -> np.ndarray:
+    """Rows of the second half of what ends at a time; the last row before it, where there is none."""
+    rows = np.flatnonzero((times >= end / 2) & (times <= end * (1 + 1e-9)))
+    return rows if rows.size else np.array([max(int(np.searchsorted(times, end, "right")) - 1, 0)])
 
 
 def invariant_divergence(model: Sequence[np.ndarray], flow: np.ndarray) -> float:
@@ -116,34 +132,47 @@ def section(run: Rollout, span: StationarySpan) -> Section:
         found, turnover = ForcedStatistics.of(run, span), run.turnover
     except ValueError as error:
         return Section("forced", title, notices=[f"It is not compared: {error}."])
-    half = run.filter_wavenumber / 2
-    (energy, deviation), (flow_energy, flow_deviation) = found.late_energy, found.flow_energy
-    error = spectrum_error(found.wavenumber, found.spectrum, found.flow_spectrum, max(1.0, half))
-    begin = run.model.times[found.late[0]]
+    energy, flow_energy, error = found.blocks.mean(found.late_energy), found.flow_energy, found.spectrum_error
+    begin, count = run.model.times[found.late[0]], len(found.blocks.members)
     shown = Section(
         "forced", title,
         f"The model is forced with a power of {float(run.attributes['injection_rate']):.3g} a mass. Its averages, from "
         f"{begin / turnover:.3g} to {found.times[-1] / turnover:.3g} T, beside those of the filtered flow over the "
-        f"{span.turnovers:.3g} turnovers in which it was stationary. PDFs are compared with those of the true tracers "
-        "at the start, each in units of its own standard deviation.",
+        f"{span.turnovers:.3g} turnovers in which it was stationary. Standard errors are those of blocks of a turnover "
+        f"or more, {count} of the model: frames closer than that are no independent samples. PDFs are compared with "
+        "those of the true tracers at the start, each in units of its own standard deviation.",
         metrics=[
-            Metric("energy", "kinetic energy", {"model": energy, "deviation": deviation, "stationary flow": flow_energy,
-                                                "its deviation": flow_deviation}),
-            Metric("acceleration_rms", "rms of an acceleration component",
-                   {"model": float(found.acceleration_rms.mean()), "deviation": float(found.acceleration_rms.std()),
-                    "flow at the start": found.flow_acceleration_rms}),
-            Metric("spectrum_error", "error of the mean spectrum, 1 ≤ k ≤ k_d/2 (relative L2)", error),
+            Metric("energy", "kinetic energy", {
+                **_with_trend(found.blocks, found.late_energy, turnover), "deviation": float(found.late_energy.std()),
+                "stationary flow": flow_energy.value, "its standard error": flow_energy.error,
+                "its deviation": found.flow_deviation}),
+            Metric("acceleration_rms", "rms of an acceleration component", {
+                **_with_trend(found.blocks, found.acceleration_rms, turnover),
+                "deviation": float(found.acceleration_rms.std()), "flow at the start": found.flow_acceleration_rms}),
+            Metric("spectrum_error", "error of the mean spectrum, rms of ln(E/E_filtered) over 1 ≤ k ≤ k_d",
+                   {"model": error.value, "standard error": error.error}),
             Metric("velocity_kl", "KL divergence of the velocity PDF, standardised", found.divergence("velocity")),
             Metric("acceleration_kl", "KL divergence of the acceleration PDF, standardised",
                    found.divergence("acceleration")),
-            Metric("qr_kl", "KL divergence of the Q–R joint PDF, standardised", found.qr_kl),
+            Metric("qr_kl", "KL divergence of the Q–R joint PDF, standardised", found.qr_kl, WITHOUT_KERNEL),
         ])
     shown.add_figure(
         "forced", "Forced rollout", forced_rollout(found, turnover, run.filter_wavenumber),
-        f"Energy of the model {energy:.3g} ± {deviation:.2g}, of the stationary flow {flow_energy:.3g} ± "
-        f"{flow_deviation:.2g} (band; ± is the standard deviation in time). Mean spectra through the kernel differ by "
-        f"{error:.3f} up to k_d/2 (dotted: k_d). KL of the acceleration PDF {found.divergence('acceleration'):.2g}.")
+        f"Energy of the model {_shown(energy)}, of the stationary flow {_shown(flow_energy)} (± is the standard error; "
+        f"band: standard deviation in time). Rms of ln(E/E_filtered) of the mean spectra up to k_d (dotted): "
+        f"{_shown(error)}. KL of the acceleration PDF {found.divergence('acceleration'):.2g}.")
     return shown
+
+
+def _with_trend(blocks: Blocks, samples: np.ndarray, turnover: float) -> dict[str, float]:
+    """Mean and slope per turnover of the model, each with its standard error."""
+    mean, slope = blocks.mean(samples), blocks.trend(samples)
+    return {"model": mean.value, "standard error": mean.error, "trend per turnover": slope.value * turnover,
+            "its error": slope.error * turnover}
+
+
+def _shown(found: Estimate) -> str:
+    return f"{found.value:.3g} ± {found.error:.2g}" if np.isfinite(found.error) else f"{found.value:.3g}"
 
 
 @styled
@@ -151,7 +180,7 @@ def forced_rollout(found: ForcedStatistics, turnover: float, cutoff: float) -> F
     """Energy over time, mean spectra and acceleration PDFs of the model and of the stationary flow."""
     figure, axes = panels(1, 3, (3.7, 3.2))
     energy, spectra, accelerations = axes.flat
-    mean, deviation = found.flow_energy
+    mean, deviation = found.flow_energy.value, found.flow_deviation
     energy.axhspan(mean - deviation, mean + deviation, color=TRUTH, alpha=0.2, linewidth=0)
     energy.axhline(mean, color=TRUTH, label="stationary flow")
     energy.plot(found.times / turnover, found.energy, color=MODEL, label="forced model")

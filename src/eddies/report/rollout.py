@@ -8,8 +8,10 @@ import numpy as np
 from eddies.analysis import against_truth
 from eddies.analysis.against_truth import CommonFrames, Frames, Pair, ParticleFrames
 from eddies.analysis.errors import normalized_l2
-from eddies.analysis.spectra import spectrum_error, vorticity
-from eddies.report import disorder, rollout_figures
+from eddies.analysis.path_statistics import of_both
+from eddies.analysis.rollout_spectra import RolloutSpectra
+from eddies.analysis.spectra import vorticity
+from eddies.report import disorder, lagrangian, rollout_figures, spectra
 from eddies.report.page import Metric, Section
 from eddies.report.statistics import invariant_plane, particle_pdfs
 
@@ -20,8 +22,8 @@ METHODS = {
     "learned": "the trained model, terms {terms}",
     "none": "no force: every particle keeps its velocity",
     "wcsph": "WCSPH, {kernel} kernel, density by summation, α = {alpha:g}, β = {beta:g}, γ = {exponent:g}",
-    "eulerian": "Eulerian large-eddy simulation on {cells}³ cells, |kᵢ| ≤ {largest_wavenumber}, Smagorinsky constant "
-                "{smagorinsky:g}",
+    "eulerian": "Eulerian large-eddy simulation on {cells}³ cells, |kᵢ| ≤ {largest_wavenumber}, {fluid}, {equations} "
+                "velocity, closure: {closure}",
 }
 WITHOUT_KERNEL = "measured through the smoothing kernel, and the scene has none"
 TRUTH_NAMES = {"filtered": "filtered DNS", "truth": "true tracers"}
@@ -31,9 +33,9 @@ TRUTH_NAMES = {"filtered": "filtered DNS", "truth": "true tracers"}
 class Rollout:
     """A rollout as stored, with what it is compared with.
 
-    attributes: of the group `rollout`; model, truth: trajectories; fields: the series "model", "truth" and
-    "filtered", or None where there was no kernel to make them; length: box edge; filter_width and eulerian (table
-    `spectra`): of the ground truth, or None;
+    attributes: of the group `rollout`; model, truth: trajectories; spectra: those stored with it; fields: the series
+    "model", "truth" and "filtered", or None where there was no kernel to make them; length: box edge; filter_width: of
+    the ground truth, or None;
     outside_training: share of the pairs outside the training range, (frames,), where it was counted;
     closure: columns over the frames on the solves for the resolved velocity, where there were any.
     """
@@ -41,10 +43,10 @@ class Rollout:
     attributes: Mapping[str, float | str]
     model: ParticleFrames
     truth: ParticleFrames
+    spectra: RolloutSpectra
     fields: Mapping[str, Frames] | None
     length: float
     filter_width: float | None
-    eulerian: Mapping[str, np.ndarray] | None
     outside_training: np.ndarray | None = None
     closure: Mapping[str, np.ndarray] | None = None
 
@@ -114,10 +116,10 @@ def section(run: Rollout) -> Section:
     if run.fields is not None:
         _add_planes(shown, run, run.fields, last)
         _add_invariants(shown, run, common)
-        _add_spectra(shown, run, run.fields, last)
     else:
-        shown.metrics += [Metric(key, key.replace("_", " "), None, WITHOUT_KERNEL)
-                          for key in ("spectrum_error", "qr_kl")]
+        shown.metrics += [Metric(key, key.replace("_", " "), None, WITHOUT_KERNEL) for key in ("qr_kl", "qr_kl_floor")]
+    spectra.add(shown, run.spectra, _just_after(last), run.turnover, run.filter_wavenumber)
+    lagrangian.add(shown, *of_both(run.model, run.truth, common, run.length), run.turnover)
     found = disorder.measure({"model": run.model, "truth": run.truth}, run.fields, common, run.length, broken,
                              run.filter_wavenumber)
     disorder.add(shown, found, run.turnover)
@@ -185,8 +187,8 @@ def _add_planes(shown: Section, run: Rollout, fields: Mapping[str, Frames], last
 def _add_particles(shown: Section, run: Rollout, common: CommonFrames) -> None:
     errors = against_truth.error_series(run.model, run.truth, common)
     final = {name: float(values[-1]) for name, values in errors.items()}
-    model = against_truth.particle_series(run.model, np.arange(run.model.times.size), run.length)
-    truth = against_truth.particle_series(run.truth, common.truth, run.length)
+    model = against_truth.particle_series(run.model, np.arange(run.model.times.size))
+    truth = against_truth.particle_series(run.truth, common.truth)
     ratio = float(model["energy"][common.model[-1]] / truth["energy"][-1])
     shown.metrics += [
         Metric("energy_ratio", "particle kinetic energy, model / truth", ratio),
@@ -217,47 +219,20 @@ def _add_particles(shown: Section, run: Rollout, common: CommonFrames) -> None:
         rollout_figures.errors_over_time(model, truth, errors, run.turnover),
         f"At the last common time the model has {ratio:.3f} of the truth's energy and a velocity error of "
         f"{final['velocity_error']:.3f} (dotted: 1, as large as the velocity itself).")
-    shown.add_figure(
-        "lagrangian", "Lagrangian statistics",
-        rollout_figures.lagrangian({"truth": truth, "model": model}, run.turnover),
-        "Correlation of the velocity with that at the start, and spreading of nearest neighbours in units of "
-        "their mean-square separation. Correlation at the last common time: "
-        f"{truth['correlation'][-1]:.3f} (truth), {model['correlation'][common.model[-1]]:.3f} (model).")
 
 
 def _add_invariants(shown: Section, run: Rollout, common: CommonFrames) -> None:
     statistics = against_truth.invariant_statistics(run.model, run.truth, common)
-    shown.metrics.append(Metric("qr_kl", "KL divergence of the Q–R joint PDF", statistics.divergence))
+    shown.metrics += [
+        Metric("qr_kl", "KL divergence of the Q–R joint PDF", statistics.divergence),
+        Metric("qr_kl_floor", "the same of two samples of the truth, as large as this", statistics.floor)]
     shown.add_figure(
         "figure-7-invariants", "Invariants Q and R of the velocity gradient (the paper's Fig. 7)",
         invariant_plane(statistics),
         f"Joint PDF at t = {common.times[-1] / run.turnover:.2f} T (isolines half a decade apart, smoothed "
-        f"over one bin for drawing; KL {statistics.divergence:.2g} from raw bins) and mean motion over all "
+        f"over one bin for drawing; KL {statistics.divergence:.2g} from raw bins, between samples of the truth "
+        f"{statistics.floor:.2g}) and mean motion over all "
         "frames until then. Orange: Vieillefosse line. Both are in units of the truth's ⟨Q_w⟩ = ⟨W:W⟩/2.")
-
-
-def _add_spectra(shown: Section, run: Rollout, fields: Mapping[str, Frames], last: float) -> None:
-    model, truth = fields["model"], fields["truth"]
-    common = CommonFrames.of(model, truth, _just_after(last))
-    series = [against_truth.spectra_pair(model, truth, common, index) for index in common.spread(3)]
-    at = series[-1]
-    caption = "Model and true tracers through the learned kernel; the DNS at the nearest stored time."
-    cutoff, half, whole = run.filter_wavenumber, None, None
-    if cutoff is not None:
-        half, whole = (spectrum_error(at.wavenumber, at.model, at.truth, max(1.0, largest))
-                       for largest in (cutoff / 2, cutoff))
-        caption += (f" Relative L2 difference at t = {at.time / run.turnover:.2f} T: {half:.3f} up to k_d/2, "
-                    f"{whole:.3f} up to k_d = π/d = {cutoff:.3g}.")
-    missing = "the filter width is in ground_truth.h5, which is not here"
-    shown.metrics += [
-        Metric("spectrum_error", "spectrum error, 1 ≤ k ≤ k_d/2 (relative L2)", half, missing),
-        Metric("spectrum_error_resolved", "spectrum error, 1 ≤ k ≤ k_d (relative L2)", whole, missing),
-        Metric("filter_wavenumber", "filter wavenumber k_d = π/d", cutoff, missing),
-    ]
-    start = float(run.attributes["start_time"])
-    figure = rollout_figures.energy_spectra(series, run.eulerian, start, run.turnover, cutoff)
-    title = "Energy spectra over time (the paper's Fig. 8)"
-    shown.add_figure("figure-8-spectra", title, figure, caption)
 
 
 def _plane_of_first_component(model: Frames, truth: Frames, common: CommonFrames, index: int) -> Pair:

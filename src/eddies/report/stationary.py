@@ -62,7 +62,8 @@ def section(statistics: Mapping[str, np.ndarray], span: StationarySpan) -> Secti
     shown = Section(
         "stationary", "Stationary turbulence",
         f"Averages over {span.turnovers:.3g} large-eddy turnovers of the forced flow, t = {first:.3g} to {last:.3g}, "
-        "with the standard deviation in time, and the literature's values at this Re_λ.",
+        "with the standard error of blocks of a turnover or more (frames closer than that are no independent samples) "
+        "and the standard deviation in time, and the literature's values at this Re_λ.",
         metrics=[Metric(row.key, row.label, columns_of(row)) for row in comparison(span)])
     shown.add_figure(
         "stationary", "The stationary state", stationary_state(statistics, span),
@@ -73,5 +74,6 @@ def section(statistics: Mapping[str, np.ndarray], span: StationarySpan) -> Secti
 
 def columns_of(row: Row) -> dict[str, float | str]:
     """A row by the names of its columns; what it does not have is left out."""
-    columns = {"this run": row.value, "deviation": row.deviation, "literature": row.literature, "source": row.source}
+    columns = {"this run": row.value, "standard error": row.error, "deviation": row.deviation,
+               "literature": row.literature, "source": row.source}
     return {name: value for name, value in columns.items() if value not in (None, "")}

@@ -116,8 +116,7 @@ def tracer_problems(scene: Scene) -> Iterator[str]:
     """Stored fields no finer than the simulation; a flow that moves, and for a model one that changes."""
     tracers, initial = scene.tracers, scene.initial
     if tracers and tracers.forced and scene.forcing is None:
-        yield ("[tracers] forced = true: there is no [forcing] that could stay on; add it with an injection_rate, or "
-               "remove the key")
+        yield "[tracers] forced = true: there is no [forcing] that could stay on; add it, or remove the key"
     if tracers and tracers.forced and scene.model and any(
             isinstance(settings, Forcing) for settings in scene.model.settings.values()):
         yield ('[model] terms: "forcing": with [tracers] forced = true the forcing of the ground truth is added by '
@@ -137,7 +136,7 @@ def tracer_problems(scene: Scene) -> Iterator[str]:
 def section_problems(scene: Scene) -> Iterator[str]:
     """Which sections need which others."""
     needs = {"kernel": ("tracers",), "model": ("tracers",), "training": ("model",), "simulation": ("tracers",)}
-    if scene.simulation and "model" in scene.simulation.needs:
+    if scene.needs_model:
         needs["simulation"] = ("model",)
     for name, others in needs.items():
         for other in others:
@@ -277,10 +276,17 @@ def baseline_problems(scene: Scene) -> Iterator[str]:
                f"0.4 h / (c (1 + 0.6 alpha)) = {acoustic_step(scene):.3g}, h half the support of {scene.neighbors:g} "
                "neighbors and c [flow] sound_speed; lower step")
     if simulation and simulation.method == "eulerian":
-        cells = (scene.eulerian or Eulerian()).cells_for(scene.tracers.filter_width)
-        if cells > scene.tracers.cells:
-            yield (f"[eulerian] cells = {cells}: must be at most the {scene.tracers.cells} of the filtered fields that "
-                   "it starts from; lower cells or raise [tracers] field_cells")
+        eulerian = scene.eulerian or Eulerian()
+        cells = eulerian.cells_for(scene.tracers.filter_width)
+        if cells > scene.flow.cells:
+            yield (f"[eulerian] cells = {cells}: must be at most the {scene.flow.cells} of the flow that it starts "
+                   "from; lower cells")
+        if eulerian.closure == "learned" and "damping" not in scene.model.settings:
+            yield ('[eulerian] closure = "learned": takes the rates of the term "damping", which [model] has not; add '
+                   "it to its terms, or choose another closure")
+        if eulerian.fluid == "compressible" and not scene.flow.compressible:
+            yield ('[eulerian] fluid = "compressible": [flow] fluid is incompressible and has no sound speed; set both '
+                   "to the same")
 
 
 def acoustic_step(scene: Scene) -> float:

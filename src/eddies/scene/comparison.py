@@ -1,15 +1,19 @@
 """A comparison: variants of one scene that are run from the same moment on one machine, as read from one TOML file."""
 
-from dataclasses import dataclass
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
+from eddies.measures import MEASURES
 from eddies.scene.reader import find_document, parse_document, read_section, read_text
 from eddies.scene.rules import nearest, quoted
 from eddies.scene.scene import Scene, SceneError, load_scene
-from eddies.scene.values import Document, Section, directory_name, integer, number, sections, text, texts
+from eddies.scene.values import (Document, Section, directory_name, integer, integers, number, sections, text,
+                                 texts)
 
-__all__ = ["BASELINE", "Comparison", "Variant", "load_comparison"]
+__all__ = ["BASELINE", "Comparison", "PlannedRun", "Variant", "load_comparison"]
 
 BUILT_IN = Path(__file__).parents[1] / "comparisons"
 BASELINE = "baseline"
@@ -28,6 +32,15 @@ class Variant(Section):
                            default=None)
 
 
+@dataclass(frozen=True)
+class PlannedRun:
+    """A run of a variant: its scene, its run directory below that of the comparison, and that of its ground truth."""
+
+    scene: Scene
+    directory: Path
+    ground_truth: Path
+
+
 @dataclass(frozen=True, kw_only=True)
 class Comparison(Document):
     """A whole comparison; making one loads the scenes of all variants and checks that they can be compared."""
@@ -38,18 +51,29 @@ class Comparison(Document):
     run: str | None = text("run directory that holds the base's ground truth; absent: runs/BASE", default=None)
     set: tuple[str, ...] = texts('changes "section.key=value" of the base, for all variants', default=())
     turnovers: float = number("large-eddy turnovers of every rollout", default=1.0, above=0)
-    repeats: int = integer("how often every variant is timed, in rounds over all of them", default=3, at_least=1)
+    realisations: tuple[int, ...] | None = integers(
+        "seeds of ground truths that no training sees, in the run directories RUN-seed-N: every variant is trained on "
+        "its own ground truth and rolled out on each of these, from its beginning; absent: on its own, after the "
+        "training window", default=None, at_least=0)
+    repeats: int = integer("how often every rollout is timed, in rounds over all of them", default=3, at_least=1)
     model: str | None = text("the variant that the summary is about; absent: the first", default=None)
+    columns: tuple[str, ...] | None = texts("measures that its table and figures show; absent: the main ones",
+                                            *MEASURES, default=None)
     variant: tuple[Variant, ...] = sections(Variant)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self._check_names()
+        if self.columns == ():
+            raise SceneError(f"columns = []: name at least one of {', '.join(MEASURES)}, or leave the key out")
         base = load_scene(self.base)
         for section, why in (("simulation", "of which errors are compared"),
                              ("kernel", "through which fields are compared")):
             if getattr(base, section) is None:
                 raise SceneError(f'base = "{self.base}": has no [{section}], {why}; add it, or take another base')
+        if self.realisations is not None and base.seed in self.realisations:
+            raise SceneError(f"realisations = {list(self.realisations)}: {base.seed} is the seed of the base, on whose "
+                             "ground truth models are trained; leave it out")
         for variant in self.variant:
             problem = self._difference(variant)
             if problem:
@@ -76,9 +100,25 @@ class Comparison(Document):
         return Path(self.run) if self.run else Path("runs") / load_scene(self.base).name
 
     def ground_truth_of(self, name: str) -> Path:
-        """The run directory with the ground truth of a variant."""
+        """The run directory with the ground truth of a variant, on which its model is trained."""
         own = next(variant.run for variant in self.variant if variant.name == name)
         return Path(own) if own else self.run_directory
+
+    def runs_of(self, name: str, output: Path) -> list[PlannedRun]:
+        """What is run for a variant, in order: all of its scene; or, with realisations, the training, if there is one,
+        and the rollout on each of them."""
+        scene, truth, directory = self.scenes[name], self.ground_truth_of(name), output / name
+        if self.realisations is None:
+            return [PlannedRun(scene, directory, truth)]
+        runs, model = [], scene.model if "train" in scene.stages else None
+        if model is not None and model.path is None:
+            runs.append(PlannedRun(replace(scene, simulation=None), directory, truth))
+            model = replace(model, path=str(directory))
+        for seed in self.realisations:
+            unseen = replace(scene, seed=seed, model=model, training=None,
+                             simulation=replace(scene.simulation, start=0.0))
+            runs.append(PlannedRun(unseen, directory / f"seed-{seed}", truth.with_name(f"{truth.name}-seed-{seed}")))
+        return runs
 
     @property
     def _shared(self) -> list[str]:
@@ -116,7 +156,7 @@ class Comparison(Document):
             if ours != theirs:
                 return (f"[simulation] {key} = {ours} where the base has {theirs}: all variants start at the same "
                         "moment and are compared at the same times; change it for all of them, or not")
-        if scene.simulation.start is None and scene.window != base.window:
+        if self.realisations is None and scene.simulation.start is None and scene.window != base.window:
             return (f"[training] window = {scene.window:g} where the base has {base.window:g}: rollouts start where it "
                     "ends, and all must start at the same moment; give [simulation] start for all of them")
         ours, theirs = (other.training and other.training.truths for other in (scene, base))

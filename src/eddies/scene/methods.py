@@ -12,7 +12,7 @@ METHODS = {
     "learned": ("eddies.workflows.rollout.particle_run:LearnedRun", ("model",)),
     "none": ("eddies.workflows.rollout.particle_run:BallisticRun", ()),
     "wcsph": ("eddies.workflows.rollout.particle_run:SmoothedRun", ("density", "pairs")),
-    "eulerian": ("eddies.workflows.rollout.eulerian_run:EulerianRun", ("density",)),
+    "eulerian": ("eddies.workflows.rollout.eulerian_run:EulerianRun", ()),
 }
 
 

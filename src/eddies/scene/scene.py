@@ -58,9 +58,15 @@ class Scene(Document):
     @property
     def stages(self) -> tuple[str, ...]:
         """The stages that this scene asks for, in the order in which they run."""
-        learned = self.simulation is None or "model" in self.simulation.needs
+        learned = self.simulation is None or self.needs_model
         return tuple(stage.name for stage in STAGES.values() if (learned or stage.name != "train")
                      and (stage.section is None or getattr(self, stage.section) is not None))
+
+    @property
+    def needs_model(self) -> bool:
+        """Whether the rollout needs a trained model: to be moved by it, or for a coefficient of a coarse grid."""
+        on_grid = self.eulerian is not None and self.eulerian.closure == "learned"
+        return self.simulation is not None and ("model" in self.simulation.needs or on_grid)
 
     def inputs(self, stage: str) -> tuple[Stage, ...]:
         """The stages from whose products a stage makes its own: of those that it depends on the ones the scene has."""

@@ -6,12 +6,13 @@ cube [0, 2 pi)^3, the mean density is 1, and times are in the unit that follows 
 
 import math
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 from eddies.import_path import is_path, load
 from eddies.scene.methods import METHODS, needs_of
-from eddies.scene.values import (Section, boolean, choice, integer, integers, named, number, product_file, section,
-                                 text, texts)
+from eddies.scene.values import (KeyProblem, Section, boolean, choice, integer, integers, named, number, numbers,
+                                 product_file, section, text, texts)
 
 BOX_LENGTH = 2 * math.pi
 DEFAULT_WINDOW = 0.5
@@ -98,6 +99,9 @@ class Tracers(Section):
     field_cells: int | None = integer("grid of the stored fields; absent: 1.5 x particles_per_side, even",
                                       default=None, at_least=4)
     field_every: int = integer("frames per stored field", default=5, at_least=1)
+    states: tuple[float, ...] | None = numbers(
+        "fractions of the ground truth at which the unfiltered flow is stored too, for coarse grids to start from; "
+        "absent: 0 and where a rollout starts", default=None, at_least=0, below=1)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -227,14 +231,33 @@ class Wcsph(Section):
                              at_least=1)
 
 
+#: The closures of a coarse grid by what its equations are of.
+CLOSURES = {
+    "unfiltered": ("none", "smagorinsky", "dynamic-smagorinsky", "spectral", "learned"),
+    "filtered": ("none", "smagorinsky", "dynamic-smagorinsky", "gradient", "dynamic-mixed"),
+}
+
+
 @dataclass(frozen=True, kw_only=True)
 class Eulerian(Section):
     """Large-eddy simulation on a coarse grid, with method = "eulerian"; absent: the defaults."""
 
     cells: int | None = integer("of the coarse grid; absent: its Nyquist wavenumber is pi / filter width, at least 8",
                                 default=None, at_least=8)
-    smagorinsky: float = number("C_s of the eddy viscosity (C_s d)^2 (2 S:S)^(1/2), d the filter width; 0: no model",
-                                default=0.17, at_least=0)
+    fluid: str = choice("equations of motion on the coarse grid", "incompressible", "compressible",
+                        default="incompressible")
+    equations: str = choice("unfiltered: of the velocity, whose filtered part moves the particles; filtered: of the "
+                            "filtered velocity", *CLOSURES, default="unfiltered")
+    closure: str = choice("what stands for the scales that the grid, or the filter, leaves out; see Baselines",
+                          *dict.fromkeys(chain.from_iterable(CLOSURES.values())), default="none")
+    smagorinsky: float = number("C_s of closure smagorinsky, the eddy viscosity (C_s Delta)^2 (2 S:S)^(1/2)",
+                                default=0.17, above=0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.closure not in CLOSURES[self.equations]:
+            raise KeyProblem("eulerian", "closure", f' = "{self.closure}": with equations = "{self.equations}" it must '
+                             f"be one of {', '.join(CLOSURES[self.equations])}; change one of the two")
 
     def cells_for(self, filter_width: float) -> int:
         """Cells along each side: as given, or the fewest whose Nyquist wavenumber reaches pi / d."""

@@ -11,6 +11,7 @@ import json
 import logging
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -42,8 +43,9 @@ def run(comparison: Comparison, comm: Comm, output: Path, overwrite: bool, take_
         WorkAtStake: without `overwrite`, where work of other settings or numbers of ranks would be replaced.
         RunInUse: another job works in the directory, or in that of a variant.
     """
-    runs = [VariantRun(scene, output / name, comparison.ground_truth_of(name))
-            for name, scene in comparison.scenes.items()]
+    runs_of = {name: [VariantRun(plan.scene, plan.directory, plan.ground_truth)
+                      for plan in comparison.runs_of(name, output)] for name in comparison.scenes}
+    runs = [*chain.from_iterable(runs_of.values())]
     in_directories(comm, lambda: check_directories(runs))
     for variant in runs:
         check_ground_truth(comparison, variant, comm)
@@ -53,7 +55,7 @@ def run(comparison: Comparison, comm: Comm, output: Path, overwrite: bool, take_
         run_all(comparison, runs, comm, overwrite, take_over, run_stages)
         alone = comm.Split(comm.rank)
         try:
-            table = in_files(comm, output, lambda: rows(comparison, runs, alone, comm.size))
+            table = in_files(comm, output, lambda: rows(comparison, runs_of, alone, comm.size))
         finally:
             alone.Free()
         write(comparison, table, comm, output)
@@ -72,7 +74,7 @@ def run_all(comparison: Comparison, runs: Sequence[VariantRun], comm: Comm, over
     """Roll all variants out, then time them in rounds."""
     errors = comm.Dup()
     for done, variant in enumerate(runs):
-        log.info("compare: %s, %d of %d", variant.name, done + 1, len(runs))
+        log.info("compare: %s, %d of %d", variant.directory, done + 1, len(runs))
         look_at(variant, comm, overwrite, take_over)  # once more: hours may have passed
         in_directories(comm, lambda: variant.prepare(runs[:done], comm.size))
         variant.attempt(errors, lambda: variant.roll_out(run_stages))
@@ -92,8 +94,9 @@ def check_directories(runs: Sequence[VariantRun]) -> None:
 
 def check_ground_truth(comparison: Comparison, variant: VariantRun, comm: Comm) -> None:
     """Refuse a ground truth that is missing, of other settings than the variant's, or of too coarse frames."""
-    path, interval = variant.ground_truth / "ground_truth.h5", variant.scene.simulation.frame_interval
-    remedy = f"make it with `eddies dns {comparison.base} --output {variant.ground_truth}`"
+    path, simulation = variant.ground_truth / "ground_truth.h5", variant.scene.simulation
+    seed = "" if variant.scene.seed == comparison.base_scene.seed else f" --set seed={variant.scene.seed}"
+    remedy = f"make it with `eddies dns {comparison.base}{seed} --output {variant.ground_truth}`"
     try:
         with open_product(comm, path, "ground_truth") as file:
             fingerprint = read_provenance(file).get("fingerprint")
@@ -103,9 +106,9 @@ def check_ground_truth(comparison: Comparison, variant: VariantRun, comm: Comm) 
     if fingerprint != variant.scene.fingerprint("dns"):
         raise SceneError(f'{path}: was made with other settings than those of variant "{variant.name}"; {remedy}, or '
                          "give --run with another run directory")
-    if interval > kolmogorov_time:
-        raise SceneError(f'variant "{variant.name}": [simulation] frame_interval = {interval:g}: no frame before '
-                         f"t_eta = {kolmogorov_time:.3g}, at which errors are compared; lower it")
+    if simulation is not None and simulation.frame_interval > kolmogorov_time:
+        raise SceneError(f'variant "{variant.name}": [simulation] frame_interval = {simulation.frame_interval:g}: no '
+                         f"frame before t_eta = {kolmogorov_time:.3g}, at which errors are compared; lower it")
 
 
 def write(comparison: Comparison, table: list[dict[str, Any]], comm: Comm, output: Path) -> None:
@@ -115,7 +118,8 @@ def write(comparison: Comparison, table: list[dict[str, Any]], comm: Comm, outpu
     """
     parts = []
     if comm.rank == 0:
-        parts = sections(ErrorAgainstTime(table, comparison.subject, BASELINE), comparison.turnovers)
+        parts = sections(ErrorAgainstTime(table, comparison.subject, BASELINE, comparison.columns),
+                         comparison.turnovers)
     draw(comm, parts)
     in_directories(comm, lambda: write_files(comparison, table, parts, comm.size, output))
 

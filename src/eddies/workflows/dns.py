@@ -114,7 +114,7 @@ def follow_tracers(scene: Scene, file: File, flow: FlowRun, saved: Checkpoint | 
     """Release tracers into the flow, and store their frames, the filtered fields, the scales, and the forcing that
     stays on."""
     comm, names = flow.fluid.grid.decomposition.comm, saved.files if saved is not None else ()
-    layout = frame_layout(scene.tracers, flow.fluid.compressible)
+    layout = frame_layout(scene.tracers, flow.fluid.compressible, flow.fluid.grid.cutoff)
     with FrameSegments(comm, flow.guard.checkpoints.path, layout, names) as segments:
         run = TracerRun(scene, flow, segments, saved)
         run.follow()

@@ -51,7 +51,7 @@ def check_ground_truth(stages: Sequence[str], scene: Scene, comm: Comm, director
     path = directory / STAGES["dns"].file
     with open_product(comm, path, "ground_truth") as file:
         check_frames(stages, scene, scene.seen_in(directory), len(Trajectory(file, "tracers").times))
-        if "train" in stages or "simulate" in stages and "model" in scene.simulation.needs:
+        if {"train", "simulate"} & set(stages):
             from eddies.workflows.ground_truth.truth import GroundTruth  # torch, only here
             try:
                 GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes)).scales

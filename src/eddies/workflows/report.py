@@ -36,6 +36,7 @@ from eddies.report.rollout import section as rollout_section
 from eddies.scene.scene import Scene
 from eddies.workflows.feasibility import check_places
 from eddies.workflows.product_warnings import changed_truths, mixed_products, not_finite, others_trained_on
+from eddies.workflows.rollout.stored_spectra import read_spectra
 from eddies.workflows.run_directory.work import SECONDS
 
 log = logging.getLogger("eddies")
@@ -235,10 +236,10 @@ def _read_rollout(file: File, record: Run) -> list[Section]:
     fields = {name: FieldSeries(file, name) for name in FIELDS} if "fields" in file else None
     outside = read_table(file, "outside_training")["share"] if "outside_training" in file else None
     closure = read_table(file, "closure") if "closure" in file else None
-    rollout = Rollout(attributes, model, truth, fields, model.length, record.filter_width,
-                      record.eulerian, outside, closure)
+    rollout = Rollout(attributes, model, truth, read_spectra(file, record.eulerian), fields, model.length,
+                      record.filter_width, outside, closure)
     sections = [rollout_section(rollout)]
-    if rollout.forced and fields and record.stationary is not None and record.filter_width is not None:
+    if rollout.forced and record.stationary is not None and record.filter_width is not None:
         sections.append(forced.section(rollout, record.stationary))
     return sections
 

@@ -46,10 +46,10 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                                () if saved is None else saved.files)
         turnover = truth.reference["eddy_turnover_time"]
         count = int(np.ceil(settings.turnovers * turnover / settings.frame_interval - 1e-9))
-        with frames.segments as segments:
+        with frames.segments:
             outcome = Course(method, frames, count, settings.frame_interval, guard, saved).run()
             with create_product(comm, directory / "rollout.h5", "rollout", scene.provenance("simulate")) as file:
-                segments.assemble(file)
+                frames.write(file)
                 write_attributes(file.create_group("rollout"), {
                     **outcome, **method.description(), "method": settings.method,
                     "turnovers": outcome["time"] / turnover, "injection_rate": forcing_rate(injection(scene, truth)),

@@ -45,6 +45,12 @@ class Frames:
         self.times.append(time)
         self.steps.append(step)
 
+    def state_dict(self):
+        return {"times": self.times}
+
+    def load_state_dict(self, state):
+        self.times = state["times"]
+
 
 def course_of(comm, directory, looks=10**9, method=Standing, count=4, interval=0.25):
     guard = Guard(comm, directory, "settings", StopAtStep(comm, looks))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 from eddies.kernels.library import library, threads
@@ -9,7 +10,8 @@ from eddies.particles.smoothing_kernels import KNOTS
 from eddies.scene.scene import BOX_LENGTH, Eulerian, Initial, Scene
 from eddies.workflows.foreseen.cost_model import busiest_cells, cost, flow_bytes
 from eddies.workflows.foreseen.estimates import ground_truth_alone
-from eddies.workflows.foreseen.particle_cost import NEIGHBOR_BYTES, PROCESS_BYTES, particle_bytes, particle_cost
+from eddies.workflows.foreseen.particle_cost import (NEIGHBOR_BYTES, POINT_BYTES, PROCESS_BYTES, particle_bytes,
+                                                     particle_cost)
 from eddies.workflows.foreseen.particle_work import ParticleWork, particle_work
 from eddies.workflows.foreseen.rollout_course import EVALUATIONS, rollout_course
 from eddies.workflows.foreseen.stage_cost import FILE_BYTES_PER_SECOND, START_SECONDS, Speeds, StageCost
@@ -109,23 +111,29 @@ def rollout_cost(scene: Scene, ranks: int, speeds: Speeds) -> StageCost:
     """Of a rollout: its steps, its frames with those of the truth, and the files."""
     course, settings = rollout_course(scene), scene.simulation
     own, disk, memory = scene.tracers.particles / ranks, rollout_bytes(scene, course), PROCESS_BYTES
-    evaluation, first = 0.0, 0.0
+    evaluation, first, spectrum = 0.0, 0.0, 0.0
     parts = {"start": START_SECONDS + (TORCH_SECONDS if set(scene.stages) <= {"dns", "simulate", "report"} else 0.0)}
     if "model" in settings.needs:
         work = particle_work(scene)
         evaluation, first = (evaluation_seconds(scene, work, ranks, speeds, iterations)
                              for iterations in (work.iterations, COLD))
+        spectrum = first - evaluation_seconds(scene, work, ranks, speeds, 0)
         memory = particle_bytes(work, speeds.particles, ranks)
     parts["steps"] = first + (course.evaluations - 1) * evaluation
     if settings.method == "eulerian":
-        cells = (scene.eulerian or Eulerian()).cells_for(scene.tracers.filter_width)
-        coarse = replace(ground_truth_alone(scene), flow=replace(scene.flow, cells=cells), forcing=None, spin_up=None,
+        eulerian = scene.eulerian or Eulerian()
+        sound_speed = scene.flow.sound_speed if eulerian.fluid == "compressible" else None
+        flow = replace(scene.flow, cells=eulerian.cells_for(scene.tracers.filter_width), fluid=eulerian.fluid,
+                       sound_speed=sound_speed, precision=settings.precision)
+        coarse = replace(ground_truth_alone(scene), flow=flow, forcing=None, spin_up=None,
                          tracers=None, time=replace(scene.time, duration=1.0), initial=Initial(peak_wavenumber=1.0))
         moved = speeds.flow.tracers * busiest_cells(scene, ranks)
         parts["steps"] = course.steps * (cost(coarse, ranks, speeds.flow).seconds + moved)
         memory += flow_bytes(coarse, ranks)
     frames = course.intervals + 1 + true_frames(scene, course)
-    parts["frames"] = course.evaluations_of_frames * evaluation
+    # Spectra of particles are solves from nothing; without a model that has such solves they are not probed.
+    parts["frames"] = course.evaluations_of_frames * evaluation + frames * spectrum
+    memory += POINT_BYTES * scene.tracers.planes**2 * math.ceil(scene.tracers.planes / ranks)
     if scene.kernel:
         parts["frames"] += frames * speeds.training.averages.at(own)
     parts["files"] = disk / FILE_BYTES_PER_SECOND

@@ -10,6 +10,7 @@ from eddies.scene.scene import Scene
 from eddies.workflows.foreseen.cost_model import real_bytes
 from eddies.workflows.foreseen.estimates import flow_steps, largest_wavenumber, tracer_intervals
 from eddies.workflows.foreseen.rollout_course import RolloutCourse
+from eddies.workflows.ground_truth.frame_counts import whole_cells, whole_frames
 
 CHECKPOINTS = KEPT + 1       # with the one that is being written
 # Of the statistics: steps between two samples, numbers in each beside the spectrum.
@@ -36,8 +37,10 @@ def trajectory_bytes(scene: Scene, frames: int) -> int:
     tracers, density = scene.tracers, 1 if scene.flow.compressible else 0
     points, particles = [tracers.cells] * 3, tracers.particles
     frame = 2 * stored_bytes((particles, 3), "f8") + density * stored_bytes((particles,), "f8")
-    field = stored_bytes((3, *points), "f4") + density * stored_bytes((1, *points), "f4")
-    return 8 * particles + frames * frame + math.ceil(frames / tracers.field_every) * field
+    field, whole = (stored_bytes((3, *grid), "f4") + density * stored_bytes((1, *grid), "f4")
+                    for grid in (points, [whole_cells(largest_wavenumber(scene))] * 3))
+    return (8 * particles + frames * frame + math.ceil(frames / tracers.field_every) * field
+            + len(whole_frames(scene, frames)) * whole)
 
 
 def statistics_bytes(scene: Scene) -> int:
@@ -82,6 +85,8 @@ def rollout_bytes(scene: Scene, course: RolloutCourse) -> int:
 
 def stores_density(scene: Scene) -> bool:
     """Whether the frames of a rollout have a density."""
+    if scene.simulation.method == "eulerian":
+        return scene.eulerian is not None and scene.eulerian.fluid == "compressible"
     return scene.flow.compressible and ("density" in scene.simulation.needs or "model" in scene.simulation.needs
                                         and "density" in scene.model.reads)
 

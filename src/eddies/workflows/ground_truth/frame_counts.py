@@ -62,12 +62,33 @@ def rollout_start(scene: Scene, seen: float, frames: int, at_fields: Sequence[in
 
     Raises SceneError if none follows that leaves a frame of the ground truth to compare with.
     """
-    fraction = scene.simulation.start
-    wanted = last_seen(seen, frames) if fraction is None else int(fraction * (frames - 1))
+    wanted = _frame_at(scene.simulation.start, seen, frames)
     last = frames - 2 - round(scene.simulation.frame_interval / scene.tracers.frame_interval)
-    usable = [frame for frame in at_fields if max(wanted, 1) <= frame <= last]
+    usable = [frame for frame in at_fields if wanted <= frame <= last]
     if not usable:
         raise SceneError(f"[simulation] start: after frame {wanted} of {frames} no filtered field is followed by "
                          f"ground truth to compare with, {scene.simulation.frame_interval:g} later; lower start, "
                          "frame_interval, [training] window or [tracers] field_every, or raise [tracers] turnovers")
     return usable[0]
+
+
+def whole_frames(scene: Scene, frames: int) -> set[int]:
+    """The frames at which the unfiltered state is stored: the first with filtered fields at or after each of the
+    fractions that a scene names; without any, where its rollouts start, and where they start earliest."""
+    fractions: Sequence[float | None] = scene.tracers.states
+    if fractions is None:
+        fractions = () if scene.simulation is None else (0.0, scene.simulation.start)
+    # Where nothing of it is trained on, rollouts start earliest.
+    every, seen = scene.tracers.field_every, scene.training.window if scene.training else 0.0
+    return {math.ceil(_frame_at(fraction, seen, frames) / every) * every for fraction in fractions}
+
+
+def whole_cells(cutoff: int) -> int:
+    """Cells along each side, an even number, of the smallest grid that holds all modes of a flow up to a wavenumber."""
+    return 2 * cutoff + 2
+
+
+def _frame_at(fraction: float | None, seen: float, frames: int) -> int:
+    """The frame, not the first, at a fraction of the ground truth; the end of what is trained on, another fraction, for
+    None."""
+    return max(last_seen(seen, frames) if fraction is None else int(fraction * (frames - 1)), 1)

@@ -1,8 +1,9 @@
-"""What the ground truth stores of tracers: id-ordered frames, filtered fields and spectra."""
+"""What the ground truth stores of tracers: id-ordered frames, filtered fields, spectra, and here and there the whole
+unfiltered state."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -10,35 +11,36 @@ import numpy as np
 from eddies.clock import Clock
 from eddies.flow.statistics import energy_spectrum
 from eddies.flow.tracers import TracerParticles
-from eddies.io.frame_segments import FrameLayout, FrameSegments
+from eddies.io.frame_segments import FieldLayout, FrameLayout, FrameSegments
 from eddies.io.hdf5 import File, write_table
 from eddies.parallel.migration import IdOrder
 from eddies.parallel.slab import SlabDecomposition
 from eddies.scene.scene import BOX_LENGTH, Tracers
 from eddies.spectral.spectral_grid import SpectralGrid, restrict
+from eddies.workflows.ground_truth.frame_counts import whole_cells
 
 
-def frame_layout(settings: Tracers, compressible: bool) -> FrameLayout:
-    """What the ground truth holds of tracers and of the filtered flow."""
+def frame_layout(settings: Tracers, compressible: bool, cutoff: int) -> FrameLayout:
+    """What the ground truth holds of tracers, of the filtered flow, and of the flow itself, whose modes reach up to
+    `cutoff`."""
     columns, variables = {"position": (3,), "velocity": (3,)}, {"velocity": 3}
     if compressible:
         columns, variables = columns | {"density": ()}, variables | {"density": 1}
-    return FrameLayout(settings.particles, BOX_LENGTH, {"tracers": columns}, np.float64, settings.cells,
-                       {"filtered": variables})
+    return FrameLayout(settings.particles, BOX_LENGTH, {"tracers": columns}, np.float64, {
+        "filtered": FieldLayout(settings.cells, variables), "unfiltered": FieldLayout(whole_cells(cutoff), variables)})
 
 
 class TracerFrames:
     """Stores frames of tracers in segments, and collects the spectra.
 
-    Times are counted from the release. The density of a `compressible` flow is stored as well.
+    Times are counted from the release. The density of a `compressible` flow is stored as well. `whole` are the numbers
+    of the frames at which the unfiltered state is stored, as far as they have filtered fields.
     """
 
     def __init__(self, segments: FrameSegments, tracers: TracerParticles, settings: Tracers, released_at: float,
-                 compressible: bool) -> None:
+                 compressible: bool, whole: Collection[int]) -> None:
         self.segments, self.tracers, self.settings, self.released_at = segments, tracers, settings, released_at
-        fine = tracers.field.grid
-        slab = SlabDecomposition(fine.decomposition.comm, fine.decomposition.length, settings.cells)
-        self.coarse = SpectralGrid(slab, fine.precision, min(fine.cutoff, (settings.cells - 1) // 2))
+        self.coarse, self._whole = self._grid_of(settings.cells), whole
         self._compressible = compressible
         self._frames = 0
         self._spectra: dict[str, list] = {"time": [], "energy": [], "filtered": []}
@@ -55,6 +57,8 @@ class TracerFrames:
         self.segments.trajectories["tracers"].append(clock.steps, time, order.start, frame)
         if self._frames % self.settings.field_every == 0:
             self._store_fields(state, time)
+            if self._frames in self._whole:
+                self._store_whole(state, time)
         self._frames += 1
 
     def state_dict(self) -> dict[str, int | np.ndarray]:
@@ -71,6 +75,21 @@ class TracerFrames:
         wavenumber = np.arange(len(self._spectra["energy"][0]))
         columns = {name: np.array(rows) for name, rows in self._spectra.items()}
         write_table(file, "spectra", {"wavenumber": wavenumber, **columns})
+
+    def _grid_of(self, cells: int) -> SpectralGrid:
+        """A grid of so many cells with all modes that it can hold of the flow's."""
+        fine = self.tracers.field.grid
+        slab = SlabDecomposition(fine.decomposition.comm, fine.decomposition.length, cells)
+        return SpectralGrid(slab, fine.precision, min(fine.cutoff, (cells - 1) // 2))
+
+    def _store_whole(self, state: np.ndarray, time: float) -> None:
+        """Store all modes of velocity and ln(density), as values of velocity and density on the grid that just holds
+        them."""
+        fine = self.tracers.field.grid
+        grid = self._grid_of(whole_cells(fine.cutoff))
+        values = grid.backward(restrict(fine, grid, state))
+        planes = {"velocity": values[:3]} | ({"density": np.exp(values[3:])} if self._compressible else {})
+        self.segments.fields["unfiltered"].append(time, grid.decomposition.start, planes)
 
     def _store_fields(self, state: np.ndarray, time: float) -> None:
         field = self.tracers.field

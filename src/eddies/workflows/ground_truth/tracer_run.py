@@ -15,6 +15,7 @@ from eddies.io.frame_segments import FrameSegments
 from eddies.parallel.migration import IdOrder, id_block, migrate
 from eddies.scene.scene import Scene
 from eddies.workflows.ground_truth.flow_run import FlowRun
+from eddies.workflows.ground_truth.frame_counts import whole_frames
 from eddies.workflows.ground_truth.measured_scales import MEAN_DENSITY, measured_scales
 from eddies.workflows.ground_truth.tracer_frames import TracerFrames
 
@@ -30,7 +31,6 @@ class TracerRun:
     def __init__(self, scene: Scene, flow: FlowRun, segments: FrameSegments, saved: Checkpoint | None) -> None:
         self.scene, self.flow, self.segments, self.settings = scene, flow, segments, scene.tracers
         flow.begin_tracers(self, self.settings.forced)
-        compressible = flow.fluid.compressible
         field = FilteredField(flow.fluid.grid, self.settings.filter_width, self.settings.interpolation)
         self.comm = flow.fluid.grid.decomposition.comm
         if saved is None:
@@ -39,13 +39,13 @@ class TracerRun:
             slab = flow.fluid.grid.decomposition
             columns = release(slab, scene.seed, self.settings.particles_per_side, self.settings.placement)
             self.tracers = TracerParticles(field, columns, flow.state)
-            self.frames = TracerFrames(segments, self.tracers, self.settings, self.released_at, compressible)
+            self.frames = self._new_frames()
             self.frames.store(flow.state, flow.clock)
         else:
             self.released, self.released_at = saved["released"], saved["released_at"]
             self.interval, self.step, self.first_step = saved["interval"], saved["step"], saved["first_step"]
             self.tracers = TracerParticles(field, self._saved_columns(saved), flow.state)
-            self.frames = TracerFrames(segments, self.tracers, self.settings, self.released_at, compressible)
+            self.frames = self._new_frames()
             self.frames.load_state_dict(saved)
 
     @property
@@ -82,6 +82,10 @@ class TracerRun:
                    for name in ("position", "velocity")}
         return {"released": self.released, "released_at": self.released_at, "interval": self.interval,
                 "step": self.step, "first_step": self.first_step, **self.frames.state_dict(), **columns}
+
+    def _new_frames(self) -> TracerFrames:
+        return TracerFrames(self.segments, self.tracers, self.settings, self.released_at,
+                            self.flow.fluid.compressible, whole_frames(self.scene, self.intervals + 1))
 
     def _longest_step(self) -> float:
         interval = self.settings.frame_interval

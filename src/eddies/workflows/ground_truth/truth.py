@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
@@ -38,7 +39,7 @@ class GroundTruth:
     """
 
     def __init__(self, file: File, decomposition: SlabDecomposition) -> None:
-        self.decomposition = decomposition
+        self.decomposition, self._file = decomposition, file
         self.trajectory, self.fields = Trajectory(file, "tracers"), FieldSeries(file, "filtered")
         self.times, self.total = self.trajectory.times, self.trajectory.total
         self.reference = read_attributes(file, "reference")
@@ -46,6 +47,11 @@ class GroundTruth:
         self.forcing = Forcing(**read_attributes(file, "forcing")) if "forcing" in file else None
         self.has_density = "density" in self.trajectory.columns
         self._evolving = ("velocity", "density") if self.has_density else ("velocity",)
+
+    @cached_property
+    def states(self) -> FieldSeries:
+        """The unfiltered flow, at the few times at which it is stored."""
+        return FieldSeries(self._file, "unfiltered")
 
     @property
     def scales(self) -> ReferenceScales:
@@ -100,9 +106,11 @@ class GroundTruth:
     def field(self, index: int, variable: str, slab: SlabDecomposition | None = None) -> np.ndarray:
         """This rank's planes of a filtered field, or those of another slab, (components, z_local, y, x), in double
         precision."""
-        slab = slab or self.decomposition
-        planes = (slab.start, slab.stop)
-        return self._together(lambda: self.fields.read(index, variable, *planes)).astype(np.float64)
+        return self._planes(self.fields, index, variable, slab or self.decomposition)
+
+    def state(self, index: int, variable: str, slab: SlabDecomposition) -> np.ndarray:
+        """A slab's planes of a field of the unfiltered flow, likewise."""
+        return self._planes(self.states, index, variable, slab)
 
     def frame_of_field(self, index: int) -> int:
         """The frame taken at the time of a field."""
@@ -118,6 +126,9 @@ class GroundTruth:
         names = ("position", *self._evolving) if names is None else names
         columns = self._together(lambda: {name: self.trajectory.read(frame, name, start, stop) for name in names})
         return {"id": np.arange(start, stop, dtype=np.int64), **columns}
+
+    def _planes(self, series: FieldSeries, index: int, variable: str, slab: SlabDecomposition) -> np.ndarray:
+        return self._together(lambda: series.read(index, variable, slab.start, slab.stop)).astype(np.float64)
 
     def _together(self, read: Callable[[], Result]) -> Result:
         """What is read on this rank; what is wrong with the file on any is raised by all."""

@@ -68,15 +68,16 @@ class Course:
 
     def state_dict(self) -> dict[str, Any]:
         """All that goes on, for a checkpoint, beside the files of the frames."""
-        return {"rollout": {"clock": self.clock.state_dict(), "times": self.frames.times, "energy": self.energy,
-                            "ranks": self.comm.size, "seconds": self.seconds},
+        return {"rollout": {"clock": self.clock.state_dict(), "energy": self.energy, "ranks": self.comm.size,
+                            "seconds": self.seconds, "frames": self.frames.state_dict()},
                 **self.method.state_dict()}
 
     def _load(self, saved: Checkpoint) -> None:
         """Take what is no part of the method from a checkpoint."""
         known = saved["rollout"]
         self.clock.load_state_dict(known["clock"])
-        self.frames.times, self.energy = known["times"], known["energy"]
+        self.frames.load_state_dict(known["frames"])
+        self.energy = known["energy"]
         if known["ranks"] == self.comm.size:  # else they are no measure of the steps of this run
             self.seconds = known["seconds"]
 

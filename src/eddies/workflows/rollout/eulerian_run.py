@@ -1,4 +1,4 @@
-"""Eulerian large-eddy simulation on a coarse grid, with particles that follow its velocity."""
+"""Eulerian large-eddy simulation on a coarse grid, with particles that follow its filtered velocity."""
 
 from __future__ import annotations
 
@@ -12,19 +12,22 @@ import torch
 
 from eddies.clock import Clock
 from eddies.flow.courant import CourantLimit
+from eddies.flow.filtering import gaussian_transfer
 from eddies.flow.forcing import LinearForcing
 from eddies.flow.initial_fields import balanced_density
-from eddies.flow.navier_stokes import CompressibleFluid
-from eddies.flow.operators import gradient
+from eddies.flow.navier_stokes import FLUIDS, Fluid
+from eddies.flow.operators import gradient, project
 from eddies.flow.stability import quadratic_energy
-from eddies.flow.subgrid import Smagorinsky
+from eddies.flow.subgrid import Closure, DynamicStress, EddyDamping, SpectralViscosity, StressModel
 from eddies.flow.tracers import FilteredField, TracerParticles
 from eddies.io.checkpoint import Checkpoint
 from eddies.io.contiguous import Block
+from eddies.io.weights import load_weights
+from eddies.parallel.communicator import Comm
 from eddies.parallel.migration import migrate
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.particle_set import ParticleSet
-from eddies.scene.scene import Eulerian, Scene
+from eddies.scene.scene import Eulerian, Scene, SceneError
 from eddies.spectral.spectral_grid import SpectralGrid, restrict
 from eddies.time_stepping import ETDRK4
 from eddies.workflows.ground_truth.truth import GroundTruth
@@ -36,30 +39,34 @@ RUNAWAY_ENERGY = 100.0
 
 
 class EulerianRun:
-    """The fluid of the scene on a coarse grid, with a Smagorinsky model or without one, from a frame of the truth on.
+    """A fluid on a coarse grid, with a closure or without one, from a frame of the truth on.
 
-    It starts from those modes of the filtered velocity that the grid keeps, with the density in balance, so that the
-    start makes no sound. The true particles follow the resolved velocity.
+    It starts from those modes of the unfiltered velocity that the grid keeps, or, where its equations are those of the
+    filtered velocity, from the filter of them. The true particles follow the filtered velocity in either case.
     """
-
-    has_density = True
 
     def __init__(self, scene: Scene, truth: GroundTruth, start: int, directory: Path, device: torch.device) -> None:
         self.settings, self.longest_step = scene.eulerian or Eulerian(), scene.simulation.step
-        comm, length = truth.decomposition.comm, truth.decomposition.length
-        cells = self.settings.cells_for(scene.tracers.filter_width)
-        grid = SpectralGrid(SlabDecomposition(comm, length, cells), scene.flow.precision)
-        self.fluid = coarse_fluid(scene, truth, grid)
+        comm, length, width = truth.decomposition.comm, truth.decomposition.length, truth.scales.filter_width
+        cells = self.settings.cells_for(width)
+        grid = SpectralGrid(SlabDecomposition(comm, length, cells), scene.simulation.precision)
+        # What is left for the filter to do to the fluid's velocity, and what it has done to it.
+        self.filter_left, filter_passed = (0.0, width) if self.settings.equations == "filtered" else (width, 0.0)
+        self.fluid = coarse_fluid(scene, truth, grid, filter_passed, directory)
         self.stepper, self.clock = ETDRK4(self.fluid), Clock()
         self.step_limit = CourantLimit(grid, scene.time.courant, math.inf)
-        velocity = resolved_velocity(truth, grid, start)
-        self.state = np.concatenate([velocity, balanced_density(grid, velocity, self.fluid.sound_speed)[None]])
+        self.state = initial_state(truth, self.fluid, filter_passed, start)
         self.largest_energy = RUNAWAY_ENERGY * quadratic_energy(self.fluid, self.state)
         columns = truth.particles(start)
         columns = migrate(grid.decomposition, {name: columns[name] for name in ("id", "position")})
-        # A filter of no width: the resolved velocity is a filtered one already.
-        self.tracers = TracerParticles(FilteredField(grid, 0.0, scene.tracers.interpolation), columns, self.state)
+        self.tracers = TracerParticles(FilteredField(grid, self.filter_left, scene.tracers.interpolation), columns,
+                                       self.state)
         self.flow_seconds: list[float] = []
+
+    @property
+    def has_density(self) -> bool:
+        """Whether the particles of its frames have a density."""
+        return self.fluid.compressible
 
     @property
     def time(self) -> float:
@@ -74,6 +81,8 @@ class EulerianRun:
         step = left / math.ceil(left / longest - 1e-9)
         began = time.perf_counter()
         with np.errstate(over="ignore", invalid="ignore"):  # said in words below
+            if self.fluid.closure is not None:
+                self.fluid.closure.begin_step(self.state[:3])
             self.state = self.stepper(self.state, step)
             energy = quadratic_energy(self.fluid, self.state)
         self.flow_seconds.append(time.perf_counter() - began)
@@ -86,14 +95,18 @@ class EulerianRun:
         return None
 
     def frame(self, time: float) -> tuple[ParticleSet, torch.Tensor]:
-        """The particles with the density of the fluid, and their acceleration."""
-        columns = {**self.tracers.columns, "density": self.tracers.density(self.state)}
-        return ParticleSet.from_numpy(columns), torch.from_numpy(self._acceleration())
+        """The particles, with the density of a compressible fluid, and their acceleration."""
+        density = {"density": self.tracers.density(self.state)} if self.has_density else {}
+        return ParticleSet.from_numpy(self.tracers.columns | density), torch.from_numpy(self._acceleration())
 
     def _acceleration(self) -> np.ndarray:
-        """du/dt + v.grad u (n, 3) at the particles: the rate of change of their velocity, exact but for the splines."""
-        fluid, velocity = self.fluid, self.state[:3]
-        change = (fluid.linear(self.state) + fluid.nonlinear(self.state))[:3]
+        """du/dt + v.grad u (n, 3) of the filtered velocity u at the particles: the rate of change of their velocity,
+        exact but for the splines."""
+        fluid, transfer = self.fluid, self.tracers.field.transfer
+        velocity = transfer * self.state[:3]
+        if fluid.closure is not None:
+            fluid.closure.begin_step(self.state[:3])
+        change = transfer * (fluid.linear(self.state) + fluid.nonlinear(self.state))[:3]
         gradients = [gradient(fluid.grid, component) for component in velocity]
         spline = self.tracers.field.spline
         values = spline.at(spline.coefficients(np.concatenate([change, *gradients])), self.tracers.columns["position"])
@@ -130,26 +143,70 @@ class EulerianRun:
         the particles."""
         grid = self.fluid.grid
         seconds = {"flow_seconds_per_step": float(np.median(self.flow_seconds))} if self.flow_seconds else {}
+        constant = f", C_s = {self.settings.smagorinsky:g}" if self.settings.closure == "smagorinsky" else ""
         return {"integrator": "etdrk4", "cells": grid.cells, "largest_wavenumber": grid.cutoff,
-                "smagorinsky": self.settings.smagorinsky, **seconds}
+                "fluid": self.settings.fluid, "equations": self.settings.equations,
+                "closure": self.settings.closure + constant, **seconds}
 
 
-def coarse_fluid(scene: Scene, truth: GroundTruth, grid: SpectralGrid) -> CompressibleFluid:
-    """The fluid of a scene with the forcing of its particles and the model of what a coarse grid does not resolve."""
-    flow, constant = scene.flow, (scene.eulerian or Eulerian()).smagorinsky
-    forcing, subgrid = None, None
+def coarse_fluid(scene: Scene, truth: GroundTruth, grid: SpectralGrid, filter_passed: float,
+                 directory: Path) -> Fluid:
+    """The fluid of a coarse grid, whose velocity has passed a filter of some width or 0, with the forcing of the
+    scene's particles and the closure of the scales that the grid or the filter leaves out."""
+    settings, forcing = scene.eulerian or Eulerian(), None
     if (forced := injection(scene, truth)) is not None:
-        forcing = LinearForcing(grid, forced.injection_rate, forced.wavenumber)
-    if constant > 0:
-        subgrid = Smagorinsky(grid, constant, truth.scales.filter_width)
-    return CompressibleFluid(grid, flow.viscosity, flow.sound_speed, forcing, subgrid)
+        forcing = LinearForcing(grid, forced.injection_rate, forced.wavenumber, filter_passed)
+    sound_speed = scene.flow.sound_speed if settings.fluid == "compressible" else math.inf
+    return FLUIDS[settings.fluid](grid, scene.flow.viscosity, sound_speed, forcing,
+                                  closure_of(settings, grid, filter_passed, directory))
 
 
-def resolved_velocity(truth: GroundTruth, grid: SpectralGrid, frame: int) -> np.ndarray:
-    """The modes (3, kz, ky, kx) that a grid keeps of the filtered velocity stored at a frame."""
-    fields, slab = truth.fields, SlabDecomposition(grid.decomposition.comm, grid.decomposition.length,
-                                                   truth.fields.cells)
-    index = int(np.argmin(np.abs(fields.times - truth.times[frame])))
-    fine = SpectralGrid(slab, grid.precision, (slab.planes - 1) // 2)
-    velocity = truth.field(index, "velocity", slab).astype(fine.real)
-    return restrict(fine, grid, fine.forward(velocity))
+def closure_of(settings: Eulerian, grid: SpectralGrid, filter_width: float, directory: Path) -> Closure | None:
+    """The closure of the filtered equations, or, without a filter width, of the velocity that the grid cuts off at its
+    highest wavenumber k_c; Delta is d, or pi/k_c. What is learned is read from model.h5 in the directory."""
+    width = filter_width or math.pi / grid.cutoff
+    made = {
+        "none": lambda: None,
+        "smagorinsky": lambda: StressModel(grid, mixing_length=settings.smagorinsky * width),
+        "dynamic-smagorinsky": lambda: DynamicStress(grid, filter_width),
+        "spectral": lambda: SpectralViscosity(grid),
+        "learned": lambda: EddyDamping(grid, learned_rates(grid.decomposition.comm, directory)),
+        "gradient": lambda: StressModel(grid, filter_width=filter_width),
+        "dynamic-mixed": lambda: DynamicStress(grid, filter_width, with_gradient=True),
+    }
+    return made[settings.closure]()
+
+
+def learned_rates(comm: Comm, directory: Path) -> np.ndarray:
+    """The rates of eddy damping that a model has learned."""
+    _, weights = load_weights(comm, directory / "model.h5", "model")
+    return weights["terms.damping.rates"]
+
+
+def initial_state(truth: GroundTruth, fluid: Fluid, filter_passed: float, frame: int) -> np.ndarray:
+    """The modes that a fluid's grid keeps of the flow at a frame, its velocity passed through a filter; the density
+    as it was, or in balance with a filtered velocity.
+
+    Raises SceneError where the ground truth does not have the whole flow at that frame.
+    """
+    grid, series = fluid.grid, truth.states
+    at = [index for index, time in enumerate(series.times) if abs(time - truth.times[frame]) < 1e-9]
+    if not at:
+        known = ", ".join(f"{time / truth.times[-1]:.3g}" for time in series.times) or "nowhere"
+        raise SceneError(
+            f'[simulation] method = "eulerian": the rollout starts at {truth.times[frame] / truth.times[-1]:.3g} of the'
+            f" ground truth, which holds the unfiltered flow at {known}; start there ([simulation] start), or make the "
+            "ground truth again with this place in [tracers] states")
+    slab = SlabDecomposition(grid.decomposition.comm, grid.decomposition.length, series.cells)
+    whole = SpectralGrid(slab, grid.precision, (series.cells - 1) // 2)
+
+    def kept(values: np.ndarray) -> np.ndarray:
+        return restrict(whole, grid, whole.forward(values.astype(whole.real)))
+
+    velocity = kept(truth.state(at[0], "velocity", slab))
+    velocity *= gaussian_transfer(grid.wavenumber_squared, filter_passed).astype(grid.real)
+    if not fluid.compressible:
+        return project(grid, velocity)
+    if filter_passed:
+        return np.concatenate([velocity, balanced_density(grid, velocity, fluid.sound_speed)[None]])
+    return np.concatenate([velocity, kept(np.log(truth.state(at[0], "density", slab)))])

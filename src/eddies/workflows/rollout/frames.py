@@ -1,20 +1,23 @@
-"""What rollout.h5 stores: the model's particles, and at the same times the true ones through the same kernel."""
+"""What rollout.h5 stores: the model's particles, the true ones at the same times, what is measured of both alike."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
-from eddies.io.frame_segments import FrameLayout, FrameSegments
+from eddies.io.frame_segments import FieldLayout, FrameLayout, FrameSegments
+from eddies.io.hdf5 import File
 from eddies.parallel.migration import IdOrder, migrate
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.particle_field import ParticleField
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.smoothing_kernels import SmoothingKernel
 from eddies.workflows.ground_truth.truth import GroundTruth
+from eddies.workflows.rollout.particle_spectra import ParticleSpectra
 
 COLUMNS = {"position": (3,), "velocity": (3,), "density": (), "acceleration": (3,)}
 GRADIENT = {"velocity_gradient": (3, 3)}
@@ -26,40 +29,59 @@ class RolloutFrames:
 
     Velocity gradients at the particles and velocities on the grid of the filtered fields are averages with the
     learned kernel, for model and truth alike; without a kernel neither
-    they nor the filtered fields are stored. `times` are those of the model's frames. `density`: whether the model's
-    particles have one; it is stored where the true ones have one too. `segments` are the files in a directory that
-    take the frames; `names` those that are closed.
+    they nor the filtered fields are stored. Spectra are found where there is a filtered field to compare with, and of
+    the model alone where there is no true frame. `times` are those of the model's frames. `density`: whether the
+    model's particles have one; it is stored where the true ones have one too. `segments` are the files in a directory
+    that take the frames; `names` those that are closed.
     """
 
     def __init__(self, directory: Path, truth: GroundTruth, kernel: SmoothingKernel | None, start_time: float,
                  density: bool, names: Sequence[str] = ()) -> None:
         self.truth, self.kernel, self.start_time = truth, kernel, start_time
         self.times: list[float] = []
+        self.spectra = ParticleSpectra(truth)
         comm, length = truth.decomposition.comm, truth.decomposition.length
         cells = truth.fields.cells
         self._slab = SlabDecomposition(comm, length, cells)
         self._columns = {name: shape for name, shape in COLUMNS.items()
                          if name != "density" or density and truth.has_density}
         self._stored = self._columns | (GRADIENT if kernel else {})
-        layout = FrameLayout(truth.total, length, dict.fromkeys(("model", "truth"), self._stored), np.float32, cells,
-                             dict.fromkeys(FIELDS if kernel else (), {"velocity": 3}))
+        layout = FrameLayout(truth.total, length, dict.fromkeys(("model", "truth"), self._stored), np.float32,
+                             dict.fromkeys(FIELDS if kernel else (), FieldLayout(cells, {"velocity": 3})))
         self.segments = FrameSegments(comm, directory, layout, names)
 
     def store(self, step: int, time: float, particles: ParticleSet, acceleration: torch.Tensor) -> None:
         """Store the model's particles and what is true at that time; `time` counts from the start of the rollout."""
         self.times.append(time)
         self.segments.open(step)
-        self._store("model", step, time, {**particles.to_numpy(), "acceleration": as_numpy(acceleration)})
         frame = self._true_frame(time)
+        field = None if frame is None else self._true_field(frame)
+        measured = frame is None or field is not None
+        self._store("model", step, time, {**particles.to_numpy(), "acceleration": as_numpy(acceleration)}, measured)
         if frame is None:
             return
-        self._store("truth", step, time, self.truth.particles_with_rates(frame))
-        at = int(np.argmin(np.abs(self.truth.fields.times - self.truth.times[frame])))
-        if self.kernel is not None and abs(self.truth.fields.times[at] - self.truth.times[frame]) < 1e-9:
-            planes = self.truth.field(at, "velocity", self._slab)
+        self._store("truth", step, time, self.truth.particles_with_rates(frame), measured)
+        if self.kernel is not None and field is not None:
+            planes = self.truth.field(field, "velocity", self._slab)
             self.segments.fields["filtered"].append(time, self._slab.start, {"velocity": planes})
 
-    def _store(self, name: str, step: int, time: float, columns: dict[str, np.ndarray]) -> None:
+    def write(self, file: File) -> None:
+        """Write all that was stored into a product; collective."""
+        self.segments.assemble(file)
+        self.spectra.write(file)
+
+    def state_dict(self) -> dict[str, Any]:
+        """What a checkpoint must hold of the frames beside the files of `segments`."""
+        return {"times": self.times, "spectra": self.spectra.state_dict()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Inverse of `state_dict`."""
+        self.times = state["times"]
+        self.spectra.load_state_dict(state["spectra"])
+
+    def _store(self, name: str, step: int, time: float, columns: dict[str, np.ndarray], measured: bool) -> None:
+        if measured:
+            self.spectra.add(name, time, columns)
         columns = migrate(self._slab, {column: columns[column] for column in ("id", *self._columns)})
         if self.kernel is not None:
             position, velocity = (torch.from_numpy(columns[column]) for column in ("position", "velocity"))
@@ -78,3 +100,8 @@ class RolloutFrames:
         frame = int(np.argmin(np.abs(times - (self.start_time + time))))
         reached = abs(times[frame] - (self.start_time + time)) < 1e-6 and 0 < frame < len(times) - 1
         return frame if reached else None
+
+    def _true_field(self, frame: int) -> int | None:
+        """The filtered field of a frame of the ground truth, if it has one."""
+        field = int(np.argmin(np.abs(self.truth.fields.times - self.truth.times[frame])))
+        return field if abs(self.truth.fields.times[field] - self.truth.times[frame]) < 1e-9 else None
