@@ -58,7 +58,8 @@ def provenance(*made_from, seed=1, forcing=""):
     return {"scene": f'title = "synthetic"\nseed = {seed}\n{forcing}', "fingerprint": "0" * 64, "made_from": made_from}
 
 
-def write_ground_truth(comm, directory, tracers=True, cells=16, frames=0, stationary=False, density=True, seed=1):
+def write_ground_truth(comm, directory, tracers=True, cells=16, frames=0, stationary=False, density=True, seed=1,
+                       forced=False):
     """With `frames` of the tracers, and with a span over which the stationary state is averaged; without `density` as
     of an incompressible fluid."""
     flow, origin = RandomFlow(seed), provenance(seed=seed, forcing='[forcing]\nwavenumber = 2.0\n' * stationary)
@@ -78,6 +79,8 @@ def write_ground_truth(comm, directory, tracers=True, cells=16, frames=0, statio
             write_table(file, "spectra", decaying_spectra())
         if frames:
             write_tracers(file, frames, density)
+        if forced:
+            write_attributes(file.create_group("forcing"), {"injection_rate": 0.5, "wavenumber": 2.0})
         if stationary:
             spectra = np.outer(wiggle, decaying_spectra()["energy"][0])
             write_table(file, "spectra_of_statistics", {"energy": spectra})
@@ -174,7 +177,7 @@ class PerturbedFlow:
 
 
 def write_rollout(comm, directory, status="complete", total=600, cells=16, frames=9, broken=None, injection_rate=0.0,
-                  density=True):
+                  truth_injection_rate=0.0, density=True):
     """The truth ends three frames before the model. Velocities of the model's frame `broken` are NaN."""
     start = np.random.default_rng(5).uniform(0, LENGTH, (total, 3))
     shapes = {"position": (3,), "velocity": (3,), "acceleration": (3,), "velocity_gradient": (3, 3)}
@@ -183,7 +186,7 @@ def write_rollout(comm, directory, status="complete", total=600, cells=16, frame
     attributes = {"status": status, "start_time": 0.6, "time_step": 0.02, "integrator": "verlet",
                   "method": "learned", "terms": "pressure, pairs", "turnovers": times[-1] / TURNOVER,
                   "seconds_per_step": 0.031, "particles": total, "ranks": 1, "eddy_turnover_time": TURNOVER,
-                  "injection_rate": injection_rate}
+                  "injection_rate": injection_rate, "truth_injection_rate": truth_injection_rate}
     origin = provenance("ground_truth", "kernel", "model")
     with create_product(comm, directory / "rollout.h5", "rollout", origin) as file:
         write_attributes(file.create_group("rollout"), attributes)

@@ -97,7 +97,7 @@ def test_frames_that_are_enough_are_found(frames, every):
     at_fields = range(0, frames, every)
     usable = [frame for frame in at_fields if frame >= max(int(0.5 * (frames - 1)), 1) and frame + 5 <= frames - 2]
     if usable:
-        assert rollout_start(tiny, frames, at_fields) == usable[0]
+        assert rollout_start(tiny, 0.5, frames, at_fields) == usable[0]
     else:
         with pytest.raises(SceneError, match="start: after frame"):
-            rollout_start(tiny, frames, at_fields)
+            rollout_start(tiny, 0.5, frames, at_fields)

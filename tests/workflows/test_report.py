@@ -190,12 +190,28 @@ def test_a_forced_rollout_is_compared_with_the_stationary_state_if_there_is_one(
     write_ground_truth(comm, tmp_path, stationary=True)
     report.run(tmp_path, comm)
     metrics, page = written(tmp_path)
-    assert "The model is forced and the true tracers decay" in page and "forced" in figures(tmp_path)
+    assert "The model is forced with a power of 0.5 a mass, and the flow of the true tracers is not forced" in page
+    assert "forced" in figures(tmp_path)
     assert all(math.isfinite(value) for value in numbers(metrics["forced"].values()))
     write_ground_truth(comm, tmp_path)
     report.run(tmp_path, comm)
     metrics, page = written(tmp_path)
-    assert "The model is forced and the true tracers decay" in page and "forced" not in metrics
+    assert "from the start on they are two flows" in page and "forced" not in metrics
+
+
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.mpi(1)
+def test_a_rollout_that_is_forced_as_its_truth_is_compared_with_that_and_with_the_stationary_state(comm, tmp_path):
+    write_rollout(comm, tmp_path, injection_rate=0.5, truth_injection_rate=0.5)
+    write_ground_truth(comm, tmp_path, stationary=True, frames=9, forced=True)
+    report.run(tmp_path, comm)
+    _, page = written(tmp_path)
+    assert "Model and truth are forced alike, with a power of 0.5 a mass" in page and "two flows" not in page
+    assert "which stays forced with a power of 0.5 a mass" in page and "forced" in figures(tmp_path)
+    write_rollout(comm, tmp_path, truth_injection_rate=0.5)
+    report.run(tmp_path, comm)
+    _, page = written(tmp_path)
+    assert "The model is not forced, and the flow of the true tracers is forced with a power of 0.5" in page
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -116,8 +116,7 @@ def tracer_problems(scene: Scene) -> Iterator[str]:
     """Stored fields no finer than the simulation; a flow that moves, and for a model one that changes."""
     tracers, initial = scene.tracers, scene.initial
     if tracers and tracers.forced and scene.forcing is None:
-        yield ("[tracers] forced = true: there is no [forcing] that could stay on; add it with an injection_rate, or "
-               "remove the key")
+        yield "[tracers] forced = true: there is no [forcing] that could stay on; add it, or remove the key"
     if tracers and tracers.forced and scene.model and any(
             isinstance(settings, Forcing) for settings in scene.model.settings.values()):
         yield ('[model] terms: "forcing": with [tracers] forced = true the forcing of the ground truth is added by '

@@ -48,7 +48,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         if flow.phase == "spin-up":
             spin_up(scene.spin_up.turnovers, flow)
         if scene.tracers is not None:
-            follow_tracers(scene, scene.seen_in(directory), file, flow, saved if flow.phase == "tracers" else None)
+            follow_tracers(scene, file, flow, saved if flow.phase == "tracers" else None)
         else:
             run_for(scene.time.duration, flow)
             write_final_fields(file, flow)
@@ -110,13 +110,13 @@ def stationary_span(settings: SpinUp, history: FlowHistory) -> dict[str, float]:
     return {"start": times[first], "end": times[last]}
 
 
-def follow_tracers(scene: Scene, seen: float, file: File, flow: FlowRun, saved: Checkpoint | None) -> None:
+def follow_tracers(scene: Scene, file: File, flow: FlowRun, saved: Checkpoint | None) -> None:
     """Release tracers into the flow, and store their frames, the filtered fields, the scales, and the forcing that
     stays on."""
     comm, names = flow.fluid.grid.decomposition.comm, saved.files if saved is not None else ()
     layout = frame_layout(scene.tracers, flow.fluid.compressible, flow.fluid.grid.cutoff)
     with FrameSegments(comm, flow.guard.checkpoints.path, layout, names) as segments:
-        run = TracerRun(scene, seen, flow, segments, saved)
+        run = TracerRun(scene, flow, segments, saved)
         run.follow()
         segments.assemble(file)
     write_attributes(file.create_group("reference"), {

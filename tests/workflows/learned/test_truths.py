@@ -200,9 +200,9 @@ def test_a_rollout_is_forced_as_its_truth_was_and_starts_after_what_was_seen(com
                            (0.3, 0.3)):
             found = injection(replace(scene, simulation=replace(scene.simulation, injection=word)), truth)
             assert (found and found.injection_rate) == rate
-        coarse = EulerianRun(scene, truth, 3, tmp_path, CPU)
-        assert coarse.fluid.forcing.injection_rate == 1.0 and coarse.fluid.forcing.wavenumber == 2.0
         ends = truth.last_frame_seen(scene.training.window)
+        coarse = EulerianRun(scene, truth, ends, tmp_path, CPU)
+        assert coarse.fluid.forcing.injection_rate == 1.0 and coarse.fluid.forcing.wavenumber == 2.0
         # Every frame has a field; at the first there are no rates.
         assert start_frame(scene, truth, tmp_path / "own") == ends > 2
         assert start_frame(trained_on(scene, other), truth, tmp_path / "own") == 1

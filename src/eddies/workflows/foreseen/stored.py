@@ -40,7 +40,7 @@ def trajectory_bytes(scene: Scene, frames: int) -> int:
     field, whole = (stored_bytes((3, *grid), "f4") + density * stored_bytes((1, *grid), "f4")
                     for grid in (points, [whole_cells(largest_wavenumber(scene))] * 3))
     return (8 * particles + frames * frame + math.ceil(frames / tracers.field_every) * field
-            + len(whole_frames(scene, scene.seen_in(scene.directory), frames)) * whole)
+            + len(whole_frames(scene, frames)) * whole)
 
 
 def statistics_bytes(scene: Scene) -> int:

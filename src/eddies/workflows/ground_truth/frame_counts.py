@@ -72,13 +72,14 @@ def rollout_start(scene: Scene, seen: float, frames: int, at_fields: Sequence[in
     return usable[0]
 
 
-def whole_frames(scene: Scene, seen: float, frames: int) -> set[int]:
+def whole_frames(scene: Scene, frames: int) -> set[int]:
     """The frames at which the unfiltered state is stored: the first with filtered fields at or after each of the
     fractions that a scene names; without any, where its rollouts start, and where they start earliest."""
     fractions: Sequence[float | None] = scene.tracers.states
     if fractions is None:
         fractions = () if scene.simulation is None else (0.0, scene.simulation.start)
-    every = scene.tracers.field_every
+    # Where nothing of it is trained on, rollouts start earliest.
+    every, seen = scene.tracers.field_every, scene.training.window if scene.training else 0.0
     return {math.ceil(_frame_at(fraction, seen, frames) / every) * every for fraction in fractions}
 
 
@@ -88,5 +89,6 @@ def whole_cells(cutoff: int) -> int:
 
 
 def _frame_at(fraction: float | None, seen: float, frames: int) -> int:
-    """The frame, not the first, at a fraction of the ground truth; the end of what is trained on for None."""
+    """The frame, not the first, at a fraction of the ground truth; the end of what is trained on, another fraction, for
+    None."""
     return max(last_seen(seen, frames) if fraction is None else int(fraction * (frames - 1)), 1)

@@ -24,14 +24,12 @@ class TracerRun:
     """Releases tracers into a flow, its forcing off unless [tracers] forced, or takes them from a checkpoint, and
     follows them.
 
-    `seen` is the fraction of the frames that a model is trained on, after which rollouts start. `released` is the
-    sample of the flow at the release. Within a frame interval all steps are equal: the longest
+    `released` is the sample of the flow at the release. Within a frame interval all steps are equal: the longest
     allowed ones that divide it, so that frames are equally spaced.
     """
 
-    def __init__(self, scene: Scene, seen: float, flow: FlowRun, segments: FrameSegments,
-                 saved: Checkpoint | None) -> None:
-        self.scene, self._seen, self.flow, self.segments, self.settings = scene, seen, flow, segments, scene.tracers
+    def __init__(self, scene: Scene, flow: FlowRun, segments: FrameSegments, saved: Checkpoint | None) -> None:
+        self.scene, self.flow, self.segments, self.settings = scene, flow, segments, scene.tracers
         flow.begin_tracers(self, self.settings.forced)
         field = FilteredField(flow.fluid.grid, self.settings.filter_width, self.settings.interpolation)
         self.comm = flow.fluid.grid.decomposition.comm
@@ -87,7 +85,7 @@ class TracerRun:
 
     def _new_frames(self) -> TracerFrames:
         return TracerFrames(self.segments, self.tracers, self.settings, self.released_at,
-                            self.flow.fluid.compressible, whole_frames(self.scene, self._seen, self.intervals + 1))
+                            self.flow.fluid.compressible, whole_frames(self.scene, self.intervals + 1))
 
     def _longest_step(self) -> float:
         interval = self.settings.frame_interval
