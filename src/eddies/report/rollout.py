@@ -62,8 +62,14 @@ class Rollout:
 
     @property
     def forced(self) -> bool:
-        """Whether its large scales were forced, as the truth's are not."""
-        return float(self.attributes.get("injection_rate", 0.0)) > 0
+        """Whether its large scales were forced."""
+        return self.powers[0] > 0
+
+    @property
+    def powers(self) -> tuple[float, float]:
+        """With which its large scales were forced and those of the true tracers, a mass."""
+        model, truth = (float(self.attributes.get(name, 0.0)) for name in ("injection_rate", "truth_injection_rate"))
+        return model, truth
 
     @property
     def method(self) -> str:
