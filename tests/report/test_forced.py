@@ -53,7 +53,7 @@ def test_a_model_that_is_the_stationary_flow_but_for_a_factor():
     assert found["model"] == pytest.approx(energy * blocks.mean())
     assert found["standard error"] == pytest.approx(energy * np.std(blocks, ddof=1) / np.sqrt(3))
     assert found["deviation"] == pytest.approx(energy * np.std(FACTORS[7:] ** 2))
-    assert abs(found["trend per turnover"]) < found["its error"]
+    assert abs(found["trend per turnover"]) < found["error of the trend"]
     # The samples count a quarter, a half and a quarter.
     whole = SPECTRUM.sum()
     assert found["stationary flow"] == pytest.approx(whole, rel=1e-12)
@@ -81,6 +81,20 @@ def test_a_rollout_that_broke_at_once_is_not_compared():
     run, _ = rollout(np.array([np.nan, 1.0]))
     shown = section(run, stationary())
     assert shown.notices == ["It is not compared: the model has no finite frame."] and not shown.metrics
+
+
+def test_true_tracers_that_are_forced_too_are_averaged_over_the_same_time():
+    """And not where they are not, or end before."""
+    run, _ = rollout()
+    alike = {**vars(run), "attributes": {**run.attributes, "truth_injection_rate": 0.5}}
+    longer = Stored(run.truth.columns, np.append(FACTORS, [9.0, 9.0]))
+    shown = section(Rollout(**{**alike, "truth": longer}), stationary())
+    found = {metric.key: metric.value for metric in shown.metrics}
+    for name in ("energy", "acceleration_rms"):
+        assert found[f"true_{name}"]["true tracers"] == found[name]["model"]
+        assert found[f"true_{name}"]["standard error"] == found[name]["standard error"]
+    for others in (alike, {**vars(run), "truth": longer}):
+        assert "true_energy" not in {metric.key for metric in section(Rollout(**others), stationary()).metrics}
 
 
 def test_only_a_rollout_with_an_injection_is_forced():

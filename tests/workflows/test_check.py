@@ -289,9 +289,6 @@ def test_ghost_planes_limit_the_ranks():
     for overrides, ghosts in ((["simulation.step=0.2"], 3), (["simulation.skin=1"], 4)):
         assert most_ranks(load_scene("tiny", overrides))["ghost planes of the resolved velocity"] == 20 // ghosts
     assert "ghost planes of the resolved velocity" not in most_ranks(load_scene("tiny", ["model.preset=paper"]))
-    # Spectra of a rollout are found on the same grid, whatever moves its particles.
-    for scene in (load_scene("tiny", ["simulation.method=none"]), load_scene("tiny", ["model.preset=paper"])):
-        assert most_ranks(scene)["ghost planes of the grid for a rollout's spectra"] == 20 // 3
 
 
 @pytest.mark.mpi(1)

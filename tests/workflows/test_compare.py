@@ -121,6 +121,9 @@ def check_rows(rows):
         assert 0 < row["velocity_error_early"] < 0.5 and 0.5 < row["energy_ratio"] < 2
         assert row["wall_seconds_low"] <= row["wall_seconds"] <= row["wall_seconds_high"]
         assert row["core_seconds"] == pytest.approx(2 * row["wall_seconds"])
+        # Of the particles that all are compared with.
+        assert row["spectrum_error_floor"] == learned["spectrum_error_floor"] < row["spectrum_error"]
+        assert row["velocity_kl_floor"] == learned["velocity_kl_floor"] and row["tetrad_size_error"] > 0
     assert none["acceleration_error"] == 1 and none["training_seconds"] is None
     assert learned["training_seconds"] == longer["training_seconds"] > 0
     assert (learned["time_step"], longer["time_step"]) == (pytest.approx(0.05), pytest.approx(0.1))
@@ -221,7 +224,7 @@ def test_a_table_that_cannot_be_written_is_told_by_all(comm, tmp_path, monkeypat
         (tmp_path / "comparison.csv").mkdir()
     comm.Barrier()
     monkeypatch.setattr(compare, "sections", lambda *_: [Section("errors", "Errors")])
-    comparison = SimpleNamespace(name="small", title="small", subject="learned", turnovers=1.0, scenes={},
+    comparison = SimpleNamespace(name="small", title="small", subject="learned", turnovers=1.0, scenes={}, columns=None,
                                  base_scene=load_scene("tiny"))
     with pytest.raises(WriteError, match="comparison.csv: cannot be written .Is a directory.; choose another --output"):
         compare.write(comparison, [], comm, tmp_path)

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from eddies.analysis.against_truth import EDGES, first_broken_time, normalized_invariants
+from eddies.analysis.against_truth import EDGES, ParticleFrames, first_broken_time, normalized_invariants
 from eddies.analysis.block_averages import Blocks, Estimate
 from eddies.analysis.isotropic_turbulence import StationarySpan
 from eddies.analysis.pdfs import bin_probabilities, gaussian, kl_divergence, pdf, standardized
@@ -19,27 +19,54 @@ from eddies.report.rollout import WITHOUT_KERNEL, Rollout
 
 
 @dataclass(frozen=True)
+class LateFrames:
+    """Energy <v.v>/2 and rms of a component of the acceleration of particles at frames over which they are averaged,
+    (m,) each, with the blocks of these frames, a turnover or more each."""
+
+    blocks: Blocks
+    energy: np.ndarray
+    acceleration_rms: np.ndarray
+
+    @classmethod
+    def of(cls, run: ParticleFrames, frames: np.ndarray, turnover: float) -> "LateFrames":
+        """Of frames of a trajectory."""
+        return cls(Blocks.of(run.times[frames] / turnover, 1.0),
+                   np.array([mean_energy(run, frame) for frame in frames]),
+                   np.array([np.std(run.read(frame, "acceleration")) for frame in frames]))
+
+    def averages(self, name: str, whose: str) -> dict[str, float]:
+        """Mean, named `whose`, and slope per turnover of "energy" or "acceleration_rms", each with its standard error,
+        and the standard deviation in time."""
+        samples = getattr(self, name)
+        mean, slope = self.blocks.mean(samples), self.blocks.trend(samples)
+        return {whose: mean.value, "standard error": mean.error, "trend per turnover": slope.value,
+                "error of the trend": slope.error, "deviation": float(samples.std())}
+
+
+@dataclass(frozen=True)
 class ForcedStatistics:
     """A forced rollout and the stationary flow that it should be like.
 
     Parameters
     ----------
     times, energy : of the model, (frames,), <v.v>/2.
-    late : its frames in the second half, over which it is averaged. blocks : of these, at least a turnover each.
+    late : its frames in the second half, over which it is averaged; model : of these.
+    truth : of the true tracers at the same times, where they are forced too and last as long.
     flow_energy : mean of the filtered flow's energy over its stationary span, by blocks too; flow_deviation : its
         standard deviation in time.
-    wavenumber, flow_spectrum : the flow's mean filtered spectrum, (shells,). spectra : of the model, at times
-        `spectra_times`, (m, shells). cutoff : k_d, or the last of these shells.
+    wavenumber, flow_spectrum : the flow's mean filtered spectrum, (shells,). spectra : of the model, (m, shells), at
+        the times of `spectra_blocks`. cutoff : k_d, or the last of these shells.
     velocity, acceleration : of the model's late frames, divided by the standard deviation of their frame.
     flow_velocity, flow_acceleration : the same of the true tracers at the start, when they had just been forced.
-    acceleration_rms, flow_acceleration_rms : of one component, (late frames,) and at the start.
+    flow_acceleration_rms : of one component, at the start.
     qr_kl : divergence of the Q-R joint PDFs, each in units of its own enstrophy; None without a kernel.
     """
 
     times: np.ndarray
     energy: np.ndarray
     late: np.ndarray
-    blocks: Blocks
+    model: LateFrames
+    truth: LateFrames | None
     flow_energy: Estimate
     flow_deviation: float
     wavenumber: np.ndarray
@@ -51,7 +78,6 @@ class ForcedStatistics:
     flow_velocity: np.ndarray
     acceleration: np.ndarray
     flow_acceleration: np.ndarray
-    acceleration_rms: np.ndarray
     flow_acceleration_rms: float
     qr_kl: float | None
 
@@ -66,33 +92,26 @@ class ForcedStatistics:
             raise ValueError("the model has no finite frame")
         times = run.model.times[frames]
         late = frames[times >= times[-1] / 2]
-        energy = np.array([0.5 * np.mean(np.sum(run.model.read(frame, "velocity") ** 2, axis=1)) for frame in frames])
         shells = np.arange(span.spectra.shape[1])
         transfer = np.exp(-((shells * run.filter_width) ** 2) / 12)
         flow_energy = span.spectra @ transfer
         measured = run.spectra.model
         known, chosen = min(measured["wavenumber"].size, len(shells)), _between(measured["time"], times[-1])
-        accelerations = [run.model.read(frame, "acceleration") for frame in late]
         flow = {name: run.truth.read(0, name) for name in ("velocity", "acceleration")}
         return cls(
-            times, energy, late, Blocks.of(run.model.times[late], run.turnover),
+            times, np.array([mean_energy(run.model, frame) for frame in frames]), late,
+            LateFrames.of(run.model, late, run.turnover), _late_truth(run, times[-1]),
             span.block_mean(flow_energy), span.average(flow_energy)[1],
             shells[:known], (transfer * span.spectrum)[:known],
-            Blocks.of(measured["time"][chosen], run.turnover), measured["energy"][chosen, :known],
+            Blocks.of(measured["time"][chosen] / run.turnover, 1.0), measured["energy"][chosen, :known],
             min(np.pi / run.filter_width, known - 1.0),
             np.concatenate([standardized(run.model.read(frame, "velocity")) for frame in late]),
             standardized(flow["velocity"]),
-            np.concatenate([standardized(acceleration) for acceleration in accelerations]),
-            standardized(flow["acceleration"]),
-            np.array([np.std(acceleration) for acceleration in accelerations]), float(np.std(flow["acceleration"])),
+            np.concatenate([standardized(run.model.read(frame, "acceleration")) for frame in late]),
+            standardized(flow["acceleration"]), float(np.std(flow["acceleration"])),
             None if run.fields is None else invariant_divergence(
                 [run.model.read(frame, "velocity_gradient") for frame in late],
                 run.truth.read(0, "velocity_gradient")))
-
-    @property
-    def late_energy(self) -> np.ndarray:
-        """Energy of the late frames."""
-        return self.energy[len(self.energy) - len(self.late):]
 
     @property
     def spectrum(self) -> np.ndarray:
@@ -110,6 +129,17 @@ class ForcedStatistics:
         flow, model = (bin_probabilities(values, EDGES[column])
                        for values in (getattr(self, f"flow_{column}"), getattr(self, column)))
         return kl_divergence(flow, model)
+
+
+def mean_energy(run: ParticleFrames, frame: int) -> float:
+    """<v.v>/2 of a frame."""
+    return 0.5 * float(np.mean(np.sum(run.read(frame, "velocity") ** 2, axis=1)))
+
+
+def _late_truth(run: Rollout, end: float) -> LateFrames | None:
+    """The true tracers in the second half of what ends at a time, if they are forced and last until then."""
+    reached = run.powers[1] > 0 and run.truth.times[-1] >= end * (1 - 1e-9)
+    return LateFrames.of(run.truth, _between(run.truth.times, end), run.turnover) if reached else None
 
 
 def _between(times: np.ndarray, end: float) -> np.ndarray:
@@ -132,8 +162,8 @@ def section(run: Rollout, span: StationarySpan) -> Section:
         found, turnover = ForcedStatistics.of(run, span), run.turnover
     except ValueError as error:
         return Section("forced", title, notices=[f"It is not compared: {error}."])
-    energy, flow_energy, error = found.blocks.mean(found.late_energy), found.flow_energy, found.spectrum_error
-    begin, count = run.model.times[found.late[0]], len(found.blocks.members)
+    energy, flow_energy, error = found.model.averages("energy", "model"), found.flow_energy, found.spectrum_error
+    begin, count = run.model.times[found.late[0]], len(found.model.blocks.members)
     shown = Section(
         "forced", title,
         f"The model is forced with a power of {float(run.attributes['injection_rate']):.3g} a mass. Its averages, from "
@@ -143,12 +173,10 @@ def section(run: Rollout, span: StationarySpan) -> Section:
         "those of the true tracers at the start, each in units of its own standard deviation.",
         metrics=[
             Metric("energy", "kinetic energy", {
-                **_with_trend(found.blocks, found.late_energy, turnover), "deviation": float(found.late_energy.std()),
-                "stationary flow": flow_energy.value, "its standard error": flow_energy.error,
+                **energy, "stationary flow": flow_energy.value, "its standard error": flow_energy.error,
                 "its deviation": found.flow_deviation}),
             Metric("acceleration_rms", "rms of an acceleration component", {
-                **_with_trend(found.blocks, found.acceleration_rms, turnover),
-                "deviation": float(found.acceleration_rms.std()), "flow at the start": found.flow_acceleration_rms}),
+                **found.model.averages("acceleration_rms", "model"), "flow at the start": found.flow_acceleration_rms}),
             Metric("spectrum_error", "error of the mean spectrum, rms of ln(E/E_filtered) over 1 ≤ k ≤ k_d",
                    {"model": error.value, "standard error": error.error}),
             Metric("velocity_kl", "KL divergence of the velocity PDF, standardised", found.divergence("velocity")),
@@ -156,19 +184,17 @@ def section(run: Rollout, span: StationarySpan) -> Section:
                    found.divergence("acceleration")),
             Metric("qr_kl", "KL divergence of the Q–R joint PDF, standardised", found.qr_kl, WITHOUT_KERNEL),
         ])
+    if found.truth is not None:
+        shown.metrics += [Metric(f"true_{name}", f"the same of the true tracers at these times: {words}",
+                                 found.truth.averages(name, "true tracers"))
+                          for name, words in (("energy", "energy"), ("acceleration_rms", "acceleration"))]
     shown.add_figure(
         "forced", "Forced rollout", forced_rollout(found, turnover, run.filter_wavenumber),
-        f"Energy of the model {_shown(energy)}, of the stationary flow {_shown(flow_energy)} (± is the standard error; "
-        f"band: standard deviation in time). Rms of ln(E/E_filtered) of the mean spectra up to k_d (dotted): "
+        f"Energy of the model {_shown(found.model.blocks.mean(found.model.energy))}, of the stationary flow "
+        f"{_shown(flow_energy)} (± is the standard error; band: standard deviation in time). "
+        f"Rms of ln(E/E_filtered) of the mean spectra up to k_d (dotted): "
         f"{_shown(error)}. KL of the acceleration PDF {found.divergence('acceleration'):.2g}.")
     return shown
-
-
-def _with_trend(blocks: Blocks, samples: np.ndarray, turnover: float) -> dict[str, float]:
-    """Mean and slope per turnover of the model, each with its standard error."""
-    mean, slope = blocks.mean(samples), blocks.trend(samples)
-    return {"model": mean.value, "standard error": mean.error, "trend per turnover": slope.value * turnover,
-            "its error": slope.error * turnover}
 
 
 def _shown(found: Estimate) -> str:

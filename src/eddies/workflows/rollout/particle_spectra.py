@@ -10,12 +10,15 @@ import torch
 
 from eddies.io.hdf5 import File, write_table
 from eddies.parallel.migration import migrate
+from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.resolved_velocity import ResolvedVelocity
 from eddies.workflows.ground_truth.truth import GroundTruth
 
 RUNS = "model", "truth"
+# Of a slab, for the ghost planes of cubic splines; on many ranks the grid has more planes than the closure's.
+FEWEST_PLANES = 3
 # Residual at which a solve from nothing ends: in hit-small after 22 iterations, and what further ones would change of
 # ln E(k) up to k_d is 3e-4.
 TOLERANCE = 5e-4
@@ -26,14 +29,15 @@ MOST_ITERATIONS = 100
 class ParticleSpectra:
     """Spectra of the model's particles over time, and of the true ones.
 
-    They are those of the resolved velocity of the closure, with the same grid and wavenumbers for all methods: no
-    kernel attenuates them, and what they miss at a wavenumber they miss of model and truth alike. Each solve starts
+    They are those of the resolved velocity of the closure, with the same wavenumbers for all methods: no kernel
+    attenuates them, and what they miss at a wavenumber they miss of model and truth alike. Each solve starts
     from nothing, so that a rollout which goes on from a checkpoint finds the same; in single precision, as frames are
     stored.
     """
 
     def __init__(self, truth: GroundTruth) -> None:
-        self._slab = truth.decomposition
+        slab = truth.decomposition
+        self._slab = SlabDecomposition(slab.comm, slab.length, max(slab.planes, FEWEST_PLANES * slab.size))
         units = FlowUnits(truth.scales, cutoff=0.0, neighbors=0.0)  # no pairs
         self._resolution = ResolvedVelocity.on_slabs(self._slab, units, dtype=torch.float32)
         self._resolution.tolerance, self._resolution.most_iterations = TOLERANCE, MOST_ITERATIONS
