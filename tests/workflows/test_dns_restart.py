@@ -55,7 +55,8 @@ def product(comm, path):
         tables = {f"{table}/{name}": values for table in ("statistics", "spectra", "spectra_of_statistics")
                   for name, values in read_table(file, table).items() if name != "seconds_per_step"}
         tables |= read_attributes(file, "reference") | read_attributes(file, "stationary")
-        tables |= {"frames": trajectory.times, "fields": file["fields/filtered/velocity"][()]}
+        tables |= {"frames": trajectory.times, "fields": file["fields/filtered/velocity"][()],
+                   "whole": file["fields/unfiltered/velocity"][()]}
         tables |= {name: np.stack([trajectory.read(frame, name) for frame in range(len(trajectory.times))])
                    for name in trajectory.columns}
     return tables
@@ -88,6 +89,21 @@ def test_every_split_of_a_run_is_the_whole_run(comm, tmp_path, last, monkeypatch
         again = product(comm, directory)
         for name, values in truth.items():
             assert np.array_equal(again[name], values), (split, name)
+
+
+@pytest.mark.mpi(1)
+def test_forcing_that_stays_on_stays_on_over_a_restart(comm, tmp_path, last):
+    scene, found = load_scene("tiny", [*SPLIT, "tracers.forced=true"]), {}
+    for name, steps in (("whole", []), ("split", [14])):  # within the time of the tracers
+        directory = tmp_path / name
+        directory.mkdir()
+        for step in steps:
+            with pytest.raises(Stopped):
+                dns.run(scene, comm, directory, StopAtStep(comm, step))
+        dns.run(scene, comm, directory, StopAtStep(comm))
+        found[name] = product(comm, directory)
+    assert all(np.array_equal(found["split"][name], values) for name, values in found["whole"].items())
+    assert len(found["whole"]["whole"]) == 1 and last.run.fluid.forcing is not None
 
 
 @pytest.mark.mpi(1, 2)
