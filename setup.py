@@ -3,6 +3,7 @@
 What the compiler cannot build is left out, and without any of it the package runs by numpy and torch.
 """
 
+import copy
 import platform
 from pathlib import Path
 
@@ -24,8 +25,18 @@ class BuildKernels(build_ext):
     def get_ext_filename(self, fullname: str) -> str:
         return fullname.replace(".", "/") + ".so"
 
+    def finalize_options(self) -> None:
+        super().finalize_options()
+        self.parallel = True  # as many compilers as there are cores
+
+    def build_extension(self, extension: Extension) -> None:
+        # All instruction sets have object files of the same names, so each has a directory of its own.
+        own = copy.copy(self)
+        own.build_temp = str(Path(self.build_temp) / extension.name)
+        build_ext.build_extension(own, extension)
+
     def run(self) -> None:
-        super().run()  # one after the other: all instruction sets have the same object files
+        super().run()
         missing = [extension.name for extension in self.extensions
                    if not Path(self.get_ext_fullpath(extension.name)).exists()]
         if missing:

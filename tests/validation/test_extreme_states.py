@@ -90,15 +90,16 @@ def precision_error(comm, kind, count, total=TOTAL):
 
 def overdriven(comm, rate, count=4, total=TOTAL):
     """Energy gained by forced particles without another force, over what the filter passes of the energy injected at
-    the wavenumber 1 of their flow."""
-    position = random_points(total)
+    the wavenumber 1 of their flow, were they everywhere: where they are the flow is faster, or slower."""
+    position, everywhere = random_points(total), random_points(100_000)
+    faster = flow_velocity(position).square().mean() / flow_velocity(everywhere).square().mean()
     slab, particles = distributed(comm, position, flow_velocity(position), planes=PLANES)
     dynamics = ParticleDynamics(slab, model_of(forcing=dict(injection_rate=rate)), SKIN)
     end = advance(dynamics, particles, "rk4", 0.02, count)
     energies = [0.5 * float(by_id(comm, state, state.velocity, total).square().sum(1).mean())
                 for state in (particles, end)]
     passed = math.exp(-model_of().flow.scales.filter_width**2 / 12)
-    return (energies[1] - energies[0]) / (passed * rate * 0.02 * count)
+    return float((energies[1] - energies[0]) / (faster * passed * rate * 0.02 * count))
 
 
 class Breaking(Field):

@@ -225,7 +225,7 @@ def test_a_table_that_cannot_be_written_is_told_by_all(comm, tmp_path, monkeypat
     comm.Barrier()
     monkeypatch.setattr(compare, "sections", lambda *_: [Section("errors", "Errors")])
     comparison = SimpleNamespace(name="small", title="small", subject="learned", turnovers=1.0, scenes={}, columns=None,
-                                 base_scene=load_scene("tiny"))
+                                 realisations=None, base_scene=load_scene("tiny"))
     with pytest.raises(WriteError, match="comparison.csv: cannot be written .Is a directory.; choose another --output"):
         compare.write(comparison, [], comm, tmp_path)
 

@@ -161,13 +161,13 @@ def with_method(scene, method, **keys):
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_has_the_units_of_its_start_and_runs(comm, tmp_path, method):
     keys = {"step": 0.004, "frame_interval": 0.02, "turnovers": 0.01} if method == "wcsph" else {}
-    scene = with_method(prepared(comm, tmp_path), method, **keys)
+    scene = with_method(prepared(comm, tmp_path, overrides=["tracers.states=[0.3, 0.5]"]), method, **keys)
     with open_product(comm, tmp_path / "ground_truth.h5", "ground_truth") as file:
         release = GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, 6)).scales
     write_model(comm, tmp_path, scene, release)
     scales, _, made, particles, acceleration = method_of(comm, tmp_path, scene, 3)
     assert getattr(made, "scales", scales) == scales
-    assert (particles.density is not None) == made.has_density == (method != "none")
+    assert (particles.density is not None) == made.has_density == (method in ("learned", "wcsph"))
     assert len(acceleration) == 6**3 and bool(torch.isfinite(acceleration).all())
     assert bool(acceleration.any()) == (method != "none")
     simulate.run(scene, comm, tmp_path)
