@@ -1,5 +1,7 @@
 """Comparison files: what is read, what is refused and in which words."""
 
+from pathlib import Path
+
 import pytest
 
 from eddies.scene.comparison import BUILT_IN, load_comparison
@@ -48,6 +50,10 @@ def test_ground_truth_is_the_bases_unless_a_variant_has_its_own(tmp_path):
 @pytest.mark.parametrize("name", NAMES)
 def test_built_in_comparison(name):
     comparison = load_comparison(name)
+    for variant_name in comparison.scenes:
+        runs = comparison.runs_of(variant_name, Path("out"))
+        rollouts = [run for run in runs if "simulate" in run.scene.stages]
+        assert len(rollouts) == len(comparison.realisations or [None]) >= len(runs) - 1
     groups = {one.name: one.group for one in comparison.variant}
     assert groups[comparison.subject] != "baseline" and "baseline" in groups.values()
     methods = {scene.simulation.method for scene in comparison.scenes.values()}
@@ -59,6 +65,9 @@ BAD = [
     ('title = "x"\n' + variant("a"), "base: this key is missing"),
     (HEAD + 'repets = 3\n' + variant("a"), "repets: no such key; did you mean repeats?"),
     (HEAD + 'realisations = [3, 1]\n' + variant("a"), "realisations = [3, 1]: 1 is the seed of the base, on whose"),
+    (HEAD + 'realisations = [3, 3]\n' + variant("a"), "realisations = [3, 3]: 3 stands there more than once"),
+    (HEAD + 'realisations = [4]\n' + variant("a", "training.truths=[\"runs/tiny-seed-4\"]"),
+     'realisations = [4]: variant "a" is trained on runs/tiny-seed-4/ground_truth.h5, by [training] truths'),
     (HEAD + 'repeats = 0\n' + variant("a"), "repeats = 0: must be a whole number at least 1"),
     (HEAD + 'set = "training.steps=3"\n' + variant("a"), "must be a list of texts"),
     (HEAD + 'model = "lerned"\n' + variant("learned"), "did you mean learned?"),

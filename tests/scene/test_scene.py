@@ -80,6 +80,14 @@ def test_the_form_of_a_baseline_counts_for_its_rollout_alone(first, second):
     assert affected == ["simulate", "report"]
 
 
+def test_where_a_rollout_starts_counts_for_it_without_a_model_too():
+    plain, others = (load_scene("tiny", ["simulation.method=none", *more])
+                     for more in ([], ['training.truths=["runs/second", "runs/third"]']))
+    assert plain.seen_in(plain.directory) > 0 == others.seen_in(others.directory)
+    assert plain.fingerprint("simulate") != others.fingerprint("simulate")
+    assert plain.fingerprint("train-kernel") == others.fingerprint("train-kernel")
+
+
 def test_coarse_grid_of_the_filter():
     widths = {name: load_scene(name).tracers.filter_width for name in ("hit", "tiny")}
     assert Eulerian().cells_for(widths["hit"]) == 16  # Nyquist wavenumber 8 = pi / d

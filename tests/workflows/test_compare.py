@@ -129,7 +129,7 @@ def check_rows(rows):
     assert (learned["time_step"], longer["time_step"]) == (pytest.approx(0.05), pytest.approx(0.1))
 
 
-UNSEEN = FILE[:FILE.index("[[variant]]")].replace("repeats = 2", "repeats = 1\nrealisations = [5, 6]") + """
+UNSEEN = FILE[:FILE.index("[[variant]]")].replace("repeats = 2", "repeats = 2\nrealisations = [5, 6]") + """
 [[variant]]
 name = "learned"
 [[variant]]
@@ -230,14 +230,19 @@ def test_a_table_that_cannot_be_written_is_told_by_all(comm, tmp_path, monkeypat
         compare.write(comparison, [], comm, tmp_path)
 
 
+def truths_of(base):
+    """What of a comparison tells of its ground truths."""
+    return SimpleNamespace(base=base, base_scene=load_scene(base), changes_of_the_flow=lambda _: ["time.max_step=0.1"])
+
+
 def variant_of(scene, directory):
     return VariantRun(scene, directory / "out", directory)
 
 
 @pytest.mark.mpi(1)
 def test_ground_truth_that_does_not_fit_is_refused(comm, tmp_path):
-    comparison, scene = SimpleNamespace(base="tiny", base_scene=load_scene("tiny")), load_scene("tiny", ["name=mine"])
-    with pytest.raises(ProductError, match=r"ground_truth.h5: no such file; .*`eddies dns tiny --output"):
+    comparison, scene = truths_of("tiny"), load_scene("tiny", ["name=mine"])
+    with pytest.raises(ProductError, match=r"no such file; .*`eddies dns tiny --set time.max_step=0.1 --output"):
         check_ground_truth(comparison, variant_of(scene, tmp_path), comm)
     write_ground_truth(comm, tmp_path)
     with pytest.raises(SceneError, match='other settings than those of variant "mine"; make it with `eddies dns tiny'):
@@ -246,7 +251,7 @@ def test_ground_truth_that_does_not_fit_is_refused(comm, tmp_path):
 
 @pytest.mark.mpi(1)
 def test_frames_must_come_before_the_first_comparison(comm, tmp_path, monkeypatch):
-    comparison, scene = SimpleNamespace(base="tiny", base_scene=load_scene("tiny")), load_scene("tiny", ["name=mine"])
+    comparison, scene = truths_of("tiny"), load_scene("tiny", ["name=mine"])
     write_ground_truth(comm, tmp_path)  # t_eta = 0.17
     monkeypatch.setattr("eddies.workflows.compare.read_provenance", lambda _: {"fingerprint": scene.fingerprint("dns")})
     check_ground_truth(comparison, variant_of(scene, tmp_path), comm)

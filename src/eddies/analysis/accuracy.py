@@ -67,17 +67,19 @@ def velocity_error_at(run: StoredRollout, common: CommonFrames, time: float) -> 
     return float(np.interp(time, common.times[around], errors))
 
 
-def _at_the_end(run: StoredRollout, common: CommonFrames) -> Mapping[str, float]:
+def _at_the_end(run: StoredRollout, common: CommonFrames) -> Mapping[str, float | None]:
     last = common.times.size - 1
     velocity = particle_pair(run.model, run.truth, common, last, "velocity")
     acceleration = particle_pair(run.model, run.truth, common, last, "acceleration")
     position = particle_pair(run.model, run.truth, common, last, "position")
     spectra = run.spectra.at(float(common.times[last]))
+    # Only where a filtered field is stored is there a spectrum.
+    at_the_end = abs(spectra.time - common.times[last]) <= 1e-6 * max(1.0, spectra.time)
     final = CommonFrames(common.model[-1:], common.truth[-1:], common.times[-1:])
     invariants = invariant_statistics(run.model, run.truth, final)
     return {
-        "spectrum_error": spectra.error("model", run.filter_wavenumber),
-        "spectrum_error_floor": spectra.error("truth", run.filter_wavenumber),
+        "spectrum_error": spectra.error("model", run.filter_wavenumber) if at_the_end else None,
+        "spectrum_error_floor": spectra.error("truth", run.filter_wavenumber) if at_the_end else None,
         "energy_ratio": float(np.sum(velocity.model**2, dtype=float) / np.sum(velocity.truth**2, dtype=float)),
         "velocity_kl": pdf_divergence(velocity, EDGES["velocity"]),
         "velocity_kl_floor": sampling_floor(velocity, EDGES["velocity"]),

@@ -48,7 +48,7 @@ def band_ratios(energy: np.ndarray, reference: np.ndarray, largest_wavenumber: f
 
 
 def _shells(largest_wavenumber: float) -> slice:
-    return slice(1, max(int(largest_wavenumber), 1) + 1)
+    return slice(1, max(int(largest_wavenumber + 1e-9), 1) + 1)
 
 
 def vorticity(velocity: np.ndarray) -> np.ndarray:

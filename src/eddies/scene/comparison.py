@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 from eddies.measures import MEASURES
+from eddies.pipeline import STAGES
 from eddies.scene.reader import find_document, parse_document, read_section, read_text
 from eddies.scene.rules import nearest, quoted
 from eddies.scene.scene import Scene, SceneError, load_scene
@@ -71,9 +73,8 @@ class Comparison(Document):
                              ("kernel", "through which fields are compared")):
             if getattr(base, section) is None:
                 raise SceneError(f'base = "{self.base}": has no [{section}], {why}; add it, or take another base')
-        if self.realisations is not None and base.seed in self.realisations:
-            raise SceneError(f"realisations = {list(self.realisations)}: {base.seed} is the seed of the base, on whose "
-                             "ground truth models are trained; leave it out")
+        for problem in self._problems_of_realisations():
+            raise SceneError(f"realisations = {list(self.realisations or ())}: {problem}")
         for variant in self.variant:
             problem = self._difference(variant)
             if problem:
@@ -104,6 +105,11 @@ class Comparison(Document):
         own = next(variant.run for variant in self.variant if variant.name == name)
         return Path(own) if own else self.run_directory
 
+    def changes_of_the_flow(self, name: str) -> list[str]:
+        """The changes, shared ones and those of a variant, of what its ground truth is made from."""
+        own = next(variant.set for variant in self.variant if variant.name == name)
+        return [change for change in (*self.set, *own) if change.partition("=")[0].split(".")[0] in STAGES["dns"].reads]
+
     def runs_of(self, name: str, output: Path) -> list[PlannedRun]:
         """What is run for a variant, in order: all of its scene; or, with realisations, the training, if there is one,
         and the rollout on each of them."""
@@ -112,13 +118,32 @@ class Comparison(Document):
             return [PlannedRun(scene, directory, truth)]
         runs, model = [], scene.model if "train" in scene.stages else None
         if model is not None and model.path is None:
-            runs.append(PlannedRun(replace(scene, simulation=None), directory, truth))
+            runs.append(PlannedRun(replace(scene, simulation=None, wcsph=None, eulerian=None), directory, truth))
             model = replace(model, path=str(directory))
         for seed in self.realisations:
             unseen = replace(scene, seed=seed, model=model, training=None,
                              simulation=replace(scene.simulation, start=0.0))
-            runs.append(PlannedRun(unseen, directory / f"seed-{seed}", truth.with_name(f"{truth.name}-seed-{seed}")))
+            runs.append(PlannedRun(unseen, directory / f"seed-{seed}", self._realisation_of(name, seed)))
         return runs
+
+    def _problems_of_realisations(self) -> Iterator[str]:
+        """Flows that count twice, and such that a training sees."""
+        seeds, own = self.realisations or (), self.base_scene.seed
+        for seed in {seed for seed in seeds if seeds.count(seed) > 1}:
+            yield f"{seed} stands there more than once; name each once"
+        if own in seeds:
+            yield f"{own} is the seed of the base, on whose ground truth models are trained; leave it out"
+        for name, scene in self.scenes.items():
+            trained_on = [path.resolve() for path in scene.training.truth_files] if scene.training else []
+            for seed in seeds:
+                path = self._realisation_of(name, seed) / STAGES["dns"].file
+                if path.resolve() in trained_on:
+                    yield f'variant "{name}" is trained on {path}, by [training] truths; leave {seed} out'
+
+    def _realisation_of(self, name: str, seed: int) -> Path:
+        """The run directory with the ground truth of another seed."""
+        truth = self.ground_truth_of(name)
+        return truth.with_name(f"{truth.name}-seed-{seed}")
 
     @property
     def _shared(self) -> list[str]:
@@ -160,7 +185,7 @@ class Comparison(Document):
             return (f"[training] window = {scene.window:g} where the base has {base.window:g}: rollouts start where it "
                     "ends, and all must start at the same moment; give [simulation] start for all of them")
         ours, theirs = (other.training and other.training.truths for other in (scene, base))
-        if scene.simulation.start is None and ours != theirs:
+        if self.realisations is None and scene.simulation.start is None and ours != theirs:
             return (f"[training] truths = {quoted(ours)} where the base has {quoted(theirs)}: where rollouts start "
                     "depends on them, and all must start at the same moment; give [simulation] start for all of them")
         return None

@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from itertools import chain
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 from eddies.io.hdf5 import ProductError, in_files, open_product, read_attributes
@@ -81,7 +82,7 @@ def run_all(comparison: Comparison, runs: Sequence[VariantRun], comm: Comm, over
     for repeat in range(1, comparison.repeats):
         log.info("compare: timing, round %d of %d", repeat + 1, comparison.repeats)
         for variant in runs:
-            if variant.failure is None:
+            if variant.failure is None and "simulate" in variant.stages:
                 variant.attempt(errors, lambda: variant.time_block(comm, run_stages))
     errors.Free()
 
@@ -95,8 +96,9 @@ def check_directories(runs: Sequence[VariantRun]) -> None:
 def check_ground_truth(comparison: Comparison, variant: VariantRun, comm: Comm) -> None:
     """Refuse a ground truth that is missing, of other settings than the variant's, or of too coarse frames."""
     path, simulation = variant.ground_truth / "ground_truth.h5", variant.scene.simulation
+    changes = "".join(f" --set {quote(change)}" for change in comparison.changes_of_the_flow(variant.name))
     seed = "" if variant.scene.seed == comparison.base_scene.seed else f" --set seed={variant.scene.seed}"
-    remedy = f"make it with `eddies dns {comparison.base}{seed} --output {variant.ground_truth}`"
+    remedy = f"make it with `eddies dns {comparison.base}{changes}{seed} --output {variant.ground_truth}`"
     try:
         with open_product(comm, path, "ground_truth") as file:
             fingerprint = read_provenance(file).get("fingerprint")

@@ -176,6 +176,9 @@ def most_ranks(scene: Scene) -> dict[str, int]:
     if scene.simulation and scene.simulation.method == "eulerian":
         cells = (scene.eulerian or Eulerian()).cells_for(scene.tracers.filter_width)
         limits["ghost planes of the coarse grid"] = max(cells // GHOST_PLANES[scene.tracers.interpolation], 1)
+    elif scene.injects:
+        reach = scene.simulation.skin * scene.interaction_radius / 2
+        limits["ghost planes of the resolved velocity"] = ranks_of_resolved_grid(scene, reach)
     return limits
 
 

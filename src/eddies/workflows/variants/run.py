@@ -89,7 +89,9 @@ class VariantRun:
                                  f"ground truth, {path}; {remedy}")
         truth = self.directory / "ground_truth.h5"
         made_here = (self.directory / MARK).exists() and (truth.is_symlink() or not truth.exists())
-        if self.directory.exists() and any(self.directory.iterdir()) and not made_here:
+        held = [*self.directory.iterdir()] if self.directory.exists() else []
+        # With realisations a run directory stands in that of the variant for each of them.
+        if not made_here and not all((entry / MARK).exists() for entry in held):
             raise SceneError(f'variant "{self.name}": its run directory {self.directory} holds files that no '
                              f"comparison has made; {remedy}, or remove the directory")
 
