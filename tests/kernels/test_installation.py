@@ -4,10 +4,12 @@ import os
 import shutil
 import subprocess
 import sys
+import sysconfig
 from pathlib import Path
 
 import pytest
 
+from eddies.kernels import library
 from eddies.kernels.library import in_use
 
 CHECKOUT = Path(__file__).parents[2]
@@ -25,6 +27,17 @@ def copy(tmp_path):
     return tmp_path
 
 
+@pytest.fixture
+def nearly_built(copy):
+    """The same as a build leaves it that was stopped before the instruction set of this processor."""
+    found = copy / f"build/lib.{sysconfig.get_platform()}-{sys.implementation.cache_tag}/eddies/kernels"
+    found.mkdir(parents=True)
+    for path in Path(library.__file__).parent.glob("*.so"):
+        if path.stem != in_use():
+            shutil.copyfile(path, found / path.name)  # newer than the sources
+    return copy
+
+
 def run(*command, **variables):
     # Outside of the checkout, whose package would be found first.
     done = subprocess.run([sys.executable, *command], cwd="/", env={**os.environ, **variables}, capture_output=True,
@@ -34,9 +47,11 @@ def run(*command, **variables):
 
 
 @pytest.mark.parametrize("compiler", [True, False], ids=["with a compiler", "without one"])
-def test_the_package_is_installed_and_runs(copy, compiler):
+def test_the_package_is_installed_and_runs(request, compiler):
     if compiler and shutil.which("g++") is None:
         pytest.skip("there is no compiler")
+    # One instruction set is enough to see it compiled; a set-up has compiled all.
+    copy = request.getfixturevalue("nearly_built" if compiler else "copy")
     target, variables = copy / "installed", {} if compiler else {"CC": "/nowhere/cc", "CXX": "/nowhere/c++"}
     said = run("-m", "pip", "install", "--no-deps", "--no-build-isolation", "--no-index", "-v", "--target", target,
                copy, **variables)
