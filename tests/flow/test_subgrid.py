@@ -142,6 +142,30 @@ def test_a_dynamic_coefficient_follows_the_way_that_energy_goes(comm, width, wit
     assert lengths[1] == 0 and lengths[2] < 0.4 * lengths[0] and lengths[3] < 1e-3 * lengths[0]
 
 
+@pytest.mark.mpi(1, 2)
+@pytest.mark.parametrize("width, with_gradient", [(0.0, False), (0.8, False), (0.8, True)])
+def test_a_dynamic_coefficient_is_found_where_the_hidden_stress_is_the_models(comm, monkeypatch, width, with_gradient):
+    """The stress between the two filters, made of the same model for either width: the squares of widths of Gaussian
+    filters add up, and a cut-off at half the wavenumber is twice as wide."""
+    grid, mixing_length = coarse_grid(comm, 24), 0.13
+    velocity = turbulent_velocity(grid)
+    model = DynamicStress(grid, width, with_gradient)
+    if width:
+        test = gaussian_transfer(grid.wavenumber_squared, 2 * width)
+        wider = np.sqrt(width**2 + (2 * width) ** 2) / width
+    else:
+        below = [np.abs(axis) <= grid.cutoff // 2 for axis in grid.index]
+        test, wider = below[0] & below[1] & below[2], grid.cutoff / (grid.cutoff // 2)
+    of_gradient = width if with_gradient else 0.0
+    fine, coarse = (StressModel(grid, scale * mixing_length, scale * of_gradient) for scale in (1, wider))
+    between = coarse.stress(test * velocity) - test * fine.stress(velocity)
+    # What is taken for u u of the twice filtered velocity, less that filtered.
+    squares = iter([np.zeros_like(between), -between])
+    monkeypatch.setattr(model, "_squares", lambda _: next(squares))
+    model.begin_step(velocity)
+    assert np.sqrt(model.squared_length) == pytest.approx(mixing_length, rel=1e-9)
+
+
 def transfer_of(grid, width):
     return gaussian_transfer(grid.wavenumber_squared, width)
 
