@@ -51,7 +51,7 @@ class EulerianRun:
         cells = self.settings.cells_for(width)
         grid = SpectralGrid(SlabDecomposition(comm, length, cells), scene.simulation.precision)
         # What is left for the filter to do to the fluid's velocity, and what it has done to it.
-        self.filter_left, filter_passed = (0.0, width) if self.settings.equations == "filtered" else (width, 0.0)
+        filter_left, filter_passed = (0.0, width) if self.settings.equations == "filtered" else (width, 0.0)
         self.fluid = coarse_fluid(scene, truth, grid, filter_passed, directory)
         self.stepper, self.clock = ETDRK4(self.fluid), Clock()
         self.step_limit = CourantLimit(grid, scene.time.courant, math.inf)
@@ -59,7 +59,7 @@ class EulerianRun:
         self.largest_energy = RUNAWAY_ENERGY * quadratic_energy(self.fluid, self.state)
         columns = truth.particles(start)
         columns = migrate(grid.decomposition, {name: columns[name] for name in ("id", "position")})
-        self.tracers = TracerParticles(FilteredField(grid, self.filter_left, scene.tracers.interpolation), columns,
+        self.tracers = TracerParticles(FilteredField(grid, filter_left, scene.tracers.interpolation), columns,
                                        self.state)
         self.flow_seconds: list[float] = []
 
