@@ -5,7 +5,7 @@ from eddies.flow import initial_fields
 from eddies.flow.operators import divergence, pressure
 from eddies.flow.statistics import energy_spectrum, gradient_moments
 from eddies.parallel.slab import SlabDecomposition
-from eddies.spectral.spectral_grid import SpectralGrid, restrict
+from eddies.spectral.spectral_grid import SpectralGrid, regrid
 
 
 def make_grid(comm, cells):
@@ -30,7 +30,7 @@ def test_random_field_does_not_depend_on_the_resolution(comm):
     velocities = [initial_fields.random_velocity(grid, 5, 1.0, 2.0) for grid in (coarse, fine)]
     # Shells beyond the coarse cutoff hold next to nothing, so the common normalisation hardly differs.
     inner = np.sqrt(coarse.index_squared) < coarse.cutoff
-    difference = restrict(fine, coarse, velocities[1]) - velocities[0]
+    difference = regrid(fine, coarse, velocities[1]) - velocities[0]
     assert np.abs(difference[:, inner]).max() < 1e-6
 
 

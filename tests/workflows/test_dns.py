@@ -79,6 +79,37 @@ def test_a_final_state_is_a_start(comm, tmp_path):
     assert tables[1]["time"][-1] == pytest.approx(0.1)
 
 
+@pytest.mark.mpi(1, 2, 3)
+def test_a_flow_with_tracers_is_a_start_on_any_grid(comm, tmp_path):
+    def followed(name, scene):
+        directory = tmp_path / name
+        directory.mkdir(exist_ok=True)
+        comm.Barrier()
+        dns.run(scene, comm, directory)
+        return comm.bcast(str(directory / "ground_truth.h5"))
+
+    flow = ["time.step=0.01", "flow.fluid=compressible", "flow.sound_speed=22.5", "flow.viscosity=0.06"]
+    path = followed("first", load_scene("tiny", [
+        *flow, "flow.cells=16", "tracers.particles_per_side=6", "tracers.field_cells=8", "spin_up.turnovers=0.1",
+        "kernel.neighbors=20", "training.batch=9"]))
+    with open_product(comm, path, "ground_truth") as file:
+        # Times of fields count from the release.
+        began = read_attributes(file, "reference")["released_at"] + FieldSeries(file, "unfiltered").times[0]
+        tables = [read_table(file, "statistics")]
+    for cells in (16, 24):
+        again = followed(f"on-{cells}", load_scene("taylor-green", [
+            *flow, f"flow.cells={cells}", f"time.duration={tables[0]['time'][-1] - began}", "initial.kind=file",
+            f"initial.path={path}"]))
+        with open_product(comm, again, "ground_truth") as file:
+            tables.append(read_table(file, "statistics"))
+    whole, same, finer = (table["energy"] for table in tables)
+    # Fields are stored in single precision.
+    assert same[-1] == pytest.approx(whole[-1], rel=1e-6)
+    assert finer[0] == pytest.approx(same[0], rel=1e-6)
+    # Modes that the first grid does not hold take energy on the finer one.
+    assert 1e-6 < abs(finer[-1] / same[-1] - 1) < 0.05
+
+
 @pytest.mark.mpi(1)
 def test_zero_forcing_amplitude_equals_no_forcing(comm, tmp_path):
     ends = []

@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 # The initial flows that read a key; the others read no such key.
 INITIAL_KEYS = {
     "amplitude": ("random", "taylor-green", "abc", "shear-wave", "sound-wave"),
-    "peak_wavenumber": ("random",), "wavenumber": ("abc", "shear-wave", "sound-wave"), "path": ("file",)}
+    "peak_wavenumber": ("random",), "wavenumber": ("abc", "shear-wave", "sound-wave"), "path": ("file",),
+    "state": ("file",)}
 # What a class of the user's must have, by the key that names it.
 REQUIRED = {"fluid": ("nonlinear", "linear", "linear_function", "combine", "compressible"), "kind": ("__call__",),
             "method": ("advance", "frame", "status", "series", "description", "has_density"), "network": ("forward",)}

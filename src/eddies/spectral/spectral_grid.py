@@ -230,17 +230,18 @@ class Collector:
         return spectral
 
 
-def restrict(fine: SpectralGrid, coarse: SpectralGrid, spectral: np.ndarray) -> np.ndarray:
-    """The modes of a field (c, kz, ky, kx) on `fine` that `coarse`, with an equal or smaller cutoff, keeps."""
-    if coarse.cutoff > fine.cutoff:
-        raise ValueError(f"cannot restrict modes up to {fine.cutoff} to a grid with modes up to {coarse.cutoff}")
-    K = coarse.cutoff
-    planes = np.concatenate([np.arange(K + 1), np.arange(fine.modes - K, fine.modes)])
-    ky = fine.index[1].ravel()
-    kept = np.abs(ky) <= K
+def regrid(source: SpectralGrid, target: SpectralGrid, spectral: np.ndarray) -> np.ndarray:
+    """A field (c, kz, ky, kx) of the modes on `source` with those that `target` keeps, finer or coarser; its other
+    modes are zero."""
+    K = min(source.cutoff, target.cutoff)
+    planes = [np.r_[0 : K + 1, grid.modes - K : grid.modes] for grid in (source, target)]
+    sent, received = (np.abs(grid.index[1].ravel()) <= K for grid in (source, target))
+    ky = source.index[1].ravel()[sent]
     # Both grids cut the same ascending list of ky into blocks, so rows arrive in the order in which they are stored.
-    position = np.where(ky >= 0, ky, ky + coarse.modes)[kept]
-    owner = np.searchsorted(coarse.column_starts, position, side="right") - 1
-    rows = np.moveaxis(spectral[:, planes][:, :, kept, : K + 1], 2, 0)
-    moved = Redistribution(fine.decomposition.comm, owner).apply(rows)
-    return np.ascontiguousarray(np.moveaxis(moved, 0, 2)).astype(coarse.complex, copy=False)
+    position = np.where(ky >= 0, ky, ky + target.modes)
+    owner = np.searchsorted(target.column_starts, position, side="right") - 1
+    rows = np.moveaxis(spectral[:, planes[0]][:, :, sent, : K + 1], 2, 0)
+    moved = Redistribution(source.decomposition.comm, owner).apply(rows)
+    regridded = np.zeros((len(spectral), *target.spectral_shape), target.complex)
+    regridded[:, planes[1][:, None], np.flatnonzero(received), : K + 1] = np.moveaxis(moved, 0, 2)
+    return regridded

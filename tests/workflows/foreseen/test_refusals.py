@@ -2,10 +2,12 @@
 
 import os
 
+import numpy as np
 import pytest
 
 from eddies.errors import UserError
 from eddies.flow.forcing import ForcingError
+from eddies.parallel.slab import SlabDecomposition
 from eddies.scene.scene import load_scene
 from eddies.workflows.foreseen.refusals import refusals
 from eddies.workflows.foreseen.stage_cost import StageCost
@@ -44,12 +46,15 @@ def test_files_that_do_not_fit_are_told_in_the_words_of_the_stage(comm, tmp_path
     line, = told(comm, "taylor-green", *changes, "initial.amplitude=1")
     assert path in line
     with create_product(comm, path, "ground_truth", {"scene": "", "fingerprint": ""}) as file:
-        FieldWriter(file, "final", 12, {"velocity": 3})
-    scene = load_scene("taylor-green", changes)
+        slab = SlabDecomposition(comm, 1.0, 12)
+        at_rest = {"velocity": np.zeros((3, slab.count, 12, 12))}
+        FieldWriter(file, "unfiltered", 12, {"velocity": 3}).append(0.0, slab.start, at_rest)
+    assert told(comm, "taylor-green", *changes) == []
+    scene = load_scene("taylor-green", [*changes, "initial.state=1"])
     line, = refusals(scene, comm, [])
     with pytest.raises(UserError) as error:
         initial_state(scene, build_fluid(scene, comm))
-    assert line == str(error.value) and "holds fields of 12 cells a side, [flow] cells is 16" in line
+    assert line == str(error.value) and "holds 1 states of the whole flow" in line
 
 
 @pytest.mark.mpi(1, 2)

@@ -8,7 +8,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from eddies.errors import UserError
-from eddies.io.fields import FieldSeries
 from eddies.io.hdf5 import open_product
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm
@@ -16,7 +15,7 @@ from eddies.parallel.node import node_ranks
 from eddies.scene.scene import Scene
 from eddies.workflows.foreseen.stage_cost import StageCost, in_units
 from eddies.workflows.foreseen.stage_costs import totals
-from eddies.workflows.ground_truth.scene_flow import require_cells
+from eddies.workflows.ground_truth.scene_flow import stored_states
 
 # |k| of the initial flows of a few waves, over their wavenumber; sound has no solenoidal velocity to force.
 WAVES = {"taylor-green": 3**0.5, "abc": 1.0, "shear-wave": 1.0, "sound-wave": float("inf")}
@@ -29,12 +28,12 @@ def refusals(scene: Scene, comm: Comm, costs: Sequence[StageCost]) -> list[str]:
 
 
 def start_file(scene: Scene, comm: Comm) -> Iterator[str]:
-    """A file to start from that is not there, or of another grid."""
+    """A file to start from that is not there, or without a state to start from."""
     if scene.initial.kind != "file":
         return
     try:
         with open_product(comm, scene.initial.path, "ground_truth") as file:
-            require_cells(scene, FieldSeries(file, "final").cells)
+            stored_states(scene.initial, file)
     except UserError as error:
         yield str(error)
 

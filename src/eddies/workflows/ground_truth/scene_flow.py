@@ -13,12 +13,12 @@ from eddies.flow.navier_stokes import FLUIDS, Fluid
 from eddies.flow.operators import project
 from eddies.import_path import is_path, load
 from eddies.io.fields import FieldSeries
-from eddies.io.hdf5 import ProductError, open_product
+from eddies.io.hdf5 import File, ProductError, open_product
 from eddies.parallel.broadcast import on_all_ranks
 from eddies.parallel.communicator import Comm
 from eddies.parallel.slab import SlabDecomposition
-from eddies.scene.scene import BOX_LENGTH, Scene, SceneError
-from eddies.spectral.spectral_grid import SpectralGrid
+from eddies.scene.scene import BOX_LENGTH, Initial, Scene, SceneError
+from eddies.spectral.spectral_grid import SpectralGrid, regrid
 
 
 def build_fluid(scene: Scene, comm: Comm) -> Fluid:
@@ -68,28 +68,34 @@ def _own_velocity(scene: Scene, grid: SpectralGrid) -> np.ndarray:
     return project(grid, velocity.astype(grid.complex))
 
 
-def require_cells(scene: Scene, cells: int) -> None:
-    """Raise SceneError unless the fields of the file that a scene starts from have as many cells as its grid."""
-    if cells != scene.flow.cells:
-        raise SceneError(f"[initial] path = {scene.initial.path}: holds fields of {cells} cells a side, [flow] cells "
-                         f"is {scene.flow.cells}; make them equal")
+def stored_states(initial: Initial, file: File) -> FieldSeries:
+    """The whole flow as a ground truth holds it: at its end, or, where it followed tracers, at a few times with them.
+
+    Raises SceneError where there is no state of the number that the scene names, ProductError where there is none.
+    """
+    fields = FieldSeries(file, "final" if "fields/final" in file else "unfiltered")
+    if initial.state >= len(fields.times):
+        raise SceneError(f"[initial] state = {initial.state}: {initial.path} holds {len(fields.times)} states of the "
+                         f"whole flow, number 0 to {len(fields.times) - 1}; name one of them")
+    return fields
 
 
 def _state_from_file(scene: Scene, fluid: Fluid) -> np.ndarray:
-    grid = fluid.grid
-    with open_product(grid.decomposition.comm, scene.initial.path, "ground_truth") as file:
-        fields = FieldSeries(file, "final")
-        require_cells(scene, fields.cells)
-        planes = (grid.decomposition.start, grid.decomposition.stop)
+    grid, initial = fluid.grid, scene.initial
+    comm, length = grid.decomposition.comm, grid.decomposition.length
+    with open_product(comm, initial.path, "ground_truth") as file:
+        fields = stored_states(initial, file)
+        whole = SpectralGrid(SlabDecomposition(comm, length, fields.cells), grid.precision, (fields.cells - 1) // 2)
+        planes = (whole.decomposition.start, whole.decomposition.stop)
         names = fields.variables if fluid.compressible else ("velocity",)
-        stored = on_all_ranks(grid.decomposition.comm,
-                              lambda: {name: fields.read(-1, name, *planes) for name in names}, ProductError)
-        state = grid.forward(stored["velocity"])
-        if fluid.compressible:
-            if "density" in stored:
-                s = grid.forward(np.log(stored["density"]))
-            else:
-                s = balanced_density(grid, state, fluid.sound_speed)[None]
-            return np.concatenate([state, s])
+        stored = on_all_ranks(comm, lambda: {name: fields.read(initial.state, name, *planes) for name in names},
+                              ProductError)
+    state = regrid(whole, grid, whole.forward(stored["velocity"]))
+    if fluid.compressible:
+        if "density" in stored:
+            s = regrid(whole, grid, whole.forward(np.log(stored["density"])))
+        else:
+            s = balanced_density(grid, state, fluid.sound_speed)[None]
+        return np.concatenate([state, s])
     # A velocity of a compressible flow, or in single precision, is not solenoidal.
     return project(grid, state)

@@ -16,7 +16,7 @@ from eddies.io.hdf5 import File, write_table
 from eddies.parallel.migration import IdOrder
 from eddies.parallel.slab import SlabDecomposition
 from eddies.scene.scene import BOX_LENGTH, Tracers
-from eddies.spectral.spectral_grid import SpectralGrid, restrict
+from eddies.spectral.spectral_grid import SpectralGrid, regrid
 from eddies.workflows.ground_truth.frame_counts import whole_cells
 
 
@@ -87,7 +87,7 @@ class TracerFrames:
         them."""
         fine = self.tracers.field.grid
         grid = self._grid_of(whole_cells(fine.cutoff))
-        values = grid.backward(restrict(fine, grid, state))
+        values = grid.backward(regrid(fine, grid, state))
         planes = {"velocity": values[:3]} | ({"density": np.exp(values[3:])} if self._compressible else {})
         self.segments.fields["unfiltered"].append(time, grid.decomposition.start, planes)
 
@@ -97,7 +97,7 @@ class TracerFrames:
         modes = {"velocity": velocity}
         if self._compressible:
             modes["density"] = field.density_modes(state)
-        planes = {name: self.coarse.backward(restrict(field.grid, self.coarse, part)) for name, part in modes.items()}
+        planes = {name: self.coarse.backward(regrid(field.grid, self.coarse, part)) for name, part in modes.items()}
         self.segments.fields["filtered"].append(time, self.coarse.decomposition.start, planes)
         self._spectra["time"].append(time)
         self._spectra["energy"].append(energy_spectrum(field.grid, state[:3])[1])

@@ -28,7 +28,7 @@ from eddies.parallel.migration import migrate
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.particle_set import ParticleSet
 from eddies.scene.scene import Eulerian, Scene, SceneError
-from eddies.spectral.spectral_grid import SpectralGrid, restrict
+from eddies.spectral.spectral_grid import SpectralGrid, regrid
 from eddies.time_stepping import ETDRK4
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.rollout.particle_run import injection
@@ -201,7 +201,7 @@ def initial_state(truth: GroundTruth, fluid: Fluid, filter_passed: float, frame:
     whole = SpectralGrid(slab, grid.precision, (series.cells - 1) // 2)
 
     def kept(values: np.ndarray) -> np.ndarray:
-        return restrict(whole, grid, whole.forward(values.astype(whole.real)))
+        return regrid(whole, grid, whole.forward(values.astype(whole.real)))
 
     velocity = kept(truth.state(at[0], "velocity", slab))
     velocity *= gaussian_transfer(grid.wavenumber_squared, filter_passed).astype(grid.real)
