@@ -82,6 +82,7 @@ def test_variants_are_run_measured_and_kept(comm, folder, capfd):
     record, rows = rows_of(out)
     check_rows(rows)
     assert record["machine"]["ranks"] == 2 and record["machine"]["cores"] >= 1 and record["machine"]["processor"]
+    assert 0 < record["flow"]["kolmogorov_length"] < record["flow"]["filter_width"]
     assert (out / "learned/kernel.h5").resolve() == (out / "no-force/kernel.h5").resolve()
     assert (out / "learned/model.h5").resolve() == (out / "longer-steps/model.h5").resolve()
     assert not (out / "no-force/model.h5").exists() and not list(out.glob("*/timing"))

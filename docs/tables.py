@@ -1,0 +1,66 @@
+"""Writes the tables of README and docs from the results beside this file.
+
+    .venv/bin/python docs/tables.py
+
+A table stands between two comments. The first names the comparison in docs/results, the columns, and the rows with the
+words for them; a row `floor` is the truth's own:
+
+    <!-- table of compare-small: wall_seconds velocity_error_half
+    learned: the default
+    floor: two samples of the true particles
+    -->
+    <!-- end of table -->
+"""
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from eddies.measures import MEASURES
+
+HERE = Path(__file__).parent
+PAGES = (HERE.parent / "README.md", *sorted(HERE.glob("*.md")))
+TABLE = re.compile(r"(<!-- table of ([\w-]+): ([^\n]*)\n(.*?)-->\n).*?(?=<!-- end of table -->)", re.DOTALL)
+WORDS = MEASURES | {"wall_seconds": "seconds a turnover", "core_seconds": "core seconds a turnover",
+                    "training_seconds": "training (s)", "time_step": "step"}
+FLOOR = "floor"
+
+
+def written(page: str) -> str:
+    """A page with its tables as the results are now. KeyError where a table names what is not there."""
+    return TABLE.sub(lambda found: found[1] + table(*found.groups()[1:]), page)
+
+
+def table(comparison: str, columns: str, rows: str) -> str:
+    """The lines of one table."""
+    record = json.loads((HERE / "results" / f"{comparison}.json").read_text(encoding="utf-8"))
+    results, keys = {row["name"]: row for row in record["rows"]}, columns.split()
+    # Any complete row has the floors, which are the truth's.
+    results[FLOOR] = {key.removesuffix("_floor"): value for key, value in record["rows"][0].items()
+                      if key.endswith("_floor")}
+    lines = ["| |" + "".join(f" {WORDS[key]} |" for key in keys), "|---|" + "---|" * len(keys)]
+    for row in rows.strip().splitlines():
+        name, words = row.split(": ", 1)
+        lines.append(f"| {words} |" + "".join(f" {number(results[name], key)} |" for key in keys))
+    return "\n".join(lines) + "\n"
+
+
+def number(row: Mapping[str, Any], key: str) -> str:
+    """Two digits, those of ratios three, with the standard deviation where there is one; nothing without a number."""
+    value, spread = row.get(key), row.get(f"{key}_spread")
+    if value is None:
+        return ""
+    if key.endswith("_ratio"):
+        return f"{value:.3f}" + (f" ± {spread:.3f}" if spread is not None else "")
+    digits = f"{float(f'{value:.2g}'):g}"
+    return digits if spread is None else f"{digits} ± {float(f'{spread:.1g}'):g}"
+
+
+if __name__ == "__main__":
+    for path in PAGES:
+        text = path.read_text(encoding="utf-8")
+        if (new := written(text)) != text:
+            path.write_text(new, encoding="utf-8")
+            print(path.name)

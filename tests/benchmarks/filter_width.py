@@ -1,0 +1,85 @@
+"""Error over the width of the filter in Kolmogorov lengths, from the results of several comparisons.
+
+    .venv/bin/python tests/benchmarks/filter_width.py docs/results/compare-hit.json docs/results/compare-coarse.json \
+        docs/error-over-filter-width.png
+
+Beside the variants of the same names in all of them stands, of the coarse grids that take no longer than the learned
+model in the same run, the one with the least error.
+"""
+
+import json
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from eddies.measures import MEASURES
+from eddies.report.comparison import in_symbols, is_stable
+from eddies.report.figures import DNS, FILTERED, FOURTH, MODEL, SECOND, THIRD, TRUTH, letter, panels, png, styled
+
+DRAWN = ("velocity_error_half", "acceleration_kl")
+# Words, colour and marker of the variants.
+LOOKS = {"learned": ("the resolved velocity", MODEL, "o"), "with-pairs": ("and pairs", SECOND, "^"),
+         "grid": ("best grid of its cost", TRUTH, "s"), "paper": ("the paper's form", THIRD, "D"),
+         "transport-velocity": ("transport-velocity SPH", FOURTH, "v"), "wcsph": ("WCSPH", FILTERED, "P"),
+         "no-force": ("no force", DNS, "x")}
+
+Row = Mapping[str, Any]
+
+
+def width_of(result: Mapping[str, Any]) -> float:
+    """d/eta of a comparison."""
+    return result["flow"]["filter_width"] / result["flow"]["kolmogorov_length"]
+
+
+def best_grid(rows: Mapping[str, Row], measure: str) -> Row | None:
+    """The coarse grid with the least error of those that take no longer than the learned model."""
+    rivals = [row for row in rows.values() if "simulation.method=eulerian" in row["settings"].split()
+              and None not in (row[measure], row["wall_seconds"])
+              and row["wall_seconds"] <= rows["learned"]["wall_seconds"]]
+    return min(rivals, key=lambda row: row[measure], default=None)
+
+
+def points(results: Iterable[Mapping[str, Any]], name: str, measure: str) -> list[tuple[float, float, float, str]]:
+    """d/eta, error, its spread, and the variant that it is of, for every comparison that has one."""
+    found = []
+    for result in results:
+        rows = {row["name"]: row for row in result["rows"] if is_stable(row)}
+        row = best_grid(rows, measure) if name == "grid" else rows.get(name)
+        if row is not None and row[measure] is not None:
+            found.append((width_of(result), row[measure], row.get(f"{measure}_spread") or 0.0, row["name"]))
+    return sorted(found)
+
+
+@styled
+def drawn(results: Sequence[Mapping[str, Any]]) -> Figure:
+    """A panel for each measure."""
+    figure, axes = panels(1, len(DRAWN), (5.4, 4.2))
+    for axis, measure in zip(axes.flat, DRAWN):
+        for name, (words, colour, marker) in LOOKS.items():
+            if not (line := points(results, name, measure)):
+                continue
+            width, error, spread, _ = zip(*line)
+            axis.errorbar(width, error, [[min(s, 0.9 * e) for s, e in zip(spread, error)], spread], color=colour,
+                          marker=marker, markersize=6, capsize=2, elinewidth=1, label=words)
+        if f"{measure}_floor" in MEASURES:
+            width, floor, *_ = zip(*points(results, "learned", f"{measure}_floor"))
+            axis.plot(width, floor, color=FILTERED, linestyle=":", label="two samples of the truth")
+        axis.set(xscale="log", yscale="log", xlabel=r"width of the filter $d/\eta$",
+                 ylabel=in_symbols(MEASURES[measure]))
+        ticks = sorted({round(width_of(result)) for result in results})
+        axis.set_xticks(ticks, [str(tick) for tick in ticks])
+        axis.minorticks_off()
+    letter(axes.flat)
+    axes.flat[-1].legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+    return figure
+
+
+if __name__ == "__main__":
+    *sources, target = map(Path, sys.argv[1:])
+    given = [json.loads(source.read_text()) for source in sources]
+    for each in DRAWN:
+        print(each, *(f"d/eta {at:.1f}: {name} {error:.3g}" for at, error, _, name in points(given, "grid", each)))
+    target.write_bytes(png(drawn(given)))

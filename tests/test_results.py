@@ -1,0 +1,54 @@
+"""The tables of README and docs are those of the results that are kept with them."""
+
+import importlib.util
+import json
+from pathlib import Path
+
+import pytest
+
+DOCS = Path(__file__).parents[1] / "docs"
+RECORD = {"rows": [
+    {"name": "one", "velocity_error_half": 0.02134, "velocity_error_half_spread": 0.00312, "energy_ratio": 0.99584,
+     "qr_kl": 1.5e-5, "qr_kl_floor": 0.0251, "wall_seconds": 131.2},
+    {"name": "two", "velocity_error_half": None, "energy_ratio": None, "qr_kl": 0.0, "qr_kl_floor": 0.0251,
+     "wall_seconds": 0.0689}]}
+PAGE = """before
+<!-- table of own: wall_seconds velocity_error_half energy_ratio qr_kl
+one: the **first**
+two: 2: another
+floor: samples
+-->
+{}<!-- end of table -->
+after
+"""
+LINES = """| | seconds a turnover | velocity error at T/2 | energy, model / truth | KL Q–R |
+|---|---|---|---|---|
+| the **first** | 130 | 0.021 ± 0.003 | 0.996 | 1.5e-05 |
+| 2: another | 0.069 |  |  | 0 |
+| samples |  |  |  | 0.025 |
+"""
+
+
+@pytest.fixture
+def tables():
+    """docs/tables.py, imported."""
+    spec = importlib.util.spec_from_file_location("tables", DOCS / "tables.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_every_table_is_that_of_its_results(tables):
+    for page in tables.PAGES:
+        text = page.read_text(encoding="utf-8")
+        assert tables.written(text) == text, f"{page.name}: .venv/bin/python docs/tables.py"
+        assert text.count("<!-- table of ") == len(tables.TABLE.findall(text))
+
+
+def test_a_table_has_the_rows_and_columns_that_its_comment_names(tables, tmp_path, monkeypatch):
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results/own.json").write_text(json.dumps(RECORD))
+    monkeypatch.setattr(tables, "HERE", tmp_path)
+    assert tables.written(PAGE.format("anything\n")) == PAGE.format(LINES)
+    with pytest.raises(KeyError, match="three"):
+        tables.written(PAGE.format("").replace("two:", "three:"))
