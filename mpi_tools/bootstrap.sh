@@ -149,7 +149,7 @@ say "installing Python packages (torch is large)"
 install setuptools wheel cython pkgconfig numpy mpi4py
 install_h5py
 rm -f src/eddies/kernels/*.so  # not written over: a job may have them loaded
-install --no-build-isolation --editable '.[test]'
+install --no-build-isolation --editable '.[test,docs]'
 if ! [ -e src/eddies/kernels/plain.so ]; then
     say "no C++17 compiler with OpenMP (CXX=${CXX:-g++}): without compiled kernels everything runs, several times slower"
 fi

@@ -173,7 +173,7 @@ def test_a_mark_of_the_encoding_is_no_part_of_a_scene(tmp_path):
 @pytest.mark.parametrize("key", ["tracers.filter_width", "tracers.field_cells", "time.step", "model.path",
                                  "model.neighbors", "simulation.start", "time.duration"])
 def test_none_is_a_key_that_is_left_out(key):
-    """As the reference of the keys in README calls it."""
+    """As the reference of the keys in the docs calls it."""
     from eddies.scene.scene import load_scene
     assert load_scene("tiny", [f"{key}=none"]) == load_scene("tiny")
 

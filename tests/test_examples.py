@@ -1,4 +1,4 @@
-"""The examples of the documentation, and of the README: each trains, runs and reports, from any directory."""
+"""The examples of the documentation: each trains, runs and reports, from any directory."""
 
 import json
 import logging
@@ -53,11 +53,11 @@ def example(comm, smaller, examples):
 
 @pytest.mark.mpi(1)
 def test_ten_lines_set_a_rollout_going(smaller, caplog, monkeypatch):
-    readme = (CHECKOUT / "README.md").read_text(encoding="utf-8")
-    program = re.search(r"^```python\n(import dataclasses\n.*?)^```", readme, re.MULTILINE | re.DOTALL)[1]
+    page = (CHECKOUT / "docs/python.md").read_text(encoding="utf-8")
+    program = re.search(r"^```python\n(import dataclasses\n.*?)^```", page, re.MULTILINE | re.DOTALL)[1]
     monkeypatch.setattr(logging.getLogger("eddies"), "propagate", True)
     with caplog.at_level(logging.INFO, "eddies"):
-        exec(compile(program, "README.md", "exec"), {})
+        exec(compile(program, "python.md", "exec"), {})
     assert caplog.text.count("rollout: complete") == 2
     assert list(results(smaller / "runs" / "mine")[1]) == ["pressure", "relaxation", "pairs"]
 

@@ -22,6 +22,8 @@ BASES = ("corrected", "paper")
 class TermSettings(Section):
     """The keys of [model.NAME], and what a term that is set so declares.
 
+    Attributes
+    ----------
     reads : of "pairs" (neighbours within the interaction radius), "resolved" (the velocity that a grid resolves of the
         particles'), "density" (so that it is computed, stored, and wanted of the ground truth). What no term reads is
         not built.

@@ -3,6 +3,8 @@
 import dataclasses
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -17,25 +19,24 @@ from eddies.scene.scene import BOX_LENGTH, Scene, builtin_scenes, load_scene
 from eddies.scene.sections import Simulation
 
 CHECKOUT = Path(__file__).parents[1]
-README = (CHECKOUT / "README.md").read_text(encoding="utf-8")
-VALIDATION = CHECKOUT / "docs/validation.md"
-# Programs of the system that README mentions; what follows them is not looked at, but for paths.
-OF_THE_SYSTEM = ("module", "export", "source", "python3", ".venv/bin/pip")
+PAGES = [CHECKOUT / "README.md", *sorted((CHECKOUT / "docs").glob("*.md"))]
+README, TEXT = PAGES[0].read_text(encoding="utf-8"), "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
+# Programs of the system that are mentioned; what follows them is not looked at, but for paths.
+OF_THE_SYSTEM = ("module", "export", "source", "python3", ".venv/bin/pip", ".venv/bin/sphinx-build")
 BATCH = ("sbatch", "qsub", "bsub", "flux")
 
 
-def blocks(language, text=README):
+def blocks(language):
     """The code blocks of a language."""
-    return re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    return re.findall(rf"^```{language}\n(.*?)^```", TEXT, re.MULTILINE | re.DOTALL)
 
 
 def marked(name):
     """The text between the comments NAME and end of NAME."""
-    return README.split(f"<!-- {name} -->")[1].split(f"<!-- end of {name} -->")[0].strip()
+    return TEXT.split(f"<!-- {name} -->")[1].split(f"<!-- end of {name} -->")[0].strip()
 
 
-BASH = blocks("bash") + blocks("bash", VALIDATION.read_text(encoding="utf-8"))
-COMMANDS = [line.strip() for block in BASH for line in block.replace("\\\n", " ").splitlines()
+COMMANDS = [line.strip() for block in blocks("bash") for line in block.replace("\\\n", " ").splitlines()
             if line.strip() and not line.strip().startswith("#")]
 EXAMPLE_NAME, EXAMPLE = next(match.groups() for block in blocks("toml")
                              if (match := re.fullmatch(r"# (\S+\.toml).*?\n(.*)", block, re.DOTALL)))
@@ -94,24 +95,27 @@ def test_cheap_command_runs(comm, command, folder, capfd):
     assert output and "warning" not in output
 
 
+def test_readme_is_short():
+    assert len(README.encode()) <= 12_000
+
+
 def test_commands_in_the_text_exist():
     choices = build_parser()._subparsers._group_actions[0].choices
-    named = set(re.findall(r"`eddies ([a-z-]+)", README))
-    assert named == set(choices)
+    assert set(re.findall(r"`eddies ([a-z-]+)", TEXT)) == set(choices)
 
 
 def test_options_in_the_text_exist():
     listed = {option for command in build_parser()._subparsers._group_actions[0].choices.values()
               for action in command._actions for option in action.option_strings}
-    for option in re.findall(r"`(--(?:set|output|overwrite|take-over|resume)\b)", README):
+    for option in re.findall(r"`(--(?:set|output|overwrite|take-over|resume)\b)", TEXT):
         assert option in listed
-    assert all(f"`{option}" in README for option in listed if option.startswith("--") and option != "--help")
+    assert all(f"`{option}" in TEXT for option in listed if option.startswith("--") and option != "--help")
 
 
 def test_variables_in_the_text_are_read_somewhere():
     code = "".join(path.read_text() for pattern in ("src/**/*.py", "mpi_tools/*", "jobs/*")
                    for path in CHECKOUT.glob(pattern) if path.is_file())
-    named = set(re.findall(r"EDDIES_\w+", README))
+    named = set(re.findall(r"EDDIES_\w+", TEXT))
     assert named and all(name in code for name in named)
     assert set(re.findall(r"EDDIES_[A-Z]+", code)) <= named
 
@@ -169,7 +173,7 @@ def term_rows():
 
 
 def scene_reference():
-    """The scene reference of README, from the declarations of the keys."""
+    """The scene reference, from the declarations of the keys."""
     lines = ["| key | default | values | meaning |", "|---|---|---|---|"]
     fields = dataclasses.fields(Scene)
     lines += [key_row(field) for field in fields if "rule" in field.metadata]
@@ -197,20 +201,20 @@ def test_scene_reference():
     (METHODS, Simulation.__dataclass_fields__["method"].default, "| `method` | what moves the particles |"),
 ])
 def test_a_table_explains_every_choice(words, default, heading):
-    table = README.split(heading)[1].split("\n\n")[0]
+    table = TEXT.split(heading)[1].split("\n\n")[0]
     assert re.findall(r"^\| `([a-z +-]+)`", table, re.MULTILINE) == list(words)
     assert re.findall(r"^\| `([a-z-]+)` \(default\)", table, re.MULTILINE) == [default]
 
 
 def test_table_of_presets_lists_their_terms():
-    table = README.split("| preset | terms |")[1].split("\n\n")[0]
+    table = TEXT.split("| preset | terms |")[1].split("\n\n")[0]
     for preset, terms in PRESETS.items():
         (listed,) = re.findall(rf"^\| `{re.escape(preset)}`[^|]*\|([^|]*)\|", table, re.MULTILINE)
         assert re.findall(r"`([a-z-]+)`", listed) == list(terms)
 
 
 def test_every_term_is_in_the_table():
-    table = README.split("| term | what it gives | learned |")[1].split("\n\n")[0]
+    table = TEXT.split("| term | what it gives | learned |")[1].split("\n\n")[0]
     named = [word for row in table.splitlines()[2:] for word in re.findall(r"`([^`]+)`", row.split("|")[1])]
     assert set(named) == {*TERMS, '"module:name"'}
 
@@ -235,9 +239,6 @@ def slug(heading):
     return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
 
 
-PAGES = [CHECKOUT / "README.md", *sorted((CHECKOUT / "docs").glob("*.md"))]
-
-
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_links_and_files_of_a_page_exist(page):
     text = page.read_text(encoding="utf-8")
@@ -254,10 +255,17 @@ def test_links_and_files_of_a_page_exist(page):
 
 
 @pytest.mark.mpi(1)
-@pytest.mark.parametrize("program", [code for code in blocks("python") if "h5py" in code], ids=["of README"])
+@pytest.mark.parametrize("program", [code for code in blocks("python") if "h5py" in code], ids=["of the docs"])
 def test_python_runs_on_the_files_of_a_run(comm, tmp_path, monkeypatch, capsys, program):
     from tests.workflows.synthetic_run import write_run
     write_run(comm, tmp_path / "runs/hit-small")
     monkeypatch.chdir(tmp_path)
-    exec(compile(program, "README.md", "exec"), {})
+    exec(compile(program, "files.md", "exec"), {})
     assert "nan" not in capsys.readouterr().out
+
+
+def test_the_site_builds_without_a_warning(tmp_path):
+    command = [sys.executable, "-m", "sphinx", "-q", "-W", "-b", "html", CHECKOUT / "docs", tmp_path / "site"]
+    built = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=200)
+    assert built.returncode == 0 and not built.stderr, built.stderr
+    assert all((tmp_path / "site" / f"{page.stem}.html").exists() for page in PAGES[1:])
