@@ -27,12 +27,12 @@ LAYERS = (
     (("report*",),),
     (ROOMS,),
     (("workflows*",),),
-    (("cli*", "api*", "stages*", "logs*", "__main__"),),
+    (("cli*", "api*", "stored_run*", "stages*", "logs*", "__main__"),),
 )
 
 # What only some modules may import.
 ONLY_IN = {
-    "mpi4py*": ("parallel*", "io*", "cli", "api"),
+    "mpi4py*": ("parallel*", "io*", "cli", "api", "stored_run"),
     "h5py*": ("io*",),
     "pyfftw*": ("spectral*", "kernels.library"),
     "torch*": ("particles*", "learning*", "workflows*"),
@@ -40,7 +40,7 @@ ONLY_IN = {
     "eddies.report*": ("report*", "workflows.report", "workflows.compare", "workflows.train"),
     # Scene, rules, reader, sections, model, methods, checks, comparison
     **dict.fromkeys(("eddies.scene.[srm]*", "eddies.scene.ch*", "eddies.scene.compar*"),
-                    ("scene*", "workflows*", "cli", "api", "stages", "logs")),
+                    ("scene*", "workflows*", "cli", "api", "stored_run", "stages", "logs")),
     # Of the particles only the settings of terms declare keys of a scene.
     "eddies.scene.values*": ("scene*", "particles.terms.settings", "workflows*"),
     "eddies.import_path*": ("scene*", "particles.model", "particles.terms.pair_basis", "workflows*"),

@@ -255,12 +255,16 @@ def test_links_and_files_of_a_page_exist(page):
 
 
 @pytest.mark.mpi(1)
-@pytest.mark.parametrize("program", [code for code in blocks("python") if "h5py" in code], ids=["of the docs"])
+@pytest.mark.parametrize("program", [code for code in blocks("python") if "runs/hit-small" in code],
+                         ids=["h5py", "open_run"])
 def test_python_runs_on_the_files_of_a_run(comm, tmp_path, monkeypatch, capsys, program):
+    from eddies.workflows import report
     from tests.workflows.synthetic_run import write_run
     write_run(comm, tmp_path / "runs/hit-small")
+    if "metrics" in program:
+        report.run(tmp_path / "runs/hit-small", comm)
     monkeypatch.chdir(tmp_path)
-    exec(compile(program, "files.md", "exec"), {})
+    exec(compile(program, "docs", "exec"), {})
     assert "nan" not in capsys.readouterr().out
 
 

@@ -9,6 +9,7 @@ __version__ = "0.2.0"
 # reads a scene starts neither MPI nor torch.
 _HOMES = {
     "eddies.api": ("check", "run", "simulate", "train"),
+    "eddies.stored_run": ("StoredRun", "open_run"),
     "eddies.errors": ("UserError",),
     "eddies.import_path": ("ImportPathError",),
     "eddies.scene.scene": ("Scene", "SceneError", "load_scene", "Eulerian", "Flow", "Forcing", "Horizons", "Initial",

@@ -59,6 +59,20 @@ def test_metrics_are_finite_and_within_bounds(run_directory):
     assert rollout["velocity_error"] < 0.95 * error_of_frozen_velocities(run_directory)
 
 
+def test_every_dataset_says_its_units_axes_and_what_it_is(run_directory):
+    for product in run_directory.glob("*.h5"):
+        with h5py.File(product) as file:
+            file.visititems(lambda path, found: check_words(path, found) if isinstance(found, h5py.Dataset) else None)
+
+
+def check_words(path, dataset):
+    """The attributes of a dataset are there, with a name for each axis; a time says when it begins."""
+    units, axes, description = (dataset.attrs[name] for name in ("units", "axes", "description"))
+    where = f"{dataset.file.filename}, {path}"
+    assert path.startswith("weights/") or len(axes.split()) == dataset.ndim, where
+    assert not path.endswith("/time") or (units == "T" and description.startswith("since the")), where
+
+
 def test_what_check_foresees_is_what_was_run(run_directory):
     from eddies.workflows.foreseen.numbers import mach
     from eddies.workflows.foreseen.rollout_course import rollout_course

@@ -19,6 +19,7 @@ from mpi4py import MPI
 
 from eddies.io.errors import ProductError, WriteError, write_error
 from eddies.io.provenance import FORMAT, environment, has_this_format, identity, read_json, read_provenance
+from eddies.io.quantities import describe
 from eddies.io.run_lock import RunTakenOver
 from eddies.io.unfinished import HEADER_BYTES, Unfinished, frame_bytes, writing
 from eddies.parallel.broadcast import on_first_rank, share_text
@@ -134,7 +135,7 @@ def write_table(file: h5py.Group, name: str, columns: Mapping[str, Any]) -> None
 def write_array(group: h5py.Group, name: str, values: np.ndarray) -> None:
     """Write an array, equal on all ranks, as a dataset; all ranks call it."""
     with writing(group, values.nbytes + HEADER_BYTES):
-        group.create_dataset(name, data=values)
+        describe(group.create_dataset(name, data=values))
 
 
 def read_table(file: h5py.Group, name: str) -> dict[str, np.ndarray]:
@@ -156,7 +157,9 @@ def growing_dataset(group: h5py.Group, name: str, frame_shape: tuple[int, ...], 
     one frame as fits, or many frames of a single value. All ranks call it."""
     chunk = _chunk(frame_shape, dtype) if frame_shape else (1024,)
     with writing(group, HEADER_BYTES):
-        return group.create_dataset(name, (0, *frame_shape), dtype, maxshape=(None, *frame_shape), chunks=chunk)
+        dataset = group.create_dataset(name, (0, *frame_shape), dtype, maxshape=(None, *frame_shape), chunks=chunk)
+        describe(dataset)
+    return dataset
 
 
 def stored_bytes(frame_shape: tuple[int, ...], dtype: Any) -> int:

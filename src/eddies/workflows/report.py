@@ -6,7 +6,6 @@ Every product is optional; a section appears for what there is. Each rank makes 
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
 import tomllib
 from collections.abc import Callable, Sequence
@@ -37,7 +36,7 @@ from eddies.scene.scene import Scene
 from eddies.workflows.feasibility import check_places
 from eddies.workflows.product_warnings import changed_truths, mixed_products, not_finite, others_trained_on
 from eddies.workflows.rollout.stored_spectra import read_spectra
-from eddies.workflows.run_directory.work import SECONDS
+from eddies.workflows.run_directory.work import read_stage_seconds
 
 log = logging.getLogger("eddies")
 
@@ -88,9 +87,15 @@ def run(directory: str | Path, comm: Comm) -> None:
     in_files(comm, directory / "report", lambda: _write_report(directory, record, sections))
 
 
+def sections_of(directory: Path, alone: Comm) -> list[Section]:
+    """All sections that one rank reads, their figures not yet drawn."""
+    record = _survey(directory, alone)
+    return [*_read_share(directory, alone, alone, record), _cost_section(record)]
+
+
 def _survey(directory: Path, alone: Comm) -> Run:
     """What the sections have in common."""
-    record = Run(seconds=_stage_seconds(directory))
+    record = Run(seconds=read_stage_seconds(directory))
     for kind in KINDS:
         path = directory / f"{kind}.h5"
         if path.exists():
@@ -252,18 +257,6 @@ def _cost_section(record: Run) -> Section:
                 if key not in present]
     return Section("cost", "Cost", "Wall seconds of stages and of steps.", metrics=metrics,
                    main=("seconds_per_step",))
-
-
-def _stage_seconds(directory: Path) -> dict[str, float]:
-    """Wall seconds of the stages that have run, as the command line notes them beside the products."""
-    path = directory / SECONDS
-    if not path.exists():
-        return {}
-    try:
-        seconds = json.loads(path.read_text())
-        return {stage: float(value) for stage, value in seconds.items()}
-    except (AttributeError, TypeError, ValueError):
-        raise ProductError(f"{path}: is not what the stages wrote; delete it, the report does without") from None
 
 
 def _run_record(directory: Path, record: Run) -> RunRecord:

@@ -13,6 +13,7 @@ from typing import Any
 from eddies.clock import duration
 from eddies.errors import UserError
 from eddies.io.checkpoint import checkpoints_in
+from eddies.io.errors import ProductError
 from eddies.io.provenance import product_provenance
 from eddies.pipeline import STAGES, Stage
 from eddies.scene.rules import quoted
@@ -98,11 +99,20 @@ def stage_seconds(directory: Path) -> dict[str, float]:
     """Wall time of each stage as earlier runs noted it; a file that is missing or damaged holds nothing worth an
     error."""
     try:
-        known = json.loads((directory / SECONDS).read_text())
-    except (OSError, ValueError):
+        return read_stage_seconds(directory)
+    except (OSError, ProductError):
         return {}
-    return {stage: seconds for stage, seconds in known.items() if isinstance(seconds, int | float)} if isinstance(
-        known, dict) else {}
+
+
+def read_stage_seconds(directory: Path) -> dict[str, float]:
+    """The same; ProductError where the file is damaged."""
+    path = directory / SECONDS
+    if not path.exists():
+        return {}
+    try:
+        return {stage: float(value) for stage, value in json.loads(path.read_text()).items()}
+    except (AttributeError, TypeError, ValueError):
+        raise ProductError(f"{path}: is not what the stages wrote; delete it, the report does without") from None
 
 
 def changed_settings(stage: Stage, then: str | None, now: str | None) -> list[str]:

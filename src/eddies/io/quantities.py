@@ -1,0 +1,99 @@
+"""What the datasets of a product say of themselves: units, axes, and what they are.
+
+Units are made of L, the edge of the cube over 2 pi, T, the time that follows from lengths and velocities, and M, so
+that the mean density is 1 M/L^3.
+"""
+
+from __future__ import annotations
+
+from fnmatch import fnmatchcase
+from typing import NamedTuple
+
+import h5py
+
+BEGINNING = {"ground_truth": "since the release of the tracers", "rollout": "since the start of the rollout"}
+
+
+class Quantity(NamedTuple):
+    """Of a dataset: its units, the names of its axes, what it is."""
+
+    units: str
+    axes: str
+    description: str
+
+
+PARTICLES, FIELD, ROW = "time particle", "time component z y x", "row"
+# By path in the file, the first that fits.
+QUANTITIES = {
+    "particles/*/id": Quantity("1", "particle", "of the particle in each row of every frame"),
+    "particles/*/step": Quantity("1", "time", "number of the time step"),
+    "particles/*/box/edges": Quantity("L", "xyz", "edges of the periodic cube"),
+    "particles/*/position/value": Quantity("L", f"{PARTICLES} xyz", "wrapped into the cube, 0 <= x < edge"),
+    "particles/*/velocity/value": Quantity("L/T", f"{PARTICLES} xyz", "of the particles"),
+    "particles/*/acceleration/value": Quantity("L/T^2", f"{PARTICLES} xyz", "of the particles"),
+    "particles/*/density/value": Quantity("M/L^3", PARTICLES, "at the particles"),
+    "particles/*/velocity_gradient/value": Quantity("1/T", f"{PARTICLES} i j", "dv_i/dx_j through the kernel"),
+    "fields/*/velocity": Quantity("L/T", FIELD, "components x, y, z at the points i L / cells"),
+    "fields/*/density": Quantity("M/L^3", FIELD, "at the points i L / cells"),
+    "spectra*/wavenumber": Quantity("1/L", "wavenumber", "shell of the modes with this |k|, rounded"),
+    "spectra_of_statistics/energy": Quantity("L^2/T^2", "row wavenumber", "energy of each shell k = 0, 1, ..."),
+    "spectra/energy": Quantity("L^2/T^2", "time wavenumber", "energy of each shell of the flow"),
+    "spectra/filtered": Quantity("L^2/T^2", "time wavenumber", "energy of each shell of the filtered flow"),
+    "spectra_of_*/energy": Quantity("L^2/T^2", "time wavenumber",
+                                    "energy of each shell that least squares find in the particles' velocities"),
+    "statistics/time": Quantity("T", ROW, "since the start of the simulation"),
+    "statistics/time_step": Quantity("T", ROW, "length of a time step"),
+    "statistics/turnovers": Quantity("1", ROW, "eddy turnovers since the start of the simulation"),
+    "statistics/seconds_per_step": Quantity("s", ROW, "wall time of a step"),
+    "statistics/energy_?": Quantity("L^2/T^2", ROW, "kinetic energy per mass of a component"),
+    "statistics/energy": Quantity("L^2/T^2", ROW, "kinetic energy per mass"),
+    "statistics/total_energy": Quantity("L^2/T^2", ROW, "kinetic energy and that of compression, per mass"),
+    "statistics/compressible_fraction": Quantity("1", ROW, "share of the energy that is not solenoidal"),
+    "statistics/dissipation_rate": Quantity("L^2/T^3", ROW, "energy per mass that viscosity takes in a time"),
+    "statistics/injection_rate": Quantity("L^2/T^3", ROW, "energy per mass that the forcing brings in a time"),
+    "statistics/velocity_rms": Quantity("L/T", ROW, "rms of a component of the velocity, u'"),
+    "statistics/density_rms": Quantity("M/L^3", ROW, "rms of the density about its mean"),
+    "statistics/eddy_turnover_time": Quantity("T", ROW, "integral scale over u'"),
+    "statistics/kolmogorov_time": Quantity("T", ROW, "(nu / dissipation rate)^(1/2)"),
+    "statistics/integral_scale": Quantity("L", ROW, "pi / (2 u'^2) sum of E(k) / k"),
+    "statistics/taylor_scale": Quantity("L", ROW, "(15 nu u'^2 / dissipation rate)^(1/2)"),
+    "statistics/kolmogorov_length": Quantity("L", ROW, "(nu^3 / dissipation rate)^(1/4)"),
+    "statistics/kmax_eta": Quantity("1", ROW, "largest wavenumber along an axis times the Kolmogorov length"),
+    "statistics/mach_turbulent": Quantity("1", ROW, "rms speed over the speed of sound"),
+    "statistics/reynolds_lambda": Quantity("1", ROW, "u' times the Taylor scale over nu"),
+    "statistics/skewness": Quantity("1", ROW, "of longitudinal velocity gradients"),
+    "statistics/flatness": Quantity("1", ROW, "of longitudinal velocity gradients"),
+    "closure/time": Quantity("T", "time", "since the start of the rollout"),
+    "closure/residual": Quantity("1", "time", "largest relative residual of a solve for the resolved velocity"),
+    "closure/*": Quantity("1", "time", "solves for the resolved velocity since the frame before: {name}"),
+    "outside_training/time": Quantity("T", "time", "since the start of the rollout"),
+    "outside_training/*": Quantity("1", "time", "share of pairs with an input of the network outside of its training"),
+    "kernels/r_over_h": Quantity("1", ROW, "distance over the support"),
+    "kernels/value_*": Quantity("1", ROW, "W h^3 of the kernel {name}"),
+    "kernels/derivative_*": Quantity("1", ROW, "W' h^4 of the kernel {name}"),
+    "errors/integral_*": Quantity("1", "", "integral over space of the kernel {name}"),
+    "errors/*": Quantity("1", "", "relative L2 error on a field that was not used: {name}"),
+    "slices/*velocity*": Quantity("L/T", "y x", "u_x in a plane: {name}"),
+    "slices/*gradient*": Quantity("1/T", "y x", "du_x/dx in a plane: {name}"),
+    "history/seconds": Quantity("s", ROW, "wall time since the start of the training"),
+    "*history/*": Quantity("1", ROW, "of the training: {name}"),
+    "*a_priori/delay": Quantity("T", ROW, "since the end of the training window"),
+    "*a_priori/*": Quantity("1", ROW, "relative L2 error of the rates at the true state: {name}"),
+    "acceleration_sample/*": Quantity("L/T^2", "particle xyz", "{name} acceleration of some particles"),
+    "density_rate_sample/*": Quantity("M/L^3/T", "particle", "{name} rate of the density of some particles"),
+    "*feature_range/*": Quantity("1", "input", "{name} of each input of the network in training"),
+    "weights/*": Quantity("1", "", "trained parameters"),
+}
+
+
+def describe(dataset: h5py.Dataset) -> None:
+    """Write the attributes `units`, `axes` and `description`; nothing of a dataset that no rule knows. Collective."""
+    kind, path = dataset.file.attrs.get("kind", ""), dataset.name.strip("/")
+    group, _, name = path.rpartition("/")
+    known = next((known for pattern, known in QUANTITIES.items() if fnmatchcase(path, pattern)), None)
+    if known is None and name == "time":
+        beginning = "since the start of the simulation" if group == "fields/final" else BEGINNING.get(kind, "")
+        known = Quantity("T", "time", beginning)
+    if known is not None:
+        dataset.attrs["units"], dataset.attrs["axes"] = known.units, known.axes
+        dataset.attrs["description"] = known.description.format(name=name.replace("_", " "))

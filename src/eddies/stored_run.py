@@ -1,0 +1,143 @@
+"""A run directory as programs and notebooks read it: products, numbers and figures."""
+
+from __future__ import annotations
+
+import json
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from eddies.errors import UserError
+from eddies.pipeline import STAGES
+from eddies.scene.scene import Scene, load_scene
+
+TRAJECTORIES = {"tracers": "ground_truth/particles/tracers", "model": "rollout/particles/model",
+                "truth": "rollout/particles/truth"}
+FIELDS = {"filtered": "ground_truth/fields/filtered", "unfiltered": "ground_truth/fields/unfiltered",
+          "final": "ground_truth/fields/final", "model": "rollout/fields/model", "truth": "rollout/fields/truth"}
+SPECTRA = {"flow": ("ground_truth/spectra", "energy"), "filtered": ("ground_truth/spectra", "filtered"),
+           "model": ("rollout/spectra_of_model", "energy"), "truth": ("rollout/spectra_of_truth", "energy")}
+
+
+class StoredRun:
+    """What a run has left in its directory; nothing is read before it is asked for.
+
+    Groups of arrays are xarray Datasets with coordinates and units, whose values are read from the file when they are
+    used, or, where xarray is not installed, dictionaries of numpy arrays. What is missing is told by a UserError.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        if not self.products:
+            raise UserError(f"{self.path}: holds none of {', '.join(self._files.values())}; run `eddies dns SCENE` "
+                            "first")
+
+    @property
+    def products(self) -> tuple[str, ...]:
+        """Names of the products that there are: "ground_truth", "kernel", "model", "rollout"."""
+        return tuple(name for name, file in self._files.items() if (self.path / file).is_file())
+
+    @property
+    def groups(self) -> list[str]:
+        """All that `run[...]` gives, such as "rollout/particles/model"."""
+        from eddies.io.datasets import groups_in, opened
+        found = []
+        for product in self.products:
+            with opened(self.path / self._files[product]) as file:
+                found += [f"{product}/{group}" for group in groups_in(file)]
+        return found
+
+    def __getitem__(self, name: str) -> Any:
+        """A group of arrays: "PRODUCT/GROUP"."""
+        from eddies.io.datasets import open_group
+        product, _, group = name.partition("/")
+        if product not in self.products:
+            raise UserError(f"{self.path}: holds no {product}; it holds: {', '.join(self.products)}")
+        return open_group(self.path / self._files[product], group)
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The scene as it was run."""
+        return load_scene(self.path / "scene.toml")
+
+    @property
+    def metrics(self) -> dict[str, Any]:
+        """The numbers of the report, by section."""
+        path = self.path / "report" / "metrics.json"
+        if not path.is_file():
+            raise UserError(f"{path}: no such file; run `eddies report {self.path}` first")
+        return json.loads(path.read_text())
+
+    def trajectories(self, ids: Any = None, of: str = "model", unwrapped: bool = False) -> Any:
+        """Position, velocity and what else is stored of particles, all or those with these ids: of the "model" or the
+        "truth" of the rollout, or of the "tracers" of the ground truth.
+
+        Positions that are unwrapped go on beyond the cube, from where they are in the first frame; between frames a
+        particle must move by less than half an edge.
+        """
+        found = self[chosen(TRAJECTORIES, of)]
+        if isinstance(found, dict):  # without xarray
+            rows = slice(None) if ids is None else np.asarray(ids)
+            found = {key: values[:, rows] if values.ndim > 1 else values[rows] if key == "id" else values
+                     for key, values in found.items()}
+        elif ids is not None:
+            found = found.sel(particle=ids)
+        if unwrapped:
+            position = found["position"]
+            edge = 2 * np.pi
+            steps = np.diff(np.asarray(position), axis=0)
+            steps -= edge * np.rint(steps / edge)
+            path = np.concatenate([position[:1], position[:1] + np.cumsum(steps, axis=0)]) if len(steps) else position
+            if isinstance(found, dict):
+                return {**found, "position": path}
+            return found.assign(position=(position.dims, path, {**position.attrs, "description": "unwrapped"}))
+        return found
+
+    def field(self, name: str = "velocity", time: float | None = None, of: str = "filtered") -> Any:
+        """A field on its grid, (component, z, y, x), at the stored time next to the one given, or the last: of the
+        "filtered" or "unfiltered" flow, of the "final" one of a run without tracers, or what the kernel makes of the
+        particles of the "model" or of the "truth"."""
+        return at_time(self[chosen(FIELDS, of)], name, time)
+
+    def spectrum(self, of: str = "model", time: float | None = None) -> Any:
+        """Energy of each wavenumber at a time, likewise: of the "flow", of what is "filtered" of it, or what least
+        squares find in the velocities of the particles of the "model" or of the "truth"."""
+        group, column = chosen(SPECTRA, of)
+        return at_time(self[group], column, time)
+
+    @cached_property
+    def figures(self) -> dict[str, Any]:
+        """All figures of the report, by name, as matplotlib figures that can be changed and saved."""
+        from mpi4py import MPI
+
+        from eddies.workflows.report import sections_of
+        return {drawing.name: drawing.image for section in sections_of(self.path, MPI.COMM_SELF)
+                for drawing in section.illustrations}
+
+    @property
+    def _files(self) -> dict[str, str]:
+        return {stage.product: stage.file for stage in STAGES.values() if stage.product}
+
+    def __repr__(self) -> str:
+        return f"StoredRun({str(self.path)!r}: {', '.join(self.products)})"
+
+
+def open_run(path: str | Path) -> StoredRun:
+    """A run directory, for programs and notebooks."""
+    return StoredRun(path)
+
+
+def chosen(table: dict[str, Any], of: str) -> Any:
+    """What a name stands for; UserError with those that there are."""
+    if of not in table:
+        raise UserError(f'of = "{of}": must be one of {", ".join(table)}')
+    return table[of]
+
+
+def at_time(found: Any, name: str, time: float | None) -> Any:
+    """A variable at the stored time next to the one given, or the last."""
+    if isinstance(found, dict):  # without xarray
+        return found[name][-1 if time is None else int(np.argmin(np.abs(found["time"] - time)))]
+    return found[name].isel(time=-1) if time is None else found[name].sel(time=time, method="nearest")

@@ -1,0 +1,75 @@
+import numpy as np
+import pytest
+
+import eddies
+from eddies.io import datasets
+from tests.workflows.synthetic_run import LENGTH, write_run
+
+
+@pytest.fixture
+def directory(comm, tmp_path):
+    """The products of a made-up run."""
+    write_run(comm, tmp_path)
+    return tmp_path
+
+
+@pytest.mark.mpi(1)
+def test_groups_are_datasets_that_read_what_is_used(directory):
+    run = eddies.open_run(directory)
+    assert run.products == ("ground_truth", "kernel", "model", "rollout")
+    assert {"rollout/particles/model", "ground_truth/statistics", "kernel/errors"} <= set(run.groups)
+    model = run["rollout/particles/model"]
+    assert model["velocity"].dims == ("time", "particle", "xyz") and model["velocity"].attrs["units"] == "L/T"
+    assert list(model["xyz"].values) == ["x", "y", "z"] and model["time"].attrs["units"] == "T"
+    # What is asked for is what the file holds, in any order of indices, and nothing is read before.
+    assert not model["velocity"].variable._in_memory
+    with datasets.opened(directory / "rollout.h5") as file:
+        whole = file["particles/model/velocity/value"][()]
+    chosen = model["velocity"].isel(time=-1, particle=[5, 2, 2])
+    assert np.array_equal(chosen, whole[-1, [5, 2, 2]])
+    assert np.array_equal(model["velocity"].sel(xyz="y")[:, 3], whole[:, 3, 1])
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("with_xarray", [True, False])
+def test_trajectories_fields_and_spectra(directory, monkeypatch, with_xarray):
+    if not with_xarray:
+        monkeypatch.setattr(datasets, "xarray", None)
+    run = eddies.open_run(directory)
+    ids, all_of_them = [7, 3], run.trajectories(of="truth")
+    some = run.trajectories(ids, of="truth", unwrapped=True)
+    position, whole = (np.asarray(found["position"]) for found in (some, all_of_them))
+    assert np.array_equal(some["id"] if isinstance(some, dict) else some["particle"], ids)
+    # Unwrapped, they differ by whole edges, and no particle leaps.
+    turns = (position - whole[:, ids]) / LENGTH
+    assert np.abs(turns - np.rint(turns)).max() < 1e-6 and np.abs(np.diff(position, axis=0)).max() < LENGTH / 2
+    field, first = run.field(of="model"), run.field(of="model", time=0.0)
+    assert field.shape[0] == 3 and field.ndim == 4 and not np.array_equal(field, first)
+    if with_xarray:
+        assert field.dims == ("component", "z", "y", "x")
+        assert float(field["x"][1]) == pytest.approx(LENGTH / field.sizes["x"])
+    energy = run.spectrum("filtered")
+    assert float(np.asarray(energy).sum()) > 0 and run.spectrum("truth", time=0.0).ndim == 1
+
+
+@pytest.mark.mpi(1)
+def test_figures_are_those_of_the_report(comm, directory, tmp_path):
+    from eddies.workflows import report
+    report.run(directory, comm)
+    run = eddies.open_run(directory)
+    assert {f"{name}.png" for name in run.figures} == {path.name for path in (directory / "report/figures").iterdir()}
+    assert all(figure.axes for figure in run.figures.values())
+    assert run.metrics["rollout"]["energy_ratio"] > 0
+
+
+@pytest.mark.mpi(1)
+def test_what_is_missing_is_told(directory, tmp_path):
+    with pytest.raises(eddies.UserError, match="holds none of ground_truth.h5, .*run `eddies dns SCENE` first"):
+        eddies.open_run(tmp_path / "nowhere")
+    run = eddies.open_run(directory)
+    for ask, words in ((lambda: run["rollout/forces"], "holds no forces; it holds: .*particles/model"),
+                       (lambda: run["movie"], "holds no movie; it holds: ground_truth, kernel, model, rollout"),
+                       (lambda: run.field(of="tracers"), 'of = "tracers": must be one of filtered, unfiltered'),
+                       (lambda: run.metrics, "metrics.json: no such file; run `eddies report ")):
+        with pytest.raises(eddies.UserError, match=words):
+            ask()
