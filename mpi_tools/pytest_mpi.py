@@ -201,8 +201,9 @@ class RankRun:
         self.read, self.found = [0] * ranks, {}  # bytes of each rank's records, and what they say by event and test
         self.output = open(self.folder / "output", "w+b")
         shown = config.option.capture == "no"
+        # What the plugin left out would warn of is not shown, and it collects garbage for a second at the end.
         inner = [sys.executable, "-m", "pytest", *map(str, self.modules), f"--mpi-run={self.folder}", "-q",
-                 "--color=no", "-p", "mpi_tools.pytest_mpi", "-p", "no:cacheprovider",
+                 "--color=no", "-p", "mpi_tools.pytest_mpi", "-p", "no:cacheprovider", "-p", "no:unraisableexception",
                  f"--rootdir={config.rootpath}", f"--tb={config.option.tbstyle}",
                  *(["-c", str(config.inipath)] if config.inipath else []), *(["-s"] if shown else [])]
         path = [str(Path(__file__).parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
