@@ -8,8 +8,9 @@ The pytest process that the user starts (outer) never initialises MPI: Open MPI 
 a process that has. It starts one `mpirun -n RANKS python -m pytest MODULES` (inner) for all selected tests with
 the same number of ranks, as starting ranks takes longer than most tests, and reports each of them from the JSON
 lines that every rank writes. Where the ranks disagree about a test, or it lasts longer than its time limit, that
-mpirun ends and a new one runs the tests after it. So tests run in the order of their ranks. `tmp_path` is one
-folder for all ranks of a test; `tmp_path_factory` is not shared.
+mpirun ends and a new one runs the tests after it. So tests run in the order of their ranks. For those on one rank
+there are several mpirun, which share the modules among them: each takes the next one that none has. `tmp_path` is
+one folder for all ranks of a test; `tmp_path_factory` is not shared.
 """
 
 import json
@@ -28,6 +29,7 @@ from mpi_tools.launch import local_cores, mpi_environment, mpirun_command
 
 TIMEOUT = 120.0  # seconds for one test on all its ranks
 STALL = 60.0     # seconds without a result, beyond the time limit, after which mpirun itself is given up
+BESIDE = 4       # mpirun of one rank that run beside each other at most, on as many cores
 
 
 def pytest_addoption(parser):
@@ -89,7 +91,7 @@ class OuterRun:
 
     def __init__(self, config):
         self.config = config
-        self.run = None
+        self.runs, self.reported = [], None
         self.waiting = {}  # ranks -> items still to be reported, in order
 
     @pytest.hookimpl(trylast=True)
@@ -103,28 +105,37 @@ class OuterRun:
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_runtestloop(self, session):
-        """The tests on one rank run beside those that need none: two cores are busy."""
-        group = self.waiting.get(1)
-        if group and len(session.items) > sum(map(len, self.waiting.values())) and local_cores() > 1 \
-                and not session.config.option.collectonly and session.config.option.capture != "no":
+        """The tests on one rank run beside each other and beside those that need none: all cores are busy."""
+        group, cores, shown = self.waiting.get(1), local_cores(), session.config.option.capture == "no"
+        if group and cores > 1 and not shown and not session.config.option.collectonly:
             # A rank that waits for another leaves its core to them.
             os.environ.setdefault("OMPI_MCA_mpi_yield_when_idle", "1")
-            self.run = RankRun(self.config, 1, group)
+            self.start(group, min(cores, BESIDE, len({item.path for item in group})))
+
+    def start(self, items, count=1):
+        """So many mpirun that share these tests."""
+        first = RankRun(self.config, items)
+        self.runs += [first, *(RankRun(self.config, items, first.taken) for _ in range(count - 1))]
 
     def records(self, item) -> list[dict]:
         """Records of all ranks for a test; where no mpirun reaches it, one starts with it."""
         group = self.waiting[item.ranks]
         del group[:group.index(item)]
-        if self.run is None or not self.run.reaches(item):
-            self.close()
-            self.run = RankRun(self.config, item.ranks, group)
-            self.run.reaches(item)
-        return self.run.records(item)
+        run = next((run for run in self.runs if run.reaches(item)), None)
+        if run is None:
+            others = [run for run in self.runs if run.ranks == item.ranks and run.process.poll() is None]
+            if not others:
+                self.close()
+            # What is left of the module is nobody's; the others have or will take the modules after it.
+            self.start([other for other in group if other.path == item.path] if others else group)
+            run = self.runs[-1]
+            run.reaches(item)
+        self.reported = item
+        return run.records(item)
 
     def close(self):
-        if self.run is not None:
-            self.run.close()
-            self.run = None
+        while self.runs:
+            self.runs.pop().close(self.reported)
 
     def pytest_sessionfinish(self):
         self.close()
@@ -174,19 +185,26 @@ class MpiItem(pytest.Item):
 
 
 class RankRun:
-    """One mpirun of tests on a number of ranks."""
+    """One mpirun of tests on a number of ranks: of the modules that it takes first, where others share them.
 
-    def __init__(self, config, ranks: int, items: list[MpiItem]):
-        self.ranks, self.items = ranks, list(items)
+    To take a module is to make a link, named by its number, to one's own folder in the folder `taken` of all of them.
+    """
+
+    def __init__(self, config, items: list[MpiItem], taken: Path | None = None):
+        self.ranks, self.items = ranks, items = items[0].ranks, list(items)
+        self.modules = list(dict.fromkeys(item.path for item in items))
         self.folder = Path(tempfile.mkdtemp(prefix="pytest-mpi-"))
-        (self.folder / "tests.json").write_text(json.dumps({item.nodeid: item.timeout for item in items}))
+        self.taken = taken or self.folder / "taken"
+        self.taken.mkdir(exist_ok=True)
+        tests = {"timeouts": {item.nodeid: item.timeout for item in items}, "taken": str(self.taken)}
+        (self.folder / "tests.json").write_text(json.dumps(tests))
         self.read, self.found = [0] * ranks, {}  # bytes of each rank's records, and what they say by event and test
         self.output = open(self.folder / "output", "w+b")
         shown = config.option.capture == "no"
-        modules = dict.fromkeys(str(item.path) for item in items)
-        inner = [sys.executable, "-m", "pytest", *modules, f"--mpi-run={self.folder}", "-q", "--color=no",
-                 "-p", "mpi_tools.pytest_mpi", "-p", "no:cacheprovider", f"--rootdir={config.rootpath}",
-                 f"--tb={config.option.tbstyle}",
+        # What the plugin left out would warn of is not shown, and it collects garbage for a second at the end.
+        inner = [sys.executable, "-m", "pytest", *map(str, self.modules), f"--mpi-run={self.folder}", "-q",
+                 "--color=no", "-p", "mpi_tools.pytest_mpi", "-p", "no:cacheprovider", "-p", "no:unraisableexception",
+                 f"--rootdir={config.rootpath}", f"--tb={config.option.tbstyle}",
                  *(["-c", str(config.inipath)] if config.inipath else []), *(["-s"] if shown else [])]
         path = [str(Path(__file__).parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
         environment = mpi_environment(ranks) | {"PYTHONPATH": os.pathsep.join(path)}
@@ -213,9 +231,9 @@ class RankRun:
         return self.found.get((event, item.nodeid), {})
 
     def wait(self, item: MpiItem, event: str, ranks: int) -> dict[int, dict]:
-        """Entries of the event once so many ranks have written one, or the run has ended."""
+        """Entries of the event once so many ranks have written one, the run has ended, or another has the module."""
         give_up = time.monotonic() + item.timeout + STALL
-        while len(self.entries(item, event)) < ranks and self.process.poll() is None:
+        while len(self.entries(item, event)) < ranks and self.process.poll() is None and not self.leaves(item):
             if time.monotonic() > give_up:
                 self.stop()
             time.sleep(0.02)
@@ -224,6 +242,11 @@ class RankRun:
     def reaches(self, item: MpiItem) -> bool:
         """Waits until some rank starts the test; whether one did."""
         return item in self.items and bool(self.wait(item, "start", ranks=1))
+
+    def leaves(self, item: MpiItem) -> bool:
+        """Whether another run has taken the module of the test."""
+        link = self.taken / str(self.modules.index(item.path))
+        return link.is_symlink() and os.readlink(link) != str(self.folder)
 
     def records(self, item: MpiItem) -> list[dict]:
         """Waits until all ranks have ended the test, or the run has; one record a rank."""
@@ -258,11 +281,11 @@ class RankRun:
                 except subprocess.TimeoutExpired:
                     pass
 
-    def close(self):
-        """Gives a run that is through the time to end by itself, stops any other, removes the folder."""
-        through = len(self.entries(self.items[-1], "end")) == self.ranks
+    def close(self, reported: MpiItem | None):
+        """Gives a run whose last test is the one reported the time to end by itself, stops any other, removes the
+        folder."""
         try:
-            self.process.wait(10 if through else 0)
+            self.process.wait(10 if reported is self.items[-1] else 0)
         except subprocess.TimeoutExpired:
             self.stop()
         self.output.close()

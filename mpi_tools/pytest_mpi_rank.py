@@ -1,9 +1,11 @@
 """The inner half of the plugin `pytest_mpi`: one rank of `mpirun -n RANKS python -m pytest MODULES`."""
 
+import contextlib
 import faulthandler
 import json
 import os
 import signal
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +16,14 @@ GRACE = 3.0  # seconds that the other ranks get to end a test that has failed on
 
 
 class InnerRun:
-    """Runs the tests named in FOLDER/tests.json on this rank and writes FOLDER/RANK.jsonl."""
+    """Runs the tests named in FOLDER/tests.json, of modules that no other run has taken, on this rank and writes
+    FOLDER/RANK.jsonl."""
 
     def __init__(self, folder: Path):
         # Of its own: what a failing test leaves unreceived on COMM_WORLD cannot be mistaken on this one.
         self.comm = MPI.COMM_WORLD.Dup()
-        self.timeouts = json.loads((folder / "tests.json").read_text())
+        tests = json.loads((folder / "tests.json").read_text())
+        self.folder, self.taken, self.timeouts = folder, Path(tests["taken"]), tests["timeouts"]
         self.results = open(folder / f"{self.comm.rank}.jsonl", "w", buffering=1)
         self.stack = open(folder / f"{self.comm.rank}.stack", "w")
         # mpirun ends the ranks of an aborted run with SIGTERM: each then says where it was.
@@ -29,6 +33,25 @@ class InnerRun:
     def pytest_collection_modifyitems(self, items):
         collected = {item.nodeid: item for item in items}
         items[:] = [collected[nodeid] for nodeid in self.timeouts]
+
+    @pytest.hookimpl(tryfirst=True)
+    def pytest_runtestloop(self, session):
+        """As that of pytest, which also ends a run whose modules cannot be collected."""
+        if session.testsfailed:
+            return None
+        for number, (_, items) in enumerate(groupby(session.items, key=lambda item: item.path)):
+            if self.take(number):
+                first, *others = items
+                for item, following in zip([first, *others], [*others, None]):
+                    item.config.hook.pytest_runtest_protocol(item=item, nextitem=following)
+        return True
+
+    def take(self, number: int) -> bool:
+        """Whether the module of this number is this run's."""
+        link = self.taken / str(number)
+        with contextlib.suppress(FileExistsError):
+            link.symlink_to(self.folder)
+        return os.readlink(link) == str(self.folder)
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item):

@@ -50,6 +50,14 @@ def quick_solves(monkeypatch):
 
 
 @pytest.fixture
+def quick_spectra(monkeypatch):
+    """Three iterations for each spectrum that a rollout stores, which is half of a short one's time, where nobody looks
+    at them."""
+    from eddies.workflows.rollout import particle_spectra
+    monkeypatch.setattr(particle_spectra, "MOST_ITERATIONS", 3)
+
+
+@pytest.fixture
 def own(tmp_path, monkeypatch):
     """A function that writes a module of a user's, NAME and text, into tmp_path, where modules are found as long as the
     test lasts."""

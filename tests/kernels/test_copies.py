@@ -1,15 +1,9 @@
 """Compiled copies around transforms against those of numpy, for each instruction set that this processor runs."""
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from eddies.kernels.copies import CompiledColumnCopies, CompiledPlaneCopies
-from eddies.kernels.library import instruction_sets, load
 from eddies.spectral.copies import ColumnCopies, PlaneCopies
 
 TOLERANCE = {np.complex128: 1e-14, np.complex64: 1e-6}
@@ -134,32 +128,3 @@ def test_arrays_of_another_kind_are_refused(library):
         for call in calls:
             with pytest.raises(ValueError, match=message):
                 call()
-
-
-def test_the_same_bits_with_any_number_of_threads(library):
-    program = """
-import hashlib, sys, numpy as np
-from tests.kernels.test_copies import CompiledColumnCopies, CompiledPlaneCopies, load, noise
-digest, size = hashlib.sha256(), (144, 47, np.complex128)
-planes, columns = (kind(load(sys.argv[1]), *size) for kind in (CompiledPlaneCopies, CompiledColumnCopies))
-arrays = [noise(1, complex, 2, 4, 95, 48), noise(2, complex, 2, 144, 98), noise(3, complex, 144, 20, 48),
-          noise(4, complex, 1, 95, 40, 48), noise(5, complex, 95)]
-blocks, (rows, column, modes, factors) = planes.described_blocks(arrays[:1]), map(planes.described, arrays[1:])
-arrays.append(planes.pack(blocks, slice(0, 4)))
-for _ in planes.filled(arrays[-1], noise(5, complex, 1, 1, 95, 1), rows):
-    planes.unpack(rows, blocks, 1, slice(0, 4))
-columns.store(column, 0.3, modes, 0, slice(7, 27))
-columns.fill(modes, 0, slice(9, 29), factors, column)
-for array in arrays:
-    digest.update(array.tobytes())
-print(digest.hexdigest())
-"""
-    assert len(printed(library, program)) == 1
-
-
-def printed(library, program):
-    """What a program prints with one, two and three threads."""
-    name = next(name for name in instruction_sets() if load(name) is library)
-    return {subprocess.run([sys.executable, "-c", program, name], cwd=Path(__file__).parents[2], timeout=60, check=True,
-                           capture_output=True, text=True, env={**os.environ, "OMP_NUM_THREADS": threads}).stdout
-            for threads in ("1", "2", "3")}

@@ -7,7 +7,6 @@ from eddies.flow.formulas import Formulas
 from eddies.kernels.flow import CompiledFormulas
 from eddies.parallel.slab import SlabDecomposition
 from eddies.spectral.spectral_grid import SpectralGrid
-from tests.kernels.test_copies import printed
 
 TOLERANCE = {"float64": 1e-13, "float32": 3e-6}
 SHAPES = [(3, 5, 14), (1, 1, 1), (0, 4, 8)]
@@ -112,22 +111,3 @@ def test_arrays_of_another_kind_are_refused(library):
             compiled.project(spoiled)
     with pytest.raises(ValueError, match="contiguous factors"):
         compiled.sum_of_decays([(factors(grid, 5, 1), modes(grid, 3))])
-
-
-def test_the_same_bits_with_any_number_of_threads(library):
-    program = """
-import hashlib, sys
-from eddies.kernels.library import load
-from tests.kernels.test_flow import both, factors, fields, modes
-digest = hashlib.sha256()
-for precision in ("float64", "float32"):
-    grid, _, compiled = both(load(sys.argv[1]), precision, 60)
-    out, terms = fields(grid, 4, (2, 60, 120)), [(factors(grid, 5, seed), modes(grid, 4, seed)) for seed in (1, 2)]
-    compiled.advection(fields(grid, 15, (2, 60, 120)), 0.3, out)
-    results = [out, compiled.project(modes(grid, 3)), compiled.sum_of_acoustic_blocks(terms),
-               compiled.sum_of_decays([(factors(grid, 1, 1), modes(grid, 3))])]
-    for array in results:
-        digest.update(array.tobytes())
-print(digest.hexdigest())
-"""
-    assert len(printed(library, program)) == 1

@@ -1,15 +1,11 @@
 """Compiled sums over pairs against those of torch, for each instruction set that this processor runs."""
 
-import os
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from eddies.kernels.library import instruction_sets, load
 from eddies.kernels.pairs import CompiledPairs, PairSpace, Summand
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.smoothing_kernels import CubicSpline, WendlandC2
@@ -156,37 +152,3 @@ def test_kernels_end_where_they_should(library):
                                   np.ones(2, bool), np.float64)
             found = pairs.sums([Summand("summation-density", 1, (kind,), (1.0, 1.0))], [np.zeros(0)])[0]
             assert found == pytest.approx(value(kernel, distance, 1.0))
-
-
-PROGRAM = """
-import hashlib, sys
-import numpy as np
-from eddies.kernels.library import load
-from eddies.kernels.pairs import CompiledPairs, PairSpace, Summand
-
-random, digest = np.random.default_rng(1), hashlib.sha256()
-position, velocity = random.uniform(0, 1, (5000, 3)), random.standard_normal((5000, 3))
-summands = [Summand("pair-network", 6, (2, 1, 1, 1, 1, 1, 9, 6)), Summand("moments", 7)]
-parameters = [random.standard_normal(9 * 6 + 6 * 10 + 2 * 7), np.zeros(0)]
-for kind in (np.float32, np.float64):
-    for mutual in (True, False):
-        space = PairSpace(1.0, mutual, 0.13, 0.1, 1.0, mutual)
-        pairs = CompiledPairs(load(sys.argv[1]), space, position, velocity, random.standard_normal((1, 5000)),
-                              random.uniform(size=5000) < 0.9, kind)
-        sums = pairs.sums(summands, parameters)
-        by_parameters, by_columns = pairs.gradients(summands, parameters, sums, True)
-        for array in (*sums, *by_parameters, *by_columns):
-            digest.update(array.tobytes())
-assert all(np.abs(array).max() > 0 for array in (*sums, by_parameters[0], *by_columns))
-print(digest.hexdigest())
-"""
-
-
-def test_the_same_bits_with_any_number_of_threads_and_from_run_to_run(library):
-    name = next(name for name in instruction_sets() if load(name) is library)
-    found = set()
-    for threads in ("1", "2", "3", "2"):
-        made = subprocess.run([sys.executable, "-c", PROGRAM, name], timeout=60, capture_output=True, check=True,
-                              text=True, env={**os.environ, "OMP_NUM_THREADS": threads})
-        found.add(made.stdout)
-    assert len(found) == 1

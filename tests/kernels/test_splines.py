@@ -1,18 +1,11 @@
 """Compiled splines against those of numpy, for each instruction set that this processor runs."""
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from eddies.kernels.library import instruction_sets, load
 from eddies.kernels.splines import CompiledSplines, MisplacedPoint, PaddedPlanes
 from eddies.spectral.splines import Splines
 
-CHECKOUT = Path(__file__).parents[2]
 SPACING, BELOW, ABOVE = 0.3, 3, 4
 # With fewer cells than splines are wide and than columns are moved together, with one chunk of lines and with many.
 CELLS = (4, 7, 11, 18, 41)
@@ -130,26 +123,3 @@ def test_columns_and_planes_of_another_size_are_refused(library):
         compiled.spread(np.zeros((3, 2)), parts(11, 2))
     with pytest.raises(ValueError, match="18 planes"):
         compiled.at(parts(11)[1:])
-
-
-def test_the_same_bits_with_any_number_of_threads_and_from_run_to_run(library):
-    """Threads are a process's own; those of spreading meet, on lattices with an odd number of lines too."""
-    program = """
-import hashlib, sys, numpy as np
-from tests.kernels.test_splines import both, load, parts
-random, digest = np.random.default_rng(7), hashlib.sha256()
-for degree, cells, kind in ((3, 41, "f8"), (5, 18, "f8"), (3, 11, "f8"), (3, 41, "f4"), (5, 41, "f4")):
-    positions, values = random.uniform(0, 20, (30000, 3)), random.standard_normal((30000, 3))
-    compiled, planes = both(load(sys.argv[1]), degree, positions, cells)[1], parts(cells, kind=kind)
-    compiled.spread(values, planes)
-    for array in (compiled.at(planes), compiled.slope(planes, values), *planes):
-        digest.update(array.tobytes())
-print(digest.hexdigest())
-"""
-    name = next(name for name in instruction_sets() if load(name) is library)
-    found = set()
-    for threads in ("1", "2", "3", "2"):
-        made = subprocess.run([sys.executable, "-c", program, name], cwd=CHECKOUT, timeout=60, check=True, text=True,
-                              capture_output=True, env={**os.environ, "OMP_NUM_THREADS": threads})
-        found.add(made.stdout)
-    assert len(found) == 1

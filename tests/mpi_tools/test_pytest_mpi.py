@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from mpi_tools.launch import local_cores
+
 CHECKOUT = Path(__file__).parents[2]
 HEAD = "import os, time\nimport numpy as np\nimport pytest\n\n\n"
 
@@ -124,6 +126,34 @@ def test_hanging_and_dying_ranks_are_reported(failing):
     assert "rank 1 of 2 did not finish\nnot at its end after the time limit of 2 s" in output
     assert "test_made_up.py\", line 10 in test_hangs" in output
     assert "died; output of the run" in output
+
+
+MEETING = """
+@pytest.mark.mpi(1, timeout=40)
+def test_meets(comm):
+    open("{}", "w").close()
+    while not os.path.exists("{}"):
+        time.sleep(0.01)
+"""
+
+
+@pytest.mark.skipif(local_cores() < 2, reason="nothing runs beside another on one core")
+def test_runs_on_one_rank_share_the_modules(tmp_path):
+    """Tests of two modules wait for each other; what one left when it died is done as well."""
+    (tmp_path / "test_others.py").write_text(HEAD + MEETING.format("one", "two") + """
+
+@pytest.mark.mpi(1)
+def test_dies(comm):
+    os._exit(3)
+
+
+@pytest.mark.mpi(1)
+def test_after(comm):
+    pass
+""")
+    output, closing = run(tmp_path, MEETING.format("two", "one") + "\n\ndef test_unmarked():\n    pass\n")
+    assert " 1 failed, 4 passed" in closing, output
+    assert "test_dies[mpi-1] FAILED" in output and "test_after[mpi-1] PASSED" in output
 
 
 @pytest.mark.parametrize("options, passed", [

@@ -13,6 +13,8 @@ from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.smoothing_kernels import KernelNetwork
 from eddies.scene.scene import BOX_LENGTH, SceneError, load_scene
 
+pytestmark = pytest.mark.usefixtures("quick_spectra")
+
 SCENE = """
 [flow]
 fluid = "compressible"

@@ -141,7 +141,7 @@ group = "baseline"
 
 
 @pytest.mark.mpi(1, timeout=240)
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("undrawn", "quick_spectra")
 def test_realisations_that_no_training_has_seen(comm, folder, capfd):
     """One training, a rollout on each; mean and spread of two numbers are half of their sum and difference."""
     (folder / "small.toml").write_text(UNSEEN)

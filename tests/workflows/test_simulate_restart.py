@@ -19,6 +19,8 @@ from eddies.workflows.ground_truth.truth import GroundTruth
 from tests.workflows.rollout.test_particle_run import OWN_METHOD, prepared, with_method, write_model
 from tests.workflows.stopping import StopAtStep
 
+pytestmark = pytest.mark.usefixtures("quick_spectra")
+
 MODELS = {
     "default": Model(preset="resolved + pairs"),
     "told densities": Model(preset="resolved + pairs", settings={"pairs": {

@@ -34,6 +34,7 @@ start = 0.3
 """
 
 
+@pytest.mark.usefixtures("undrawn", "quick_spectra")
 @pytest.mark.mpi(1, 2)
 def test_a_model_is_trained_run_and_reported(comm, tmp_path):
     if comm.rank == 0:

@@ -75,7 +75,8 @@ def share_threads() -> None:
         return
     import pyfftw
     places = (line.split(maxsplit=5)[5] for line in maps.read_text().splitlines() if "/libgomp" in line)
-    brought = Path(pyfftw.__file__).parents[1] / "pyfftw.libs"  # elsewhere it has that of the system, as all do
+    # As maps have it, also where the way to it is a link; elsewhere it has that of the system, as all do.
+    brought = Path(pyfftw.__file__).resolve().parents[1] / "pyfftw.libs"
     for place in dict.fromkeys(places):
         if Path(place).parent == brought:
             ctypes.CDLL(place, mode=ctypes.RTLD_GLOBAL)

@@ -23,6 +23,8 @@ from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.learned.description import describe
 from eddies.workflows.learned.model import scene_model
 
+pytestmark = pytest.mark.usefixtures("quick_spectra")
+
 SCENE = """
 [flow]
 fluid = "{fluid}"

@@ -1,0 +1,119 @@
+"""The same bits with any number of threads and from run to run, for each instruction set that this processor runs."""
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from eddies.kernels.copies import CompiledColumnCopies, CompiledPlaneCopies
+from eddies.kernels.library import instruction_sets, load
+from eddies.kernels.modes import CompiledModePasses
+from eddies.kernels.pairs import CompiledPairs, PairSpace, Summand
+from eddies.kernels.splines import CompiledSplines
+from tests.kernels import test_flow as flow
+from tests.kernels.test_copies import noise
+from tests.kernels.test_splines import padded_planes, parts
+
+CHECKOUT = Path(__file__).parents[2]
+PROGRAM = "import json\nfrom tests.kernels.test_threads import digests\nprint(json.dumps(digests()))"
+
+
+def copied(library):
+    size = (144, 47, np.complex128)
+    planes, columns = (kind(library, *size) for kind in (CompiledPlaneCopies, CompiledColumnCopies))
+    arrays = [noise(1, complex, 2, 4, 95, 48), noise(2, complex, 2, 144, 98), noise(3, complex, 144, 20, 48),
+              noise(4, complex, 1, 95, 40, 48), noise(5, complex, 95)]
+    blocks, (rows, column, modes, factors) = planes.described_blocks(arrays[:1]), map(planes.described, arrays[1:])
+    arrays.append(planes.pack(blocks, slice(0, 4)))
+    for _ in planes.filled(arrays[-1], noise(5, complex, 1, 1, 95, 1), rows):
+        planes.unpack(rows, blocks, 1, slice(0, 4))
+    columns.store(column, 0.3, modes, 0, slice(7, 27))
+    columns.fill(modes, 0, slice(9, 29), factors, column)
+    yield from arrays
+
+
+def formulas(library):
+    for precision in ("float64", "float32"):
+        grid, _, compiled = flow.both(library, precision, 60)
+        out = flow.fields(grid, 4, (2, 60, 120))
+        compiled.advection(flow.fields(grid, 15, (2, 60, 120)), 0.3, out)
+        yield out
+        yield compiled.project(flow.modes(grid, 3))
+        yield compiled.sum_of_acoustic_blocks([(flow.factors(grid, 5, seed), flow.modes(grid, 4, seed))
+                                               for seed in (1, 2)])
+        yield compiled.sum_of_decays([(flow.factors(grid, 1, 1), flow.modes(grid, 3))])
+
+
+def mode_passes(library):
+    random, shape = np.random.default_rng(1), (33, 17, 17)
+    wavevector = [random.standard_normal(axis) for axis in ((1, 1, 17), (1, 17, 1), (33, 1, 1))]
+    for kind in (np.float64, np.float32):
+        inverse, *weights = (random.uniform(0, 1, shape).astype(kind) for _ in range(3))
+        given, modes, direction, image, found, residual = (
+            noise(seed, np.result_type(kind, np.complex64), 3, *shape) for seed in range(6))
+        compiled = CompiledModePasses(library, wavevector, random.integers(1, 3, (1, 1, 17)).astype(float),
+                                      random.uniform(0, 1, shape), *weights)
+        made, product = compiled.image(given, modes)
+        square = compiled.descend(0.7, inverse, direction, image, found, residual)
+        compiled.turn(-0.3, inverse, residual, direction)
+        yield from (np.array([product, square]), made, direction, found, residual)
+
+
+def pair_sums(library):
+    random = np.random.default_rng(1)
+    position, velocity = random.uniform(0, 1, (5000, 3)), random.standard_normal((5000, 3))
+    summands = [Summand("pair-network", 6, (2, 1, 1, 1, 1, 1, 9, 6)), Summand("moments", 7)]
+    parameters = [random.standard_normal(9 * 6 + 6 * 10 + 2 * 7), np.zeros(0)]
+    for kind in (np.float32, np.float64):
+        for mutual in (True, False):
+            space = PairSpace(1.0, mutual, 0.13, 0.1, 1.0, mutual)
+            pairs = CompiledPairs(library, space, position, velocity, random.standard_normal((1, 5000)),
+                                  random.uniform(size=5000) < 0.9, kind)
+            sums = pairs.sums(summands, parameters)
+            by_parameters, by_columns = pairs.gradients(summands, parameters, sums, True)
+            yield from (*sums, by_parameters[0], *by_columns)
+
+
+def splines(library):
+    """Threads of spreading meet, on lattices with an odd number of lines too."""
+    random = np.random.default_rng(7)
+    for degree, cells, kind in ((3, 41, "f8"), (5, 18, "f8"), (3, 11, "f8"), (3, 41, "f4"), (5, 41, "f4")):
+        positions, values = random.uniform(0, 20, (30000, 3)), random.standard_normal((30000, 3))
+        compiled, planes = CompiledSplines(library, degree, positions, padded_planes(cells)), parts(cells, kind=kind)
+        compiled.spread(values, planes)
+        yield from (compiled.at(planes), compiled.slope(planes, values), *planes)
+
+
+KERNELS = {function.__name__: function for function in (copied, formulas, mode_passes, pair_sums, splines)}
+
+
+def digests():
+    """Of all bits that a kernel makes, by kernel and instruction set."""
+    found = {}
+    for kernel, function in KERNELS.items():
+        for name in instruction_sets():
+            digest = hashlib.sha256()
+            for array in function(load(name)):
+                assert np.abs(array).max() > 0
+                digest.update(array.tobytes())
+            found[f"{kernel} {name}"] = digest.hexdigest()
+    return found
+
+
+@pytest.fixture(scope="module")
+def found():
+    """Digests in processes of 1, 2, 3 and again 2 threads, which are a process's own."""
+    return [json.loads(subprocess.run(
+        [sys.executable, "-c", PROGRAM], cwd=CHECKOUT, timeout=120, check=True, capture_output=True, text=True,
+        env={**os.environ, "OMP_NUM_THREADS": threads}).stdout) for threads in ("1", "2", "3", "2")]
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_the_same_bits_with_any_number_of_threads_and_from_run_to_run(library, found, kernel):
+    name = next(name for name in instruction_sets() if load(name) is library)
+    assert len({digests[f"{kernel} {name}"] for digests in found}) == 1
