@@ -2,7 +2,7 @@
 
 import eddies
 
-project, author, copyright = "eddies", "the authors of eddies", "the authors of eddies"
+project, author, copyright = "eddies", "the eddies developers", "the eddies developers"
 release = eddies.__version__
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 exclude_patterns = ["results", "examples"]
