@@ -37,7 +37,7 @@ ONLY_IN = {
     "pyfftw*": ("spectral*", "kernels.library"),
     "torch*": ("particles*", "learning*", "workflows*"),
     "matplotlib*": ("report*",),
-    "eddies.report*": ("report*", "workflows.report", "workflows.compare", "workflows.train"),
+    "eddies.report*": ("report*", "workflows.report", "workflows.compare", "workflows.diff", "workflows.train"),
     # Scene, rules, reader, sections, model, methods, checks, comparison
     **dict.fromkeys(("eddies.scene.[srm]*", "eddies.scene.ch*", "eddies.scene.compar*"),
                     ("scene*", "workflows*", "cli", "api", "stored_run", "stages", "logs")),

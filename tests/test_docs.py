@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from eddies.cli import build_parser, main
+from eddies.cli import main
+from eddies.cli_options import build_parser
 from eddies.particles.terms.presets import DEFAULT_PRESET, PRESETS, TERMS
 from eddies.scene.comparison import Comparison, Variant, load_comparison
 from eddies.scene.methods import METHODS

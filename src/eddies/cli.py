@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import math
 import os
 import signal
 import sys
@@ -16,10 +15,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import eddies
+from eddies.cli_options import parse_arguments
 from eddies.errors import UserError
 from eddies.logs import Output, configure_logging, show_warnings
-from eddies.pipeline import STAGES
 from eddies.scene.scene import SceneError, builtin_scenes, load_scene
 
 if TYPE_CHECKING:
@@ -68,11 +66,11 @@ def run(arguments: list[str] | None) -> int:
         configure_logging(comm.rank)
         share_threads()
         options = parse_arguments(arguments, comm.rank)
-        if options.command in (run_command, compare_command):
-            options.command(options, comm, signals)
-        else:
+        if options.command in SHORT_COMMANDS:
             release_signals(signals)
-            options.command(options, comm)
+            SHORT_COMMANDS[options.command](options, comm)
+        else:
+            (compare_command if options.command == "compare" else run_command)(options, comm, signals)
         return 0
     except Stopped as stopped:
         if comm.rank == 0:
@@ -142,99 +140,6 @@ def end_with_error(error: BaseException, comm: Comm) -> int:
     return code
 
 
-def parse_arguments(arguments: list[str] | None, rank: int) -> argparse.Namespace:
-    """The options of the command line; help and usage errors are printed by rank 0 alone."""
-    with contextlib.ExitStack() as stack:
-        if rank > 0:
-            silence = stack.enter_context(open(os.devnull, "w"))
-            stack.enter_context(contextlib.redirect_stdout(silence))
-            stack.enter_context(contextlib.redirect_stderr(silence))
-        return build_parser().parse_args(arguments)
-
-
-def build_parser() -> argparse.ArgumentParser:
-    """Sub-commands and their options."""
-    parser = argparse.ArgumentParser(prog="eddies", description=eddies.__doc__,
-                                     epilog="EDDIES_LOG = debug, info or warning sets what is logged.")
-    parser.add_argument("--version", action="version", version=f"eddies {eddies.__version__}")
-    commands = parser.add_subparsers(metavar="COMMAND", required=True)
-    stages = {"run": "every stage of the scene, in order"}
-    stages |= {stage.name: stage.about for stage in STAGES.values() if stage.product is not None}
-    for name, about in stages.items():
-        command = commands.add_parser(name, help=about, description=about)
-        add_scene_options(command)
-        add_job_options(command, "run directory (default: runs/NAME)")
-        command.set_defaults(command=run_command, stage=name)
-    report = commands.add_parser("report", help=STAGES["report"].about)
-    report.add_argument("run", type=directory, metavar="RUN", help="a run directory, such as runs/tiny")
-    report.set_defaults(command=report_command)
-    compare = commands.add_parser("compare", help="error against run time of variants of a scene")
-    compare.add_argument("comparison", metavar="COMPARISON",
-                         help="name of a built-in comparison, or path of a TOML file")
-    compare.add_argument("--run", type=directory, metavar="DIR",
-                         help="run directory with the ground truth (default: the comparison's, or runs/BASE)")
-    add_job_options(compare, "directory of the comparison (default: runs/NAME)")
-    compare.set_defaults(command=compare_command)
-    export = commands.add_parser("export", help="fields and particles of a run directory, for ParaView")
-    export.add_argument("run", type=directory, metavar="RUN", help="a run directory, such as runs/tiny")
-    export.add_argument("--format", choices=["vtkhdf"], default="vtkhdf", help="format of the files (default: vtkhdf)")
-    export.add_argument("--output", type=directory, metavar="DIR", help="where the files go (default: RUN/vtkhdf)")
-    export.set_defaults(command=export_command)
-    check = commands.add_parser("check", help="derived numbers, memory, ranks and time; writes nothing")
-    add_scene_options(check)
-    check.add_argument("--json", action="store_true", help="the numbers as JSON, for programs")
-    check.set_defaults(command=check_command)
-    scenes = commands.add_parser("scenes", help="the built-in scenes, a line each; or one with all settings")
-    scenes.add_argument("scene", nargs="?", metavar="SCENE", help="print this scene, defaults included")
-    scenes.set_defaults(command=scenes_command)
-    return parser
-
-
-class OptionError(UserError):
-    """An option of the command line that cannot be meant."""
-
-
-def directory(text: str) -> Path:
-    """A directory of the command line, there or not."""
-    if not text:
-        raise OptionError("an empty text is no directory, and would mean the one that you are in; give its name (. for "
-                          "the one that you are in)")
-    try:
-        Path(text).exists()
-    except OSError as error:
-        raise OptionError(f"{text[:60]}...: cannot be used as a directory: {error.strerror}; choose another") from None
-    return Path(text)
-
-
-def positive(text: str) -> float:
-    """A number of the command line that is larger than zero."""
-    value = float(text)
-    if not value > 0:
-        raise argparse.ArgumentTypeError(f"{text}: a number larger than 0 is expected")
-    return value
-
-
-def add_scene_options(parser: argparse.ArgumentParser) -> None:
-    """The scene and changes to it."""
-    parser.add_argument("scene", metavar="SCENE", help="name of a built-in scene, or path of a TOML file")
-    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", dest="overrides",
-                        help="change a key of the scene; repeatable")
-
-
-def add_job_options(parser: argparse.ArgumentParser, output: str) -> None:
-    """Options of commands that run for long: where the products go, what they may replace, and when to stop."""
-    parser.add_argument("--output", type=directory, metavar="DIR", help=output)
-    parser.add_argument("--overwrite", action="store_true", help="replace products and checkpoints of other settings; "
-                        "else they are named, and nothing is touched. What fits is kept, or gone on with")
-    parser.add_argument("--take-over", action="store_true",
-                        help="end another job in the same directory, or one that only seems to be there")
-    parser.add_argument("--resume", action="store_true", help=argparse.SUPPRESS)  # of job scripts of eddies 0.1
-    parser.add_argument("--checkpoint-minutes", type=positive, default=10.0, metavar="M",
-                        help="wall time between two checkpoints (default: 10)")
-    parser.add_argument("--max-minutes", type=positive, default=math.inf, metavar="M",
-                        help="stop after M minutes of wall time, with exit code 75; the same command goes on")
-
-
 def run_command(options: argparse.Namespace, comm: Comm, signals: list[int]) -> None:
     """One stage of a scene, or all that it has, until a signal, a file STOP or the limit of wall time ends it."""
     from eddies.parallel.stop import StopRequest
@@ -243,7 +148,7 @@ def run_command(options: argparse.Namespace, comm: Comm, signals: list[int]) -> 
     directory = options.output or scene.directory
     stop = StopRequest(comm, signals, directory / "STOP", 60 * options.max_minutes,
                        60 * options.checkpoint_minutes)
-    stages = scene.stages if options.stage == "run" else (options.stage,)
+    stages = scene.stages if options.command == "run" else (options.command,)
     run_stages(stages, scene, comm, directory, stop, options.overwrite, options.take_over)
 
 
@@ -252,6 +157,9 @@ def report_command(options: argparse.Namespace, comm: Comm) -> None:
     if not options.run.is_dir():
         raise SceneError(f"{options.run}: no such directory; give a run directory, such as runs/tiny")
     import_module("eddies.workflows.report").run(options.run, comm)
+    if options.open and comm.rank == 0:
+        import webbrowser
+        webbrowser.open((options.run / "report" / "index.html").resolve().as_uri())
 
 
 def compare_command(options: argparse.Namespace, comm: Comm, signals: list[int]) -> None:
@@ -297,3 +205,18 @@ def scenes_command(options: argparse.Namespace, comm: Comm) -> None:
         text = "".join(f"{name:{width}}  {title}\n" for name, title in scenes)
     if comm.rank == 0:
         sys.stdout.write(text)
+
+
+def status_command(options: argparse.Namespace, comm: Comm) -> None:
+    """What stands in run directories."""
+    import_module("eddies.workflows.status").run(options.directory, comm)
+
+
+def diff_command(options: argparse.Namespace, comm: Comm) -> None:
+    """What differs between two runs."""
+    import_module("eddies.workflows.diff").run(options.one, options.other, comm)
+
+
+# Those that no signal asks to stop: they take seconds.
+SHORT_COMMANDS = {"report": report_command, "export": export_command, "check": check_command, "scenes": scenes_command,
+                  "status": status_command, "diff": diff_command}

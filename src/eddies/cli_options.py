@@ -1,0 +1,134 @@
+"""The command line: sub-commands, their options, and examples of each."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import math
+import os
+from pathlib import Path
+
+import eddies
+from eddies.errors import UserError
+from eddies.pipeline import STAGES
+
+# What `--help` of a command ends with.
+EXAMPLES = {
+    "run": ("eddies run hit-small", "mpirun -n 2 eddies run mine.toml --set training.steps=200 --output runs/second"),
+    "dns": ("eddies dns hit-small --set seed=2 --output runs/hit-small-seed-2",),
+    "train-kernel": ("eddies train-kernel hit-small --set kernel.steps=500",),
+    "train": ("eddies train hit-small", "eddies train hit-mt016 --set model.path=runs/hit"),
+    "simulate": ("eddies simulate hit-small --overwrite --set simulation.method=none",),
+    "report": ("eddies report runs/hit-small --open",),
+    "compare": ("eddies compare compare-small", "eddies compare mine.toml --run runs/hit --output runs/cost"),
+    "export": ("eddies export runs/tiny --format vtkhdf",),
+    "check": ("eddies check hit", "eddies check mine.toml --set flow.cells=256 --json"),
+    "scenes": ("eddies scenes", "eddies scenes tiny"),
+    "status": ("eddies status", "eddies status runs/hit-small"),
+    "diff": ("eddies diff runs/hit-small runs/second",),
+}
+
+
+def parse_arguments(arguments: list[str] | None, rank: int) -> argparse.Namespace:
+    """The options of the command line; help and usage errors are printed by rank 0 alone."""
+    with contextlib.ExitStack() as stack:
+        if rank > 0:
+            silence = stack.enter_context(open(os.devnull, "w"))
+            stack.enter_context(contextlib.redirect_stdout(silence))
+            stack.enter_context(contextlib.redirect_stderr(silence))
+        return build_parser().parse_args(arguments)
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Sub-commands and their options."""
+    parser = argparse.ArgumentParser(prog="eddies", description=eddies.__doc__,
+                                     epilog="EDDIES_LOG = debug, info or warning sets what is logged.")
+    parser.add_argument("--version", action="version", version=f"eddies {eddies.__version__}")
+    commands = parser.add_subparsers(metavar="COMMAND", dest="command", required=True)
+    for name, about in {"run": "every stage of the scene, in order",
+                        **{stage.name: stage.about for stage in STAGES.values() if stage.product is not None}}.items():
+        command = add_command(commands, name, about)
+        add_scene_options(command)
+        add_job_options(command, "run directory (default: runs/NAME)")
+    report = add_command(commands, "report", STAGES["report"].about)
+    add_run(report, "run")
+    report.add_argument("--open", action="store_true", help="show the page in a browser")
+    compare = add_command(commands, "compare", "error against run time of variants of a scene")
+    compare.add_argument("comparison", metavar="COMPARISON",
+                         help="name of a built-in comparison, or path of a TOML file")
+    compare.add_argument("--run", type=directory, metavar="DIR",
+                         help="run directory with the ground truth (default: the comparison's, or runs/BASE)")
+    add_job_options(compare, "directory of the comparison (default: runs/NAME)")
+    export = add_command(commands, "export", "fields and particles of a run directory, for ParaView")
+    add_run(export, "run")
+    export.add_argument("--format", choices=["vtkhdf"], default="vtkhdf", help="format of the files (default: vtkhdf)")
+    export.add_argument("--output", type=directory, metavar="DIR", help="where the files go (default: RUN/vtkhdf)")
+    check = add_command(commands, "check", "derived numbers, memory, ranks and time; writes nothing")
+    add_scene_options(check)
+    check.add_argument("--json", action="store_true", help="the numbers as JSON, for programs")
+    scenes = add_command(commands, "scenes", "the built-in scenes, a line each; or one with all settings")
+    scenes.add_argument("scene", nargs="?", metavar="SCENE", help="print this scene, defaults included")
+    status = add_command(commands, "status", "what stands in run directories: stages, checkpoints, jobs, sizes")
+    status.add_argument("directory", nargs="?", type=directory, default=Path("runs"), metavar="DIR",
+                        help="a run directory, or one of several (default: runs)")
+    diff = add_command(commands, "diff", "what differs between two runs: settings and numbers")
+    add_run(diff, "one")
+    add_run(diff, "other")
+    return parser
+
+
+def add_command(commands: argparse._SubParsersAction, name: str, about: str) -> argparse.ArgumentParser:
+    """A sub-command with its examples."""
+    form = argparse.RawDescriptionHelpFormatter
+    return commands.add_parser(name, help=about, description=about, formatter_class=form,
+                               epilog="\n  ".join(["examples:", *EXAMPLES[name]]))
+
+
+def add_run(parser: argparse.ArgumentParser, name: str) -> None:
+    """A run directory."""
+    parser.add_argument(name, type=directory, metavar="RUN", help="a run directory, such as runs/tiny")
+
+
+class OptionError(UserError):
+    """An option of the command line that cannot be meant."""
+
+
+def directory(text: str) -> Path:
+    """A directory of the command line, there or not."""
+    if not text:
+        raise OptionError("an empty text is no directory, and would mean the one that you are in; give its name (. for "
+                          "the one that you are in)")
+    try:
+        Path(text).exists()
+    except OSError as error:
+        raise OptionError(f"{text[:60]}...: cannot be used as a directory: {error.strerror}; choose another") from None
+    return Path(text)
+
+
+def positive(text: str) -> float:
+    """A number of the command line that is larger than zero."""
+    value = float(text)
+    if not value > 0:
+        raise argparse.ArgumentTypeError(f"{text}: a number larger than 0 is expected")
+    return value
+
+
+def add_scene_options(parser: argparse.ArgumentParser) -> None:
+    """The scene and changes to it."""
+    parser.add_argument("scene", metavar="SCENE", help="name of a built-in scene, or path of a TOML file")
+    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", dest="overrides",
+                        help="change a key of the scene; repeatable")
+
+
+def add_job_options(parser: argparse.ArgumentParser, output: str) -> None:
+    """Options of commands that run for long: where the products go, what they may replace, and when to stop."""
+    parser.add_argument("--output", type=directory, metavar="DIR", help=output)
+    parser.add_argument("--overwrite", action="store_true", help="replace products and checkpoints of other settings; "
+                        "else they are named, and nothing is touched. What fits is kept, or gone on with")
+    parser.add_argument("--take-over", action="store_true",
+                        help="end another job in the same directory, or one that only seems to be there")
+    parser.add_argument("--resume", action="store_true", help=argparse.SUPPRESS)  # of job scripts of eddies 0.1
+    parser.add_argument("--checkpoint-minutes", type=positive, default=10.0, metavar="M",
+                        help="wall time between two checkpoints (default: 10)")
+    parser.add_argument("--max-minutes", type=positive, default=math.inf, metavar="M",
+                        help="stop after M minutes of wall time, with exit code 75; the same command goes on")

@@ -1,0 +1,86 @@
+"""What stands in run directories, for people: stages, what they were made with, checkpoints, jobs and sizes."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from eddies.clock import duration
+from eddies.errors import UserError
+from eddies.io.checkpoint import checkpoints_in
+from eddies.io.hdf5 import in_files
+from eddies.io.provenance import product_provenance
+from eddies.io.run_lock import find_lock
+from eddies.parallel.communicator import Comm
+from eddies.pipeline import STAGES, Stage
+from eddies.scene.scene import Scene, SceneError, load_scene
+from eddies.workflows.foreseen.stage_cost import in_units
+from eddies.workflows.run_directory.work import changed_settings, is_done, of_other_settings, stage_seconds
+
+SCENE, PAGE = "scene.toml", Path("report") / "index.html"
+
+
+def run(directory: Path, comm: Comm) -> None:
+    """Print a line for every stage of the runs in a directory, or of the run that it is; all ranks call it."""
+    lines = in_files(comm, directory, lambda: list(status_lines(directory)))
+    if comm.rank == 0:
+        sys.stdout.write("".join(f"{line}\n" for line in lines))
+
+
+def status_lines(directory: Path) -> Iterator[str]:
+    """Those of all runs, in order of their names; UserError where there is none."""
+    runs = [directory] if is_run(directory) else sorted(path.parent for path in directory.glob(f"**/{SCENE}"))
+    if not runs:
+        raise UserError(f"{directory}: holds no run; make one with `eddies run SCENE`, or give the directory of one")
+    for path in runs:
+        yield from run_lines(path)
+
+
+def is_run(directory: Path) -> bool:
+    """Whether stages have worked here."""
+    return (directory / SCENE).is_file() or any((directory / stage.file).is_file() for stage in STAGES.values())
+
+
+def run_lines(directory: Path) -> Iterator[str]:
+    """Its name, size and job, then its stages."""
+    files = [path for path in directory.rglob("*") if path.is_file() and not path.is_symlink()]
+    size, held = in_units(sum(path.stat().st_size for path in files)), find_lock(directory)
+    job = "" if held is None else f", {held.holder}{', without a sign of life' if held.stale else ''}"
+    try:
+        scene = load_scene(directory / SCENE)
+    except SceneError as error:
+        yield f"{directory}  {size}{job}: {error}"
+        return
+    yield f"{directory}  {size}{job}: {scene.title}"
+    seconds = stage_seconds(directory)
+    for name in scene.stages:
+        took = duration(seconds[name]) if name in seconds else ""
+        yield f"  {name:13}  {took:>12}  {stage_state(STAGES[name], scene, directory)}".rstrip()
+
+
+def stage_state(stage: Stage, scene: Scene, directory: Path) -> str:
+    """What there is of a stage, in words."""
+    if stage.product is None:
+        return page_state(directory)
+    product, found = directory / stage.file, checkpoints_in(directory / stage.checkpoints) if stage.checkpoints else []
+    if is_done(stage.name, scene, directory):
+        return f"complete, {in_units(product.stat().st_size)}"
+    if found:
+        fits = scene.fingerprint(stage.name) in [fingerprint for _, fingerprint in found]
+        return f"stopped at step {found[-1][0]}, {'goes on' if fits else 'with other settings'}"
+    if product.is_file():
+        origin = product_provenance(product)
+        return "made with " + of_other_settings(changed_settings(stage, origin.get("scene"), scene.to_toml())) if (
+            origin) else "damaged, unfinished or of another version"
+    return "to do"
+
+
+def page_state(directory: Path) -> str:
+    """Whether the report is there, and newer than what it is about."""
+    page = directory / PAGE
+    if not page.is_file():
+        return "to do"
+    products = [path for stage in STAGES.values() if (path := directory / stage.file).is_file()]
+    old = any(path.stat().st_mtime > page.stat().st_mtime for path in products)
+    return f"older than the products: `eddies report {directory}`" if old else f"complete, {page}"
