@@ -2,6 +2,7 @@
 
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -15,8 +16,10 @@ from eddies.learning.losses import relative_error
 from eddies.parallel.reduction import global_sum
 from eddies.particles.model import FORCING
 from eddies.scene.scene import SceneError, load_scene
-from eddies.stages import check_inputs
+from eddies.stages import check_inputs, check_ranks
 from eddies.workflows import dns, train
+from eddies.workflows.foreseen.estimates import most_ranks
+from eddies.workflows.foreseen.warnings import warnings
 from eddies.workflows.ground_truth.truth import load_frame
 from eddies.workflows.learned.training_data import model_of
 from eddies.workflows.learned.truths import open_truths, training_data, truth_problems
@@ -245,3 +248,38 @@ def test_truths_that_do_not_fit_are_refused_before_any_work(comm, tmp_path, over
     # The own ground truth, which is named too, is made by the run itself.
     with pytest.raises(SceneError, match=r"own: \[training\] truths: "):
         check_inputs(("train",), scene, comm, tmp_path / "own")
+
+
+def on_ranks(size):
+    return SimpleNamespace(size=size)
+
+
+@pytest.mark.mpi(1)
+def test_more_ranks_than_another_truth_can_be_cut_for_are_refused_before_any_work(comm, tmp_path):
+    """Into 8 layers, of which the own has 14; no thinner than a radius of 2.5 of them, nor than what particles stray in
+    the training through horizons, at the speed that they have there."""
+    other = made(comm, tmp_path, "tracers.particles_per_side=4", "training.batch=60", runs=("other",))
+    assert other.tracers.planes == 8
+    place = f'[training] truths: "{tmp_path / "other"}"'
+    for model, most, reason in (('{terms=["viscosity"]}', 2, "ghost planes of the resolved velocity"),
+                                ('{preset="learned-density", neighbors=8}', 2, "slabs no thinner than the particles' "
+                                                                               "reach 1.95")):
+        alone = scene_of(tmp_path, "tracers.particles_per_side=8", f"model={model}")
+        alone = replace(alone, training=replace(alone.training, horizons=None))
+        scene = trained_on(alone, tmp_path / "nowhere", tmp_path / "other")
+        check_ranks(("train",), alone, on_ranks(3))
+        check_ranks(("train",), scene, on_ranks(most))
+        with pytest.raises(SceneError) as refusal:
+            check_ranks(("train",), scene, on_ranks(3))
+        assert f"3 ranks are more than the {most} that it can use ({place}: {reason}); start at most {most}" in str(
+            refusal.value)
+        assert [line for line in warnings(scene, 3) if "ranks" in line] == [
+            f"this job has 3 ranks, and the scene can use at most {most}: start fewer"]
+        # The ground truth of the run is made by as many as it can be cut for, and weights are taken by as many.
+        check_ranks(("dns",), scene, on_ranks(3))
+        check_ranks(("train",), replace(scene, model=replace(scene.model, path="runs/other")), on_ranks(3))
+
+    with h5py.File(tmp_path / "other/ground_truth.h5", "r+") as file:
+        file["reference"].attrs["velocity_rms"] = 30.0
+    scene = trained_on(scene_of(tmp_path, "tracers.particles_per_side=8"), tmp_path / "other")
+    assert most_ranks(scene)[f"{place}: ghost planes of the grid in the training through horizons"] == 1
