@@ -4,7 +4,7 @@ import datetime
 import json
 import platform
 import uuid
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -73,6 +73,13 @@ def product_attributes(path: str | Path, group: str) -> dict[str, Any]:
 def product_fingerprint(path: str | Path) -> str | None:
     """The scene's fingerprint stored in a complete product of this format; None if there is none."""
     return product_provenance(path).get("fingerprint")
+
+
+def others_trained_on(origin: Mapping[str, Any]) -> list[str]:
+    """The ground truths that a model was trained on where that of its own run is none of them; `origin` is the
+    provenance of the model."""
+    truths = origin.get("truths", {})
+    return [] if origin.get("made_from", {}).get("ground_truth") in truths.values() else list(truths)
 
 
 def read_provenance(file: h5py.File) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """Training on the ground truths of other runs, alone and together, forced and unforced."""
 
+import json
 import shutil
 from dataclasses import replace
 from types import SimpleNamespace
@@ -11,6 +12,7 @@ import torch
 from mpi4py import MPI
 
 from eddies.io.hdf5 import open_product, read_table
+from eddies.io.provenance import product_attributes, product_provenance
 from eddies.io.weights import load_weights
 from eddies.learning.losses import relative_error
 from eddies.parallel.reduction import global_sum
@@ -21,6 +23,7 @@ from eddies.workflows import dns, train
 from eddies.workflows.foreseen.estimates import most_ranks
 from eddies.workflows.foreseen.warnings import warnings
 from eddies.workflows.ground_truth.truth import load_frame
+from eddies.workflows.learned import transfer
 from eddies.workflows.learned.training_data import model_of
 from eddies.workflows.learned.truths import open_truths, training_data, truth_problems
 from eddies.workflows.rollout.eulerian_run import EulerianRun
@@ -132,6 +135,7 @@ def twice_as_fast(source, target):
     """The same flow in another unit of time, half as long."""
     powers = {"velocity_rms": 1, "acceleration_rms": 2, "sound_speed": 1, "viscosity": 1, "density_rate_rms": 1}
     with h5py.File(copied(source, target), "r+") as file:
+        file.attrs["provenance"] = json.dumps(json.loads(file.attrs["provenance"]) | {"id": "another"})
         reference, tracers = file["reference"].attrs, file["particles/tracers"]
         for name, power in powers.items():
             reference[name] *= 2.0**power
@@ -154,6 +158,12 @@ def test_the_same_is_learned_of_the_same_flow_in_other_units(comm, tmp_path):
         assert np.allclose(weights[name], tensor, rtol=1e-9)
     assert np.allclose(unseen["history"]["loss"], seen["history"]["loss"], rtol=1e-9)
     assert np.allclose(unseen["a_priori"]["acceleration_error"], seen["a_priori"]["acceleration_error"], rtol=1e-9)
+    # Weights that are taken over say where they were trained, not where they lay.
+    transfer.run(replace(scene, model=replace(scene.model, path=str(own))), comm, tmp_path / "fast")
+    source = product_provenance(tmp_path / "fast/model.h5")["source"]
+    (truth, mach), = source["truths"].items()
+    assert truth == str(tmp_path / "fast/ground_truth.h5") and source["path"] == str(own)
+    assert mach == product_attributes(truth, "reference")["mach_turbulent"] > 0
     # The delay is that since the end of what was seen: here all, or nothing.
     assert seen["a_priori"]["delay"].max() < 0 < unseen["a_priori"]["delay"].min()
 
