@@ -4,6 +4,7 @@
 MEASURES = {
     "velocity_error_early": "velocity error at t_η",
     "velocity_error_half": "velocity error at T/2",
+    "velocity_error_end": "velocity error at the end",
     "spectrum_error": "spectrum error, k ≤ k_d (rms of logarithms)",
     "spectrum_error_floor": "spectrum error of the true tracers",
     "energy_ratio": "energy, model / truth",
@@ -25,8 +26,9 @@ MEASURES = {
 }
 #: Those that a comparison shows unless it asks for others, and of them those that it draws.
 DRAWN = ("velocity_error_early", "velocity_error_half", "spectrum_error", "acceleration_kl")
-SHOWN = ("velocity_error_early", "velocity_error_half", "spectrum_error", "energy_ratio", "velocity_kl",
-         "velocity_kl_floor", "acceleration_kl", "acceleration_kl_floor", "qr_kl", "qr_kl_floor", "acceleration_error")
+SHOWN = ("velocity_error_early", "velocity_error_half", "velocity_error_end", "spectrum_error", "energy_ratio",
+         "velocity_kl", "velocity_kl_floor", "acceleration_kl", "acceleration_kl_floor", "qr_kl", "qr_kl_floor",
+         "acceleration_error")
 
 
 def is_error(name: str) -> bool:

@@ -65,6 +65,7 @@ def test_an_error_that_grows_in_time_is_found_between_frames():
     # Frames stand at 0.2, 0.4, ...: t_eta = 0.15 and T/2 = 0.6; the error is exactly linear in time.
     assert found["velocity_error_early"] == pytest.approx(0.015)
     assert found["velocity_error_half"] == pytest.approx(0.06)
+    assert found["velocity_error_end"] == pytest.approx(0.12)
     assert found["acceleration_error"] == 0
     assert found["energy_ratio"] == pytest.approx(1.12**2)
     assert found["spectrum_error"] == pytest.approx(2 * np.log(1.12)) and found["spectrum_error_floor"] == 0

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from eddies.analysis.pareto import pareto_front, verdict
+from eddies.analysis.pareto import cheapest_grid, pareto_front, verdict
 
 
 def test_front_of_known_points():
@@ -67,3 +67,30 @@ def test_what_differs_by_less_than_the_spread_of_realisations_is_as_accurate():
     assert "early error (0.1, 1 of 2 baselines beaten; as accurate and no slower: close, 0.115" in not_worth
     worth, not_worth = verdict(learned, [close, far | {"early_spread": 0.03}], "seconds", WORDS)
     assert "0 of 2 baselines beaten" in not_worth and "late error" in worth
+
+
+GRIDS = [row("grid-24", 1, 0.3, 0.4), row("grid-48", 4, 0.1, 0.15), row("grid-40", 3, 0.05, 0.3), row("dns", 9, 0, 0),
+         row("unmeasured", None, 0, 0), row("short", 1, 0, None)]
+TIMES = {"early": "T/2", "late": "1 T"}
+
+
+def test_the_cheapest_grid_is_as_accurate_at_every_time():
+    assert cheapest_grid(row("learned", 8, 0.1, 0.2), GRIDS, "seconds", TIMES) == (
+        "The cheapest grid that keeps the velocity error after T/2 and 1 T at or below that of learned (0.1, 0.2) is "
+        "grid-48 (0.1, 0.15), at 0.5 of its cost.")
+    early = cheapest_grid(row("learned", 2, 0.1, None), GRIDS, "seconds", {"early": "T/2"})
+    assert early == ("The cheapest grid that keeps the velocity error after T/2 at or below that of learned (0.1) is "
+                     "short (0), at 0.5 of its cost.")
+
+
+def test_means_are_compared_whatever_their_spread():
+    learned = row("learned", 8, 0.1, 0.2) | {"early_spread": 1.0, "late_spread": 1.0}
+    assert "is grid-48 (" in cheapest_grid(learned, GRIDS, "seconds", TIMES)
+
+
+def test_that_no_grid_is_as_accurate_is_said_and_of_a_model_without_numbers_nothing():
+    assert cheapest_grid(row("learned", 8, 0.1, 0.2), GRIDS[:1], "seconds", TIMES) == (
+        "No grid keeps the velocity error after T/2 and 1 T at or below that of learned (0.1, 0.2).")
+    for model in (row("learned", 8, None, 0.2), row("learned", None, 0.1, 0.2)):
+        assert cheapest_grid(model, GRIDS, "seconds", TIMES) == ""
+    assert cheapest_grid(row("learned", 8, 0.1, 0.2), GRIDS, "seconds", {}) == ""

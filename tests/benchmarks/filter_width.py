@@ -36,7 +36,7 @@ def width_of(result: Mapping[str, Any]) -> float:
 
 def best_grid(rows: Mapping[str, Row], measure: str) -> Row | None:
     """The coarse grid with the least error of those that take no longer than the learned model."""
-    rivals = [row for row in rows.values() if "simulation.method=eulerian" in row["settings"].split()
+    rivals = [row for row in rows.values() if row["method"] == "eulerian"
               and None not in (row[measure], row["wall_seconds"])
               and row["wall_seconds"] <= rows["learned"]["wall_seconds"]]
     return min(rivals, key=lambda row: row[measure], default=None)

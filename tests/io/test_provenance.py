@@ -6,7 +6,7 @@ import h5py
 import pytest
 
 from eddies.io.hdf5 import create_product, open_product
-from eddies.io.provenance import product_provenance, read_provenance
+from eddies.io.provenance import others_trained_on, product_provenance, read_provenance
 
 
 def write(comm, directory, kind, *made_from):
@@ -37,3 +37,11 @@ def test_a_product_without_an_id_stays_readable(comm, tmp_path):
         file.attrs["provenance"] = json.dumps(origin)
     assert product_provenance(tmp_path / "ground_truth.h5") == origin
     assert write(comm, tmp_path, "kernel", "ground_truth")["made_from"] == {"ground_truth": None}
+
+
+def test_a_model_that_was_trained_on_others_alone_says_so():
+    own = {"made_from": {"ground_truth": "t1", "kernel": "k1"}}
+    assert others_trained_on({**own, "truths": {"runs/other/ground_truth.h5": "t2"}}) == ["runs/other/ground_truth.h5"]
+    both = {"runs/other/ground_truth.h5": "t2", "runs/own/ground_truth.h5": "t1"}
+    for truths in ({}, {"truths": {}}, {"truths": both}):
+        assert others_trained_on(own | truths) == []

@@ -9,8 +9,8 @@ from eddies.report.figures import panels, styled
 from eddies.report.labels import fix_layout, place_labels
 
 
-def row(name, seconds, error, group="model", status="complete", stopped_at=None):
-    return {"name": name, "group": group, "status": status, "stopped_at": stopped_at, "end": 1.0,
+def row(name, seconds, error, group="model", status="complete", stopped_at=None, method="learned"):
+    return {"name": name, "group": group, "method": method, "status": status, "stopped_at": stopped_at, "end": 1.0,
             "wall_seconds": seconds, "wall_seconds_low": seconds and 0.9 * seconds,
             "wall_seconds_high": seconds and 1.2 * seconds, "core_seconds": seconds,
             "seconds_per_step": 0.1, "time_step": 0.02, "training_seconds": None, **dict.fromkeys(MEASURES, error)}
@@ -98,7 +98,24 @@ def test_rows_without_a_time_say_why():
 
 def test_an_unstable_model_is_worth_nothing():
     unstable = [{**ROWS[0], "status": "stopped: step 9", "stopped_at": 0.8}, *ROWS[1:]]
-    assert ErrorAgainstTime(unstable, "learned", "baseline").summary[0] == "learned is worth its cost in no measure."
+    grid = row("grid", 9.0, 0.1, "baseline", method="eulerian")
+    summary = ErrorAgainstTime([*unstable, grid], "learned", "baseline").summary
+    assert summary[0] == "learned is worth its cost in no measure." and len(summary) == 2
+
+
+def test_the_summary_names_the_cheapest_grid_that_would_do():
+    """Complete grids alone, at T/2 and at the end; where that is T/2 too it is said once."""
+    grids = [row("grid-24", 2.0, 0.2, "baseline", method="eulerian"),
+             row("grid-48", 9.0, 0.1, "grid", method="eulerian"),
+             row("unstable", 1.0, 0.05, "baseline", "stopped: step 9", 0.8, method="eulerian")]
+    found = ErrorAgainstTime(ROWS + grids, "learned", "baseline").summary
+    assert len(found) == 3 and found[2] == (
+        "The cheapest grid that keeps the velocity error after T/2 and 1 T at or below that of learned (0.1, 0.1) is "
+        "grid-48 (0.1, 0.1), at 0.45 of its cost.")
+    halves = [{**each, "end": 0.501} for each in ROWS + grids[:1]]
+    assert ErrorAgainstTime(halves, "learned", "baseline").summary[2] == (
+        "No grid keeps the velocity error after T/2 at or below that of learned (0.1).")
+    assert len(TABLE.summary) == 2
 
 
 @pytest.mark.parametrize("measure", DRAWN)

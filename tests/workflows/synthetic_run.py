@@ -152,7 +152,8 @@ def write_model(comm, directory, terms=("pressure", "pairs"), source=None):
         tables["density_rate_sample"] = {"truth": truth[:, 0], "predicted": 0.8 * truth[:, 0]}
     origin = provenance("ground_truth", "kernel")
     if source:
-        tables["source_a_priori"] = {name: 0.9 * errors for name, errors in tables["a_priori"].items()}
+        if "truths" not in source:
+            tables["source_a_priori"] = {name: 0.9 * errors for name, errors in tables["a_priori"].items()}
         origin |= {"mach_turbulent": 0.16, "source": source}
     save_weights(comm, directory / "model.h5", "model", {"terms": {term: {} for term in terms}},
                  {"weight": np.ones(3)}, origin, tables)

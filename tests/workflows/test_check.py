@@ -186,8 +186,8 @@ def test_ranks_for_horizons_are_those_that_the_grid_and_the_particles_accept(com
     from eddies.particles.particle_set import ParticleSet
     from eddies.particles.resolved_velocity import ResolvedVelocity
     from eddies.scene.scene import BOX_LENGTH
-    from eddies.workflows.foreseen.estimates import (ALLOWED_VELOCITY, expected_turbulence, horizon_time,
-                                                     most_training_ranks, particle_drift)
+    from eddies.workflows.foreseen.estimates import (ALLOWED_VELOCITY, PEAK_VELOCITY, expected_turbulence,
+                                                     horizon_time, most_training_ranks)
     from tests.particles.configurations import FLOW
 
     def accepted(build):
@@ -207,7 +207,7 @@ def test_ranks_for_horizons_are_those_that_the_grid_and_the_particles_accept(com
     time = horizon_time(scene)
     drift = ALLOWED_VELOCITY * speed * time
     assert accepted(lambda: ResolvedVelocity.on_slabs(slab, FLOW, drift)) == (comm.size <= by_grid)
-    far = torch.tensor([[1.0, 1.0, slab.upper + particle_drift(scene, time)]], dtype=torch.float64)
+    far = torch.tensor([[1.0, 1.0, slab.upper + PEAK_VELOCITY * speed * time]], dtype=torch.float64)
     particles = ParticleSet(torch.tensor([comm.rank]), far, torch.zeros_like(far), torch.ones(1))
     around = Neighborhood(slab, BOX_LENGTH, support, 0.0)
     assert accepted(lambda: around.update(particles)) == (comm.size <= by_reach)

@@ -158,7 +158,9 @@ def test_realisations_that_no_training_has_seen(comm, folder, capfd):
     assert not (out / "learned/rollout.h5").exists() and not (out / "grid/seed-5/model.h5").exists()
     weights = [load_weights(comm, path, "model")[1] for path in out.glob("**/model.h5")]
     assert all(np.array_equal(one[name], values) for one in weights for name, values in weights[0].items())
-    rows = rows_of(out)[1]
+    record, rows = rows_of(out)
+    (summary,) = (sentence for sentence in record["summary"] if "keeps the velocity error after" in sentence)
+    assert summary in (out / "index.html").read_text() and rows["grid"]["method"] == "eulerian"
     assert rows["learned"]["training_seconds"] > 0 and rows["grid"]["training_seconds"] is None
     for name, row in rows.items():
         assert row["realisations"] == 2 and row["status"] == "complete"

@@ -6,7 +6,7 @@ import pytest
 
 from eddies.io.hdf5 import open_product
 from eddies.io.provenance import product_provenance
-from eddies.workflows.product_warnings import changed_truths, mixed_products, not_finite, others_trained_on
+from eddies.workflows.product_warnings import changed_truths, mixed_products, not_finite
 from tests.workflows.synthetic_run import write_ground_truth, write_kernel, write_model, write_rollout
 
 TRUTH = {"id": "t1", "made_from": {}, "date": "2030-01-01", "scene": "seed = 1\n[flow]\ncells = 48"}
@@ -45,9 +45,6 @@ def test_a_truth_of_another_run_that_is_another_now_is_named(comm, tmp_path):
     for truths, said in (({path: known}, 0), ({path: "t9"}, 1), ({str(tmp_path / "gone.h5"): "t9"}, 0)):
         found = changed_truths({**MODEL, "truths": truths})
         assert len(found) == said and all(f"was trained on another {path} than is there now" in each for each in found)
-    assert others_trained_on({**MODEL, "truths": {path: known}}) == [path]
-    for own in ({}, {"truths": {}}, {"truths": {path: known, "runs/own/ground_truth.h5": "t1"}}):
-        assert others_trained_on({**MODEL, **own}) == []
 
 
 def test_what_is_gone_may_be_brought_back():

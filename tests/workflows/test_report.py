@@ -270,6 +270,17 @@ def test_a_source_of_unknown_mach_number_is_said(comm, tmp_path):
 
 @pytest.mark.usefixtures("undrawn")
 @pytest.mark.mpi(1)
+def test_of_weights_that_a_run_learned_from_others_alone_these_are_named(comm, tmp_path):
+    write_model(comm, tmp_path, source={"path": "runs/other", "truths": {"runs/a/ground_truth.h5": 0.04,
+                                                                         "runs/b/ground_truth.h5": None}})
+    report.run(tmp_path, comm)
+    assert ("Trained on runs/a/ground_truth.h5 (M_t = 0.040), runs/b/ground_truth.h5, and on nothing of the flow of "
+            "runs/other, where its weights come from.") in written(tmp_path)[1]
+    assert "figure-3b-mach" not in figures(tmp_path)
+
+
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.mpi(1)
 def test_a_dns_alone(comm, tmp_path):
     write_ground_truth(comm, tmp_path, tracers=False)
     report.run(tmp_path, comm)

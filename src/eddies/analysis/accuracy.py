@@ -33,9 +33,9 @@ class StoredRollout:
 def accuracy(run: StoredRollout, complete: bool) -> dict[str, float | None]:
     """All MEASURES and `end`, the last common time over T; None for what the rollout or the truth does not reach.
 
-    The velocity error, the normalised L2 norm by particle, is interpolated linearly between frames. Spectrum, energy,
-    divergences and counts are those at the end, Lagrangian statistics those until then, and of a rollout that is
-    `complete` alone: at an earlier time than the others' they would not be comparable.
+    The velocity error, the normalised L2 norm by particle, is interpolated linearly between frames. That at the end,
+    spectrum, energy, divergences and counts are those of the last of them, Lagrangian statistics those until then, and
+    of a rollout that is `complete` alone: at an earlier time than the others' they would not be comparable.
     """
     broken = first_broken_time(run.model)
     measures: dict[str, float | None] = dict.fromkeys(MEASURES)
@@ -78,6 +78,7 @@ def _at_the_end(run: StoredRollout, common: CommonFrames) -> Mapping[str, float 
     final = CommonFrames(common.model[-1:], common.truth[-1:], common.times[-1:])
     invariants = invariant_statistics(run.model, run.truth, final)
     return {
+        "velocity_error_end": float(normalized_l2(velocity.model, velocity.truth)),
         "spectrum_error": spectra.error("model", run.filter_wavenumber) if at_the_end else None,
         "spectrum_error_floor": spectra.error("truth", run.filter_wavenumber) if at_the_end else None,
         "energy_ratio": float(np.sum(velocity.model**2, dtype=float) / np.sum(velocity.truth**2, dtype=float)),

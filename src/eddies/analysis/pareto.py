@@ -55,6 +55,26 @@ def verdict(model: Mapping[str, Any], baselines: Sequence[Mapping[str, Any]], co
             "There is no measure in which a baseline is as accurate and no slower."]
 
 
+def cheapest_grid(model: Mapping[str, Any], grids: Sequence[Mapping[str, Any]], cost: str,
+                  times: Mapping[str, str]) -> str:
+    """A sentence: the grid of least cost that keeps the velocity error at or below the model's at some times, by key in
+    `times` with words for each, or that none does. Of several realisations it is of means. "" where the model has not
+    all numbers."""
+    def errors(row: Mapping[str, Any]) -> str:
+        return ", ".join(f"{row[key]:.3g}" for key in times)
+
+    if not times or None in [model[key] for key in (cost, *times)]:
+        return ""
+    limit = f"keeps the velocity error after {' and '.join(times.values())} at or below that of {model['name']}"
+    kept = [row for row in grids if None not in [row[key] for key in (cost, *times)]
+            and all(row[key] <= model[key] for key in times)]
+    if not kept:
+        return f"No grid {limit} ({errors(model)})."
+    best = min(kept, key=lambda row: row[cost])
+    return (f"The cheapest grid that {limit} ({errors(model)}) is {best['name']} ({errors(best)}), at "
+            f"{best[cost] / model[cost]:.2g} of its cost.")
+
+
 def _worse(row: Mapping[str, Any], model: Mapping[str, Any], key: str) -> bool:
     """Whether the error of a row is larger, by more than either's spread."""
     spread = max(one.get(f"{key}_spread") or 0.0 for one in (row, model))

@@ -4,7 +4,7 @@ import datetime
 import json
 import platform
 import uuid
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -62,17 +62,24 @@ def identity(directory: Path, kinds: Iterable[str]) -> dict[str, Any]:
 
 def product_provenance(path: str | Path) -> dict[str, Any]:
     """Where a complete product of this format comes from, as `read_provenance`; empty if there is none."""
-    try:
-        with h5py.File(path, "r") as file:
-            sound = file.attrs.get("complete", False) and has_this_format(file)
-            return read_provenance(file) if sound else {}
-    except (OSError, ValueError, KeyError, TypeError, RuntimeError):  # ProductError is one of the last
-        return {}
+    return _read_sound(path, read_provenance)
+
+
+def product_attributes(path: str | Path, group: str) -> dict[str, Any]:
+    """The attributes of a group of a complete product of this format; empty if there is none."""
+    return _read_sound(path, lambda file: dict(file[group].attrs))
 
 
 def product_fingerprint(path: str | Path) -> str | None:
     """The scene's fingerprint stored in a complete product of this format; None if there is none."""
     return product_provenance(path).get("fingerprint")
+
+
+def others_trained_on(origin: Mapping[str, Any]) -> list[str]:
+    """The ground truths that a model was trained on where that of its own run is none of them; `origin` is the
+    provenance of the model."""
+    truths = origin.get("truths", {})
+    return [] if origin.get("made_from", {}).get("ground_truth") in truths.values() else list(truths)
 
 
 def read_provenance(file: h5py.File) -> dict[str, Any]:
@@ -94,6 +101,15 @@ def read_json(file: h5py.File, name: str) -> dict[str, Any]:
     if not isinstance(found, dict):
         raise _damaged(file, name)
     return found
+
+
+def _read_sound(path: str | Path, read: Callable[[h5py.File], dict[str, Any]]) -> dict[str, Any]:
+    """What is read of a complete product of this format; empty if there is none."""
+    try:
+        with h5py.File(path, "r") as file:
+            return read(file) if file.attrs.get("complete", False) and has_this_format(file) else {}
+    except (OSError, ValueError, KeyError, TypeError, RuntimeError):  # ProductError is one of the last
+        return {}
 
 
 def _damaged(file: h5py.File, name: str) -> ProductError:

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
-from eddies.analysis.pareto import pareto_front, verdict
+from eddies.analysis.pareto import cheapest_grid, pareto_front, verdict
 from eddies.measures import DRAWN, MEASURES, SHOWN, is_error
 from eddies.report.figures import DNS, FILTERED, FOURTH, GUIDE, MODEL, SECOND, THIRD, TRUTH, letter, panels, styled
 from eddies.report.labels import fix_layout, place_labels
@@ -57,11 +57,16 @@ class ErrorAgainstTime:
 
     @property
     def summary(self) -> list[str]:
-        """Where the subject is worth its cost and where it is not; what became unstable counts as without numbers."""
+        """Where the subject is worth its cost, where it is not, and which grid, if there are any, would do; what became
+        unstable counts as without numbers."""
         numbers = [row if is_stable(row) else {**row, **dict.fromkeys(self.drawn)} for row in self.rows]
         subject = next(row for row in numbers if row["name"] == self.subject)
         others = [row for row in numbers if row["group"] == self.baselines and row is not subject]
-        return verdict(subject, others, COST, {key: MEASURES[key] for key in self.drawn})
+        sentences = verdict(subject, others, COST, {key: MEASURES[key] for key in self.drawn})
+        grids = [row for row in numbers if row["method"] == "eulerian" and is_stable(row) and row is not subject]
+        if grids and is_stable(subject):
+            sentences.append(cheapest_grid(subject, grids, COST, _times_of_errors(subject)))
+        return [sentence for sentence in sentences if sentence]
 
     def finished(self, measure: str) -> list[Row]:
         """Rows of stable variants that have this measure and a time."""
@@ -70,6 +75,13 @@ class ErrorAgainstTime:
     def stopped(self) -> list[Row]:
         """Rows of variants that became unstable and have a time."""
         return [row for row in self.rows if not is_stable(row) and row[COST] is not None]
+
+
+def _times_of_errors(row: Row) -> dict[str, str]:
+    """The times later than t_eta at which velocity errors are compared, T/2 and the end, in words by measure."""
+    end = f"{row['end'] or 0:.2g} T"
+    times = {"velocity_error_half": "T/2"} | ({} if end == "0.5 T" else {"velocity_error_end": end})
+    return {measure: words for measure, words in times.items() if row[measure] is not None}
 
 
 def is_stable(row: Row) -> bool:

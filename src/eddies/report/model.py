@@ -89,8 +89,8 @@ def section(description: Mapping[str, object], table: Mapping[str, np.ndarray],
     """The model: a-priori figures and the errors at the last frame, from the tables.
 
     `source` names the run that the weights come from, if it is another; the history is that run's, and None where
-    there was nothing to learn. `others` are ground truths that it was trained on, where that of this flow is none of
-    them.
+    there was nothing to learn. `others` are ground truths that it was trained on, where that of this flow, or of the
+    source's, is none of them.
     """
     last = int(np.argmax(table["delay"]))
     at = {name: float(values[last]) for name, values in table.items()}
@@ -101,7 +101,10 @@ def section(description: Mapping[str, object], table: Mapping[str, np.ndarray],
     since = "training window" if source is None else "release of the tracers, or the training window"
     trained = ""
     if others:
-        since, trained = "release of the tracers", f" Trained on {', '.join(others)}, and on nothing of this flow."
+        whose = "this flow" if source is None else f"the flow of {source}, where its weights come from"
+        trained = f" Trained on {', '.join(others)}, and on nothing of {whose}."
+    if others and source is None:
+        since = "release of the tracers"
     text = (f"Terms: {terms}.{trained} A-priori: the model sees the true particles of a frame. Numbers are of the last "
             f"frame, {at['delay']:.3g} after the {since}.")
     shown = Section("model", "Model", text, metrics=metrics,

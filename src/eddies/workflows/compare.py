@@ -120,28 +120,28 @@ def write(comparison: Comparison, table: list[dict[str, Any]], comm: Comm, outpu
     """
     with open_product(comm, comparison.ground_truth_of(comparison.subject) / "ground_truth.h5", "ground_truth") as file:
         flow = read_attributes(file, "reference")
-    parts = []
-    if comm.rank == 0:
-        parts = sections(ErrorAgainstTime(table, comparison.subject, BASELINE, comparison.columns),
-                         comparison.turnovers)
+    drawn = ErrorAgainstTime(table, comparison.subject, BASELINE, comparison.columns)
+    parts = sections(drawn, comparison.turnovers) if comm.rank == 0 else []
     draw(comm, parts)
-    in_directories(comm, lambda: write_files(comparison, table, flow, parts, comm.size, output))
+    in_directories(comm, lambda: write_files(comparison, drawn, flow, parts, comm.size, output))
 
 
-def write_files(comparison: Comparison, table: list[dict[str, Any]], flow: dict[str, float], parts: Sequence[Section],
+def write_files(comparison: Comparison, drawn: ErrorAgainstTime, flow: dict[str, float], parts: Sequence[Section],
                 ranks: int, output: Path) -> None:
-    """Write rows as CSV and JSON, and the page of drawn sections; one rank calls it. `flow` has the scales of the
-    ground truth of the comparison's subject."""
+    """Write rows and summary as CSV and JSON, and the page of drawn sections; one rank calls it. `flow` has the scales
+    of the ground truth of the comparison's subject."""
     computer = machine(comparison.base_scene.device, ranks)
     lines = io.StringIO(newline="")
     writer = csv.DictWriter(lines, COLUMNS)
     writer.writeheader()
-    writer.writerows(table)
+    writer.writerows(drawn.rows)
     record = {"name": comparison.name, "title": comparison.title, "machine": computer, "flow": flow,
-              "rows": table}
+              "rows": drawn.rows, "summary": drawn.summary}
     parts[0].notices += notes(comparison)
     page = run_record(comparison.name, comparison.title, comparison.base_scene.to_toml(), computer)
     write_page(output, page, parts, {
         output / "comparison.csv": lines.getvalue(),
         output / "comparison.json": json.dumps(record, indent=2, allow_nan=False) + "\n"})
+    for sentence in drawn.summary:
+        log.info("compare: %s", sentence)
     log.info("compare: %s", output / "index.html")

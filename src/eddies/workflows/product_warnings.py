@@ -56,13 +56,6 @@ def changed_truths(origin: Provenance) -> list[str]:
             "it as of another flow" for path, known in truths.items() if now[path] not in (None, known)]
 
 
-def others_trained_on(origin: Provenance) -> list[str]:
-    """The ground truths that a model was trained on where that of its own run is none of them; `origin` is the
-    provenance of the model."""
-    truths = origin.get("truths", {})
-    return [] if origin.get("made_from", {}).get("ground_truth") in truths.values() else list(truths)
-
-
 def not_finite(file: File, kind: str) -> str:
     """A sentence on the numbers of an open product that are not finite, or ""; of series the last frame counts."""
     places = []

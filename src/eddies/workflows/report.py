@@ -20,7 +20,7 @@ from eddies.analysis.spectra import energy_spectrum, vorticity
 from eddies.analysis.tracer_statistics import tracer_statistics
 from eddies.io.fields import FieldSeries
 from eddies.io.hdf5 import File, ProductError, in_files, open_product, read_attributes, read_table
-from eddies.io.provenance import read_json, read_provenance
+from eddies.io.provenance import others_trained_on, read_json, read_provenance
 from eddies.io.trajectories import Trajectory
 from eddies.parallel.broadcast import on_all_ranks
 from eddies.parallel.communicator import Comm
@@ -34,7 +34,7 @@ from eddies.report.rollout import Rollout
 from eddies.report.rollout import section as rollout_section
 from eddies.scene.scene import Scene
 from eddies.workflows.feasibility import check_places
-from eddies.workflows.product_warnings import changed_truths, mixed_products, not_finite, others_trained_on
+from eddies.workflows.product_warnings import changed_truths, mixed_products, not_finite
 from eddies.workflows.rollout.stored_spectra import read_spectra
 from eddies.workflows.run_directory.work import read_stage_seconds
 
@@ -223,12 +223,15 @@ def _read_kernel(file: File, record: Run) -> list[Section]:
 def _read_model(file: File, record: Run) -> list[Section]:
     density_rate = read_table(file, "density_rate_sample") if "density_rate_sample" in file else None
     provenance, errors = record.provenance["model"], read_table(file, "a_priori")
-    source = provenance.get("source")
+    source, others = provenance.get("source"), others_trained_on(provenance)
+    if source and "truths" in source:
+        others = [path if reached is None else f"{path} (M_t = {reached:.3f})"
+                  for path, reached in source["truths"].items()]
     history = read_table(file, "history") if "history" in file else None
     shown = model_section(read_json(file, "description"), errors,
                           read_table(file, "acceleration_sample"), density_rate, history, source and source["path"],
-                          others_trained_on(provenance))
-    if source:
+                          others)
+    if source and "source_a_priori" in file:
         own = mach.FlowErrors("this flow", provenance["mach_turbulent"], errors)
         mach.add(shown, own, mach.FlowErrors(source["path"], source["mach_turbulent"],
                                              read_table(file, "source_a_priori")))

@@ -71,9 +71,12 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         if model.networks:
             tables["feature_range"] = vars(feature_range(data))
         mach, description = truth.reference.get("mach_turbulent"), describe(scene, truth.scales)
+        mach_of_truths = {str(path): each.reference.get("mach_turbulent")
+                          for path, each in zip(scene.training.truth_files, trained_on)}
     weights = {name: tensor.cpu().numpy() for name, tensor in model.state_dict().items()}
     save_weights(comm, directory / "model.h5", "model", description, weights,
-                 {**scene.provenance("train"), "mach_turbulent": mach, "truths": truth_ids(scene)}, tables)
+                 {**scene.provenance("train"), "mach_turbulent": mach, "truths": truth_ids(scene),
+                  "mach_of_truths": mach_of_truths}, tables)
     guard.checkpoints.remove()
     errors = tables["a_priori"]
     beside = (f" (exact filtered pressure gradient {errors['pressure_gradient_error'][-1]:.3f})"

@@ -1,22 +1,30 @@
 """Costs of stages: what must hold whatever the machine, and memory against what is kept."""
 
 import logging
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
+from eddies.flow.subgrid import DynamicStress
 from eddies.scene.scene import load_scene
+from eddies.workflows.foreseen import cost_model
+from eddies.workflows.foreseen.coarse_probe import probe_coarse
 from eddies.workflows.foreseen.cost_model import Speed
 from eddies.workflows.foreseen.learning_cost import SAMPLES, kernel_cost, rollout_cost, training_cost
 from eddies.workflows.foreseen.particle_probe import PARTS, ParticleSpeed, Rate
 from eddies.workflows.foreseen.stage_cost import Speeds, flow_cost
 from eddies.workflows.foreseen.stage_costs import stage_costs
 from eddies.workflows.foreseen.training_probe import Line, TrainingSpeed, cube_rows, probe_training
+from eddies.workflows.ground_truth.scene_flow import build_fluid
 
 PARTICLES = ParticleSpeed(dict.fromkeys(PARTS, Rate(1e-4, 1e-8)), {"splines": 4, "transforms": 8},
                           {"splines": 13, "transforms": 31}, (24, 24, 8, 24))
-SPEEDS = Speeds(Speed(1e-6, 1e9, 2e-7, 1e-7), PARTICLES, TrainingSpeed(*[Line(1e-3, 1e-6)] * 6), {})
+SPEEDS = Speeds(Speed(1e-6, 1e9, 2e-7, 1e-7), PARTICLES, TrainingSpeed(*[Line(1e-3, 1e-6)] * 6), {}, PARTICLES,
+                Speed(5e-7, 1e9, 0.0, 1e-6))
+
+begin_step = DynamicStress.begin_step
 
 
 def cost_of(stage, *overrides, scene="hit-small", ranks=1):
@@ -105,9 +113,41 @@ def test_lines_pass_through_both_sizes_and_are_never_negative():
 @pytest.mark.parametrize("changes", [["simulation.method=none"], ["simulation.method=eulerian"]])
 def test_rollouts_without_a_model_are_foreseen_too(changes):
     scene = load_scene("hit-small", changes)
-    bare = Speeds(SPEEDS.flow, None, SPEEDS.training, {})
+    bare = replace(SPEEDS, particles=None)
     found = rollout_cost(scene, 2, bare)
     assert 0 < found.seconds < 100 and (found.parts["steps"] > 0) == ("eulerian" in changes[0])
+    # Steps at the speed of the coarse grid, whatever that of the direct simulation.
+    once, flow = bare.coarse, replace(bare.flow, work=1.0, tracers=1.0)
+    twice = replace(bare, flow=flow, coarse=replace(once, work=2 * once.work, tracers=2 * once.tracers))
+    slower, found = (rollout_cost(scene, 1, speeds).parts["steps"] for speeds in (twice, bare))
+    assert slower == pytest.approx(2 * found)
+
+
+def test_spectra_are_foreseen_whatever_moves_the_particles():
+    """A solve from nothing each, of the same particles: as dear for all."""
+    learned, *others = (cost_of("simulate", *changes).parts["spectra"] for changes in (
+        [], ["simulation.method=none"], ["simulation.method=eulerian"],
+        ["model.preset=paper", "simulation.integrator=verlet", "simulation.step=0.005"]))
+    assert learned > 0 and others == pytest.approx(3 * [learned], rel=0.02)
+
+
+@pytest.mark.mpi(1, 2)
+def test_a_coarse_grid_is_probed_as_it_runs(comm, monkeypatch):
+    """Its own fluid and precision, with the closure that it has."""
+    built, steps = [], []
+    for name in ("incompressible", "compressible"):
+        scene = load_scene("tiny", ["simulation.method=eulerian", "eulerian.cells=16", f"eulerian.fluid={name}",
+                                    "eulerian.equations=filtered", "eulerian.closure=dynamic-mixed"])
+        monkeypatch.setattr(cost_model, "build_fluid", lambda *given: built.append(build_fluid(*given)) or built[-1])
+        monkeypatch.setattr(DynamicStress, "begin_step", lambda *given: steps.append(begin_step(*given)))
+        speed = probe_coarse(scene, comm)
+        assert speed.work > 0 and speed.tracers > 0
+    for fluid, compressible in zip(built, (False, True)):
+        assert (fluid.compressible, fluid.grid.cells, fluid.grid.precision) == (compressible, 16, "float32")
+        assert fluid.closure.squared_width > 0
+    assert len(steps) == 2 * 6
+    # What is learned is not there before it is.
+    assert probe_coarse(load_scene("tiny", ["simulation.method=eulerian", "eulerian.closure=learned"]), comm).work > 0
 
 
 @pytest.mark.mpi(1)

@@ -58,6 +58,14 @@ def test_weights_that_go_from_run_to_run_keep_where_they_were_trained():
     origin, own = trained_on(scene, first)
     assert origin == {"path": "runs/first", "mach_turbulent": 0.08} and own == errors["a_priori"]
 
+    # On another flow alone: not on that of the run, of which are Mach number and errors.
+    elsewhere = {"mach_turbulent": 0.08, "made_from": {"ground_truth": "t1"},
+                 "truths": {"runs/a/ground_truth.h5": "t2"}, "mach_of_truths": {"runs/a/ground_truth.h5": 0.04}}
+    found = trained_on(scene, ModelSource(Path("first"), {}, {}, errors, elsewhere))
+    assert found == ({"path": "runs/first", "truths": {"runs/a/ground_truth.h5": 0.04}}, None)
+    second = ModelSource(Path("second"), {}, {}, errors, {"mach_turbulent": 0.16, "source": found[0]})
+    assert trained_on(load_scene("tiny", ["model.path=runs/second"]), second) == found
+
     tables = {"a_priori": {"acceleration_error": 0.5}, "source_a_priori": own}
     second = ModelSource(Path("second"), {}, {}, tables, {"mach_turbulent": 0.16, "source": origin})
     assert trained_on(load_scene("tiny", ["model.path=runs/second"]), second) == (origin, own)

@@ -1,7 +1,9 @@
 """Training on the ground truths of other runs, alone and together, forced and unforced."""
 
+import json
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -10,14 +12,18 @@ import torch
 from mpi4py import MPI
 
 from eddies.io.hdf5 import open_product, read_table
+from eddies.io.provenance import product_attributes, product_provenance
 from eddies.io.weights import load_weights
 from eddies.learning.losses import relative_error
 from eddies.parallel.reduction import global_sum
 from eddies.particles.model import FORCING
 from eddies.scene.scene import SceneError, load_scene
-from eddies.stages import check_inputs
+from eddies.stages import check_inputs, check_ranks
 from eddies.workflows import dns, train
+from eddies.workflows.foreseen.estimates import most_ranks
+from eddies.workflows.foreseen.warnings import warnings
 from eddies.workflows.ground_truth.truth import load_frame
+from eddies.workflows.learned import transfer
 from eddies.workflows.learned.training_data import model_of
 from eddies.workflows.learned.truths import open_truths, training_data, truth_problems
 from eddies.workflows.rollout.eulerian_run import EulerianRun
@@ -129,6 +135,7 @@ def twice_as_fast(source, target):
     """The same flow in another unit of time, half as long."""
     powers = {"velocity_rms": 1, "acceleration_rms": 2, "sound_speed": 1, "viscosity": 1, "density_rate_rms": 1}
     with h5py.File(copied(source, target), "r+") as file:
+        file.attrs["provenance"] = json.dumps(json.loads(file.attrs["provenance"]) | {"id": "another"})
         reference, tracers = file["reference"].attrs, file["particles/tracers"]
         for name, power in powers.items():
             reference[name] *= 2.0**power
@@ -151,6 +158,12 @@ def test_the_same_is_learned_of_the_same_flow_in_other_units(comm, tmp_path):
         assert np.allclose(weights[name], tensor, rtol=1e-9)
     assert np.allclose(unseen["history"]["loss"], seen["history"]["loss"], rtol=1e-9)
     assert np.allclose(unseen["a_priori"]["acceleration_error"], seen["a_priori"]["acceleration_error"], rtol=1e-9)
+    # Weights that are taken over say where they were trained, not where they lay.
+    transfer.run(replace(scene, model=replace(scene.model, path=str(own))), comm, tmp_path / "fast")
+    source = product_provenance(tmp_path / "fast/model.h5")["source"]
+    (truth, mach), = source["truths"].items()
+    assert truth == str(tmp_path / "fast/ground_truth.h5") and source["path"] == str(own)
+    assert mach == product_attributes(truth, "reference")["mach_turbulent"] > 0
     # The delay is that since the end of what was seen: here all, or nothing.
     assert seen["a_priori"]["delay"].max() < 0 < unseen["a_priori"]["delay"].min()
 
@@ -245,3 +258,38 @@ def test_truths_that_do_not_fit_are_refused_before_any_work(comm, tmp_path, over
     # The own ground truth, which is named too, is made by the run itself.
     with pytest.raises(SceneError, match=r"own: \[training\] truths: "):
         check_inputs(("train",), scene, comm, tmp_path / "own")
+
+
+def on_ranks(size):
+    return SimpleNamespace(size=size)
+
+
+@pytest.mark.mpi(1)
+def test_more_ranks_than_another_truth_can_be_cut_for_are_refused_before_any_work(comm, tmp_path):
+    """Into 8 layers, of which the own has 14; no thinner than a radius of 2.5 of them, nor than what particles stray in
+    the training through horizons, at the speed that they have there."""
+    other = made(comm, tmp_path, "tracers.particles_per_side=4", "training.batch=60", runs=("other",))
+    assert other.tracers.planes == 8
+    place = f'[training] truths: "{tmp_path / "other"}"'
+    for model, most, reason in (('{terms=["viscosity"]}', 2, "ghost planes of the resolved velocity"),
+                                ('{preset="learned-density", neighbors=8}', 2, "slabs no thinner than the particles' "
+                                                                               "reach 1.95")):
+        alone = scene_of(tmp_path, "tracers.particles_per_side=8", f"model={model}")
+        alone = replace(alone, training=replace(alone.training, horizons=None))
+        scene = trained_on(alone, tmp_path / "nowhere", tmp_path / "other")
+        check_ranks(("train",), alone, on_ranks(3))
+        check_ranks(("train",), scene, on_ranks(most))
+        with pytest.raises(SceneError) as refusal:
+            check_ranks(("train",), scene, on_ranks(3))
+        assert f"3 ranks are more than the {most} that it can use ({place}: {reason}); start at most {most}" in str(
+            refusal.value)
+        assert [line for line in warnings(scene, 3) if "ranks" in line] == [
+            f"this job has 3 ranks, and the scene can use at most {most}: start fewer"]
+        # The ground truth of the run is made by as many as it can be cut for, and weights are taken by as many.
+        check_ranks(("dns",), scene, on_ranks(3))
+        check_ranks(("train",), replace(scene, model=replace(scene.model, path="runs/other")), on_ranks(3))
+
+    with h5py.File(tmp_path / "other/ground_truth.h5", "r+") as file:
+        file["reference"].attrs["velocity_rms"] = 30.0
+    scene = trained_on(scene_of(tmp_path, "tracers.particles_per_side=8"), tmp_path / "other")
+    assert most_ranks(scene)[f"{place}: ghost planes of the grid in the training through horizons"] == 1

@@ -2,7 +2,9 @@
 class of the user's."""
 
 import json
+import logging
 from dataclasses import replace
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -22,6 +24,7 @@ from eddies.workflows import dns, report, simulate, train
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.learned.description import describe
 from eddies.workflows.learned.model import scene_model
+from eddies.workflows.rollout.particle_run import SOLVES, LearnedRun
 
 pytestmark = pytest.mark.usefixtures("quick_spectra")
 
@@ -360,3 +363,17 @@ def test_a_method_of_the_users(comm, tmp_path, own, fluid):
             assert np.array_equal(velocity[-1], np.broadcast_to(np.float32([0.5, 0, -1]), velocity[-1].shape))
             assert "density" not in file["particles/model"] and "density" not in file["particles/truth"]
     comm.Barrier()
+
+
+@pytest.mark.mpi(1)
+def test_solves_that_do_not_converge_are_told_once_and_all_counted(comm, monkeypatch, caplog):
+    monkeypatch.setattr(logging.getLogger("eddies"), "propagate", True)
+    run = LearnedRun.__new__(LearnedRun)
+    run.comm, run._solves = comm, {name: [] for name in SOLVES}
+    with caplog.at_level(logging.INFO, logger="eddies"):
+        for solves in ([(3, 1e-3, True)], [(3, 1e-3, True), (300, 0.02, False)], [(300, 0.04, False)]):
+            run.dynamics = SimpleNamespace(resolution=SimpleNamespace(solves=solves))
+            run._count_solves()
+    (said,) = caplog.messages
+    assert said.startswith("rollout: 1 of 2 solves for the resolved velocity did not converge in 300 iterations, the")
+    assert run.series()["closure"]["not_converged"] == [0, 1, 1]

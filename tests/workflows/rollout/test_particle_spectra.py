@@ -1,5 +1,6 @@
 """Spectra that are found in the velocities of particles against those of the field that they sample."""
 
+import logging
 from types import SimpleNamespace
 
 import numpy as np
@@ -66,13 +67,19 @@ def test_the_spectrum_of_a_known_field_is_found_on_any_number_of_ranks(comm, tmp
 
 
 @pytest.mark.mpi(1)
-def test_particles_in_a_few_clusters_do_not_hold_a_rollout_up(comm):
+def test_particles_in_a_few_clusters_do_not_hold_a_rollout_up_and_are_told_once(comm, monkeypatch, caplog):
+    monkeypatch.setattr(logging.getLogger("eddies"), "propagate", True)
     modes, energy = known_field()
-    slab, columns = sampled(comm, modes, "cluster across a corner")
-    spectra = spectra_on(slab)
-    spectra.add("model", 0.0, columns)
-    (solve,) = spectra._resolution.solves
-    assert solve[0] == 100 and 0 < sum(spectra.state_dict()["model"]["energy"][0]) < 3 * energy.sum()
+    spectra = spectra_on(SlabDecomposition(comm, LENGTH, PLANES))
+    with caplog.at_level(logging.INFO, logger="eddies"):
+        spectra.add("truth", 0.0, sampled(comm, modes)[1])
+        assert caplog.messages == []
+        for time in (0.5, 0.75):
+            spectra.add("model", time, sampled(comm, modes, "cluster across a corner")[1])
+    (said,) = caplog.messages
+    assert said.startswith("rollout: at time 0.5 particles of the model have gathered and left voids: the solve for "
+                           "their spectrum did not converge in 100 iterations and left ")
+    assert all(0 < sum(found) < 3 * energy.sum() for found in spectra.state_dict()["model"]["energy"])
 
 
 @pytest.mark.mpi(1)

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from statistics import median
 
@@ -21,6 +22,7 @@ import numpy as np
 
 from eddies.clock import Clock
 from eddies.flow.history import FlowHistory
+from eddies.flow.subgrid import Closure
 from eddies.flow.tracers import FilteredField, TracerParticles, release
 from eddies.kernels.library import threads
 from eddies.parallel.communicator import Comm
@@ -137,21 +139,28 @@ def flow_bytes(scene: Scene, ranks: int) -> float:
     return size
 
 
-def probe(scene: Scene, comm: Comm, steps: int = 5) -> Speed:
-    """The speed of the ranks at hand, from a few steps of the scene's fluid; all ranks call it.
+def probe(scene: Scene, comm: Comm, steps: int = 5,
+          closure: Callable[[SpectralGrid], Closure | None] = lambda grid: None) -> Speed:
+    """The speed of the ranks at hand, from a few steps of the scene's fluid with a closure or none; all ranks call it.
 
     The grid has no more cells a rank than PROBE_CELLS^3.
     """
     small = small_flow(scene, comm.size)
     fluid, clock = build_fluid(small, comm), Clock(end=small.time.duration)
     grid, stepper, state = fluid.grid, STEPPERS[scene.time.stepper](fluid), initial_state(small, fluid)
-    step = build_step_limit(small, grid)(state, clock)
-    state = stepper(state, step)  # the first step also plans transforms and makes tables
+    step, fluid.closure = build_step_limit(small, grid)(state, clock), closure(grid)
+
+    def advanced(state: np.ndarray) -> np.ndarray:
+        if fluid.closure is not None:
+            fluid.closure.begin_step(state[:3])
+        return stepper(state, step)
+
+    state = advanced(state)  # the first step also plans transforms and makes tables
     times = []
     for _ in range(steps):
         comm.Barrier()
         start = time.perf_counter()
-        state = stepper(state, step)
+        state = advanced(state)
         comm.Barrier()
         times.append(time.perf_counter() - start)
     seconds, bandwidth = median(times), RANK_BANDWIDTH

@@ -4,8 +4,10 @@ import math
 from dataclasses import dataclass, replace
 
 from eddies.clock import ladder_step
+from eddies.io.provenance import product_attributes
 from eddies.particles.reference_scales import allowed_step, resolved_wavenumber
-from eddies.scene.scene import BOX_LENGTH, Eulerian, Scene
+from eddies.scene.rules import quoted
+from eddies.scene.scene import BOX_LENGTH, Eulerian, Scene, Tracers
 
 DISSIPATION_CONSTANT = 0.5   # C_eps = eps L / u'^3 of developed turbulence
 DECAY_EXPONENT = 1.2         # of the energy of turbulence that nothing forces (Saffman 1967)
@@ -178,7 +180,7 @@ def most_ranks(scene: Scene) -> dict[str, int]:
         limits["ghost planes of the coarse grid"] = max(cells // GHOST_PLANES[scene.tracers.interpolation], 1)
     elif scene.injects:
         reach = scene.simulation.skin * scene.interaction_radius / 2
-        limits["ghost planes of the resolved velocity"] = ranks_of_resolved_grid(scene, reach)
+        limits["ghost planes of the resolved velocity"] = ranks_of_resolved_grid(scene.tracers, reach)
     return limits
 
 
@@ -186,19 +188,46 @@ def most_training_ranks(scene: Scene) -> dict[str, int]:
     """The same for what a model is trained on and by."""
     # The a-priori test interpolates filtered fields to the particles, terms what they make of the resolved velocity.
     limits = {"ghost planes of the filtered fields": max(scene.tracers.cells // GHOST_PLANES["quintic"], 1)}
-    radius, simulation = scene.interaction_radius, scene.simulation
     if scene.resolves:
-        skin = simulation.skin * radius if simulation else 0.0
-        limits["ghost planes of the resolved velocity"] = ranks_of_resolved_grid(scene, skin / 2)
-    time = horizon_time(scene)
+        skin = scene.simulation.skin * scene.interaction_radius if scene.simulation else 0.0
+        limits["ghost planes of the resolved velocity"] = ranks_of_resolved_grid(scene.tracers, skin / 2)
+    turbulence = expected_turbulence(scene)
+    limits |= most_horizon_ranks(scene, scene.tracers, turbulence.velocity_rms if turbulence else 0.0)
+    return limits | most_ranks_of_truths(scene)
+
+
+def most_horizon_ranks(scene: Scene, tracers: Tracers, velocity: float) -> dict[str, int]:
+    """The same for what trains through horizons, among tracers of an rms `velocity` of a component."""
+    time, radius, limits = horizon_time(scene), tracers.radius_of(scene.neighbors), {}
     if time > 0:
         if learns_pairs(scene):
-            reach = radius + 2 * particle_drift(scene, time)
+            reach = radius + 2 * PEAK_VELOCITY * velocity * time
             limits[f"slabs no thinner than the particles' reach {reach:.3g} in the training through horizons"] = (
-                thick_slabs(scene.tracers.planes, reach))
+                thick_slabs(tracers.planes, reach))
         if scene.training.horizons.energy_weight > 0 or scene.resolves:
             limits["ghost planes of the grid in the training through horizons"] = ranks_of_resolved_grid(
-                scene, particle_drift(scene, time, ALLOWED_VELOCITY))
+                tracers, ALLOWED_VELOCITY * velocity * time)
+    return limits
+
+
+def most_ranks_of_truths(scene: Scene) -> dict[str, int]:
+    """The strictest limit of each ground truth that [training] names and that is there: it may have another number of
+    tracers, and move otherwise."""
+    limits = {}
+    named = zip(scene.training.truths or (), scene.training.truth_files) if scene.training else ()
+    for name, path in named if scene.model.path is None else ():
+        if "spacing" not in (reference := product_attributes(path, "reference")):
+            continue
+        tracers = replace(scene.tracers, particles_per_side=round(BOX_LENGTH / reference["spacing"]))
+        found = most_horizon_ranks(scene, tracers, reference["velocity_rms"])
+        if learns_pairs(scene):
+            reach = tracers.radius_of(scene.neighbors)
+            found[f"slabs no thinner than the particles' reach {reach:.3g}"] = thick_slabs(tracers.planes, reach)
+        if scene.resolves or product_attributes(path, "forcing"):
+            found["ghost planes of the resolved velocity"] = ranks_of_resolved_grid(tracers, 0.0)
+        if found:
+            reason = min(found, key=found.__getitem__)
+            limits[f"[training] truths: {quoted(name)}: {reason}"] = found[reason]
     return limits
 
 
@@ -225,12 +254,6 @@ def thick_slabs(planes: int, width: float) -> int:
 def particle_reach(scene: Scene) -> float:
     """How thick slabs must be for the particles: radius of interaction, and skin of the neighbour list."""
     return scene.interaction_radius * (1 + (scene.simulation.skin if scene.simulation else 0.0))
-
-
-def particle_drift(scene: Scene, time: float, peak: float = PEAK_VELOCITY) -> float:
-    """How far a particle may move along z in a time if it has `peak` times u'; 0 where that is not foreseen."""
-    turbulence = expected_turbulence(scene)
-    return peak * turbulence.velocity_rms * time if turbulence else 0.0
 
 
 def resolved_shells(scene: Scene) -> int:
@@ -264,9 +287,9 @@ def horizon_time(scene: Scene) -> float:
     return max(horizons.frames) * scene.tracers.frame_interval
 
 
-def ranks_of_resolved_grid(scene: Scene, outside: float) -> int:
+def ranks_of_resolved_grid(tracers: Tracers, outside: float) -> int:
     """The largest number of ranks for the cubic splines on the grid of the resolved velocity, which have one more ghost
     plane for each plane that a particle may be outside its slab."""
-    planes = scene.tracers.planes
+    planes = tracers.planes
     ghosts = GHOST_PLANES["cubic"] - 1 + max(math.ceil(outside * planes / BOX_LENGTH - 1e-9), 1)
     return max(planes // ghosts, 1)

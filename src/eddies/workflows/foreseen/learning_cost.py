@@ -7,16 +7,17 @@ from dataclasses import replace
 
 from eddies.kernels.library import library, threads
 from eddies.particles.smoothing_kernels import KNOTS
-from eddies.scene.scene import BOX_LENGTH, Eulerian, Initial, Scene
+from eddies.scene.scene import BOX_LENGTH, Scene
+from eddies.workflows.foreseen.coarse_probe import coarse_scene
 from eddies.workflows.foreseen.cost_model import busiest_cells, cost, flow_bytes
-from eddies.workflows.foreseen.estimates import ground_truth_alone
 from eddies.workflows.foreseen.particle_cost import (NEIGHBOR_BYTES, POINT_BYTES, PROCESS_BYTES, particle_bytes,
                                                      particle_cost)
 from eddies.workflows.foreseen.particle_work import ParticleWork, particle_work
 from eddies.workflows.foreseen.rollout_course import EVALUATIONS, rollout_course
 from eddies.workflows.foreseen.stage_cost import FILE_BYTES_PER_SECOND, START_SECONDS, Speeds, StageCost
-from eddies.workflows.foreseen.stored import kernel_bytes, model_bytes, rollout_bytes, true_frames
-from eddies.workflows.foreseen.training_probe import cube_rows, evaluated_scene, trained_scene
+from eddies.workflows.foreseen.stored import (kernel_bytes, model_bytes, rollout_bytes, stored_spectra,
+                                              true_frames)
+from eddies.workflows.foreseen.training_probe import cube_rows, evaluated_scene, spectral_scene, trained_scene
 from eddies.workflows.learned.a_priori import EVALUATIONS as TESTED_FRAMES
 from eddies.workflows.learned.training_data import COMBINED_DRAWS, VALIDATION_PARTICLES
 from eddies.workflows.learned.training_phases import HORIZON_VALIDATIONS, VALIDATIONS
@@ -111,28 +112,22 @@ def rollout_cost(scene: Scene, ranks: int, speeds: Speeds) -> StageCost:
     """Of a rollout: its steps, its frames with those of the truth, and the files."""
     course, settings = rollout_course(scene), scene.simulation
     own, disk, memory = scene.tracers.particles / ranks, rollout_bytes(scene, course), PROCESS_BYTES
-    evaluation, first, spectrum = 0.0, 0.0, 0.0
+    evaluation, first = 0.0, 0.0
     parts = {"start": START_SECONDS + (TORCH_SECONDS if set(scene.stages) <= {"dns", "simulate", "report"} else 0.0)}
     if "model" in settings.needs:
         work = particle_work(scene)
         evaluation, first = (evaluation_seconds(scene, work, ranks, speeds, iterations)
                              for iterations in (work.iterations, COLD))
-        spectrum = first - evaluation_seconds(scene, work, ranks, speeds, 0)
         memory = particle_bytes(work, speeds.particles, ranks)
     parts["steps"] = first + (course.evaluations - 1) * evaluation
     if settings.method == "eulerian":
-        eulerian = scene.eulerian or Eulerian()
-        sound_speed = scene.flow.sound_speed if eulerian.fluid == "compressible" else None
-        flow = replace(scene.flow, cells=eulerian.cells_for(scene.tracers.filter_width), fluid=eulerian.fluid,
-                       sound_speed=sound_speed, precision=settings.precision)
-        coarse = replace(ground_truth_alone(scene), flow=flow, forcing=None, spin_up=None,
-                         tracers=None, time=replace(scene.time, duration=1.0), initial=Initial(peak_wavenumber=1.0))
-        moved = speeds.flow.tracers * busiest_cells(scene, ranks)
-        parts["steps"] = course.steps * (cost(coarse, ranks, speeds.flow).seconds + moved)
+        coarse = coarse_scene(scene)
+        moved = speeds.coarse.tracers * busiest_cells(coarse, ranks)
+        parts["steps"] = course.steps * (cost(coarse, ranks, speeds.coarse).seconds + moved)
         memory += flow_bytes(coarse, ranks)
     frames = course.intervals + 1 + true_frames(scene, course)
-    # Spectra of particles are solves from nothing; without a model that has such solves they are not probed.
-    parts["frames"] = course.evaluations_of_frames * evaluation + frames * spectrum
+    parts["frames"] = course.evaluations_of_frames * evaluation
+    parts["spectra"] = stored_spectra(scene, course) * spectrum_seconds(scene, ranks, speeds)
     memory += POINT_BYTES * scene.tracers.planes**2 * math.ceil(scene.tracers.planes / ranks)
     if scene.kernel:
         parts["frames"] += frames * speeds.training.averages.at(own)
@@ -144,6 +139,14 @@ def evaluation_seconds(scene: Scene, work: ParticleWork, ranks: int, speeds: Spe
     """Seconds of an evaluation of the model with so many iterations of its solve, if it has one."""
     work = replace(work, iterations=iterations if work.wavenumber else 0.0)
     return particle_cost(work, speeds.particles, ranks, threads(), speeds.flow.bandwidth).seconds
+
+
+def spectrum_seconds(scene: Scene, ranks: int, speeds: Speeds) -> float:
+    """Seconds of a solve from nothing for the resolved velocity, of whose modes a spectrum is."""
+    work, bandwidth = particle_work(spectral_scene(scene)), speeds.flow.bandwidth
+    whole, rest = (particle_cost(replace(work, iterations=iterations), speeds.spectra, ranks, threads(), bandwidth)
+                   for iterations in (COLD, 0.0))
+    return whole.seconds - rest.seconds
 
 
 def frame_bytes(scene: Scene, work: ParticleWork, ranks: int, speeds: Speeds) -> float:

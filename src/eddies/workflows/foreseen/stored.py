@@ -91,6 +91,14 @@ def stores_density(scene: Scene) -> bool:
                                         and "density" in scene.model.reads)
 
 
+def stored_spectra(scene: Scene, course: RolloutCourse) -> int:
+    """Spectra of a rollout: of model and truth at the times of filtered fields, of the model alone after the truth."""
+    tracers, true = scene.tracers, true_frames(scene, course)
+    every = round(course.interval / tracers.frame_interval)
+    with_field = sum(frame * every % tracers.field_every == 0 for frame in range(true))
+    return 2 * with_field + course.intervals + 1 - true
+
+
 def true_frames(scene: Scene, course: RolloutCourse) -> int:
     """Frames of a rollout at whose times there is a ground truth."""
     start = scene.seen_in(scene.directory) if scene.simulation.start is None else scene.simulation.start

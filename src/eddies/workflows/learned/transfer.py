@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from eddies.io.hdf5 import open_product
+from eddies.io.provenance import others_trained_on
 from eddies.io.weights import save_weights
 from eddies.parallel.communicator import Comm
 from eddies.parallel.slab import SlabDecomposition
@@ -29,7 +30,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path) -> None:
 
     Terms work in units of the flow (Eq. 4), so only the scales and the support are this flow's. The tables are
     the source's, but for the a-priori tests: those of this flow, beside `source_a_priori`, those of the flow on which
-    the weights were trained.
+    the weights were trained, if the source tested them there.
     """
     device, source = prepare_torch(scene.device, comm), read_source(scene, comm)
     slab = SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes)
@@ -43,17 +44,26 @@ def run(scene: Scene, comm: Comm, directory: str | Path) -> None:
         mach, description = truth.reference.get("mach_turbulent"), describe(scene, truth.scales)
     origin, own_errors = trained_on(scene, source)
     provenance = {**scene.provenance("train"), "mach_turbulent": mach, "source": origin}
-    kept = source.tables | {"source_a_priori": own_errors}
+    kept = source.tables | ({"source_a_priori": own_errors} if own_errors else {})
     save_weights(comm, Path(directory) / "model.h5", "model", description, source.weights, provenance, kept | tables)
-    errors = tables["a_priori"]
-    beside = (f"exact filtered pressure gradient {errors['pressure_gradient_error'][-1]:.3f}; "
-              if "pressure_gradient_error" in errors else "")
-    log.info("model: weights of %s; acceleration error %.3f (%son its own flow %.3f)", source.path,
-             errors["acceleration_error"][-1], beside, own_errors["acceleration_error"][-1])
+    errors, beside = tables["a_priori"], []
+    if "pressure_gradient_error" in errors:
+        beside.append(f"exact filtered pressure gradient {errors['pressure_gradient_error'][-1]:.3f}")
+    beside.append(f"on its own flow {own_errors['acceleration_error'][-1]:.3f}" if own_errors else
+                  f"trained on {', '.join(origin['truths'])}")
+    log.info("model: weights of %s; acceleration error %.3f (%s)", source.path, errors["acceleration_error"][-1],
+             "; ".join(beside))
 
 
-def trained_on(scene: Scene, source: ModelSource) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Path and Mach number of the run where weights were trained, and errors there; not of one that took them."""
-    direct = {"path": scene.model.path, "mach_turbulent": source.provenance.get("mach_turbulent")}
-    return (source.provenance.get("source", direct),
-            source.tables.get("source_a_priori", source.tables["a_priori"]))
+def trained_on(scene: Scene, source: ModelSource) -> tuple[dict[str, Any], dict[str, np.ndarray] | None]:
+    """Path and Mach number of the run where weights were trained, and errors there; not of one that took them.
+
+    Where that run trained on ground truths of others alone, its own flow was none of them: then these by path with
+    their Mach numbers, as `truths`, in place of its own, and no errors.
+    """
+    origin, path = source.provenance, scene.model.path
+    if "source" in origin:
+        return origin["source"], source.tables.get("source_a_priori")
+    if others_trained_on(origin):
+        return {"path": path, "truths": origin["mach_of_truths"]}, None
+    return {"path": path, "mach_turbulent": origin.get("mach_turbulent")}, source.tables["a_priori"]

@@ -141,9 +141,11 @@ class ParticleRun:
         found = len(solves), iterations.sum(), iterations.max(), residuals.max(), failed
         for name, value in zip(SOLVES, found):
             self._solves[name].append(float(value))
-        if failed and self.comm.rank == 0:
+        # Said once; the report counts them.
+        if 0 < failed == sum(self._solves["not_converged"]) and self.comm.rank == 0:
             log.warning("rollout: %d of %d solves for the resolved velocity did not converge in %d iterations, the "
-                        "worst left a residual of %.1e", failed, len(solves), max(iterations), residuals.max())
+                        "worst left a residual of %.1e; the report counts later ones too", failed, len(solves),
+                        max(iterations), residuals.max())
 
     def status(self) -> str:
         """Iterations of a solve for the resolved velocity, for the progress line: the last mean between two frames."""

@@ -26,8 +26,8 @@ from eddies.workflows.variants.run import StepSeconds, VariantRun
 COST = ("seconds_per_step", "time_step", "wall_seconds", "wall_seconds_low", "wall_seconds_high", "core_seconds")
 # Measured on gradients that the kernel makes of the particles, of the model and of the truth.
 THROUGH_KERNEL = ("qr_kl", "qr_kl_floor")
-COLUMNS = ("name", "group", "status", "stopped_at", "realisations", *MEASURES, "end", *COST, "training_seconds",
-           *(f"{measure}_spread" for measure in MEASURES), "settings")
+COLUMNS = ("name", "group", "method", "status", "stopped_at", "realisations", *MEASURES, "end", *COST,
+           "training_seconds", *(f"{measure}_spread" for measure in MEASURES), "settings")
 
 
 def rows(comparison: Comparison, runs_of: Mapping[str, Sequence[VariantRun]], alone: Comm,
@@ -41,7 +41,8 @@ def rows(comparison: Comparison, runs_of: Mapping[str, Sequence[VariantRun]], al
     for variant in comparison.variant:
         runs = runs_of[variant.name]
         row: dict[str, Any] = dict.fromkeys(COLUMNS)
-        row |= {"name": variant.name, "group": variant.group, "settings": " ".join(variant.set)}
+        row |= {"name": variant.name, "group": variant.group, "settings": " ".join(variant.set),
+                "method": comparison.scenes[variant.name].simulation.method}
         failures = [run.failure for run in runs if run.failure is not None]
         if failures:
             row |= {"status": f"failed: {failures[0]}"}
