@@ -13,7 +13,7 @@ _HOMES = {
     "eddies.errors": ("UserError",),
     "eddies.import_path": ("ImportPathError",),
     "eddies.scene.scene": ("Scene", "SceneError", "load_scene", "Eulerian", "Flow", "Forcing", "Horizons", "Initial",
-                           "Kernel", "Model", "Simulation", "SpinUp", "Time", "Tracers", "Training", "Wcsph"),
+                           "Kernel", "Model", "Simulation", "SpinUp", "Time", "Tracers", "Training"),
     "eddies.scene.values": ("boolean", "choice", "integer", "integers", "named", "number", "text", "texts"),
     "eddies.particles.terms.settings": ("TermSettings",),
     "eddies.particles.terms.term": ("PairTerm", "Term", "TermError"),

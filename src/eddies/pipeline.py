@@ -46,7 +46,7 @@ STAGES = {stage.name: stage for stage in (
           ("device", "model", "weights", "training", "truths", "own_model"),
           ("dns", "train-kernel"), "checkpoints-train", "eddies.workflows.train:run"),
     Stage("simulate", "the trained model, without the direct simulation", "simulation", "rollout",
-          ("device", "simulation", "window", "truths", "wcsph", "eulerian", "own_simulation"),
+          ("device", "simulation", "window", "truths", "eulerian", "own_simulation"),
           ("dns", "train-kernel", "train"), "checkpoints-rollout", "eddies.workflows.simulate:run"),
     Stage("report", "figures, one page and metrics.json of a run directory", None, None,
           (), ("dns", "train-kernel", "train", "simulate"), None, "eddies.workflows.report:run_stage"),

@@ -271,8 +271,8 @@ def test_keys_of_an_own_initial_flow():
 def test_what_methods_need():
     assert Simulation(step=1, turnovers=1, frame_interval=1).needs == ("model",)
     needs = {method: Simulation(method=method, step=1, turnovers=1, frame_interval=1).needs
-             for method in ("none", "wcsph", "eulerian")}
-    assert needs["none"] == needs["eulerian"] == () and "density" in needs["wcsph"]
+             for method in ("none", "eulerian")}
+    assert needs["none"] == needs["eulerian"] == ()
 
 
 def test_a_scene_with_a_model_loads_no_torch():

@@ -237,7 +237,7 @@ def test_what_no_term_reads_limits_no_ranks():
 
 
 def test_steps_that_sound_outruns_are_told():
-    """Of terms of SPH, as of the method, which refuses them."""
+    """Of terms of SPH."""
     from eddies.workflows.foreseen.warnings import warnings
     told = {changes: [line for line in warnings(load_scene("tiny", changes), 1) if "resolve sound" in line]
             for changes in (("model.preset=wcsph",), ("model.preset=wcsph", "simulation.step=0.001"), ())}
@@ -256,7 +256,6 @@ def test_a_rollout_is_foreseen_where_a_model_moves_the_particles_of_a_cpu(comm):
     assert len(lines) == len(rows) + 2 and "3 evaluations a step, 2.8 iterations each" in lines[0]
     assert all(row.binds in line and f"{row.ranks} x {row.threads}" in line for row, line in zip(rows, lines[2:]))
     for changes, stages in ((["simulation.method=none"], ["dns", "train-kernel", "simulate", "report"]),
-                            (["simulation.method=wcsph", "simulation.step=0.005"], ["dns", "train-kernel", "report"]),
                             (["device=cuda"], ["dns", "train-kernel", "report"])):
         other = load_scene("tiny", changes)
         speeds = probe_scene(other, comm)

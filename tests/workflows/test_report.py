@@ -71,7 +71,7 @@ def test_a_complete_run_shows_everything(comm, tmp_path):
         assert all(math.isfinite(value) for value in numbers(metrics[section].values()))
         missing = {key for key in keys if metrics[section][key] is None}
         assert missing == ({"density_rate_error"} if section == "model" else set())
-    assert "the trained model, terms pressure, pairs" in page
+    assert "the model, terms pressure, pairs" in page
     assert "terms pressure, pairs have none" in page
     check_stationary(metrics["stationary"], page)
 

@@ -38,7 +38,6 @@ CASES = {
     "own density": ("own density", "learned", {**DENSITY, "precision": "float64"}),
     "own density, forced, Verlet": ("own density", "learned", {
         **DENSITY, "step": 0.02, "injection": 0.5, "integrator": "verlet"}),
-    "wcsph": (None, "wcsph", {"step": 0.008, "turnovers": 0.06}),
     "eulerian": (None, "eulerian", {"step": 0.02}, {"fluid": "compressible"}),
     "eulerian, forced": (None, "eulerian", {"step": 0.02, "injection": 1.0}, {"closure": "dynamic-smagorinsky"}),
     "none": (None, "none", {"step": 0.015}),

@@ -19,9 +19,8 @@ MAIN = ("turnovers", "energy_ratio", "velocity_error", "spectrum_error", "veloci
         "qr_kl")
 # What moved the particles, by [simulation] method, from the attributes of the rollout.
 METHODS = {
-    "learned": "the trained model, terms {terms}",
+    "learned": "the model, terms {terms}",
     "none": "no force: every particle keeps its velocity",
-    "wcsph": "WCSPH, {kernel} kernel, density by summation, α = {alpha:g}, β = {beta:g}, γ = {exponent:g}",
     "eulerian": "Eulerian large-eddy simulation on {cells}³ cells, |kᵢ| ≤ {largest_wavenumber}, {fluid}, {equations} "
                 "velocity, closure: {closure}",
 }

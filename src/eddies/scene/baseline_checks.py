@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from eddies.scene.sections import Eulerian, Wcsph
+from eddies.particles.terms.settings import WCSPH
+from eddies.scene.sections import Eulerian
 
 if TYPE_CHECKING:
     from eddies.scene.scene import Scene
 
 
 def baseline_problems(scene: Scene) -> Iterator[str]:
-    """Sections of another method; a step that sound outruns; a coarse grid that is finer than what it starts from."""
+    """A section of another method; a coarse grid that is finer than what it starts from."""
     simulation = scene.simulation
-    for name in ("wcsph", "eulerian"):
-        if getattr(scene, name) is not None and (simulation is None or simulation.method != name):
-            yield f'[{name}]: only read with [simulation] method = "{name}"; set it, or remove [{name}]'
-    if simulation and simulation.method == "wcsph" and simulation.step > acoustic_step(scene):
-        yield (f'[simulation] step = {simulation.step:g}: method = "wcsph" must resolve sound, with a step of at most '
-               f"0.4 h / (c (1 + 0.6 alpha)) = {acoustic_step(scene):.3g}, h half the support of {scene.neighbors:g} "
-               "neighbors and c [flow] sound_speed; lower step")
+    if scene.eulerian is not None and (simulation is None or simulation.method != "eulerian"):
+        yield '[eulerian]: only read with [simulation] method = "eulerian"; set it, or remove [eulerian]'
     if simulation and simulation.method == "eulerian":
         eulerian = scene.eulerian or Eulerian()
         cells = eulerian.cells_for(scene.tracers.filter_width)
@@ -35,8 +31,6 @@ def baseline_problems(scene: Scene) -> Iterator[str]:
                    "to the same")
 
 
-def acoustic_step(scene: Scene, form: Any = None) -> float:
-    """The longest step of WCSPH, 0.4 h / (c (1 + 0.6 alpha)) (Monaghan 1992), h half the kernel's support; of the
-    method, or of a term with settings of that `form`."""
-    h, alpha = scene.interaction_radius / 2, (form or scene.wcsph or Wcsph()).alpha
-    return 0.4 * h / (scene.flow.sound_speed * (1 + 0.6 * alpha))
+def acoustic_step(scene: Scene, form: WCSPH) -> float:
+    """The longest step of the term WCSPH, 0.4 h / (c (1 + 0.6 alpha)) (Monaghan 1992), h half the kernel's support."""
+    return 0.4 * scene.interaction_radius / 2 / (scene.flow.sound_speed * (1 + 0.6 * form.alpha))

@@ -202,7 +202,7 @@ def support_problems(scene: Scene) -> Iterator[str]:
     if scene.tracers is None:
         return
     skin = scene.simulation.skin if scene.simulation else 0.0
-    for section, part in (("kernel", scene.kernel), ("model", scene.model), ("wcsph", scene.wcsph)):
+    for section, part in (("kernel", scene.kernel), ("model", scene.model)):
         neighbors = part.neighbors if part else None
         reach = 0.0 if neighbors is None else scene.tracers.radius_of(neighbors) * (1 + skin)
         if reach >= math.pi:

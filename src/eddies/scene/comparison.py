@@ -118,7 +118,7 @@ class Comparison(Document):
             return [PlannedRun(scene, directory, truth)]
         runs, model = [], scene.model if "train" in scene.stages else None
         if model is not None and model.path is None:
-            runs.append(PlannedRun(replace(scene, simulation=None, wcsph=None, eulerian=None), directory, truth))
+            runs.append(PlannedRun(replace(scene, simulation=None, eulerian=None), directory, truth))
             model = replace(model, path=str(directory))
         for seed in self.realisations:
             unseen = replace(scene, seed=seed, model=model, training=None,

@@ -11,7 +11,6 @@ NEEDS = ("model", "density", "pairs")
 METHODS = {
     "learned": ("eddies.workflows.rollout.particle_run:LearnedRun", ("model",)),
     "none": ("eddies.workflows.rollout.particle_run:BallisticRun", ()),
-    "wcsph": ("eddies.workflows.rollout.particle_run:SmoothedRun", ("density", "pairs")),
     "eulerian": ("eddies.workflows.rollout.eulerian_run:EulerianRun", ()),
 }
 

@@ -17,11 +17,11 @@ from eddies.scene.checks import first_inconsistency
 from eddies.scene.model import Model, replace_terms
 from eddies.scene.reader import apply_overrides, find_document, parse_document, read_section, read_text, write_section
 from eddies.scene.sections import (BOX_LENGTH, DEFAULT_WINDOW, NEIGHBORS, Eulerian, Flow, Forcing, Horizons, Initial,
-                                   Kernel, Simulation, SpinUp, Time, Tracers, Training, Wcsph)
+                                   Kernel, Simulation, SpinUp, Time, Tracers, Training)
 from eddies.scene.values import Document, SceneError, choice, directory_name, import_paths, integer, section, text
 
 __all__ = ["BOX_LENGTH", "Scene", "SceneError", "builtin_scenes", "load_scene", "Eulerian", "Flow", "Forcing",
-           "Horizons", "Initial", "Kernel", "Model", "Simulation", "SpinUp", "Time", "Tracers", "Training", "Wcsph"]
+           "Horizons", "Initial", "Kernel", "Model", "Simulation", "SpinUp", "Time", "Tracers", "Training"]
 
 # Sections that may name classes and functions of the user's.
 FOREIGN_IN = ("flow", "initial", "model", "simulation")
@@ -46,7 +46,6 @@ class Scene(Document):
     model: Model | None = section(Model, default=None)
     training: Training | None = section(Training, default=None)
     simulation: Simulation | None = section(Simulation, default=None)
-    wcsph: Wcsph | None = section(Wcsph, default=None)
     eulerian: Eulerian | None = section(Eulerian, default=None)
 
     def __post_init__(self) -> None:
@@ -112,9 +111,9 @@ class Scene(Document):
     @property
     def neighbors(self) -> float:
         """Mean number of particles within the radius of interaction of pairs."""
-        smoothed = self.simulation is not None and self.simulation.method == "wcsph"
-        own, kernel = self.wcsph if smoothed else self.model, self.kernel.neighbors if self.kernel else NEIGHBORS
-        return own.neighbors if own and own.neighbors is not None else kernel
+        if self.model and self.model.neighbors is not None:
+            return self.model.neighbors
+        return self.kernel.neighbors if self.kernel else NEIGHBORS
 
     @property
     def interaction_radius(self) -> float:

@@ -181,7 +181,7 @@ class Training(Section):
                            default=DEFAULT_WINDOW, above=0, at_most=1)
     frames: int = integer("frames to draw from, in all, evenly shared by the ground truths", at_least=2)
     batch: int = integer("particles per step", at_least=1)
-    steps: int = integer("optimiser steps", at_least=1)
+    steps: int = integer("optimiser steps; 0: parameters stay as they start", at_least=0)
     learning_rate: float = number("of the optimiser, at the start", default=5e-3, above=0)
     final_learning_rate: float = number("of the optimiser, at the end", default=1e-4, above=0)
     precision: str = choice("of the training", "float32", "float64", default="float32")
@@ -219,19 +219,6 @@ class Simulation(Section):
     def needs(self) -> tuple[str, ...]:
         """What the method needs, of "model", "density" and "pairs"."""
         return needs_of(self.method)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Wcsph(Section):
-    """Weakly compressible smoothed particle hydrodynamics, with method = "wcsph"; absent: the defaults."""
-
-    neighbors: float | None = number("mean number of particles within the smoothing kernel's support; absent: as in "
-                                     "[kernel], or 60", default=None, at_least=8)
-    kernel: str = choice("smoothing kernel", "cubic-spline", "wendland", default="cubic-spline")
-    alpha: float = number("linear coefficient of the artificial viscosity", default=1.0, at_least=0)
-    beta: float = number("quadratic coefficient of the artificial viscosity", default=2.0, at_least=0)
-    exponent: float = number("gamma of the pressure c^2 rho_0 / gamma ((rho / rho_0)^gamma - 1)", default=1.0,
-                             at_least=1)
 
 
 #: The closures of a coarse grid by what its equations are of.

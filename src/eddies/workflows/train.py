@@ -57,10 +57,12 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         guard = Guard(comm, directory / STAGES["train"].checkpoints, scene.fingerprint("train"), stop,
                       " of the training")
         history = {}
-        if next(model.parameters(), None) is None:
-            log.info("train: the terms have no parameters, nothing is learned")
-        else:
+        phases = []
+        if next(model.parameters(), None) is not None:
             phases = [*one_step_phases(scene, data, kernel), *horizon_phases(scene, data)]
+        if not phases:
+            log.info("train: the terms have no parameters, or [training] no steps: nothing is learned")
+        else:
             training, curves = Training(comm, model, phases), LearningCurves(comm, directory / "learning.png")
             take_all_steps(training, guard, "train", "training", "lower learning_rate here or in [training.horizons], "
                            "or shorten time_step there", curves)

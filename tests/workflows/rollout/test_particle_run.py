@@ -165,22 +165,21 @@ def with_method(scene, method, **keys):
 @pytest.mark.mpi(1)
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_has_the_units_of_its_start_and_runs(comm, tmp_path, method):
-    keys = {"step": 0.004, "frame_interval": 0.02, "turnovers": 0.01} if method == "wcsph" else {}
-    scene = with_method(prepared(comm, tmp_path, overrides=["tracers.states=[0.3, 0.5]"]), method, **keys)
+    scene = with_method(prepared(comm, tmp_path, overrides=["tracers.states=[0.3, 0.5]"]), method)
     with open_product(comm, tmp_path / "ground_truth.h5", "ground_truth") as file:
         release = GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, 6)).scales
     write_model(comm, tmp_path, scene, release)
     scales, _, made, particles, acceleration = method_of(comm, tmp_path, scene, 3)
     assert getattr(made, "scales", scales) == scales
-    assert (particles.density is not None) == made.has_density == (method in ("learned", "wcsph"))
+    assert (particles.density is not None) == made.has_density == (method == "learned")
     assert len(acceleration) == 6**3 and bool(torch.isfinite(acceleration).all())
     assert bool(acceleration.any()) == (method != "none")
     simulate.run(scene, comm, tmp_path)
     with open_product(comm, tmp_path / "rollout.h5", "rollout") as file:
         attributes = read_attributes(file, "rollout")
         assert attributes["status"] == "complete" and attributes["method"] == method
-        assert ("density" in Trajectory(file, "model").columns) == (method in ("learned", "wcsph"))
-    terms = {"learned": ", ".join(scene.model.terms), "none": "none", "wcsph": "summation-density, wcsph"}
+        assert ("density" in Trajectory(file, "model").columns) == (method == "learned")
+    terms = {"learned": ", ".join(scene.model.terms), "none": "none"}
     assert attributes.get("terms") == terms.get(method)
 
 
@@ -312,7 +311,7 @@ def test_other_models_run(comm, tmp_path, model, weights, rate):
     metrics, _ = reported(comm, tmp_path)
     assert (metrics["model"]["density_rate_error"] is not None) == rate and metrics["rollout"]["stable"]
     terms = scene.model.terms
-    assert metrics["rollout"]["method"] == f"the trained model, terms {', '.join(terms)}"
+    assert metrics["rollout"]["method"] == f"the model, terms {', '.join(terms)}"
     with open_product(comm, tmp_path / "model.h5", "model") as file:
         assert len(file["weights"]) == weights and ("feature_range" in file) == ("pairs" in terms)
         assert list(json.loads(file.attrs["description"])["terms"]) == list(terms)

@@ -222,4 +222,4 @@ def small_flow(scene: Scene, ranks: int) -> Scene:
         forcing = replace(forcing, wavenumber=min(forcing.wavenumber, cells / 3))
     return replace(scene, flow=replace(scene.flow, cells=cells), initial=initial, forcing=forcing,
                    time=replace(scene.time, duration=1.0), spin_up=None, tracers=None, kernel=None, model=None,
-                   training=None, simulation=None, wcsph=None, eulerian=None)
+                   training=None, simulation=None, eulerian=None)

@@ -243,7 +243,7 @@ def sees_pairs(scene: Scene) -> bool:
 
 def ground_truth_alone(scene: Scene) -> Scene:
     """The scene without what learns of its ground truth, which may use more ranks."""
-    return replace(scene, kernel=None, model=None, training=None, simulation=None, wcsph=None, eulerian=None)
+    return replace(scene, kernel=None, model=None, training=None, simulation=None, eulerian=None)
 
 
 def thick_slabs(planes: int, width: float) -> int:

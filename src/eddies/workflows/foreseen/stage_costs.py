@@ -49,8 +49,6 @@ def unforeseen(scene: Scene) -> dict[str, str]:
         missing["dns"] = "the time step or the turnover time is not known before"
     if scene.simulation and rollout_course(scene) is None:
         missing["simulate"] = "the turnover time is not known before, or the method is one's own"
-    elif scene.simulation and scene.simulation.method == "wcsph":
-        missing["simulate"] = "the pairs of WCSPH are not probed"
     return missing
 
 

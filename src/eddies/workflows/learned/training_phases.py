@@ -32,7 +32,7 @@ def one_step_phases(scene: Scene, data: Sequence[TrainingData], kernel: Smoothin
     held_out = [each.validation_frame() for each in data]
     alone = settings.steps - settings.combined_steps
     fall = settings.final_learning_rate / settings.learning_rate
-    between = settings.learning_rate * fall ** (alone / settings.steps)
+    between = settings.learning_rate * fall ** (alone / max(settings.steps, 1))
 
     def phase(name: str, steps: int, rates: tuple[float, float], take, error) -> Phase:
         # Work in evaluations of the force of a particle.

@@ -1,9 +1,9 @@
-"""Particles moved by the terms of a model, learned or of SPH, or by none."""
+"""Particles moved by the terms of a model, or by none."""
 
 from __future__ import annotations
 
 import logging
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +18,12 @@ from eddies.particles.faults import Limits, find_fault
 from eddies.particles.feature_range import FeatureRange, pair_features
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.integrators import INTEGRATORS
-from eddies.particles.model import LagrangianModel, build_model
+from eddies.particles.model import LagrangianModel
 from eddies.particles.moment import Moment, between
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.reference_scales import allowed_step
-from eddies.particles.terms.settings import WCSPH, Forcing, SummationDensity
-from eddies.scene.scene import Scene, Wcsph
+from eddies.particles.terms.settings import Forcing
+from eddies.scene.scene import Scene
 from eddies.workflows.ground_truth.truth import GroundTruth, particles_for
 from eddies.workflows.learned.model import load_feature_range, load_model
 from eddies.workflows.rollout.particle_state import particle_state, restored_particles
@@ -182,7 +182,7 @@ class LearnedRun(ParticleRun):
     def build(self, scene: Scene, directory: Path) -> LagrangianModel:
         path = directory / "model.h5"
         model = load_model(scene, self.comm, path, self.scales)
-        if self.scales.density is not None:
+        if model.integrates_density and self.scales.density is not None:
             self.largest_deviation = RUNAWAY_DENSITY * self.scales.density
         if model.networks:
             self.seen = load_feature_range(self.comm, path)
@@ -194,21 +194,6 @@ class BallisticRun(ParticleRun):
 
     def build(self, scene: Scene, directory: Path) -> LagrangianModel:
         return LagrangianModel({}, self.flow)
-
-
-class SmoothedRun(ParticleRun):
-    """Moved by weakly compressible SPH with the fluid's sound speed. The summed density of particles at random deviates
-    far from the mean without a fault."""
-
-    def build(self, scene: Scene, directory: Path) -> LagrangianModel:
-        form = asdict(scene.wcsph or Wcsph())
-        del form["neighbors"]  # which are in the units
-        settings = {"summation-density": SummationDensity(kernel=form["kernel"]), "wcsph": WCSPH(**form)}
-        return build_model(settings, settings, self.flow)
-
-    def description(self) -> dict[str, float | str]:
-        """The coefficients too."""
-        return {**super().description(), **asdict(self.model.terms["wcsph"].settings)}
 
 
 def injection(scene: Scene, truth: GroundTruth) -> Forcing | None:
