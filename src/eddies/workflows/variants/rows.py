@@ -64,7 +64,7 @@ def together(realised: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     for key in (*MEASURES, "end"):
         values = [one[key] for one in realised]
         row[key] = None if None in values else float(np.mean(values))
-        if key in MEASURES and row[key] is not None and len(values) > 1:
+        if key in MEASURES and finite(row[key]) is not None and len(values) > 1:
             row[f"{key}_spread"] = float(np.std(values, ddof=1))
     for key in COST:
         values = [one[key] for one in realised if one.get(key) is not None]
