@@ -227,10 +227,11 @@ def test_a_table_that_cannot_be_written_is_told_by_all(comm, tmp_path, monkeypat
         (tmp_path / "comparison.csv").mkdir()
     comm.Barrier()
     monkeypatch.setattr(compare, "sections", lambda *_: [Section("errors", "Errors")])
+    monkeypatch.setattr(compare.ErrorAgainstTime, "summary", [])
     comparison = SimpleNamespace(name="small", title="small", subject="learned", turnovers=1.0, scenes={}, columns=None,
                                  realisations=None, base_scene=load_scene("tiny"))
     with pytest.raises(WriteError, match="comparison.csv: cannot be written .Is a directory.; choose another --output"):
-        compare.write(comparison, [], comm, tmp_path)
+        compare.write(comparison, [], {}, comm, tmp_path)
 
 
 def truths_of(base):

@@ -59,7 +59,7 @@ def run(comparison: Comparison, comm: Comm, output: Path, overwrite: bool, take_
             table = in_files(comm, output, lambda: rows(comparison, runs_of, alone, comm.size))
         finally:
             alone.Free()
-        write(comparison, table, comm, output)
+        write(comparison, table, reference_of(comparison, comm), comm, output)
 
 
 def look_at(variant: VariantRun, comm: Comm, overwrite: bool, take_over: bool) -> None:
@@ -113,13 +113,18 @@ def check_ground_truth(comparison: Comparison, variant: VariantRun, comm: Comm) 
                          f"frame before t_eta = {kolmogorov_time:.3g}, at which errors are compared; lower it")
 
 
-def write(comparison: Comparison, table: list[dict[str, Any]], comm: Comm, output: Path) -> None:
-    """Write the rows and what is drawn of them; all ranks call it.
+def reference_of(comparison: Comparison, comm: Comm) -> dict[str, float]:
+    """The scales of the ground truth of a comparison's subject."""
+    with open_product(comm, comparison.ground_truth_of(comparison.subject) / "ground_truth.h5", "ground_truth") as file:
+        return read_attributes(file, "reference")
+
+
+def write(comparison: Comparison, table: list[dict[str, Any]], flow: dict[str, float], comm: Comm,
+          output: Path) -> None:
+    """Write the rows, the scales of the flow and what is drawn; all ranks call it.
 
     Raises WriteError where rank 0 cannot write.
     """
-    with open_product(comm, comparison.ground_truth_of(comparison.subject) / "ground_truth.h5", "ground_truth") as file:
-        flow = read_attributes(file, "reference")
     drawn = ErrorAgainstTime(table, comparison.subject, BASELINE, comparison.columns)
     parts = sections(drawn, comparison.turnovers) if comm.rank == 0 else []
     draw(comm, parts)
@@ -128,8 +133,7 @@ def write(comparison: Comparison, table: list[dict[str, Any]], comm: Comm, outpu
 
 def write_files(comparison: Comparison, drawn: ErrorAgainstTime, flow: dict[str, float], parts: Sequence[Section],
                 ranks: int, output: Path) -> None:
-    """Write rows and summary as CSV and JSON, and the page of drawn sections; one rank calls it. `flow` has the scales
-    of the ground truth of the comparison's subject."""
+    """Write rows and summary as CSV and JSON, and the page of drawn sections; one rank calls it."""
     computer = machine(comparison.base_scene.device, ranks)
     lines = io.StringIO(newline="")
     writer = csv.DictWriter(lines, COLUMNS)

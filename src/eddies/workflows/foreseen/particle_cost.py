@@ -167,7 +167,7 @@ def particle_bytes(work: ParticleWork, speed: ParticleSpeed, ranks: int) -> floa
     seen = work.own(ranks) + work.ghosts(ranks)
     points = work.cells**2 * work.planes(ranks) if work.wavenumber else 0
     size = PROCESS_BYTES + PARTICLE_BYTES * seen + POINT_BYTES * work.real / 4 * points
-    return size + (list_bytes(work, ranks) + speed.block_bytes if speed.listed else 0.0)
+    return size + (list_bytes(work, ranks) + speed.block_bytes if speed.listed and work.neighbors else 0.0)
 
 
 def list_bytes(work: ParticleWork, ranks: int) -> float:

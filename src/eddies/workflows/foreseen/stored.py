@@ -16,7 +16,7 @@ CHECKPOINTS = KEPT + 1       # with the one that is being written
 # Of the statistics: steps between two samples, numbers in each beside the spectrum.
 SAMPLE_EVERY, SAMPLE_COLUMNS = 4, 25
 SAMPLES = 20_000             # particles of which a model's rates are kept, 48 bytes each
-PRODUCT_BYTES = 30_000       # of a product beside what grows: the scene, headers, small tables
+PRODUCT_BYTES = 45_000       # of a product beside what grows: the scene, headers, words on datasets, small tables
 FIGURE_BYTES = 0.6e6         # of a figure of a report, in its page too
 
 
