@@ -13,6 +13,7 @@ words for them; a row `floor` is the truth's own:
 """
 
 import json
+import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -48,14 +49,20 @@ def table(comparison: str, columns: str, rows: str) -> str:
 
 
 def number(row: Mapping[str, Any], key: str) -> str:
-    """Two digits, those of ratios three, with the standard deviation where there is one; nothing without a number."""
+    """Two digits, or as many as the standard deviation tells where there is one; ratios to three digits after the
+    point; nothing without a number."""
     value, spread = row.get(key), row.get(f"{key}_spread")
     if value is None:
         return ""
     if key.endswith("_ratio"):
         return f"{value:.3f}" + (f" ± {spread:.3f}" if spread is not None else "")
-    digits = f"{float(f'{value:.2g}'):g}"
-    return digits if spread is None else f"{digits} ± {float(f'{spread:.1g}'):g}"
+    if spread is None or spread == 0:
+        return f"{float(f'{value:.2g}'):g}"
+    # To the first digit of the deviation, or to its second behind a 1.
+    places = -math.floor(math.log10(spread / 1.95))
+    if places > 5:
+        return f"{value:.1e} ± {spread:.0e}"
+    return f"{value:.{max(places, 0)}f} ± {spread:.{max(places, 0)}f}"
 
 
 if __name__ == "__main__":
