@@ -3,6 +3,8 @@ import pytest
 
 import eddies
 from eddies.io import datasets
+from eddies.io.fields import FieldWriter
+from eddies.io.hdf5 import create_product
 from tests.workflows.synthetic_run import LENGTH, write_run
 
 
@@ -50,6 +52,16 @@ def test_trajectories_fields_and_spectra(directory, monkeypatch, with_xarray):
         assert float(field["x"][1]) == pytest.approx(LENGTH / field.sizes["x"])
     energy = run.spectrum("filtered")
     assert float(np.asarray(energy).sum()) > 0 and run.spectrum("truth", time=0.0).ndim == 1
+
+
+@pytest.mark.mpi(1)
+def test_a_scalar_field_has_no_components(comm, tmp_path):
+    fields = {"velocity": np.random.default_rng(1).random((3, 4, 4, 4)), "density": np.full((1, 4, 4, 4), 1.5)}
+    with create_product(comm, tmp_path / "ground_truth.h5", "ground_truth", {}) as file:
+        FieldWriter(file, "filtered", 4, {"velocity": 3, "density": 1}).append(0.5, 0, fields)
+    run = eddies.open_run(tmp_path)
+    assert run.field("density").dims == ("z", "y", "x") and float(run.field("density")[1, 2, 3]) == 1.5
+    assert np.array_equal(run.field("velocity", time=0.4), fields["velocity"].astype(np.float32))
 
 
 @pytest.mark.mpi(1)

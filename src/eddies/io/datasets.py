@@ -73,7 +73,10 @@ def dataset_of(path: Path, arrays: Mapping[str, h5py.Dataset], attributes: Mappi
         if own:
             coordinates[axes[0]] = (axes, array[()], words)
         else:
-            variables[key] = (axes, LazilyIndexedArray(StoredArray(path, array)), words)
+            found = xarray.Variable(axes, LazilyIndexedArray(StoredArray(path, array)), words)
+            # A scalar has no components.
+            scalar = "component" in axes and array.shape[axes.index("component")] == 1
+            variables[key] = found.isel(component=0) if scalar else found
         for axis, size in zip(axes, array.shape):
             if axis in AXES and size == len(AXES[axis]):
                 coordinates.setdefault(axis, ([axis], AXES[axis]))
