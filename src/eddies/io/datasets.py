@@ -34,11 +34,11 @@ def open_group(path: Path, name: str) -> Any:
         group = file.get(name)
         if not isinstance(group, h5py.Group):
             raise ProductError(f"{path}: holds no {name}; it holds: {', '.join(groups_in(file))}")
-        arrays = {key: found.name for key, element in group.items() for found in [element.get("value", None)
-                  if isinstance(element, h5py.Group) else element] if isinstance(found, h5py.Dataset)}
+        elements = {key: item.get("value") if isinstance(item, h5py.Group) else item for key, item in group.items()}
+        arrays = {key: item for key, item in elements.items() if isinstance(item, h5py.Dataset)}
         if xarray is None:
-            return {key: file[array][()] for key, array in arrays.items()}
-        return dataset_of(path, {key: file[array] for key, array in arrays.items()}, dict(group.attrs))
+            return {key: array[()] for key, array in arrays.items()}
+        return dataset_of(path, arrays, dict(group.attrs))
 
 
 def groups_in(file: h5py.File) -> list[str]:

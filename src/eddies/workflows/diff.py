@@ -13,6 +13,7 @@ from eddies.io.hdf5 import in_files
 from eddies.parallel.communicator import Comm
 from eddies.report.page import shown
 from eddies.scene.scene import load_scene
+from eddies.workflows.run_directory.work import leaves
 
 METRICS = Path("report") / "metrics.json"
 
@@ -36,23 +37,14 @@ def diff_lines(one: Path, other: Path) -> Iterator[str]:
 
 def settings(directory: Path) -> dict[str, Any]:
     """Every key of the scene that was run, by its path; SceneError where there is none."""
-    return dict(leaves(tomllib.loads(load_scene(directory / "scene.toml").to_toml())))
+    scene = tomllib.loads(load_scene(directory / "scene.toml").to_toml())
+    return {".".join(keys): value for keys, value in leaves(scene)}
 
 
 def numbers(directory: Path) -> dict[str, Any]:
     """Every number of the report, by section and key."""
     found = json.loads((directory / METRICS).read_text())
-    return {key: value for key, value in leaves(found) if isinstance(value, int | float)}
-
-
-def leaves(table: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
-    """All values of nested tables with their paths."""
-    for key, value in table.items():
-        name = f"{path}.{key}" if path else key
-        if isinstance(value, dict):
-            yield from leaves(value, name)
-        else:
-            yield name, value
+    return {".".join(keys): value for keys, value in leaves(found) if isinstance(value, int | float)}
 
 
 def differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:

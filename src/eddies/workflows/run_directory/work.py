@@ -120,7 +120,7 @@ def changed_settings(stage: Stage, then: str | None, now: str | None) -> list[st
     both values; none where a text is missing or damaged."""
     read = {key for name in (*stage.depends_on, stage.name) for key in STAGES[name].reads}
     try:
-        before, after = (dict(_leaves(tomllib.loads(text or ""))) for text in (then, now))
+        before, after = (dict(leaves(tomllib.loads(text or ""))) for text in (then, now))
     except (TypeError, ValueError):
         return []
     if not before or not after:
@@ -149,9 +149,10 @@ def _value(settings: Mapping[tuple[str, ...], Any], key: tuple[str, ...]) -> str
     return quoted(settings[key]) if key in settings else "absent"
 
 
-def _leaves(table: Mapping[str, Any], within: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+def leaves(table: Mapping[str, Any], within: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """All values of nested tables, each with the keys that lead to it."""
     for key, value in table.items():
         if isinstance(value, dict):
-            yield from _leaves(value, (*within, key))
+            yield from leaves(value, (*within, key))
         else:
             yield (*within, key), value
