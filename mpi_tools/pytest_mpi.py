@@ -9,7 +9,8 @@ a process that has. It starts one `mpirun -n RANKS python -m pytest MODULES` (in
 the same number of ranks, as starting ranks takes longer than most tests, and reports each of them from the JSON
 lines that every rank writes. Where the ranks disagree about a test, or it lasts longer than its time limit, that
 mpirun ends and a new one runs the tests after it. So tests run in the order of their ranks. For those on one rank
-there are several mpirun, which share the modules among them: each takes the next one that none has. `tmp_path` is
+there are several mpirun, which share the modules among them: each takes the next one that none has. These run beside
+the tests that need none; where they end first, the next number of ranks follows. `tmp_path` is
 one folder for all ranks of a test; `tmp_path_factory` is not shared.
 """
 
@@ -92,6 +93,7 @@ class OuterRun:
     def __init__(self, config):
         self.config = config
         self.runs, self.reported = [], None
+        self.ahead = False  # whether ranks start before their first test is to be reported
         self.waiting = {}  # ranks -> items still to be reported, in order
 
     @pytest.hookimpl(trylast=True)
@@ -111,6 +113,15 @@ class OuterRun:
             # A rank that waits for another leaves its core to them.
             os.environ.setdefault("OMPI_MCA_mpi_yield_when_idle", "1")
             self.start(group, min(cores, BESIDE, len({item.path for item in group})))
+            self.ahead = True
+
+    def pytest_runtest_logfinish(self):
+        """The next tests start when the ranks before them have ended, not only once all of those are reported."""
+        if self.ahead and self.runs and all(run.process.poll() is not None for run in self.runs):
+            begun = {run.ranks for run in self.runs}
+            later = [ranks for ranks in sorted(self.waiting) if ranks > max(begun)]
+            if later:
+                self.start(self.waiting[later[0]])
 
     def start(self, items, count=1):
         """So many mpirun that share these tests."""
@@ -125,7 +136,7 @@ class OuterRun:
         if run is None:
             others = [run for run in self.runs if run.ranks == item.ranks and run.process.poll() is None]
             if not others:
-                self.close()
+                self.close(item.ranks)
             # What is left of the module is nobody's; the others have or will take the modules after it.
             self.start([other for other in group if other.path == item.path] if others else group)
             run = self.runs[-1]
@@ -133,9 +144,12 @@ class OuterRun:
         self.reported = item
         return run.records(item)
 
-    def close(self):
-        while self.runs:
-            self.runs.pop().close(self.reported)
+    def close(self, most=None):
+        """Ends the runs, or those of so many ranks at most."""
+        ended = [run for run in self.runs if most is None or run.ranks <= most]
+        self.runs = [run for run in self.runs if run not in ended]
+        for run in reversed(ended):
+            run.close(self.reported)
 
     def pytest_sessionfinish(self):
         self.close()

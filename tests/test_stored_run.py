@@ -65,6 +65,7 @@ def test_a_scalar_field_has_no_components(comm, tmp_path):
 
 
 @pytest.mark.mpi(1)
+@pytest.mark.usefixtures("undrawn")
 def test_figures_are_those_of_the_report(comm, directory, tmp_path):
     from eddies.workflows import report
     report.run(directory, comm)

@@ -156,6 +156,23 @@ def test_after(comm):
     assert "test_dies[mpi-1] FAILED" in output and "test_after[mpi-1] PASSED" in output
 
 
+@pytest.mark.skipif(local_cores() < 2, reason="nothing runs beside another on one core")
+def test_two_ranks_do_not_wait_for_tests_without_any(tmp_path):
+    output, closing = run(tmp_path, """
+@pytest.mark.mpi(1, 2)
+def test_marked(comm):
+    open(str(comm.size), "w").close()
+
+
+@pytest.mark.parametrize("time_left", range(400, 0, -1))
+def test_unmarked(time_left):
+    if not os.path.exists("2"):
+        time.sleep(0.1)
+        assert time_left > 1
+""")
+    assert " 402 passed" in closing, output
+
+
 @pytest.mark.parametrize("options, passed", [
     (["test_made_up.py::test_one", "test_made_up.py::test_two[mpi-2-b]", "-k", "mpi-2"], 2),
     (["-m", "not mpi"], 1)])

@@ -95,7 +95,7 @@ def test_gradients_through_several_steps_do_not_depend_on_the_ranks(comm, integr
         assert_close(torch.from_numpy(actual), reference, 1e-11)
 
 
-@pytest.mark.mpi(2, 3)
+@pytest.mark.mpi(3)
 @pytest.mark.parametrize("name, integrator, steps", [("pairs", "verlet", 25), ("told densities", "verlet", 25),
                                                      ("resolved + pairs", "rk3", 8), ("resolved", "rk3", 8)])
 def test_particles_that_cross_slabs_go_on_as_on_one_rank(comm, name, integrator, steps):

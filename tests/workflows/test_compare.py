@@ -130,7 +130,7 @@ def check_rows(rows):
     assert (learned["time_step"], longer["time_step"]) == (pytest.approx(0.05), pytest.approx(0.1))
 
 
-UNSEEN = FILE[:FILE.index("[[variant]]")].replace("repeats = 2", "repeats = 2\nrealisations = [5, 6]") + """
+UNSEEN = FILE[:FILE.index("[[variant]]")].replace("repeats = 2", "repeats = 1\nrealisations = [5, 6]") + """
 [[variant]]
 name = "learned"
 [[variant]]
