@@ -3,6 +3,7 @@
 import json
 import logging
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -241,11 +242,35 @@ def test_levels_of_the_log(comm, capfd, monkeypatch):
     assert capfd.readouterr().out == ""
 
 
+@pytest.mark.mpi(1, 2)
+def test_a_quiet_command_says_where_its_product_is_and_a_verbose_one_every_step(comm, tmp_path, capfd):
+    for option, told in (("--quiet", r"dns: abc, after \d s: \S+/quiet/ground_truth.h5\n"),
+                         ("--verbose", r"(?s).*dns  step 1  .* s/step .*dns  step 2  .*dns: abc, after .*")):
+        assert run_cli("dns", *ABC, option, "--output", tmp_path / option[2:]) == 0
+        assert re.fullmatch(told if comm.rank == 0 else "", capfd.readouterr().out)
+
+
+@pytest.mark.mpi(1)
+def test_a_shell_completes_commands_options_and_names(comm, tmp_path, capfd):
+    assert run_cli("completion", "bash") == 0
+    (tmp_path / "eddies.bash").write_text(capfd.readouterr().out)
+
+    def completed(*words):
+        line = (f'source {tmp_path}/eddies.bash; COMP_WORDS=({" ".join(map(repr, words))}); '
+                f'COMP_CWORD={len(words) - 1}; _eddies; echo "${{COMPREPLY[@]}}"')
+        return subprocess.run(["bash", "-c", line], capture_output=True, text=True, check=True).stdout.split()
+
+    assert completed("eddies", "tra") == ["train-kernel", "train"] and completed("eddies", "run", "ti") == ["tiny"]
+    assert "--unset" in completed("eddies", "check", "tiny", "--") and completed("eddies", "compare", "compare-s")
+    assert completed("eddies", "export", "runs/tiny", "--format", "") == ["vtkhdf"]
+    assert completed("eddies", "run", "tiny", "--output", "") == []  # names of files, by the shell itself
+
+
 @pytest.mark.mpi(1)
 def test_unknown_log_level_is_bad_input(comm, capfd, monkeypatch):
     monkeypatch.setenv("EDDIES_LOG", "loud")
     assert run_cli("scenes") == 2
-    assert "EDDIES_LOG = loud: must be one of debug, info, warning" in capfd.readouterr().err
+    assert "EDDIES_LOG = loud: must be one of debug, info, outcome, warning" in capfd.readouterr().err
 
 
 def test_exit_code_of_the_program():

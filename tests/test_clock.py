@@ -1,4 +1,4 @@
-"""The progress line: by wall time, also between frames, and what it says of the time left."""
+"""The progress line: by wall time, also between frames, and what it says of a step and of the time left."""
 
 import logging
 import re
@@ -22,7 +22,7 @@ def lines(caplog, monkeypatch):
     """The lines so far: seconds a step, percent, and what is left."""
     monkeypatch.setattr(logging.getLogger("eddies"), "propagate", True)
     caplog.set_level(logging.INFO, logger="eddies")
-    pattern = re.compile(r"(\S+) s/step  (\d+) %  (.+) left")
+    pattern = re.compile(r"(\S+) s/step(?: \(storing: \d+ % of the time\))?  (\d+) %  (.+) left")
     return lambda: [pattern.search(record.getMessage()).groups() for record in caplog.records]
 
 
@@ -36,7 +36,28 @@ def test_lines_come_by_time_and_not_by_steps(wall, lines):
 
 
 def test_what_an_earlier_job_did_is_no_measure_of_what_is_left(wall, lines):
-    progress = ProgressLine("stage", lambda: "state", done=0.5, step=1000)
+    progress = ProgressLine("stage", lambda: "state", done=0.5)
     wall[0] += 10
     progress(0.6, 1010)
-    assert lines() == [("1.000", "60", "40 s")]
+    assert lines() == [("10.000", "60", "40 s")]
+
+
+def test_a_step_is_told_without_its_warm_up_and_what_is_stored(wall, lines, caplog):
+    """Steps of 1 s after two of 4 s, and 2 s to store each: of 24 s, the time left included, half is storing."""
+    progress = ProgressLine("stage", lambda: "state", interval=24.0)
+    for step, seconds in enumerate((4, 4, 1, 1, 1, 1), 1):
+        with progress.storing():
+            wall[0] += 2
+        wall[0] += seconds
+        progress(step / 12, step)
+    assert lines() == [("1.000", "50", "24 s")]
+    assert "1.000 s/step (storing: 50 % of the time)" in caplog.text and progress.storing_share == 0.5
+
+
+def test_where_more_is_logged_there_is_a_line_for_every_step(wall, lines, caplog):
+    caplog.set_level(logging.DEBUG, logger="eddies")
+    progress = ProgressLine("stage", lambda: "state")
+    for step in (1, 2):
+        wall[0] += 1
+        progress(step / 4, step)
+    assert lines() == [("1.000", "25", "3 s"), ("1.000", "50", "2 s")]

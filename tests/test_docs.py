@@ -69,7 +69,7 @@ def check_eddies(arguments):
     if getattr(options, "comparison", None):
         load_comparison(options.comparison)
     if getattr(options, "scene", None):
-        load_scene(options.scene, getattr(options, "overrides", []))
+        load_scene(options.scene, getattr(options, "overrides", []), getattr(options, "removals", []))
 
 
 @pytest.mark.parametrize("command", COMMANDS)

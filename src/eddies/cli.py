@@ -7,25 +7,32 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import logging
 import os
 import signal
 import sys
+import time
 import traceback
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from eddies.cli_options import parse_arguments
+from eddies.clock import duration
 from eddies.errors import UserError
-from eddies.logs import Output, configure_logging, show_warnings
+from eddies.logs import OUTCOME, Output, configure_logging, show_warnings
+from eddies.pipeline import STAGES
 from eddies.scene.scene import SceneError, builtin_scenes, load_scene
 
 if TYPE_CHECKING:
     from eddies.parallel.communicator import Comm
 
+log = logging.getLogger("eddies")
+
 BAD_INPUT = 2
 INTERRUPTED = 128 + signal.SIGINT
 STOPPED = 75  # EX_TEMPFAIL: the same command goes on
+REPORT = Path("report") / "index.html"
 STOP_SIGNALS = (signal.SIGUSR1, signal.SIGTERM)
 
 
@@ -63,9 +70,9 @@ def run(arguments: list[str] | None) -> int:
     from eddies.kernels.library import share_threads
     from eddies.parallel.stop import Stopped
     try:
-        configure_logging(comm.rank)
-        share_threads()
         options = parse_arguments(arguments, comm.rank)
+        configure_logging(comm.rank, getattr(options, "log", None))
+        share_threads()
         if options.command in SHORT_COMMANDS:
             release_signals(signals)
             SHORT_COMMANDS[options.command](options, comm)
@@ -144,12 +151,16 @@ def run_command(options: argparse.Namespace, comm: Comm, signals: list[int]) -> 
     """One stage of a scene, or all that it has, until a signal, a file STOP or the limit of wall time ends it."""
     from eddies.parallel.stop import StopRequest
     from eddies.stages import run_stages
-    scene = load_scene(options.scene, options.overrides)
+    start = time.perf_counter()
+    scene = load_scene(options.scene, options.overrides, options.removals)
     directory = options.output or scene.directory
     stop = StopRequest(comm, signals, directory / "STOP", 60 * options.max_minutes,
                        60 * options.checkpoint_minutes)
     stages = scene.stages if options.command == "run" else (options.command,)
     run_stages(stages, scene, comm, directory, stop, options.overwrite, options.take_over)
+    last = STAGES[stages[-1]]
+    made = directory / (last.file if last.product else REPORT)
+    log.log(OUTCOME, "%s: %s, after %s: %s", options.command, scene.name, duration(time.perf_counter() - start), made)
 
 
 def report_command(options: argparse.Namespace, comm: Comm) -> None:
@@ -157,9 +168,10 @@ def report_command(options: argparse.Namespace, comm: Comm) -> None:
     if not options.run.is_dir():
         raise SceneError(f"{options.run}: no such directory; give a run directory, such as runs/tiny")
     import_module("eddies.workflows.report").run(options.run, comm)
+    log.log(OUTCOME, "report: %s", options.run / REPORT)
     if options.open and comm.rank == 0:
         import webbrowser
-        webbrowser.open((options.run / "report" / "index.html").resolve().as_uri())
+        webbrowser.open((options.run / REPORT).resolve().as_uri())
 
 
 def compare_command(options: argparse.Namespace, comm: Comm, signals: list[int]) -> None:
@@ -179,18 +191,20 @@ def compare_command(options: argparse.Namespace, comm: Comm, signals: list[int])
         comparison, comm, directory, options.overwrite, options.take_over,
         lambda: working_in(comm, directory, stop, options.take_over),
         lambda stages, scene, where: run_stages(stages, scene, comm, where, stop, True, options.take_over))
+    log.log(OUTCOME, "compare: %s", directory / "index.html")
 
 
 def export_command(options: argparse.Namespace, comm: Comm) -> None:
     """The fields and particles of a run directory in another format."""
     output = options.output or options.run / options.format
     import_module("eddies.workflows.export").run(options.run, output, comm)
+    log.log(OUTCOME, "export: %s", output)
 
 
 def check_command(options: argparse.Namespace, comm: Comm) -> None:
     """Derived numbers and estimates of a scene."""
     from eddies.workflows.feasibility import check_feasible
-    scene = load_scene(options.scene, options.overrides)
+    scene = load_scene(options.scene, options.overrides, options.removals)
     check_feasible(scene.stages, scene, comm)
     import_module("eddies.workflows.check").run(scene, comm, options.json)
 
@@ -217,6 +231,13 @@ def diff_command(options: argparse.Namespace, comm: Comm) -> None:
     import_module("eddies.workflows.diff").run(options.one, options.other, comm)
 
 
+def completion_command(options: argparse.Namespace, comm: Comm) -> None:
+    """What makes a shell complete commands."""
+    text = import_module("eddies.cli_completion").completion(options.shell)
+    if comm.rank == 0:
+        sys.stdout.write(text)
+
+
 # Those that no signal asks to stop: they take seconds.
 SHORT_COMMANDS = {"report": report_command, "export": export_command, "check": check_command, "scenes": scenes_command,
-                  "status": status_command, "diff": diff_command}
+                  "status": status_command, "diff": diff_command, "completion": completion_command}

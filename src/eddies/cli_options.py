@@ -22,10 +22,11 @@ EXAMPLES = {
     "report": ("eddies report runs/hit-small --open",),
     "compare": ("eddies compare compare-small", "eddies compare mine.toml --run runs/hit --output runs/cost"),
     "export": ("eddies export runs/tiny --format vtkhdf",),
-    "check": ("eddies check hit", "eddies check mine.toml --set flow.cells=256 --json"),
+    "check": ("eddies check hit", "eddies check mine.toml --set flow.cells=256 --unset forcing --json"),
     "scenes": ("eddies scenes", "eddies scenes tiny"),
     "status": ("eddies status", "eddies status runs/hit-small"),
     "diff": ("eddies diff runs/hit-small runs/second",),
+    "completion": ('eval "$(eddies completion bash)"', "eddies completion fish | source"),
 }
 
 
@@ -42,7 +43,8 @@ def parse_arguments(arguments: list[str] | None, rank: int) -> argparse.Namespac
 def build_parser() -> argparse.ArgumentParser:
     """Sub-commands and their options."""
     parser = argparse.ArgumentParser(prog="eddies", description=eddies.__doc__,
-                                     epilog="EDDIES_LOG = debug, info or warning sets what is logged.")
+                                     epilog="EDDIES_LOG = debug (as --verbose), info, outcome (as --quiet) or warning "
+                                            "sets what is logged.")
     parser.add_argument("--version", action="version", version=f"eddies {eddies.__version__}")
     commands = parser.add_subparsers(metavar="COMMAND", dest="command", required=True)
     for name, about in {"run": "every stage of the scene, in order",
@@ -52,6 +54,7 @@ def build_parser() -> argparse.ArgumentParser:
         add_job_options(command, "run directory (default: runs/NAME)")
     report = add_command(commands, "report", STAGES["report"].about)
     add_run(report, "run")
+    add_log_options(report)
     report.add_argument("--open", action="store_true", help="show the page in a browser")
     compare = add_command(commands, "compare", "error against run time of variants of a scene")
     compare.add_argument("comparison", metavar="COMPARISON",
@@ -63,6 +66,7 @@ def build_parser() -> argparse.ArgumentParser:
     add_run(export, "run")
     export.add_argument("--format", choices=["vtkhdf"], default="vtkhdf", help="format of the files (default: vtkhdf)")
     export.add_argument("--output", type=directory, metavar="DIR", help="where the files go (default: RUN/vtkhdf)")
+    add_log_options(export)
     check = add_command(commands, "check", "derived numbers, memory, ranks and time; writes nothing")
     add_scene_options(check)
     check.add_argument("--json", action="store_true", help="the numbers as JSON, for programs")
@@ -74,6 +78,8 @@ def build_parser() -> argparse.ArgumentParser:
     diff = add_command(commands, "diff", "what differs between two runs: settings and numbers")
     add_run(diff, "one")
     add_run(diff, "other")
+    completion = add_command(commands, "completion", "a script with which a shell completes commands of eddies")
+    completion.add_argument("shell", choices=["bash", "zsh", "fish"], help="the shell that it is for")
     return parser
 
 
@@ -118,6 +124,8 @@ def add_scene_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scene", metavar="SCENE", help="name of a built-in scene, or path of a TOML file")
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", dest="overrides",
                         help="change a key of the scene; repeatable")
+    parser.add_argument("--unset", action="append", default=[], metavar="SECTION[.KEY]", dest="removals",
+                        help="leave a key or a section of the scene out, before any --set; repeatable")
 
 
 def add_job_options(parser: argparse.ArgumentParser, output: str) -> None:
@@ -132,3 +140,13 @@ def add_job_options(parser: argparse.ArgumentParser, output: str) -> None:
                         help="wall time between two checkpoints (default: 10)")
     parser.add_argument("--max-minutes", type=positive, default=math.inf, metavar="M",
                         help="stop after M minutes of wall time, with exit code 75; the same command goes on")
+    add_log_options(parser)
+
+
+def add_log_options(parser: argparse.ArgumentParser) -> None:
+    """How much is said meanwhile."""
+    how_much = parser.add_mutually_exclusive_group()
+    how_much.add_argument("--quiet", action="store_const", const="outcome", dest="log",
+                          help="say only what is wrong, and at the end what was made and where")
+    how_much.add_argument("--verbose", action="store_const", const="debug", dest="log",
+                          help="a line for every step, and what frames, checkpoints and parts of the report took")

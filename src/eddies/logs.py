@@ -11,16 +11,18 @@ from typing import Any
 
 from eddies.scene.scene import SceneError
 
-LEVELS = {"debug": logging.DEBUG, "info": logging.INFO, "warning": logging.WARNING}
+OUTCOME = (logging.INFO + logging.WARNING) // 2  # of the line in which a command says what it has made, and where
+LEVELS = {"debug": logging.DEBUG, "info": logging.INFO, "outcome": OUTCOME, "warning": logging.WARNING}
 
 
-def configure_logging(rank: int) -> None:
-    """Send the logger "eddies" to standard output; `EDDIES_LOG` = debug, info or warning sets rank 0's level.
+def configure_logging(rank: int, level: str | None = None) -> None:
+    """Send the logger "eddies" to standard output; `level` = debug, info, outcome or warning is rank 0's, by default
+    that of the variable EDDIES_LOG.
 
     Raises:
         SceneError: EDDIES_LOG is none of these.
     """
-    name = os.environ.get("EDDIES_LOG", "info")
+    name = level or os.environ.get("EDDIES_LOG", "info")
     if name not in LEVELS:
         raise SceneError(f"EDDIES_LOG = {name}: must be one of {', '.join(LEVELS)}")
     handler = logging.StreamHandler(sys.stdout)

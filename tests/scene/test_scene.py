@@ -253,6 +253,23 @@ def test_steps_of_a_scheme_that_tells_what_is_between_need_not_fall_on_frames(in
     assert load_scene("tiny", ["simulation.integrator=verlet", "simulation.step=0.05"]).simulation.step == 0.05
 
 
+def test_keys_and_sections_are_left_out_before_others_are_set():
+    pairs = ["model.preset=resolved + pairs", "model.pairs.hidden=[4]"]
+    scene = load_scene("tiny", pairs, ["seed", "forcing", "model", "training.window"])
+    assert scene.forcing is None and scene.seed == 1 and "hidden = [4]" in scene.to_toml()
+    assert scene.training.frames == 8
+
+
+@pytest.mark.parametrize("removal, message", [
+    ("spinup", "--unset spinup: the file has no such key or section, .* there are: title, seed, flow"),
+    ("flow.forcing", "there are: fluid, cells, viscosity, sound_speed"), ("seed.x", "there are: title"),
+    ("flow.cells", r"tiny.toml, --unset: \[flow\] cells: this key is missing"),
+    ("flow", r"tiny.toml, --unset: \[flow\]: this section is missing")])
+def test_what_cannot_be_left_out_is_said(removal, message):
+    with pytest.raises(SceneError, match=message):
+        load_scene("tiny", (), [removal])
+
+
 def test_override_is_named_as_the_origin():
     with pytest.raises(SceneError, match=r"tiny.toml, --set: \[flow\] cells = 3: "):
         load_scene("tiny", ["flow.cells=3"])

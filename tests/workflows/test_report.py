@@ -73,6 +73,8 @@ def test_a_complete_run_shows_everything(comm, tmp_path):
         assert missing == ({"density_rate_error"} if section == "model" else set())
     assert "the model, terms pressure, pairs" in page
     assert "terms pressure, pairs have none" in page
+    assert metrics["verdict"]["velocity"]["verdict"] == "good" and page.index("synthetic") < page.index("Verdict")
+    assert page.index('id="rollout"') < page.index('id="kernel"') < page.index('id="ground_truth"')
     check_stationary(metrics["stationary"], page)
 
 
@@ -169,6 +171,14 @@ def test_numbers_of_a_known_rollout(comm, tmp_path):
     assert rollout["last_common_time"] == pytest.approx(0.5 / 1.2)
     assert rollout["velocity_error"] == pytest.approx(0.2, rel=0.15)
     assert rollout["energy_ratio"] == pytest.approx(1.04, abs=0.05)
+    # The truth ends before half a turnover. Without a force its particles would keep the velocities of the start.
+    assert rollout["early_time"] == rollout["last_common_time"]
+    assert rollout["early_velocity_error"] == rollout["velocity_error"]
+    with h5py.File(tmp_path / "rollout.h5") as file:
+        velocity = file["particles/truth/velocity/value"]
+        apart, energy = ((velocity[0] - velocity[-1]) ** 2).mean(), (velocity[:].astype(float) ** 2).mean(axis=(1, 2))
+    assert rollout["early_velocity_error_no_force"] == pytest.approx((apart / energy[-1]) ** 0.5, rel=1e-5)
+    assert rollout["energy_ratio_no_force"] == pytest.approx(energy[0] / energy[-1], rel=1e-5)
     assert rollout["filter_wavenumber"] == pytest.approx(4)
     # Of the spectra as they are written.
     assert rollout["spectrum_error"] == pytest.approx(0.1) and rollout["spectrum_error_floor"] == 0
@@ -340,7 +350,7 @@ def told_at_the_top(directory, output):
 
 def top_of(page):
     """What the page has before the first section of its own."""
-    return page[page.index("<main>"):page.index('<section id="ground_truth"')]
+    return page[page.index("<main>"):page.index("<section><details")]
 
 
 @pytest.mark.usefixtures("no_figures")

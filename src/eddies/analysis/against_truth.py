@@ -89,15 +89,16 @@ def particle_series(frames: ParticleFrames, chosen: Sequence[int]) -> dict[str, 
 
 
 def error_series(model: Frames, truth: Frames, common: CommonFrames) -> dict[str, np.ndarray]:
-    """Columns over the common frames: time, velocity_error (normalised L2), velocity_kl, acceleration_kl."""
-    rows = []
+    """Columns over the common frames: time, velocity_error (normalised L2), velocity_kl, acceleration_kl, and the
+    velocity error no_force of particles that keep the velocity of the first of them."""
+    rows, first = [], truth.read(int(common.truth[0]), "velocity")
     for index in range(common.times.size):
         velocity = particle_pair(model, truth, common, index, "velocity")
         acceleration = particle_pair(model, truth, common, index, "acceleration")
         rows.append((velocity.time, normalized_l2(velocity.model, velocity.truth),
                      pdf_divergence(velocity, EDGES["velocity"]),
-                     pdf_divergence(acceleration, EDGES["acceleration"])))
-    names = ("time", "velocity_error", "velocity_kl", "acceleration_kl")
+                     pdf_divergence(acceleration, EDGES["acceleration"]), normalized_l2(first, velocity.truth)))
+    names = ("time", "velocity_error", "velocity_kl", "acceleration_kl", "no_force")
     return dict(zip(names, np.array(rows).T))
 
 

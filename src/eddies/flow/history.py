@@ -61,6 +61,10 @@ class FlowHistory:
         self.spectra.append(spectrum)
         return row
 
+    def leave_out(self, seconds: float) -> None:
+        """Count wall time since the last sample as no part of the steps."""
+        self._wall += seconds
+
     @property
     def budget_error(self) -> float:
         """Normalised error of the energy budget from the first sample to the last."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import time
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -10,6 +12,8 @@ from mpi4py import MPI
 from eddies.io.checkpoint import CheckpointDirectory
 from eddies.io.frame_segments import FrameSegments
 from eddies.parallel.stop import Stopped, StopRequest
+
+log = logging.getLogger("eddies")
 
 
 class Run(Protocol):
@@ -43,6 +47,8 @@ class Guard:
 
     def save(self, run: Run, segments: FrameSegments | None = None) -> None:
         """Write a checkpoint of now."""
+        began = time.perf_counter()
         if segments is not None:
             segments.close()
         self.checkpoints.write(run.steps, run.state_dict(), () if segments is None else segments.names)
+        log.debug("checkpoint of step %d%s: %.3f s", run.steps, self.of, time.perf_counter() - began)

@@ -76,14 +76,16 @@ def training_history(history: Mapping[str, np.ndarray]) -> Figure:
 
 METRICS = {  # key in the report: column of the table of errors, label
     "integral": ("integral_learned", "integral of the learned kernel"),
-    "velocity_error": ("velocity_error_learned", "velocity error, learned"),
-    "gradient_error": ("gradient_error_learned", "gradient error, learned"),
-    "no_gradient_velocity_error": ("velocity_error_learned_no_gradient", "velocity error, without L_g"),
-    "no_gradient_gradient_error": ("gradient_error_learned_no_gradient", "gradient error, without L_g"),
-    "cubic_spline_velocity_error": ("velocity_error_cubic_spline", "velocity error, cubic spline"),
-    "cubic_spline_gradient_error": ("gradient_error_cubic_spline", "gradient error, cubic spline"),
-    "wendland_velocity_error": ("velocity_error_wendland", "velocity error, Wendland C²"),
-    "wendland_gradient_error": ("gradient_error_wendland", "gradient error, Wendland C²"),
+    "velocity_error": ("velocity_error_learned", "error of the velocity field, learned kernel"),
+    "gradient_error": ("gradient_error_learned", "error of the gradient field, learned kernel"),
+    "no_gradient_velocity_error": ("velocity_error_learned_no_gradient",
+                                   "error of the velocity field, learned without L_g"),
+    "no_gradient_gradient_error": ("gradient_error_learned_no_gradient",
+                                   "error of the gradient field, learned without L_g"),
+    "cubic_spline_velocity_error": ("velocity_error_cubic_spline", "error of the velocity field, cubic spline"),
+    "cubic_spline_gradient_error": ("gradient_error_cubic_spline", "error of the gradient field, cubic spline"),
+    "wendland_velocity_error": ("velocity_error_wendland", "error of the velocity field, Wendland C²"),
+    "wendland_gradient_error": ("gradient_error_wendland", "error of the gradient field, Wendland C²"),
 }
 
 
@@ -94,7 +96,8 @@ def section(support: float, kernels: Mapping[str, np.ndarray], slices: Mapping[s
     for key, (column, label) in METRICS.items():
         value = float(errors[column]) if column in errors else None
         metrics.append(Metric(key, label, value, "this kernel was not compared"))
-    shown = Section("kernel", "Smoothing kernel", "Errors: normalised L2 over a whole unseen field.",
+    shown = Section("kernel", "Smoothing kernel", "What kernels make of particles, beside the filtered field itself. "
+                    "Errors: normalised L2 over a whole unseen field.",
                     metrics=metrics, main=("velocity_error", "gradient_error"))
     shown.add_figure(
         "figure-1-kernels", "Kernels and their derivatives (the paper's Fig. 1)", shapes(kernels),

@@ -19,12 +19,12 @@ ERRORS = (  # column of the table, label, colour, line style, marker
 )
 EDGES = bin_edges(8, 65)  # of the PDFs, in standard deviations of the truth
 METRICS = {  # key in the report: column of the table, label
-    "acceleration_error": ("acceleration_error", "a-priori acceleration error"),
+    "acceleration_error": ("acceleration_error", "acceleration error at the true state (a priori)"),
     "true_density_acceleration_error": (
-        "true_density_acceleration_error", "acceleration error given the true density"),
-    "density_rate_error": ("density_rate_error", "a-priori density rate error"),
+        "true_density_acceleration_error", "the same given the true density"),
+    "density_rate_error": ("density_rate_error", "density rate error at the true state"),
     "filtered_pressure_gradient_error": (
-        "pressure_gradient_error", "error of the exact filtered pressure gradient"),
+        "pressure_gradient_error", "acceleration error of the exact filtered pressure gradient"),
 }
 
 

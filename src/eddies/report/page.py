@@ -19,12 +19,14 @@ CSS = """
 body{margin:0;background:var(--back);color:var(--ink);font:16px/1.55 system-ui,sans-serif}
 header,main{max-width:1080px;margin:0 auto;padding:1rem}
 h1{font-size:1.7rem;margin:.6rem 0 .2rem}
-h2{font-size:1.25rem;margin:0 0 .6rem}h3{font-size:1rem;margin:1.2rem 0 .4rem}
-.soft{color:var(--soft)}
+h2{font-size:1.25rem;margin:0;display:inline}h3{font-size:1rem;margin:1.2rem 0 .4rem}
+.title{font-size:1.1rem}.soft{color:var(--soft)}
 nav{display:flex;flex-wrap:wrap;gap:.3rem 1.1rem;margin-top:.6rem}a{color:var(--accent);text-decoration:none}
 section{background:#fff;border:1px solid var(--line);border-radius:8px;padding:1.1rem;margin:0 0 1.1rem}
-.tiles{display:flex;flex-wrap:wrap;gap:.6rem}
-.tile{flex:1 1 150px;border:1px solid var(--line);border-radius:6px;padding:.55rem .7rem}
+summary{cursor:pointer}
+.body{margin-top:.6rem;scroll-margin-top:4rem}
+.tiles{display:flex;flex-wrap:wrap;gap:.6rem;margin-top:.7rem}
+.tile{flex:1 1 130px;border:1px solid var(--line);border-radius:6px;padding:.55rem .7rem}
 .tile b{display:block;font-size:1.3rem;font-variant-numeric:tabular-nums}
 .tile span{font-size:.82rem;color:var(--soft)}
 figure{margin:1.3rem 0}img{display:block;max-width:100%;min-width:560px;height:auto;margin:0 auto}
@@ -34,6 +36,7 @@ table{border-collapse:collapse;font-size:.92rem;width:100%}
 td,th{text-align:left;padding:.3rem .8rem .3rem 0;border-bottom:1px solid var(--line);vertical-align:top}
 td.number{font-variant-numeric:tabular-nums;white-space:nowrap}
 .notice{border-left:4px solid #d55e00;background:#fdf3ec;padding:.6rem .8rem;margin:.6rem 0}
+@media(max-width:600px){body{font-size:15px}header,main{padding:.6rem}section{padding:.7rem}table{font-size:.85rem}}
 pre{overflow-x:auto;background:var(--back);padding:.8rem;font-size:.85rem;border-radius:6px}
 """
 
@@ -71,7 +74,8 @@ class Illustration:
 
 @dataclass
 class Section:
-    """A part of the page, and of metrics.json under `key`; notices are what must not be missed."""
+    """A part of the page, and of metrics.json under `key`; notices are what must not be missed. One that is `folded`
+    shows its title and its main metrics until it is opened."""
 
     key: str
     title: str
@@ -79,7 +83,8 @@ class Section:
     notices: list[str] = field(default_factory=list)
     illustrations: list[Illustration] = field(default_factory=list)
     metrics: list[Metric] = field(default_factory=list)
-    main: Sequence[str] = ()  # keys of the metrics shown at the top of the page
+    main: Sequence[str] = ()  # keys of the metrics shown beside the title
+    folded: bool = False
 
     def add_figure(self, name: str, title: str, figure: Any, caption: str) -> None:
         """Put a matplotlib Figure after those that are there."""
@@ -133,8 +138,8 @@ def render_page(run: RunRecord, sections: Sequence[Section]) -> str:
         '<!DOCTYPE html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width,initial-scale=1">'
         f"<title>{_text(run.name)}</title><style>{CSS}</style></head><body>"
-        f'<header><h1>{_text(run.name)}</h1><div class="soft">{_text(run.summary)}</div><nav>{links}'
-        f'<a href="#run">The run</a></nav></header><main>{_warnings(run)}{_tiles(sections)}{body}{_run(run)}</main>'
+        f'<header><h1>{_text(run.name)}</h1><div class="title">{_text(run.summary)}</div><nav>{links}'
+        f'<a href="#run">The run</a></nav></header><main>{_warnings(run)}{body}{_run(run)}</main>'
         "</body></html>\n"
     )
 
@@ -143,13 +148,11 @@ def _text(text: str) -> str:
     return html.escape(str(text))
 
 
-def _tiles(sections: Sequence[Section]) -> str:
-    chosen = [metric for section in sections for metric in section.metrics
-              if metric.key in section.main and metric.value is not None]
+def _tiles(section: Section) -> str:
     tiles = "".join(
-        f'<div class="tile"><b>{_text(shown(metric.value))}</b><span>{_text(metric.label)}</span></div>'
-        for metric in chosen)
-    return f'<section class="tiles">{tiles}</section>' if tiles else ""
+        f'<span class="tile"><b>{_text(shown(metric.value))}</b><span>{_text(metric.label)}</span></span>'
+        for metric in section.metrics if metric.key in section.main and metric.value is not None)
+    return f'<span class="tiles">{tiles}</span>' if tiles else ""
 
 
 def _warnings(run: RunRecord) -> str:
@@ -164,8 +167,10 @@ def _notices(notices: Sequence[str]) -> str:
 def _section(section: Section) -> str:
     figures = "".join(_illustration(illustration) for illustration in section.illustrations)
     text = f"<p>{_text(section.text)}</p>" if section.text else ""
-    return (f'<section id="{section.key}"><h2>{_text(section.title)}</h2>{text}{_notices(section.notices)}{figures}'
-            f"{_metric_table(section.metrics)}</section>")
+    # A browser opens what is folded around the target of a link.
+    return (f'<section><details{"" if section.folded else " open"}><summary><h2>{_text(section.title)}</h2>'
+            f'{_tiles(section)}</summary><div class="body" id="{section.key}">{text}{_notices(section.notices)}'
+            f"{figures}{_metric_table(section.metrics)}</div></details></section>")
 
 
 def _illustration(illustration: Illustration) -> str:

@@ -94,8 +94,10 @@ def section(run: Rollout) -> Section:
         Metric("method", "what moved the particles", run.method),
         Metric("status", "status", run.status),
         Metric("stable", "stable to the end", run.status == "complete" and not np.isfinite(broken)),
-        Metric("turnovers", "eddy turnovers run", float(run.attributes["turnovers"])),
+        Metric("turnovers", "eddy turnovers of the rollout", float(run.attributes["turnovers"])),
     ])
+    if run.powers[0] != run.powers[1]:
+        shown.metrics.append(Metric("two_flows", "model and truth are forced differently", True))
     if run.outside_training is not None:
         shown.metrics.append(Metric("outside_training", "pairs outside the training range, largest share over time",
                                     float(run.outside_training.max())))
@@ -190,10 +192,13 @@ def _add_particles(shown: Section, run: Rollout, common: CommonFrames) -> None:
     truth = against_truth.particle_series(run.truth, common.truth)
     ratio = float(model["energy"][common.model[-1]] / truth["energy"][-1])
     shown.metrics += [
-        Metric("energy_ratio", "particle kinetic energy, model / truth", ratio),
-        Metric("velocity_error", "velocity error by particle (normalised L2)", final["velocity_error"]),
-        Metric("velocity_kl", "KL divergence of the velocity PDF", final["velocity_kl"]),
-        Metric("acceleration_kl", "KL divergence of the acceleration PDF", final["acceleration_kl"]),
+        Metric("energy_ratio", "kinetic energy of the particles at the end, model / truth", ratio),
+        Metric("energy_ratio_no_force", "the same of particles on which no force acts",
+               float(truth["energy"][0] / truth["energy"][-1])),
+        Metric("velocity_error", "velocity error by particle at the end (normalised L2)", final["velocity_error"]),
+        *_early_errors(run.turnover, errors),
+        Metric("velocity_kl", "KL divergence of the velocity PDF at the end", final["velocity_kl"]),
+        Metric("acceleration_kl", "KL divergence of the acceleration PDF at the end", final["acceleration_kl"]),
     ]
     pairs = {column: [against_truth.particle_pair(run.model, run.truth, common, index, column)
                       for index in common.spread(3)] for column in against_truth.EDGES}
@@ -217,7 +222,17 @@ def _add_particles(shown: Section, run: Rollout, common: CommonFrames) -> None:
         "figure-9-errors", "Rollout over time",
         rollout_figures.errors_over_time(model, truth, errors, run.turnover),
         f"At the last common time the model has {ratio:.3f} of the truth's energy and a velocity error of "
-        f"{final['velocity_error']:.3f} (dotted: 1, as large as the velocity itself).")
+        f"{final['velocity_error']:.3f}; particles on which no force acts (dashed) would have "
+        f"{errors['no_force'][-1]:.3f} (dotted: 1, as large as the velocity itself).")
+
+
+def _early_errors(turnover: float, errors: Mapping[str, np.ndarray]) -> list[Metric]:
+    """Velocity errors of the model and of no force after half a turnover, or at the end if that is earlier."""
+    time = min(turnover / 2, float(errors["time"][-1]))
+    model, without = (float(np.interp(time, errors["time"], errors[name])) for name in ("velocity_error", "no_force"))
+    return [Metric("early_time", "half a turnover, or the end if that is earlier / T", time / turnover),
+            Metric("early_velocity_error", "velocity error by particle then", model),
+            Metric("early_velocity_error_no_force", "the same of particles on which no force acts", without)]
 
 
 def _add_invariants(shown: Section, run: Rollout, common: CommonFrames) -> None:

@@ -67,7 +67,9 @@ def errors_over_time(model: Mapping[str, np.ndarray], truth: Mapping[str, np.nda
     else:
         density.remove()
     energy.legend()
-    error.plot(errors["time"] / turnover, errors["velocity_error"], color=MODEL)
+    error.plot(errors["time"] / turnover, errors["velocity_error"], color=MODEL, label="model")
+    error.plot(errors["time"] / turnover, errors["no_force"], color=GUIDE, linestyle="--", label="no force")
+    error.legend()
     error.axhline(1, color=GUIDE, linestyle=":", linewidth=1.2)
     error.set(title="Velocity error", ylabel="normalised L2 by particle", ylim=(0, None))
     for column, colour, style in (("velocity_kl", DNS, "-"), ("acceleration_kl", FOURTH, "--")):

@@ -1,4 +1,4 @@
-"""Turns a TOML document and the user's `--set` overrides into sections, and sections into TOML.
+"""Turns a TOML document and the user's `--set` and `--unset` into sections, and sections into TOML.
 
 Nothing here knows a particular section or key: what is allowed stands beside the fields of the dataclasses
 (`scene/values.py`), which check their values themselves.
@@ -6,6 +6,7 @@ Nothing here knows a particular section or key: what is allowed stands beside th
 
 import dataclasses
 import tomllib
+from collections.abc import Sequence
 from dataclasses import MISSING
 from pathlib import Path
 from typing import Any
@@ -57,7 +58,26 @@ def read_text(path: Path) -> str:
         raise SceneError(f"cannot be read: {reason}; give the path of a scene, a TOML file") from None
 
 
-def apply_overrides(document: dict[str, Any], overrides: list[str]) -> set[str]:
+def remove(document: dict[str, Any], removals: Sequence[str]) -> None:
+    """Take each "key", "section", "section.key", ... out of the document, with all that is in it.
+
+    Raises:
+        SceneError: the document has no such thing; what it has is named.
+    """
+    for removal in removals:
+        table: Any = document
+        *outer, last = removal.strip().split(".")
+        try:
+            for name in outer:
+                table = table[name]
+            del table[last]
+        except (KeyError, TypeError):
+            known = table if isinstance(table, dict) else document
+            raise SceneError(f"--unset {shortened(removal)}: the file has no such key or section, so there is nothing "
+                             f"to leave out; there are: {', '.join(known) or 'none'}") from None
+
+
+def apply_overrides(document: dict[str, Any], overrides: Sequence[str]) -> set[str]:
     """Write each "section.key=value" (or "key=value", or "section.sub.key=value") over the document; returns the keys
     written, with the sections that hold them.
 

@@ -15,7 +15,8 @@ from eddies.import_path import load, origins, search_in
 from eddies.pipeline import STAGES, Stage
 from eddies.scene.checks import first_inconsistency
 from eddies.scene.model import Model, replace_terms
-from eddies.scene.reader import apply_overrides, find_document, parse_document, read_section, read_text, write_section
+from eddies.scene.reader import (apply_overrides, find_document, parse_document, read_section, read_text, remove,
+                                 write_section)
 from eddies.scene.sections import (BOX_LENGTH, DEFAULT_WINDOW, NEIGHBORS, Eulerian, Flow, Forcing, Horizons, Initial,
                                    Kernel, Simulation, SpinUp, Time, Tracers, Training)
 from eddies.scene.values import Document, SceneError, choice, directory_name, import_paths, integer, section, text
@@ -158,28 +159,31 @@ class Scene(Document):
             yield from (path for _, path in import_paths(part))
 
 
-def load_scene(name_or_path: str | Path, overrides: list[str] | tuple[str, ...] = ()) -> Scene:
-    """Read a built-in scene by name, or a TOML file by path, and write overrides "section.key=value" over it.
+def load_scene(name_or_path: str | Path, overrides: Sequence[str] = (), removals: Sequence[str] = ()) -> Scene:
+    """Read a built-in scene by name, or a TOML file by path, take the `removals` "section.key" or "section" out of it,
+    and write overrides "section.key=value" over what is left.
 
     Modules of the classes that it names are looked for where Python looks, then beside the file, then in the working
     directory.
 
     Raises:
-        SceneError: names the file (or --set), the section and the key, what is allowed and what to do.
+        SceneError: names the file (or --set, --unset), the section and the key, what is allowed and what to do.
     """
     path = find_document(str(name_or_path), BUILT_IN, "scene")
     search_in(path.parent)
     search_in(Path())
     keys: set[str] = set()
     try:
-        document = {"name": path.stem, **parse_document(read_text(path))}
-        keys = apply_overrides(document, list(overrides))
+        document = parse_document(read_text(path))
+        remove(document, removals)
+        document = {"name": path.stem, **document}
+        keys = apply_overrides(document, overrides)
         if isinstance(document.get("model"), dict):
             replace_terms(document["model"], keys)
         return read_section(Scene, document)
     except SceneError as error:
-        origin = f"{path}, --set" if error.key in keys else path
-        raise SceneError(f"{origin}: {error}", error.key) from None
+        option = ", --set" if error.key in keys else ", --unset" if error.key in removals else ""
+        raise SceneError(f"{path}{option}: {error}", error.key) from None
 
 
 def builtin_scenes() -> list[tuple[str, str]]:

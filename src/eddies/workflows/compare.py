@@ -148,4 +148,3 @@ def write_files(comparison: Comparison, drawn: ErrorAgainstTime, flow: dict[str,
         output / "comparison.json": json.dumps(record, indent=2, allow_nan=False) + "\n"})
     for sentence in drawn.summary:
         log.info("compare: %s", sentence)
-    log.info("compare: %s", output / "index.html")

@@ -80,15 +80,14 @@ def run_for(duration: float, flow: FlowRun) -> None:
     if flow.phase == "start":
         clock.end, flow.phase = clock.time + duration, "run"
     start = clock.end - duration
-    progress = ProgressLine("dns", flow.history.describe, done=(clock.time - start) / duration, step=clock.steps)
+    progress = ProgressLine("dns", flow.history.describe, done=(clock.time - start) / duration)
     flow.advance([flow.history, lambda _, clock: progress((clock.time - start) / duration, clock.steps)])
 
 
 def spin_up(turnovers: float, flow: FlowRun) -> None:
     """Run until the flow has turned over the given number of times."""
     history = flow.history
-    progress = ProgressLine("spin-up", history.describe, done=history.rows[-1]["turnovers"] / turnovers,
-                            step=flow.clock.steps)
+    progress = ProgressLine("spin-up", history.describe, done=history.rows[-1]["turnovers"] / turnovers)
 
     def until_turned_over(_: np.ndarray, clock: Clock) -> None:
         done = history.rows[-1]["turnovers"] / turnovers

@@ -32,6 +32,8 @@ from eddies.report.model import section as model_section
 from eddies.report.page import Metric, RunRecord, Section, metrics_json, shown, write_page
 from eddies.report.rollout import Rollout
 from eddies.report.rollout import section as rollout_section
+from eddies.report.verdict import KEY as VERDICT
+from eddies.report.verdict import arranged
 from eddies.scene.scene import Scene
 from eddies.workflows.feasibility import check_places
 from eddies.workflows.product_warnings import changed_truths, mixed_products, not_finite
@@ -42,7 +44,8 @@ log = logging.getLogger("eddies")
 
 KINDS = "ground_truth", "kernel", "model", "rollout"  # products, in the order of the page
 FIELDS = "model", "truth", "filtered"  # of a rollout, as workflows/rollout/frames.py has them, which imports torch
-ROLLOUT_COST = {"seconds_per_step": "rollout, seconds per step", "particles": "particles of the rollout",
+ROLLOUT_COST = {"seconds_per_step": "rollout: seconds of a step (median, without storing)",
+                "particles": "particles of the rollout",
                 "ranks": "ranks of the rollout"}
 
 
@@ -117,7 +120,7 @@ def _survey(directory: Path, alone: Comm) -> Run:
 
 def _survey_ground_truth(file: File, record: Run) -> None:
     reference, statistics = read_attributes(file, "reference"), read_table(file, "statistics")
-    record.cost.append(Metric("dns_seconds_per_step", "DNS, seconds per step (median)",
+    record.cost.append(Metric("dns_seconds_per_step", "DNS: seconds of a step (median, without storing)",
                               float(np.median(statistics["seconds_per_step"]))))
     if "released_at" in reference:
         record.eulerian, record.filter_width = read_table(file, "spectra"), reference["filter_width"]
@@ -131,6 +134,8 @@ def _survey_rollout(file: File, record: Run) -> None:
     untimed = "too few steps to time one: the first two, and the first two after a restart, are left out"
     record.cost += [Metric(key, label, attributes.get(key), untimed) for key, label in ROLLOUT_COST.items()]
     if "evaluations" in attributes and attributes["turnovers"] > 0:
+        record.cost.append(Metric("storing_share", "rollout: share of the wall time that storing took",
+                                  attributes.get("storing_share"), "made by an earlier version"))
         record.cost.append(Metric("evaluations_per_turnover", "evaluations of the forces a turnover",
                                   attributes["evaluations"] / attributes["turnovers"]))
 
@@ -160,10 +165,15 @@ def _read_part(kind: str, file: File, record: Run, read: Callable[[File, Run], l
 
 
 def _write_report(directory: Path, record: Run, sections: Sequence[Section]) -> None:
-    for section in sections[:-1]:
-        log.info("report: %s, %d figures", section.title, len(section.illustrations))
+    sections = arranged(sections, bool(record.warnings))
     _write_files(directory / "report", _run_record(directory, record), sections)
-    _log_main_numbers(sections)
+    for section in sections:
+        log.info("report: %s, %d figures", section.title, len(section.illustrations))
+        if section.key == VERDICT:
+            log.info("  %s", section.text)
+        for metric in section.metrics:
+            if metric.key in section.main:
+                log.info("  %-60s %s", metric.label, "-" if metric.value is None else shown(metric.value))
     for warning in record.warnings:
         log.warning("report: %s", warning)
 
@@ -267,14 +277,13 @@ def _run_record(directory: Path, record: Run) -> RunRecord:
     for kind, origin in record.provenance.items():
         stage = MAKER_OF[kind].name
         seconds = shown(record.seconds[stage]) if stage in record.seconds else "not stored"
-        commit = (origin["commit"] or "not a checkout")[:12]
+        commit = origin["commit"][:12] if origin["commit"] else "not a checkout"
         libraries = ", ".join(f"{name} {version}" for name, version in origin["libraries"].items())
         ranks = str(origin["ranks"])
         rows.append((stage, ranks, seconds, origin["date"], origin["eddies"], commit, libraries))
     newest = list(record.provenance.values())[-1]
-    stages = ", ".join(MAKER_OF[kind].name for kind in record.provenance)
-    summary = f"Lagrangian large-eddy simulation; stages: {stages}; {newest['date']}"
-    return RunRecord(directory.resolve().name, summary, newest["scene"], rows, record.warnings)
+    title = tomllib.loads(newest["scene"]).get("title", "untitled scene")
+    return RunRecord(directory.resolve().name, title, newest["scene"], rows, record.warnings)
 
 
 def _write_files(output: Path, record: RunRecord, sections: Sequence[Section]) -> None:
@@ -283,11 +292,3 @@ def _write_files(output: Path, record: RunRecord, sections: Sequence[Section]) -
     for stale in (output / "figures").glob("*.png"):
         if stale.name not in drawn:
             stale.unlink()
-    log.info("report: %s", output / "index.html")
-
-
-def _log_main_numbers(sections: Sequence[Section]) -> None:
-    for section in sections:
-        for metric in section.metrics:
-            if metric.key in section.main:
-                log.info("  %-48s %s", metric.label, "-" if metric.value is None else shown(metric.value))

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from eddies.clock import pace_in_words
 from eddies.io.guard import Guard
 from eddies.io.hdf5 import create_product, open_product, write_attributes, write_table
 from eddies.parallel.communicator import Comm
@@ -59,7 +60,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                 for name, columns in method.series().items():
                     write_table(file, name, {"time": frames.times, **columns})
     guard.checkpoints.remove()
-    pace = f"{outcome['seconds_per_step']:.3f} s/step" if "seconds_per_step" in outcome else "too few steps to time one"
+    pace = (pace_in_words(outcome["seconds_per_step"], outcome["storing_share"]) if "seconds_per_step" in outcome
+            else "too few steps to time one")
     log.info("rollout: %s after %.2f turnovers, %s", outcome["status"], outcome["time"] / turnover, pace)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import numpy as np
@@ -57,7 +58,7 @@ class TracerRun:
     def follow(self) -> None:
         """Follow the tracers to the end of the last interval."""
         flow = self.flow
-        progress = ProgressLine("tracers", flow.history.describe, done=self._done, step=self._steps)
+        progress = ProgressLine("tracers", flow.history.describe, done=self._done)
         if self.interval > 0:
             self._finish_interval(progress)
         while self.interval < self.intervals:
@@ -104,7 +105,10 @@ class TracerRun:
         flow, step = self.flow, self.step
         flow.advance([flow.history, lambda state, _: self.tracers.advance(state, step),
                       lambda *_: progress(self._done, self._steps)], FixedStep(step))
-        self.frames.store(flow.state, flow.clock)
+        began = time.perf_counter()
+        with progress.storing():
+            self.frames.store(flow.state, flow.clock)
+        flow.history.leave_out(time.perf_counter() - began)
 
     def _saved_columns(self, saved: Checkpoint) -> dict[str, np.ndarray]:
         """Each saved tracer on the rank whose slab holds it."""

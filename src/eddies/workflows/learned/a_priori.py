@@ -46,7 +46,7 @@ def evaluate(truth: GroundTruth, model: LagrangianModel, frames: np.ndarray, las
     truth that has a density.
     """
     rows, comm = [], truth.decomposition.comm
-    progress = ProgressLine("train", lambda: "of the a-priori test")
+    progress = ProgressLine("train", lambda: "of the a-priori test", unit="frame")
     for index in frames:
         frame = load_frame(truth, index, model, dtype, device)
         errors = frame.errors()

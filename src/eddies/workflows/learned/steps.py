@@ -32,7 +32,7 @@ def take_all_steps(training: Training, guard: Guard, stage: str, section: str, r
         shown = f"  validation error {errors[-1]:.3f}" if errors else ""
         return f"{training.phase.name}  loss {last['loss']:.4f}{shown}"
 
-    progress = ProgressLine(stage, describe, done=training.done, step=training.steps)
+    progress = ProgressLine(stage, describe, done=training.done)
     while training.running:
         guard(training)
         try:

@@ -56,7 +56,7 @@ class TrainingData:
     def frames(self) -> list[TrainingFrame]:
         """The single frames that are trained on; the first use is collective."""
         seen = np.unique(np.linspace(1, self.learned, self.count).astype(int))
-        progress, frames = ProgressLine("train", lambda: "of preparing frames"), []
+        progress, frames = ProgressLine("train", lambda: "prepared", unit="frame"), []
         for index in seen:
             frames.append(self._frame(index))
             progress(len(frames) / len(seen), len(frames))

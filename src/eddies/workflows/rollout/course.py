@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from eddies.clock import Clock, ProgressLine
+from eddies.clock import WARM_UP_STEPS, Clock, ProgressLine
 from eddies.io.checkpoint import Checkpoint
 from eddies.io.guard import Guard
 from eddies.parallel.reduction import global_sum
@@ -17,9 +17,6 @@ from eddies.workflows.rollout.frames import RolloutFrames
 from eddies.workflows.rollout.method import Method
 
 log = logging.getLogger("eddies")
-
-# The first steps plan, compile and fill caches: they are no measure of the others. So are those after a restart.
-WARM_UP_STEPS = 2
 
 
 class Course:
@@ -38,8 +35,7 @@ class Course:
             self._load(saved)
             method.load_state_dict(saved)
             log.info("rollout: goes on from step %d, time %.4g", self.steps, self.clock.time)
-        self.progress = ProgressLine("rollout", self._describe, done=self.clock.time / self.clock.end,
-                                     step=self.steps)
+        self.progress = ProgressLine("rollout", self._describe, done=self.clock.time / self.clock.end)
 
     @property
     def steps(self) -> int:
@@ -48,7 +44,8 @@ class Course:
 
     def run(self) -> dict[str, float | str]:
         """Advance to the last frame, or until the state is at fault; returns status, time, steps and, where there are
-        any, their mean length and the seconds of those that were timed."""
+        any, their mean length and the seconds of those that were timed, and the share of the wall time, since the start
+        or the last restart, that storing frames took."""
         complaint: str | None = None
         if not self.frames.times:
             self._store(0.0)
@@ -64,7 +61,8 @@ class Course:
             log.warning("rollout stopped at time %.4g: %s", self.clock.time, complaint)
         step = {"time_step": self.clock.time / self.steps} if self.steps else {}
         return {"status": "complete" if complaint is None else f"stopped: {complaint}", "time": self.frames.times[-1],
-                "steps": self.steps, **step, **quartiles(self.seconds)}
+                "steps": self.steps, **step, **quartiles(self.seconds),
+                "storing_share": self.progress.storing_share}
 
     def state_dict(self) -> dict[str, Any]:
         """All that goes on, for a checkpoint, beside the files of the frames."""
@@ -100,8 +98,9 @@ class Course:
 
     def _store(self, at: float) -> None:
         """Store the frame of a time, and take down the mean kinetic energy <v.v>/2 of its particles."""
-        particles, acceleration = self.method.frame(at)
-        self.frames.store(self.steps, at, particles, acceleration)
+        with self.progress.storing():
+            particles, acceleration = self.method.frame(at)
+            self.frames.store(self.steps, at, particles, acceleration)
         energy = 0.5 * float(particles.velocity.double().square().sum())
         self.energy = float(global_sum(self.comm, energy)) / self.frames.truth.total
 
