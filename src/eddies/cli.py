@@ -197,7 +197,7 @@ def compare_command(options: argparse.Namespace, comm: Comm, signals: list[int])
 def export_command(options: argparse.Namespace, comm: Comm) -> None:
     """The fields and particles of a run directory in another format."""
     output = options.output or options.run / options.format
-    import_module("eddies.workflows.export").run(options.run, output, comm)
+    import_module("eddies.workflows.export").run(options.run, output, comm, options.format)
     log.log(OUTCOME, "export: %s", output)
 
 

@@ -21,7 +21,7 @@ EXAMPLES = {
     "simulate": ("eddies simulate hit-small --overwrite --set simulation.method=none",),
     "report": ("eddies report runs/hit-small --open",),
     "compare": ("eddies compare compare-small", "eddies compare mine.toml --run runs/hit --output runs/cost"),
-    "export": ("eddies export runs/tiny --format vtkhdf",),
+    "export": ("eddies export runs/tiny --format vtkhdf", "eddies export runs/hit --format lagrangebench"),
     "check": ("eddies check hit", "eddies check mine.toml --set flow.cells=256 --unset forcing --json"),
     "scenes": ("eddies scenes", "eddies scenes tiny"),
     "status": ("eddies status", "eddies status runs/hit-small"),
@@ -62,10 +62,11 @@ def build_parser() -> argparse.ArgumentParser:
     compare.add_argument("--run", type=directory, metavar="DIR",
                          help="run directory with the ground truth (default: the comparison's, or runs/BASE)")
     add_job_options(compare, "directory of the comparison (default: runs/NAME)")
-    export = add_command(commands, "export", "fields and particles of a run directory, for ParaView")
+    export = add_command(commands, "export", "fields and particles of a run directory, for other programs")
     add_run(export, "run")
-    export.add_argument("--format", choices=["vtkhdf"], default="vtkhdf", help="format of the files (default: vtkhdf)")
-    export.add_argument("--output", type=directory, metavar="DIR", help="where the files go (default: RUN/vtkhdf)")
+    export.add_argument("--format", choices=["vtkhdf", "lagrangebench"], default="vtkhdf",
+                        help="for ParaView, or particles as learned simulators read them (default: vtkhdf)")
+    export.add_argument("--output", type=directory, metavar="DIR", help="where the files go (default: RUN/FORMAT)")
     add_log_options(export)
     check = add_command(commands, "check", "derived numbers, memory, ranks and time; writes nothing")
     add_scene_options(check)

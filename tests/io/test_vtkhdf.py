@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from vtkmodules.util.numpy_support import vtk_to_numpy
 
-from eddies.io import room, vtkhdf
+from eddies.io import exported_file, room, vtkhdf
 from eddies.io.fields import FieldSeries, FieldWriter
 from eddies.io.hdf5 import ProductError, create_product, open_product
 from eddies.io.provenance import read_provenance
@@ -105,10 +105,28 @@ def test_particles_survive(comm, tmp_path):
         assert data.GetNumberOfVerts() == data.GetNumberOfCells() == PARTICLES
         assert np.array_equal(vtk_to_numpy(data.GetVerts().GetConnectivityArray()), np.arange(PARTICLES))
         assert np.array_equal(arrays.pop("id"), np.arange(PARTICLES))
+        assert arrays.pop("image").shape == (PARTICLES, 3)
         assert arrays.keys() == COLUMNS.keys() - {"position"}
         assert arrays["density"].ndim == 1
         for name, values in arrays.items():
             assert np.array_equal(values.reshape(PARTICLES, *COLUMNS[name]), column(frame, name))
+
+
+@pytest.mark.mpi(1)
+def test_images_lead_paths_beyond_the_cube(comm, tmp_path):
+    """Out of the cube and back, through both ends of an axis, and more than once."""
+    path = np.array([[0.9, 0.5, 0.1], [1.2, 0.5, -0.2], [1.6, 0.5, -0.6], [2.05, 0.5, -0.1], [1.9, 0.5, 0.2]]) * LENGTH
+    with create_product(comm, tmp_path / "p.h5", "rollout", {}) as file:
+        writer = TrajectoryWriter(file, "model", 1, LENGTH, {"position": (3,)}, np.float64)
+        for step, position in enumerate(path):
+            writer.append(step, float(step), 0, {"position": position[None] % LENGTH})
+    with open_product(comm, tmp_path / "p.h5", "rollout") as file:
+        vtkhdf.write_points(tmp_path / "p.vtkhdf", Trajectory(file, "model"), {})
+    read = VtkFile(tmp_path / "p.vtkhdf")
+    for frame, position in enumerate(path):
+        data, arrays = read.step(frame)
+        found = vtk_to_numpy(data.GetPoints().GetData()) + LENGTH * arrays["image"]
+        assert np.allclose(found, position, atol=1e-12)
 
 
 @pytest.mark.mpi(1)
@@ -160,12 +178,12 @@ def test_the_space_of_a_file_is_reserved_in_full(comm, tmp_path, monkeypatch):
         reserved[Path(os.readlink(f"/proc/self/fd/{descriptor}")).stem] = stop
         room.reserve(descriptor, start, stop)
 
-    monkeypatch.setattr(vtkhdf, "reserve", reserve)
+    monkeypatch.setattr(exported_file, "reserve", reserve)
     with product(comm, tmp_path) as file:
         vtkhdf.write_images(tmp_path / "f.vtkhdf", FieldSeries(file, "filtered"), LENGTH, {})
         vtkhdf.write_points(tmp_path / "p.vtkhdf", Trajectory(file, "tracers"), {})
     for name in ("f.vtkhdf", "p.vtkhdf"):
-        assert (tmp_path / name).stat().st_size < reserved[name] - vtkhdf.OVERHEAD_BYTES / 2
+        assert (tmp_path / name).stat().st_size < reserved[name] - exported_file.OVERHEAD_BYTES / 2
 
 
 @pytest.mark.mpi(1)

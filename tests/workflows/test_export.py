@@ -66,6 +66,23 @@ def test_a_run_without_tracers_has_its_last_field(comm, tmp_path):
     assert exported(tmp_path / "elsewhere") == {"ground_truth-fields-final.vtkhdf"}
 
 
+@pytest.mark.mpi(1, 2)
+def test_particles_as_data_sets(comm, tmp_path, caplog):
+    """Of a rollout; its truth, three frames shorter, is too short."""
+    if comm.rank == 0:
+        write_rollout(comm.Create_group(comm.group.Incl([0])), tmp_path, total=20, cells=6, frames=11)
+    comm.Barrier()
+    export.run(tmp_path, tmp_path / "sets", comm, "lagrangebench")
+    if comm.rank == 0:
+        assert exported(tmp_path / "sets") == {"rollout-particles-model"}
+        assert "particles/truth of rollout.h5 is left out: has 8 frames" in caplog.text
+        with h5py.File(tmp_path / "sets/rollout-particles-model/valid.h5") as copy, h5py.File(
+                tmp_path / "rollout.h5") as file:
+            stored = file["particles/model/position/value"][5:8]
+            assert np.array_equal(copy["00000/position"], stored.astype(np.float32))
+            assert copy.attrs["provenance"] == file.attrs["provenance"]
+
+
 @pytest.mark.mpi(1)
 def test_a_series_without_frames_is_left_out(comm, tmp_path):
     """As the filtered fields of a rollout whose times fall between those of the ground truth's fields."""

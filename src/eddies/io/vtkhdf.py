@@ -7,9 +7,7 @@ The reader takes a file of one step for one without time, and fails on an axis o
 therefore written without steps; its time is the field data `time`.
 """
 
-import json
 import math
-import os
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,18 +16,14 @@ from typing import Any
 import h5py
 import numpy as np
 
-from eddies.io.errors import NoRoom, write_error
+from eddies.io.exported_file import Layout, create_export
 from eddies.io.fields import FieldSeries
 from eddies.io.hdf5 import write_attributes
-from eddies.io.room import reserve
-from eddies.io.sink import Sink
 from eddies.io.trajectories import Trajectory
 
 VERSION = (2, 0)
 BLOCK_BYTES = 2**26  # of a field at once in memory
-OVERHEAD_BYTES, OVERHEAD_BYTES_PER_STEP = 2**20, 2**10  # of a file, above its datasets: far more than is needed
-
-Layout = dict[str, tuple[tuple[int, ...], Any]]  # shape and type of each large dataset
+OVERHEAD_BYTES_PER_STEP = 2**10  # above its large datasets: far more than is needed
 
 
 def write_images(path: Path, series: FieldSeries, length: float, provenance: Mapping[str, Any]) -> None:
@@ -65,7 +59,9 @@ def write_images(path: Path, series: FieldSeries, length: float, provenance: Map
 def write_points(path: Path, trajectory: Trajectory, provenance: Mapping[str, Any]) -> None:
     """Write trajectories as PolyData, a step for each frame, a vertex for each particle; called by one rank.
 
-    Point data are the particle's `id` and all columns but the position; of a 3 x 3 column the 9 components, row by row.
+    Point data are the particle's `id`, all columns but the position, of a 3 x 3 column the 9 components, row by row,
+    and `image`, (3,): Points + length * image go on beyond the cube, as long as a particle moves by less than half an
+    edge between frames.
 
     Args:
         path: of the file; its directory is made if there is none.
@@ -81,50 +77,45 @@ def write_points(path: Path, trajectory: Trajectory, provenance: Mapping[str, An
         sample = trajectory.read(0, column, 0, 0)
         components = (math.prod(sample.shape[1:]),) if sample.ndim > 1 else ()
         layout[name] = (frames * total, *components), sample.dtype
+    layout["PointData/image"] = (frames * total, 3), np.int32
     counted = {"PointData/id": total, "Vertices/Connectivity": total, "Vertices/Offsets": total + 1}
     layout |= {name: ((count,), np.int64) for name, count in counted.items()}
     with _create(path, "PolyData", frames, layout, provenance) as root:
         for name, count in counted.items():
             root[name][:] = np.arange(count)
         _write_cells(root, total)
-        _write_steps(root, trajectory.times, _point_offsets(frames, total, names.values()))
+        _write_steps(root, trajectory.times, _point_offsets(frames, total, (*names.values(), "PointData/image")))
         for column, name in names.items():
             for frame in range(frames):
                 values = trajectory.read(frame, column).reshape(total, *root[name].shape[1:])
                 root[name][frame * total:(frame + 1) * total] = values
+        for frame, image in enumerate(_images(trajectory)):
+            root["PointData/image"][frame * total:(frame + 1) * total] = image
+
+
+def _images(trajectory: Trajectory) -> Iterator[np.ndarray]:
+    """How often each particle has left the cube along each axis since the first frame: (N, 3) at every frame."""
+    before, image = None, np.zeros((trajectory.total, 3), np.int32)
+    for frame in range(len(trajectory.times)):
+        position = trajectory.read(frame, "position")
+        if before is not None:
+            # A rollout may end with positions that are not finite.
+            left = np.nan_to_num(np.rint((before - position) / trajectory.length), posinf=0, neginf=0)
+            image = image + left.astype(np.int32)
+        before = position
+        yield image
 
 
 @contextmanager
 def _create(path: Path, kind: str, frames: int, layout: Layout,
             provenance: Mapping[str, Any]) -> Iterator[h5py.Group]:
     """The group VTKHDF of a new file, with empty datasets; the file appears under `path` once the block ends well."""
-    partial = path.with_name(path.name + ".partial")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        bulk = sum(math.prod(shape) * np.dtype(dtype).itemsize for shape, dtype in layout.values())
-        size = bulk + OVERHEAD_BYTES + OVERHEAD_BYTES_PER_STEP * frames
-        sink = Sink(partial)
-        with sink, h5py.File(sink, "w") as file:
-            try:
-                reserve(sink.fileno(), 0, size)  # HDF5 cuts off what it does not need
-            except OSError as error:
-                raise NoRoom.of(error, partial, size) from None
-            write_attributes(file, {"provenance": json.dumps(dict(provenance))})
-            root = file.create_group("VTKHDF")
-            # The reader wants the type as a string of fixed length.
-            write_attributes(root, {"Version": np.array(VERSION), "Type": np.bytes_(kind)})
-            for name, (shape, dtype) in layout.items():
-                root.create_dataset(name, shape, dtype)
-            yield root
-        sink.check()
-        os.replace(partial, path)
-    except OSError as error:
-        words = (f"{path}: cannot be written: {error}; check its directory, the space on the disk, and whether the "
-                 "product it is made from is whole")
-        raise write_error(path, error, words) from None
-    finally:
-        if partial.is_file():
-            partial.unlink()
+    within = {f"VTKHDF/{name}": dataset for name, dataset in layout.items()}
+    with create_export(path, within, provenance, OVERHEAD_BYTES_PER_STEP * frames) as file:
+        root = file["VTKHDF"]
+        # The reader wants the type as a string of fixed length.
+        write_attributes(root, {"Version": np.array(VERSION), "Type": np.bytes_(kind)})
+        yield root
 
 
 def _write_steps(root: h5py.Group, times: np.ndarray, offsets: Mapping[str, np.ndarray]) -> None:

@@ -1,4 +1,4 @@
-"""The fields and particles of a run as VTKHDF files, one for each series. Rank 0 does the work, the others wait."""
+"""The fields and particles of a run in files for other programs, by series. Rank 0 does the work, the others wait."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 
 from eddies.io.fields import FieldSeries
 from eddies.io.hdf5 import File, ProductError, open_product
+from eddies.io.lagrangebench import shortcoming, write_dataset
 from eddies.io.provenance import read_provenance
 from eddies.io.trajectories import Trajectory
 from eddies.io.vtkhdf import write_images, write_points
@@ -19,35 +20,37 @@ log = logging.getLogger("eddies")
 PRODUCTS = ("ground_truth", "rollout")
 
 
-def run(run_directory: Path, output: Path, comm: Comm) -> None:
-    """Write OUTPUT/PRODUCT-fields-NAME.vtkhdf and OUTPUT/PRODUCT-particles-NAME.vtkhdf for every series of a run
-    directory; all ranks call it.
+def run(run_directory: Path, output: Path, comm: Comm, layout: str = "vtkhdf") -> None:
+    """Write every series of a run directory; all ranks call it.
+
+    With the layout "vtkhdf" a series is the file OUTPUT/PRODUCT-GROUP-NAME.vtkhdf, GROUP being fields or particles;
+    with "lagrangebench" one of particles is the directory OUTPUT/PRODUCT-particles-NAME.
 
     Raises:
         ProductError: on all ranks, if there is no such series, a product is damaged, or a file cannot be written.
     """
     alone = comm.Split(comm.rank)
     try:
-        on_first_rank(comm, lambda: _export(run_directory, output, alone))
+        on_first_rank(comm, lambda: _export(run_directory, output, alone, layout))
     except OSError as error:
         raise ProductError(f"{error}; check the files and the directory") from None
     finally:
         alone.Free()
 
 
-def _export(run_directory: Path, output: Path, alone: Comm) -> None:
-    written = 0
+def _export(run_directory: Path, output: Path, alone: Comm, layout: str) -> None:
+    written, (export, what) = 0, LAYOUTS[layout]
     for kind in PRODUCTS:
         path = run_directory / f"{kind}.h5"
         if path.exists():
             with open_product(alone, path, kind) as file:
-                written += _export_product(file, kind, output)
+                written += export(file, kind, output)
     if not written:
-        raise ProductError(f"{run_directory}: holds no fields or particles, which would be in "
+        raise ProductError(f"{run_directory}: holds no {what}, which would be in "
                            f"{' and '.join(f'{kind}.h5' for kind in PRODUCTS)}; run `eddies dns SCENE` first")
 
 
-def _export_product(file: File, kind: str, output: Path) -> int:
+def _write_vtkhdf(file: File, kind: str, output: Path) -> int:
     """Write the series of a product; returns how many have been written."""
     provenance, written = read_provenance(file), 0
     for group, reader in (("fields", FieldSeries), ("particles", Trajectory)):
@@ -63,3 +66,23 @@ def _export_product(file: File, kind: str, output: Path) -> int:
             log.info("export: %s, %d steps", path, len(series.times))
             written += 1
     return written
+
+
+def _write_datasets(file: File, kind: str, output: Path) -> int:
+    """Write the particles of a product as data sets; returns how many have been written."""
+    provenance, written = read_provenance(file), 0
+    for name in file.get("particles", ()):
+        trajectory, case = Trajectory(file, name), f"{kind}-particles-{name}"
+        problem = shortcoming(trajectory)
+        if problem:
+            log.warning("export: particles/%s of %s.h5 is left out: %s", name, kind, problem)
+            continue
+        write_dataset(output / case, trajectory, case, provenance)
+        log.info("export: %s, %d frames", output / case, len(trajectory.times))
+        written += 1
+    return written
+
+
+# What writes a product in a layout, and what of it.
+LAYOUTS = {"vtkhdf": (_write_vtkhdf, "fields or particles"),
+           "lagrangebench": (_write_datasets, "particles that make a data set")}

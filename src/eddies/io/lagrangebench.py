@@ -1,0 +1,116 @@
+"""Trajectories as learned simulators of particles read them: a data set in the layout of LagrangeBench.
+
+Layout: what the reader of LagrangeBench (Toshev et al., NeurIPS 2023, Datasets and Benchmarks) indexes, and the keys
+of its metadata. A directory holds train.h5, valid.h5 and test.h5, each with a trajectory `00000` of consecutive frames,
+and metadata.json. Velocities and accelerations are differences between frames, in units of length.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from eddies.io.exported_file import create_export
+from eddies.io.trajectories import Trajectory
+from eddies.io.whole_files import write_files
+
+SPLITS = ("train", "valid", "test")
+FRAMES_OF_A_SPLIT = 3  # an acceleration needs as many
+FLUID = 0  # the type of all particles
+CONNECTIVITY = 1.45  # radius of the pairs of the data sets of LagrangeBench, in mean distances between particles
+SMALLEST_DEVIATION = 1e-7  # what varies less is not divided by its standard deviation
+
+
+def split_frames(frames: int) -> list[int]:
+    """Frames of train, valid and test, as LagrangeBench shares one long trajectory: about 2 : 1 : 1."""
+    held_out = math.ceil(frames / 4)
+    return [frames - 2 * held_out, held_out, held_out]
+
+
+def shortcoming(trajectory: Trajectory) -> str | None:
+    """Why a trajectory makes no data set; None if it does."""
+    times = trajectory.times
+    if min(split_frames(len(times))) < FRAMES_OF_A_SPLIT:
+        return f"has {len(times)} frames, too few for three parts with {FRAMES_OF_A_SPLIT} each"
+    intervals = np.diff(times)
+    if not np.allclose(intervals, intervals.mean(), rtol=1e-6, atol=0):
+        return "its frames do not follow each other at equal intervals"
+    if not np.isfinite(trajectory.read(len(times) - 1, "position")).all():
+        return "ends with positions that are not finite"
+    return None
+
+
+def write_dataset(directory: Path, trajectory: Trajectory, case: str, provenance: Mapping[str, Any]) -> None:
+    """Write a data set of three consecutive parts of a trajectory in which `shortcoming` finds nothing; one rank calls
+    it.
+
+    Args:
+        directory: of the data set; it is made if there is none.
+        trajectory: the particles.
+        case: what the metadata call it.
+        provenance: JSON-able, stored in every file.
+
+    Raises:
+        ProductError: a file cannot be written; those that were there are as they were.
+    """
+    total, start, moments = trajectory.total, 0, []
+    lengths = split_frames(len(trajectory.times))
+    with ExitStack() as files:
+        for split, frames in zip(SPLITS, lengths):
+            layout = {"00000/position": ((frames, total, 3), np.float32), "00000/particle_type": ((total,), np.int32)}
+            file = files.enter_context(create_export(directory / f"{split}.h5", layout, provenance))
+            file["00000/particle_type"][:] = FLUID
+            moments.append(_copy_frames(trajectory, start, file["00000/position"]))
+            start += frames
+        about = _metadata(trajectory, lengths) | _statistics(np.array(moments))
+        write_files({directory / "metadata.json": json.dumps(
+            {"case": case, **about, "provenance": dict(provenance)}, indent=1)})
+
+
+def _copy_frames(trajectory: Trajectory, start: int, positions: h5py.Dataset) -> np.ndarray:
+    """Copy frames from `start` on; mean and mean square of their velocities and accelerations: (2, 2, 3)."""
+    length, sums, before, velocity_before = trajectory.length, np.zeros((2, 2, 3)), None, None
+    for row in range(len(positions)):
+        stored = trajectory.read(start + row, "position").astype(np.float32)
+        stored[stored >= length] = 0  # rounded up to the edge, where no particle may be
+        positions[row] = stored
+        position = stored.astype(np.float64)
+        if before is not None:
+            velocity = position - before
+            velocity -= length * np.rint(velocity / length)
+            sums[0] += velocity.mean(axis=0), (velocity**2).mean(axis=0)
+            if velocity_before is not None:
+                acceleration = velocity - velocity_before
+                sums[1] += acceleration.mean(axis=0), (acceleration**2).mean(axis=0)
+            velocity_before = velocity
+        before = position
+    return sums / np.array([len(positions) - 1, len(positions) - 2])[:, None, None]
+
+
+def _statistics(moments: np.ndarray) -> dict[str, list[float]]:
+    """Mean and standard deviation of velocity and acceleration by component, of moments (parts, 2, 2, 3): all parts
+    count the same, however long."""
+    found = {}
+    for name, (mean, square) in zip(("vel", "acc"), moments.mean(axis=0)):
+        deviation = np.sqrt(np.maximum(square - mean**2, 0))
+        found[f"{name}_mean"] = mean.tolist()
+        found[f"{name}_std"] = np.where(deviation < SMALLEST_DEVIATION, 1.0, deviation).tolist()
+    return found
+
+
+def _metadata(trajectory: Trajectory, lengths: list[int]) -> dict[str, Any]:
+    times, length = trajectory.times, trajectory.length
+    distance, duration = length / trajectory.total ** (1 / 3), float(times[-1] - times[0])
+    counts = {f"sequence_length_{split}": frames - 1 for split, frames in zip(SPLITS, lengths)}  # steps, not frames
+    counts |= {f"num_trajs_{split}": 1 for split in SPLITS}
+    return {"solver": "eddies", "dim": 3, "dx": distance, "dt": duration / (len(times) - 1), "write_every": 1,
+            "t_end": duration, **counts, "num_particles_max": trajectory.total,
+            "periodic_boundary_conditions": [True] * 3, "bounds": [[0.0, length]] * 3,
+            "default_connectivity_radius": CONNECTIVITY * distance}
