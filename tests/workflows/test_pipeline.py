@@ -4,6 +4,7 @@ import dataclasses
 import html
 import json
 import math
+import re
 import shutil
 import tempfile
 from pathlib import Path
@@ -12,6 +13,7 @@ import h5py
 import numpy as np
 import pytest
 
+from eddies.scene.model import COME_ALONG, WEIGHTS, weights_that_come_along
 from eddies.scene.scene import load_scene
 
 pytestmark = pytest.mark.mpi(2, timeout=240)
@@ -120,6 +122,25 @@ def test_pairs_outside_the_training_data_are_counted(run_directory):
     assert np.all((0 <= share) & (share < 0.01))
     shown = json.loads((run_directory / "report" / "metrics.json").read_text())
     assert shown["rollout"]["outside_training"] == share.max()
+
+
+def test_weights_that_come_along_are_as_good_as_their_card_says(comm, run_directory, tmp_path):
+    """On a flow that differs from theirs by round-off alone."""
+    page = (Path(__file__).parents[2] / "docs/training.md").read_text()
+    card = {name: float(error) for name, error in re.findall(r"^\| `(eddies:.+?)` \|.*\| ([\d.]+) \|$", page, re.M)}
+    assert list(card) == weights_that_come_along()
+    for name, error in card.items():
+        with h5py.File(WEIGHTS / f"{name.removeprefix(COME_ALONG)}.h5") as file:
+            assert f"{file['a_priori/acceleration_error'][-1]:.3f}" == f"{error:.3f}", name
+            assert json.loads(file.attrs["provenance"])["scene"].startswith(f'name = "{name.removeprefix(COME_ALONG)}"')
+    if comm.rank == 0:
+        for name in ("ground_truth.h5", "kernel.h5"):
+            (tmp_path / name).symlink_to(run_directory / name)
+    comm.Barrier()
+    assert eddies("train", "tiny", "--set", "model.path=eddies:tiny", "--output", tmp_path) == 0
+    with h5py.File(tmp_path / "model.h5") as file:
+        assert file["a_priori/acceleration_error"][-1] == pytest.approx(card["eddies:tiny"], rel=0.02)
+        assert file["source_a_priori/acceleration_error"][-1] == pytest.approx(card["eddies:tiny"], rel=0.01)
 
 
 def provenance_of(directory):

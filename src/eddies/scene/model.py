@@ -15,6 +15,15 @@ from eddies.scene.values import (KeyProblem, SceneError, Section, choice, import
                                  sub_sections, text, texts)
 
 
+COME_ALONG = "eddies:"  # what [model] path begins with, for weights of the package
+WEIGHTS = Path(__file__).parents[1] / "weights"
+
+
+def weights_that_come_along() -> list[str]:
+    """The trained weights of the package, as [model] path names them."""
+    return sorted(f"{COME_ALONG}{path.stem}" for path in WEIGHTS.glob("*.h5"))
+
+
 @dataclass(frozen=True, kw_only=True)
 class Model(Section):
     """The terms whose sum moves the particles, each with its settings; a preset is a list of them that has a name.
@@ -29,8 +38,8 @@ class Model(Section):
                                           "of [model.NAME]", *TERMS, default=None, paths=True)
     neighbors: float | None = number("mean number of particles within the radius of interaction, with terms that read "
                                      "pairs; absent: as in [kernel], or 60", default=None, at_least=8)
-    path: str | None = text("run directory or model.h5 whose trained weights are used; absent: they are trained",
-                            default=None)
+    path: str | None = text("run directory or model.h5 whose trained weights are used, or \"eddies:NAME\", those of a "
+                            "built-in scene that come with the package; absent: they are trained", default=None)
     settings: dict[str, TermSettings] = sub_sections()
 
     def __post_init__(self) -> None:
@@ -38,6 +47,9 @@ class Model(Section):
         if self.preset is not None and self.terms is not None:
             raise SceneError(f"[model] preset = {quoted(self.preset)}: with terms = {quoted(self.terms)} the list is "
                              "given twice; remove one of the two", "model.preset")
+        if self.path is not None and self.path.startswith(COME_ALONG) and not self.weights_file.is_file():
+            raise KeyProblem("model", "path", f" = {quoted(self.path)}: must be a run directory, a model.h5, or one of "
+                             f"{', '.join(weights_that_come_along())}")
         preset = PRESETS[self.preset or DEFAULT_PRESET] if self.terms is None else {}
         terms = self.terms if self.terms is not None else tuple(preset)
         named = {short_name(term): term for term in terms}
@@ -60,7 +72,9 @@ class Model(Section):
     @property
     def weights_file(self) -> Path | None:
         """The file of the weights, which `path` names; None without it."""
-        return None if self.path is None else product_file(self.path, "model.h5")
+        if self.path is None or not self.path.startswith(COME_ALONG):
+            return None if self.path is None else product_file(self.path, "model.h5")
+        return WEIGHTS / f"{self.path.removeprefix(COME_ALONG)}.h5"
 
     @property
     def reads(self) -> frozenset[str]:
