@@ -138,6 +138,7 @@ def test_statistics_are_sampled_every_few_steps_at_the_release_and_at_the_end(co
     assert statistics["time"][row] == reference["released_at"]
     # Each sample has its spectrum, and the stationary state is the last part of the spin-up.
     assert spectra["energy"].sum(axis=1) == pytest.approx(statistics["energy"], rel=1e-12)
+    assert spectra["wavenumber"].tolist() == list(range(spectra["energy"].shape[1]))
     assert sum(statistics[f"energy_{axis}"] for axis in "xyz") == pytest.approx(statistics["energy"], rel=1e-12)
     turned = np.interp([stationary["start"], stationary["end"]], statistics["time"], statistics["turnovers"])
     assert stationary["end"] == reference["released_at"]

@@ -19,7 +19,7 @@ from mpi4py import MPI
 
 from eddies.io.errors import ProductError, WriteError, write_error
 from eddies.io.provenance import FORMAT, environment, has_this_format, identity, read_json, read_provenance
-from eddies.io.quantities import describe
+from eddies.io.quantities import conventions, describe
 from eddies.io.run_lock import RunTakenOver
 from eddies.io.unfinished import HEADER_BYTES, Unfinished, frame_bytes, writing
 from eddies.parallel.broadcast import on_first_rank, share_text
@@ -71,7 +71,8 @@ def create_product(comm: MPI.Comm, path: str | Path, kind: str,
     try:
         with writing(unfinished.file, len(origin) + HEADER_BYTES):
             write_attributes(unfinished.file,
-                             {"kind": kind, "format": FORMAT, "complete": False, "provenance": origin})
+                             {"kind": kind, "format": FORMAT, "complete": False, "provenance": origin,
+                              **conventions(kind)})
         yield unfinished.file
         with writing(unfinished.file, HEADER_BYTES):
             unfinished.file.attrs["complete"] = True

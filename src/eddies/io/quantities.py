@@ -12,6 +12,18 @@ from typing import NamedTuple
 import h5py
 
 BEGINNING = {"ground_truth": "since the release of the tracers", "rollout": "since the start of the rollout"}
+# What holds for a whole product, by kind: attributes of the file.
+CONVENTIONS = {
+    "units": "L: edge of the cube over 2 pi; T: follows from lengths and velocities; M: so that the mean density is "
+             "1 M/L^3",
+    "box": "cube with edges 2 pi L, periodic along x, y and z; 0 <= x, y, z < 2 pi; positions are wrapped into it",
+}
+ORIGINS = {
+    "ground_truth": "of particles, filtered and unfiltered fields and `spectra`: the release of the tracers, at "
+                    "released_at (attribute of reference) of the simulation; of `statistics`, `stationary` and "
+                    "fields/final: the start of the simulation",
+    "rollout": "the start of the rollout, at start_time (attribute of rollout) after the release of the tracers",
+}
 
 
 class Quantity(NamedTuple):
@@ -23,6 +35,7 @@ class Quantity(NamedTuple):
 
 
 PARTICLES, FIELD, ROW = "time particle", "time component z y x", "row"
+POINTS = "at the points i edge / cells of the periodic cube, i = 0, 1, ..."
 # By path in the file, the first that fits.
 QUANTITIES = {
     "particles/*/id": Quantity("1", "particle", "of the particle in each row of every frame"),
@@ -33,8 +46,8 @@ QUANTITIES = {
     "particles/*/acceleration/value": Quantity("L/T^2", f"{PARTICLES} xyz", "of the particles"),
     "particles/*/density/value": Quantity("M/L^3", PARTICLES, "at the particles"),
     "particles/*/velocity_gradient/value": Quantity("1/T", f"{PARTICLES} i j", "dv_i/dx_j through the kernel"),
-    "fields/*/velocity": Quantity("L/T", FIELD, "components x, y, z at the points i L / cells"),
-    "fields/*/density": Quantity("M/L^3", FIELD, "at the points i L / cells"),
+    "fields/*/velocity": Quantity("L/T", FIELD, f"components x, y, z {POINTS}"),
+    "fields/*/density": Quantity("M/L^3", FIELD, POINTS),
     "spectra*/wavenumber": Quantity("1/L", "wavenumber", "shell of the modes with this |k|, rounded"),
     "spectra_of_statistics/energy": Quantity("L^2/T^2", "row wavenumber", "energy of each shell k = 0, 1, ..."),
     "spectra/energy": Quantity("L^2/T^2", "time wavenumber", "energy of each shell of the flow"),
@@ -84,6 +97,12 @@ QUANTITIES = {
     "*feature_range/*": Quantity("1", "input", "{name} of each input of the network in training"),
     "weights/*": Quantity("1", "", "trained parameters"),
 }
+
+
+def conventions(kind: str) -> dict[str, str]:
+    """Attributes of a product that say what its numbers are in, where t = 0 is, and in which box; none of a product
+    without a flow."""
+    return {**CONVENTIONS, "time_origin": ORIGINS[kind]} if kind in ORIGINS else {}
 
 
 def describe(dataset: h5py.Dataset) -> None:

@@ -56,7 +56,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                 **scales_of(flow.history.sample(flow.state, flow.clock)), "viscosity": flow.fluid.viscosity,
                 "energy_budget_error": flow.history.budget_error})
         write_table(file, "statistics", flow.history.columns())
-        write_table(file, "spectra_of_statistics", {"energy": np.array(flow.history.spectra)})
+        energy = np.array(flow.history.spectra)
+        write_table(file, "spectra_of_statistics", {"wavenumber": np.arange(energy.shape[1]), "energy": energy})
         if scene.spin_up is not None and scene.spin_up.stationary is not None:
             write_attributes(file.create_group("stationary"), stationary_span(scene.spin_up, flow.history))
     guard.checkpoints.remove()

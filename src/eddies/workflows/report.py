@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import time
 import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -75,7 +76,7 @@ def run(directory: str | Path, comm: Comm) -> None:
 
     Raises ProductError if the directory holds no product, or a damaged one, or the report cannot be written.
     """
-    directory = Path(directory)
+    directory, began = Path(directory), time.perf_counter()
     check_places(("report",), comm, directory)
     alone = comm.Split(comm.rank)
     try:
@@ -84,7 +85,9 @@ def run(directory: str | Path, comm: Comm) -> None:
                                                   lambda: _read_share(directory, comm, alone, record)), ProductError)
     finally:
         alone.Free()
+    read = time.perf_counter()
     draw(comm, own)
+    log.debug("report: read and measured in %.1f s, drawn in %.1f s", read - began, time.perf_counter() - read)
     gathered = comm.gather(own) or []
     sections = [section for own in gathered for section in own] + [_cost_section(record)]
     in_files(comm, directory / "report", lambda: _write_report(directory, record, sections))
