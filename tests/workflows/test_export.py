@@ -84,6 +84,14 @@ def test_particles_as_data_sets(comm, tmp_path, caplog):
 
 
 @pytest.mark.mpi(1)
+def test_a_run_without_tracers_makes_no_data_set(comm, tmp_path):
+    write_ground_truth(comm, tmp_path, tracers=False, cells=8)
+    with pytest.raises(ProductError, match=r"holds no particles that make a data set.* a scene that has \[tracers\]"):
+        export.run(tmp_path, tmp_path / "sets", comm, "lagrangebench")
+    assert not (tmp_path / "sets").exists()
+
+
+@pytest.mark.mpi(1)
 def test_a_series_without_frames_is_left_out(comm, tmp_path):
     """As the filtered fields of a rollout whose times fall between those of the ground truth's fields."""
     with create_product(comm, tmp_path / "rollout.h5", "rollout", {}) as file:

@@ -39,6 +39,10 @@ class FieldSeries:
     def __init__(self, file: h5py.File, name: str) -> None:
         self._group = find_group(file, f"fields/{name}")
 
+    def __len__(self) -> int:
+        """Number of stored fields."""
+        return len(self.times)
+
     @cached_property
     def times(self) -> np.ndarray:
         """Time of each field, (frames,)."""

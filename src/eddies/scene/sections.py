@@ -48,10 +48,10 @@ class Initial(Section):
                               default=1.0, above=0)
     peak_wavenumber: float = number("wavenumber of the spectrum's peak, random only", default=3.0, above=0)
     wavenumber: int = integer("waves in the cube; abc, shear-wave, sound-wave only", default=1, at_least=1)
-    path: str | None = text("the ground_truth.h5 to start from, kind file only; its grid may be another",
-                            default=None)
-    state: int = integer("which of the states of the whole flow that the file holds: fields/final, or with tracers "
-                         "fields/unfiltered", default=0, at_least=0)
+    path: str | None = text("the ground_truth.h5, JHTDB cutout or fluidsim state to start from, kind file only; its "
+                            "grid may be another", default=None)
+    state: int = integer("which of the states of the whole flow that the file holds, in time: fields/final, with "
+                         "tracers fields/unfiltered, of a cutout Velocity_####", default=0, at_least=0)
 
 
 @dataclass(frozen=True, kw_only=True)

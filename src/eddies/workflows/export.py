@@ -39,7 +39,7 @@ def run(run_directory: Path, output: Path, comm: Comm, layout: str = "vtkhdf") -
 
 
 def _export(run_directory: Path, output: Path, alone: Comm, layout: str) -> None:
-    written, (export, what) = 0, LAYOUTS[layout]
+    written, (export, what, maker) = 0, LAYOUTS[layout]
     for kind in PRODUCTS:
         path = run_directory / f"{kind}.h5"
         if path.exists():
@@ -47,7 +47,7 @@ def _export(run_directory: Path, output: Path, alone: Comm, layout: str) -> None
                 written += export(file, kind, output)
     if not written:
         raise ProductError(f"{run_directory}: holds no {what}, which would be in "
-                           f"{' and '.join(f'{kind}.h5' for kind in PRODUCTS)}; run `eddies dns SCENE` first")
+                           f"{' and '.join(f'{kind}.h5' for kind in PRODUCTS)}; run {maker} first")
 
 
 def _write_vtkhdf(file: File, kind: str, output: Path) -> int:
@@ -83,6 +83,7 @@ def _write_datasets(file: File, kind: str, output: Path) -> int:
     return written
 
 
-# What writes a product in a layout, and what of it.
-LAYOUTS = {"vtkhdf": (_write_vtkhdf, "fields or particles"),
-           "lagrangebench": (_write_datasets, "particles that make a data set")}
+# What writes a product in a layout, what of it, and where that comes from.
+LAYOUTS = {"vtkhdf": (_write_vtkhdf, "fields or particles", "`eddies dns SCENE`"),
+           "lagrangebench": (_write_datasets, "particles that make a data set",
+                             "`eddies dns SCENE` with a scene that has [tracers]")}

@@ -8,7 +8,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from eddies.errors import UserError
-from eddies.io.hdf5 import open_product
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm
 from eddies.parallel.node import node_ranks
@@ -32,8 +31,8 @@ def start_file(scene: Scene, comm: Comm) -> Iterator[str]:
     if scene.initial.kind != "file":
         return
     try:
-        with open_product(comm, scene.initial.path, "ground_truth") as file:
-            stored_states(scene.initial, file)
+        with stored_states(scene.initial, comm):
+            pass
     except UserError as error:
         yield str(error)
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 
@@ -12,8 +14,9 @@ from eddies.flow.initial_fields import INITIAL_FLOWS, balanced_density, sound_wa
 from eddies.flow.navier_stokes import FLUIDS, Fluid
 from eddies.flow.operators import project
 from eddies.import_path import is_path, load
+from eddies.io.errors import ProductError
 from eddies.io.fields import FieldSeries
-from eddies.io.hdf5 import File, ProductError, open_product
+from eddies.io.flow_states import VelocityCubes, open_states
 from eddies.parallel.broadcast import on_all_ranks
 from eddies.parallel.communicator import Comm
 from eddies.parallel.slab import SlabDecomposition
@@ -68,34 +71,33 @@ def _own_velocity(scene: Scene, grid: SpectralGrid) -> np.ndarray:
     return project(grid, velocity.astype(grid.complex))
 
 
-def stored_states(initial: Initial, file: File) -> FieldSeries:
-    """The whole flow as a ground truth holds it: at its end, or, where it followed tracers, at a few times with them.
+@contextmanager
+def stored_states(initial: Initial, comm: Comm) -> Iterator[FieldSeries | VelocityCubes]:
+    """The states of the whole flow in the file that a scene starts from; all ranks call it.
 
     Raises SceneError where there is no state of the number that the scene names, ProductError where there is none.
     """
-    fields = FieldSeries(file, "final" if "fields/final" in file else "unfiltered")
-    if initial.state >= len(fields.times):
-        raise SceneError(f"[initial] state = {initial.state}: {initial.path} holds {len(fields.times)} states of the "
-                         f"whole flow, number 0 to {len(fields.times) - 1}; name one of them")
-    return fields
+    with open_states(comm, initial.path) as states:
+        if initial.state >= len(states):
+            raise SceneError(f"[initial] state = {initial.state}: {initial.path} holds {len(states)} states of the "
+                             f"whole flow, number 0 to {len(states) - 1}; name one of them")
+        yield states
 
 
 def _state_from_file(scene: Scene, fluid: Fluid) -> np.ndarray:
     grid, initial = fluid.grid, scene.initial
     comm, length = grid.decomposition.comm, grid.decomposition.length
-    with open_product(comm, initial.path, "ground_truth") as file:
-        fields = stored_states(initial, file)
+    with stored_states(initial, comm) as fields:
         whole = SpectralGrid(SlabDecomposition(comm, length, fields.cells), grid.precision, (fields.cells - 1) // 2)
         planes = (whole.decomposition.start, whole.decomposition.stop)
         names = fields.variables if fluid.compressible else ("velocity",)
         stored = on_all_ranks(comm, lambda: {name: fields.read(initial.state, name, *planes) for name in names},
                               ProductError)
-    state = regrid(whole, grid, whole.forward(stored["velocity"]))
-    if fluid.compressible:
-        if "density" in stored:
-            s = regrid(whole, grid, whole.forward(np.log(stored["density"])))
-        else:
-            s = balanced_density(grid, state, fluid.sound_speed)[None]
-        return np.concatenate([state, s])
-    # A velocity of a compressible flow, or in single precision, is not solenoidal.
-    return project(grid, state)
+    velocity = regrid(whole, grid, whole.forward(stored["velocity"]))
+    if "density" in stored:
+        return np.concatenate([velocity, regrid(whole, grid, whole.forward(np.log(stored["density"])))])
+    # A velocity of a compressible flow, in single precision, or of every second point alone, is not solenoidal.
+    velocity = project(grid, velocity)
+    if not fluid.compressible:
+        return velocity
+    return np.concatenate([velocity, balanced_density(grid, velocity, fluid.sound_speed)[None]])
