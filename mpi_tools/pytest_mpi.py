@@ -8,10 +8,8 @@ The pytest process that the user starts (outer) never initialises MPI: Open MPI 
 a process that has. It starts one `mpirun -n RANKS python -m pytest MODULES` (inner) for all selected tests with
 the same number of ranks, as starting ranks takes longer than most tests, and reports each of them from the JSON
 lines that every rank writes. Where the ranks disagree about a test, or it lasts longer than its time limit, that
-mpirun ends and a new one runs the tests after it. So tests run in the order of their ranks. For those on one rank
-there are several mpirun, which share the modules among them: each takes the next one that none has. These run beside
-the tests that need none; where they end first, the next number of ranks follows. `tmp_path` is
-one folder for all ranks of a test; `tmp_path_factory` is not shared.
+mpirun ends and a new one runs the tests after it. So tests run in the order of their ranks. Those on one rank
+are shared among several mpirun: each takes the next module that none has. `tmp_path` is one folder for all ranks of a test.
 """
 
 import json
@@ -92,8 +90,7 @@ class OuterRun:
 
     def __init__(self, config):
         self.config = config
-        self.runs, self.reported = [], None
-        self.ahead = False  # whether ranks start before their first test is to be reported
+        self.runs, self.reported, self.ahead = [], None, False  # ahead: ranks start before they are reported
         self.waiting = {}  # ranks -> items still to be reported, in order
 
     @pytest.hookimpl(trylast=True)
@@ -110,18 +107,16 @@ class OuterRun:
         """The tests on one rank run beside each other and beside those that need none: all cores are busy."""
         group, cores, shown = self.waiting.get(1), local_cores(), session.config.option.capture == "no"
         if group and cores > 1 and not shown and not session.config.option.collectonly:
-            # A rank that waits for another leaves its core to them.
-            os.environ.setdefault("OMPI_MCA_mpi_yield_when_idle", "1")
+            os.environ.setdefault("OMPI_MCA_mpi_yield_when_idle", "1")  # a rank that waits leaves its core to them
             self.start(group, min(cores, BESIDE, len({item.path for item in group})))
             self.ahead = True
 
     def pytest_runtest_logfinish(self):
         """The next tests start when the ranks before them have ended, not only once all of those are reported."""
         if self.ahead and self.runs and all(run.process.poll() is not None for run in self.runs):
-            begun = {run.ranks for run in self.runs}
-            later = [ranks for ranks in sorted(self.waiting) if ranks > max(begun)]
-            if later:
-                self.start(self.waiting[later[0]])
+            later = [ranks for ranks in sorted(self.waiting) if ranks > max(run.ranks for run in self.runs)]
+            for ranks in later[:1]:
+                self.start(self.waiting[ranks])
 
     def start(self, items, count=1):
         """So many mpirun that share these tests."""
@@ -146,9 +141,8 @@ class OuterRun:
 
     def close(self, most=None):
         """Ends the runs, or those of so many ranks at most."""
-        ended = [run for run in self.runs if most is None or run.ranks <= most]
-        self.runs = [run for run in self.runs if run not in ended]
-        for run in reversed(ended):
+        for run in [run for run in reversed(self.runs) if most is None or run.ranks <= most]:
+            self.runs.remove(run)
             run.close(self.reported)
 
     def pytest_sessionfinish(self):
