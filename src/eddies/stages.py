@@ -16,6 +16,7 @@ from eddies.clock import duration
 from eddies.io.checkpoint import CheckpointDirectory
 from eddies.io.hdf5 import in_files, open_product
 from eddies.io.run_lock import lock_directory, refuse_if_held
+from eddies.io.single_writer import LARGEST_BYTES, has_single_writer
 from eddies.io.whole_files import write_files
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm
@@ -24,6 +25,8 @@ from eddies.pipeline import STAGES, Stage
 from eddies.scene.scene import Scene, SceneError
 from eddies.workflows.feasibility import check_feasible, check_ground_truth, check_places
 from eddies.workflows.foreseen.estimates import ground_truth_alone, most_ranks
+from eddies.workflows.foreseen.refusals import single_writer
+from eddies.workflows.foreseen.stage_cost import in_units
 from eddies.workflows.foreseen.warnings import stage_warnings
 from eddies.workflows.learned.source import read_source
 from eddies.workflows.run_directory.work import SECONDS, Work, find_work, is_done, stage_seconds
@@ -42,8 +45,8 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
     Raises:
         Stopped: `stop` found a reason to; the running stage has kept what the next run needs.
         SceneError: a file STOP asks the job to end before it begins, the scene lacks a section that a stage is about,
-            cannot be cut into as many slabs as there are ranks, or differs from that of a product the stages start
-            from.
+            cannot be cut into as many slabs as there are ranks, makes a file too large for rank 0 to write for all, or
+            differs from that of a product the stages start from.
         RunInUse, RunTakenOver: another job works in the directory, or has taken it over.
         WorkAtStake: work of other settings would be replaced.
         WriteError: the directory cannot be written.
@@ -51,6 +54,8 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
     """
     check_feasible(stages, scene, comm, directory)
     check_ranks(stages, scene, comm)
+    for problem in single_writer(stages, scene, comm):
+        raise SceneError(f"{scene.name}: {problem}")
     check_places(stages, comm, directory)
     if take_over:
         look_at_work(stages, scene, comm, directory, overwrite)  # a command that is refused ends no other job
@@ -91,7 +96,9 @@ def working_in(comm: Comm, directory: Path, stop: StopRequest, take_over: bool) 
 
 
 def tell(stages: Sequence[str], scene: Scene, comm: Comm) -> None:
-    """Log what is foreign to the package in a scene, and what its stages give reason to doubt."""
+    """Log what is foreign to the package in a scene, who writes, and what its stages give reason to doubt."""
+    if has_single_writer(comm):
+        log.info("rank 0 writes for all, up to %s a file: this h5py is built without MPI", in_units(LARGEST_BYTES))
     if scene.foreign:
         log.info("%s: uses classes that are not of this package: %s", scene.name, ", ".join(scene.foreign))
     if comm.rank == 0:

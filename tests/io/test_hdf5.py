@@ -143,15 +143,6 @@ def test_unknown_table_lists_the_others(comm, tmp_path):
             read_table(file, "spectra")
 
 
-@pytest.mark.mpi(2)
-def test_serial_hdf5_is_explained(comm, tmp_path, monkeypatch):
-    serial = type("Configuration", (), {"mpi": False})
-    monkeypatch.setattr(h5py, "get_config", lambda: serial)
-    with pytest.raises(ProductError, match="built without MPI.*HDF5_MPI=ON"):
-        with create_product(comm, tmp_path / "a.h5", "kernel", {}):
-            pass
-
-
 @pytest.mark.mpi(1)
 @pytest.mark.parametrize("shape, dtype", [((), float), ((5,), float), ((262144, 3), np.float32),
                                           ((3, 96, 96, 96), np.float32)])

@@ -1,7 +1,8 @@
 """Products: HDF5 files that are complete or absent, say what they are, and are written by all ranks together.
 
 A product is written under a temporary name, marked complete, closed, and only then renamed: never half written. Writing
-uses parallel HDF5 on several ranks, in room taken before (io/unfinished.py); every rank reads by itself.
+uses parallel HDF5 on several ranks, or rank 0 where there is none (io/single_writer.py), in room taken before
+(io/unfinished.py); every rank reads by itself.
 """
 
 import errno
@@ -21,7 +22,7 @@ from eddies.io.errors import ProductError, WriteError, write_error
 from eddies.io.provenance import FORMAT, environment, has_this_format, identity, read_json, read_provenance
 from eddies.io.quantities import conventions, describe
 from eddies.io.run_lock import RunTakenOver
-from eddies.io.unfinished import HEADER_BYTES, Unfinished, frame_bytes, writing
+from eddies.io.unfinished import HEADER_BYTES, Unfinished, frame_bytes, writing, written_here
 from eddies.parallel.broadcast import on_first_rank, share_text
 from eddies.parallel.stop import Stopped
 from eddies.pipeline import MAKER_OF
@@ -58,13 +59,8 @@ def create_product(comm: MPI.Comm, path: str | Path, kind: str,
 
     Raises:
         WriteError: the file cannot be made or get its name, or there is no room for it.
-        ProductError: there are several ranks and HDF5 is not parallel.
     """
     path = Path(path)
-    if comm.size > 1 and not h5py.get_config().mpi:
-        raise ProductError(
-            f"{path}: this h5py is built without MPI, so {comm.size} ranks cannot write one file; run on "
-            "one, or build it: `CC=mpicc HDF5_MPI=ON pip install --no-binary=h5py --no-build-isolation h5py`")
     unfinished = Unfinished(comm, path.with_name(path.name + ".partial"))
     origin = share_text(comm, "" if comm.rank else json.dumps({
         **environment(comm.size), **provenance, **identity(path.parent, provenance.get("made_from", ()))}))
@@ -182,7 +178,8 @@ def append_frame(dataset: h5py.Dataset, block: np.ndarray, offset: tuple[int, ..
     Collective: every rank calls it, also with an empty block.
     """
     frame = dataset.shape[0]
-    block, transfer = np.asarray(block, dataset.dtype, order="C")[None], _collective(dataset.file)
+    block, offset = written_here(dataset, np.asarray(block, dataset.dtype, order="C"), offset)
+    block, transfer = block[None], _collective(dataset.file)
     with writing(dataset, frame_bytes(dataset)):
         dataset.resize(frame + 1, axis=0)
         in_file, in_memory = dataset.id.get_space(), h5py.h5s.create_simple(block.shape)

@@ -10,11 +10,13 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import h5py
+import numpy as np
 from mpi4py import MPI
 
 from eddies.io.errors import NoRoom, ProductError, WriteError, wanted_and_free, write_error
 from eddies.io.room import MARGIN_BYTES, check_limit, reserve
 from eddies.io.run_lock import RunTakenOver
+from eddies.io.single_writer import gather_frame, has_single_writer
 from eddies.io.sink import Sink
 from eddies.parallel.broadcast import first_complaint
 
@@ -34,19 +36,23 @@ class Unfinished:
     HDF5 does not survive a write that fails: it crashes when it closes the file or, with several ranks, those that
     could write wait for the one that could not. So every write is announced, and blocks of the disk are taken for it
     beforehand; a margin stays taken for what HDF5 writes when it closes the file, and is cut off then. Where blocks
-    cannot be taken and the disk fills meanwhile, one rank still writes into a `Sink`; of several the one that meets it
-    raises ProductError, upon which the job has to be aborted.
+    cannot be taken and the disk fills meanwhile, one rank still writes into a `Sink`; of several that write together
+    the one that meets it raises ProductError, upon which the job has to be aborted.
+
+    Where rank 0 writes for all, the others have a file in memory with the same groups, attributes and shapes, so that
+    nobody else needs to know of it; of frames it holds nothing.
     """
 
     def __init__(self, comm: MPI.Comm, path: Path) -> None:
         self.comm, self.path, self.broken = comm, path, False
         self._needed, self._held = 0, 0
         self._sink: Sink | None = None
-        if comm.size == 1:
-            self._alike(self._open_sink)
-        else:
+        self._together = comm.size > 1 and not has_single_writer(comm)
+        if self._together:
             self._alike(self._make)
             self._alike(self._open_together)
+        else:
+            self._alike(self._open_sink if comm.rank == 0 else self._open_in_memory)
         self._inode = path.stat().st_ino if comm.rank == 0 else 0
         self._name = self.file.filename
         _open[self._name] = self
@@ -62,9 +68,17 @@ class Unfinished:
             self._held = stop
 
     def check(self) -> None:
-        """Raise WriteError where something could not be written in spite of the room taken; by one rank alone."""
-        if self._sink is not None and self._sink.failure is not None:
-            raise self._error(self._sink.failure)
+        """Raise WriteError where rank 0, which writes alone, could not do so in spite of the room taken."""
+        if not self._together:
+            self._alike(lambda: self._sink and self._sink.check())
+
+    def written_here(self, shape: tuple[int, ...], block: np.ndarray,
+                     offset: tuple[int, ...]) -> tuple[np.ndarray, tuple[int, ...]]:
+        """What this rank writes of a frame of this shape, of which it has a block, and where. A single value all ranks
+        have and write."""
+        if self.comm.size == 1 or self._together or not shape:
+            return block, offset
+        return gather_frame(self.comm, shape, block, offset)
 
     def close(self) -> None:
         """Close the file, cutting off the room that it does not need."""
@@ -90,13 +104,20 @@ class Unfinished:
         return self.path.exists() and self.path.stat().st_ino == self._inode
 
     def abandon(self) -> None:
-        """Leave the file open, as other ranks may not know that it is not written any more."""
-        _open.pop(self._name, None)
-        _abandoned.append(self)
+        """Leave the file where it is, as other ranks may not know that it is not written any more; and open, if
+        closing it needs them all."""
+        if self._together:
+            _open.pop(self._name, None)
+            _abandoned.append(self)
+        else:
+            self.close()
 
     def _open_sink(self) -> None:
         self._sink = Sink(self.path)
         self.file = h5py.File(self._sink, "w")
+
+    def _open_in_memory(self) -> None:
+        self.file = h5py.File(self.path, "w", driver="core", backing_store=False)
 
     def _make(self) -> None:
         """Make a file without content, as HDF5 would empty one that it makes anew, and give back its room."""
@@ -164,6 +185,12 @@ def writing(group: h5py.Group | h5py.Dataset, size: int) -> Iterator[None]:
         raise ProductError(f"{unfinished.path}: cannot be written: {error}: {lack}; make room, or check the disk, then "
                            "run the command again") from None
     unfinished.check()
+
+
+def written_here(dataset: h5py.Dataset, block: np.ndarray,
+                 offset: tuple[int, ...]) -> tuple[np.ndarray, tuple[int, ...]]:
+    """What this rank writes of the next frame of a dataset, of which it has a block at an offset; collective."""
+    return _open[dataset.file.filename].written_here(dataset.shape[1:], block, offset)
 
 
 def frame_bytes(dataset: h5py.Dataset) -> int:

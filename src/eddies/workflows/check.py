@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from eddies.clock import duration
+from eddies.io.single_writer import LARGEST_BYTES, has_single_writer
 from eddies.kernels.library import threads
 from eddies.parallel.communicator import Comm
 from eddies.scene.scene import BOX_LENGTH, Scene
@@ -43,7 +44,7 @@ def run(scene: Scene, comm: Comm, as_json: bool = False) -> None:
         return
     subjects = {"grid": grid_lines(scene), "turbulence": turbulence_lines(scene),
                 "particles": particle_lines(scene), "time step": step_lines(scene), "rollout": course_lines(scene),
-                "ranks": rank_lines(scene), "stages": stage_lines(scene, comm.size, speeds, stages),
+                "ranks": rank_lines(scene, comm), "stages": stage_lines(scene, comm.size, speeds, stages),
                 "fails here": refused, "more ranks": cost_lines(scene, speeds.flow), "": rollout_lines(scene, rollout)}
     log.info("%s: %s", scene.name, scene.title)
     for title, lines in subjects.items():
@@ -120,14 +121,16 @@ def step_lines(scene: Scene) -> Iterator[str]:
         yield f"with tracers at most that, and a whole fraction of the frame interval {interval:g}"
 
 
-def rank_lines(scene: Scene) -> Iterator[str]:
-    """How many ranks can be used, and why no more."""
+def rank_lines(scene: Scene, comm: Comm) -> Iterator[str]:
+    """How many ranks can be used, and why no more; and who writes, if not all."""
     limits, alone = most_ranks(scene), most_ranks(ground_truth_alone(scene))
     yield f"at most {min(limits.values())}"
     for reason, ranks in limits.items():
         yield f"    {ranks}: {reason}"
     if min(alone.values()) > min(limits.values()):
         yield f"the direct simulation alone (`eddies dns`) at most {min(alone.values())}: {min(alone, key=alone.get)}"
+    if has_single_writer(comm):
+        yield f"rank 0 writes for all, up to {in_units(LARGEST_BYTES)} a file: this h5py is built without MPI"
 
 
 def course_lines(scene: Scene) -> Iterator[str]:

@@ -8,12 +8,15 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from eddies.errors import UserError
+from eddies.io.single_writer import LARGEST_BYTES, REMEDY, has_single_writer
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm
 from eddies.parallel.node import node_ranks
+from eddies.pipeline import STAGES
 from eddies.scene.scene import Scene
 from eddies.workflows.foreseen.stage_cost import StageCost, in_units
 from eddies.workflows.foreseen.stage_costs import totals
+from eddies.workflows.foreseen.stored import product_bytes
 from eddies.workflows.ground_truth.scene_flow import stored_states
 
 # |k| of the initial flows of a few waves, over their wavenumber; sound has no solenoidal velocity to force.
@@ -23,7 +26,7 @@ WAVES = {"taylor-green": 3**0.5, "abc": 1.0, "shear-wave": 1.0, "sound-wave": fl
 def refusals(scene: Scene, comm: Comm, costs: Sequence[StageCost]) -> list[str]:
     """A line for each; all ranks call it and get the same."""
     found = [*start_file(scene, comm), *forced_modes(scene), *weights(scene, comm), *truths(scene, comm)]
-    return found + [*memory(comm, costs), *disk(comm, costs)]
+    return found + [*single_writer(scene.stages, scene, comm), *memory(comm, costs), *disk(comm, costs)]
 
 
 def start_file(scene: Scene, comm: Comm) -> Iterator[str]:
@@ -66,6 +69,16 @@ def truths(scene: Scene, comm: Comm) -> list[str]:
         return []
     from eddies.workflows.learned.truths import truth_problems  # torch, where there is a model
     return truth_problems(scene, comm, scene.directory)
+
+
+def single_writer(stages: Sequence[str], scene: Scene, comm: Comm) -> Iterator[str]:
+    """Products that are too large for rank 0 to write for all."""
+    if not has_single_writer(comm):
+        return
+    for stage, size in product_bytes(scene).items():
+        if stage in stages and size > LARGEST_BYTES:
+            yield (f"{STAGES[stage].file}: this h5py is built without MPI, so that rank 0 writes for all {comm.size}, "
+                   f"up to {in_units(LARGEST_BYTES)} a file, and this will have about {in_units(size)}; {REMEDY}")
 
 
 def memory(comm: Comm, costs: Sequence[StageCost]) -> Iterator[str]:

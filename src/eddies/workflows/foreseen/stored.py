@@ -9,7 +9,7 @@ from eddies.io.hdf5 import stored_bytes
 from eddies.scene.scene import Scene
 from eddies.workflows.foreseen.cost_model import real_bytes
 from eddies.workflows.foreseen.estimates import flow_steps, largest_wavenumber, tracer_intervals
-from eddies.workflows.foreseen.rollout_course import RolloutCourse
+from eddies.workflows.foreseen.rollout_course import RolloutCourse, rollout_course
 from eddies.workflows.ground_truth.frame_counts import whole_cells, whole_frames
 
 CHECKPOINTS = KEPT + 1       # with the one that is being written
@@ -18,6 +18,13 @@ SAMPLE_EVERY, SAMPLE_COLUMNS = 4, 25
 SAMPLES = 20_000             # particles of which a model's rates are kept, 48 bytes each
 PRODUCT_BYTES = 45_000       # of a product beside what grows: the scene, headers, words on datasets, small tables
 FIGURE_BYTES = 0.6e6         # of a figure of a report, in its page too
+
+
+def product_bytes(scene: Scene) -> dict[str, int]:
+    """Of the products that grow with a run, by stage, as far as they are foreseen."""
+    course = rollout_course(scene) if scene.simulation else None
+    found = {"dns": ground_truth_bytes(scene), "simulate": rollout_bytes(scene, course) if course else None}
+    return {stage: size for stage, size in found.items() if size is not None}
 
 
 def ground_truth_bytes(scene: Scene) -> int | None:

@@ -1,0 +1,30 @@
+#!/usr/bin/env bash
+# Builds the sdist, and from it the wheel; installs that in an environment of its own, and runs a scene there, shortened,
+# away from the checkout.
+# The environment has nothing of its own but the wheel, with --no-deps: a .pth file shows it the packages of .venv, so
+# that torch is not fetched and unpacked once more. The eddies of .venv stays out of sight, as that is itself a .pth
+# file, which Python reads in an environment's own folder alone.
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+shared=$PWD/.venv
+unset PYTHONPATH
+work=$(mktemp -d)
+trap 'rm -rf "$work"' EXIT
+
+"$shared/bin/python" -m build --no-isolation --outdir "$work" . > "$work/log" 2>&1 || { cat "$work/log" >&2; exit 1; }
+"$shared/bin/python" -m venv "$work/clean"
+packages='import sysconfig; print(sysconfig.get_path("purelib"))'
+"$shared/bin/python" -c "$packages" > "$("$work/clean/bin/python" -c "$packages")/shared.pth"
+"$work/clean/bin/python" -m pip install -qq --disable-pip-version-check --no-deps --no-index "$work"/eddies-*.whl
+
+cd "$work"
+export OMP_NUM_THREADS=${OMP_NUM_THREADS:-1}
+found=$(clean/bin/python -c 'import eddies; print(eddies.__file__)')
+case $found in "$work"/clean/*) ;; *) echo "package_test: $found is not of the wheel" >&2; exit 1 ;; esac
+kernels='from eddies.kernels.library import in_use; print(in_use())'
+[ "$(clean/bin/python -c "$kernels")" = "$("$shared/bin/python" -c "$kernels")" ] ||
+    { echo "package_test: the wheel lacks compiled kernels" >&2; exit 1; }
+clean/bin/eddies --version
+clean/bin/eddies run tiny --set kernel.steps=20 --set training.steps=20 > log || { cat log >&2; exit 1; }
+[ -e runs/tiny/report/index.html ]
+echo "package_test: sdist and wheel build, install and run"
