@@ -9,7 +9,7 @@ a process that has. It starts one `mpirun -n RANKS python -m pytest MODULES` (in
 the same number of ranks, as starting ranks takes longer than most tests, and reports each of them from the JSON
 lines that every rank writes. Where the ranks disagree about a test, or it lasts longer than its time limit, that
 mpirun ends and a new one runs the tests after it. So tests run in the order of their ranks. Those on one rank
-are shared among several mpirun: each takes the next module that none has. `tmp_path` is one folder for all ranks of a test.
+are shared among several mpirun: each takes the next module that none has. `tmp_path` is one folder for all.
 """
 
 import json
