@@ -89,7 +89,8 @@ def product(comm, directory):
     with h5py.File(directory / "rollout.h5") as file:
         file.visititems(lambda name, item: found.update({name: item[()]} if isinstance(item, h5py.Dataset) else {}))
         found["frames at steps"] = file["particles/model/step"][()]  # of which there are several links
-        found |= {name: value for name, value in file["rollout"].attrs.items() if "seconds" not in name}
+        found |= {name: value for name, value in file["rollout"].attrs.items()
+                  if "seconds" not in name and name != "storing_share"}
     comm.Barrier()
     return found
 

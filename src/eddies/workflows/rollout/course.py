@@ -43,9 +43,11 @@ class Course:
         return self.clock.steps
 
     def run(self) -> dict[str, float | str]:
-        """Advance to the last frame, or until the state is at fault; returns status, time, steps and, where there are
-        any, their mean length and the seconds of those that were timed, and the share of the wall time, since the start
-        or the last restart, that storing frames took."""
+        """Advance to the last frame, or until the state is at fault.
+
+        Returns status, time, steps and, where there are any, their mean length, the share of the wall time since the
+        start or the last restart that storing frames took, and the seconds of those steps that were timed.
+        """
         complaint: str | None = None
         if not self.frames.times:
             self._store(0.0)
@@ -59,10 +61,10 @@ class Course:
                 self._store(until)
         if complaint is not None and self.comm.rank == 0:
             log.warning("rollout stopped at time %.4g: %s", self.clock.time, complaint)
-        step = {"time_step": self.clock.time / self.steps} if self.steps else {}
+        step = {"time_step": self.clock.time / self.steps,
+                "storing_share": self.progress.storing_share} if self.steps else {}
         return {"status": "complete" if complaint is None else f"stopped: {complaint}", "time": self.frames.times[-1],
-                "steps": self.steps, **step, **quartiles(self.seconds),
-                "storing_share": self.progress.storing_share}
+                "steps": self.steps, **step, **quartiles(self.seconds)}
 
     def state_dict(self) -> dict[str, Any]:
         """All that goes on, for a checkpoint, beside the files of the frames."""
