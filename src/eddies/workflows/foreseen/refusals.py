@@ -77,8 +77,8 @@ def single_writer(stages: Sequence[str], scene: Scene, comm: Comm) -> Iterator[s
         return
     for stage, size in product_bytes(scene).items():
         if stage in stages and size > LARGEST_BYTES:
-            yield (f"{STAGES[stage].file}: this h5py is built without MPI, so that rank 0 writes for all {comm.size}, "
-                   f"up to {in_units(LARGEST_BYTES)} a file, and this will have about {in_units(size)}; {REMEDY}")
+            yield (f"{STAGES[stage].file}: this h5py is built without MPI, so that rank 0 writes for {comm.size} "
+                   f"ranks, up to {in_units(LARGEST_BYTES)} a file, and this will take {in_units(size)}; {REMEDY}")
 
 
 def memory(comm: Comm, costs: Sequence[StageCost]) -> Iterator[str]:
