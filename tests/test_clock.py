@@ -43,14 +43,14 @@ def test_what_an_earlier_job_did_is_no_measure_of_what_is_left(wall, lines):
 
 
 def test_a_step_is_told_without_its_warm_up_and_what_is_stored(wall, lines, caplog):
-    """Steps of 1 s after two of 4 s, and 2 s to store each: of 24 s, the time left included, half is storing."""
-    progress = ProgressLine("stage", lambda: "state", interval=24.0)
-    for step, seconds in enumerate((4, 4, 1, 1, 1, 1), 1):
+    """Two steps of 4 s, two of 1 s, and 2.5 s to store each: of 20 s half is storing."""
+    progress = ProgressLine("stage", lambda: "state", interval=20.0)
+    for step, seconds in enumerate((4, 4, 1, 1), 1):
         with progress.storing():
-            wall[0] += 2
+            wall[0] += 2.5
         wall[0] += seconds
-        progress(step / 12, step)
-    assert lines() == [("1.000", "50", "24 s")]
+        progress(step / 8, step)
+    assert lines() == [("1.000", "50", "20 s")]
     assert "1.000 s/step (storing: 50 % of the time)" in caplog.text and progress.storing_share == 0.5
 
 

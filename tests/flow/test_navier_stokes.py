@@ -104,6 +104,20 @@ def test_energy_budget_closes(comm, forced, tolerance):
     assert 0 < history.rows[-1]["dissipation_rate"]
 
 
+@pytest.mark.mpi(1)
+def test_the_seconds_of_a_step_are_without_what_is_left_out(comm, monkeypatch):
+    """Two steps in 5 s, of which 3 s are for something else."""
+    now, (fluid, state) = [100.0], forced_fluid(comm, cells=8)
+    monkeypatch.setattr("eddies.flow.history.time.perf_counter", lambda: now[0])
+    history, clock = FlowHistory(fluid), Clock()
+    history.sample(state, clock)
+    now[0] += 5
+    history.leave_out(3.0)
+    clock.tick(0.1)
+    clock.tick(0.1)
+    assert history.sample(state, clock)["seconds_per_step"] == 1
+
+
 @pytest.mark.mpi(1, 2)
 def test_forcing_injects_its_rate_and_none_of_it_at_zero_amplitude(comm):
     fluid, state = forced_fluid(comm)
