@@ -270,7 +270,7 @@ def test_a_shell_completes_commands_options_and_names(comm, tmp_path, capfd):
 
     assert completed("eddies", "tra") == ["train-kernel", "train"] and completed("eddies", "run", "ti") == ["tiny"]
     assert "--unset" in completed("eddies", "check", "tiny", "--") and completed("eddies", "compare", "compare-s")
-    assert completed("eddies", "export", "runs/tiny", "--format", "") == ["vtkhdf"]
+    assert completed("eddies", "export", "runs/tiny", "--format", "") == ["vtkhdf", "lagrangebench"]
     assert completed("eddies", "run", "tiny", "--output", "") == []  # names of files, by the shell itself
 
 
