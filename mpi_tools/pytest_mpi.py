@@ -8,8 +8,8 @@ The pytest process that the user starts (outer) never initialises MPI: Open MPI 
 a process that has. It starts one `mpirun -n RANKS python -m pytest MODULES` (inner) for all selected tests with
 the same number of ranks, as starting ranks takes longer than most tests, and reports each of them from the JSON
 lines that every rank writes. Where the ranks disagree about a test, or it lasts longer than its time limit, that
-mpirun ends and a new one runs the tests after it. So tests run in the order of their ranks. Those on one rank
-are shared among several mpirun: each takes the next module that none has. `tmp_path` is one folder for all.
+mpirun ends and a new one runs the tests after it. So tests run in the order of their ranks; those on one rank are
+shared by module among several mpirun. All ranks of a test have the same `tmp_path`, but not `tmp_path_factory`.
 """
 
 import json
