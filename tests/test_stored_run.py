@@ -42,7 +42,8 @@ def test_trajectories_fields_and_spectra(directory, monkeypatch, with_xarray):
     some = run.trajectories(ids, of="truth", unwrapped=True)
     position, whole = (np.asarray(found["position"]) for found in (some, all_of_them))
     assert np.array_equal(some["id"] if isinstance(some, dict) else some["particle"], ids)
-    # Unwrapped, they differ by whole edges, and no particle leaps.
+    # Unwrapped, they start in the cube, differ by whole edges, and no particle leaps.
+    assert np.array_equal(position[0], whole[0, ids])
     turns = (position - whole[:, ids]) / LENGTH
     assert np.abs(turns - np.rint(turns)).max() < 1e-6 and np.abs(np.diff(position, axis=0)).max() < LENGTH / 2
     field, first = run.field(of="model"), run.field(of="model", time=0.0)

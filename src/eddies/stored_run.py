@@ -85,11 +85,11 @@ class StoredRun:
         elif ids is not None:
             found = found.sel(particle=ids)
         if unwrapped:
+            if "image" not in found:
+                raise UserError(f"{self.path}: its particles have no image, as those of eddies 0.2 and before; make "
+                                "them again")
             position = found["position"]
-            edge = 2 * np.pi
-            steps = np.diff(np.asarray(position), axis=0)
-            steps -= edge * np.rint(steps / edge)
-            path = np.concatenate([position[:1], position[:1] + np.cumsum(steps, axis=0)]) if len(steps) else position
+            path = np.asarray(position) + 2 * np.pi * np.asarray(found["image"])
             if isinstance(found, dict):
                 return {**found, "position": path}
             return found.assign(position=(position.dims, path, {**position.attrs, "description": "unwrapped"}))

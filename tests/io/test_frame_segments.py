@@ -22,6 +22,26 @@ def test_a_directory_that_cannot_be_made_is_told_by_all(comm, tmp_path):
 
 
 @pytest.mark.mpi(1, 2, 3)
+def test_images_are_counted_over_all_segments(comm, tmp_path):
+    """A particle that goes on through the box, segment by segment, on whichever rank its row is; another stays."""
+    layout = FrameLayout(2, 2.0, {"model": {"position": (3,)}}, np.float64, {})
+    paths = np.stack([np.outer(np.arange(6), [0.7, -0.9, 0.3]), np.zeros((6, 3))], axis=1) + 1.0
+    start, stop = id_block(comm, 2)
+    with FrameSegments(comm, tmp_path, layout) as segments:
+        for step, frame in enumerate(paths):
+            segments.open(step)
+            segments.trajectories["model"].append(step, step / 4, start, {"position": frame[start:stop] % 2.0})
+            if step % 2:
+                segments.close()
+    with create_product(comm, tmp_path / "all.h5", "rollout", {}) as file:
+        segments.assemble(file)
+    with open_product(comm, tmp_path / "all.h5", "rollout") as file:
+        found = Trajectory(file, "model")
+        for step, frame in enumerate(paths):
+            assert np.allclose(found.read(step, "position") + 2.0 * found.read(step, "image"), frame)
+
+
+@pytest.mark.mpi(1, 2, 3)
 def test_frames_of_all_segments_are_put_together_in_order(comm, tmp_path):
     """Also those of a trajectory, or of fields, of which a segment has none."""
     start, stop = id_block(comm, 5)

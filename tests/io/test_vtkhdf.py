@@ -36,7 +36,7 @@ def product(comm, folder, times=TIMES):
     """An open product with fields and particles at some times."""
     with create_product(comm, folder / "p.h5", "ground_truth", {"scene": "made up"}) as file:
         fields = FieldWriter(file, "filtered", CELLS, {"velocity": 3, "density": 1})
-        particles = TrajectoryWriter(file, "tracers", PARTICLES, LENGTH, COLUMNS, np.float64)
+        particles = TrajectoryWriter(file, "tracers", PARTICLES, LENGTH, COLUMNS, np.float64, images=True)
         for frame, time in enumerate(times):
             fields.append(time, 0, {"velocity": field(frame, 3), "density": field(frame, 1)})
             particles.append(frame, time, 0, {name: column(frame, name) for name in COLUMNS})
@@ -117,7 +117,7 @@ def test_images_lead_paths_beyond_the_cube(comm, tmp_path):
     """Out of the cube and back, through both ends of an axis, and more than once."""
     path = np.array([[0.9, 0.5, 0.1], [1.2, 0.5, -0.2], [1.6, 0.5, -0.6], [2.05, 0.5, -0.1], [1.9, 0.5, 0.2]]) * LENGTH
     with create_product(comm, tmp_path / "p.h5", "rollout", {}) as file:
-        writer = TrajectoryWriter(file, "model", 1, LENGTH, {"position": (3,)}, np.float64)
+        writer = TrajectoryWriter(file, "model", 1, LENGTH, {"position": (3,)}, np.float64, images=True)
         for step, position in enumerate(path):
             writer.append(step, float(step), 0, {"position": position[None] % LENGTH})
     with open_product(comm, tmp_path / "p.h5", "rollout") as file:

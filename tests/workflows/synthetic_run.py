@@ -92,7 +92,7 @@ def write_tracers(file, frames, density, total=600):
     """Frames of tracers until the last of the spectra."""
     shapes = {"position": (3,), "velocity": (3,)} | ({"density": ()} if density else {})
     flow, start = PerturbedFlow(0.0), np.random.default_rng(6).uniform(0, LENGTH, (total, 3))
-    writer = TrajectoryWriter(file, "tracers", total, LENGTH, shapes, np.float64)
+    writer = TrajectoryWriter(file, "tracers", total, LENGTH, shapes, np.float64, images=True)
     for step, time in enumerate(np.linspace(0, 1.2, frames)):
         writer.append(step, time, 0, flow.particles(start, time))
 
@@ -198,7 +198,7 @@ def write_rollout(comm, directory, status="complete", total=600, cells=16, frame
                                       "residual": np.full(len(times), 1e-3), "not_converged": 1.0 * ~late})
         runs = (("truth", times[:-3], PerturbedFlow(0.0)), ("model", times, PerturbedFlow(0.4)))
         for name, own, flow in runs:
-            writer = TrajectoryWriter(file, name, total, LENGTH, shapes, np.float64)
+            writer = TrajectoryWriter(file, name, total, LENGTH, shapes, np.float64, images=True)
             fields = FieldWriter(file, name, cells, {"velocity": 3})
             for step, time in enumerate(own):
                 columns = flow.particles(start, time)

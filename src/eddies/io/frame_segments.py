@@ -44,9 +44,11 @@ class FrameLayout:
     dtype: type[np.floating]
     fields: Mapping[str, FieldLayout]
 
-    def writers(self, file: File) -> tuple[dict[str, TrajectoryWriter], dict[str, FieldWriter]]:
-        """Of the trajectories and of the fields, by name; collective."""
-        return ({name: TrajectoryWriter(file, name, self.total, self.length, columns, self.dtype)
+    def writers(self, file: File, images: bool = False) -> tuple[dict[str, TrajectoryWriter], dict[str, FieldWriter]]:
+        """Of the trajectories and of the fields, by name; collective. `images`: whether those with positions count how
+        often particles have left the box."""
+        return ({name: TrajectoryWriter(file, name, self.total, self.length, columns, self.dtype,
+                                        images and "position" in columns)
                  for name, columns in self.trajectories.items()},
                 {name: FieldWriter(file, name, series.cells, series.variables) for name, series in self.fields.items()})
 
@@ -88,9 +90,9 @@ class FrameSegments:
         return frames[:count]
 
     def assemble(self, file: File) -> None:
-        """Copy the frames of all segments into a product."""
+        """Copy the frames of all segments into a product; images are counted there, over all of them."""
         self.close()
-        trajectories, fields = self.layout.writers(file)
+        trajectories, fields = self.layout.writers(file, images=True)
         slabs = {name: SlabDecomposition(self.comm, self.layout.length, series.cells)
                  for name, series in self.layout.fields.items()}
         start, _ = id_block(self.comm, self.layout.total)

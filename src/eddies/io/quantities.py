@@ -42,6 +42,7 @@ QUANTITIES = {
     "particles/*/step": Quantity("1", "time", "number of the time step"),
     "particles/*/box/edges": Quantity("L", "xyz", "edges of the periodic cube"),
     "particles/*/position/value": Quantity("L", f"{PARTICLES} xyz", "wrapped into the cube, 0 <= x < edge"),
+    "particles/*/image/value": Quantity("1", f"{PARTICLES} xyz", "position + edge * image goes on beyond the cube"),
     "particles/*/velocity/value": Quantity("L/T", f"{PARTICLES} xyz", "of the particles"),
     "particles/*/acceleration/value": Quantity("L/T^2", f"{PARTICLES} xyz", "of the particles"),
     "particles/*/density/value": Quantity("M/L^3", PARTICLES, "at the particles"),

@@ -14,6 +14,9 @@ import eddies
 from eddies.io.hdf5 import append_frame, find_group, growing_dataset, read_frame, write_array, write_attributes
 
 
+IMAGE = "image"
+
+
 class TrajectoryWriter:
     """Adds frames of `total` particles to /particles/NAME. Making one and every `append` are collective.
 
@@ -24,10 +27,13 @@ class TrajectoryWriter:
         length: edge of the periodic cube.
         columns: shape of one particle's value by column, such as {"position": (3,), "density": ()}.
         dtype: of every column in the file.
+        images: count as well, in the column `image` (3,), how often a particle has left the cube along each axis since
+            the first frame: position + edge * image goes on beyond it, as long as a particle moves by less than half an
+            edge between frames. Then every `append` of a rank has the same rows.
     """
 
     def __init__(self, file: h5py.File, name: str, total: int, length: float,
-                 columns: Mapping[str, tuple[int, ...]], dtype: str | np.dtype) -> None:
+                 columns: Mapping[str, tuple[int, ...]], dtype: str | np.dtype, images: bool = False) -> None:
         _write_header(file)
         self._group = file.create_group(f"particles/{name}")
         box = self._group.create_group("box")
@@ -38,11 +44,16 @@ class TrajectoryWriter:
         self._time = growing_dataset(self._group, "time", (), np.float64)
         self._columns = {column: self._element(column, (total, *shape), dtype)
                          for column, shape in columns.items()}
+        self._images = _Images(length) if images else None
+        if images:
+            self._columns[IMAGE] = self._element(IMAGE, (total, 3), np.int16)
 
     def append(self, step: int, time: float, start: int, columns: Mapping[str, np.ndarray]) -> None:
         """Add a frame: this rank holds rows start, start + 1, ... of every column, by id; maybe none."""
         append_frame(self._step, np.array(step), ())
         append_frame(self._time, np.array(time), ())
+        if self._images is not None:
+            columns = {**columns, IMAGE: self._images.after(columns["position"])}
         for column, dataset in self._columns.items():
             append_frame(dataset, columns[column], (start,) + (0,) * (dataset.ndim - 2))
 
@@ -51,6 +62,23 @@ class TrajectoryWriter:
         # Hard links: all elements share their times.
         element["step"], element["time"] = self._step, self._time
         return growing_dataset(element, "value", frame_shape, dtype)
+
+
+class _Images:
+    """How often particles have left a cube along each axis since the first frame."""
+
+    def __init__(self, length: float) -> None:
+        self.length = length
+        self._before: np.ndarray | None = None
+        self._image: np.ndarray | int = 0
+
+    def after(self, position: np.ndarray) -> np.ndarray:
+        """The counts (n, 3) when the same particles are at wrapped positions (n, 3), those of the next frame."""
+        left = np.zeros_like(position) if self._before is None else np.rint((self._before - position) / self.length)
+        # A rollout may end with positions that are not finite.
+        self._image = self._image + np.nan_to_num(left, posinf=0, neginf=0).astype(np.int16)
+        self._before = position
+        return self._image
 
 
 class Trajectory:

@@ -59,9 +59,8 @@ def write_images(path: Path, series: FieldSeries, length: float, provenance: Map
 def write_points(path: Path, trajectory: Trajectory, provenance: Mapping[str, Any]) -> None:
     """Write trajectories as PolyData, a step for each frame, a vertex for each particle; called by one rank.
 
-    Point data are the particle's `id`, all columns but the position, of a 3 x 3 column the 9 components, row by row,
-    and `image`, (3,): Points + length * image go on beyond the cube, as long as a particle moves by less than half an
-    edge between frames.
+    Point data are the particle's `id` and all columns but the position, of a 3 x 3 column the 9 components, row by row;
+    with the column `image` Points + length * image go on beyond the cube.
 
     Args:
         path: of the file; its directory is made if there is none.
@@ -77,33 +76,17 @@ def write_points(path: Path, trajectory: Trajectory, provenance: Mapping[str, An
         sample = trajectory.read(0, column, 0, 0)
         components = (math.prod(sample.shape[1:]),) if sample.ndim > 1 else ()
         layout[name] = (frames * total, *components), sample.dtype
-    layout["PointData/image"] = (frames * total, 3), np.int32
     counted = {"PointData/id": total, "Vertices/Connectivity": total, "Vertices/Offsets": total + 1}
     layout |= {name: ((count,), np.int64) for name, count in counted.items()}
     with _create(path, "PolyData", frames, layout, provenance) as root:
         for name, count in counted.items():
             root[name][:] = np.arange(count)
         _write_cells(root, total)
-        _write_steps(root, trajectory.times, _point_offsets(frames, total, (*names.values(), "PointData/image")))
+        _write_steps(root, trajectory.times, _point_offsets(frames, total, names.values()))
         for column, name in names.items():
             for frame in range(frames):
                 values = trajectory.read(frame, column).reshape(total, *root[name].shape[1:])
                 root[name][frame * total:(frame + 1) * total] = values
-        for frame, image in enumerate(_images(trajectory)):
-            root["PointData/image"][frame * total:(frame + 1) * total] = image
-
-
-def _images(trajectory: Trajectory) -> Iterator[np.ndarray]:
-    """How often each particle has left the cube along each axis since the first frame: (N, 3) at every frame."""
-    before, image = None, np.zeros((trajectory.total, 3), np.int32)
-    for frame in range(len(trajectory.times)):
-        position = trajectory.read(frame, "position")
-        if before is not None:
-            # A rollout may end with positions that are not finite.
-            left = np.nan_to_num(np.rint((before - position) / trajectory.length), posinf=0, neginf=0)
-            image = image + left.astype(np.int32)
-        before = position
-        yield image
 
 
 @contextmanager

@@ -43,7 +43,8 @@ def trajectory_bytes(scene: Scene, frames: int) -> int:
     """Of so many frames of tracers with the filtered fields."""
     tracers, density = scene.tracers, 1 if scene.flow.compressible else 0
     points, particles = [tracers.cells] * 3, tracers.particles
-    frame = 2 * stored_bytes((particles, 3), "f8") + density * stored_bytes((particles,), "f8")
+    frame = (2 * stored_bytes((particles, 3), "f8") + density * stored_bytes((particles,), "f8")
+             + stored_bytes((particles, 3), "i2"))
     field, whole = (stored_bytes((3, *grid), "f4") + density * stored_bytes((1, *grid), "f4")
                     for grid in (points, [whole_cells(largest_wavenumber(scene))] * 3))
     return (8 * particles + frames * frame + math.ceil(frames / tracers.field_every) * field
@@ -81,7 +82,7 @@ def model_bytes(scene: Scene) -> int:
 def rollout_bytes(scene: Scene, course: RolloutCourse) -> int:
     """Of rollout.h5: frames of the model, and of the truth as long as it lasts."""
     particles, points = scene.tracers.particles, [scene.tracers.cells] * 3
-    frame, field = 3 * stored_bytes((particles, 3), "f4"), 0
+    frame, field = 3 * stored_bytes((particles, 3), "f4") + stored_bytes((particles, 3), "i2"), 0
     if stores_density(scene):
         frame += stored_bytes((particles,), "f4")
     if scene.kernel:
