@@ -50,7 +50,7 @@ def execute(folder, monkeypatch):
         given = "\n".join(f"{key} = {value!r}" for key, value in parameters.items())
         notebook.cells.insert(place + 1, nbformat.v4.new_code_cell(QUICK + given))
         notebook.cells.append(nbformat.v4.new_code_cell(f"import json\nprint(json.dumps({expression}, default=float))"))
-        NotebookClient(notebook, timeout=100, resources={"metadata": {"path": str(folder)}}).execute()
+        NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(folder)}}).execute()
         return {cell.id: cell for cell in notebook.cells}, json.loads(notebook.cells[-1].outputs[0].text)
 
     return run
