@@ -4,8 +4,8 @@ import eddies
 
 project, author, copyright = "eddies", "the eddies developers", "the eddies developers"
 release = eddies.__version__
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
-exclude_patterns = ["results", "examples"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+exclude_patterns = ["results", "examples", "notebooks/runs", "**/.ipynb_checkpoints"]
 
 # The pages read the same on the hosts of code: formulas in ```math, anchors of headings as there.
 myst_enable_extensions = ["dollarmath"]
@@ -13,5 +13,11 @@ myst_fence_as_directive = ["math"]
 myst_heading_anchors = 3
 napoleon_use_ivar = True
 
+# Notebooks are kept without what they show; `-D nb_execution_mode=force` runs them, for a site with their figures.
+nb_execution_mode = "off"
+nb_execution_in_temp = nb_execution_raise_on_error = nb_merge_streams = True
+nb_execution_timeout = 600
+
 html_theme = "furo"
 html_title = "eddies"
+html_static_path = html_css_files = ["site.css"]

@@ -1,6 +1,7 @@
 """README.md and docs say what is true: their commands, scenes, keys, links and code are those of this checkout."""
 
 import dataclasses
+import json
 import re
 import shlex
 import subprocess
@@ -20,11 +21,23 @@ from eddies.scene.scene import BOX_LENGTH, Scene, builtin_scenes, load_scene
 from eddies.scene.sections import Simulation
 
 CHECKOUT = Path(__file__).parents[1]
-PAGES = [CHECKOUT / "README.md", *sorted((CHECKOUT / "docs").glob("*.md"))]
-README, TEXT = PAGES[0].read_text(encoding="utf-8"), "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
+PAGES = [CHECKOUT / "README.md", *sorted((CHECKOUT / "docs").glob("*.md")),
+         *sorted((CHECKOUT / "docs/notebooks").glob("*.ipynb"))]
 # Programs of the system that are mentioned; what follows them is not looked at, but for paths.
-OF_THE_SYSTEM = ("module", "export", "source", "python3", ".venv/bin/pip", ".venv/bin/sphinx-build")
+OF_THE_SYSTEM = ("module", "export", "source", "python3",
+                 *(f".venv/bin/{name}" for name in ("pip", "sphinx-build", "jupyter")))
 BATCH = ("sbatch", "qsub", "bsub", "flux")
+
+
+def text_of(page):
+    """What a page says; of a notebook its words, not its code."""
+    text = page.read_text(encoding="utf-8")
+    if page.suffix != ".ipynb":
+        return text
+    return "\n\n".join("".join(cell["source"]) for cell in json.loads(text)["cells"] if cell["cell_type"] == "markdown")
+
+
+README, TEXT = text_of(PAGES[0]), "\n".join(map(text_of, PAGES))
 
 
 def blocks(language):
@@ -242,13 +255,13 @@ def slug(heading):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_links_and_files_of_a_page_exist(page):
-    text = page.read_text(encoding="utf-8")
+    text = text_of(page)
     for link in re.findall(r"\]\(([^)\s]+)\)", text):
         if not link.startswith("https://"):
             path, _, anchor = link.partition("#")
             target = page.parent / path if path else page
             assert target.exists(), link
-            headings = re.findall(r"^#+ (.+)$", target.read_text("utf-8"), re.MULTILINE) if anchor else []
+            headings = re.findall(r"^#+ (.+)$", text_of(target), re.MULTILINE) if anchor else []
             assert not anchor or anchor in map(slug, headings), link
     for path in re.findall(r"`((?:mpi_tools|jobs|tests|src|docs)/[\w./-]*)`", text):
         assert (CHECKOUT / path).exists(), path
@@ -274,4 +287,5 @@ def test_the_site_builds_without_a_warning(tmp_path):
     command = [sys.executable, "-m", "sphinx", "-q", "-W", "-b", "html", CHECKOUT / "docs", tmp_path / "site"]
     built = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=200)
     assert built.returncode == 0 and not built.stderr, built.stderr
-    assert all((tmp_path / "site" / f"{page.stem}.html").exists() for page in PAGES[1:])
+    assert all((tmp_path / "site" / page.relative_to(CHECKOUT / "docs").with_suffix(".html")).exists()
+               for page in PAGES[1:])

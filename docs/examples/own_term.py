@@ -1,4 +1,4 @@
-"""A term of one's own: Smagorinsky's model of the stress that the filter hides, in place of the gradient model.
+"""A term of one's own: Smagorinsky's model of the stress that the filter hides, in place of the deconvolved one.
 
     python docs/examples/own_term.py                # or: mpirun -n 2 python docs/examples/own_term.py
 

@@ -8,12 +8,13 @@ __version__ = "0.2.0"
 # What a program uses, by the module that it comes from. Each is imported when it is first asked for: a program that
 # reads a scene starts neither MPI nor torch.
 _HOMES = {
-    "eddies.api": ("check", "run", "simulate", "train"),
+    "eddies.api": ("check", "compare", "run", "simulate", "train"),
     "eddies.stored_run": ("StoredRun", "open_run"),
     "eddies.errors": ("UserError",),
     "eddies.import_path": ("ImportPathError",),
     "eddies.scene.scene": ("Scene", "SceneError", "load_scene", "Eulerian", "Flow", "Forcing", "Horizons", "Initial",
                            "Kernel", "Model", "Simulation", "SpinUp", "Time", "Tracers", "Training"),
+    "eddies.scene.comparison": ("Comparison", "Variant", "load_comparison"),
     "eddies.scene.values": ("boolean", "choice", "integer", "integers", "named", "number", "text", "texts"),
     "eddies.particles.terms.settings": ("TermSettings",),
     "eddies.particles.terms.term": ("PairTerm", "Term", "TermError"),

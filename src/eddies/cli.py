@@ -183,19 +183,11 @@ def compare_command(options: argparse.Namespace, comm: Comm, signals: list[int])
     """Variants of a scene, one after the other, until a signal, a file STOP or the limit of wall time ends it."""
     from eddies.parallel.stop import StopRequest
     from eddies.scene.comparison import load_comparison
-    from eddies.stages import check_ranks, check_stop_file, run_stages, working_in
-    from eddies.workflows.feasibility import check_feasible
+    from eddies.stages import run_comparison
     comparison = load_comparison(options.comparison, options.run)
-    for scene in comparison.scenes.values():
-        check_ranks(scene.stages, scene, comm)
-        check_feasible([stage for stage in scene.stages if stage != "dns"], scene, comm)  # the ground truth is there
-    directory = options.output or Path("runs") / comparison.name
-    check_stop_file(comm, directory)
+    directory = options.output or comparison.directory
     stop = StopRequest(comm, signals, directory / "STOP", 60 * options.max_minutes, 60 * options.checkpoint_minutes)
-    import_module("eddies.workflows.compare").run(
-        comparison, comm, directory, options.overwrite, options.take_over,
-        lambda: working_in(comm, directory, stop, options.take_over),
-        lambda stages, scene, where: run_stages(stages, scene, comm, where, stop, True, options.take_over))
+    run_comparison(comparison, comm, directory, stop, options.overwrite, options.take_over)
     log.log(OUTCOME, "compare: %s", directory / "index.html")
 
 

@@ -22,6 +22,7 @@ from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm
 from eddies.parallel.stop import Stopped, StopRequest
 from eddies.pipeline import STAGES, Stage
+from eddies.scene.comparison import Comparison
 from eddies.scene.scene import Scene, SceneError
 from eddies.workflows.feasibility import check_feasible, check_ground_truth, check_places
 from eddies.workflows.foreseen.estimates import ground_truth_alone, most_ranks
@@ -78,6 +79,21 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
                 rest, known = stages[stages.index(stage.name):], True
                 check_ground_truth(rest, scene, comm, directory)
             run_stage(stage, scene, comm, directory, stop, stage.name in work.begun)
+
+
+def run_comparison(comparison: Comparison, comm: Comm, directory: Path, stop: StopRequest, overwrite: bool = False,
+                   take_over: bool = False) -> None:
+    """Run the variants of a comparison, one after the other on all ranks, and write their errors and run times.
+
+    Raises as `run_stages` and `workflows.compare.run`.
+    """
+    for scene in comparison.scenes.values():
+        check_ranks(scene.stages, scene, comm)
+        check_feasible([stage for stage in scene.stages if stage != "dns"], scene, comm)  # the ground truth is there
+    check_stop_file(comm, directory)
+    import_module("eddies.workflows.compare").run(
+        comparison, comm, directory, overwrite, take_over, lambda: working_in(comm, directory, stop, take_over),
+        lambda stages, scene, where: run_stages(stages, scene, comm, where, stop, True, take_over))
 
 
 def look_at_work(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path, overwrite: bool) -> Work:

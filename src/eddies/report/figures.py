@@ -37,13 +37,15 @@ STYLE = {
     "legend.frameon": False, "figure.dpi": 150, "savefig.dpi": 150, "axes.prop_cycle": matplotlib.cycler(
         color=[TRUTH, MODEL, SECOND, THIRD, FOURTH, DNS]),
 }
+# Of the settings all but the backend: no context gives back that of the user, in which a notebook shows its figures.
+PLAIN = {key: value for key, value in matplotlib.rcParamsDefault.items() if key != "backend"}
 
 
 def styled(draw: Callable[..., Figure]) -> Callable[..., Figure]:
     """Run a drawing function under the common style, whatever the user's matplotlib settings are."""
     @functools.wraps(draw)
     def drawn(*arguments, **named):
-        with matplotlib.rc_context({**matplotlib.rcParamsDefault, **STYLE, "backend": "agg"}):
+        with matplotlib.rc_context({**PLAIN, **STYLE}):
             return draw(*arguments, **named)
     return drawn
 

@@ -96,6 +96,11 @@ class Comparison(Document):
         return {variant.name: self._scene(variant) for variant in self.variant}
 
     @property
+    def directory(self) -> Path:
+        """Where its results go, unless another directory is given."""
+        return Path("runs") / self.name
+
+    @property
     def run_directory(self) -> Path:
         """Where the ground truth of the base is."""
         return Path(self.run) if self.run else Path("runs") / load_scene(self.base).name

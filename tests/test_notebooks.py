@@ -1,0 +1,112 @@
+"""The notebooks of the documentation: each runs from its first cell to its last, on a smaller scene, and finds what
+it says."""
+
+import base64
+import json
+from pathlib import Path
+
+import nbformat
+import numpy as np
+import pytest
+from nbclient import NotebookClient
+
+from eddies.analysis.pareto import pareto_front
+from mpi_tools.launch import mpi_environment
+
+NOTEBOOKS = Path(__file__).parents[1] / "docs" / "notebooks"
+NAMES = [path.stem for path in sorted(NOTEBOOKS.glob("*.ipynb"))]
+SMALLER = ["spin_up.turnovers=0.3", "tracers.particles_per_side=8", "tracers.field_cells=12",
+           "tracers.turnovers=0.3", "kernel.steps=4", "kernel.points=50"]
+TRAINED_LESS = ["training.steps=8", "training.combined_steps=2", "training.frames=2", "training.batch=64"]
+# As quick_spectra and undrawn, but in the notebook's process. Of the figures that of PDFs is shown.
+QUICK = """
+from eddies.report import figures
+from eddies.workflows.rollout import particle_spectra
+
+particle_spectra.MOST_ITERATIONS = 3
+png = figures.png
+figures.png = lambda figure: png(figure) if "KL" in figure.axes[0].get_title("left") else b""
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Where they run: what one has made the next finds."""
+    return tmp_path_factory.mktemp("notebooks")
+
+
+@pytest.fixture
+def execute(folder, monkeypatch):
+    """A function that runs a notebook in a process of its own; gives its cells, by id, and the value of an expression
+    at its end."""
+    for name, value in {**mpi_environment(1), "JUPYTER_DATA_DIR": folder, "JUPYTER_RUNTIME_DIR": folder,
+                        "IPYTHONDIR": folder}.items():
+        monkeypatch.setenv(name, str(value))
+
+    def run(name, expression, **parameters):
+        notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
+        (place,) = [number for number, cell in enumerate(notebook.cells)
+                    if "parameters" in cell.metadata.get("tags", ())]
+        given = "\n".join(f"{key} = {value!r}" for key, value in parameters.items())
+        notebook.cells.insert(place + 1, nbformat.v4.new_code_cell(QUICK + given))
+        notebook.cells.append(nbformat.v4.new_code_cell(f"import json\nprint(json.dumps({expression}, default=float))"))
+        NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(folder)}}).execute()
+        return {cell.id: cell for cell in notebook.cells}, json.loads(notebook.cells[-1].outputs[0].text)
+
+    return run
+
+
+def figures(cells):
+    """The images that cells show, by id, as bytes."""
+    return {name: base64.b64decode(output.data["image/png"]) for name, cell in cells.items()
+            for output in cell.get("outputs", ()) if "image/png" in output.get("data", {})}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_notebook_is_kept_without_what_it_shows(name):
+    notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
+    nbformat.validate(notebook)
+    assert all(not cell.outputs and cell.execution_count is None for cell in notebook.cells if cell.cell_type == "code")
+    assert set(notebook.metadata) == {"kernelspec", "language_info"}
+
+
+def test_a_first_run(execute, folder):
+    cells, (error, without) = execute("a-first-run", "[error.values.tolist(), without.values.tolist()]",
+                                      changes=[*SMALLER, *TRAINED_LESS, "simulation.turnovers=0.1"])
+    shown = figures(cells)
+    assert set(shown) == {"paths", "spectra", "field", "report"} and min(map(len, shown.values())) > 9000
+    assert (folder / "runs/tiny/report/index.html").exists()
+    assert error[0] == 0 and len(error) > 1 and np.all(np.less(error[1:], without[1:]))
+
+
+def test_a_term_of_ones_own(execute, folder):
+    cells, (constant, table) = execute("own-term", "[constant, table.to_dict('index')]", turnovers=0.1,
+                                       changes=[*SMALLER, *TRAINED_LESS])
+    assert set(figures(cells)) == {"spectra"} and list(table) == ["none", "smagorinsky", "deconvolution"]
+    assert 0 < constant < 0.3 and constant != pytest.approx(0.17, rel=1e-6)
+    error = {name: row["acceleration"] for name, row in table.items()}
+    assert error["deconvolution"] < error["smagorinsky"] != error["none"] < 1
+    assert all(0.8 < row["energy"] < 1.2 for row in table.values())
+    # It is the class of the example.
+    example = (NOTEBOOKS.parent / "examples" / "own_term.py").read_text(encoding="utf-8")
+    of_the_class = example[example.index("@dataclass"):example.index("\n\nif __name__")].strip()
+    assert of_the_class in (folder / "own_term.py").read_text(encoding="utf-8")
+
+
+def test_another_flow(execute):
+    cells, table = execute("another-flow", "table", changes=[*SMALLER, "flow.cells=24", "simulation.turnovers=0.1"])
+    assert set(figures(cells)) == {"figure"} and len(table) == 2
+    for errors in table.values():
+        assert 0 < errors["acceleration"] < errors["pressure gradient"] < 1.5
+        assert 0 < errors["velocity at the end"] < errors["no force"]
+
+
+def test_error_against_run_time(execute, folder):
+    cells, (front, rows) = execute("error-against-run-time", "[list(front.index), table.to_dict('index')]",
+                                   changes=SMALLER, turnovers=0.15, repeats=1)
+    assert set(figures(cells)) == {"front"} and (folder / "runs/cost/index.html").exists()
+    assert {row["status"] for row in rows.values()} == {"complete"}
+    cost, error = ([row[key] for row in rows.values()] for key in ("wall_seconds", "velocity_error_end"))
+    assert front == [[*rows][number] for number in pareto_front(cost, error)]
+    errors = [rows[name]["velocity_error_end"] for name in ("grid-24", "grid-16", "grid-8")]
+    assert errors == sorted(errors) and rows["learned"]["velocity_error_end"] < rows["no-force"]["velocity_error_end"]
