@@ -1,5 +1,7 @@
 """Compiled splines against those of numpy, for each instruction set that this processor runs."""
 
+import functools
+
 import numpy as np
 import pytest
 
@@ -28,6 +30,12 @@ def padded_planes(cells):
 
 def parts(cells, components=3, seed=1, kind=np.float64):
     """Planes below, own ones, planes above."""
+    return [part.copy() for part in made_once(cells, components, seed, kind)]
+
+
+@functools.cache  # making them takes longer than what they are made for
+def made_once(cells, components, seed, kind):
+    """Random planes below, own ones, planes above."""
     random = np.random.default_rng(seed)
     return [random.standard_normal((components, planes, cells, cells)).astype(kind)
             for planes in (BELOW, cells, ABOVE)]

@@ -188,7 +188,7 @@ def test_particles_without_a_density_are_stepped_as_those_with_one(comm, name, t
     ends = []
     for columns in ((position, velocity), (position, velocity, density)):
         slab, particles = distributed(comm, *columns)
-        ends.append(run(name, dynamics_of(slab, model(MODELS[terms]), 0.1), particles, 0.1, 3))
+        ends.append(run(name, dynamics_of(slab, model(MODELS[terms]), 0.1, iterations=3), particles, 0.1, 3))
     assert ends[0].density is None and torch.equal(ends[1].density, density[ends[1].id])
     assert torch.equal(ends[0].velocity, ends[1].velocity) and torch.equal(ends[0].position, ends[1].position)
     assert set(ends[0].columns()) == {"id", "position", "velocity"}

@@ -1,6 +1,9 @@
 """What a rollout does without a learned force: of particles left alone, of WCSPH, and of a coarse Eulerian flow."""
 
 import logging
+import shutil
+import tempfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -41,22 +44,37 @@ SMOOTHED = ['model.terms=["summation-density", "wcsph"]', "training.steps=0", "t
             "simulation.method=learned", "simulation.step=0.004", "simulation.precision=float64"]
 
 
-@pytest.fixture
-def folder(comm, tmp_path):
-    """A run directory with the scene, its ground truth, and a kernel with the weights that training starts from."""
+@pytest.fixture(scope="module")
+def made(comm):
+    """A directory with the scene, its ground truth, and a kernel with the weights that training starts from; the same
+    on all ranks."""
     from eddies.workflows import dns
 
-    path = tmp_path / "baseline.toml"
+    folder = Path(comm.bcast(tempfile.mkdtemp() if comm.rank == 0 else None))
     if comm.rank == 0:
-        path.write_text(SCENE)
+        (folder / "baseline.toml").write_text(SCENE)
     comm.Barrier()
-    scene = load_scene(path)
-    dns.run(scene, comm, tmp_path)
+    scene = load_scene(folder / "baseline.toml")
+    dns.run(scene, comm, folder)
     network = KernelNetwork(scene.kernel_support, [4])
     description = {"form": network.FORM, "support": network.support, "hidden": [4], "cutoff": "smooth"}
     weights = {name: tensor.numpy() for name, tensor in network.state_dict().items()}
     provenance = {"scene": SCENE, "fingerprint": scene.fingerprint("train-kernel")}
-    save_weights(comm, tmp_path / "kernel.h5", "kernel", description, weights, provenance)
+    save_weights(comm, folder / "kernel.h5", "kernel", description, weights, provenance)
+    comm.Barrier()
+    yield folder
+    comm.Barrier()
+    if comm.rank == 0:
+        shutil.rmtree(folder)
+
+
+@pytest.fixture
+def folder(comm, made, tmp_path):
+    """A run directory of a test's own with these."""
+    if comm.rank == 0:
+        for path in made.iterdir():
+            (tmp_path / path.name).symlink_to(path)
+    comm.Barrier()
     return tmp_path
 
 

@@ -19,7 +19,7 @@ def lines_of(scene, comm, caplog):
 
 
 @pytest.fixture
-def recorded(monkeypatch):
+def recorded(monkeypatch, quick_probes):
     monkeypatch.setattr(logging.getLogger("eddies"), "propagate", True)
 
 
@@ -39,6 +39,7 @@ def test_check_on_more_ranks(comm, caplog, recorded):
     assert comm.rank > 0 or "at most 12" in text
 
 
+@pytest.mark.usefixtures("quick_probes")
 @pytest.mark.mpi(1, 2)
 def test_numbers_for_programs(comm, capfd):
     from eddies.workflows import check
@@ -76,6 +77,7 @@ def check_sums(told):
     assert rollout["evaluations"] == 3 * rollout["steps"] + 1
 
 
+@pytest.mark.usefixtures("quick_probes")
 @pytest.mark.mpi(1)
 def test_every_key_is_described(comm, capfd):
     from eddies.workflows import check
@@ -91,6 +93,7 @@ def test_every_key_is_described(comm, capfd):
     assert [key for key in dict.fromkeys(keys(json.loads(capfd.readouterr().out))) if f"`{key}`" not in described] == []
 
 
+@pytest.mark.usefixtures("quick_probes")
 @pytest.mark.mpi(1)
 def test_what_is_not_foreseen_is_null(comm, capfd):
     from eddies.workflows import check
@@ -246,6 +249,7 @@ def test_steps_that_sound_outruns_are_told():
     assert list(told.values()) == [[], []]
 
 
+@pytest.mark.usefixtures("quick_probes")
 @pytest.mark.mpi(1)
 def test_a_rollout_is_foreseen_where_a_model_moves_the_particles_of_a_cpu(comm):
     from eddies.workflows.check import rollout_costs, rollout_lines

@@ -79,7 +79,7 @@ def test_a_final_state_is_a_start(comm, tmp_path):
     assert tables[1]["time"][-1] == pytest.approx(0.1)
 
 
-@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.mpi(1, 3)
 def test_a_flow_with_tracers_is_a_start_on_any_grid(comm, tmp_path):
     def followed(name, scene):
         directory = tmp_path / name

@@ -21,6 +21,8 @@ SPLIT = ["flow.cells=12", "tracers.particles_per_side=5", "tracers.field_cells=8
          "simulation.frame_interval=0.06", "tracers.field_every=2", "time.max_step=0.025", "kernel.neighbors=20",
          "training.batch=9"]
 STEPS = 20
+# Of both parts the first steps and the last, and the whole interval between two frames.
+SPLITS = (0, 1, 7, 8, 9, 10, 11, 12, 19)
 
 
 @pytest.fixture
@@ -63,7 +65,7 @@ def product(comm, path):
 
 
 @pytest.mark.mpi(2)
-def test_every_split_of_a_run_is_the_whole_run(comm, tmp_path, last, monkeypatch):
+def test_a_split_of_a_run_is_the_whole_run(comm, tmp_path, last, monkeypatch):
     monkeypatch.setattr("eddies.io.checkpoint.KEPT", 100)
     scene, whole = load_scene("tiny", SPLIT), tmp_path / "whole"
     if comm.rank == 0:
@@ -75,7 +77,7 @@ def test_every_split_of_a_run_is_the_whole_run(comm, tmp_path, last, monkeypatch
     expected, truth = fingerprint(last), product(comm, whole)
     assert last.run.clock.steps == STEPS
     assert len(truth["frames"]) == 5 and len(list((whole / "checkpoints").glob("step-*"))) == STEPS
-    for split in range(STEPS):
+    for split in SPLITS:
         directory = tmp_path / f"split-{split}"
         if comm.rank == 0:
             (directory / "checkpoints").mkdir(parents=True)

@@ -115,7 +115,7 @@ def test_a_product_of_another_version_is_said_in_one_line(comm, tmp_path):
         report.run(tmp_path, comm)
 
 
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("no_figures")
 @pytest.mark.mpi(1, 2, timeout=60)
 def test_a_report_that_cannot_be_written_is_told_in_one_line(comm, tmp_path, capfd):
     """A file where a directory of it should be. All ranks end with the exit code of what the user can mend."""
@@ -147,7 +147,7 @@ def check_stationary(shown, page):
     assert "Ishihara et al. 2007" in page
 
 
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("no_figures")
 @pytest.mark.mpi(1)
 def test_a_span_too_short_to_average_is_said_and_the_rest_is_shown(comm, tmp_path):
     write_ground_truth(comm, tmp_path, stationary=True)
@@ -159,7 +159,7 @@ def test_a_span_too_short_to_average_is_said_and_the_rest_is_shown(comm, tmp_pat
     assert "stationary" not in figures(tmp_path) and metrics["ground_truth"]["reynolds_lambda"] > 0
 
 
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("no_figures")
 @pytest.mark.mpi(1)
 def test_numbers_of_a_known_rollout(comm, tmp_path):
     """The model is the truth plus an error of 0.4 t times an independent flow of the same energy."""
@@ -209,7 +209,7 @@ def test_a_forced_rollout_is_compared_with_the_stationary_state_if_there_is_one(
     assert "from the start on they are two flows" in page and "forced" not in metrics
 
 
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("no_figures")
 @pytest.mark.mpi(1)
 def test_a_rollout_that_is_forced_as_its_truth_is_compared_with_that_and_with_the_stationary_state(comm, tmp_path):
     write_rollout(comm, tmp_path, injection_rate=0.5, truth_injection_rate=0.5)
@@ -224,7 +224,7 @@ def test_a_rollout_that_is_forced_as_its_truth_is_compared_with_that_and_with_th
     assert "The model is not forced, and the flow of the true tracers is forced with a power of 0.5" in page
 
 
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("no_figures")
 @pytest.mark.mpi(1)
 def test_a_stopped_rollout_is_said_to_be_stopped(comm, tmp_path):
     write_run(comm, tmp_path, status="stopped: particle 17 is not finite at t=0.62", broken=4)
@@ -237,7 +237,7 @@ def test_a_stopped_rollout_is_said_to_be_stopped(comm, tmp_path):
     assert all(math.isfinite(value) for value in numbers(metrics["rollout"].values()))
 
 
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("no_figures")
 @pytest.mark.mpi(1)
 def test_a_rollout_that_breaks_at_once_is_not_compared(comm, tmp_path):
     write_rollout(comm, tmp_path, status="stopped: particle 3 is too fast", broken=0)
@@ -247,7 +247,7 @@ def test_a_rollout_that_breaks_at_once_is_not_compared(comm, tmp_path):
     assert "stopped: particle 3 is too fast" in page and "no finite frame at a common time" in page
 
 
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("no_figures")
 @pytest.mark.mpi(1)
 def test_a_model_that_integrates_density(comm, tmp_path):
     write_model(comm, tmp_path, terms=("pairs", "density-flux"))
@@ -269,7 +269,7 @@ def test_a_model_of_another_flow_is_shown_beside_its_source(comm, tmp_path):
     assert (metrics["model"]["source_mach_turbulent"], metrics["model"]["mach_turbulent"]) == (0.08, 0.16)
 
 
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("no_figures")
 @pytest.mark.mpi(1)
 def test_a_source_of_unknown_mach_number_is_said(comm, tmp_path):
     write_model(comm, tmp_path, source={"path": "runs/other", "mach_turbulent": None})
@@ -278,7 +278,7 @@ def test_a_source_of_unknown_mach_number_is_said(comm, tmp_path):
     assert "figure-3b-mach" not in figures(tmp_path)
 
 
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("no_figures")
 @pytest.mark.mpi(1)
 def test_of_weights_that_a_run_learned_from_others_alone_these_are_named(comm, tmp_path):
     write_model(comm, tmp_path, source={"path": "runs/other", "truths": {"runs/a/ground_truth.h5": 0.04,
@@ -289,7 +289,7 @@ def test_of_weights_that_a_run_learned_from_others_alone_these_are_named(comm, t
     assert "figure-3b-mach" not in figures(tmp_path)
 
 
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("no_figures")
 @pytest.mark.mpi(1)
 def test_a_dns_alone(comm, tmp_path):
     write_ground_truth(comm, tmp_path, tracers=False)
@@ -304,7 +304,7 @@ def test_a_dns_alone(comm, tmp_path):
     assert written(tmp_path)[0]["cost"]["stage_seconds"] == {"dns": 12.5}
 
 
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("no_figures")
 @pytest.mark.mpi(1)
 def test_a_rollout_without_its_ground_truth(comm, tmp_path):
     write_rollout(comm, tmp_path)
@@ -326,7 +326,7 @@ def test_a_rollout_of_an_earlier_version_without_spectra_is_refused(comm, tmp_pa
         report.run(tmp_path, comm)
 
 
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("no_figures")
 @pytest.mark.mpi(1)
 def test_figures_of_an_earlier_report_do_not_stay(comm, tmp_path):
     write_kernel(comm, tmp_path)
@@ -382,7 +382,7 @@ def test_numbers_that_are_not_finite_are_said_at_the_top(comm, tmp_path, capfd, 
     assert said.startswith(f"{kind}.h5 holds numbers that are not finite ({place}")
 
 
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("no_figures")
 @pytest.mark.mpi(1)
 def test_a_section_that_cannot_be_made_of_such_numbers_says_so(comm, tmp_path, capfd):
     """There is no PDF of them; the other sections are there."""

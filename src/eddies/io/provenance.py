@@ -1,6 +1,7 @@
 """Where a product comes from: id, versions, commit, ranks, date and what it was made from, as JSON in every file."""
 
 import datetime
+import functools
 import json
 import platform
 import uuid
@@ -26,15 +27,21 @@ LIBRARIES = ("numpy", "mpi4py", "h5py", "pyfftw", "torch")
 
 def environment(ranks: int) -> dict[str, object]:
     """Versions of this package and its libraries, the commit in a checkout, number of ranks, date."""
-    versions = {"python": platform.python_version(), "hdf5": h5py.version.hdf5_version,
-                "mpi": MPI.Get_library_version().strip("\0 \n").split("\n")[0]}
+    return {"eddies": eddies.__version__, "commit": commit(), "libraries": versions(), "kernels": in_use(),
+            "ranks": ranks, "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")}
+
+
+@functools.cache  # files with long texts are read for some of them
+def versions() -> dict[str, str]:
+    """Versions of the libraries that this process has loaded."""
+    found = {"python": platform.python_version(), "hdf5": h5py.version.hdf5_version,
+             "mpi": MPI.Get_library_version().strip("\0 \n").split("\n")[0]}
     for library in LIBRARIES:
         try:
-            versions[library] = metadata.version(library)
+            found[library] = metadata.version(library)
         except metadata.PackageNotFoundError:
             continue
-    return {"eddies": eddies.__version__, "commit": commit(), "libraries": versions, "kernels": in_use(),
-            "ranks": ranks, "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")}
+    return found
 
 
 def commit() -> str | None:

@@ -24,6 +24,7 @@ def scene_of(*changes):
     return load_scene("tiny", list(changes))
 
 
+@pytest.mark.usefixtures("quick_probes")
 @pytest.mark.mpi(1, 2)
 @pytest.mark.parametrize("preset", PRESETS)
 def test_every_preset_is_probed(comm, preset):
@@ -39,6 +40,7 @@ def test_every_preset_is_probed(comm, preset):
     assert bool(speed.ghost_columns) == pairs
 
 
+@pytest.mark.usefixtures("quick_probes")
 @pytest.mark.mpi(1, 2)
 def test_pairs_that_are_told_the_densities_want_the_pressure_at_particles_and_ghosts(comm):
     preset = "model.preset=resolved + pairs"
@@ -48,6 +50,7 @@ def test_pairs_that_are_told_the_densities_want_the_pressure_at_particles_and_gh
     assert sorted(told.ghost_columns) == sorted([*without.ghost_columns, 8])
 
 
+@pytest.mark.usefixtures("quick_probes")
 @pytest.mark.mpi(1, 2)
 def test_terms_of_the_users_are_probed(comm, own, monkeypatch):
     monkeypatch.setattr(sys, "path", [*sys.path, str(EXAMPLES)])
@@ -59,6 +62,7 @@ def test_terms_of_the_users_are_probed(comm, own, monkeypatch):
     assert unknown.listed and unknown.block_bytes > 0
 
 
+@pytest.mark.usefixtures("quick_probes")
 @pytest.mark.mpi(1, 2)
 def test_a_term_that_fails_is_told(comm, own):
     own("own_fault", OWN_PAIRS.replace("pass", "compiled = None\n    def pair_values(self, pairs): return 1 / 0"))
@@ -72,12 +76,14 @@ def test_a_flow_of_a_single_resolved_shell_is_probed(comm):
     assert speed.rates["modes"].unit == 0 < speed.rates["transforms"].unit
 
 
+@pytest.mark.usefixtures("quick_probes")
 @pytest.mark.mpi(1)
 def test_forcing_is_probed_too(comm):
     forced = probe_particles(scene_of("simulation.injection=0.5"), comm)
     assert forced.components["transforms"] == 30
 
 
+@pytest.mark.usefixtures("quick_probes")
 @pytest.mark.mpi(1, 2)
 def test_nothing_is_left_behind(comm, monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "2")

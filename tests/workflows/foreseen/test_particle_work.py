@@ -82,6 +82,7 @@ def counted(monkeypatch):
     return messages, sizes
 
 
+@pytest.mark.usefixtures("quick_probes")
 @pytest.mark.mpi(2, 3)
 @pytest.mark.parametrize("changes", [["resolved"], ["resolved + pairs"], ["resolved + pairs", TOLD_DENSITIES],
                                      ["learned-density"]])

@@ -91,6 +91,7 @@ def test_particles_in_and_around_a_cube_are_those_that_a_step_takes(changes, row
     assert rows is None or cube_rows(scene, 12) == pytest.approx(rows)
 
 
+@pytest.mark.usefixtures("quick_probes")
 @pytest.mark.mpi(1, 2)
 @pytest.mark.parametrize("preset", ["resolved + pairs", "learned-density"])
 def test_the_probe_of_training_leaves_nothing_behind(comm, preset):

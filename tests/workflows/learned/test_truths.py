@@ -103,7 +103,7 @@ def copied(source, target):
     return shutil.copy(source / "ground_truth.h5", target)
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_training_on_two_flows_takes_the_same_steps_on_any_number_of_ranks(comm, tmp_path, quick_solves):
     scene = trained_on(made(comm, tmp_path, runs=("one", "two")), tmp_path / "one", tmp_path / "two")
     weights, tables = weights_and_errors(scene, comm, tmp_path / "one")

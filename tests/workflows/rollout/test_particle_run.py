@@ -140,6 +140,7 @@ def method_of(comm, directory, scene, start):
             return truth.scales_at(start), truth.scales, method, *method.frame(0.0)
 
 
+@pytest.mark.usefixtures("quick_solves")
 @pytest.mark.mpi(1, 2)
 def test_units_are_those_of_the_start_frame_whatever_follows(comm, tmp_path):
     """A flow that is followed twice as long gives the same rollout, bit for bit."""
@@ -162,6 +163,7 @@ def with_method(scene, method, **keys):
     return replace(scene, simulation=replace(scene.simulation, method=method, **keys))
 
 
+@pytest.mark.usefixtures("quick_solves")
 @pytest.mark.mpi(1)
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_has_the_units_of_its_start_and_runs(comm, tmp_path, method):
@@ -205,6 +207,7 @@ def reported(comm, directory, untrained=("kernel.h5",)):
     return json.loads((directory / "report" / "metrics.json").read_text()), page
 
 
+@pytest.mark.usefixtures("quick_solves")
 @pytest.mark.mpi(2, 3)
 def test_the_rollout_is_the_same_on_any_number_of_ranks(comm, tmp_path):
     """With frames between steps and on them."""
@@ -285,7 +288,7 @@ def test_steps_are_as_short_as_the_resolved_velocity_needs(comm, tmp_path, monke
     assert attributes["time_step"] * highest * columns["velocity"][0].std() == pytest.approx(0.05, rel=0.2)
 
 
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("no_figures", "quick_solves")
 @pytest.mark.mpi(2)
 def test_a_rollout_that_goes_wrong_ends_there_and_keeps_its_frames(comm, tmp_path):
     simulate.run(with_method(untrained(comm, tmp_path), "learned", injection=1e6), comm, tmp_path)
