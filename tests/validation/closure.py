@@ -31,7 +31,7 @@ from eddies.scene.scene import BOX_LENGTH
 from eddies.workflows.ground_truth.truth import GroundTruth
 
 SHARES = (0.75, 0.875, 1.0, 1.125, 1.25, 1.375, 1.5, 1.625)
-WEIGHTS = {3.0: FOURTH, WEIGHT: MODEL, 300.0: SECOND}
+WEIGHTS = {WEIGHT / 10: FOURTH, WEIGHT: MODEL, 10 * WEIGHT: SECOND}
 ITERATIONS = (2, 4, 6, 8, 12, 16, 24, 32, 48, 64)
 TIGHT = 1e-4
 
@@ -52,7 +52,8 @@ class Known:
         settings = {"pressure": Pressure(), "stress": Stress(form=form), "viscosity": Viscosity()}
         model = build_model(settings, settings, FlowUnits(self.scales, self.scales.filter_width, 60.0))
         dynamics = ParticleDynamics(self.slab, model, 0.0)
-        resolution = ResolvedVelocity(FourierGrid(self.slab, int(highest)), self.scales.filter_width, weight)
+        resolution = ResolvedVelocity(FourierGrid(self.slab, int(highest)), self.scales.filter_width,
+                                      self.scales.kolmogorov_length, weight)
         resolution.tolerance, resolution.iterations, dynamics.resolution = TIGHT, iterations, resolution
         context = dynamics.context(self.particles)
         missed = model.rates(context).acceleration - self.exact

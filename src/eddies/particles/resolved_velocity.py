@@ -21,9 +21,9 @@ from eddies.particles.rank_sums import mean_over_ranks
 from eddies.particles.reference_scales import resolved_wavenumber
 from eddies.particles.resolved_flow import ResolvedFlow
 
-# The exponent of the prior's power law, and how many times the energy that it expects beyond the resolved modes is
-# taken for noise. Measured in docs/closure.md.
-EXPONENT, WEIGHT = 11 / 3, 30.0
+# The exponent of the prior's power law, how it ends in the dissipation range (Pope 2000, Eq. 6.248), and how many
+# times the energy that it expects beyond the resolved modes is taken for noise. The latter measured in docs/closure.md.
+EXPONENT, DISSIPATION, DISSIPATION_ONSET, WEIGHT = 11 / 3, 5.2, 0.4, 300.0
 # Residuals, relative to the velocities, at which a solve ends: one that starts from nothing, and one that starts from
 # what is foreseen. The latter's is spread over all modes, the former's is left in those that are hardest to tell.
 TOLERANCE, TOLERANCE_FORESEEN = 2e-4, 2e-3
@@ -38,10 +38,10 @@ class ResolvedVelocity:
         minimise  sum_i |v_i - u(x_i)|^2  +  sum_k (sigma^2 / P_k) |u(k)|^2
 
     as is done for measured particle tracks (Gesemann et al. 2016). The velocities v_i are relative to their mean over
-    all particles. P_k ~ k^(-11/3) G^2, G the transfer of the filter, is the energy expected of a mode, and sigma^2
-    `weight` times what this law has beyond k_c, which is noise to the modes within; both in units of the velocities, so
-    that their ratio is a number. As the filtered velocity is smooth and solenoidal, modes beyond the particles' Nyquist
-    wavenumber can be told.
+    all particles. P_k ~ k^(-11/3) f(k eta) G^2, f the end of the spectrum in the dissipation range and G the transfer
+    of the filter, is the energy expected of a mode, and sigma^2 `weight` times what this law has beyond k_c, which is
+    noise to the modes within; both in units of the velocities, so that their ratio is a number. As the filtered
+    velocity is smooth and solenoidal, modes beyond the particles' Nyquist wavenumber can be told.
 
     Conjugate gradients, preconditioned by 1 / (N + 5 sigma^2/P_k), solve for the modes until the preconditioned
     residual is `tolerance` of the velocities; or take a given number of `iterations`. Where the time of an evaluation
@@ -54,6 +54,7 @@ class ResolvedVelocity:
     ----------
     grid : where the velocity is resolved.
     filter_width : d of the filter.
+    kolmogorov_length : eta of the flow; 0 where nothing ends its spectrum.
     weight : of what is expected beyond k_c, taken for noise.
 
     Differentiable in the particles' positions and velocities: on the way back the same system is solved. All ranks call
@@ -65,14 +66,15 @@ class ResolvedVelocity:
     #: iterations and residual of the solves so far, and whether they converged, one after the other
     solves: list[tuple[int, float, bool]]
 
-    def __init__(self, grid: FourierGrid, filter_width: float, weight: float = WEIGHT) -> None:
+    def __init__(self, grid: FourierGrid, filter_width: float, kolmogorov_length: float = 0.0,
+                 weight: float = WEIGHT) -> None:
         self.grid, self.filter_width = grid, filter_width
         inside = (grid.shell > 0) & (grid.shell <= grid.resolved)
         self._moments: list[_Moment] = []
         self.solves = []
         #: rms u' of a component of the resolved velocity last remembered; 0 before
         self.speed = 0.0
-        law, tail = _prior(grid, filter_width, inside)
+        law, tail = _prior(grid, filter_width, kolmogorov_length, inside)
         penalty = torch.where(inside, weight * tail / (3 * torch.where(inside, law, 1.0)), 0.0)
         #: whose solution it is
         self.equations = LeastSquares(grid, inside, penalty)
@@ -88,7 +90,7 @@ class ResolvedVelocity:
         resolved = min(max(shells, 1), (decomposition.planes - 1) // 2)
         planes = max(math.ceil(margin / decomposition.spacing - 1e-9), 1)
         grid = FourierGrid(decomposition, resolved, planes, dtype or torch.float64)
-        return cls(grid, flow.scales.filter_width)
+        return cls(grid, scales.filter_width, scales.kolmogorov_length)
 
     def of(self, particles: ParticleSet, time: float | None = None) -> ResolvedFlow:
         """The resolved flow of particles; `time` tells what is foreseen of it."""
@@ -250,12 +252,20 @@ class _Solution(torch.autograd.Function):
         return ctx.adjoint(gradient), None, None
 
 
-def _prior(grid: FourierGrid, filter_width: float, inside: Tensor) -> tuple[Tensor, float]:
+def dissipation_range(wavenumber: np.ndarray) -> np.ndarray:
+    """f(k eta), by which spectra fall below the power law of the inertial range: exp(-5.2 ((k eta)^4 + 0.4^4)^(1/4) +
+    5.2 * 0.4) (Pope 2000, Eq. 6.248); 1 where `wavenumber`, k eta, is 0."""
+    return np.exp(DISSIPATION * (DISSIPATION_ONSET - (wavenumber**4 + DISSIPATION_ONSET**4) ** 0.25))
+
+
+def _prior(grid: FourierGrid, filter_width: float, kolmogorov_length: float,
+           inside: Tensor) -> tuple[Tensor, float]:
     """Energy P_k of a component of each mode (kz, ky, kx), and the energy beyond, for <v.v> = 1."""
     unit = 2 * math.pi / grid.decomposition.length
 
-    def law(k):
-        return k**-EXPONENT * np.exp(-((unit * k * filter_width) ** 2) / 12)
+    def law(shell):
+        k = unit * shell
+        return shell**-EXPONENT * dissipation_range(k * kolmogorov_length) * np.exp(-((k * filter_width) ** 2) / 12)
 
     modes = torch.where(inside, torch.from_numpy(law(grid.shell.clamp_min(1).numpy())), 0.0)
     total = float(global_sum(grid.decomposition.comm, float(2 * (modes * grid.multiplicity).sum())))

@@ -38,7 +38,7 @@ def test_density_is_stored_where_both_have_one(comm, tmp_path, of_truth, of_mode
         names = list(truth.trajectory.columns)
     with open_product(comm, tmp_path / "rollout.h5", "rollout") as file:
         model, stored = Trajectory(file, "model"), Trajectory(file, "truth")
-        both = {"position", "velocity", "acceleration", "velocity_gradient"}
+        both = {"position", "image", "velocity", "acceleration", "velocity_gradient"}
         both |= {"density"} if of_truth and of_model else set()
         assert set(model.columns) == set(stored.columns) == both
         for name, values in zip(names, true):

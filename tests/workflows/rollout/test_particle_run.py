@@ -334,7 +334,7 @@ def test_where_no_term_reads_the_density_an_incompressible_truth_will_do(comm, t
         assert ("feature_range" in file) == (kind == "pairs") and "density_rate_sample" not in file
     with open_product(comm, tmp_path / "rollout.h5", "rollout") as file:
         assert read_attributes(file, "rollout")["status"] == "complete"
-        both = {"position", "velocity", "acceleration", "velocity_gradient"}
+        both = {"position", "image", "velocity", "acceleration", "velocity_gradient"}
         assert set(Trajectory(file, "model").columns) == set(Trajectory(file, "truth").columns) == both
         assert ("outside_training" in file) == (kind == "pairs")
     assert f"terms {', '.join(scene.model.terms)}" in reported(comm, tmp_path)[1]
