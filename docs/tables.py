@@ -10,6 +10,13 @@ words for them; a row `floor` is the truth's own:
     floor: two samples of the true particles
     -->
     <!-- end of table -->
+
+The numbers of a run stand likewise, a row each, taken from its `metrics.json` as RUN.json in docs/results:
+
+    <!-- numbers of hit-small
+    resolution k_max eta = {ground_truth[kmax_eta]:.2f}
+    -->
+    <!-- end of numbers -->
 """
 
 import json
@@ -24,6 +31,7 @@ from eddies.measures import MEASURES
 HERE = Path(__file__).parent
 PAGES = (HERE.parent / "README.md", *sorted(HERE.glob("*.md")))
 TABLE = re.compile(r"(<!-- table of ([\w-]+): ([^\n]*)\n(.*?)-->\n).*?(?=<!-- end of table -->)", re.DOTALL)
+NUMBERS = re.compile(r"(<!-- numbers of ([\w-]+)\n(.*?)-->\n).*?(?=<!-- end of numbers -->)", re.DOTALL)
 WORDS = MEASURES | {"wall_seconds": "seconds a turnover", "core_seconds": "core seconds a turnover",
                     "training_seconds": "training (s)", "time_step": "step"}
 FLOOR = "floor"
@@ -31,7 +39,8 @@ FLOOR = "floor"
 
 def written(page: str) -> str:
     """A page with its tables as the results are now. KeyError where a table names what is not there."""
-    return TABLE.sub(lambda found: found[1] + table(*found.groups()[1:]), page)
+    page = TABLE.sub(lambda found: found[1] + table(*found.groups()[1:]), page)
+    return NUMBERS.sub(lambda found: found[1] + numbers(*found.groups()[1:]), page)
 
 
 def table(comparison: str, columns: str, rows: str) -> str:
@@ -45,6 +54,16 @@ def table(comparison: str, columns: str, rows: str) -> str:
     for row in rows.strip().splitlines():
         name, words = row.split(": ", 1)
         lines.append(f"| {words} |" + "".join(f" {number(results[name], key)} |" for key in keys))
+    return "\n".join(lines) + "\n"
+
+
+def numbers(run: str, rows: str) -> str:
+    """The lines of the numbers of a run."""
+    record = json.loads((HERE / "results" / f"{run}.json").read_text(encoding="utf-8"))
+    lines = ["| quantity | value |", "|---|---|"]
+    for row in rows.strip().splitlines():
+        words, pattern = row.rsplit(" = ", 1)
+        lines.append(f"| {words} | {pattern.format(**record)} |")
     return "\n".join(lines) + "\n"
 
 

@@ -43,6 +43,18 @@ def test_every_table_is_that_of_its_results(tables):
         text = page.read_text(encoding="utf-8")
         assert tables.written(text) == text, f"{page.name}: .venv/bin/python docs/tables.py"
         assert text.count("<!-- table of ") == len(tables.TABLE.findall(text))
+        assert text.count("<!-- numbers of ") == len(tables.NUMBERS.findall(text))
+
+
+def test_numbers_of_a_run_are_those_of_its_metrics(tables, tmp_path, monkeypatch):
+    (tmp_path / "results").mkdir()
+    record = {"rollout": {"energy_ratio": 0.99584, "bands": {"1-2": 1.25}}}
+    (tmp_path / "results/own.json").write_text(json.dumps(record))
+    monkeypatch.setattr(tables, "HERE", tmp_path)
+    page = ("<!-- numbers of own\nenergy = {{rollout[energy_ratio]:.2f}}\n"
+            "bands k = 1 = {{rollout[bands][1-2]:.1f}}\n-->\n{}<!-- end of numbers -->")
+    lines = "| quantity | value |\n|---|---|\n| energy | 1.00 |\n| bands k = 1 | 1.2 |\n"
+    assert tables.written(page.format("old\n")) == page.format(lines)
 
 
 def test_a_table_has_the_rows_and_columns_that_its_comment_names(tables, tmp_path, monkeypatch):

@@ -92,7 +92,7 @@ def test_columns_are_those_that_are_stored(comm, path, density):
     (has_density, particles, rates, window), times, stored = read(comm, path, ask)
     assert has_density == density
     names = {"position", "velocity"} | ({"density"} if density else set())
-    assert stored.keys() == names and particles.keys() == {"id"} | names
+    assert stored.keys() == names | {"image"} and particles.keys() == {"id"} | names
     assert rates.keys() == {"id", "acceleration"} | names | ({"density_rate"} if density else set())
     assert window.keys() == {"id"} | names | {f"{name}_later" for name in names}
     ids = particles["id"]
