@@ -3,7 +3,7 @@
 from importlib import import_module
 from typing import Any
 
-__version__ = "0.2.0"
+__version__ = "1.0.0"
 
 # What a program uses, by the module that it comes from. Each is imported when it is first asked for: a program that
 # reads a scene starts neither MPI nor torch.
