@@ -161,7 +161,7 @@ def test_a_dynamic_coefficient_is_found_where_the_hidden_stress_is_the_models(co
     between = coarse.stress(test * velocity) - test * fine.stress(velocity)
     # What is taken for u u of the twice filtered velocity, less that filtered.
     squares = iter([np.zeros_like(between), -between])
-    monkeypatch.setattr(model, "_squares", lambda _: next(squares))
+    monkeypatch.setattr(grid, "squares", lambda _: next(squares))
     model.begin_step(velocity)
     assert np.sqrt(model.squared_length) == pytest.approx(mixing_length, rel=1e-9)
 

@@ -177,7 +177,7 @@ def test_derivatives_projection_and_pressure_are_those_of_plain_transforms(comm)
     pressure = (1j * whole.wave * divergence).sum(0) * whole.inverse
     stress_modes = grid.to_modes(own(grid, stress))
     assert_fields(grid, grid.stress_divergence(stress_modes), whole.fields(divergence))
-    assert_fields(grid, grid.pressure_of(stress_modes), whole.fields(pressure))
+    assert_fields(grid, grid.pressure_of(grid.stress_divergence(stress_modes)), whole.fields(pressure))
     hidden = grid.hidden_stress(stress_modes)
     assert_fields(grid, hidden.pressure_modes, whole.fields(pressure))
     assert_fields(grid, hidden.force_modes, whole.fields(-1j * whole.wave * pressure - divergence))
@@ -200,6 +200,23 @@ def test_products_of_fields_at_the_grid_points(comm):
     both = torch.stack([own(grid, first), own(grid, second)], dim=1)
     found = grid.products(both, both)
     assert_fields(grid, found, np.stack([cut(first[i] * first[j] + second[i] * second[j]) for i, j in pairs]))
+
+
+@pytest.mark.mpi(1, 2, 3)
+def test_squares_are_products_that_keep_no_fields_and_differentiate_as_these(comm):
+    grid = grid_on(comm, 18, 4)
+    modes = modes_like(comm, grid, 3)
+    change, weights = modes_like(comm, grid, 3), modes_like(comm, grid, 6)
+
+    def products(modes):
+        fields = grid.to_fields(modes)
+        return grid.within(grid.products(fields, fields))
+
+    torch.testing.assert_close(grid.squares(modes), products(modes), rtol=0, atol=1e-12)
+    back = [pulled_back(function, modes, weights) for function in (grid.squares, products)]
+    torch.testing.assert_close(*back, rtol=0, atol=1e-10 * float(back[1].abs().max()))
+    # and by differences, which for squares have no error but that of rounding
+    assert slope(comm, grid.squares, modes, change, weights, 1e-3) == pytest.approx(inner(comm, back[0], change), rel=1e-9)
 
 
 @pytest.mark.mpi(1, 2, 3)

@@ -34,11 +34,13 @@ def test_what_is_found_solves_the_equations(comm, monkeypatch, compiled):
     right = equations.gathered(values, points)
     count = 300.0 * comm.size
     size = equations.size(right, count)
-    found, iterations, left = equations.solve(points, right, count, 1e-24 * size, None, 100)
-    assert 5 < iterations < 100 and left <= 1e-24 * size
-    image = equations.gathered(equations.grid.at(found, points), points) + equations.penalty * found
+    found = equations.solve(points, right, count, 1e-24 * size, None, 100)
+    assert 5 < found.iterations < 100 and found.left <= 1e-24 * size
+    at_points = equations.grid.at(found.modes, points)
+    torch.testing.assert_close(found.at_points, at_points, rtol=0, atol=1e-12 * float(at_points.abs().max()))
+    image = equations.gathered(at_points, points) + equations.penalty * found.modes
     assert equations.size(right - image, count) <= 1e-22 * size
     # A given number of iterations is taken, and what is left of the residual told.
-    found, iterations, left = equations.solve(points, right, count, 0.0, 3, 100)
-    image = equations.gathered(equations.grid.at(found, points), points) + equations.penalty * found
-    assert iterations == 3 and equations.size(right - image, count) == pytest.approx(left, rel=1e-9)
+    found = equations.solve(points, right, count, 0.0, 3, 100)
+    image = equations.gathered(equations.grid.at(found.modes, points), points) + equations.penalty * found.modes
+    assert found.iterations == 3 and equations.size(right - image, count) == pytest.approx(found.left, rel=1e-9)

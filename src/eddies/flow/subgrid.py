@@ -108,7 +108,7 @@ class DynamicStress(StressModel):
     def begin_step(self, velocity: np.ndarray) -> None:
         """Find the mixing length; collective."""
         test, coarser = self.test, self.test * velocity
-        hidden = test * self._squares(velocity) - self._squares(coarser)
+        hidden = test * self.grid.squares(velocity) - self.grid.squares(coarser)
         strain, coarser_strain = (self._of_gradients(u, _into(strain_product)) for u in (velocity, coarser))
         model = 2 * (test * strain - self.ratio * coarser_strain)
         if self.squared_width:
@@ -116,14 +116,6 @@ class DynamicStress(StressModel):
             hidden -= self.squared_width / 12 * (self.ratio * coarser_products - test * products)
         found, norm = (self._contraction(tensor, model) for tensor in (hidden, model))
         self.squared_length = max(found / norm, 0.0) if norm > 0 else 0.0
-
-    def _squares(self, velocity: np.ndarray) -> np.ndarray:
-        """Modes of u_i u_j."""
-        def product(u: np.ndarray, out: np.ndarray) -> None:
-            for row, (i, j) in enumerate(((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))):
-                np.multiply(u[i], u[j], out=out[row])
-
-        return self.grid.multiply(velocity, product, 6, fields=3)
 
     def _contraction(self, one: np.ndarray, other: np.ndarray) -> float:
         """<A:B> of symmetric tensors, over the modes that the second filter leaves."""

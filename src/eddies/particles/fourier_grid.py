@@ -17,7 +17,7 @@ from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.particle_set import as_numpy
 from eddies.particles.rates import Rates
 from eddies.spectral.interpolation import SplineInterpolation
-from eddies.spectral.spectral_grid import SpectralGrid
+from eddies.spectral.spectral_grid import SYMMETRIC, SpectralGrid
 from eddies.spectral.splines import Splines
 
 
@@ -39,6 +39,7 @@ class FourierGrid:
         self.reach = margin * decomposition.spacing
         #: kx, ky, kz, to broadcast over (kz, ky, kx)
         self.wavevector = tuple(torch.from_numpy(axis) for axis in self.spectral.wavevector)
+        self._derivatives = tuple(1j * k for k in self.wavevector)
         #: |k|, in units of the smallest one
         self.shell = torch.from_numpy(np.sqrt(self.spectral.index_squared))
         self.wavenumber_squared = torch.from_numpy(self.spectral.wavenumber_squared)
@@ -92,33 +93,35 @@ class FourierGrid:
 
     def gradient(self, scalar: Tensor) -> Tensor:
         """i k f of one component (kz, ky, kx): (3, kz, ky, kx)."""
-        return torch.stack([1j * k * scalar for k in self.wavevector])
+        return torch.stack([derivative * scalar for derivative in self._derivatives])
 
     def divergence(self, vector: Tensor) -> Tensor:
         """i k.u of a vector: (kz, ky, kx)."""
-        return 1j * self._along(vector)
+        return _dot(self._derivatives, vector)
 
     def solenoidal(self, vector: Tensor) -> Tensor:
         """u - k (k.u) / k^2, the projection of a vector on solenoidal fields."""
-        longitudinal = self._along(vector) * self.inverse_squared
+        longitudinal = _dot(self.wavevector, vector) * self.inverse_squared
         return vector - torch.stack([k * longitudinal for k in self.wavevector])
 
     def stress_divergence(self, stress: Tensor) -> Tensor:
         """d_j tau_ij of a symmetric matrix (6, kz, ky, kx): (3, kz, ky, kx)."""
         xx, yy, zz, xy, xz, yz = stress
-        return torch.stack([self.divergence(row) for row in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))])
+        return torch.stack([_dot(self._derivatives, row) for row in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))])
 
-    def pressure_of(self, stress: Tensor) -> Tensor:
-        """p (kz, ky, kx) with  laplacian p = -d_i d_j tau_ij  and mean zero, of a symmetric matrix (6, kz, ky, kx)."""
-        return self.divergence(self.stress_divergence(stress)) * self.inverse_squared
+    def pressure_of(self, vector: Tensor) -> Tensor:
+        """p (kz, ky, kx) with  laplacian p = -div f  and mean zero, of a vector f (3, kz, ky, kx), such as the
+        divergence of a stress: f + grad p is solenoidal."""
+        return self.divergence(vector) * self.inverse_squared
 
     def hidden_stress(self, stress: Tensor) -> Rates:
         """What a stress tau that the filter hides does to the filtered flow, of (6, kz, ky, kx): its divergence and the
         gradient of its pressure p_tau (`pressure_of`), which together are the force
 
             -grad p_tau - div tau = -P[div tau],   P the projection on solenoidal fields."""
-        return Rates(force_modes=-self.solenoidal(self.stress_divergence(stress)),
-                     pressure_modes=self.pressure_of(stress))
+        divergence = self.stress_divergence(stress)
+        pressure = self.pressure_of(divergence)
+        return Rates(force_modes=-(divergence + self.gradient(pressure)), pressure_modes=pressure)
 
     def slopes(self, vector: Tensor) -> Tensor:
         """Fields d_j u_i of a vector's modes: (3, 3, z_local, y, x) [component, direction]."""
@@ -128,22 +131,21 @@ class FourierGrid:
     def products(self, first: Tensor, second: Tensor) -> Tensor:
         """Modes (6, kz, ky, kx) of a_i.b_j, symmetric in i and j, of fields (3, ..., z_local, y, x); what stands
         between is summed over."""
-        pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-        fields = [first[i] * second[j] for i, j in pairs]
+        fields = [first[i] * second[j] for i, j in SYMMETRIC]
         return self.to_modes(torch.stack([field.sum(0) if field.dim() > 3 else field for field in fields]))
 
     def squares(self, vector: Tensor) -> Tensor:
         """Modes (6, kz, ky, kx), |k| <= `resolved`, of u_i u_j of a vector's modes."""
-        fields = self.to_fields(vector)
-        return self.within(self.products(fields, fields))
+        return self.within(_Squares.apply(vector, self))
 
     def within(self, vector: Tensor) -> Tensor:
         """The modes with |k| <= `resolved` of a vector."""
         return torch.where(self.shell <= self.resolved, vector, 0.0)
 
-    def _along(self, vector: Tensor) -> Tensor:
-        kx, ky, kz = self.wavevector
-        return kx * vector[0] + ky * vector[1] + kz * vector[2]
+
+def _dot(wavevector: Sequence[Tensor], vector: Tensor) -> Tensor:
+    kx, ky, kz = wavevector
+    return kx * vector[0] + ky * vector[1] + kz * vector[2]
 
 
 class Points:
@@ -197,6 +199,24 @@ class _ToFields(torch.autograd.Function):
         grid = ctx.grid
         modes = torch.from_numpy(grid.spectral.forward(as_numpy(gradient)))
         return modes * (grid.spectral.cells**3 * grid.multiplicity), None
+
+
+class _Squares(torch.autograd.Function):
+    """`FourierGrid.products` of a vector with itself, a few planes at a time: fields are not kept, so on the way back
+    they are made anew."""
+
+    @staticmethod
+    def forward(ctx, modes: Tensor, grid: FourierGrid) -> Tensor:
+        ctx.grid = grid
+        ctx.save_for_backward(modes)
+        return torch.from_numpy(grid.spectral.squares(as_numpy(modes.resolve_conj())))
+
+    @staticmethod
+    def backward(ctx, gradient: Tensor) -> tuple[Tensor, None]:
+        with torch.enable_grad():
+            modes = ctx.saved_tensors[0].detach().requires_grad_()
+            fields = ctx.grid.to_fields(modes)
+            return torch.autograd.grad(ctx.grid.products(fields, fields), modes, gradient)[0], None
 
 
 class _Interpolated(torch.autograd.Function):

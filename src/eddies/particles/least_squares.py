@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -14,6 +16,17 @@ from eddies.particles.fourier_grid import FourierGrid, Points
 # How many times stronger the preconditioner holds the small scales back: their errors count most, as the filter is
 # undone, and the first iterations would make many of them.
 SMOOTHING = 5.0
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Modes (3, kz, ky, kx), their values at the points (n, 3), which the iterations come by, how many these were, and
+    the squared residual that is left."""
+
+    modes: Tensor
+    at_points: Tensor
+    iterations: int
+    left: float
 
 
 class LeastSquares:
@@ -56,21 +69,23 @@ class LeastSquares:
 
     @torch.no_grad()
     def solve(self, points: Points, right: Tensor, count: float, enough: float, iterations: int | None,
-              most: int) -> tuple[Tensor, int, float]:
-        """Modes y with A y = `right` by preconditioned conjugate gradients, and the iterations and the squared residual
-        (`size`) that is left; until that is `enough`, in `most` iterations, or in a given number of them."""
+              most: int) -> Solution:
+        """Modes y with A y = `right` by preconditioned conjugate gradients, until the squared residual (`size`) is
+        `enough`, in `most` iterations, or in a given number of them."""
         inverse, residual = self.preconditioner(count).numpy(), np.array(right.numpy(), order="C")
         found, direction, passes = np.zeros_like(residual), inverse * residual, self._passes
+        at_points = points.position.new_zeros((len(points.position), len(residual)), dtype=torch.float64)
         left, taken = self.size(right, count), 0
         while (left > enough and taken < most) if iterations is None else (taken < iterations and left > 0):
             values = self.grid.at(torch.from_numpy(direction), points)
             image, product = passes.image(self.grid.to_modes(points.spread(values)).numpy(), direction)
             length = left / self._over_ranks(product)
+            at_points += length * values
             before = left
             left = self._over_ranks(passes.descend(length, inverse, direction, image, found, residual))
             passes.turn(left / before, inverse, residual, direction)
             taken += 1
-        return torch.from_numpy(found), taken, left
+        return Solution(torch.from_numpy(found), at_points, taken, left)
 
     def _over_ranks(self, value: float) -> float:
         return float(global_sum(self.grid.decomposition.comm, value))

@@ -24,6 +24,7 @@ class ResolvedFlow:
     points : of the owned particles on the grid.
     relative_velocity : (n, 3), theirs less its mean over all particles.
     filter_width : d of the filter that the particles' velocity has passed.
+    left_over : (n, 3), what `missing` gives, where it is known.
     iterations : that the solve took. residual : that it ended with, relative to the velocities. converged : whether
         that is as little as was asked for.
     """
@@ -33,6 +34,7 @@ class ResolvedFlow:
     points: Points
     relative_velocity: Tensor
     filter_width: float
+    left_over: Tensor | None = None
     iterations: int = 0
     residual: float = 0.0
     converged: bool = True
@@ -43,6 +45,8 @@ class ResolvedFlow:
 
     def missing(self) -> Tensor:
         """What the grid does not resolve of the particles' velocities relative to their mean: (n, 3); collective."""
+        if self.left_over is not None:
+            return self.left_over
         return self.relative_velocity - self.at_particles(self.velocity).to(self.relative_velocity)
 
     @cached_property
@@ -61,6 +65,11 @@ class ResolvedFlow:
     def products(self) -> Tensor:
         """Modes (6, kz, ky, kx) of u_i u_j; collective, differentiable."""
         return self.grid.squares(self.velocity)
+
+    @cached_property
+    def convection(self) -> Tensor:
+        """Modes (3, kz, ky, kx) of d_j (u_i u_j); collective, differentiable."""
+        return self.grid.stress_divergence(self.products)
 
     @property
     def filter_transfer(self) -> Tensor:

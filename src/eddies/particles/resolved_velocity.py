@@ -15,7 +15,7 @@ from eddies.parallel.reduction import global_max, global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.fourier_grid import FourierGrid
-from eddies.particles.least_squares import LeastSquares
+from eddies.particles.least_squares import LeastSquares, Solution
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.rank_sums import mean_over_ranks
 from eddies.particles.reference_scales import resolved_wavenumber
@@ -106,7 +106,8 @@ class ResolvedVelocity:
             flow = self._solved(flow, start, count, square)
         self.solves.append((flow.iterations, flow.residual, flow.converged))
         if torch.is_grad_enabled():
-            gradient = self._descent(flow)
+            flow = replace(flow, left_over=None)  # which is without a gradient
+            gradient = self._descent(flow, flow.missing())
             flow = replace(flow, velocity=_Solution.apply(gradient, flow.velocity, self._adjoint(flow)))
         return flow
 
@@ -123,8 +124,7 @@ class ResolvedVelocity:
         """Keep a flow and its rate of change for later evaluations to start from. `force` are the modes
         (3, kz, ky, kx) of the particles' acceleration as a field: du/dt = P[force - div(uu)], P the solenoidal
         projection, in the frame that moves with the particles' mean velocity."""
-        change = -self.grid.stress_divergence(flow.products)
-        rate = self.equations.projected(change if force is None else force.detach() + change)
+        rate = self.equations.projected((0 if force is None else force.detach()) - flow.convection)
         self._moments = [moment for moment in self._moments if moment.time != time][-1:]
         self._moments.append(_Moment(time, flow.velocity.detach(), rate))
         self.speed = float(flow.rms)
@@ -170,9 +170,8 @@ class ResolvedVelocity:
 
     def _carried(self, modes: Tensor, step: float, mean: np.ndarray) -> Tensor:
         """Modes of a field that has moved with the mean velocity for a time."""
-        for k, velocity in zip(self.grid.wavevector, mean):
-            modes = modes * torch.exp(-1j * step * velocity * k)
-        return modes
+        turns = [torch.exp(-1j * step * velocity * k) for k, velocity in zip(self.grid.wavevector, mean)]
+        return math.prod(turns) * modes
 
     # ---- the solve
 
@@ -180,23 +179,25 @@ class ResolvedVelocity:
         """The flow with the modes that conjugate gradients find, of `count` particles with sum_i |v_i|^2 = `square`."""
         if start is not None:
             flow = replace(flow, velocity=start)
-        right = self._descent(flow)
+        missing = flow.missing()
+        right = self._descent(flow, missing)
         begin = self.equations.size(right, count)
         tolerance = self.tolerance if start is None else self.tolerance_foreseen
         if begin > square and start is not None:  # worse than nothing is
             return self._solved(replace(flow, velocity=torch.zeros_like(start)), None, count, square)
-        change, iterations, left = self._change(flow, right, count, tolerance**2 * square)
+        change = self._change(flow, right, count, tolerance**2 * square)
         # What is not finite has not converged.
-        return replace(flow, velocity=flow.velocity + change, iterations=iterations,
-                       residual=math.sqrt(left / square) if square > 0 else 0.0,
-                       converged=self.iterations is not None or left <= tolerance**2 * square)
+        return replace(flow, velocity=flow.velocity + change.modes, iterations=change.iterations,
+                       left_over=missing - change.at_points.to(missing),
+                       residual=math.sqrt(change.left / square) if square > 0 else 0.0,
+                       converged=self.iterations is not None or change.left <= tolerance**2 * square)
 
-    def _change(self, flow: ResolvedFlow, right: Tensor, count: float, enough: float) -> tuple[Tensor, int, float]:
+    def _change(self, flow: ResolvedFlow, right: Tensor, count: float, enough: float) -> Solution:
         return self.equations.solve(flow.points, right, count, enough, self.iterations, self.most_iterations)
 
-    def _descent(self, flow: ResolvedFlow) -> Tensor:
-        """Half the steepest descent of what is minimised, P B^T (v - B u) - (sigma^2/P_k) u, zero at its minimum."""
-        missing = flow.relative_velocity.double() - self.grid.at(flow.velocity, flow.points)
+    def _descent(self, flow: ResolvedFlow, missing: Tensor) -> Tensor:
+        """Half the steepest descent of what is minimised, P B^T (v - B u) - (sigma^2/P_k) u, zero at its minimum, with
+        `missing` = v - B u."""
         return self.equations.gathered(missing, flow.points) - self.equations.penalty * flow.velocity
 
     def _adjoint(self, flow: ResolvedFlow) -> Callable[[Tensor], Tensor]:
@@ -212,10 +213,10 @@ class ResolvedVelocity:
             fields = grid.to_fields(gradient.resolve_conj() / grid.multiplicity)
             right = self.equations.projected(grid.to_modes(fields))
             enough = self.tolerance**2 * self.equations.size(right, count)
-            found, iterations, left = self._change(flow, right, count, enough)
-            self.solves.append((iterations, self.tolerance * math.sqrt(left / enough) if enough > 0 else 0.0,
-                                self.iterations is not None or left <= enough))
-            return grid.multiplicity * found
+            found = self._change(flow, right, count, enough)
+            self.solves.append((found.iterations, self.tolerance * math.sqrt(found.left / enough) if enough > 0 else 0.0,
+                                self.iterations is not None or found.left <= enough))
+            return grid.multiplicity * found.modes
 
         return solve
 

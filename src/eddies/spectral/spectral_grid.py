@@ -16,6 +16,9 @@ from eddies.spectral.fourier_passes import ColumnPass, Part, PlanePass, PlanePla
 REAL = {"float64": np.float64, "float32": np.float32}
 COMPLEX = {"float64": np.complex128, "float32": np.complex64}
 
+# Entries of a symmetric matrix, in the order in which they are stored.
+SYMMETRIC = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+
 Expansion = Callable[[np.ndarray], Sequence[Part]]
 
 
@@ -120,6 +123,15 @@ class SpectralGrid:
             product(values, plans.values)
             collected.add(planes, plans)
         return collected.modes()
+
+    def squares(self, vector: np.ndarray) -> np.ndarray:
+        """Fourier coefficients (6, kz, ky_local, kx) of u_i u_j, ij = xx, yy, zz, xy, xz, yz, of those of a vector
+        (3, kz, ky_local, kx)."""
+        def product(u: np.ndarray, out: np.ndarray) -> None:
+            for row, (i, j) in enumerate(SYMMETRIC):
+                np.multiply(u[i], u[j], out=out[row])
+
+        return self.multiply(vector, product, len(SYMMETRIC), fields=3)
 
     def blocks(self, spectral: np.ndarray, fields: int, expand: Expansion | None = None,
                z_derivatives: int = 0) -> Iterator[np.ndarray]:

@@ -19,6 +19,6 @@ class Pressure(Term):
     def forward(self, context: Context) -> Rates:
         """Modes of pressure and force."""
         grid = context.resolved.grid
-        pressure = grid.pressure_of(context.resolved.products)
+        pressure = grid.pressure_of(context.resolved.convection)
         force = -grid.gradient(pressure) if self.settings.force else None
         return Rates(force_modes=force, pressure_modes=pressure)
