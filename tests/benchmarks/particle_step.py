@@ -51,7 +51,7 @@ DAMPING = (0.0, 0.0, 0.01, 0.14, 1.0, 1.6)
 PAIR_SHARE = 0.03  # of the acceleration, about what a trained network adds: one that is as large blows the flow up
 ETA = 1.5
 PARTS = {
-    "transforms": [(SpectralGrid, "forward"), (SpectralGrid, "backward")],
+    "transforms": [(SpectralGrid, name) for name in ("forward", "backward", "squares")],
     "splines": [(Points, "at"), (Points, "spread"), (SplineInterpolation, "with_ghosts")],
     "vectors": [(passes, name) for passes in (ModePasses, CompiledModePasses) for name in ("image", "descend", "turn")],
     "solve, the rest": [(LeastSquares, "solve")],

@@ -40,6 +40,11 @@ def test_what_is_found_solves_the_equations(comm, monkeypatch, compiled):
     torch.testing.assert_close(found.at_points, at_points, rtol=0, atol=1e-12 * float(at_points.abs().max()))
     image = equations.gathered(at_points, points) + equations.penalty * found.modes
     assert equations.size(right - image, count) <= 1e-22 * size
+    # The descent is made in one pass where nothing is recorded.
+    with torch.no_grad():
+        descent = equations.descent(values, points, found.modes)
+    recorded = equations.descent(values, points, found.modes)
+    torch.testing.assert_close(descent, recorded, rtol=0, atol=1e-13 * float(right.abs().max()))
     # A given number of iterations is taken, and what is left of the residual told.
     found = equations.solve(points, right, count, 0.0, 3, 100)
     image = equations.gathered(equations.grid.at(found.modes, points), points) + equations.penalty * found.modes

@@ -43,6 +43,7 @@ class LeastSquares:
 
     def __init__(self, grid: FourierGrid, inside: Tensor, penalty: Tensor) -> None:
         self.grid, self.inside, self.penalty = grid, inside, penalty.to(grid.dtype)
+        self._inside = inside.to(grid.dtype)
         scale = torch.where(inside, grid.prefilter * grid.spectral.cells**3, 0.0)
         weights = (grid.spectral.wavevector, grid.spectral.multiplicity, grid.inverse_squared.numpy(), scale.numpy(),
                    self.penalty.numpy())
@@ -53,9 +54,16 @@ class LeastSquares:
         """P B^T of values (n, 3) at points; collective, differentiable."""
         return self.projected(self.grid.spread(values, points) * self.grid.spectral.cells**3)
 
+    def descent(self, values: Tensor, points: Points, modes: Tensor) -> Tensor:
+        """P B^T values - penalty modes; collective, differentiable."""
+        if torch.is_grad_enabled():
+            return self.gathered(values, points) - self.penalty * modes
+        given = self.grid.to_modes(points.spread(values))
+        return torch.from_numpy(self._passes.image(given.numpy(), -modes.numpy())[0])
+
     def projected(self, modes: Tensor) -> Tensor:
         """P of modes; differentiable."""
-        return torch.where(self.inside, self.grid.solenoidal(modes), 0.0)
+        return self.grid.solenoidal(modes) * self._inside
 
     def preconditioner(self, count: float) -> Tensor:
         """1 / (N + 5 penalty), next to the inverse of A for N = `count` points; 0 outside."""

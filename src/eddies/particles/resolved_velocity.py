@@ -198,7 +198,7 @@ class ResolvedVelocity:
     def _descent(self, flow: ResolvedFlow, missing: Tensor) -> Tensor:
         """Half the steepest descent of what is minimised, P B^T (v - B u) - (sigma^2/P_k) u, zero at its minimum, with
         `missing` = v - B u."""
-        return self.equations.gathered(missing, flow.points) - self.equations.penalty * flow.velocity
+        return self.equations.descent(missing, flow.points, flow.velocity)
 
     def _adjoint(self, flow: ResolvedFlow) -> Callable[[Tensor], Tensor]:
         """By the implicit function theorem: the gradient by modes of the minimum -> that by the descent there.
@@ -214,7 +214,8 @@ class ResolvedVelocity:
             right = self.equations.projected(grid.to_modes(fields))
             enough = self.tolerance**2 * self.equations.size(right, count)
             found = self._change(flow, right, count, enough)
-            self.solves.append((found.iterations, self.tolerance * math.sqrt(found.left / enough) if enough > 0 else 0.0,
+            residual = self.tolerance * math.sqrt(found.left / enough) if enough > 0 else 0.0
+            self.solves.append((found.iterations, residual,
                                 self.iterations is not None or found.left <= enough))
             return grid.multiplicity * found.modes
 
