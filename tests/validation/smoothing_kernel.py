@@ -17,6 +17,9 @@ from mpi4py import MPI
 
 from eddies.io.hdf5 import open_product
 from eddies.parallel.slab import SlabDecomposition
+from eddies.particles.neighbor_list import NeighborList
+from eddies.particles.particle_field import grid_points
+from eddies.particles.periodic_box import PeriodicBox
 from eddies.particles.smoothing_kernels import CubicSpline, HermiteKernel, WendlandC2
 from eddies.scene.scene import BOX_LENGTH
 from eddies.scene.sections import Tracers
@@ -38,9 +41,12 @@ class Field:
             truth = GroundTruth(file, SlabDecomposition(MPI.COMM_SELF, BOX_LENGTH, 8))
             slab = SlabDecomposition(MPI.COMM_SELF, BOX_LENGTH, truth.fields.cells)
             side = round(truth.total ** (1 / 3))
-            self.support = Tracers(side, turnovers=1.0, frame_interval=1.0).radius_of(neighbors)
+            self.support = Tracers(particles_per_side=side, turnovers=1.0, frame_interval=1.0).radius_of(neighbors)
             truth = GroundTruth(file, slab)
-            self.sample = load_sample(truth, len(truth.fields.times) - 1, self.support)
+            last = len(truth.fields.times) - 1
+            self.sample = load_sample(truth, last, self.support)
+            columns = truth.block(truth.frame_of_field(last), ("position", "velocity"))
+            self.position, self.velocity = (torch.from_numpy(columns[name]) for name in ("position", "velocity"))
         chosen = np.random.default_rng(seed).choice(slab.planes**3, min(POINTS, slab.planes**3), replace=False)
         self.rows = torch.from_numpy(np.sort(chosen))
 
@@ -80,23 +86,9 @@ class Field:
         slopes = torch.cat([values.new_zeros(1), (values[2:] - values[:-2]) * (KNOTS - 1) / 2, values.new_zeros(1)])
         return HermiteKernel(self.support, values, slopes)
 
-    def moving_least_squares(self, degree):
-        """Velocity and gradient of the polynomial that fits the neighbours of each point best."""
-        particles, weights = self.sample.particles, WendlandC2(self.support)
-        parts = []
-        for rows in self.rows.split(TOGETHER):
-            pairs = particles._around.pairs(particles._points, particles._position, rows, torch.float64)
-            monomials = _monomials(-pairs.displacement / self.support, degree)
-            weighted = weights.value(pairs.distance)[:, None] * monomials
-            matrix = pairs.sum(weighted[:, :, None] * monomials[:, None, :])
-            right = pairs.sum(weighted[:, :, None] * pairs.at_senders(particles._velocity).double()[:, None, :])
-            ridge = LEAST_WEIGHT * matrix.amax((1, 2))[:, None, None] * torch.eye(matrix.shape[1])
-            found = torch.linalg.solve(matrix + ridge, right)
-            parts.append((found[:, 0], found[:, 1:4].transpose(1, 2) / self.support))
-        return [torch.cat(part) for part in zip(*parts)]
-
     def errors(self, steps):
         """Errors of velocity and gradient, by what they are of."""
+        points = grid_points(self.sample.decomposition, self.sample.decomposition.planes)[self.rows]
         found = {"cubic spline": self.average(CubicSpline(self.support)),
                  "Wendland C2": self.average(WendlandC2(self.support))}
         for name, aim in AIMS.items():
@@ -104,8 +96,27 @@ class Field:
             with torch.no_grad():
                 found[f"best for {name}"] = self.average(kernel)
         for name, degree in DEGREES.items():
-            found[f"moving least squares, {name}"] = self.moving_least_squares(degree)
+            found[f"moving least squares, {name}"] = moving_least_squares(
+                points, self.position, self.velocity, self.support, degree)
         return {name: [float(share) ** 0.5 for share in self.shares(*fields)] for name, fields in found.items()}
+
+
+def moving_least_squares(points, position, velocity, support, degree):
+    """Values (k, 3) and gradients (k, 3, 3) [component, direction] at points of the polynomials of a degree, 1 or 2,
+    that fit the velocities (n, 3) of the particles within the support best, with Wendland's weights."""
+    neighbors, weights = NeighborList(PeriodicBox(BOX_LENGTH), support, 0.0), WendlandC2(support)
+    neighbors.build(points, position, exclude_self=False)
+    parts = []
+    for rows in torch.arange(len(points)).split(TOGETHER):
+        pairs = neighbors.pairs(points, position, rows, torch.float64)
+        monomials = _monomials(-pairs.displacement / support, degree)
+        weighted = weights.value(pairs.distance)[:, None] * monomials
+        matrix = pairs.sum(weighted[:, :, None] * monomials[:, None, :])
+        right = pairs.sum(weighted[:, :, None] * pairs.at_senders(velocity).double()[:, None, :])
+        ridge = LEAST_WEIGHT * matrix.amax((1, 2))[:, None, None] * torch.eye(matrix.shape[1])
+        found = torch.linalg.solve(matrix + ridge, right)
+        parts.append((found[:, 0], found[:, 1:4].transpose(1, 2) / support))
+    return [torch.cat(part) for part in zip(*parts)]
 
 
 def _monomials(x, degree):
