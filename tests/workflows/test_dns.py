@@ -79,6 +79,23 @@ def test_a_final_state_is_a_start(comm, tmp_path):
     assert tables[1]["time"][-1] == pytest.approx(0.1)
 
 
+@pytest.mark.mpi(1, 2)
+def test_a_start_with_another_speed_of_sound_makes_no_sound(comm, tmp_path):
+    """The compressible part of the energy stays that of the pressure that follows the flow, of order M_t^4."""
+    scene, shares = ["flow.cells=24", "flow.fluid=compressible", "time.step=0.01", "time.duration=0.3"], []
+    for name, speed in (("first", 20.0), ("second", 10.0)):
+        if shares:
+            scene += ["initial.kind=file", f"initial.path={comm.bcast(str(tmp_path / 'first' / 'ground_truth.h5'))}"]
+        (tmp_path / name).mkdir(exist_ok=True)
+        comm.Barrier()
+        dns.run(load_scene("taylor-green", [*scene, f"flow.sound_speed={speed}"]), comm, tmp_path / name)
+        with open_product(comm, tmp_path / name / "ground_truth.h5", "ground_truth") as file:
+            shares.append(read_table(file, "statistics")["compressible_fraction"].max())
+    # At twice the Mach number 16 times the share; sound of a pressure that were but a quarter of what it should be has
+    # hundreds of times that.
+    assert 0 < shares[1] < 40 * shares[0]
+
+
 @pytest.mark.mpi(1, 3)
 def test_a_flow_with_tracers_is_a_start_on_any_grid(comm, tmp_path):
     def followed(name, scene):

@@ -37,7 +37,7 @@ class FieldSeries:
     """Reads /fields/NAME of an open product; ProductError if there is none."""
 
     def __init__(self, file: h5py.File, name: str) -> None:
-        self._group = find_group(file, f"fields/{name}")
+        self.file, self._group = file, find_group(file, f"fields/{name}")
 
     def __len__(self) -> int:
         """Number of stored fields."""

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 import re
+import tomllib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -24,6 +25,7 @@ from mpi4py import MPI
 from eddies.io.errors import ProductError
 from eddies.io.fields import FieldSeries
 from eddies.io.hdf5 import open_product
+from eddies.io.provenance import read_provenance
 from eddies.parallel.broadcast import on_all_ranks, on_first_rank
 
 CUTOUT_EDGE = 2 * math.pi
@@ -31,6 +33,15 @@ CUTOUT_NAME = re.compile(r"Velocity_(\d+)")
 FLUIDSIM_PARAMETERS = "info_simul/params/oper"
 # Of a grid step: coordinates of cutouts are stored in single precision.
 PLACE_TOLERANCE = 0.01
+
+
+class StoredStates(FieldSeries):
+    """States of the whole flow in an open ground truth."""
+
+    @property
+    def sound_speed(self) -> float | None:
+        """That of the fluid; None without one."""
+        return tomllib.loads(read_provenance(self.file)["scene"])["flow"].get("sound_speed")
 
 
 class VelocityCubes:
@@ -43,7 +54,7 @@ class VelocityCubes:
         ProductError: these are not velocities on equally many points along each axis.
     """
 
-    variables = ("velocity",)
+    variables, sound_speed = ("velocity",), None
 
     def __init__(self, states: Sequence[Sequence[h5py.Dataset]]) -> None:
         self._states = states
@@ -67,7 +78,7 @@ class VelocityCubes:
 
 
 @contextmanager
-def open_states(comm: MPI.Comm, path: str | Path) -> Iterator[FieldSeries | VelocityCubes]:
+def open_states(comm: MPI.Comm, path: str | Path) -> Iterator[StoredStates | VelocityCubes]:
     """The states of the whole flow that a file holds; all ranks call it, and if one cannot read it, all raise.
 
     A ground truth has them at its end, or, where it followed tracers, at a few times with them.
@@ -77,7 +88,7 @@ def open_states(comm: MPI.Comm, path: str | Path) -> Iterator[FieldSeries | Velo
     """
     if on_first_rank(comm, lambda: _is_product(Path(path))):
         with open_product(comm, path, "ground_truth") as file:
-            yield FieldSeries(file, "final" if "fields/final" in file else "unfiltered")
+            yield StoredStates(file, "final" if "fields/final" in file else "unfiltered")
     else:
         with on_all_ranks(comm, lambda: _open(path), ProductError) as file:
             yield on_all_ranks(comm, lambda: _velocity_cubes(file), ProductError)

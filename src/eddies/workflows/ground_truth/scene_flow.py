@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,13 +16,14 @@ from eddies.flow.navier_stokes import FLUIDS, Fluid
 from eddies.flow.operators import project
 from eddies.import_path import is_path, load
 from eddies.io.errors import ProductError
-from eddies.io.fields import FieldSeries
-from eddies.io.flow_states import VelocityCubes, open_states
+from eddies.io.flow_states import StoredStates, VelocityCubes, open_states
 from eddies.parallel.broadcast import on_all_ranks
 from eddies.parallel.communicator import Comm
 from eddies.parallel.slab import SlabDecomposition
 from eddies.scene.scene import BOX_LENGTH, Initial, Scene, SceneError
 from eddies.spectral.spectral_grid import SpectralGrid, regrid
+
+log = logging.getLogger("eddies")
 
 
 def build_fluid(scene: Scene, comm: Comm) -> Fluid:
@@ -72,7 +74,7 @@ def _own_velocity(scene: Scene, grid: SpectralGrid) -> np.ndarray:
 
 
 @contextmanager
-def stored_states(initial: Initial, comm: Comm) -> Iterator[FieldSeries | VelocityCubes]:
+def stored_states(initial: Initial, comm: Comm) -> Iterator[StoredStates | VelocityCubes]:
     """The states of the whole flow in the file that a scene starts from; all ranks call it.
 
     Raises SceneError where there is no state of the number that the scene names, ProductError where there is none.
@@ -93,9 +95,18 @@ def _state_from_file(scene: Scene, fluid: Fluid) -> np.ndarray:
         names = fields.variables if fluid.compressible else ("velocity",)
         stored = on_all_ranks(comm, lambda: {name: fields.read(initial.state, name, *planes) for name in names},
                               ProductError)
+        stored_speed = on_all_ranks(comm, lambda: fields.sound_speed, ProductError)
     velocity = regrid(whole, grid, whole.forward(stored["velocity"]))
     if "density" in stored:
-        return np.concatenate([velocity, regrid(whole, grid, whole.forward(np.log(stored["density"])))])
+        density = regrid(whole, grid, whole.forward(np.log(stored["density"])))
+        if stored_speed not in (None, fluid.sound_speed):
+            # With the density as it is the pressure would be another, and what does not balance the velocity is sound.
+            density *= (stored_speed / fluid.sound_speed) ** 2
+            if comm.rank == 0:
+                log.info("dns: starts from a flow with the speed of sound %g: fluctuations of ln(density) are taken "
+                         "times %.3g, so that the pressure stays", stored_speed,
+                         (stored_speed / fluid.sound_speed) ** 2)
+        return np.concatenate([velocity, density])
     # A velocity of a compressible flow, in single precision, or of every second point alone, is not solenoidal.
     velocity = project(grid, velocity)
     if not fluid.compressible:
