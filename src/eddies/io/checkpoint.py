@@ -34,7 +34,7 @@ STATE, MANIFEST = "state.h5", "manifest.json"
 # The dataset of what is no array.
 PLAIN = "plain"
 # Of the layout of a checkpoint: others are not used. To be raised with that of the products too: frames are such.
-FORMAT = 7
+FORMAT = 8
 
 
 @dataclass(frozen=True)

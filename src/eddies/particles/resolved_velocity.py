@@ -23,7 +23,7 @@ from eddies.particles.resolved_flow import ResolvedFlow
 
 # The exponent of the prior's power law, how it ends in the dissipation range (Pope 2000, Eq. 6.248), and how many
 # times the energy that it expects beyond the resolved modes is taken for noise. The latter measured in docs/closure.md.
-EXPONENT, DISSIPATION, DISSIPATION_ONSET, WEIGHT = 11 / 3, 5.2, 0.4, 300.0
+EXPONENT, DISSIPATION, DISSIPATION_ONSET, WEIGHT = 11 / 3, 5.2, 0.4, 100.0
 # Residuals, relative to the velocities, at which a solve ends: one that starts from nothing, and one that starts from
 # what is foreseen. The latter's is spread over all modes, the former's is left in those that are hardest to tell.
 TOLERANCE, TOLERANCE_FORESEEN = 2e-4, 2e-3
