@@ -33,9 +33,8 @@ def test_every_preset_is_probed(comm, preset):
     assert set(speed.rates) == set(PARTS)
     assert all(rate.call >= 0 and rate.unit >= 0 for rate in speed.rates.values())
     assert speed.listed is (library() is None and pairs)
-    # The residual that a solve starts from and the products are two transforms each, the stress two, what it misses of
-    # the velocities one, the force one.
-    expected = (8, 30) if "pressure" in PRESETS[preset] else (0, 0)
+    # The residual that a solve starts from and the products are two transforms each, the stress two, the force one.
+    expected = (7, 27) if "pressure" in PRESETS[preset] else (0, 0)
     assert (speed.calls["transforms"], speed.components["transforms"]) == expected
     assert bool(speed.ghost_columns) == pairs
 
@@ -46,7 +45,7 @@ def test_pairs_that_are_told_the_densities_want_the_pressure_at_particles_and_gh
     preset = "model.preset=resolved + pairs"
     told = probe_particles(scene_of(preset, 'model.pairs.inputs=["density", "distance", "speed", "approach"]'), comm)
     without = probe_particles(scene_of(preset), comm)
-    assert (told.calls["transforms"], told.components["transforms"]) == (8, 31)
+    assert (told.calls["transforms"], told.components["transforms"]) == (7, 28)
     assert sorted(told.ghost_columns) == sorted([*without.ghost_columns, 8])
 
 
@@ -56,7 +55,7 @@ def test_terms_of_the_users_are_probed(comm, own, monkeypatch):
     monkeypatch.setattr(sys, "path", [*sys.path, str(EXAMPLES)])
     stress = probe_particles(scene_of('model.terms=["pressure", "own_term:SmagorinskyStress", "pairs"]'), comm)
     # It transforms nine slopes and six products in the place of three velocities and six products.
-    assert stress.components["transforms"] == 31 - 3 - 3 + 9
+    assert stress.components["transforms"] == 28 - 3 + 9
     own("own_pairs", OWN_PAIRS)
     unknown = probe_particles(scene_of('model.terms=["pressure", "own_pairs:Unknown"]'), comm)
     assert unknown.listed and unknown.block_bytes > 0
@@ -80,7 +79,7 @@ def test_a_flow_of_a_single_resolved_shell_is_probed(comm):
 @pytest.mark.mpi(1)
 def test_forcing_is_probed_too(comm):
     forced = probe_particles(scene_of("simulation.injection=0.5"), comm)
-    assert forced.components["transforms"] == 30
+    assert forced.components["transforms"] == 27
 
 
 @pytest.mark.usefixtures("quick_probes")

@@ -31,6 +31,7 @@ from eddies.particles.reference_scales import ReferenceScales
 from eddies.particles.terms.settings import Forcing
 from eddies.particles.terms.term import PairTerm
 from eddies.scene.scene import BOX_LENGTH, Scene
+from eddies.spectral.spectral_grid import SYMMETRIC
 from eddies.workflows.foreseen.estimates import expected_turbulence
 from eddies.workflows.foreseen.particle_work import VECTOR, particle_work
 
@@ -97,9 +98,10 @@ class Watch:
         self.seconds[self._open[-1]] += now - self._last
         self._last = now
 
-    def on(self, thing: object, name: str, part: str, components: Callable[..., int] | None = None) -> None:
-        """Let calls of this thing's method count for a part, with their components, or without where they belong to
-        another call."""
+    def on(self, thing: object, name: str, part: str, components: Callable[..., int] | None = None,
+           calls: int = 1) -> None:
+        """Let calls of this thing's method count for a part, each as so many calls with their components, or without
+        where they belong to another call."""
         method = getattr(thing, name)
 
         def watched(*arguments, **named):
@@ -111,7 +113,7 @@ class Watch:
                 self.switch()
                 self._open.pop()
             if components is not None:
-                self.calls[part] += 1
+                self.calls[part] += calls
                 self.components[part] += components(*arguments)
             return result
 
@@ -162,6 +164,8 @@ class Probe:
             grid = resolution.grid
             watch.on(grid.spectral, "forward", "transforms", len)
             watch.on(grid.spectral, "backward", "transforms", len)
+            # Back with the vector, forth with its products.
+            watch.on(grid.spectral, "squares", "transforms", lambda vector: len(vector) + len(SYMMETRIC), calls=2)
             watch.on(grid.spline, "with_ghosts", "splines")
             watch.on(resolution.equations, "solve", "modes")
             make_points = grid.points
