@@ -9,6 +9,24 @@ from eddies.parallel.slab import SlabDecomposition
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.time_stepping import STEPPERS
 
+# A small flow with tracers.
+WITH_TRACERS = """
+title = "decaying turbulence with tracers"
+[flow]
+fluid = "incompressible"
+cells = 32
+viscosity = 0.03
+[initial]
+kind = "random"
+amplitude = 1.0
+peak_wavenumber = 2
+[tracers]
+particles_per_side = 16
+turnovers = 0.1
+frame_interval = 0.02
+field_every = 2
+"""
+
 
 def make_grid(comm, cells, precision="float64", cutoff=None):
     return SpectralGrid(SlabDecomposition(comm, 2 * np.pi, cells), precision, cutoff)

@@ -2,32 +2,16 @@
 
 import pytest
 from closure import figure, measure
+from flows import WITH_TRACERS
 from matplotlib.figure import Figure
 
 from eddies.scene.scene import load_scene
 from eddies.workflows import dns
 
-SCENE = """
-title = "decaying turbulence with tracers"
-[flow]
-fluid = "incompressible"
-cells = 32
-viscosity = 0.03
-[initial]
-kind = "random"
-amplitude = 1.0
-peak_wavenumber = 2
-[tracers]
-particles_per_side = 16
-turnovers = 0.1
-frame_interval = 0.02
-field_every = 2
-"""
-
 
 @pytest.mark.mpi(1)
 def test_errors_over_wavenumbers_and_iterations(comm, tmp_path):
-    (tmp_path / "scene.toml").write_text(SCENE)
+    (tmp_path / "scene.toml").write_text(WITH_TRACERS)
     dns.run(load_scene(tmp_path / "scene.toml"), comm, tmp_path)
     found = measure(tmp_path, shares=(0.75, 1.25), iterations=(2, 20))
     coarse, fine = (error for error, _ in found["by_weight"]["100"])

@@ -3,27 +3,11 @@
 import numpy as np
 import pytest
 import torch
+from flows import WITH_TRACERS
 from smoothing_kernel import AIMS, Field, moving_least_squares
 
 from eddies.scene.scene import load_scene
 from eddies.workflows import dns
-
-SCENE = """
-title = "decaying turbulence with tracers"
-[flow]
-fluid = "incompressible"
-cells = 32
-viscosity = 0.03
-[initial]
-kind = "random"
-amplitude = 1.0
-peak_wavenumber = 2
-[tracers]
-particles_per_side = 16
-turnovers = 0.1
-frame_interval = 0.02
-field_every = 2
-"""
 
 
 @pytest.mark.parametrize("degree", [1, 2])
@@ -48,7 +32,7 @@ def test_moving_least_squares_reproduce_polynomials(degree):
 
 @pytest.mark.mpi(1)
 def test_the_best_kernel_is_better_than_the_one_that_it_starts_from(comm, tmp_path):
-    (tmp_path / "scene.toml").write_text(SCENE)
+    (tmp_path / "scene.toml").write_text(WITH_TRACERS)
     dns.run(load_scene(tmp_path / "scene.toml"), comm, tmp_path)
     errors = Field(tmp_path, 40.0).errors(steps=8)
     for name, aim in AIMS.items():
