@@ -81,6 +81,15 @@ def test_views_of_planes(library, degree):
         compiled.spread(np.zeros((3000, 3)), [*parts(18)[:2], parts(18, kind=np.float32)[2]])
 
 
+@pytest.mark.parametrize("turned", [np.asfortranarray, np.float32])
+def test_positions_that_lie_otherwise(library, turned):
+    # What they are copied to once was given back before it was read, and held other numbers now and then.
+    positions = turned(np.random.default_rng(2).uniform(0, 5, (1000, 3)).astype(np.float32).astype(float))
+    expected = both(library, 3, np.array(positions, np.float64, order="C"), 18)[1].at(parts(18))
+    for _ in range(20):
+        assert np.array_equal(both(library, 3, positions, 18)[1].at(parts(18)), expected)
+
+
 @pytest.mark.parametrize("degree", [3, 5])
 def test_spreading_is_the_transpose_of_interpolation(library, degree):
     random = np.random.default_rng(5)

@@ -48,6 +48,7 @@ class CompiledSplines:
 
     def __init__(self, library: ctypes.CDLL, degree: int, positions: np.ndarray, padded: PaddedPlanes) -> None:
         self._library, self._padded, count = library, padded, len(positions)
+        positions = _doubles(positions)  # to live until the call has ended
         sizes = padded.cells, padded.planes
         self._arrays = {"order": np.empty(count, np.int32), "first": np.empty((count, 3), np.int32),
                         "fraction": np.zeros((3, count + PADDING)),
@@ -55,7 +56,7 @@ class CompiledSplines:
         self._cloud = _Cloud(count, *sizes, degree, *(array.ctypes.data for array in self._arrays.values()))
         arrange = library.splines_arrange
         arrange.restype = ctypes.c_int64
-        misplaced = arrange(ctypes.byref(self._cloud), _address(_doubles(positions)), ctypes.c_double(padded.spacing),
+        misplaced = arrange(ctypes.byref(self._cloud), _address(positions), ctypes.c_double(padded.spacing),
                             ctypes.c_int64(padded.lowest))
         if misplaced >= 0:
             raise MisplacedPoint(misplaced)
