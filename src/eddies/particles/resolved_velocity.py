@@ -92,8 +92,9 @@ class ResolvedVelocity:
         grid = FourierGrid(decomposition, resolved, planes, dtype or torch.float64)
         return cls(grid, scales.filter_width, scales.kolmogorov_length)
 
-    def of(self, particles: ParticleSet, time: float | None = None) -> ResolvedFlow:
-        """The resolved flow of particles; `time` tells what is foreseen of it."""
+    def of(self, particles: ParticleSet, time: float | None = None, near: Tensor | None = None) -> ResolvedFlow:
+        """The resolved flow of particles; `time` tells what is foreseen of it. `near`: modes (3, kz, ky, kx) that are
+        known to be near it, without a time."""
         self._require_reach(particles.position)
         comm = self.grid.decomposition.comm
         mean = mean_over_ranks(comm, particles.velocity)
@@ -102,7 +103,9 @@ class ResolvedVelocity:
         with torch.no_grad():
             count, square = global_sum(comm, np.array([len(relative), float(relative.double().square().sum())]))
             speed = math.sqrt(square / (3 * count)) if count else 0.0
-            start = None if time is None else self.foreseen(time, as_numpy(mean), speed)
+            start = None if near is None else self.equations.projected(near)
+            if time is not None:
+                start = self.foreseen(time, as_numpy(mean), speed)
             flow = self._solved(flow, start, count, square)
         self.solves.append((flow.iterations, flow.residual, flow.converged))
         if torch.is_grad_enabled():

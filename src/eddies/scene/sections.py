@@ -133,7 +133,8 @@ class Tracers(Section):
     @property
     def planes(self) -> int:
         """Layers at which the particles' slabs are cut, cells of the grid on which their velocity is resolved: 1.75
-        particles_per_side rounded to even, so that modes up to 1.625 times their Nyquist wavenumber fit in."""
+        particles_per_side rounded to even. Of modes up to 1.5 times their Nyquist wavenumber the shortest wave then has
+        2.3 cells, which cubic splines still follow."""
         return 2 * round(0.875 * self.particles_per_side)
 
 

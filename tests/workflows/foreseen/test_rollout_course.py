@@ -64,7 +64,7 @@ def test_a_rollout_takes_the_steps_that_are_foreseen(comm, folder, overrides, mo
     with h5py.File(folder / "rollout.h5") as file:
         found, times = dict(file["rollout"].attrs), file["particles/model/time"][()]
         steps, size = file["particles/model/step"][()], stored(file)
-        spectra = sum(len(file[f"spectra_of_{name}/time"]) for name in ("model", "truth"))
+        spectra = tuple(len(file[f"spectra_of_{name}/time"]) for name in ("model", "truth"))
     course = rollout_course(scene, found["eddy_turnover_time"])
     assert (course.steps, course.intervals) == (found["steps"], len(times) - 1)
     assert np.array_equal(course.steps_to_frames, steps)

@@ -41,7 +41,7 @@ class Frames:
     def __init__(self, comm):
         self.truth, self.times, self.steps = SimpleNamespace(decomposition=SimpleNamespace(comm=comm), total=1), [], []
 
-    def store(self, step, time, particles, acceleration):
+    def store(self, step, time, particles, acceleration, near):
         self.times.append(time)
         self.steps.append(step)
 

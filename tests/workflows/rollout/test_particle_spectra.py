@@ -9,6 +9,8 @@ import pytest
 from eddies.io.hdf5 import create_product, open_product, read_table
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.reference_scales import ReferenceScales
+from eddies.particles.resolved_velocity import ResolvedVelocity
+from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.workflows.rollout.particle_spectra import ParticleSpectra
 from tests.particles.configurations import positions
 from tests.validation import filtered_fields
@@ -30,6 +32,15 @@ def spectra_on(slab):
     scales = ReferenceScales(filter_width=2 * SPACING, spacing=SPACING, velocity=1.0, density_mean=1.0,
                              acceleration=2.0, viscosity=0.02)
     return ParticleSpectra(SimpleNamespace(decomposition=slab, scales=scales))
+
+
+def on_grid(comm, modes):
+    """A velocity on a grid of its own, of 16 planes."""
+    slab = SlabDecomposition(comm, LENGTH, 16)
+    grid = SpectralGrid(slab, "float64", cutoff=5)
+    points = np.stack(np.broadcast_arrays(*grid.coordinates()), axis=-1)
+    values = filtered_fields.at(modes, points.reshape(-1, 3)).T.reshape(3, *grid.physical_shape)
+    return grid, grid.forward(values)
 
 
 def sampled(comm, modes, kind="even"):
@@ -64,6 +75,25 @@ def test_the_spectrum_of_a_known_field_is_found_on_any_number_of_ranks(comm, tmp
     # To the tolerance of a solve, 2e-4 of the velocities, and in single precision.
     for other in (model["energy"][1], truth["energy"][0] / 4):
         assert other[:5] == pytest.approx(found[:5], rel=1e-3)
+
+
+@pytest.mark.mpi(1, 2, 3)
+def test_a_velocity_that_is_near_saves_iterations_and_changes_no_spectrum(comm, monkeypatch):
+    """The solve ends where one from nothing does, also from half the velocity, to what the tolerance of both leaves in the
+    weakest shell, an eightieth of the energy. The velocity is on a grid of its own and cut otherwise."""
+    modes, _ = known_field()
+    slab, columns = sampled(comm, modes)
+    spectra, taken = spectra_on(slab), []
+    solved = ResolvedVelocity.of
+    monkeypatch.setattr(ResolvedVelocity, "of", lambda *given, **named: (
+        found := solved(*given, **named), taken.append(found.iterations))[0])
+    grid, near = on_grid(comm, modes)
+    for start in (None, (grid, near), (grid, near / 2)):
+        spectra.add("model", 0.0, columns, start)
+    unknown, known, half = (np.array(energy[:5]) for energy in spectra.state_dict()["model"]["energy"])
+    assert taken[1] < 0.5 * taken[0]
+    for found in (known, half):
+        assert found[1:] == pytest.approx(unknown[1:], rel=0.015)
 
 
 @pytest.mark.mpi(1)

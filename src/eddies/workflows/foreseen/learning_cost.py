@@ -26,9 +26,9 @@ SAMPLES = 4                  # fields that a kernel is trained on, one more is c
 # Seconds in which torch is loaded, what draws the curves, and torch's checkpointing; of tiny on one idle rank.
 TORCH_SECONDS, CURVES_SECONDS, CHECKPOINTING_SECONDS = 1.3, 2.0, 4.0
 # Iterations of a solve for the resolved velocity: that starts from nothing; that starts from what is foreseen and goes
-# to the same tolerance, as in a training through horizons; of its gradient. Of tiny and hit-small, 20 to 25, 1 to 7, 24
-# to 34.
-COLD, FORESEEN, ADJOINT = 25.0, 4.0, 32.0
+# to the same tolerance, as in a training through horizons; that starts from a field that is near and goes farther, for a
+# spectrum; of its gradient. Of tiny and hit-small, 20 to 25, 1 to 7, 8 to 12, 24 to 34.
+COLD, FORESEEN, NEAR, ADJOINT = 25.0, 4.0, 10.0, 32.0
 # Of a loss without its gradient over that of an optimiser step; of the sums of an evaluation with theirs, made once
 # forth, once more on the way back, and differentiated (docs/performance.md: 2.3 to 2.6 times).
 LOSS_ALONE, WITH_GRADIENT = 0.6, 4.5
@@ -127,7 +127,10 @@ def rollout_cost(scene: Scene, ranks: int, speeds: Speeds) -> StageCost:
         memory += flow_bytes(coarse, ranks)
     frames = course.intervals + 1 + true_frames(scene, course)
     parts["frames"] = course.evaluations_of_frames * evaluation
-    parts["spectra"] = stored_spectra(scene, course) * spectrum_seconds(scene, ranks, speeds)
+    of_model, of_truth = stored_spectra(scene, course)
+    known = settings.method == "eulerian" or "model" in settings.needs and "resolved" in scene.model.reads
+    parts["spectra"] = (of_model * spectrum_seconds(scene, ranks, speeds, NEAR if known else COLD)
+                        + of_truth * spectrum_seconds(scene, ranks, speeds, NEAR))
     memory += POINT_BYTES * scene.tracers.planes**2 * math.ceil(scene.tracers.planes / ranks)
     if scene.kernel:
         parts["frames"] += frames * speeds.training.averages.at(own)
@@ -141,11 +144,11 @@ def evaluation_seconds(scene: Scene, work: ParticleWork, ranks: int, speeds: Spe
     return particle_cost(work, speeds.particles, ranks, threads(), speeds.flow.bandwidth).seconds
 
 
-def spectrum_seconds(scene: Scene, ranks: int, speeds: Speeds) -> float:
-    """Seconds of a solve from nothing for the resolved velocity, of whose modes a spectrum is."""
+def spectrum_seconds(scene: Scene, ranks: int, speeds: Speeds, iterations: float) -> float:
+    """Seconds of a solve in so many iterations for the resolved velocity, of whose modes a spectrum is."""
     work, bandwidth = particle_work(spectral_scene(scene)), speeds.flow.bandwidth
-    whole, rest = (particle_cost(replace(work, iterations=iterations), speeds.spectra, ranks, threads(), bandwidth)
-                   for iterations in (COLD, 0.0))
+    whole, rest = (particle_cost(replace(work, iterations=number), speeds.spectra, ranks, threads(), bandwidth)
+                   for number in (iterations, 0.0))
     return whole.seconds - rest.seconds
 
 

@@ -99,12 +99,13 @@ def stores_density(scene: Scene) -> bool:
                                         and "density" in scene.model.reads)
 
 
-def stored_spectra(scene: Scene, course: RolloutCourse) -> int:
-    """Spectra of a rollout: of model and truth at the times of filtered fields, of the model alone after the truth."""
+def stored_spectra(scene: Scene, course: RolloutCourse) -> tuple[int, int]:
+    """Spectra of a rollout of model and truth: of both at the times of filtered fields, of the model also after the
+    truth."""
     tracers, true = scene.tracers, true_frames(scene, course)
     every = round(course.interval / tracers.frame_interval)
     with_field = sum(frame * every % tracers.field_every == 0 for frame in range(true))
-    return 2 * with_field + course.intervals + 1 - true
+    return with_field + course.intervals + 1 - true, with_field
 
 
 def true_frames(scene: Scene, course: RolloutCourse) -> int:

@@ -99,6 +99,10 @@ class EulerianRun:
         density = {"density": self.tracers.density(self.state)} if self.has_density else {}
         return ParticleSet.from_numpy(self.tracers.columns | density), torch.from_numpy(self._acceleration())
 
+    def velocity_modes(self, time: float) -> tuple[SpectralGrid, np.ndarray]:
+        """The grid, and the modes of the velocity that the particles follow."""
+        return self.fluid.grid, self.tracers.field.transfer * self.state[:3]
+
     def _acceleration(self) -> np.ndarray:
         """du/dt + v.grad u (n, 3) of the filtered velocity u at the particles: the rate of change of their velocity,
         exact but for the splines."""

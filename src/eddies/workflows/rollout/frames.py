@@ -16,8 +16,9 @@ from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.particle_field import ParticleField
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.smoothing_kernels import SmoothingKernel
+from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.workflows.ground_truth.truth import GroundTruth
-from eddies.workflows.rollout.particle_spectra import ParticleSpectra
+from eddies.workflows.rollout.particle_spectra import GridModes, ParticleSpectra
 
 COLUMNS = {"position": (3,), "velocity": (3,), "density": (), "acceleration": (3,)}
 GRADIENT = {"velocity_gradient": (3, 3)}
@@ -43,6 +44,7 @@ class RolloutFrames:
         comm, length = truth.decomposition.comm, truth.decomposition.length
         cells = truth.fields.cells
         self._slab = SlabDecomposition(comm, length, cells)
+        self._grid = SpectralGrid(self._slab, "float32", cutoff=(cells - 1) // 2)
         self._columns = {name: shape for name, shape in COLUMNS.items()
                          if name != "density" or density and truth.has_density}
         self._stored = self._columns | (GRADIENT if kernel else {})
@@ -50,20 +52,27 @@ class RolloutFrames:
                              dict.fromkeys(FIELDS if kernel else (), FieldLayout(cells, {"velocity": 3})))
         self.segments = FrameSegments(comm, directory, layout, names)
 
-    def store(self, step: int, time: float, particles: ParticleSet, acceleration: torch.Tensor) -> None:
-        """Store the model's particles and what is true at that time; `time` counts from the start of the rollout."""
+    def store(self, step: int, time: float, particles: ParticleSet, acceleration: torch.Tensor,
+              near: GridModes | None = None) -> None:
+        """Store the model's particles and what is true at that time; `time` counts from the start of the rollout.
+        `near`: a velocity that is known to be near the particles'."""
         self.times.append(time)
         self.segments.open(step)
         frame = self._true_frame(time)
         field = None if frame is None else self._true_field(frame)
-        measured = frame is None or field is not None
-        self._store("model", step, time, {**particles.to_numpy(), "acceleration": as_numpy(acceleration)}, measured)
+        columns = {**particles.to_numpy(), "acceleration": as_numpy(acceleration)}
+        if frame is None or field is not None:
+            self.spectra.add("model", time, columns, near)
+        self._store("model", step, time, columns)
         if frame is None:
             return
-        self._store("truth", step, time, self.truth.particles_with_rates(frame), measured)
-        if self.kernel is not None and field is not None:
+        columns = self.truth.particles_with_rates(frame)
+        if field is not None:
             planes = self.truth.field(field, "velocity", self._slab)
-            self.segments.fields["filtered"].append(time, self._slab.start, {"velocity": planes})
+            self.spectra.add("truth", time, columns, (self._grid, self._grid.forward(planes)))
+            if self.kernel is not None:
+                self.segments.fields["filtered"].append(time, self._slab.start, {"velocity": planes})
+        self._store("truth", step, time, columns)
 
     def write(self, file: File) -> None:
         """Write all that was stored into a product; collective."""
@@ -79,9 +88,7 @@ class RolloutFrames:
         self.times = state["times"]
         self.spectra.load_state_dict(state["spectra"])
 
-    def _store(self, name: str, step: int, time: float, columns: dict[str, np.ndarray], measured: bool) -> None:
-        if measured:
-            self.spectra.add(name, time, columns)
+    def _store(self, name: str, step: int, time: float, columns: dict[str, np.ndarray]) -> None:
         columns = migrate(self._slab, {column: columns[column] for column in ("id", *self._columns)})
         if self.kernel is not None:
             position, velocity = (torch.from_numpy(columns[column]) for column in ("position", "velocity"))

@@ -20,10 +20,12 @@ from eddies.particles.flow_units import FlowUnits
 from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.model import LagrangianModel
 from eddies.particles.moment import Moment, between
-from eddies.particles.particle_set import ParticleSet
+from eddies.particles.particle_set import ParticleSet, as_numpy
+from eddies.particles.rank_sums import mean_over_ranks
 from eddies.particles.reference_scales import allowed_step
 from eddies.particles.terms.settings import Forcing
 from eddies.scene.scene import Scene
+from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.workflows.ground_truth.truth import GroundTruth, particles_for
 from eddies.workflows.learned.model import load_feature_range, load_model
 from eddies.workflows.rollout.particle_state import particle_state, restored_particles
@@ -125,6 +127,15 @@ class ParticleRun:
             self._shares_outside.append(self.seen.share_outside(self.comm, pair_features(self.dynamics, particles)))
         self._count_solves()
         return particles, rates.acceleration
+
+    def velocity_modes(self, time: float) -> tuple[SpectralGrid, np.ndarray] | None:
+        """The grid of the resolved velocity, if there is one, and its modes as foreseen for a time."""
+        resolution = self.dynamics.resolution
+        if resolution is None:
+            return None
+        mean = as_numpy(mean_over_ranks(self.comm, self.particles.velocity))
+        modes = resolution.foreseen(time, mean, resolution.speed)
+        return None if modes is None else (resolution.grid.spectral, modes.numpy())
 
     def _now(self) -> Moment:
         """The particles with their acceleration, which the next step does not evaluate again; collective."""
