@@ -128,8 +128,8 @@ def test_list_of_scenes(comm, capfd):
     assert run_cli("scenes") == 0
     lines = capfd.readouterr().out.splitlines()
     assert sorted(line.split()[0] for line in lines) == ([] if comm.rank else [
-        "abc", "hit", "hit-coarse", "hit-mt004", "hit-mt008", "hit-mt016", "hit-paper", "hit-small", "shear-wave",
-        "sound-wave", "taylor-green", "tiny", "tracers-only"])
+        "abc", "hit", "hit-256", "hit-coarse", "hit-mt004", "hit-mt008", "hit-mt016", "hit-paper", "hit-small",
+        "shear-wave", "sound-wave", "taylor-green", "tiny", "tracers-only"])
     assert run_cli("scenes", "abc") == 0
     assert ("viscosity = 0.1  # " in capfd.readouterr().out) == (comm.rank == 0)
 
