@@ -35,12 +35,14 @@ def test_separations_of_pairs_that_leave_through_the_faces_are_continuous():
     assert np.allclose(found - found[0], (path[:, :1] - path[:, 1:]) - (path[0, :1] - path[0, 1:]))
 
 
-def test_pairs_at_a_distance_are_all_of_them_once():
-    position = np.random.default_rng(4).uniform(0, LENGTH, (300, 3))
-    found = pairs_at(position, LENGTH, [0.5, 2.0], 0.1, followed=40)
+@pytest.mark.parametrize("shift", [0.0, -0.7, LENGTH], ids=["in the box", "across a face", "in the next box"])
+def test_pairs_at_a_distance_are_all_of_them_once(shift):
+    position = (np.random.default_rng(4).uniform(0, LENGTH, (300, 3)) + shift).astype(np.float32)
+    distances = (0.5, 2.0, 3.0)  # of the last one, pairs are up to more than half a box apart
+    found = pairs_at(position, LENGTH, distances, 0.1, followed=40)
     apart = np.linalg.norm(minimum_image(position[:40, None] - position[None], LENGTH), axis=-1)
     apart[np.tril_indices(40)] = np.inf
-    for distance, pairs in zip((0.5, 2.0), found):
+    for distance, pairs in zip(distances, found):
         assert np.array_equal(pairs, np.nonzero(np.abs(apart - distance) <= 0.1 * distance))
     assert pairs_at(position, LENGTH, [1e-6], 0.1, followed=40)[0].shape == (2, 0)
 

@@ -31,17 +31,23 @@ def nearest_distances(position: np.ndarray, length: float) -> np.ndarray:
     Positions lie in the periodic cube of side `length`, in any arrangement. Infinite for a particle that is alone.
     """
     chosen = np.unique(np.linspace(0, len(position) - 1, min(len(position), SAMPLED)).astype(int))
-    cells = max(int(len(position) ** (1 / 3) / 1.5), 1)
-    cell = np.floor(position * (cells / length)).astype(int) % cells
+    cells = max(int(len(position) ** (1 / 3) / 1.5), 3)
+    scaled = position * (cells / length)
+    cell = np.floor(scaled).astype(int)
+    below, cell = scaled[chosen] - cell[chosen], cell % cells
     index = np.ravel_multi_index(cell.T, (cells,) * 3)
     order = np.argsort(index, kind="stable")
     counts = np.bincount(index, minlength=cells**3)
     starts = np.cumsum(counts) - counts
     nearest = np.full(chosen.size, np.inf)
-    for offset in itertools.product(range(-1, 2) if cells > 2 else range(cells), repeat=3):
-        beside = np.ravel_multi_index(((cell[chosen] + offset) % cells).T, (cells,) * 3)
-        _keep_smaller(nearest, position, chosen, order, starts[beside], counts[beside], length)
-    # The cells around hold all within a cell's side, and the whole box where there are three of them or fewer.
+    # The own cell comes first: once a neighbour is known, most of those beside are farther. Their gaps are rounded.
+    for offset in sorted(itertools.product((-1, 0, 1), repeat=3), key=np.linalg.norm):
+        gaps = np.where(np.equal(offset, 0), 0, np.where(np.less(offset, 0), below, 1 - below))
+        some = np.flatnonzero(nearest > length / cells * (np.linalg.norm(gaps, axis=1) - 1e-3))
+        beside = np.ravel_multi_index(((cell[chosen[some]] + offset) % cells).T, (cells,) * 3)
+        nearest[some] = _keep_smaller(nearest[some], position, chosen[some], order, starts[beside], counts[beside],
+                                      length)
+    # The cells around hold all within a cell's side, and the whole box where there are three of them.
     far = np.flatnonzero(nearest > length / cells) if cells > 3 else np.empty(0, int)
     everyone = np.full(far.size, len(position))
     nearest[far] = _keep_smaller(nearest[far], position, chosen[far], order, 0 * everyone, everyone, length)

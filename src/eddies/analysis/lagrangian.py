@@ -76,13 +76,13 @@ def pairs_at(position: np.ndarray, length: float, distances: Sequence[float], to
     The first of a pair is one of the first `followed` rows, which are compared with all.
     """
     pairs = [[np.empty((2, 0), int)] for _ in distances]
-    components, reach = np.ascontiguousarray(position.T), 1.001 * (1 + tolerance) * max(distances, default=0.0)
-    for row, start in enumerate(position[:followed]):
-        near = np.flatnonzero(np.abs(minimum_image(components[0] - start[0], length)) <= reach)
-        near = near[(near >= followed) | (near > row)]  # each pair once
-        apart = np.sqrt(np.sum(minimum_image(components[:, near] - start[:, None], length) ** 2, axis=0))
+    slabs, reach = _Slabs(position, length), 1.001 * (1 + tolerance) * max(distances, default=0.0)
+    for row in range(min(followed, len(position))):
+        near, squared = slabs.around(row, reach)
+        apart = np.sqrt(squared)
         for distance, found in zip(distances, pairs):
             others = near[np.abs(apart - distance) <= tolerance * distance]
+            others = np.sort(others[(others >= followed) | (others > row)])  # each pair once
             found.append(np.stack([np.full(others.size, row), others]))
     return [np.concatenate(found, axis=1) for found in pairs]
 
@@ -94,14 +94,36 @@ def nearest_rows(position: np.ndarray, length: float, chosen: np.ndarray, count:
     """
     if len(position) <= count:
         raise ValueError(f"{len(position)} particles: none has {count} neighbours")
-    components, mean_distance = np.ascontiguousarray(position.T), length / len(position) ** (1 / 3)
+    slabs, mean_distance = _Slabs(position, length), length / len(position) ** (1 / 3)
     found = np.empty((count, chosen.size), int)
     for number, row in enumerate(chosen):
-        reach, near, squared = mean_distance, np.empty(0, int), np.empty(0)
-        while np.count_nonzero(squared <= reach**2) <= count and near.size < len(position):
+        reach, near = mean_distance, np.empty(0, int)
+        while near.size <= count:
             reach *= 2
-            near = np.flatnonzero(np.abs(minimum_image(components[0] - position[row, 0], length)) <= reach)
-            squared = np.sum(minimum_image(components[:, near] - position[row][:, None], length) ** 2, axis=0)
+            near, squared = slabs.around(row, reach)
         squared[near == row] = -1.0  # before any other in the same place
-        found[:, number] = near[np.argsort(squared, kind="stable")[1:count + 1]]
+        found[:, number] = near[np.lexsort((near, squared))[1:count + 1]]
     return found
+
+
+class _Slabs:
+    """Positions (n, 3) in a periodic box, sorted along x, so that those near a plane lie together."""
+
+    def __init__(self, position: np.ndarray, length: float) -> None:
+        wrapped = position[:, 0] % length
+        rows = np.argsort(wrapped)
+        # The box twice, so that a slab that leaves it at one face goes on from there.
+        self.rows, self.along = np.tile(rows, 2), np.concatenate([wrapped[rows], wrapped[rows] + length])
+        self.components = np.ascontiguousarray(position[self.rows].T)
+        self.position, self.length = position, length
+
+    def around(self, row: int, reach: float) -> tuple[np.ndarray, np.ndarray]:
+        """Rows within a distance of a row, itself among them, in any order, and their squared distances."""
+        first, last, wider = 0, len(self.position), 1.001 * reach  # what is wrapped is rounded
+        if wider < self.length / 2:
+            low = (self.position[row, 0] - wider) % self.length
+            first, last = np.searchsorted(self.along, (low, low + 2 * wider))
+        apart = minimum_image(self.components[:, first:last] - self.position[row][:, None], self.length)
+        squared = np.sum(apart**2, axis=0)
+        inside = squared <= reach**2
+        return self.rows[first:last][inside], squared[inside]
