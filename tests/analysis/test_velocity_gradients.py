@@ -88,7 +88,7 @@ def test_conditional_velocity_of_restricted_euler():
     flow = ConditionalVelocity(bins)
     for _ in range(2):
         after = midpoint_step(gradient, step)
-        flow.add(gradient, after, step, scale)
+        flow.add(invariants(gradient), invariants(after), step, scale)
         gradient = after
     second_rate, third_rate = flow.mean(at_least=30)
     q = ((bins.second[1:] + bins.second[:-1]) / 2)[:, None]
@@ -103,7 +103,7 @@ def test_conditional_velocity_of_restricted_euler():
 
 def test_cells_with_few_particles_are_unknown():
     flow = ConditionalVelocity(InvariantBins(np.linspace(-1, 1, 5), np.linspace(-1, 1, 5)))
-    still = np.zeros((3, 3, 3))
+    still = invariants(np.zeros((3, 3, 3)))
     flow.add(still, still, 0.1, 1.0)
     assert np.isfinite(flow.mean(at_least=3)[0]).sum() == 1
     assert np.isfinite(flow.mean(at_least=4)[0]).sum() == 0

@@ -159,11 +159,13 @@ def normalized_invariants(gradient: np.ndarray, scale: float) -> tuple[np.ndarra
 def _conditional_flows(model: Frames, truth: Frames, common: CommonFrames,
                        bins: InvariantBins) -> tuple[ConditionalVelocity, ConditionalVelocity]:
     flows = ConditionalVelocity(bins.coarser()), ConditionalVelocity(bins.coarser())
-    before = particle_pair(model, truth, common, 0, "velocity_gradient")
-    for index in range(1, common.times.size):
-        after = particle_pair(model, truth, common, index, "velocity_gradient")
-        scale = (enstrophy_scale(before.truth) + enstrophy_scale(after.truth)) / 2
-        flows[0].add(before.model, after.model, after.time - before.time, scale)
-        flows[1].add(before.truth, after.truth, after.time - before.time, scale)
+    before = None
+    for index in range(common.times.size):
+        pair = particle_pair(model, truth, common, index, "velocity_gradient")
+        after = pair.time, enstrophy_scale(pair.truth), [invariants(run) for run in (pair.model, pair.truth)]
+        if before is not None:
+            interval, scale = after[0] - before[0], (before[1] + after[1]) / 2
+            for flow, *both in zip(flows, before[2], after[2]):
+                flow.add(*both, interval, scale)
         before = after
     return flows
