@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import io
+import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
@@ -14,8 +15,9 @@ from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import TICKDOWN, TICKLEFT, Line2D
-from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
-from matplotlib.transforms import Bbox
+from matplotlib.spines import Spine
+from matplotlib.ticker import LogFormatterSciNotation, LogLocator, NullLocator, StrMethodFormatter
+from matplotlib.transforms import Bbox, ScaledTranslation
 
 from eddies.report.page import Section
 
@@ -28,11 +30,13 @@ SECOND, THIRD, FOURTH = "#009E73", "#CC79A7", "#E69F00"
 GUIDE = "#9a9a9a"
 LEAST = (0, -0.1, 0, 0.2)  # what stands around a panel at least, in inches: left, below, right, above
 SIGNED, POSITIVE = "RdBu_r", "viridis"
+SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 STYLE = {
     "font.size": 10.5, "axes.titlesize": 10.5, "axes.labelsize": 10.5, "legend.fontsize": 9,
     "xtick.labelsize": 9, "ytick.labelsize": 9, "font.family": "DejaVu Sans",
     "mathtext.fontset": "dejavusans",
+    "axes.titley": 1.0,  # to look for a place measures the tick labels twice more
     "axes.spines.top": False, "axes.spines.right": False, "axes.linewidth": 0.8, "lines.linewidth": 1.7,
     "legend.frameon": False, "figure.dpi": 150, "savefig.dpi": 150, "axes.prop_cycle": matplotlib.cycler(
         color=[TRUTH, MODEL, SECOND, THIRD, FOURTH, DNS]),
@@ -55,18 +59,65 @@ class Panel(Axes):
 
     _guessed = False
 
-    def get_tightbbox(self, renderer=None, **options) -> Bbox | None:
+    def __init__(self, *arguments, **named) -> None:
+        self._beside: dict[Axis, list[str]] = {}  # by axis, the tick labels beside which its label has been put
+        super().__init__(*arguments, **named)
+
+    def draw(self, renderer) -> None:
+        """Draw all, the labels of x and y beside their tick labels as they are after the layout."""
+        for axis, labels in self._beside.items():
+            if labels != _tick_labels(axis):
+                self._place_label(axis, renderer)
+        super().draw(renderer)
+
+    def get_tightbbox(self, renderer=None, *, for_layout_only=False, **options) -> Bbox | None:
         """The box of the axes with what stands around them, in pixels.
 
         A constrained layout asks twice, the first time to give the axes about their size. That answer is a guess; it is
         low, because larger axes have more ticks and wider labels, and the layout only ever widens margins. Colour bars
-        take the size of their panels: beside them it asks in earnest.
+        take the size of their panels: beside them it asks in earnest. The tick labels, which axes measure several times
+        to find places for other texts, are then measured once.
         """
-        if self._guessed or not all(isinstance(axes, Panel) for axes in self.figure.axes):
-            return super().get_tightbbox(renderer, **options)
-        self._guessed = True
+        if not self._guessed and all(isinstance(axes, Panel) for axes in self.figure.axes):
+            self._guessed = True
+            self.apply_aspect()
+            return Bbox.from_extents(*(self.bbox.extents + self.figure.dpi * np.array(LEAST)))
+        if not (for_layout_only and self.axison):
+            return super().get_tightbbox(renderer, for_layout_only=for_layout_only, **options)
         self.apply_aspect()
-        return Bbox.from_extents(*(self.bbox.extents + self.figure.dpi * np.array(LEAST)))
+        axes = [axis for axis in (self.xaxis, self.yaxis) if axis.get_visible()]
+        boxes = [box for axis in axes for box in self._place_label(axis, renderer)]
+        others = [artist for artist in self.get_default_bbox_extra_artists() if not isinstance(artist, Spine)]
+        for axis in axes:
+            axis.set_visible(False)
+        rest = super().get_tightbbox(renderer, for_layout_only=True, bbox_extra_artists=others)
+        for axis in axes:
+            axis.set_visible(True)
+        return Bbox.union([rest, *boxes])
+
+    def _place_label(self, axis: Axis, renderer) -> list[Bbox]:
+        """Put the label of x or y beside its tick labels. The boxes of all texts and the ticks, in pixels, of the label
+        only how far it stands out: a panel is not widened for a long one."""
+        texts = [text for text in (axis.label, axis.offsetText) if text.get_visible()]
+        for text in texts:
+            text.set_visible(False)
+        labels = axis.get_tightbbox(renderer)
+        for text in texts:
+            text.set_visible(True)
+        direction = np.array([axis is self.yaxis, axis is self.xaxis], int)  # away from the panel: left or below
+        dots, corner = self.figure.dpi / 72, self.bbox.min
+        ticks = Bbox([corner - direction * dots * axis.get_tick_padding(), self.bbox.max])
+        boxes = [ticks] if labels is None else [ticks, labels]
+        away = (corner - Bbox.union(boxes).min) / dots + axis.labelpad
+        axis.set_label_coords(*(1 - direction) / 2, self.transAxes + ScaledTranslation(
+            *(-direction * away / 72), self.figure.dpi_scale_trans))
+        self._beside[axis] = _tick_labels(axis)
+        if axis.label.get_text():
+            label = axis.label.get_window_extent(renderer).min
+            boxes.append(Bbox([np.where(direction, label, corner), self.bbox.max]))
+        if axis.offsetText.get_text():
+            boxes.append(axis.offsetText.get_window_extent(renderer))
+        return boxes
 
     def minor_ticks(self) -> list[tuple[Axis, np.ndarray]]:
         """The axes x and y whose minor ticks have no label, and where these are."""
@@ -91,11 +142,30 @@ class Panel(Axes):
                 markeredgewidth=matplotlib.rcParams["xtick.minor.width"], zorder=2.01)).set_in_layout(False)
 
 
+def _tick_labels(axis: Axis) -> list[str]:
+    return axis.get_major_formatter().format_ticks(axis.get_majorticklocs())
+
+
+class Powers(LogFormatterSciNotation):
+    """Labels 10⁻³ and 2 × 10⁻³ of a logarithmic axis in characters of the font: formulas are slow to set."""
+
+    def __call__(self, x: float, pos: int | None = None) -> str:
+        if not super().__call__(x, pos):
+            return ""
+        exponent = math.floor(math.log10(x) + 1e-9)
+        factor = f"{x / 10.0**exponent:g}"
+        return ("" if factor == "1" else f"{factor}\u2009×\u2009") + f"10{str(exponent).translate(SUPERSCRIPTS)}"
+
+
 def panels(rows: int, columns: int, size: tuple[float, float], **sharing) -> tuple[Figure, np.ndarray]:
     """A figure of rows x columns axes, always a two-dimensional array; `size` is of one panel in inches."""
     figure = Figure(figsize=(size[0] * columns, size[1] * rows), layout="constrained")
     figure.get_layout_engine().set(w_pad=0.06, h_pad=0.06)
-    return figure, figure.subplots(rows, columns, squeeze=False, subplot_kw={"axes_class": Panel}, **sharing)
+    axes = figure.subplots(rows, columns, squeeze=False, subplot_kw={"axes_class": Panel}, **sharing)
+    for panel in axes.flat:
+        # A factor of the tick labels stands above them and beside the title.
+        panel.yaxis.get_offset_text().set(horizontalalignment="right", x=-0.02)
+    return figure, axes
 
 
 def letter(axes: Sequence[Axes]) -> None:
@@ -107,9 +177,29 @@ def letter(axes: Sequence[Axes]) -> None:
             panel.set_title("", loc="center")
 
 
+def _once_a_place(axes: Axes) -> Callable[..., Bbox | None]:
+    """Their `get_tightbbox`, which measures once where they stand: a layout asks a colour bar for every panel of it."""
+    measure, known = axes.get_tightbbox, {}
+
+    def get_tightbbox(renderer=None, **options) -> Bbox | None:
+        place = *axes.get_position(original=True).bounds, *options.items()
+        if place not in known:
+            known[place] = measure(renderer, **options)
+        return known[place]
+    return get_tightbbox
+
+
 @styled
 def png(figure: Figure) -> bytes:
     """The figure as a PNG image."""
+    for axes in figure.axes:
+        for axis in (axes.xaxis, axes.yaxis):
+            if type(axis.get_major_formatter()) is LogFormatterSciNotation:
+                axis.set_major_formatter(Powers())
+            if type(axis.get_minor_formatter()) is LogFormatterSciNotation:
+                axis.set_minor_formatter(Powers())
+        if not isinstance(axes, Panel):
+            axes.get_tightbbox = _once_a_place(axes)
     panels = [axes for axes in figure.axes if isinstance(axes, Panel)]
     ticks = [axes.minor_ticks() for axes in panels]  # of all, before any changes those of panels that share its axis
     for axes, found in zip(panels, ticks):
@@ -152,8 +242,8 @@ def show_plane(axis: Axes, plane: np.ndarray, limits: tuple[float, float], colou
     image = axis.imshow(plane, origin="lower", extent=(0, length, 0, length), cmap=colours, vmin=limits[0],
                         vmax=limits[1], interpolation="bilinear", aspect="equal")
     ticks = [0, length / 2, length]
-    axis.set_xticks(ticks, ["0", r"$\pi$", r"$2\pi$"])
-    axis.set_yticks(ticks, ["0", r"$\pi$", r"$2\pi$"])
+    axis.set_xticks(ticks, ["0", "π", "2π"])
+    axis.set_yticks(ticks, ["0", "π", "2π"])
     for side in ("top", "right"):
         axis.spines[side].set_visible(True)
     return image
