@@ -22,12 +22,13 @@ from eddies.workflows.foreseen.particle_work import (SUMS_OF_EVALUATION, SUMS_OF
                                                      ParticleWork)
 
 MOST_CORES = 4096
-# Work of a grid point in the transforms over that of the probe, by cells along a side: planes outgrow the caches. From
-# 64^3 particles on of the slab of one of many ranks.
-TRANSFORM_GROWTH = {42: 1.0, 112: 1.0, 168: 1.25, 448: 1.3, 896: 1.75}
-# Work of a particle in what torch and numpy do, over that of the probe, by particles of a rank: arrays outgrow the
-# caches, then come as fresh pages. From tests/benchmarks/particle_step.py with 24^3 to 96^3 on one rank.
-PARTICLE_GROWTH = {14e3: 1.0, 110e3: 1.3, 262e3: 1.45, 885e3: 2.0}
+# Work of a grid point in the transforms over that of the probe, by cells along a side: more of a plane is copied and
+# transformed at once, until planes outgrow the caches. To 168 from tests/benchmarks/particle_step.py with 32^3 to 96^3
+# particles, beyond of the slab of one of many ranks.
+TRANSFORM_GROWTH = {42: 1.0, 56: 0.85, 112: 0.72, 168: 1.0, 448: 1.0, 896: 1.35}
+# Work of a particle in what torch and numpy do, over that of the probe, by particles of a rank: likewise, then arrays come
+# as fresh pages. From the same with 24^3 to 96^3 particles.
+PARTICLE_GROWTH = {14e3: 1.0, 33e3: 0.85, 110e3: 0.75, 262e3: 0.8, 885e3: 1.2}
 # Settling on several ranks over that on one: rows are put in order of ranks and copied as well. From the same, on two.
 MIGRATION = 1.7
 # Memory of a rank: of a process with torch; of a grid point in single precision and of a particle, ghosts included,
