@@ -42,7 +42,7 @@ def test_more_ranks_take_less_time_and_memory_and_leave_as_much(stage):
 @pytest.mark.parametrize("stage, part, override, factor", [
     ("dns", "tracers", "tracers.turnovers=4.8", 2), ("train-kernel", "steps", "kernel.steps=400", 2),
     ("train", "frames", "training.frames=33", 2),
-    ("simulate", "steps", "simulation.step=0.06", 2), ("simulate", "frames", "simulation.turnovers=0.5", 0.54)])
+    ("simulate", "steps", "simulation.step=0.045", 2), ("simulate", "frames", "simulation.turnovers=0.5", 0.54)])
 def test_time_goes_with_the_work(stage, part, override, factor):
     once, twice = cost_of(stage), cost_of(stage, override)
     assert twice.parts[part] == pytest.approx(factor * once.parts[part], rel=0.1)
