@@ -125,7 +125,7 @@ def test_rollouts_without_a_model_are_foreseen_too(changes):
 
 
 def test_spectra_are_foreseen_whatever_moves_the_particles():
-    """A solve each, of the same particles: in 10 iterations where a field is near, that of the truth always, or in 25."""
+    """A solve each, of the same particles: in 10 iterations where a field is near, as for the truth always, or 25."""
     learned, grid, *unknown = (cost_of("simulate", *changes).parts["spectra"] for changes in (
         [], ["simulation.method=eulerian"], ["simulation.method=none"],
         ["model.preset=paper", "simulation.integrator=verlet", "simulation.step=0.005"]))

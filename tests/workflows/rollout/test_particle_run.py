@@ -20,6 +20,7 @@ from eddies.particles.resolved_velocity import ResolvedVelocity
 from eddies.particles.smoothing_kernels import KernelNetwork
 from eddies.scene.methods import METHODS, method_class
 from eddies.scene.scene import BOX_LENGTH, Model, SceneError, load_scene
+from eddies.spectral.interpolation import SplineInterpolation
 from eddies.workflows import dns, report, simulate, train
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.learned.description import describe
@@ -176,6 +177,14 @@ def test_every_method_has_the_units_of_its_start_and_runs(comm, tmp_path, method
     assert (particles.density is not None) == made.has_density == (method == "learned")
     assert len(acceleration) == 6**3 and bool(torch.isfinite(acceleration).all())
     assert bool(acceleration.any()) == (method != "none")
+    near = made.velocity_modes(0.0)
+    assert (near is None) == (method == "none")
+    if near is not None:
+        spline = SplineInterpolation(near[0], "quintic")
+        velocity = particles.velocity.numpy()
+        left = spline.at(spline.coefficients(near[1]), particles.position.numpy()) - (velocity - velocity.mean(0))
+        # 216 particles tell a sixth less than all, and the mean over them is not that of the field.
+        assert np.linalg.norm(left) < {"learned": 0.2, "eulerian": 0.1}[method] * np.linalg.norm(velocity)
     simulate.run(scene, comm, tmp_path)
     with open_product(comm, tmp_path / "rollout.h5", "rollout") as file:
         attributes = read_attributes(file, "rollout")

@@ -79,8 +79,8 @@ def test_the_spectrum_of_a_known_field_is_found_on_any_number_of_ranks(comm, tmp
 
 @pytest.mark.mpi(1, 2, 3)
 def test_a_velocity_that_is_near_saves_iterations_and_changes_no_spectrum(comm, monkeypatch):
-    """The solve ends where one from nothing does, also from half the velocity, to what the tolerance of both leaves in the
-    weakest shell, an eightieth of the energy. The velocity is on a grid of its own and cut otherwise."""
+    """The solve ends where one from nothing does, also from half the velocity, to what the tolerance of both leaves in
+    the weakest shell, an eightieth of the energy. The velocity is on a grid of its own and cut otherwise."""
     modes, _ = known_field()
     slab, columns = sampled(comm, modes)
     spectra, taken = spectra_on(slab), []

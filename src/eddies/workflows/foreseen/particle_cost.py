@@ -26,8 +26,8 @@ MOST_CORES = 4096
 # transformed at once, until planes outgrow the caches. To 168 from tests/benchmarks/particle_step.py with 32^3 to 96^3
 # particles, beyond of the slab of one of many ranks.
 TRANSFORM_GROWTH = {42: 1.0, 56: 0.85, 112: 0.72, 168: 1.0, 448: 1.0, 896: 1.35}
-# Work of a particle in what torch and numpy do, over that of the probe, by particles of a rank: likewise, then arrays come
-# as fresh pages. From the same with 24^3 to 96^3 particles.
+# Work of a particle in what torch and numpy do, over that of the probe, by particles of a rank: likewise, then arrays
+# come as fresh pages. From the same with 24^3 to 96^3 particles.
 PARTICLE_GROWTH = {14e3: 1.0, 33e3: 0.85, 110e3: 0.75, 262e3: 0.8, 885e3: 1.2}
 # Settling on several ranks over that on one: rows are put in order of ranks and copied as well. From the same, on two.
 MIGRATION = 1.7

@@ -24,8 +24,8 @@ GridModes = tuple[SpectralGrid, np.ndarray]  # a grid, and modes (3, kz, ky_loca
 RUNS = "model", "truth"
 # Of a slab, for the ghost planes of cubic splines; on many ranks the grid has more planes than the closure's.
 FEWEST_PLANES = 3
-# Residuals at which solves end, from nothing and from a field that is near: in hit-small after 23 and 8 iterations. What
-# further ones would change of ln E(k) is 2e-4 (rms) up to k_d and 4e-3 up to twice that, either way.
+# Residuals at which solves end, from nothing and from a field that is near: in hit-small after 23 and 8 iterations.
+# What further ones would change of ln E(k) is 2e-4 (rms) up to k_d and 4e-3 up to twice that, either way.
 TOLERANCE, TOLERANCE_NEAR = 5e-4, 3e-4
 # Where particles have gathered and left voids a solve takes more, and gains little by most: see ParticleSpectra.
 MOST_ITERATIONS = 100
