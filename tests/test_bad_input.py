@@ -264,8 +264,10 @@ def test_an_encoding_without_the_letters(encoding, tmp_path):
 def a_simulation(directory, *before):
     """A direct simulation that is on its way."""
     line = [*before, sys.executable, "-u", "-m", "eddies", "dns", "hit-small", "--output", directory]
+    # A shell's background job ignores the interrupt, and hands that down.
     job = subprocess.Popen(list(map(str, line)), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
-                           stderr=subprocess.PIPE, text=True, start_new_session=True)
+                           stderr=subprocess.PIPE, text=True, start_new_session=True,
+                           preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
     try:
         while "dns: starts" not in job.stdout.readline():
             pass
