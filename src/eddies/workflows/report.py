@@ -145,15 +145,12 @@ def _survey_rollout(file: File, record: Run) -> None:
 
 def _read_share(directory: Path, comm: Comm, alone: Comm, record: Run) -> list[Section]:
     """The sections of this rank, neighbours on the page, without that on the cost."""
-    # About how long each takes, in tenths of seconds of a run with 32768 particles.
-    readers = {"ground_truth": ((_read_flow, 3), (_read_tracers, 12)), "kernel": ((_read_kernel, 3),),
-               "model": ((_read_model, 1),), "rollout": ((_read_rollout, 22),)}
-    parts = [(kind, *reader) for kind in record.provenance for reader in readers[kind]]
-    ends = np.cumsum([cost for _, _, cost in parts])
+    readers = {"ground_truth": (_read_flow, _read_tracers), "kernel": (_read_kernel,), "model": (_read_model,),
+               "rollout": (_read_rollout,)}
+    parts = [(kind, read) for kind in record.provenance for read in readers[kind]]
     sections = []
-    for (kind, read, cost), end in zip(parts, ends):
-        if int((end - cost / 2) / ends[-1] * comm.size) != comm.rank:
-            continue
+    for index in np.array_split(np.arange(len(parts)), comm.size)[comm.rank]:
+        kind, read = parts[index]
         with open_product(alone, directory / f"{kind}.h5", kind) as file:
             sections += _read_part(kind, file, record, read)
     return sections
