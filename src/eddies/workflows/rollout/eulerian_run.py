@@ -31,6 +31,7 @@ from eddies.scene.scene import Eulerian, Scene, SceneError
 from eddies.spectral.spectral_grid import SpectralGrid, regrid
 from eddies.time_stepping import ETDRK4
 from eddies.workflows.ground_truth.truth import GroundTruth
+from eddies.workflows.rollout.method import GridModes
 from eddies.workflows.rollout.particle_run import injection
 from eddies.workflows.rollout.saved_rows import restored_rows, saved_rows
 
@@ -99,7 +100,7 @@ class EulerianRun:
         density = {"density": self.tracers.density(self.state)} if self.has_density else {}
         return ParticleSet.from_numpy(self.tracers.columns | density), torch.from_numpy(self._acceleration())
 
-    def velocity_modes(self, time: float) -> tuple[SpectralGrid, np.ndarray]:
+    def velocity_modes(self, time: float) -> GridModes:
         """The grid, and the modes of the velocity that the particles follow."""
         return self.fluid.grid, self.tracers.field.transfer * self.state[:3]
 

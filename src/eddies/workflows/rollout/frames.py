@@ -18,7 +18,8 @@ from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.smoothing_kernels import SmoothingKernel
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.workflows.ground_truth.truth import GroundTruth
-from eddies.workflows.rollout.particle_spectra import GridModes, ParticleSpectra
+from eddies.workflows.rollout.method import GridModes
+from eddies.workflows.rollout.particle_spectra import ParticleSpectra
 
 COLUMNS = {"position": (3,), "velocity": (3,), "density": (), "acceleration": (3,)}
 GRADIENT = {"velocity_gradient": (3, 3)}

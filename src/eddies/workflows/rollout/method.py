@@ -12,6 +12,9 @@ from eddies.particles.particle_set import ParticleSet
 from eddies.spectral.spectral_grid import SpectralGrid
 
 
+GridModes = tuple[SpectralGrid, np.ndarray]  # a grid, and modes (3, kz, ky_local, kx) of a velocity on it
+
+
 class Method(Protocol):
     """What moves the particles of a rollout, made as Class(scene, truth, start, directory, device) where `start` is the
     frame of the ground truth that it starts from. All methods are collective.
@@ -31,9 +34,8 @@ class Method(Protocol):
     def frame(self, time: float) -> tuple[ParticleSet, torch.Tensor]:
         """The particles at a time that the last step reached, in any order, and their acceleration (n, 3)."""
 
-    def velocity_modes(self, time: float) -> tuple[SpectralGrid, np.ndarray] | None:
-        """A grid and modes (3, kz, ky_local, kx) on it of a velocity near that of the particles of the frame at a
-        time, if there is one."""
+    def velocity_modes(self, time: float) -> GridModes | None:
+        """A velocity near that of the particles of the frame at a time, if one is known."""
 
     def status(self) -> str:
         """What the progress line shows of it beside time and energy."""

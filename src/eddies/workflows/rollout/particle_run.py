@@ -25,9 +25,9 @@ from eddies.particles.rank_sums import mean_over_ranks
 from eddies.particles.reference_scales import allowed_step
 from eddies.particles.terms.settings import Forcing
 from eddies.scene.scene import Scene
-from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.workflows.ground_truth.truth import GroundTruth, particles_for
 from eddies.workflows.learned.model import load_feature_range, load_model
+from eddies.workflows.rollout.method import GridModes
 from eddies.workflows.rollout.particle_state import particle_state, restored_particles
 
 log = logging.getLogger("eddies")
@@ -128,7 +128,7 @@ class ParticleRun:
         self._count_solves()
         return particles, rates.acceleration
 
-    def velocity_modes(self, time: float) -> tuple[SpectralGrid, np.ndarray] | None:
+    def velocity_modes(self, time: float) -> GridModes | None:
         """The grid of the resolved velocity, if there is one, and its modes as foreseen for a time."""
         resolution = self.dynamics.resolution
         if resolution is None:

@@ -15,12 +15,12 @@ from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.resolved_velocity import ResolvedVelocity
-from eddies.spectral.spectral_grid import SpectralGrid, regrid
+from eddies.spectral.spectral_grid import regrid
 from eddies.workflows.ground_truth.truth import GroundTruth
+from eddies.workflows.rollout.method import GridModes
 
 log = logging.getLogger("eddies")
 
-GridModes = tuple[SpectralGrid, np.ndarray]  # a grid, and modes (3, kz, ky_local, kx) of a velocity on it
 RUNS = "model", "truth"
 # Of a slab, for the ghost planes of cubic splines; on many ranks the grid has more planes than the closure's.
 FEWEST_PLANES = 3
