@@ -30,8 +30,9 @@ def test_pieces_are_the_kernel(kind):
 def averages(field, kernel):
     """Everything that a field is asked for without a gradient."""
     with torch.no_grad():
-        return [field.volumes(kernel), field.velocity_on_whole_grid(kernel), *field.on_whole_grid(kernel),
-                *field.at_particles(kernel)]
+        volume = field.volumes(kernel)
+        return [volume, field.velocity_on_whole_grid(kernel, volume), *field.on_whole_grid(kernel, volume),
+                *field.at_particles(kernel, volume)]
 
 
 @pytest.mark.mpi(1, 2, 3)

@@ -16,64 +16,99 @@ struct Reconstruction {
     double spacing, support;
     const double *position, *kernel;  // (particles, 3), and as smoothing.hpp wants it
     const void* columns;              // (particles, 4), each to be added with the weight W
-    void* sums;                       // (planes, cells, cells, 4), zero at first
+    void* sums;                       // (planes, cells, cells, 4)
 };
 
 }  // extern "C"
 
 namespace {
 
+using eddies::Vector;
+
+// A plane's sums while particles are added: for each line four rows of one column each. Rows go on beyond the box by what
+// a particle at its end reaches.
 template <typename Real>
-struct FourOf {
-    typedef Real type __attribute__((vector_size(4 * sizeof(Real)), aligned(alignof(Real)), may_alias));
+class Plane {
+   public:
+    Plane(std::int64_t cells, std::int64_t beyond)
+        : cells_(cells), width_(cells + beyond), rows_(4 * cells * width_) {}
+
+    Real* row(std::int64_t line, int column) { return rows_.data() + (4 * line + column) * width_; }
+
+    // (line, point, column); what went beyond the box is where it began.
+    void write(Real* sums) {
+        std::fill_n(sums, 4 * cells_ * cells_, Real(0));
+        for (std::int64_t line = 0; line < cells_; ++line)
+            for (int column = 0; column < 4; ++column)
+                for (std::int64_t x = 0; x < width_; ++x)
+                    sums[4 * (line * cells_ + x % cells_) + column] += row(line, column)[x];
+    }
+
+   private:
+    std::int64_t cells_, width_;
+    std::vector<Real> rows_;
 };
 
-// Planes are shared by threads; each adds up its particles in their order.
+// Adds to a vector that stands anywhere.
+template <typename Real>
+void add(Real* place, Vector<Real> more) {
+    typedef Real Anywhere __attribute__((vector_size(eddies::VECTOR_BYTES), may_alias, aligned(alignof(Real))));
+    *reinterpret_cast<Anywhere*>(place) += (Anywhere)more;
+}
+
+// The first grid point at a coordinate or beyond it.
+std::int64_t point_from(double coordinate, double spacing) {
+    return static_cast<std::int64_t>(std::ceil(coordinate / spacing));
+}
+
+std::int64_t wrapped(std::int64_t point, std::int64_t cells) { return (point % cells + cells) % cells; }
+
+// Planes are shared by threads; each adds up its particles in their order, a vector of points along x at a time.
 template <typename Real>
 void add_up(const Reconstruction& r) {
-    using Four = typename FourOf<Real>::type;
+    constexpr int lanes = eddies::VectorOf<Real>::lanes;
     const eddies::Smoothing<Real> kernel(r.kernel);
+    const double length = r.spacing * static_cast<double>(r.cells);
     std::vector<std::vector<std::int64_t>> near(r.planes);  // particles that reach each plane
     for (std::int64_t p = 0; p < r.particles; ++p) {
         const double z = r.position[3 * p + 2];
-        const auto low = static_cast<std::int64_t>(std::ceil((z - r.support) / r.spacing));
-        const auto high = static_cast<std::int64_t>(std::floor((z + r.support) / r.spacing));
-        for (std::int64_t plane = low; plane <= high; ++plane) {
-            const std::int64_t at = (r.periodic_z ? (plane % r.cells + r.cells) % r.cells : plane) - r.first_plane;
+        for (std::int64_t plane = point_from(z - r.support, r.spacing); plane * r.spacing <= z + r.support; ++plane) {
+            const std::int64_t at = (r.periodic_z ? wrapped(plane, r.cells) : plane) - r.first_plane;
             if (at >= 0 && at < r.planes) near[at].push_back(p);
         }
     }
     const auto square = static_cast<Real>(r.support * r.support);
+    const auto across_x = static_cast<std::int64_t>(2 * r.support / r.spacing) / lanes + 1;  // vectors
+    Vector<Real> along;
+    for (int lane = 0; lane < lanes; ++lane) along[lane] = static_cast<Real>(lane * r.spacing);
 #pragma omp parallel for schedule(dynamic, 1)
     for (std::int64_t plane = 0; plane < r.planes; ++plane) {
-        Four* sums = static_cast<Four*>(r.sums) + plane * r.cells * r.cells;
+        Plane<Real> sums(r.cells, across_x * lanes);
         for (const std::int64_t p : near[plane]) {
-            const double *position = r.position + 3 * p, length = r.spacing * static_cast<double>(r.cells);
+            const double* position = r.position + 3 * p;
+            const Real* column = static_cast<const Real*>(r.columns) + 4 * p;
             double gap = static_cast<double>(r.first_plane + plane) * r.spacing - position[2];
             if (r.periodic_z) gap -= length * std::nearbyint(gap / length);
-            const Four column = static_cast<const Four*>(r.columns)[p];
-            const double left = r.support * r.support - gap * gap;
-            if (left <= 0) continue;
-            const double half = std::sqrt(left);
-            const auto low_y = static_cast<std::int64_t>(std::ceil((position[1] - half) / r.spacing));
-            const auto high_y = static_cast<std::int64_t>(std::floor((position[1] + half) / r.spacing));
-            for (std::int64_t y = low_y; y <= high_y; ++y) {
-                const double gap_y = static_cast<double>(y) * r.spacing - position[1], room = left - gap_y * gap_y;
-                if (room <= 0) continue;
-                const double half_x = std::sqrt(room);
-                const auto low_x = static_cast<std::int64_t>(std::ceil((position[0] - half_x) / r.spacing));
-                const auto high_x = static_cast<std::int64_t>(std::floor((position[0] + half_x) / r.spacing));
-                Four* line = sums + (y % r.cells + r.cells) % r.cells * r.cells;
+            const double half = std::sqrt(std::max(r.support * r.support - gap * gap, 0.0));
+            const std::int64_t low_x = point_from(position[0] - r.support, r.spacing);
+            const std::int64_t low_y = point_from(position[1] - half, r.spacing);
+            const auto first_x = static_cast<Real>(static_cast<double>(low_x) * r.spacing - position[0]);
+            const std::int64_t x = wrapped(low_x, r.cells);
+            double gap_y = static_cast<double>(low_y) * r.spacing - position[1];
+            for (std::int64_t line = wrapped(low_y, r.cells); gap_y <= half; gap_y += r.spacing) {
                 const auto across = static_cast<Real>(gap * gap + gap_y * gap_y);
-                std::int64_t column_x = (low_x % r.cells + r.cells) % r.cells;
-                for (std::int64_t x = low_x; x <= high_x; ++x) {
-                    const auto gap_x = static_cast<Real>(static_cast<double>(x) * r.spacing - position[0]);
-                    const Real distance = gap_x * gap_x + across;
-                    if (distance < square) line[column_x] += kernel.value(std::sqrt(distance)) * column;
-                    if (++column_x == r.cells) column_x = 0;
+                for (std::int64_t v = 0; v < across_x; ++v) {
+                    const Vector<Real> gap_x = along + (first_x + static_cast<Real>(v * lanes * r.spacing));
+                    const Vector<Real> distance = gap_x * gap_x + across;
+                    Vector<Real> root;
+                    for (int lane = 0; lane < lanes; ++lane) root[lane] = std::sqrt(distance[lane]);
+                    const Vector<Real> weight = distance < square ? kernel.value(root) : Vector<Real>{};
+                    for (int c = 0; c < 4; ++c) add(sums.row(line, c) + x + v * lanes, weight * column[c]);
                 }
+                if (++line == r.cells) line = 0;
             }
         }
+        sums.write(static_cast<Real*>(r.sums) + 4 * plane * r.cells * r.cells);
     }
 }
 

@@ -33,7 +33,7 @@ def sums_on_grid(library: ctypes.CDLL, grid: GridPlanes, support: float, pieces:
     position, columns = np.ascontiguousarray(position, np.float64), np.ascontiguousarray(columns)
     if columns.shape != (len(position), 4):
         raise ValueError(f"columns {columns.shape} of {len(position)} particles: four are needed")
-    sums = np.zeros((grid.planes * grid.cells**2, 4), columns.dtype)
+    sums = np.empty((grid.planes * grid.cells**2, 4), columns.dtype)
     told = np.array(told_kernel(support, pieces))
     given = _Reconstruction(len(position), grid.cells, grid.first, grid.planes, grid.periodic_z, grid.spacing, support,
                             *(array.ctypes.data for array in (position, told, columns, sums)))

@@ -2,47 +2,64 @@
 
 #pragma once
 
+#include <algorithm>
 #include <cstdint>
-#include <vector>
+
+#include "vectors.hpp"
 
 namespace eddies {
 
 template <typename Real>
 class Smoothing {
+    using V = Vector<Real>;
+
    public:
     // h, number of pieces, coefficients of each; then these, of u = 1 ... 0 from begin to end of a piece.
     explicit Smoothing(const double* given)
-        : pieces_(static_cast<int>(given[1])), width_(static_cast<int>(given[2])),
-          per_length_(static_cast<Real>(given[1] / given[0])),
-          coefficients_(given + 3, given + 3 + pieces_ * width_) {}
-
-    Real value(Real distance) const {
-        Real u;
-        const Real* c = locate(distance, u);
-        Real sum = c[width_ - 1];
-        for (int k = width_ - 2; k >= 0; --k) sum = sum * u + c[k];
-        return sum > 0 ? sum : Real(0);  // below zero by rounding alone
+        : pieces_(static_cast<int>(given[1])), width_(static_cast<int>(given[2])), stride_(padded<Real>(width_)),
+          per_length_(static_cast<Real>(given[1] / given[0])), coefficients_(std::size_t(pieces_) * stride_) {
+        for (int piece = 0; piece < pieces_; ++piece)
+            std::copy_n(given + 3 + piece * width_, width_, coefficients_.data() + piece * stride_);
     }
 
-    // dW/dr.
-    Real slope(Real distance) const {
-        Real u;
-        const Real* c = locate(distance, u);
-        Real sum = (width_ - 1) * c[width_ - 1];
-        for (int k = width_ - 2; k >= 1; --k) sum = sum * u + k * c[k];
-        return -sum * per_length_;
+    // W of some distances below h; of others anything that is finite.
+    V value(V distance) const {
+        V slope;
+        return evaluated<false>(distance, slope);
     }
+
+    // The same, and dW/dr.
+    V value(V distance, V& slope) const { return evaluated<true>(distance, slope); }
 
    private:
-    int pieces_, width_;
+    int pieces_, width_, stride_;
     Real per_length_;
-    std::vector<Real> coefficients_;
+    Aligned<Real> coefficients_;  // of each piece, and zeros up to a whole number of groups
 
-    const Real* locate(Real distance, Real& u) const {
-        const Real place = distance * per_length_;
-        const int piece = static_cast<int>(place), last = pieces_ - 1, kept = piece < last ? piece : last;
-        u = static_cast<Real>(kept + 1) - place;
-        return &coefficients_[kept * width_];
+    template <bool sloping>
+    V evaluated(V distance, V& slope) const {
+        constexpr int lanes = VectorOf<Real>::lanes, group = GROUP<Real>;
+        const V place = distance * per_length_;
+        BitVector<Real> piece = __builtin_convertvector(place, BitVector<Real>);
+        piece = piece < pieces_ - 1 ? piece : pieces_ - 1 - BitVector<Real>{};
+        const V u = __builtin_convertvector(piece + 1, V) - place;
+        V sum{}, rate{};
+        for (int begin = stride_ - group; begin >= 0; begin -= group) {
+            V part[group];
+            for (int q = 0; q < group; ++q) {
+                const Real* groups[lanes / group];
+                for (int g = 0; g < lanes / group; ++g)
+                    groups[g] = coefficients_.data() + piece[g * group + q] * stride_ + begin;
+                part[q] = together(groups);
+            }
+            transpose<Real>(part);
+            for (int k = group - 1; k >= 0; --k) {  // Horner, and its derivative
+                if (sloping) rate = rate * u + sum;
+                sum = sum * u + part[k];
+            }
+        }
+        if (sloping) slope = -rate * per_length_;
+        return sum > 0 ? sum : V{};  // below zero by rounding alone
     }
 };
 

@@ -590,7 +590,8 @@ class KernelSum : public Summand<Real> {
     explicit KernelSum(const double* constants) : Summand<Real>(1, Real(1)), kernel_(constants) {}
 
     void values(const Block<Real>& pairs, Components<Real> found) override {
-        for (int p = 0; p < BLOCK; ++p) found[0][p] = kernel_.value(pairs.distance[p]);
+        for (int p = 0; p < BLOCK; p += VectorOf<Real>::lanes)
+            vector_at(found[0] + p) = kernel_.value(vector_at(pairs.distance + p));
     }
 
     void gradients(const Block<Real>&, GivenComponents<Real>, ByPairs<Real>*, Real*) override {}
@@ -610,10 +611,11 @@ class KernelAverage : public Summand<Real> {
     void values(const Block<Real>& pairs, Components<Real> found) override {
         const Real* volume = pairs.scalar[1][scalar_];
         alignas(64) Real slope[BLOCK];
-        for (int p = 0; p < BLOCK; ++p) {
-            const Real r = pairs.distance[p];
-            found[0][p] = volume[p] * kernel_.value(r);
-            slope[p] = r > 0 ? volume[p] * kernel_.slope(r) / r : Real(0);
+        for (int p = 0; p < BLOCK; p += VectorOf<Real>::lanes) {
+            const Vector<Real> r = vector_at(pairs.distance + p);
+            Vector<Real> rate;
+            vector_at(found[0] + p) = vector_at(volume + p) * kernel_.value(r, rate);
+            vector_at(slope + p) = r > 0 ? vector_at(volume + p) * rate / r : Vector<Real>{};
         }
         for (int d = 0; d < 3; ++d)
             EDDIES_PAIRS found[4 + d][p] = slope[p] * pairs.x[d][p];

@@ -63,6 +63,17 @@ inline auto unaligned(const Thing* place) {
     return (Vector<Real>)*reinterpret_cast<const Anywhere*>(place);
 }
 
+// The vector that stands where one may begin.
+template <typename Real>
+inline Vector<Real>& vector_at(Real* place) {
+    return *reinterpret_cast<Vector<Real>*>(place);
+}
+
+template <typename Real>
+inline const Vector<Real>& vector_at(const Real* place) {
+    return *reinterpret_cast<const Vector<Real>*>(place);
+}
+
 // Bits of lanes, all of whose bits are set or none, the first lane's first.
 template <typename Lanes>
 inline std::uint64_t bits(Lanes lanes) {

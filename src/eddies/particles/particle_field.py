@@ -78,9 +78,8 @@ class ParticleField:
         return reconstruct_with_gradient(kernel, pairs, volume, self._velocity)
 
     @torch.no_grad()
-    def on_whole_grid(self, kernel: SmoothingKernel) -> tuple[Tensor, Tensor]:
-        """Velocity (m, 3) and gradient (m, 3, 3) at all of this rank's grid points; collective."""
-        volume = self.volumes(kernel)
+    def on_whole_grid(self, kernel: SmoothingKernel, volume: Tensor) -> tuple[Tensor, Tensor]:
+        """Velocity (m, 3) and gradient (m, 3, 3) at all of this rank's grid points, by the kernel's `volumes`."""
         if self._served:
             none = self._velocity.new_zeros(len(self._points), 4)
             return self._averages(kernel, torch.cat([self._points, self._position]),
@@ -88,10 +87,9 @@ class ParticleField:
         return _joined(self.on_grid(kernel, volume, block) for block in self._around.blocks(PAIRS_TOGETHER))
 
     @torch.no_grad()
-    def velocity_on_whole_grid(self, kernel: SmoothingKernel) -> Tensor:
-        """Velocity (m, 3) at all of this rank's grid points, cheaper than with its gradient; collective, not
-        differentiable."""
-        volume, slab = self.volumes(kernel), self.decomposition
+    def velocity_on_whole_grid(self, kernel: SmoothingKernel, volume: Tensor) -> Tensor:
+        """Velocity (m, 3) at all of this rank's grid points, cheaper than with its gradient; not differentiable."""
+        slab = self.decomposition
         if self._served:
             weighted = volume.unsqueeze(1) * torch.cat([torch.ones_like(volume).unsqueeze(1), self._velocity], dim=1)
             planes = GridPlanes(slab.planes, slab.spacing, slab.start, slab.count, slab.size == 1)
@@ -101,9 +99,8 @@ class ParticleField:
         return reconstruct_on_grid(kernel, slab, self._position, volume, self._velocity)
 
     @torch.no_grad()
-    def at_particles(self, kernel: SmoothingKernel) -> tuple[Tensor, Tensor]:
-        """Velocity (n, 3) and gradient (n, 3, 3) [component, direction] at the owned particles; collective."""
-        volume = self.volumes(kernel)
+    def at_particles(self, kernel: SmoothingKernel, volume: Tensor) -> tuple[Tensor, Tensor]:
+        """Velocity (n, 3) and gradient (n, 3, 3) [component, direction] at the owned particles."""
         if self._served:
             columns = self._columns(volume)
             itself = columns[: len(self.owned)].clone()

@@ -66,6 +66,8 @@ class ResolvedVelocity:
     iterations: int | None = None
     #: iterations and residual of the solves so far, and whether they converged, one after the other
     solves: list[tuple[int, float, bool]]
+    #: modes that the last solve found; None before
+    found: Tensor | None = None
 
     def __init__(self, grid: FourierGrid, filter_width: float, kolmogorov_length: float = 0.0,
                  weight: float = WEIGHT) -> None:
@@ -109,6 +111,7 @@ class ResolvedVelocity:
                 start = self.foreseen(time, as_numpy(mean), speed)
             flow = self._solved(flow, start, count, square)
         self.solves.append((flow.iterations, flow.residual, flow.converged))
+        self.found = flow.velocity.detach()
         if torch.is_grad_enabled():
             flow = replace(flow, left_over=None)  # which is without a gradient
             gradient = self._descent(flow, flow.missing())
@@ -156,7 +159,7 @@ class ResolvedVelocity:
 
     def forget(self) -> None:
         """Start the next solve from nothing."""
-        self._moments, self.solves, self.speed = [], [], 0.0
+        self._moments, self.solves, self.speed, self.found = [], [], 0.0, None
 
     def state_dict(self) -> dict[str, Tensor]:
         """What later solves start from: times (m,), and modes (m, 2, 3, kz, ky_local, kx) of velocity and rate; and the

@@ -128,7 +128,7 @@ def compare(kernels: dict[str, SmoothingKernel], sample: KernelSample) -> dict[s
     slices["truth_velocity"] = _middle_plane(slab, sample.field[:, 0])
     slices["truth_gradient"] = _middle_plane(slab, sample.gradient[:, 0, 0])
     for name, kernel in kernels.items():
-        velocity, derivative = sample.particles.on_whole_grid(kernel)
+        velocity, derivative = sample.particles.on_whole_grid(kernel, sample.particles.volumes(kernel))
         errors[f"velocity_error_{name}"], errors[f"gradient_error_{name}"] = sample.errors_of(velocity, derivative)
         errors[f"integral_{name}"] = float(integral(kernel))
         slices[f"velocity_{name}"] = _middle_plane(slab, velocity[:, 0])

@@ -177,7 +177,7 @@ def test_every_method_has_the_units_of_its_start_and_runs(comm, tmp_path, method
     assert (particles.density is not None) == made.has_density == (method == "learned")
     assert len(acceleration) == 6**3 and bool(torch.isfinite(acceleration).all())
     assert bool(acceleration.any()) == (method != "none")
-    near = made.velocity_modes(0.0)
+    near = made.velocity_modes()
     assert (near is None) == (method == "none")
     if near is not None:
         spline = SplineInterpolation(near[0], "quintic")

@@ -167,8 +167,9 @@ def _of_kernel(scene: Scene, alone: Comm, side: int) -> dict[str, float]:
 def _averages(slab: SlabDecomposition, kernel, position: torch.Tensor, velocity: torch.Tensor) -> None:
     """What a frame of a rollout is averaged for."""
     field = ParticleField(slab, kernel.support, position, velocity)
-    field.at_particles(kernel)
-    field.velocity_on_whole_grid(kernel)
+    volume = field.volumes(kernel)
+    field.at_particles(kernel, volume)
+    field.velocity_on_whole_grid(kernel, volume)
 
 
 def _of_model(scene: Scene, alone: Comm, side: int, number: int) -> dict[str, tuple[float, float]]:

@@ -102,7 +102,7 @@ class Course:
         """Store the frame of a time, and take down the mean kinetic energy <v.v>/2 of its particles."""
         with self.progress.storing():
             particles, acceleration = self.method.frame(at)
-            near = self.method.velocity_modes(at) if hasattr(self.method, "velocity_modes") else None
+            near = self.method.velocity_modes() if hasattr(self.method, "velocity_modes") else None
             self.frames.store(self.steps, at, particles, acceleration, near)
         energy = 0.5 * float(particles.velocity.double().square().sum())
         self.energy = float(global_sum(self.comm, energy)) / self.frames.truth.total

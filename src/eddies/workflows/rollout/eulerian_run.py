@@ -100,7 +100,7 @@ class EulerianRun:
         density = {"density": self.tracers.density(self.state)} if self.has_density else {}
         return ParticleSet.from_numpy(self.tracers.columns | density), torch.from_numpy(self._acceleration())
 
-    def velocity_modes(self, time: float) -> GridModes:
+    def velocity_modes(self) -> GridModes:
         """The grid, and the modes of the velocity that the particles follow."""
         return self.fluid.grid, self.tracers.field.transfer * self.state[:3]
 

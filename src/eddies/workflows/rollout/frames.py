@@ -94,8 +94,9 @@ class RolloutFrames:
         if self.kernel is not None:
             position, velocity = (torch.from_numpy(columns[column]) for column in ("position", "velocity"))
             particle_field = ParticleField(self._slab, self.kernel.support, position, velocity)
-            columns["velocity_gradient"] = as_numpy(particle_field.at_particles(self.kernel)[1])
-            field, n = as_numpy(particle_field.velocity_on_whole_grid(self.kernel)).T, self._slab.planes
+            volume, n = particle_field.volumes(self.kernel), self._slab.planes
+            columns["velocity_gradient"] = as_numpy(particle_field.at_particles(self.kernel, volume)[1])
+            field = as_numpy(particle_field.velocity_on_whole_grid(self.kernel, volume)).T
             planes = field.reshape(3, self._slab.count, n, n)
             self.segments.fields[name].append(time, self._slab.start, {"velocity": planes})
         order = IdOrder(self._slab.comm, columns["id"], self.truth.total)

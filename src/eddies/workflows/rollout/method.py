@@ -34,8 +34,8 @@ class Method(Protocol):
     def frame(self, time: float) -> tuple[ParticleSet, torch.Tensor]:
         """The particles at a time that the last step reached, in any order, and their acceleration (n, 3)."""
 
-    def velocity_modes(self, time: float) -> GridModes | None:
-        """A velocity near that of the particles of the frame at a time, if one is known."""
+    def velocity_modes(self) -> GridModes | None:
+        """A velocity near that of the particles of the last `frame`, if one is known."""
 
     def status(self) -> str:
         """What the progress line shows of it beside time and energy."""

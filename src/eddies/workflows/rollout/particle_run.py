@@ -20,8 +20,7 @@ from eddies.particles.flow_units import FlowUnits
 from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.model import LagrangianModel
 from eddies.particles.moment import Moment, between
-from eddies.particles.particle_set import ParticleSet, as_numpy
-from eddies.particles.rank_sums import mean_over_ranks
+from eddies.particles.particle_set import ParticleSet
 from eddies.particles.reference_scales import allowed_step
 from eddies.particles.terms.settings import Forcing
 from eddies.scene.scene import Scene
@@ -128,14 +127,13 @@ class ParticleRun:
         self._count_solves()
         return particles, rates.acceleration
 
-    def velocity_modes(self, time: float) -> GridModes | None:
-        """The grid of the resolved velocity, if there is one, and its modes as foreseen for a time."""
+    def velocity_modes(self) -> GridModes | None:
+        """The grid of the resolved velocity, if there is one, and its modes in the last evaluation of the forces, which
+        is that of the last frame."""
         resolution = self.dynamics.resolution
-        if resolution is None:
+        if resolution is None or resolution.found is None:
             return None
-        mean = as_numpy(mean_over_ranks(self.comm, self.particles.velocity))
-        modes = resolution.foreseen(time, mean, resolution.speed)
-        return None if modes is None else (resolution.grid.spectral, modes.numpy())
+        return resolution.grid.spectral, resolution.found.numpy()
 
     def _now(self) -> Moment:
         """The particles with their acceleration, which the next step does not evaluate again; collective."""
