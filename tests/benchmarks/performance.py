@@ -1,6 +1,6 @@
 """What an evaluation of a particle model costs, over particles, ranks and threads: measured, bounded, foreseen.
 
-    OMP_NUM_THREADS=1 .venv/bin/python tests/benchmarks/performance.py measure docs/performance.json  # 15 min
+    OMP_NUM_THREADS=1 .venv/bin/python tests/benchmarks/performance.py measure docs/performance.json  # 10 min
     .venv/bin/python tests/benchmarks/performance.py draw docs/performance.json docs/performance.png
 
 Measures by the programs beside it, each a job of its own: `particle_step.py` on one rank, on one rank of two threads
@@ -14,6 +14,7 @@ import math
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -46,15 +47,15 @@ NOTEBOOKS, PAPER = 46.0, 0.5
 
 def measure() -> dict:
     """All of it."""
-    found = {"processor": processor(), "cores": os.cpu_count(), "steps": [],
-             "grid": [], "bounds": bounds(), "foreseen": foreseen()}
+    found: dict = {"processor": processor(), "cores": os.cpu_count(), "steps": [], "grid": []}
     for side in SIDES:
         for model in MODELS:
             for ranks, threads in LAYOUTS if side <= ALL_LAYOUTS else LAYOUTS[-1:]:
                 found["steps"].append(of_job(ranks, threads, "particle_step.py", side, "--model", model,
                                              "--threads", threads))
         found["grid"].append(of_job(2, 1, "step.py", round(CELLS_A_PARTICLE * side), "--precision", "float32"))
-    return found
+    taken = next(row["iterations"] for row in found["steps"] if (row["particles"], row["model"]) == (64, MODELS[1]))
+    return found | {"bounds": bounds(taken), "foreseen": foreseen()}
 
 
 def of_job(ranks: int, threads: int, program: str, *arguments: object) -> dict:
@@ -75,13 +76,12 @@ def scene_of(side: int, model: str) -> Scene:
                               f"flow.viscosity={0.0072 * (32 / side) ** (4 / 3)}", f'model.preset="{model}"'])
 
 
-def bounds() -> dict[str, float]:
-    """Seconds of parts of an evaluation with 64^3 particles on one core, at best; for as many iterations as are
-    foreseen."""
+def bounds(iterations: float) -> dict[str, float]:
+    """Seconds of parts of an evaluation with 64^3 particles on one core, at best."""
     a, b = np.ones((2, 1024, 1024), np.float32)
     flops = 2 * 1024**3 / best(lambda: a @ b)
     scene = scene_of(64, MODELS[1])
-    work, speed = particle_work(scene), probe_particles(scene, MPI.COMM_SELF)
+    work, speed = replace(particle_work(scene), iterations=iterations), probe_particles(scene, MPI.COMM_SELF)
     grid = SpectralGrid(SlabDecomposition(MPI.COMM_SELF, 2 * math.pi, work.cells), "float32", work.wavenumber)
     return {"flops": flops,
             "pairs": work.pairs(1) * PAIR_FLOPS / flops,

@@ -27,8 +27,8 @@ SAMPLES = 4                  # fields that a kernel is trained on, one more is c
 TORCH_SECONDS, CURVES_SECONDS, CHECKPOINTING_SECONDS = 1.3, 2.0, 4.0
 # Iterations of a solve for the resolved velocity: that starts from nothing; that starts from what is foreseen and goes
 # to the same tolerance, as in a training through horizons; that starts from a field that is near and goes farther, for
-# a spectrum; of its gradient. Of tiny and hit-small, 20 to 25, 1 to 7, 8 to 12, 24 to 34.
-COLD, FORESEEN, NEAR, ADJOINT = 25.0, 4.0, 10.0, 32.0
+# a spectrum; of its gradient. Of tiny to hit, 20 to 40, 1 to 7, 2 to 13, 24 to 34.
+COLD, FORESEEN, NEAR, ADJOINT = 25.0, 4.0, 7.0, 32.0
 # Of a loss without its gradient over that of an optimiser step; of the sums of an evaluation with theirs, made once
 # forth, once more on the way back, and differentiated (docs/performance.md: 2.3 to 2.6 times).
 LOSS_ALONE, WITH_GRADIENT = 0.6, 4.5

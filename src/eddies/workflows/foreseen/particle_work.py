@@ -12,7 +12,7 @@ from eddies.workflows.foreseen.estimates import expected_turbulence, resolved_sh
 from eddies.workflows.foreseen.rollout_course import EVALUATIONS, rollout_step
 
 # Of a solve that starts from what is foreseen, at about the longest steps that the flow allows: docs/closure.md.
-ITERATIONS = {"verlet": 1.0, "rk2": 1.2, "rk3": 4.0, "rk4": 6.5}
+ITERATIONS = {"verlet": 1.0, "rk2": 1.2, "rk3": 3.0, "rk4": 6.5}
 # Sums over ranks: of an iteration; of the rest of an evaluation with the built-in terms; of a settling.
 SUMS_OF_ITERATION, SUMS_OF_EVALUATION, SUMS_OF_SETTLING = 2, 11, 5
 VECTOR = 24                  # bytes of a vector of a particle
