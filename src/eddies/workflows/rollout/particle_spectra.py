@@ -25,8 +25,8 @@ RUNS = "model", "truth"
 # Of a slab, for the ghost planes of cubic splines; on many ranks the grid has more planes than the closure's.
 FEWEST_PLANES = 3
 # Residuals at which solves end, from nothing and from a field that is near: in hit after 40 iterations, and after 8
-# from the filtered flow or one from what the forces had. What further ones would change of ln E(k) is 1e-3 (rms) up to k_d,
-# and 0.1 up to twice that, either way.
+# from the filtered flow or one from what the forces had. What further ones would change of ln E(k) is 1e-3 (rms) up to
+# k_d, and 0.1 up to twice that, either way.
 TOLERANCE, TOLERANCE_NEAR = 5e-4, 8e-4
 # Where particles have gathered and left voids a solve takes more, and gains little by most: see ParticleSpectra.
 MOST_ITERATIONS = 100
