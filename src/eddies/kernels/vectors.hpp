@@ -77,7 +77,7 @@ inline const Vector<Real>& vector_at(const Real* place) {
 // Bits of lanes, all of whose bits are set or none, the first lane's first.
 template <typename Lanes>
 inline std::uint64_t bits(Lanes lanes) {
-    constexpr bool single = sizeof(lanes[0]) == 4;
+    [[maybe_unused]] constexpr bool single = sizeof(lanes[0]) == 4;
 #if defined(__AVX512F__)
     if constexpr (single) return _mm512_movepi32_mask((__m512i)lanes);
     return _mm512_movepi64_mask((__m512i)lanes);
