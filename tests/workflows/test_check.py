@@ -257,7 +257,7 @@ def test_a_rollout_is_foreseen_where_a_model_moves_the_particles_of_a_cpu(comm):
     learned = load_scene("tiny")
     rows = rollout_costs(learned, probe_scene(learned, comm))
     lines = list(rollout_lines(learned, rows))
-    assert len(lines) == len(rows) + 2 and "3 evaluations a step, 4 iterations each" in lines[0]
+    assert len(lines) == len(rows) + 2 and "3 evaluations a step, 3 iterations each" in lines[0]
     assert all(row.binds in line and f"{row.ranks} x {row.threads}" in line for row, line in zip(rows, lines[2:]))
     for changes, stages in ((["simulation.method=none"], ["dns", "train-kernel", "simulate", "report"]),
                             (["device=cuda"], ["dns", "train-kernel", "report"])):

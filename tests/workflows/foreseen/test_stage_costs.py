@@ -42,7 +42,7 @@ def test_more_ranks_take_less_time_and_memory_and_leave_as_much(stage):
 @pytest.mark.parametrize("stage, part, override, factor", [
     ("dns", "tracers", "tracers.turnovers=4.8", 2), ("train-kernel", "steps", "kernel.steps=400", 2),
     ("train", "frames", "training.frames=33", 2),
-    ("simulate", "steps", "simulation.step=0.045", 2), ("simulate", "frames", "simulation.turnovers=0.5", 0.54)])
+    ("simulate", "steps", "simulation.step=0.0348", 2), ("simulate", "frames", "simulation.turnovers=0.5", 0.54)])
 def test_time_goes_with_the_work(stage, part, override, factor):
     once, twice = cost_of(stage), cost_of(stage, override)
     assert twice.parts[part] == pytest.approx(factor * once.parts[part], rel=0.1)
@@ -125,12 +125,12 @@ def test_rollouts_without_a_model_are_foreseen_too(changes):
 
 
 def test_spectra_are_foreseen_whatever_moves_the_particles():
-    """A solve each, of the same particles: in 10 iterations where a field is near, as for the truth always, or 25."""
+    """A solve each, of the same particles: in 7 iterations where a field is near, as for the truth always, or 25."""
     learned, grid, *unknown = (cost_of("simulate", *changes).parts["spectra"] for changes in (
         [], ["simulation.method=eulerian"], ["simulation.method=none"],
         ["model.preset=paper", "simulation.integrator=verlet", "simulation.step=0.005"]))
     assert learned > 0 and grid == pytest.approx(learned, rel=0.02)
-    assert unknown == pytest.approx(2 * [learned * (25 + 10) / (10 + 10)], rel=0.02)
+    assert unknown == pytest.approx(2 * [learned * (25 + 7) / (7 + 7)], rel=0.02)
 
 
 @pytest.mark.mpi(1, 2)
