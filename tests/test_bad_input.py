@@ -286,6 +286,14 @@ def test_an_interrupt_is_a_line_and_leaves_nothing_half_written(tmp_path):
     assert not list(tmp_path.rglob("*.partial"))
 
 
+def test_an_interrupt_within_code_of_a_string_is_one_like_others(tmp_path):
+    (tmp_path / "job.py").write_text("from eddies import cli\n"
+                                     "cli.run = lambda arguments: exec('raise KeyboardInterrupt')\n"
+                                     "raise SystemExit(cli.main([]))\n")
+    ended = subprocess.run([sys.executable, "-m", "job"], cwd=tmp_path, capture_output=True, text=True)
+    assert (ended.returncode, ended.stderr) == (130, "eddies: interrupted\n")
+
+
 def test_an_interrupted_job_of_two_ranks_ends(tmp_path):
     with a_simulation(tmp_path, sys.executable, LAUNCHER, "-n", 2, "--") as job:
         os.killpg(job.pid, signal.SIGINT)  # as the keyboard does
