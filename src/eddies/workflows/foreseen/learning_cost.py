@@ -27,7 +27,7 @@ SAMPLES = 4                  # fields that a kernel is trained on, one more is c
 TORCH_SECONDS, CURVES_SECONDS, CHECKPOINTING_SECONDS = 1.3, 2.0, 4.0
 # Iterations of a solve for the resolved velocity: that starts from nothing; that starts from what is foreseen and goes
 # to the same tolerance, as in a training through horizons; that starts from a field that is near and goes farther, for
-# a spectrum; of its gradient. Of tiny to hit, 20 to 40, 1 to 7, 2 to 13, 24 to 34.
+# a spectrum; of its gradient. Of tiny to hit, 20 to 40, 1 to 7, 0 to 10, 24 to 34.
 COLD, FORESEEN, NEAR, ADJOINT = 25.0, 4.0, 7.0, 32.0
 # Of a loss without its gradient over that of an optimiser step; of the sums of an evaluation with theirs, made once
 # forth, once more on the way back, and differentiated (docs/performance.md: 2.3 to 2.6 times).
