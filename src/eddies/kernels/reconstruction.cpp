@@ -40,21 +40,16 @@ class Plane {
         std::fill_n(sums, 4 * cells_ * cells_, Real(0));
         for (std::int64_t line = 0; line < cells_; ++line)
             for (int column = 0; column < 4; ++column)
-                for (std::int64_t x = 0; x < width_; ++x)
-                    sums[4 * (line * cells_ + x % cells_) + column] += row(line, column)[x];
+                for (std::int64_t x = 0, point = 0; x < width_; ++x) {
+                    sums[4 * (line * cells_ + point) + column] += row(line, column)[x];
+                    if (++point == cells_) point = 0;
+                }
     }
 
    private:
     std::int64_t cells_, width_;
     std::vector<Real> rows_;
 };
-
-// Adds to a vector that stands anywhere.
-template <typename Real>
-void add(Real* place, Vector<Real> more) {
-    typedef Real Anywhere __attribute__((vector_size(eddies::VECTOR_BYTES), may_alias, aligned(alignof(Real))));
-    *reinterpret_cast<Anywhere*>(place) += (Anywhere)more;
-}
 
 // The first grid point at a coordinate or beyond it.
 std::int64_t point_from(double coordinate, double spacing) {
@@ -103,7 +98,7 @@ void add_up(const Reconstruction& r) {
                     Vector<Real> root;
                     for (int lane = 0; lane < lanes; ++lane) root[lane] = std::sqrt(distance[lane]);
                     const Vector<Real> weight = distance < square ? kernel.value(root) : Vector<Real>{};
-                    for (int c = 0; c < 4; ++c) add(sums.row(line, c) + x + v * lanes, weight * column[c]);
+                    for (int c = 0; c < 4; ++c) eddies::add_unaligned(sums.row(line, c) + x + v * lanes, weight * column[c]);
                 }
                 if (++line == r.cells) line = 0;
             }

@@ -55,12 +55,22 @@ struct BitVectorOf {
 template <typename Real>
 using BitVector = typename BitVectorOf<Real>::type;
 
+template <typename Real>
+struct VectorAnywhere {
+    typedef Real type __attribute__((vector_size(VECTOR_BYTES), may_alias, aligned(sizeof(Real))));
+};
+
 // A vector of what stands anywhere, of numbers or other things of as many bits.
 template <typename Thing>
 inline auto unaligned(const Thing* place) {
     using Real = std::conditional_t<sizeof(Thing) == 4, float, double>;
-    typedef Real Anywhere __attribute__((vector_size(VECTOR_BYTES), may_alias, aligned(sizeof(Thing))));
-    return (Vector<Real>)*reinterpret_cast<const Anywhere*>(place);
+    return (Vector<Real>)*reinterpret_cast<const typename VectorAnywhere<Real>::type*>(place);
+}
+
+// Adds to a vector that stands anywhere.
+template <typename Real>
+inline void add_unaligned(Real* place, Vector<Real> more) {
+    *reinterpret_cast<typename VectorAnywhere<Real>::type*>(place) += more;
 }
 
 // The vector that stands where one may begin.
