@@ -34,7 +34,7 @@ def resolution(slab):
 def solving(resolved, iterations):
     """With as many iterations in each solve, or None: until nothing is left that a difference of losses would show."""
     resolved.iterations = iterations
-    resolved.tolerance = resolved.tolerance_foreseen = 1e-10
+    resolved.tolerance = resolved.tolerance_foreseen = resolved.tolerance_adjoint = 1e-10
     return resolved
 
 
@@ -71,7 +71,7 @@ def trainer_of(comm, preset="resolved + pairs", integrator="verlet", steps=1, it
         solving(dynamics.resolution, iterations)
     window = window_of(slab, model.integrates_density)
     trainer = RolloutTrainer(comm, INTEGRATORS[integrator](dynamics), [window], INTERVAL, steps, 0.5,
-                             solving(resolution(slab), iterations).band_energies, 5)
+                             solving(resolution(slab), iterations), 5)
     return trainer, model
 
 

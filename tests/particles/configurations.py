@@ -132,9 +132,10 @@ def dynamics_of(slab, lagrangian, skin=0.2, iterations=None, tolerance=None, **o
     """Dynamics; a number of iterations of the solves for a resolved velocity, or the residual at which they end."""
     dynamics = ParticleDynamics(slab, lagrangian, skin, **options)
     if dynamics.resolution is not None:
-        dynamics.resolution.iterations = iterations
+        resolution = dynamics.resolution
+        resolution.iterations = iterations
         if tolerance is not None:
-            dynamics.resolution.tolerance = dynamics.resolution.tolerance_foreseen = tolerance
+            resolution.tolerance = resolution.tolerance_foreseen = resolution.tolerance_adjoint = tolerance
     return dynamics
 
 

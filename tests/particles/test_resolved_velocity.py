@@ -33,7 +33,7 @@ def units(side, width=2.0):
 
 def resolution_on(slab, side=SIDE, tolerance=1e-6):
     found = ResolvedVelocity.on_slabs(slab, units(side))
-    found.tolerance = found.tolerance_foreseen = tolerance
+    found.tolerance = found.tolerance_foreseen = found.tolerance_adjoint = tolerance
     return found
 
 

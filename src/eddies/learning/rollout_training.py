@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,6 +17,7 @@ from eddies.parallel.communicator import Comm
 from eddies.parallel.reduction import global_sum
 from eddies.particles.integrators import Integrator
 from eddies.particles.particle_set import ParticleSet
+from eddies.particles.resolved_velocity import ResolvedVelocity
 
 # A band that loses less than this share of what the fastest loses counts as if it lost that.
 SLOWEST = 0.1
@@ -59,18 +60,18 @@ class RolloutTrainer:
     integrator : of dynamics with fixed ranks.
     windows : on the slabs of the dynamics.
     frame_interval : time between frames. steps_per_frame : time steps in it.
-    energy_weight : of the energies beside the velocity; if it is zero, neither windows nor `energies` give any.
-    energies : gives those of particles.
+    energy_weight : of the energies beside the velocity; if it is zero, windows give none.
+    resolution : gives the energies of particles; None if the weight is zero.
     stationary : whether the flow is kept up, so that a band loses as much as it gains; then what its energy changes by
         counts, its rms, instead of what it loses on average.
     """
 
     def __init__(self, comm: Comm, integrator: Integrator, windows: Sequence[TrainingWindow], frame_interval: float,
-                 steps_per_frame: int, energy_weight: float, energies: Callable[[ParticleSet], Tensor] | None,
+                 steps_per_frame: int, energy_weight: float, resolution: ResolvedVelocity | None,
                  seed: int, stationary: bool = False) -> None:
         self.comm, self.integrator, self.windows = comm, integrator, windows
         self.steps_per_frame, self.time_step = steps_per_frame, frame_interval / steps_per_frame
-        self.energy_weight, self.energies, self.seed = energy_weight, energies, seed
+        self.energy_weight, self.resolution, self.seed = energy_weight, resolution, seed
         self.total = int(global_sum(comm, len(windows[0].particles)))
         self.losses = mean_losses(windows, stationary) if energy_weight > 0 else None
 
@@ -103,8 +104,14 @@ class RolloutTrainer:
 
     def _energy_share(self, window: TrainingWindow, frame: int, particles: ParticleSet) -> Tensor:
         """This rank's part of the squared error of the energies by bands; all ranks' parts are equal."""
+        near = self.resolution.found  # the flow that the last evaluation found; on the way back the solution itself
+
         def found(position: Tensor, velocity: Tensor) -> Tensor:
-            return self.energies(replace(particles, position=position, velocity=velocity))
+            nonlocal near
+            moved = replace(particles, position=position, velocity=velocity)
+            energies = self.resolution.band_energies(moved, near=near)
+            near = self.resolution.found
+            return energies
 
         columns = particles.position, particles.velocity
         energies = checkpoint(found, *columns, use_reentrant=False, preserve_rng_state=False) \
@@ -116,6 +123,8 @@ class RolloutTrainer:
         """Number and particles of each frame reached."""
         memory: dict[str, Tensor] = {}
         self.integrator.dynamics.begin()
+        if self.resolution is not None:
+            self.resolution.forget()
         for reached in range(horizon):
             for _ in range(self.steps_per_frame):
                 particles, memory = self._advanced(particles, memory)

@@ -27,8 +27,8 @@ SAMPLES = 4                  # fields that a kernel is trained on, one more is c
 TORCH_SECONDS, CURVES_SECONDS, CHECKPOINTING_SECONDS = 1.3, 2.0, 4.0
 # Iterations of a solve for the resolved velocity: that starts from nothing; that starts from what is foreseen and goes
 # to the same tolerance, as in a training through horizons; that starts from a field that is near and goes farther, for
-# a spectrum; of its gradient. Of tiny to hit, 20 to 40, 1 to 7, 0 to 10, 24 to 34.
-COLD, FORESEEN, NEAR, ADJOINT = 25.0, 4.0, 7.0, 32.0
+# a spectrum; of its gradient. Of tiny to hit, 20 to 40, 1 to 7, 0 to 10, 18 to 22.
+COLD, FORESEEN, NEAR, ADJOINT = 25.0, 4.0, 7.0, 20.0
 # Of a loss without its gradient over that of an optimiser step; of the sums of an evaluation with theirs, made once
 # forth, once more on the way back, and differentiated (docs/performance.md: 2.3 to 2.6 times).
 LOSS_ALONE, WITH_GRADIENT = 0.6, 4.5
@@ -101,9 +101,9 @@ def horizon_seconds(scene: Scene, work: ParticleWork, ranks: int, speeds: Speeds
     interval = scene.tracers.frame_interval
     evaluations = EVALUATIONS[settings.integrator] * round(interval / (settings.time_step or interval))  # of a frame
     measured = settings.energy_weight > 0
-    forth = evaluations * (rest + FORESEEN * iteration) + measured * COLD * iteration
+    forth = evaluations * (rest + FORESEEN * iteration) + measured * FORESEEN * iteration
     both = (evaluations * (WITH_GRADIENT * rest + (2 * FORESEEN + ADJOINT) * iteration)
-            + measured * (2 * COLD + ADJOINT) * iteration)
+            + measured * (FORESEEN + ADJOINT) * iteration)
     return {"horizon start": CHECKPOINTING_SECONDS, "horizons": settings.steps * sum(settings.frames) * both,
             "horizon validation": len(settings.frames) * (HORIZON_VALIDATIONS + 2) * max(settings.frames) * forth}
 

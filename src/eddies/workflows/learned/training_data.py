@@ -78,17 +78,17 @@ class TrainingData:
         interval, slab = scene.tracers.frame_interval, self.truth.decomposition
         drift = ALLOWED_VELOCITY * self.model.flow.scales.velocity * interval * self.longest
         dynamics = ParticleDynamics(slab, self.model, 0.0, self.dtype, fixed_ranks=True, drift=drift)
-        if dynamics.resolution is not None:
-            # Whose gradient is that of the particles alone: what is foreseen may not be part of the result.
-            dynamics.resolution.tolerance_foreseen = dynamics.resolution.tolerance
-        resolution = None
-        if settings.energy_weight > 0:
-            resolution = dynamics.resolution or ResolvedVelocity.on_slabs(slab, self.model.flow, drift, self.dtype)
+        resolution = dynamics.resolution
+        if resolution is None and settings.energy_weight > 0:
+            resolution = ResolvedVelocity.on_slabs(slab, self.model.flow, drift, self.dtype)
+        if resolution is not None:
+            # Gradients are those of the particles alone: what is foreseen may not be part of the result.
+            resolution.tolerance_foreseen = resolution.tolerance
         starts = np.unique(np.linspace(0, self.learned - self.longest, self.count).astype(int))
         windows = [self._window(start, resolution) for start in starts]
         substeps = round(interval / (settings.time_step or interval))
         trainer = RolloutTrainer(slab.comm, INTEGRATORS[settings.integrator](dynamics), windows, interval,
-                                 substeps, settings.energy_weight, resolution and resolution.band_energies, scene.seed,
+                                 substeps, settings.energy_weight, resolution, scene.seed,
                                  stationary=self.truth.forcing is not None)
         return trainer, self._window(self.last - self.longest, resolution)
 
@@ -107,9 +107,11 @@ class TrainingData:
         position = particles.position + PeriodicBox(BOX_LENGTH).displacement(later["position"], particles.position)
         moments = [particles, *(ParticleSet(particles.id, *moved) for moved in zip(position, later["velocity"]))]
         energies = None
-        if resolution is not None:
+        if self.settings.horizons.energy_weight > 0:
+            resolution.forget()
             with torch.no_grad():
-                energies = torch.stack([resolution.band_energies(moment) for moment in moments])
+                # Each from the one before, as in training: solves from nothing leave the small scales 1 % too strong.
+                energies = torch.stack([resolution.band_energies(moment, near=resolution.found) for moment in moments])
         return TrainingWindow(particles, later["velocity"], later.get("density"), energies)
 
 
