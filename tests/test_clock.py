@@ -54,6 +54,16 @@ def test_a_step_is_told_without_its_warm_up_and_what_is_stored(wall, lines, capl
     assert "1.000 s/step (storing: 50 % of the time)" in caplog.text and progress.storing_share == 0.5
 
 
+def test_steps_of_another_kind_have_a_median_of_their_own(wall, lines):
+    progress = ProgressLine("stage", lambda: "state", interval=20.0)
+    for step, seconds in enumerate((1, 1, 1, 1, 8, 8), 1):
+        if step == 5:
+            progress.renew()
+        wall[0] += seconds
+        progress(step / 12, step)
+    assert lines() == [("8.000", "50", "20 s")]
+
+
 def test_where_more_is_logged_there_is_a_line_for_every_step(wall, lines, caplog):
     caplog.set_level(logging.DEBUG, logger="eddies")
     progress = ProgressLine("stage", lambda: "state")

@@ -110,6 +110,11 @@ class ProgressLine:
         log.info("%s  %s %d  %s  %s  %.0f %%  %s left", self.stage, self.unit, step, self.describe(), pace, 100 * done,
                  duration(left))
 
+    def renew(self) -> None:
+        """Steps from now on are of another kind: the median is theirs alone."""
+        self._seconds.clear()
+        self._taken = 0
+
     def _time_step(self, now: float) -> None:
         """Take down how long the step took that has just ended."""
         self._taken += 1

@@ -28,7 +28,7 @@ from eddies.scene.scene import Scene, load_scene
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.workflows.foreseen.cost_model import RANK_BANDWIDTH
 from eddies.workflows.foreseen.estimates import most_ranks
-from eddies.workflows.foreseen.particle_cost import components, particle_costs
+from eddies.workflows.foreseen.particle_cost import components, particle_cost, particle_costs
 from eddies.workflows.foreseen.particle_probe import probe_particles
 from eddies.workflows.foreseen.particle_work import particle_work
 from eddies.workflows.variants.rows import processor
@@ -55,7 +55,7 @@ def measure() -> dict:
                                              "--threads", threads))
         found["grid"].append(of_job(2, 1, "step.py", round(CELLS_A_PARTICLE * side), "--precision", "float32"))
     taken = next(row["iterations"] for row in found["steps"] if (row["particles"], row["model"]) == (64, MODELS[1]))
-    return found | {"bounds": bounds(taken), "foreseen": foreseen()}
+    return found | {"bounds": bounds(taken), "foreseen": foreseen(), "held": held(found["steps"])}
 
 
 def of_job(ranks: int, threads: int, program: str, *arguments: object) -> dict:
@@ -98,6 +98,21 @@ def foreseen() -> list[dict]:
         rows += [{"particles": side, "cores": row.cores, "ranks": row.ranks, "threads": row.threads,
                   "seconds": row.seconds, "memory": row.memory, "binds": row.binds}
                  for row in particle_costs(particle_work(scene), speed, most, RANK_BANDWIDTH)]
+    return rows
+
+
+def held(steps: list[dict]) -> list[dict]:
+    """What the same model has for the evaluations that were measured, of as many iterations, over what they took."""
+    rows = []
+    for side, model in dict.fromkeys((row["particles"], row["model"]) for row in steps):
+        scene = scene_of(side, model)
+        work, speed = particle_work(scene), probe_particles(scene, MPI.COMM_SELF)
+        for row in steps:
+            if (row["particles"], row["model"]) == (side, model):
+                cost = particle_cost(replace(work, iterations=row["iterations"]), speed, row["ranks"], row["threads"],
+                                     RANK_BANDWIDTH)
+                rows.append({name: row[name] for name in ("particles", "model", "ranks", "threads")}
+                            | {"foreseen_over_measured": cost.seconds / row["seconds_per_evaluation"]})
     return rows
 
 

@@ -35,10 +35,13 @@ def take_all_steps(training: Training, guard: Guard, stage: str, section: str, r
     progress = ProgressLine(stage, describe, done=training.done)
     while training.running:
         guard(training)
+        phase = training.number
         try:
             training.step()
         except (TrainingDiverged, HaloError) as error:
             raise SceneError(f"[{section}] {error}; {remedy}") from None
         if training.running:
             progress(training.done, training.steps)
+        if training.number != phase:
+            progress.renew()
         after_each(training)
