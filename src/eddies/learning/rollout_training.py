@@ -61,7 +61,7 @@ class RolloutTrainer:
     windows : on the slabs of the dynamics.
     frame_interval : time between frames. steps_per_frame : time steps in it.
     energy_weight : of the energies beside the velocity; if it is zero, windows give none.
-    resolution : gives the energies of particles; None if the weight is zero.
+    resolution : gives the energies of particles; not asked if the weight is zero.
     stationary : whether the flow is kept up, so that a band loses as much as it gains; then what its energy changes by
         counts, its rms, instead of what it loses on average.
     """
@@ -104,7 +104,9 @@ class RolloutTrainer:
 
     def _energy_share(self, window: TrainingWindow, frame: int, particles: ParticleSet) -> Tensor:
         """This rank's part of the squared error of the energies by bands; all ranks' parts are equal."""
-        near = self.resolution.found  # the flow that the last evaluation found; on the way back the solution itself
+        # From nothing, as the truth's: what is foreseen leaves in the energies what only forecasts tell. On the way back
+        # the solution itself, so that nothing is left to solve.
+        near: Tensor | None = None
 
         def found(position: Tensor, velocity: Tensor) -> Tensor:
             nonlocal near
@@ -123,8 +125,6 @@ class RolloutTrainer:
         """Number and particles of each frame reached."""
         memory: dict[str, Tensor] = {}
         self.integrator.dynamics.begin()
-        if self.resolution is not None:
-            self.resolution.forget()
         for reached in range(horizon):
             for _ in range(self.steps_per_frame):
                 particles, memory = self._advanced(particles, memory)

@@ -101,9 +101,9 @@ def horizon_seconds(scene: Scene, work: ParticleWork, ranks: int, speeds: Speeds
     interval = scene.tracers.frame_interval
     evaluations = EVALUATIONS[settings.integrator] * round(interval / (settings.time_step or interval))  # of a frame
     measured = settings.energy_weight > 0
-    forth = evaluations * (rest + FORESEEN * iteration) + measured * FORESEEN * iteration
+    forth = evaluations * (rest + FORESEEN * iteration) + measured * COLD * iteration
     both = (evaluations * (WITH_GRADIENT * rest + (2 * FORESEEN + ADJOINT) * iteration)
-            + measured * (FORESEEN + ADJOINT) * iteration)
+            + measured * (COLD + ADJOINT) * iteration)
     return {"horizon start": CHECKPOINTING_SECONDS, "horizons": settings.steps * sum(settings.frames) * both,
             "horizon validation": len(settings.frames) * (HORIZON_VALIDATIONS + 2) * max(settings.frames) * forth}
 

@@ -108,10 +108,8 @@ class TrainingData:
         moments = [particles, *(ParticleSet(particles.id, *moved) for moved in zip(position, later["velocity"]))]
         energies = None
         if self.settings.horizons.energy_weight > 0:
-            resolution.forget()
             with torch.no_grad():
-                # Each from the one before, as in training: solves from nothing leave the small scales 1 % too strong.
-                energies = torch.stack([resolution.band_energies(moment, near=resolution.found) for moment in moments])
+                energies = torch.stack([resolution.band_energies(moment) for moment in moments])
         return TrainingWindow(particles, later["velocity"], later.get("density"), energies)
 
 
