@@ -104,8 +104,8 @@ class RolloutTrainer:
 
     def _energy_share(self, window: TrainingWindow, frame: int, particles: ParticleSet) -> Tensor:
         """This rank's part of the squared error of the energies by bands; all ranks' parts are equal."""
-        # From nothing, as the truth's: what is foreseen leaves in the energies what only forecasts tell. On the way back
-        # the solution itself, so that nothing is left to solve.
+        # From nothing, as the truth's: what is foreseen leaves in the energies what only forecasts tell. On the way
+        # back from the solution itself, so that nothing is left to solve.
         near: Tensor | None = None
 
         def found(position: Tensor, velocity: Tensor) -> Tensor:
