@@ -110,6 +110,24 @@ def test_gradient_through_several_steps_against_finite_differences(comm, preset,
     assert found == pytest.approx(expected, rel=1e-5)
 
 
+@pytest.mark.mpi(1)
+def test_gradient_as_the_solves_of_training_end(comm):
+    """Theirs on the way back end at the residual of training: the gradient is that of solves to 1e-10, to 1 %, which is
+    far below what one window has of all. And none of them solves for the energies of a frame once more."""
+    def gradient(adjoint):
+        trainer, model = trainer_of(comm, iterations=None)
+        for resolved in (trainer.resolution, trainer.integrator.dynamics.resolution):
+            resolved.tolerance_adjoint = adjoint
+        recorder = Recorder(comm, model)
+        trainer.step(recorder, 0, FRAMES)
+        return recorder.gradient, [iterations for iterations, *_ in trainer.resolution.solves]
+
+    (exact, _), (found, iterations) = gradient(1e-10), gradient(ResolvedVelocity.tolerance_adjoint)
+    assert 0 < np.linalg.norm(found - exact) < 0.01 * np.linalg.norm(exact)
+    # Of each frame: the energies, on the way back these very ones, and their gradient.
+    assert len(iterations) == 3 * FRAMES and iterations.count(0) == FRAMES
+
+
 @pytest.mark.mpi(2, 3)
 def test_particles_leave_their_slabs_within_a_window(comm):
     """What the test of ranks covers: with the flow along z particles end up beyond the neighbouring planes."""
