@@ -1,6 +1,7 @@
 """Error over the width of the filter in Kolmogorov lengths, from the results of several comparisons.
 
-    .venv/bin/python tests/benchmarks/filter_width.py docs/results/compare-hit.json docs/results/compare-coarse.json \
+    .venv/bin/python tests/benchmarks/filter_width.py docs/results/compare-small.json docs/results/compare-hit.json \
+        docs/results/compare-coarse.json docs/results/compare-256-32.json docs/results/compare-256.json \
         docs/error-over-filter-width.png
 
 Beside the variants of the same names in all of them stands, of the coarse grids that take no longer than the learned
