@@ -81,23 +81,30 @@ def test_planes_are_joined_and_split_as_by_numpy(library, planes, dtype):
 
 @pytest.mark.parametrize("dtype", TOLERANCE)
 @pytest.mark.parametrize("cells, cutoff, cut", GRIDS)
+@pytest.mark.parametrize("gap", [0, 3])
 @pytest.mark.parametrize("rows", [slice(0, 1), slice(1, 4)], ids=str)
-def test_columns_are_copied_as_by_numpy(library, cells, cutoff, cut, rows, dtype):
+def test_columns_are_copied_as_by_numpy(library, cells, cutoff, cut, rows, gap, dtype):
     modes, width, lines = 2 * cutoff + 1, cutoff + 1, 4
+    shape = (cells, rows.stop - rows.start, width)
+
+    def column_of(memory):
+        return memory[:, : memory.shape[1] - gap].reshape(shape)
+
     cut = (cells - sum(cut[1:]), *cut[1:])
     results = []
     for copies in both(library, "columns", cells, cutoff, dtype):
         blocks = [noise(rank, dtype, 3, planes, lines, width) for rank, planes in enumerate(cut)]
-        column = np.zeros((cells, rows.stop - rows.start, width), dtype)
+        memory, noisy = np.zeros((cells, shape[1] * width + gap), dtype), noise(9, dtype, cells, shape[1] * width + gap)
+        column = column_of(memory)
         stored = noise(6, dtype, 2, modes, lines, width)
-        described, place, made = copies.described_blocks(blocks), copies.described(column), []
+        described, place, made = copies.described_blocks(blocks), copies.described_column(column), []
         for factors in (None, copies.described(noise(7, dtype, modes))):
             copies.fill(copies.described(noise(8, dtype, 3, modes, lines, width)), 2, rows, factors, place)
             made.append(column.copy())
         copies.receive(described, 2, rows, place)
         copies.store(place, 0.3, copies.described(stored), 1, rows)
-        copies.send(copies.described(noise(9, dtype, *column.shape)), described, 1, rows)
-        results.append([*made, column, stored, *blocks])
+        copies.send(copies.described_column(column_of(noisy)), described, 1, rows)
+        results.append([*made, memory, stored, *blocks])
     for found, expected in zip(*results[::-1]):
         assert_close(found, expected)
 
@@ -109,6 +116,9 @@ def test_arrays_of_another_kind_are_refused(library):
     def array(*shape, dtype=np.complex128):
         return planes.described(noise(1, dtype, *shape))
 
+    def column(*shape, dtype=np.complex128):
+        return columns.described_column(noise(1, dtype, *shape))
+
     refused = {
         "are needed": [
             lambda: planes.described_blocks(plane_blocks(3, (7,), np.complex64)),
@@ -117,12 +127,16 @@ def test_arrays_of_another_kind_are_refused(library):
             lambda: planes.unpack(array(1, 12, 9, dtype=np.complex64), blocks, 0, slice(0, 2)),
             lambda: next(planes.filled(noise(1, np.complex128, 1, 1, 7, 6), None, array(1, 12, 9))),
             lambda: planes.join(array(1, 2, 12, 12), 0, slice(0, 2), array(1, 12, 12)),
-            lambda: columns.fill(array(1, 7, 4, 4), 0, slice(0, 3), array(6), array(12, 3, 4))],
+            lambda: columns.described_column(np.zeros((2, 4, 4), np.complex128)[:, :, ::2]),
+            lambda: columns.fill(array(1, 7, 4, 4), 0, slice(0, 3), array(6), column(12, 3, 4))],
+        "is needed": [
+            lambda: columns.fill(array(1, 7, 4, 4), 0, slice(0, 3), None, column(12, 2, 4)),
+            lambda: columns.fill(array(1, 7, 4, 4), 0, slice(0, 3), None, column(12, 3, 4, dtype=np.complex64))],
         "an even number": [lambda: planes.pack(blocks, slice(0, 3))],
         "6 to 8 of 7": [lambda: planes.pack(blocks, slice(6, 8))],
         "3 to 4 of 3": [lambda: planes.unpack(array(1, 12, 9), blocks, 3, slice(0, 2))],
-        "2 to 5 of 4": [lambda: columns.fill(array(1, 7, 4, 4), 0, slice(2, 5), None, array(12, 3, 4))],
-        "1 to 2 of 1": [lambda: columns.store(array(12, 3, 4), 1.0, array(1, 7, 4, 4), 1, slice(0, 3))],
+        "2 to 5 of 4": [lambda: columns.fill(array(1, 7, 4, 4), 0, slice(2, 5), None, column(12, 3, 4))],
+        "1 to 2 of 1": [lambda: columns.store(column(12, 3, 4), 1.0, array(1, 7, 4, 4), 1, slice(0, 3))],
     }
     for message, calls in refused.items():
         for call in calls:

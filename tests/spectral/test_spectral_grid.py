@@ -25,7 +25,7 @@ def make_grid(comm, cells, **options):
 
 @pytest.mark.mpi(1, 2, 3)
 @pytest.mark.parametrize("precision", ["float64", "float32"])
-@pytest.mark.parametrize("cells", [7, 8, 15])
+@pytest.mark.parametrize("cells", [7, 8, 15, 48])
 def test_forward_and_backward_against_numpy(comm, cells, precision):
     grid = make_grid(comm, cells, precision=precision)
     own = slice(grid.decomposition.start, grid.decomposition.stop)
@@ -35,6 +35,20 @@ def test_forward_and_backward_against_numpy(comm, cells, precision):
     # A field without the dropped modes comes back; applying both again changes nothing.
     physical = grid.backward(modes)
     assert np.abs(grid.backward(grid.forward(physical)) - physical).max(initial=0) < 10 * TOLERANCE[precision]
+
+
+@pytest.mark.mpi(1, 2)
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+@pytest.mark.parametrize("cells", [48, 96, 120, 128, 192])
+def test_what_is_transformed_across_lines_does_not_crowd_in_a_cache(comm, cells, precision):
+    grid = make_grid(comm, cells, precision=precision)
+    kept = grid.column_starts[grid.decomposition.rank + 1] - grid.column_starts[grid.decomposition.rank]
+    columns = [grid.column_pass.plan("FORWARD", rows).plan for rows in grid.column_pass.rows(kept)]
+    along_y = grid.plane_pass.plans("FORWARD", 1, 1).plans[0][1:]
+    for plan, axis in [*((plan, 0) for plan in columns), *((plan, 1) for plan in along_y)]:
+        for array in (plan.input_array, plan.output_array):
+            # 512 bytes are eight lines of a cache of 64 sets.
+            assert array.strides[axis] % 512
 
 
 @pytest.mark.mpi(1, 2, 3)

@@ -180,24 +180,26 @@ void join(Int points, const Real* __restrict f, const Real* __restrict g, Real* 
     }
 }
 
-// Modes (kz, lines, width) at some lines, to a column (cells, those lines, width) with a gap in z.
+// Modes (kz, lines, width) at some lines, to a column (cells, those lines, width) with a gap in z, whose numbers of one z
+// lie `apart` from those of the next.
 template <typename Real>
-void fill_column(Int K, Int cells, Int plane, Int count, const Real* modes, const Real* factors, Real* column) {
+void fill_column(Int K, Int cells, Int plane, Int count, Int apart, const Real* modes, const Real* factors,
+                 Real* column) {
     const Int kept = 2 * K + 1;
 #pragma omp parallel for schedule(static) if (kept * count > FEW)
     for (Int z = 0; z < kept; ++z) {
-        Real* to = column + 2 * (z <= K ? z : cells - kept + z) * count;
+        Real* to = column + 2 * (z <= K ? z : cells - kept + z) * apart;
         if (factors) times(modes + 2 * z * plane, factors[2 * z], factors[2 * z + 1], to, count);
         else copy(modes + 2 * z * plane, to, count);
     }
 }
 
 template <typename Real>
-void store_column(Int K, Int cells, Int plane, Int count, const Real* column, Real scale, Real* modes) {
+void store_column(Int K, Int cells, Int plane, Int count, Int apart, const Real* column, Real scale, Real* modes) {
     const Int kept = 2 * K + 1;
 #pragma omp parallel for schedule(static) if (kept * count > FEW)
     for (Int z = 0; z < kept; ++z) {
-        const Real* __restrict from = column + 2 * (z <= K ? z : cells - kept + z) * count;
+        const Real* __restrict from = column + 2 * (z <= K ? z : cells - kept + z) * apart;
         Real* __restrict to = modes + 2 * z * plane;
 #pragma omp simd
         for (Int i = 0; i < 2 * count; ++i) to[i] = scale * from[i];
@@ -205,13 +207,13 @@ void store_column(Int K, Int cells, Int plane, Int count, const Real* column, Re
 }
 
 template <typename Real, bool send>
-void exchange_column(const Blocks& blocks, Int component, Int line, Int lines, Real* column) {
+void exchange_column(const Blocks& blocks, Int component, Int line, Int lines, Int apart, Real* column) {
     std::vector<Real*> planes(blocks.planes);
     find_planes(blocks, component, planes.data());
     const Int count = lines * blocks.width;
 #pragma omp parallel for schedule(static) if (blocks.planes * count > FEW)
     for (Int z = 0; z < blocks.planes; ++z) {
-        Real *own = column + 2 * z * count, *block = planes[z] + 2 * line * blocks.width;
+        Real *own = column + 2 * z * apart, *block = planes[z] + 2 * line * blocks.width;
         if (send) copy(own, block, count);
         else copy(block, own, count);
     }
@@ -236,19 +238,21 @@ void exchange_column(const Blocks& blocks, Int component, Int line, Int lines, R
     void copies_join_##precision(Int points, const Real* f, const Real* g, Real* planes) {                            \
         join(points, f, g, planes);                                                                                   \
     }                                                                                                                 \
-    void copies_fill_column_##precision(Int K, Int cells, Int plane, Int count, const Real* modes,                    \
+    void copies_fill_column_##precision(Int K, Int cells, Int plane, Int count, Int apart, const Real* modes,         \
                                         const Real* factors, Real* column) {                                          \
-        fill_column(K, cells, plane, count, modes, factors, column);                                                  \
+        fill_column(K, cells, plane, count, apart, modes, factors, column);                                           \
     }                                                                                                                 \
-    void copies_store_column_##precision(Int K, Int cells, Int plane, Int count, const Real* column, double scale,    \
-                                         Real* modes) {                                                               \
-        store_column(K, cells, plane, count, column, static_cast<Real>(scale), modes);                                \
+    void copies_store_column_##precision(Int K, Int cells, Int plane, Int count, Int apart, const Real* column,       \
+                                         double scale, Real* modes) {                                                 \
+        store_column(K, cells, plane, count, apart, column, static_cast<Real>(scale), modes);                         \
     }                                                                                                                 \
-    void copies_send_column_##precision(const Blocks* blocks, Int component, Int line, Int lines, Real* column) {     \
-        exchange_column<Real, true>(*blocks, component, line, lines, column);                                         \
+    void copies_send_column_##precision(const Blocks* blocks, Int component, Int line, Int lines, Int apart,          \
+                                        Real* column) {                                                               \
+        exchange_column<Real, true>(*blocks, component, line, lines, apart, column);                                  \
     }                                                                                                                 \
-    void copies_receive_column_##precision(const Blocks* blocks, Int component, Int line, Int lines, Real* column) {  \
-        exchange_column<Real, false>(*blocks, component, line, lines, column);                                        \
+    void copies_receive_column_##precision(const Blocks* blocks, Int component, Int line, Int lines, Int apart,       \
+                                           Real* column) {                                                            \
+        exchange_column<Real, false>(*blocks, component, line, lines, apart, column);                                 \
     }
 
 extern "C" {

@@ -42,6 +42,19 @@ class _Array:
             _require(self.array, shape, dtype)
 
 
+class _Column(_Array):
+    """A column (z, rows, x), contiguous but for what lies between the numbers of one z and those of the next."""
+
+    def __init__(self, array: np.ndarray) -> None:
+        super().__init__(array[0])
+        self.shape, self.apart = array.shape, array.strides[0] // array.itemsize
+
+    def require(self, shape: tuple[int, ...], dtype: np.dtype) -> None:
+        """ValueError where it is another column."""
+        if self.shape != shape or self.dtype != dtype:
+            raise ValueError(f"a column {self.dtype} {self.shape}: {dtype} {shape} is needed")
+
+
 class CompiledColumnCopies:
     """Copies around transforms along z: see `eddies.spectral.copies.ColumnCopies`, which is the definition and has the
     same methods. Arrays that lie as they do there, contiguous and of its precision, are needed: ValueError otherwise.
@@ -49,40 +62,44 @@ class CompiledColumnCopies:
 
     def __init__(self, library: ctypes.CDLL, cells: int, cutoff: int, dtype: np.dtype) -> None:
         self._cells, self._cutoff, self._dtype = cells, cutoff, np.dtype(dtype)
-        self._fill = _function(library, "fill_column", self._dtype, *4 * [INT], *3 * [ADDRESS])
-        self._store = _function(library, "store_column", self._dtype, *4 * [INT], ADDRESS, NUMBER, ADDRESS)
-        self._send, self._receive = (_function(library, name, self._dtype, ADDRESS, *3 * [INT], ADDRESS)
+        self._fill = _function(library, "fill_column", self._dtype, *5 * [INT], *3 * [ADDRESS])
+        self._store = _function(library, "store_column", self._dtype, *5 * [INT], ADDRESS, NUMBER, ADDRESS)
+        self._send, self._receive = (_function(library, name, self._dtype, ADDRESS, *4 * [INT], ADDRESS)
                                      for name in ("send_column", "receive_column"))
 
     def described_blocks(self, blocks: Sequence[np.ndarray]) -> _Blocks:
         """Blocks as the other methods want them."""
         return _Blocks(blocks, 1, self._dtype)
 
+    def described_column(self, column: np.ndarray) -> _Column:
+        """A column as the other methods want it."""
+        return _Column(column)
+
     def described(self, array: np.ndarray) -> _Array:
         """Any other array as the other methods want it."""
         return _Array(array)
 
-    def fill(self, modes: _Array, component: int, rows: slice, factors: _Array | None, column: _Array) -> None:
+    def fill(self, modes: _Array, component: int, rows: slice, factors: _Array | None, column: _Column) -> None:
         """Modes, times factors (kz) if there are any, to a column."""
         sizes, start = self._place(modes, component, rows, column)
         if factors is not None:
             factors.require(modes.shape[1:2], self._dtype)
         self._fill(*sizes, start, None if factors is None else factors.address, column.address)
 
-    def store(self, column: _Array, scale: float, modes: _Array, component: int, rows: slice) -> None:
+    def store(self, column: _Column, scale: float, modes: _Array, component: int, rows: slice) -> None:
         """A column times a number to modes."""
         sizes, start = self._place(modes, component, rows, column)
         self._store(*sizes, column.address, scale, start)
 
-    def send(self, column: _Array, blocks: _Blocks, component: int, rows: slice) -> None:
+    def send(self, column: _Column, blocks: _Blocks, component: int, rows: slice) -> None:
         """A column to blocks."""
         self._exchange(self._send, column, blocks, component, rows)
 
-    def receive(self, blocks: _Blocks, component: int, rows: slice, column: _Array) -> None:
+    def receive(self, blocks: _Blocks, component: int, rows: slice, column: _Column) -> None:
         """Blocks to a column."""
         self._exchange(self._receive, column, blocks, component, rows)
 
-    def _place(self, modes: _Array, component: int, rows: slice, column: _Array) -> tuple[tuple[int, ...], int]:
+    def _place(self, modes: _Array, component: int, rows: slice, column: _Column) -> tuple[tuple[int, ...], int]:
         """The sizes that the library wants, and where the rows of the modes begin."""
         components, kept, lines, width = modes.shape
         modes.require((components, 2 * self._cutoff + 1, lines, width), self._dtype)
@@ -90,15 +107,15 @@ class CompiledColumnCopies:
         _within(rows.start, rows.stop, lines)
         _within(component, component + 1, components)
         start = modes.address + component * modes.strides[0] + rows.start * modes.strides[2]
-        return (self._cutoff, self._cells, lines * width, column.shape[1] * width), start
+        return (self._cutoff, self._cells, lines * width, column.shape[1] * width, column.apart), start
 
-    def _exchange(self, function: Callable[..., None], column: _Array, blocks: _Blocks, component: int,
+    def _exchange(self, function: Callable[..., None], column: _Column, blocks: _Blocks, component: int,
                   rows: slice) -> None:
         planes, lines, width = blocks.shape
         column.require((planes, rows.stop - rows.start, width), self._dtype)
         _within(rows.start, rows.stop, lines)
         _within(component, component + 1, blocks.components)
-        function(ctypes.byref(blocks), component, rows.start, rows.stop - rows.start, column.address)
+        function(ctypes.byref(blocks), component, rows.start, rows.stop - rows.start, column.apart, column.address)
 
 
 class CompiledPlaneCopies:

@@ -16,7 +16,8 @@ Blocks = Sequence[np.ndarray]
 
 class ColumnCopies:
     """Copies between modes (c, kz, y, x), columns (z, rows, x) of one component that are transformed along z, and the
-    blocks (c, z, y, x) of columns that ranks exchange, which follow each other in z. `rows` are those of y in a column.
+    blocks (c, z, y, x) of columns that ranks exchange, which follow each other in z. `rows` are those of y in a column,
+    which is contiguous but for what may lie between one z and the next.
     """
 
     def __init__(self, cells: int, cutoff: int, dtype: np.dtype) -> None:
@@ -26,6 +27,10 @@ class ColumnCopies:
     def described_blocks(self, blocks: Blocks) -> Blocks:
         """Blocks as the other methods want them."""
         return blocks
+
+    def described_column(self, column: np.ndarray) -> np.ndarray:
+        """A column as the other methods want it."""
+        return column
 
     def described(self, array: np.ndarray) -> np.ndarray:
         """Any other array as the other methods want it."""

@@ -21,8 +21,10 @@ from eddies.kernels.library import library, threads
 from eddies.spectral.copies import ColumnCopies, PlaneCopies
 
 BLOCK_BYTES = 2**18  # of one component and thread in a pass: a few of them fit the second-level cache of a core
-PADDING = 8           # complex numbers between the lines along x of a plane that is transformed along y
 CACHE_LINE = 64
+# Numbers of one transform so many bytes apart, or a multiple, fall into few sets of a cache and push each other out:
+# with 48 of them it takes twelve times as long, with 192 four times.
+CROWDED = 512
 
 #: Packed modes (c, pairs, ky, kx), or these and factors (1, 1, ky, 1) or (1, 1, 1, kx) by which they are multiplied.
 Part = np.ndarray | tuple[np.ndarray, np.ndarray]
@@ -46,10 +48,15 @@ class ColumnPass:
         """The plan for a block; whoever fills the input of "BACKWARD" leaves its gap zero."""
         key = (direction, rows.stop - rows.start)
         if key not in self._plans:
-            given, result = (pyfftw.zeros_aligned((self.cells, key[1], self.width), self.dtype) for _ in range(2))
+            given, result = (self._zeros(key[1]) for _ in range(2))
             plan = _plan(given, result, 0, direction)
-            self._plans[key] = ColumnPlan(plan, *map(self.copies.described, (given, result)))
+            self._plans[key] = ColumnPlan(plan, *map(self.copies.described_column, (given, result)))
         return self._plans[key]
+
+    def _zeros(self, rows: int) -> np.ndarray:
+        count = rows * self.width
+        memory = pyfftw.zeros_aligned((self.cells, count + _gap(count, self.dtype)), self.dtype)
+        return memory[:, :count].reshape(self.cells, rows, self.width)
 
 
 @dataclass(frozen=True)
@@ -128,12 +135,14 @@ class PlanePass:
         stop, start = K + 1 + -(K + 1) % vector, n - K - (n - K) % vector
         if stop > start:
             stop, start = K + 1, n - K
-        rows = pyfftw.zeros_aligned((pairs, n, stop + n - start), self.dtype)
-        # Lines a power of two apart would all fall into the same few sets of a cache, and push each other out.
-        lines = pyfftw.zeros_aligned((pairs, n, n + PADDING), self.dtype)[..., :n]
+        # What keeps rows apart is in their gap, where dropped modes are.
+        width = stop + n - start
+        width += _gap(width, self.dtype)
+        rows = pyfftw.zeros_aligned((pairs, n, width), self.dtype)
+        lines = pyfftw.zeros_aligned((pairs, n, n + _gap(n, self.dtype)), self.dtype)[..., :n]
         values = self._values(fields, pairs)
         planes = [field.view(self.dtype) for field in values]
-        kept = [(rows[..., :stop], lines[..., :stop]), (rows[..., stop:], lines[..., start:])]
+        kept = [(rows[..., :stop], lines[..., :stop]), (rows[..., width - n + start :], lines[..., start:])]
         if direction == "BACKWARD":
             along_y = [_plan(a, b, 1, direction) for a, b in kept if a.size]
             plans = [[*along_y, _plan(lines, field, 2, direction)] for field in planes]
@@ -151,6 +160,11 @@ class PlanePass:
         memory = pyfftw.zeros_aligned(fields * apart, np.uint8, n=CACHE_LINE)
         real = np.zeros(1, self.dtype).real.dtype
         return np.ndarray((fields, pairs, n, 2 * n), real, memory, strides=(apart, n * n * item, n * item, item // 2))
+
+
+def _gap(count: int, dtype: np.dtype) -> int:
+    """Numbers to leave between lines of so many, which are transformed across, for the cache's sake."""
+    return 0 if count * dtype.itemsize % CROWDED else CACHE_LINE // dtype.itemsize
 
 
 def _plan(given: np.ndarray, result: np.ndarray, axis: int, direction: str) -> pyfftw.FFTW:
