@@ -24,6 +24,7 @@ from eddies.particles.scaled_pairs import ScaledPairs
 from eddies.particles.terms.term import TermError
 
 if TYPE_CHECKING:
+    from eddies.particles.kriging import Kriging
     from eddies.particles.resolved_flow import ResolvedFlow
     from eddies.particles.resolved_velocity import ResolvedVelocity
 
@@ -133,6 +134,16 @@ class Context:
         if self._resolution is None:
             raise TermError('no term of this model reads "resolved": add it to the `reads` of the settings')
         return self._resolution.of(self.particles, self._time)
+
+    @cached_property
+    def kriging(self) -> Kriging:
+        """What neighbours tell of smooth fields at all owned particles; collective."""
+        from eddies.particles.kriging import Kriging
+        local = self.local
+        pairs = local.neighbors.pairs(local.position[: len(self.particles)].detach(), local.position.detach(),
+                                      dtype=self.dtype)
+        return Kriging(pairs, len(local.position), self.flow.cutoff, self.flow.scales.filter_width,
+                       local.neighborhood.column)
 
     def without_mean(self, rows: Tensor) -> Tensor:
         """Rows (n, c) of the owned particles less their mean over all particles of all ranks; collective."""

@@ -129,8 +129,10 @@ class LagrangianModel(nn.Module):
     @torch.no_grad()
     def linear_rates(self, context: Context) -> dict[str, LinearRates]:
         """What the single parameters do at given particles, by name of the terms that are linear in them and do not
-        read the density: a training that looks at these particles again and again keeps it; collective."""
-        return {name: self._linear_rates(term, context) for name, term in self._stages[0] if term.linear}
+        read a density that others give: a training that looks at these particles again and again keeps it;
+        collective."""
+        terms = self._stages[0] if self.density_is_given else self.terms.items()
+        return {name: self._linear_rates(term, context) for name, term in terms if term.linear}
 
     @torch.no_grad()
     def require_linear(self, context: Context) -> None:

@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from eddies.scene.values import KeyProblem, Section, boolean, choice, integers, named, number, texts
+from eddies.scene.values import KeyProblem, Section, boolean, choice, integer, integers, named, number, texts
 
-READS = ("pairs", "resolved", "density")
+READS = ("pairs", "kriging", "resolved", "density")
 GIVES = ("acceleration", "density", "density_rate", "shift_velocity")
 #: What a network can be told of a pair, in units of the flow: the densities of both, |x|, |v| and x.v.
 INPUTS = ("density", "distance", "speed", "approach")
@@ -24,9 +24,9 @@ class TermSettings(Section):
 
     Attributes
     ----------
-    reads : of "pairs" (neighbours within the interaction radius), "resolved" (the velocity that a grid resolves of the
-        particles'), "density" (so that it is computed, stored, and wanted of the ground truth). What no term reads is
-        not built.
+    reads : of "pairs" (neighbours within the interaction radius), "kriging" (derivatives that they tell, with "pairs"),
+        "resolved" (the velocity that a grid resolves of the particles'), "density" (so that it is computed, stored, and
+        wanted of the ground truth). What no term reads is not built.
     gives : of "acceleration", "density" (a part of it), "density_rate" and "shift_velocity".
     learns_through_horizons : its parameters are trained through several steps of the simulation alone.
     numbers_per_pair : how many numbers it keeps of each pair while it is evaluated, for an estimate of the memory.
@@ -221,3 +221,20 @@ class TransportVelocity(TermSettings):
     reads = ("pairs", "density")
     gives = ("shift_velocity",)
     learns_through_horizons = True
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilteredEquations(TermSettings):
+    """The filtered equations of motion by derivatives that neighbours tell."""
+
+    sweeps: int = integer("of the pressure from neighbour to neighbour, each time that forces are asked for", default=8,
+                          at_least=1)
+    relaxation: float = number("rate, over 2 u'/d, at which velocities relax to what neighbours tell", default=2.0,
+                               at_least=0)
+    solenoidal: float = number("rate, over 2 u'/d, at which the pressure takes out a divergence", default=3.5,
+                               at_least=0)
+    density: float = number("rate, over 2 u'/d, at which the density follows the pressure", default=3.5, at_least=0)
+
+    numbers_per_pair = 30
+    reads = ("pairs", "kriging", "density")
+    gives = ("acceleration", "density_rate")

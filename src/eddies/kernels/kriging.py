@@ -1,0 +1,44 @@
+"""Weights of kriging by the compiled library."""
+
+from __future__ import annotations
+
+import ctypes
+
+import numpy as np
+
+MOST_SCALES = 8
+
+
+class _Kriging(ctypes.Structure):
+    _fields_ = ([("receivers", ctypes.c_int64), ("pairs", ctypes.c_int64), ("offsets", ctypes.c_void_p),
+                 ("displacement", ctypes.c_void_p), ("support", ctypes.c_double), ("noise", ctypes.c_double),
+                 ("scales", ctypes.c_int64), ("slowest", ctypes.c_double)]
+                + [(name, ctypes.c_void_p) for name in ("amplitudes", "own", "weights")])
+
+
+def kriging_weights(library: ctypes.CDLL, offsets: np.ndarray, displacement: np.ndarray, support: float, noise: float,
+                    slowest: float, amplitudes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Weights of the receivers' own values, (10, n), and of their neighbours', (10, m): see
+    `eddies.particles.kriging.weights`, which is the definition.
+
+    Parameters
+    ----------
+    offsets : int64 (n + 1,), each receiver's pairs.
+    displacement : (3, m), x_i - x_j, contiguous, of single or double precision.
+    support : beyond which there are no neighbours. noise : variance of what is not part of the field.
+    slowest, amplitudes : of the covariance sum_m amplitudes[m] exp(-slowest 2^m r^2), at most eight.
+
+    Raises ValueError for arrays of another kind.
+    """
+    dtype, pairs = displacement.dtype, displacement.shape[-1]
+    offsets, amplitudes = np.ascontiguousarray(offsets, np.int64), np.ascontiguousarray(amplitudes, np.float64)
+    if (dtype not in (np.float32, np.float64) or displacement.shape != (3, pairs) or len(amplitudes) > MOST_SCALES
+            or not displacement.flags.c_contiguous or offsets[-1] != pairs):
+        raise ValueError(f"kriging: contiguous displacements (3, {offsets[-1]}) of single or double precision and at "
+                         f"most {MOST_SCALES} amplitudes are needed; found {dtype} {displacement.shape} and "
+                         f"{len(amplitudes)}")
+    own, weights = np.empty((10, len(offsets) - 1), dtype), np.empty((10, pairs), dtype)
+    given = _Kriging(len(offsets) - 1, pairs, offsets.ctypes.data, displacement.ctypes.data, support, noise,
+                     len(amplitudes), slowest, *(array.ctypes.data for array in (amplitudes, own, weights)))
+    getattr(library, f"kriging_{dtype}")(ctypes.byref(given))
+    return own, weights

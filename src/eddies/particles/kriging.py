@@ -1,0 +1,173 @@
+"""Derivatives of a smooth field at particles, from its values at their neighbours, by kriging."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from eddies.kernels.kriging import kriging_weights
+from eddies.kernels.library import library
+from eddies.particles.pairs import Pairs
+
+#: Rows of weights: of 1, then of the first and of the second derivatives xx, xy, xz, yy, yz, zz.
+OWN, FIRST, SECOND = 0, slice(1, 4), slice(4, 10)
+ENTRIES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+# Rows of the entries (j, k) of a symmetric matrix.
+PLACES = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
+
+# What is no part of the field, as a share of its variance: what the smallest distances of particles at random ask for.
+NOISE = 1e-3
+# Squared lengths of the Gaussians that make up the covariance, in those of the narrowest of all fields that have passed
+# the filter, which a Gaussian filter leaves of white noise: each twice the one before.
+NARROWEST, SCALES = 1.2, 6
+# Receivers that torch solves for at once.
+TOGETHER = 256
+
+
+@dataclass(frozen=True)
+class Covariance:
+    """C(r) = sum_m amplitudes[m] exp(-slowest 2^m r^2), C(0) = 1, from the widest to the narrowest part.
+
+    `of_filtered_turbulence` is that of a velocity with E(k) ~ k^(-5/3) after a Gaussian filter of width d, whatever its
+    variance: a spectrum k^(-5/3) is a sum of Gaussians of lengths l with weights l^(2/3), none narrower than d/sqrt(6),
+    as E G^2 ~ exp(-k^2 d^2/12).
+    """
+
+    slowest: float
+    amplitudes: tuple[float, ...]
+
+    @classmethod
+    def of_filtered_turbulence(cls, width: float) -> Covariance:
+        """That of a filter of this width."""
+        squares = [width**2 / 6 * NARROWEST * 2.0**m for m in reversed(range(SCALES))]
+        weights = [square ** (1 / 3) for square in squares]
+        return cls(1 / (2 * squares[0]), tuple(weight / sum(weights) for weight in weights))
+
+    def derivatives(self, square: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """C, C' and C'' as functions of r^2."""
+        rates = [self.slowest * 2**m for m in range(len(self.amplitudes))]
+        parts = [amplitude * torch.exp(-rate * square) for rate, amplitude in zip(rates, self.amplitudes)]
+        return (torch.stack(parts).sum(0), torch.stack([-rate * part for rate, part in zip(rates, parts)]).sum(0),
+                torch.stack([rate**2 * part for rate, part in zip(rates, parts)]).sum(0))
+
+
+def noise_at(distance: Tensor, support: float) -> Tensor:
+    """Variance of the noise of a neighbour: without bound at the support, where neighbours come and go."""
+    return NOISE / (1 - (distance / support) ** 4).clamp_min(1e-4)
+
+
+@torch.no_grad()
+def weights(pairs: Pairs, support: float, covariance: Covariance) -> tuple[Tensor, Tensor]:
+    """By which weights of the values f_j at a particle and its neighbours what is asked for there is told best:
+    sum_j w_j f_j, w = K^-1 b, K_jk = C(|x_j - x_k|) plus the noise of each on the diagonal.
+
+    Of f itself b is 1 for the particle and 0 for its neighbours: f_i less what the neighbours alone tell of it, over
+    w_i. Of derivatives b is that of C(|x - x_j|) by x at the particle.
+
+    Returns the particles' own weights (10, k) and the neighbours' (10, m), in the order of `FIRST` and `SECOND`.
+    """
+    compiled = library() if pairs.displacement.device.type == "cpu" else None
+    if compiled is not None:
+        found = kriging_weights(compiled, pairs.offsets.numpy(), np.ascontiguousarray(pairs.displacement.T.numpy()),
+                                support, NOISE, covariance.slowest, np.array(covariance.amplitudes))
+        return torch.from_numpy(found[0]), torch.from_numpy(found[1])
+    return solved(pairs.offsets, pairs.displacement, support, covariance)
+
+
+def solved(offsets: Tensor, displacement: Tensor, support: float, covariance: Covariance) -> tuple[Tensor, Tensor]:
+    """The same by torch, of displacements (m, 3) x_i - x_j of each particle's pairs: the definition."""
+    count = len(offsets) - 1
+    own, found = displacement.new_empty((10, count)), displacement.new_empty((10, len(displacement)))
+    for start in range(0, count, TOGETHER):
+        edges = offsets[start : start + TOGETHER + 1]
+        listed = edges[1:] - edges[:-1]
+        place = torch.arange(int(listed.max()) if len(listed) else 0, device=offsets.device)
+        known = place < listed[:, None]
+        pair = (edges[:-1, None] + place)[known]
+        away = displacement.new_zeros((len(listed), len(place) + 1, 3))  # the particle itself the first
+        away[:, 1:][known] = -displacement[pair]
+        known = torch.cat([known.new_ones(len(listed), 1), known], 1)
+        right, matrix = _equations(away, known, support, covariance)
+        solution = torch.cholesky_solve(right, torch.linalg.cholesky(matrix))
+        own[:, start : start + len(listed)] = solution[:, 0].T
+        found[:, pair] = solution[:, 1:][known[:, 1:]].T
+    return own, found
+
+
+def _equations(away: Tensor, known: Tensor, support: float, covariance: Covariance) -> tuple[Tensor, Tensor]:
+    """Right-hand sides (k, p, 10) and matrices (k, p, p) of places x_j - x_i, those that are `known`."""
+    value, _, _ = covariance.derivatives((away[:, :, None] - away[:, None]).square().sum(-1))
+    both = known[:, :, None] & known[:, None]
+    distance = away.norm(dim=-1)
+    diagonal = torch.where(known, noise_at(distance, support), 1.0)
+    matrix = torch.where(both, value, 0.0) + torch.diag_embed(diagonal)
+    _, first, second = covariance.derivatives(distance.square())
+    right = [torch.zeros_like(first), *(-2 * first * away[..., axis] for axis in range(3)),
+             *(4 * second * away[..., j] * away[..., k] + (2 * first if j == k else 0) for j, k in ENTRIES)]
+    right[0][:, 0] = 1
+    return torch.stack(right, -1) * known[..., None], matrix
+
+
+class Kriging:
+    """What neighbours tell of fields at the owned particles of a rank.
+
+    Parameters
+    ----------
+    pairs : of all owned particles with those that the rank sees, `seen` in all. support : within which they are.
+    filter_width : d of the filter that the fields have passed.
+    with_ghosts : what the rank sees of a column of its own particles; collective.
+
+    Everything is linear in the fields, differentiable in them, not in the positions, and collective.
+    """
+
+    def __init__(self, pairs: Pairs, seen: int, support: float, filter_width: float,
+                 with_ghosts: Callable[[Tensor], Tensor]) -> None:
+        self._own, self._others = weights(pairs, support, Covariance.of_filtered_turbulence(filter_width))
+        self._seen = seen
+        self._offsets, self._senders, self._with_ghosts = pairs.offsets, pairs.sender, with_ghosts
+
+    def derivatives(self, field: Tensor) -> tuple[Tensor, Tensor]:
+        """First (n, c, 3) and second (n, c, 3, 3) derivatives of fields (n, c)."""
+        seen = self._with_ghosts(field.to(self._own))
+        found = torch.stack([self._applied(row, seen) for row in range(1, 10)], -1)
+        return found[..., :3], found[..., 3:][..., PLACES]
+
+    def gradient(self, field: Tensor) -> Tensor:
+        """(n, 3) of a field (n,)."""
+        seen = self._with_ghosts(field.to(self._own)).unsqueeze(1)
+        return torch.cat([self._applied(row, seen) for row in (1, 2, 3)], 1)
+
+    def untold(self, field: Tensor) -> Tensor:
+        """Fields (n, c) less what the neighbours alone tell of them."""
+        return self._applied(OWN, self._with_ghosts(field.to(self._own))) / self._own[OWN, :, None]
+
+    def laplacian(self, field: Tensor) -> Tensor:
+        """(n,) of a field (n,)."""
+        own, matrix = self._laplacian
+        seen = self._with_ghosts(field.to(own))
+        return own * seen[: len(own)] + (matrix @ seen.unsqueeze(1)).squeeze(1)
+
+    @cached_property
+    def laplacian_bound(self) -> Tensor:
+        """The sum of its weights' sizes, (n,)."""
+        own, matrix = self._laplacian
+        return own.abs() + torch.segment_reduce(matrix.values().abs(), "sum", offsets=self._offsets)
+
+    @cached_property
+    def _laplacian(self) -> tuple[Tensor, Tensor]:
+        rows = [SECOND.start + PLACES[axis][axis] for axis in range(3)]
+        return self._own[rows].sum(0), self._matrix(self._others[rows].sum(0))
+
+    def _applied(self, row: int, seen: Tensor) -> Tensor:
+        return self._own[row, :, None] * seen[: self._own.shape[1]] + self._matrix(self._others[row]) @ seen
+
+    def _matrix(self, values: Tensor) -> Tensor:
+        with warnings.catch_warnings():  # of torch, that such matrices may change
+            warnings.simplefilter("ignore")
+            return torch.sparse_csr_tensor(self._offsets, self._senders, values, (len(self._offsets) - 1, self._seen))

@@ -1,0 +1,46 @@
+"""Compiled weights of kriging against those of torch, for each instruction set that this processor runs."""
+
+import numpy as np
+import pytest
+import torch
+
+from eddies.kernels.kriging import kriging_weights
+from eddies.particles.kriging import NOISE, Covariance, solved
+from eddies.particles.neighbor_list import NeighborList
+from eddies.particles.periodic_box import PeriodicBox
+
+SUPPORT, WIDTH = 0.4, 0.33
+# Conditions are NOISE over the number of neighbours, some 2e-5, so that single precision keeps two digits.
+TOLERANCE = {torch.float64: 1e-9, torch.float32: 2e-2}
+
+
+def pairs(count, dtype, seed=1):
+    """Those of points at random in a box of edge 1, of which some are alone in a corner that is else empty."""
+    position = torch.from_numpy(np.random.default_rng(seed).random((count, 3)) * [1, 1, 0.5])
+    position[:2] = torch.tensor([[0.1, 0.1, 0.95], [0.6, 0.6, 0.75]])
+    listed = NeighborList(PeriodicBox(1.0), SUPPORT, 0.0)
+    listed.build(position, position, exclude_self=True)
+    return listed.pairs(position, position, dtype=dtype)
+
+
+@pytest.mark.parametrize("dtype", TOLERANCE, ids=str)
+@pytest.mark.parametrize("count", [2, 37, 300])
+def test_weights_are_those_of_torch(library, count, dtype):
+    found_pairs, covariance = pairs(count, dtype), Covariance.of_filtered_turbulence(WIDTH)
+    displacement = np.ascontiguousarray(found_pairs.displacement.T.numpy())
+    found = kriging_weights(library, found_pairs.offsets.numpy(), displacement, SUPPORT, NOISE, covariance.slowest,
+                            np.array(covariance.amplitudes))
+    expected = solved(found_pairs.offsets, found_pairs.displacement.double(), SUPPORT, covariance)
+    for one, other in zip(map(torch.from_numpy, found), expected):
+        assert one.shape == other.shape and one.dtype == dtype
+        for row, of_row in zip(one, other):
+            assert (row - of_row).norm() <= TOLERANCE[dtype] * of_row.norm()
+
+
+def test_arrays_of_another_kind_are_refused(library):
+    offsets, amplitudes = np.array([0, 2]), np.ones(3) / 3
+    for displacement in (np.zeros((2, 3)), np.zeros((3, 3)), np.zeros((3, 2), int), np.zeros((3, 4))[:, ::2]):
+        with pytest.raises(ValueError, match="are needed"):
+            kriging_weights(library, offsets, displacement, SUPPORT, NOISE, 1.0, amplitudes)
+    with pytest.raises(ValueError, match="at most 8"):
+        kriging_weights(library, offsets, np.zeros((3, 2)), SUPPORT, NOISE, 1.0, np.ones(9))
