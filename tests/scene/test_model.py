@@ -106,7 +106,7 @@ def test_what_terms_read_and_give():
 @pytest.mark.parametrize("changes, message", [
     (dict(terms=("pressure", "pressure")), 'terms = ["pressure", "pressure"]: must be one or more terms, each once'),
     (dict(terms=()), "[model] terms = []: must be one or more terms"),
-    (dict(terms=("presure",)), '"transport-velocity", or the import path "module:name" of your own (what accelerates'),
+    (dict(terms=("presure",)), '"filtered-equations", or the import path "module:name" of your own (what accelerates'),
     (dict(terms=("presure",)), "did you mean pressure?"),
     (dict(terms="pressure"), '[model] terms = "pressure": must be a list of any of "pairs", "eddy-viscosity"'),
     (dict(terms=("pressure",), preset="wcsph"), "the list is given twice; remove one of the two"),
@@ -170,7 +170,7 @@ def test_an_own_term_has_keys_of_its_own(tmp_path, own):
     ("class Bad(Term):\n    def forward(self): pass\n    @dataclass(frozen=True)\n    class Settings(TermSettings):\n"
      "        a: complex = 1j\n", "Bad.Settings.a: complex: a key is declared by number, integer"),
     ("class Bad(Term):\n    def forward(self): pass\n    @dataclass(frozen=True)\n    class Settings(TermSettings):\n"
-     "        reads = ('vorticity',)\n", 'reads = ["vorticity"]: must be a tuple of any of "pairs", "resolved", '),
+     "        reads = ('vorticity',)\n", 'reads = ["vorticity"]: must be a tuple of any of "pairs", "kriging", '),
     ("class Bad: pass\n", "must be a class derived from eddies.Term"),
     ("Bad = 3\n", "must be a class derived from eddies.Term"),
 ])

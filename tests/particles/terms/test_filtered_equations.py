@@ -38,51 +38,59 @@ def test_the_force_is_that_of_the_filtered_equations(comm):
     """Within what 60 neighbours at random tell; without its stress it is another, and so without pressure."""
     exact = at(FIELD.force(NU), POSITION)
     found = accelerations(comm, equations())
-    assert relative(found, exact) < 0.16
+    assert relative(found, exact) < 0.17
     assert np.abs(found.sum(0)).max() < 1e-9 * np.abs(found).sum()  # momentum is kept
     none = equations()
     none.terms["filtered-equations"].stress.data.zero_()
-    assert relative(accelerations(comm, none), exact) > 1.8 * relative(found, exact)
+    assert relative(accelerations(comm, none), exact) > 1.5 * relative(found, exact)
+
+
+def settled(slab, particles, lagrangian, times):
+    """The rates when the density has followed the pressure so many times, while particles stay where they are."""
+    dynamics, rate = dynamics_of(slab, lagrangian), lagrangian.terms["filtered-equations"].settings.density
+    velocity = particles.velocity - particles.velocity.mean(0)
+    rate = rate * 2 * float(velocity.square().mean().sqrt()) / UNITS.scales.filter_width
+    with torch.no_grad():
+        for _ in range(times):
+            particles = replace(particles, density=particles.density + dynamics.rates(particles).density_rate / rate)
+        return particles, dynamics.rates(particles)
 
 
 @pytest.mark.mpi(1)
-def test_sweeps_find_the_pressure_from_nothing(comm):
-    """Repeated, from a density without any: what far away particles have a part in takes the most sweeps."""
-    rest, errors = torch.ones(len(POSITION), dtype=torch.float64), {}
-    exact = at(FIELD.force(NU), POSITION)
-    for sweeps in (1, 8, 64, 400):
-        errors[sweeps] = relative(accelerations(comm, equations(sweeps=sweeps), density=rest), exact)
-    assert errors[1] > errors[8] > errors[64] > errors[400] and errors[400] < 0.2
-
-
-@pytest.mark.mpi(1)
-def test_the_density_goes_where_the_pressure_is(comm):
-    lagrangian, c = equations(density=2.0, sweeps=400), UNITS.scales.sound_speed
-    slab, particles = particles_on(comm, torch.ones(len(POSITION), dtype=torch.float64))
-    rate = dynamics_of(slab, lagrangian).rates(particles).density_rate.detach()
-    speed = float(VELOCITY.square().mean().sqrt())
-    exact = 2.0 * 2 * speed / UNITS.scales.filter_width * PRESSURE[particles.id] / c**2
-    assert relative(rate.numpy(), exact.numpy()) < 0.2
+@pytest.mark.parametrize("sweeps, enough", [(1, 256), (8, 8), (32, 1)])
+def test_sweeps_find_the_pressure_from_nothing_and_stay_there(comm, sweeps, enough):
+    """A hundred evaluations more change nothing: no part of the pressure grows."""
+    rest, exact = torch.ones(len(POSITION), dtype=torch.float64), PRESSURE / UNITS.scales.sound_speed**2
+    slab, particles = alone(torch.from_numpy(POSITION), VELOCITY, rest)
+    for times in (enough, enough + 100):
+        found, rates = settled(slab, particles, equations(sweeps=sweeps), times)
+        assert relative(found.density.numpy() - 1, exact[found.id].numpy()) < 0.2
+        assert relative(rates.acceleration.numpy(), at(FIELD.force(NU), POSITION)[found.id.numpy()]) < 0.19
+    first = dynamics_of(slab, equations(sweeps=sweeps)).rates(particles).acceleration.detach()
+    assert sweeps == 32 or relative(first.numpy(), at(FIELD.force(NU), POSITION)[particles.id.numpy()]) > 0.2
 
 
 @pytest.mark.mpi(1)
 def test_a_divergence_is_taken_out_and_what_neighbours_do_not_tell_relaxes(comm):
-    """A potential flow is slowed down by the pressure alone, noise by the relaxation alone."""
+    """A weak potential flow is slowed down by the pressure alone, noise by the relaxation alone."""
     x = torch.from_numpy(POSITION)
     velocity = 1e-3 * torch.stack([torch.sin(x[:, 0]), torch.sin(2 * x[:, 1]), torch.zeros_like(x[:, 2])], 1)
     rest = torch.ones(len(x), dtype=torch.float64)
-    rate = 2 * float((velocity - velocity.mean(0)).square().mean().sqrt()) / UNITS.scales.filter_width
+    own = velocity - velocity.mean(0)
+    rate = 2 * float(own.square().mean().sqrt()) / UNITS.scales.filter_width
     still = replace(UNITS, scales=replace(UNITS.scales, viscosity=0.0))
-    terms = {"filtered-equations": dict(sweeps=400, solenoidal=1e3, relaxation=0.0)}
     slab, particles = alone(x, velocity, rest)
-    found = dynamics_of(slab, model(terms, still)).rates(particles).acceleration.detach()
-    own = velocity[particles.id] - velocity.mean(0)
-    assert relative(found.numpy(), -1e3 * rate * own.numpy()) < 0.15
+    terms = {"filtered-equations": dict(sweeps=16, solenoidal=1e3, relaxation=0.0)}
+    _, rates = settled(slab, particles, model(terms, still), 10)
+    assert relative(rates.acceleration.numpy(), -1e3 * rate * own[particles.id].numpy()) < 0.15
     noise = torch.from_numpy(np.random.default_rng(5).normal(0, 1e-3, (len(x), 3)))
-    terms = {"filtered-equations": dict(sweeps=1, solenoidal=0.0, relaxation=1e3)}
     slab, particles = alone(x, noise, rest)
+    terms = {"filtered-equations": dict(sweeps=1, solenoidal=0.0, relaxation=1e3)}
     found = dynamics_of(slab, model(terms, still)).rates(particles).acceleration.detach()
-    assert float((found * particles.velocity).sum()) < 0
+    speed = float(noise.square().mean().sqrt())
+    loss = -float((found * particles.velocity).sum() / particles.velocity.square().sum())
+    # Of noise the neighbours tell nothing: all of it relaxes, and more, as they tell what is not there.
+    assert loss > 1e3 * 2 * speed / UNITS.scales.filter_width
 
 
 @pytest.mark.mpi(1)

@@ -12,8 +12,8 @@ from eddies.particles.rates import Rates
 from eddies.particles.terms import settings as declared
 from eddies.particles.terms.term import Term
 
-# Of a sweep, in what the weights of the Laplacian of a particle add up to: at 2 some part of the pressure would grow.
-SWEEP = 1.8
+# Sweeps reduce what has eigenvalues from this over the square of their number to 1 alike, to an eighth.
+LEAST = 2.0
 
 
 class FilteredEquations(Term):
@@ -66,8 +66,11 @@ class FilteredEquations(Term):
     def _balanced(self, context: Context, pressure: Tensor, source: Tensor) -> Tensor:
         """The pressure after some sweeps."""
         told, source = context.kriging, context.without_mean(source[:, None])[:, 0]
-        step = SWEEP / told.laplacian_bound
-        for _ in range(self.settings.sweeps):
-            pressure = pressure + step * (told.laplacian(pressure) + source)
-            pressure = context.without_mean(pressure[:, None])[:, 0]
+        least, change, factor = LEAST / self.settings.sweeps**2, torch.zeros_like(pressure), 0.0
+        middle, half = (1 + least) / 2, (1 - least) / 2
+        for sweep in range(self.settings.sweeps):
+            residual = (told.laplacian(pressure) + source) / told.laplacian_bound
+            factor = 1 / middle if sweep == 0 else 1 / (middle - half**2 * factor / (2 if sweep == 1 else 4))
+            change = factor * residual + (factor * middle - 1) * change
+            pressure = context.without_mean((pressure + change)[:, None])[:, 0]
         return pressure

@@ -40,7 +40,7 @@ PRESETS: dict[str, dict[str, Mapping[str, Any]]] = {
     "resolved + pairs": {**dict.fromkeys(RESOLVED, {}), "pairs": {"inputs": ("distance", "speed", "approach")}},
     "learned-density": {"pairs": {}, "density-flux": {"zero_at_first": True}, "density-transport": {}},
     "paper": {"pairs": {"basis": "paper", "hidden": (20, 100, 20)}, "density-flux": {"hidden": (20, 100, 20)}},
-    "local": {"filtered-equations": {}},
+    "local": {"filtered-equations": {}, "eddy-viscosity": {}},
     "wcsph": {"continuity": {}, "wcsph": LITTLE_FRICTION},
     "transport-velocity": {"continuity": {}, "wcsph": LITTLE_FRICTION, "transport-velocity": {}},
 }
