@@ -31,9 +31,10 @@ def test_weights_are_those_of_torch(library, count, dtype):
     found = kriging_weights(library, found_pairs.offsets.numpy(), displacement, SUPPORT, NOISE, covariance.slowest,
                             np.array(covariance.amplitudes))
     expected = solved(found_pairs.offsets, found_pairs.displacement.double(), SUPPORT, covariance)
-    for one, other in zip(map(torch.from_numpy, found), expected):
-        assert one.shape == other.shape and one.dtype == dtype
-        for row, of_row in zip(one, other):
+    for one, other in zip(found, expected):
+        assert len(one) == len(other) == 10
+        for row, of_row in zip(map(torch.from_numpy, one), other):
+            assert row.shape == of_row.shape and row.dtype == dtype
             assert (row - of_row).norm() <= TOLERANCE[dtype] * of_row.norm()
 
 

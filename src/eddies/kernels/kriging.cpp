@@ -19,7 +19,8 @@ struct Kriging {
     std::int64_t scales;
     double slowest;                 // the covariance is sum_m amplitude_m exp(-slowest 2^m r^2), the widest first
     const double* amplitudes;       // (scales,)
-    void *own, *weights;            // (10, receivers), (10, pairs)
+    void* own;                      // (10, receivers)
+    void* const* weights;           // ten of (pairs,)
 };
 
 }  // extern "C"
@@ -94,9 +95,10 @@ class Equations {
    public:
     static constexpr int lanes = eddies::VectorOf<Real>::lanes;
 
+    // An odd number of vectors from row to row: those of one column would else fall into few sets of a cache.
     explicit Equations(Int most)
-        : most_(most), places_(3 * most * lanes), noise_(most * lanes), known_(most * lanes),
-          rows_((most + FUNCTIONALS) * most * lanes), inverse_(most * lanes) {}
+        : apart_(most | 1), places_(3 * most * lanes), noise_(most * lanes), known_(most * lanes),
+          rows_((most + FUNCTIONALS) * apart_ * lanes), inverse_(most * lanes) {}
 
     void solve(const Kriging& k, const Covariance<Real>& covariance, const Int* receiver, int count) {
         read(k, receiver, count);
@@ -112,7 +114,7 @@ class Equations {
     V& place(Int j, int axis) { return eddies::vector_at(places_.data() + (3 * j + axis) * lanes); }
     V& noise(Int j) { return eddies::vector_at(noise_.data() + j * lanes); }
     V& known(Int j) { return eddies::vector_at(known_.data() + j * lanes); }
-    V* row(Int i) { return reinterpret_cast<V*>(rows_.data() + i * most_ * lanes); }
+    V* row(Int i) { return reinterpret_cast<V*>(rows_.data() + i * apart_ * lanes); }
     V& inverse(Int j) { return eddies::vector_at(inverse_.data() + j * lanes); }
 
     // Places relative to the receiver, its own the first. What a lane has fewer than others is 0 in `known`.
@@ -209,18 +211,19 @@ class Equations {
     }
 
     void write(const Kriging& k, const Int* receiver, int count) {
-        auto *own = static_cast<Real*>(k.own), *weights = static_cast<Real*>(k.weights);
+        auto* own = static_cast<Real*>(k.own);
         for (int f = 0; f < FUNCTIONALS; ++f) {
             const auto* found = reinterpret_cast<const Real*>(row(size_ + f));
+            auto* weights = static_cast<Real*>(k.weights[f]);
             for (int lane = 0; lane < count; ++lane) {
                 const Int begin = k.offsets[receiver[lane]], neighbors = k.offsets[receiver[lane] + 1] - begin;
                 own[f * k.receivers + receiver[lane]] = found[lane];
-                for (Int j = 0; j < neighbors; ++j) weights[f * k.pairs + begin + j] = found[(j + 1) * lanes + lane];
+                for (Int j = 0; j < neighbors; ++j) weights[begin + j] = found[(j + 1) * lanes + lane];
             }
         }
     }
 
-    Int most_, size_ = 0;
+    Int apart_, size_ = 0;
     eddies::Aligned<Real> places_, noise_, known_, rows_, inverse_;
 };
 

@@ -17,9 +17,9 @@ class _Kriging(ctypes.Structure):
 
 
 def kriging_weights(library: ctypes.CDLL, offsets: np.ndarray, displacement: np.ndarray, support: float, noise: float,
-                    slowest: float, amplitudes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Weights of the receivers' own values, (10, n), and of their neighbours', (10, m): see
-    `eddies.particles.kriging.weights`, which is the definition.
+                    slowest: float, amplitudes: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Weights of the receivers' own values, (10, n), and of their neighbours', ten of (m,), which are small enough for
+    memory that is kept: see `eddies.particles.kriging.solved`, which is the definition.
 
     Parameters
     ----------
@@ -37,8 +37,9 @@ def kriging_weights(library: ctypes.CDLL, offsets: np.ndarray, displacement: np.
         raise ValueError(f"kriging: contiguous displacements (3, {offsets[-1]}) of single or double precision and at "
                          f"most {MOST_SCALES} amplitudes are needed; found {dtype} {displacement.shape} and "
                          f"{len(amplitudes)}")
-    own, weights = np.empty((10, len(offsets) - 1), dtype), np.empty((10, pairs), dtype)
+    own, weights = np.empty((10, len(offsets) - 1), dtype), [np.empty(pairs, dtype) for _ in range(10)]
+    rows = np.array([row.ctypes.data for row in weights], np.uint64)
     given = _Kriging(len(offsets) - 1, pairs, offsets.ctypes.data, displacement.ctypes.data, support, noise,
-                     len(amplitudes), slowest, *(array.ctypes.data for array in (amplitudes, own, weights)))
+                     len(amplitudes), slowest, *(array.ctypes.data for array in (amplitudes, own, rows)))
     getattr(library, f"kriging_{dtype}")(ctypes.byref(given))
     return own, weights

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -63,20 +63,20 @@ def noise_at(distance: Tensor, support: float) -> Tensor:
 
 
 @torch.no_grad()
-def weights(pairs: Pairs, support: float, covariance: Covariance) -> tuple[Tensor, Tensor]:
+def weights(pairs: Pairs, support: float, covariance: Covariance) -> tuple[Tensor, Sequence[Tensor]]:
     """By which weights of the values f_j at a particle and its neighbours what is asked for there is told best:
     sum_j w_j f_j, w = K^-1 b, K_jk = C(|x_j - x_k|) plus the noise of each on the diagonal.
 
     Of f itself b is 1 for the particle and 0 for its neighbours: f_i less what the neighbours alone tell of it, over
     w_i. Of derivatives b is that of C(|x - x_j|) by x at the particle.
 
-    Returns the particles' own weights (10, k) and the neighbours' (10, m), in the order of `FIRST` and `SECOND`.
+    Returns the particles' own weights (10, k) and the neighbours', ten of (m,), in the order of `FIRST` and `SECOND`.
     """
     compiled = library() if pairs.displacement.device.type == "cpu" else None
     if compiled is not None:
         found = kriging_weights(compiled, pairs.offsets.numpy(), np.ascontiguousarray(pairs.displacement.T.numpy()),
                                 support, NOISE, covariance.slowest, np.array(covariance.amplitudes))
-        return torch.from_numpy(found[0]), torch.from_numpy(found[1])
+        return torch.from_numpy(found[0]), [torch.from_numpy(row) for row in found[1]]
     return solved(pairs.offsets, pairs.displacement, support, covariance)
 
 
@@ -162,7 +162,7 @@ class Kriging:
     @cached_property
     def _laplacian(self) -> tuple[Tensor, Tensor]:
         rows = [SECOND.start + PLACES[axis][axis] for axis in range(3)]
-        return self._own[rows].sum(0), self._matrix(self._others[rows].sum(0))
+        return self._own[rows].sum(0), self._matrix(torch.stack([self._others[row] for row in rows]).sum(0))
 
     def _applied(self, row: int, seen: Tensor) -> Tensor:
         return self._own[row, :, None] * seen[: self._own.shape[1]] + self._matrix(self._others[row]) @ seen

@@ -58,6 +58,17 @@ def test_a_flow_that_is_not_turbulent_is_told():
         assert not any("Re_lambda" in line for line in told(f"flow.viscosity={0.99 * float(remedy):.3g}"))
 
 
+def test_steps_that_relax_too_far_are_told():
+    """Runs of `hit` with C_r = 2 end in noise with velocity Verlet and steps of 0.05, not with RK3."""
+    changes = ["model.preset=local", "model.filtered-equations.relaxation=2"]
+    for integrator, step, expected in (("verlet", 0.05, True), ("verlet", 0.02, False), ("rk3", 0.05, False)):
+        lines = told(*changes, f"simulation.integrator={integrator}", f"simulation.step={step}", scene="hit")
+        assert any("relaxes so fast" in line for line in lines) is expected
+    line, = (line for line in told(*changes, scene="hit") if "relaxes so fast" in line)
+    remedy = re.search(r"more than about ([\d.]+);", line).group(1)
+    assert not any("relaxes so fast" in line for line in told(*changes, f"simulation.step={remedy}", scene="hit"))
+
+
 def test_explicit_steps_have_the_limits_of_sound_and_viscosity_too():
     found = told("time.stepper=rk4", "time.step=0.05")
     assert len(found) == 1 and "[time] step = 0.05: is unstable by sound" in found[0]

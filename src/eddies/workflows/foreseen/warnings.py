@@ -7,8 +7,8 @@ import math
 from collections.abc import Callable, Iterable, Iterator
 
 from eddies.flow.stability import REMEDIES, limits_of_step
-from eddies.particles.terms.settings import WCSPH
-from eddies.scene.baseline_checks import acoustic_step
+from eddies.particles.terms.settings import WCSPH, FilteredEquations
+from eddies.scene.baseline_checks import acoustic_step, relaxing_step
 from eddies.scene.scene import BOX_LENGTH, Scene
 from eddies.workflows.foreseen.estimates import (courant_bound, expected_turbulence, foreseen_allowed_step,
                                                  largest_wavenumber, most_ranks, peak_speed, rms_speed)
@@ -143,6 +143,20 @@ def sound_steps(scene: Scene) -> Iterator[str]:
                    'integrator = "verlet"')
 
 
+def relaxing_steps(scene: Scene) -> Iterator[str]:
+    """Steps in which particles relax to their neighbours too far."""
+    settings, speed = scene.simulation, rms_speed(scene)
+    if "model" not in settings.needs or speed is None:
+        return
+    for name, form in scene.model.settings.items():
+        if isinstance(form, FilteredEquations):
+            longest = relaxing_step(scene, form, speed / math.sqrt(3))
+            if settings.step > longest:
+                yield (f'[simulation] step = {settings.step:g}: noise among the particles of "{name}" relaxes so fast '
+                       f'that it grows with integrator = "{settings.integrator}" in steps of more than about '
+                       f"{at_most(longest)}; lower step to that")
+
+
 def at_least(value: float) -> str:
     """Two digits, rounded up."""
     return f"{math.ceil(value / _second_digit(value) - 1e-9) * _second_digit(value):.2g}"
@@ -159,4 +173,4 @@ def _second_digit(value: float) -> float:
 
 SUBJECTS: dict[str, tuple[Callable[[Scene], Iterator[str]], ...]] = {
     "dns": (resolution, compressibility, turbulence_at_all, stability, filter_width),
-    "train": (learning,), "simulate": (rollout_steps, sound_steps)}
+    "train": (learning,), "simulate": (rollout_steps, sound_steps, relaxing_steps)}
