@@ -24,8 +24,8 @@ DRAWN = ("velocity_error_half", "acceleration_kl")
 # Words, colour and marker of the variants.
 LOOKS = {"learned": ("the resolved velocity", MODEL, "o"), "with-pairs": ("and pairs", SECOND, "^"),
          "grid": ("best grid of its cost", TRUTH, "s"), "paper": ("the paper's form", THIRD, "D"),
-         "transport-velocity": ("transport-velocity SPH", FOURTH, "v"), "wcsph": ("WCSPH", FILTERED, "P"),
-         "no-force": ("no force", DNS, "x")}
+         "transport-velocity": ("transport-velocity SPH", FOURTH, "v"),
+         "local": ("all among neighbours", FILTERED, "P"), "no-force": ("no force", DNS, "x")}
 
 Row = Mapping[str, Any]
 

@@ -35,7 +35,8 @@ def test_weights_are_those_of_torch(library, count, dtype):
         assert len(one) == len(other) == 10
         for row, of_row in zip(map(torch.from_numpy, one), other):
             assert row.shape == of_row.shape and row.dtype == dtype
-            assert (row - of_row).norm() <= TOLERANCE[dtype] * of_row.norm()
+            # Alone a particle tells nothing but rounding.
+            assert (row - of_row).norm() <= TOLERANCE[dtype] * (of_row.norm() + 1e-5)
 
 
 def test_arrays_of_another_kind_are_refused(library):

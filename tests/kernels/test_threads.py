@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from eddies.kernels.copies import CompiledColumnCopies, CompiledPlaneCopies
+from eddies.kernels.kriging import kriging_weights
 from eddies.kernels.library import instruction_sets, load
 from eddies.kernels.modes import CompiledModePasses
 from eddies.kernels.pairs import CompiledPairs, PairSpace, Summand
@@ -90,7 +91,16 @@ def splines(library):
         yield from (compiled.at(planes), compiled.slope(planes, values), *planes)
 
 
-KERNELS = {function.__name__: function for function in (copied, formulas, mode_passes, pair_sums, splines)}
+def kriging(library):
+    for kind in (np.float32, np.float64):
+        random = np.random.default_rng(8)
+        offsets = np.concatenate([[0], np.cumsum(random.integers(0, 40, 500))])
+        displacement = random.uniform(-0.2, 0.2, (3, offsets[-1])).astype(kind)
+        own, others = kriging_weights(library, offsets, displacement, 0.4, 1e-2, 2.0, np.array([0.7, 0.3]))
+        yield from (own, *others)
+
+
+KERNELS = {function.__name__: function for function in (copied, formulas, kriging, mode_passes, pair_sums, splines)}
 
 
 def digests():

@@ -49,6 +49,14 @@ def test_derivatives_of_a_field_of_few_modes(comm, dtype):
 
 
 @pytest.mark.mpi(1)
+def test_a_constant_has_no_derivatives_and_is_told_by_any_neighbour(comm):
+    told, particles = kriging(comm, np.ones_like(POSITION))
+    first, second = told.derivatives(particles.velocity)
+    assert first.abs().max() * SPACING < 1e-10 and second.abs().max() * SPACING**2 < 1e-9
+    assert told.untold(particles.velocity).abs().max() < 1e-10
+
+
+@pytest.mark.mpi(1)
 def test_gradient_and_laplacian_are_those_of_all_derivatives(comm):
     told, particles = kriging(comm, at(random_velocity(2), POSITION))
     field = particles.velocity[:, 0]

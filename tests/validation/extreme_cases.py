@@ -27,6 +27,7 @@ CLOSURES = {
     "learned-density": {**PRESETS["learned-density"], "eddy-viscosity": dict(form="monaghan")},
     "paper": PAPER,
     "wcsph": {"summation-density": {}, "wcsph": {}},
+    "local": PRESETS["local"],
 }
 every_closure = pytest.mark.parametrize("kind", CLOSURES)
 every_integrator = pytest.mark.parametrize("integrator", INTEGRATORS)

@@ -26,8 +26,10 @@ MODELS = {
     "told densities": Model(preset="resolved + pairs", settings={"pairs": {
         "inputs": ("density", "distance", "speed", "approach")}}),
     "own density": Model(preset="learned-density"),
+    "local": Model(preset="local"),
 }
-FEATURES = {"default": 3, "told densities": 5, "own density": 10}  # of all networks; of each two densities, if any
+# Of all networks; of each two densities, if any.
+FEATURES = {"default": 3, "told densities": 5, "own density": 10, "local": 0}
 DENSITY = {"step": 0.015, "turnovers": 0.06}
 # Frames at every 0.04: between steps that may go beyond them, or at the ends of steps.
 CASES = {
@@ -38,6 +40,7 @@ CASES = {
     "own density": ("own density", "learned", {**DENSITY, "precision": "float64"}),
     "own density, forced, Verlet": ("own density", "learned", {
         **DENSITY, "step": 0.02, "injection": 0.5, "integrator": "verlet"}),
+    "local": ("local", "learned", {"step": 0.03}),
     "eulerian": (None, "eulerian", {"step": 0.02}, {"fluid": "compressible"}),
     "eulerian, forced": (None, "eulerian", {"step": 0.02, "injection": 1.0}, {"closure": "dynamic-smagorinsky"}),
     "none": (None, "none", {"step": 0.015}),

@@ -1,5 +1,5 @@
-// Kriging: by which weights of what neighbours have a random field with a given covariance, and its derivatives, are
-// told best at a point. Receivers are taken together, one in each lane of a vector.
+// Kriging: by which weights of what neighbours have a random field with a given covariance and an unknown mean, and its
+// derivatives, are told best at a point. Receivers are taken together, one in each lane of a vector.
 
 #include <algorithm>
 #include <cmath>
@@ -30,7 +30,7 @@ namespace {
 using eddies::Vector;
 using Int = std::int64_t;
 
-constexpr int FUNCTIONALS = 10, MOST_SCALES = 8;
+constexpr int FUNCTIONALS = 10, SIDES = FUNCTIONALS + 1, MOST_SCALES = 8;
 // Rows and columns of the six second derivatives.
 constexpr int FIRST[6] = {0, 0, 0, 1, 1, 2}, SECOND[6] = {0, 1, 2, 1, 2, 2};
 
@@ -98,13 +98,14 @@ class Equations {
     // An odd number of vectors from row to row: those of one column would else fall into few sets of a cache.
     explicit Equations(Int most)
         : apart_(most | 1), places_(3 * most * lanes), noise_(most * lanes), known_(most * lanes),
-          rows_((most + FUNCTIONALS) * apart_ * lanes), inverse_(most * lanes) {}
+          rows_((most + SIDES) * apart_ * lanes), inverse_(most * lanes) {}
 
     void solve(const Kriging& k, const Covariance<Real>& covariance, const Int* receiver, int count) {
         read(k, receiver, count);
         fill(covariance);
         factorise();
         substitute_back();
+        leave_means();
         write(k, receiver, count);
     }
 
@@ -158,6 +159,7 @@ class Equations {
             V first, second;
             covariance.derivatives(square(i, 0), first, second);
             row(size_)[i] = all<Real>(i == 0);
+            row(size_ + FUNCTIONALS)[i] = known(i);
             // By the receiver's place x of C(|x - x_j|^2): -2 C' (x_j - x), and 4 C'' (x_j - x) (x_j - x) + 2 C' I.
             for (int axis = 0; axis < 3; ++axis) row(size_ + 1 + axis)[i] = -2 * first * place(i, axis) * known(i);
             for (int q = 0; q < 6; ++q) {
@@ -170,7 +172,7 @@ class Equations {
     // The factor L of the matrix L L^T in place, and L^-1 b in place of right-hand sides b: four rows at a time against
     // those above.
     void factorise() {
-        const Int all_rows = size_ + FUNCTIONALS;
+        const Int all_rows = size_ + SIDES;
         for (Int begin = 0; begin < all_rows; begin += 4) {
             V* some[4];
             const int count = static_cast<int>(std::min<Int>(4, all_rows - begin));
@@ -199,14 +201,28 @@ class Equations {
     }
 
     void substitute_back() {
-        V* found[FUNCTIONALS];
-        for (int f = 0; f < FUNCTIONALS; ++f) found[f] = row(size_ + f);
+        V* found[SIDES];
+        for (int f = 0; f < SIDES; ++f) found[f] = row(size_ + f);
         for (Int k = size_ - 1; k >= 0; --k) {
             const V* given = row(k);
-            V last[FUNCTIONALS];
-            for (int f = 0; f < FUNCTIONALS; ++f) last[f] = found[f][k] *= inverse(k);
+            V last[SIDES];
+            for (int f = 0; f < SIDES; ++f) last[f] = found[f][k] *= inverse(k);
             for (Int j = 0; j < k; ++j)
-                for (int f = 0; f < FUNCTIONALS; ++f) found[f][j] -= given[j] * last[f];
+                for (int f = 0; f < SIDES; ++f) found[f][j] -= given[j] * last[f];
+        }
+    }
+
+    // The mean is not known: less of K^-1 1 what lets the weights of each add up to nothing.
+    void leave_means() {
+        const V* ones = row(size_ + FUNCTIONALS);
+        V whole{};
+        for (Int j = 0; j < size_; ++j) whole += ones[j];
+        for (int f = 0; f < FUNCTIONALS; ++f) {
+            V* found = row(size_ + f);
+            V part{};
+            for (Int j = 0; j < size_; ++j) part += found[j];
+            part /= whole;
+            for (Int j = 0; j < size_; ++j) found[j] -= part * ones[j];
         }
     }
 

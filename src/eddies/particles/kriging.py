@@ -26,6 +26,8 @@ NOISE = 1e-3
 # Squared lengths of the Gaussians that make up the covariance, in those of the narrowest of all fields that have passed
 # the filter, which a Gaussian filter leaves of white noise: each twice the one before.
 NARROWEST, SCALES = 1.2, 6
+# Of a particle's own value among its neighbours, in units of the inverse variance of the field.
+LEAST_WEIGHT = 0.01
 # Receivers that torch solves for at once.
 TOGETHER = 256
 
@@ -67,8 +69,9 @@ def weights(pairs: Pairs, support: float, covariance: Covariance) -> tuple[Tenso
     """By which weights of the values f_j at a particle and its neighbours what is asked for there is told best:
     sum_j w_j f_j, w = K^-1 b, K_jk = C(|x_j - x_k|) plus the noise of each on the diagonal.
 
-    Of f itself b is 1 for the particle and 0 for its neighbours: f_i less what the neighbours alone tell of it, over
-    w_i. Of derivatives b is that of C(|x - x_j|) by x at the particle.
+    Of f itself b is 1 for the particle and 0 for its neighbours: f_i less what the neighbours alone tell of it, times
+    w_i. Of derivatives b is that of C(|x - x_j|) by x at the particle. The mean of f is not known: from w is taken of
+    K^-1 1 what lets weights add up to nothing, so that a constant has no derivatives (ordinary kriging).
 
     Returns the particles' own weights (10, k) and the neighbours', ten of (m,), in the order of `FIRST` and `SECOND`.
     """
@@ -95,13 +98,15 @@ def solved(offsets: Tensor, displacement: Tensor, support: float, covariance: Co
         known = torch.cat([known.new_ones(len(listed), 1), known], 1)
         right, matrix = _equations(away, known, support, covariance)
         solution = torch.cholesky_solve(right, torch.linalg.cholesky(matrix))
+        solution, ones = solution[..., :10], solution[..., 10:]
+        solution = solution - ones * (solution.sum(1, keepdim=True) / ones.sum(1, keepdim=True))
         own[:, start : start + len(listed)] = solution[:, 0].T
         found[:, pair] = solution[:, 1:][known[:, 1:]].T
     return own, found
 
 
 def _equations(away: Tensor, known: Tensor, support: float, covariance: Covariance) -> tuple[Tensor, Tensor]:
-    """Right-hand sides (k, p, 10) and matrices (k, p, p) of places x_j - x_i, those that are `known`."""
+    """Right-hand sides (k, p, 11), the last all 1, and matrices (k, p, p) of places x_j - x_i that are `known`."""
     value, _, _ = covariance.derivatives((away[:, :, None] - away[:, None]).square().sum(-1))
     both = known[:, :, None] & known[:, None]
     distance = away.norm(dim=-1)
@@ -109,7 +114,8 @@ def _equations(away: Tensor, known: Tensor, support: float, covariance: Covarian
     matrix = torch.where(both, value, 0.0) + torch.diag_embed(diagonal)
     _, first, second = covariance.derivatives(distance.square())
     right = [torch.zeros_like(first), *(-2 * first * away[..., axis] for axis in range(3)),
-             *(4 * second * away[..., j] * away[..., k] + (2 * first if j == k else 0) for j, k in ENTRIES)]
+             *(4 * second * away[..., j] * away[..., k] + (2 * first if j == k else 0) for j, k in ENTRIES),
+             torch.ones_like(first)]
     right[0][:, 0] = 1
     return torch.stack(right, -1) * known[..., None], matrix
 
@@ -144,8 +150,10 @@ class Kriging:
         return torch.cat([self._applied(row, seen) for row in (1, 2, 3)], 1)
 
     def untold(self, field: Tensor) -> Tensor:
-        """Fields (n, c) less what the neighbours alone tell of them."""
-        return self._applied(OWN, self._with_ghosts(field.to(self._own))) / self._own[OWN, :, None]
+        """Fields (n, c) less what the neighbours alone tell of them; nothing where there are none."""
+        # The own weight is the inverse of a variance, 1/2 or more with one neighbour, and nothing alone.
+        own = self._own[OWN, :, None].clamp_min(LEAST_WEIGHT)
+        return self._applied(OWN, self._with_ghosts(field.to(self._own))) / own
 
     def laplacian(self, field: Tensor) -> Tensor:
         """(n,) of a field (n,)."""
