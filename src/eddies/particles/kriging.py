@@ -15,7 +15,7 @@ from eddies.kernels.kriging import kriging_weights
 from eddies.kernels.library import library
 from eddies.particles.pairs import Pairs
 
-#: Rows of weights: of 1, then of the first and of the second derivatives xx, xy, xz, yy, yz, zz.
+# Rows of weights: of the field itself, then of its first and of its second derivatives, xx, xy, xz, yy, yz, zz.
 OWN, FIRST, SECOND = 0, slice(1, 4), slice(4, 10)
 ENTRIES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 # Rows of the entries (j, k) of a symmetric matrix.
@@ -73,7 +73,8 @@ def weights(pairs: Pairs, support: float, covariance: Covariance) -> tuple[Tenso
     w_i. Of derivatives b is that of C(|x - x_j|) by x at the particle. The mean of f is not known: from w is taken of
     K^-1 1 what lets weights add up to nothing, so that a constant has no derivatives (ordinary kriging).
 
-    Returns the particles' own weights (10, k) and the neighbours', ten of (m,), in the order of `FIRST` and `SECOND`.
+    Returns the particles' own weights (10, k) and the neighbours', ten of (m,), of the field itself, its first and
+    its second derivatives xx, xy, xz, yy, yz, zz.
     """
     compiled = library() if pairs.displacement.device.type == "cpu" else None
     if compiled is not None:
@@ -135,19 +136,19 @@ class Kriging:
     def __init__(self, pairs: Pairs, seen: int, support: float, filter_width: float,
                  with_ghosts: Callable[[Tensor], Tensor]) -> None:
         self._own, self._others = weights(pairs, support, Covariance.of_filtered_turbulence(filter_width))
-        self._seen = seen
+        self._seen, self._filter_width = seen, filter_width
         self._offsets, self._senders, self._with_ghosts = pairs.offsets, pairs.sender, with_ghosts
 
     def derivatives(self, field: Tensor) -> tuple[Tensor, Tensor]:
         """First (n, c, 3) and second (n, c, 3, 3) derivatives of fields (n, c)."""
         seen = self._with_ghosts(field.to(self._own))
-        found = torch.stack([self._applied(row, seen) for row in range(1, 10)], -1)
+        found = torch.stack([self._applied(row, seen) for row in range(FIRST.start, SECOND.stop)], -1)
         return found[..., :3], found[..., 3:][..., PLACES]
 
     def gradient(self, field: Tensor) -> Tensor:
         """(n, 3) of a field (n,)."""
         seen = self._with_ghosts(field.to(self._own)).unsqueeze(1)
-        return torch.cat([self._applied(row, seen) for row in (1, 2, 3)], 1)
+        return torch.cat([self._applied(row, seen) for row in range(FIRST.start, FIRST.stop)], 1)
 
     def untold(self, field: Tensor) -> Tensor:
         """Fields (n, c) less what the neighbours alone tell of them; nothing where there are none."""
@@ -163,9 +164,10 @@ class Kriging:
 
     @cached_property
     def laplacian_bound(self) -> Tensor:
-        """The sum of its weights' sizes, (n,)."""
+        """The sum of its weights' sizes, (n,), some hundred over d^2; 1/d^2 for a particle alone, which has none."""
         own, matrix = self._laplacian
-        return own.abs() + torch.segment_reduce(matrix.values().abs(), "sum", offsets=self._offsets)
+        sizes = own.abs() + torch.segment_reduce(matrix.values().abs(), "sum", offsets=self._offsets)
+        return sizes.clamp_min(self._filter_width**-2)
 
     @cached_property
     def _laplacian(self) -> tuple[Tensor, Tensor]:

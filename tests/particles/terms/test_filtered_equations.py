@@ -110,9 +110,16 @@ def test_the_number_of_ranks_does_not_matter(comm):
 
 
 @pytest.mark.mpi(1)
-def test_particles_without_neighbours_go_on(comm):
-    x = torch.tensor([[1.0, 1.0, 1.0], [4.0, 4.0, 4.0]], dtype=torch.float64)
-    velocity = torch.tensor([[1.0, 0, 0], [0, 1.0, 0]], dtype=torch.float64)
-    slab, particles = alone(x, velocity, torch.ones(2, dtype=torch.float64))
-    rates = dynamics_of(slab, equations()).rates(particles)
-    assert torch.isfinite(rates.acceleration).all() and torch.isfinite(rates.density_rate).all()
+def test_a_particle_without_neighbours_goes_straight_on(comm):
+    """But for the momentum that the others leave over."""
+    far = torch.tensor([[3.0, 3.0, 3.0]], dtype=torch.float64)
+    x = torch.from_numpy(POSITION)
+    others = (x - far).abs().max(1).values > FLOW.cutoff + 0.3  # and more than the skin
+    x, velocity = torch.cat([x[others], far]), torch.cat([VELOCITY[others], -far])
+    slab, particles = alone(x, velocity, torch.ones(len(x), dtype=torch.float64))
+    dynamics, last = dynamics_of(slab, equations()), int(torch.argmax(particles.id))
+    assert int(dynamics.context(particles).local.neighbors.offsets.diff()[last]) == 0
+    with torch.no_grad():
+        acceleration = dynamics.rates(particles).acceleration
+    assert torch.isfinite(acceleration).all()
+    assert acceleration[last].norm() < 0.05 * acceleration.norm(dim=1).mean()
