@@ -21,7 +21,6 @@ from eddies.cli_options import parse_arguments
 from eddies.clock import duration
 from eddies.errors import UserError
 from eddies.logs import OUTCOME, Output, configure_logging, show_warnings
-from eddies.memory import keep_freed_memory
 from eddies.pipeline import STAGES
 from eddies.scene.scene import SceneError, builtin_scenes, load_scene
 
@@ -69,6 +68,7 @@ def run(arguments: list[str] | None) -> int:
     """Run one command, all ranks together; returns the exit code."""
     # Before numpy and torch are imported: they would start a thread for every core, in every rank.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    from eddies.kernels.memory import keep_freed_memory
     keep_freed_memory()
     signals = catch_signals()  # first of all: MPI takes a second to start
     try:

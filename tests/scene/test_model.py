@@ -170,7 +170,7 @@ def test_an_own_term_has_keys_of_its_own(tmp_path, own):
     ("class Bad(Term):\n    def forward(self): pass\n    @dataclass(frozen=True)\n    class Settings(TermSettings):\n"
      "        a: complex = 1j\n", "Bad.Settings.a: complex: a key is declared by number, integer"),
     ("class Bad(Term):\n    def forward(self): pass\n    @dataclass(frozen=True)\n    class Settings(TermSettings):\n"
-     "        reads = ('vorticity',)\n", 'reads = ["vorticity"]: must be a tuple of any of "pairs", "kriging", '),
+     "        reads = ('vorticity',)\n", 'reads = ["vorticity"]: must be a tuple of any of "pairs", "resolved", '),
     ("class Bad: pass\n", "must be a class derived from eddies.Term"),
     ("Bad = 3\n", "must be a class derived from eddies.Term"),
 ])

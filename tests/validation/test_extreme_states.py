@@ -192,8 +192,8 @@ def test_a_density_contrast_of_a_thousand_leaves_forces_bounded(comm, kind):
 @pytest.mark.mpi(1)
 @every_closure
 def test_single_precision_follows_double_precision(comm, kind):
-    # Round-off of single precision, 6e-8, a few times; more often where there are transforms and a solve.
-    most = 1e-5 if "resolved" in network_model(kind, TOTAL).reads else 1e-6
+    # Round-off of single precision, 6e-8, a few times; more often where there are transforms, and solves.
+    most = 1e-5 if "resolved" in network_model(kind, TOTAL).reads or kind == "local" else 1e-6
     assert 1e-9 < precision_error(comm, kind, 8) < most
 
 

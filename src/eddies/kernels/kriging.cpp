@@ -138,7 +138,7 @@ class Equations {
                     places_.data()[(3 * (j + 1) + axis) * lanes + lane] = -displacement[axis * k.pairs + begin + j];
             }
         }
-        // Neighbours come and go at the support, where their noise has no bound.
+        // Neighbours come and go at the support, where their noise is 1e4 times that beside the receiver.
         for (Int j = 0; j < size_; ++j) {
             const V q = square(j, 0) * reach, left = 1 - q * q;
             const V least = all<Real>(Real(1e-4));

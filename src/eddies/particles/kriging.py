@@ -60,7 +60,7 @@ class Covariance:
 
 
 def noise_at(distance: Tensor, support: float) -> Tensor:
-    """Variance of the noise of a neighbour: without bound at the support, where neighbours come and go."""
+    """Variance of the noise of a neighbour: ten times that of the field at the support, where they come and go."""
     return NOISE / (1 - (distance / support) ** 4).clamp_min(1e-4)
 
 
@@ -98,7 +98,9 @@ def solved(offsets: Tensor, displacement: Tensor, support: float, covariance: Co
         away[:, 1:][known] = -displacement[pair]
         known = torch.cat([known.new_ones(len(listed), 1), known], 1)
         right, matrix = _equations(away, known, support, covariance)
-        solution = torch.cholesky_solve(right, torch.linalg.cholesky(matrix))
+        factor, failed = torch.linalg.cholesky_ex(matrix)
+        factor[failed > 0] = torch.nan  # as the library has it: an error here would be that of one rank alone
+        solution = torch.cholesky_solve(right, factor)
         solution, ones = solution[..., :10], solution[..., 10:]
         solution = solution - ones * (solution.sum(1, keepdim=True) / ones.sum(1, keepdim=True))
         own[:, start : start + len(listed)] = solution[:, 0].T
@@ -152,7 +154,7 @@ class Kriging:
 
     def untold(self, field: Tensor) -> Tensor:
         """Fields (n, c) less what the neighbours alone tell of them; nothing where there are none."""
-        # The own weight is the inverse of a variance, 1/2 or more with one neighbour, and nothing alone.
+        # The own weight is the inverse of a variance, 1/12 or more with one neighbour, and nothing alone.
         own = self._own[OWN, :, None].clamp_min(LEAST_WEIGHT)
         return self._applied(OWN, self._with_ghosts(field.to(self._own))) / own
 

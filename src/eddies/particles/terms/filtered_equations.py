@@ -12,7 +12,7 @@ from eddies.particles.rates import Rates
 from eddies.particles.terms import settings as declared
 from eddies.particles.terms.term import Term
 
-# Sweeps reduce what has eigenvalues from this over the square of their number to 1 alike, to an eighth.
+# Two sweeps and more reduce what has eigenvalues from this over the square of their number to 1 alike, to an eighth.
 LEAST = 2.0
 
 
@@ -23,9 +23,9 @@ class FilteredEquations(Term):
     what they alone do not tell of a particle's velocity; u' the rms of a component as it is now; f is learned, near 1,
     the value of the gradient model (Leonard 1975; Clark et al. 1979), whose force is -f (d^2/12) d_j d_k u_i d_k u_j.
 
-    p/rho_0 is that of the particles' own density, c^2 (rho/rho_0 - 1), after some `sweeps` of
+    p/rho_0 is that of the particles' own density, c^2 (rho/rho_0 - 1), after some `sweeps` of Chebyshev's iteration by
 
-        p_i <- p_i + 1.8 (laplacian p + s)_i / sum_j |w_ij|,   s = d_i u_j d_j u_i + div div tau - C_d (2 u'/d) div u,
+        (laplacian p + s)_i / sum_j |w_ij|,   s = d_i u_j d_j u_i + div div tau - C_d (2 u'/d) div u,
 
     w_ij the weights of the Laplacian there, and the density follows it,
 
@@ -66,7 +66,7 @@ class FilteredEquations(Term):
     def _balanced(self, context: Context, pressure: Tensor, source: Tensor) -> Tensor:
         """The pressure after some sweeps."""
         told, source = context.kriging, context.without_mean(source[:, None])[:, 0]
-        least, change, factor = LEAST / self.settings.sweeps**2, torch.zeros_like(pressure), 0.0
+        least, change, factor = min(LEAST / self.settings.sweeps**2, 1.0), torch.zeros_like(pressure), 0.0
         middle, half = (1 + least) / 2, (1 - least) / 2
         for sweep in range(self.settings.sweeps):
             residual = (told.laplacian(pressure) + source) / told.laplacian_bound

@@ -11,7 +11,7 @@ from typing import ClassVar
 
 from eddies.scene.values import KeyProblem, Section, boolean, choice, integer, integers, named, number, texts
 
-READS = ("pairs", "kriging", "resolved", "density")
+READS = ("pairs", "resolved", "density")
 GIVES = ("acceleration", "density", "density_rate", "shift_velocity")
 #: What a network can be told of a pair, in units of the flow: the densities of both, |x|, |v| and x.v.
 INPUTS = ("density", "distance", "speed", "approach")
@@ -24,9 +24,9 @@ class TermSettings(Section):
 
     Attributes
     ----------
-    reads : of "pairs" (neighbours within the interaction radius), "kriging" (derivatives that they tell, with "pairs"),
-        "resolved" (the velocity that a grid resolves of the particles'), "density" (so that it is computed, stored, and
-        wanted of the ground truth). What no term reads is not built.
+    reads : of "pairs" (neighbours within the interaction radius, what they tell by kriging too), "resolved" (the
+        velocity that a grid resolves of the particles'), "density" (so that it is computed, stored, and wanted of the
+        ground truth). What no term reads is not built.
     gives : of "acceleration", "density" (a part of it), "density_rate" and "shift_velocity".
     learns_through_horizons : its parameters are trained through several steps of the simulation alone.
     numbers_per_pair : how many numbers it keeps of each pair while it is evaluated, for an estimate of the memory.
@@ -236,5 +236,5 @@ class FilteredEquations(TermSettings):
     density: float = number("rate, over 2 u'/d, at which the density follows the pressure", default=3.5, at_least=0)
 
     numbers_per_pair = 30
-    reads = ("pairs", "kriging", "density")
+    reads = ("pairs", "density")
     gives = ("acceleration", "density_rate")
