@@ -61,9 +61,6 @@ def mpi_environment(ranks: int) -> dict[str, str]:
         "OMP_NUM_THREADS": "1",
         # Two jobs on one machine would both be bound to its first cores.
         "OMPI_MCA_hwloc_base_binding_policy": "none",
-        # Memory that is freed stays with the process: fetching pages anew took half the time of a step on 32^3 cells.
-        # 32 MiB is the largest threshold that every glibc takes.
-        "MALLOC_MMAP_THRESHOLD_": str(2**25), "MALLOC_TRIM_THRESHOLD_": str(2**30), "MALLOC_TOP_PAD_": str(2**28),
     }
     if os.geteuid() == 0:
         # Open MPI refuses to start as root, the usual user of a container, unless both say that it is meant.

@@ -13,11 +13,11 @@ from torch import Tensor
 
 from eddies.kernels.kriging import kriging_weights
 from eddies.kernels.library import library
+from eddies.particles.moments import ENTRIES
 from eddies.particles.pairs import Pairs
 
 # Rows of weights: of the field itself, then of its first and of its second derivatives, xx, xy, xz, yy, yz, zz.
 OWN, FIRST, SECOND = 0, slice(1, 4), slice(4, 10)
-ENTRIES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 # Rows of the entries (j, k) of a symmetric matrix.
 PLACES = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
 
@@ -141,22 +141,19 @@ class Kriging:
         self._seen, self._filter_width = seen, filter_width
         self._offsets, self._senders, self._with_ghosts = pairs.offsets, pairs.sender, with_ghosts
 
-    def derivatives(self, field: Tensor) -> tuple[Tensor, Tensor]:
-        """First (n, c, 3) and second (n, c, 3, 3) derivatives of fields (n, c)."""
+    def derivatives(self, field: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Fields (n, c) less what the neighbours alone tell of them, nothing where there are none, and their first
+        (n, c, 3) and second (n, c, 3, 3) derivatives."""
         seen = self._with_ghosts(field.to(self._own))
-        found = torch.stack([self._applied(row, seen) for row in range(FIRST.start, SECOND.stop)], -1)
-        return found[..., :3], found[..., 3:][..., PLACES]
+        found = torch.stack([self._applied(row, seen) for row in range(SECOND.stop)], -1)
+        # The own weight is the inverse of a variance, 1/12 or more with one neighbour, and nothing alone.
+        untold = found[..., OWN] / self._own[OWN, :, None].clamp_min(LEAST_WEIGHT)
+        return untold, found[..., FIRST], found[..., SECOND][..., PLACES]
 
     def gradient(self, field: Tensor) -> Tensor:
         """(n, 3) of a field (n,)."""
         seen = self._with_ghosts(field.to(self._own)).unsqueeze(1)
         return torch.cat([self._applied(row, seen) for row in range(FIRST.start, FIRST.stop)], 1)
-
-    def untold(self, field: Tensor) -> Tensor:
-        """Fields (n, c) less what the neighbours alone tell of them; nothing where there are none."""
-        # The own weight is the inverse of a variance, 1/12 or more with one neighbour, and nothing alone.
-        own = self._own[OWN, :, None].clamp_min(LEAST_WEIGHT)
-        return self._applied(OWN, self._with_ghosts(field.to(self._own))) / own
 
     def laplacian(self, field: Tensor) -> Tensor:
         """(n,) of a field (n,)."""

@@ -48,13 +48,13 @@ class FilteredEquations(Term):
         """Acceleration and rate of density."""
         told, scales, settings = context.kriging, self.flow.scales, self.settings
         velocity = context.without_mean(context.particles.velocity)
-        first, second = told.derivatives(velocity)
+        untold, first, second = told.derivatives(velocity)
         speed = mean_over_ranks(context.comm, velocity.square().mean(1, keepdim=True)).clamp_min(1e-300).sqrt()
         rate = (2 * speed / scales.filter_width).to(first)
         stress = self.stress.to(first) * (scales.filter_width**2 / 12)
         laplacian = second.diagonal(dim1=2, dim2=3).sum(2)
         force = (scales.viscosity * laplacian - stress * torch.einsum("nijk,njk->ni", second, first)
-                 - settings.relaxation * rate * told.untold(velocity))
+                 - settings.relaxation * rate * untold)
         source = (torch.einsum("nij,nji->n", first, first) + stress * torch.einsum("nikj,njki->n", second, second)
                   - settings.solenoidal * rate * first.diagonal(dim1=1, dim2=2).sum(1))
         before = (self.stiffness * (context.everywhere.own_density - scales.density_mean)).to(first)
@@ -72,5 +72,5 @@ class FilteredEquations(Term):
             residual = (told.laplacian(pressure) + source) / told.laplacian_bound
             factor = 1 / middle if sweep == 0 else 1 / (middle - half**2 * factor / (2 if sweep == 1 else 4))
             change = factor * residual + (factor * middle - 1) * change
-            pressure = context.without_mean((pressure + change)[:, None])[:, 0]
-        return pressure
+            pressure = pressure + change
+        return context.without_mean(pressure[:, None])[:, 0]  # which no sweep looks at: a constant has no Laplacian

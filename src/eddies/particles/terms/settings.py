@@ -235,6 +235,5 @@ class FilteredEquations(TermSettings):
                                at_least=0)
     density: float = number("rate, over 2 u'/d, at which the density follows the pressure", default=3.5, at_least=0)
 
-    numbers_per_pair = 30
     reads = ("pairs", "density")
     gives = ("acceleration", "density_rate")
