@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from eddies.kernels.kriging import kriging_weights
+from eddies.kernels.kriging import MOST_NEIGHBORS, kriging_weights
 from eddies.particles.kriging import NOISE, Covariance, solved
 from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.periodic_box import PeriodicBox
@@ -37,6 +37,29 @@ def test_weights_are_those_of_torch(library, count, dtype):
             assert row.shape == of_row.shape and row.dtype == dtype
             # Alone a particle tells nothing but rounding.
             assert (row - of_row).norm() <= TOLERANCE[dtype] * (of_row.norm() + 1e-5)
+
+
+@pytest.mark.parametrize("dtype", TOLERANCE, ids=str)
+def test_of_one_with_too_many_neighbours_nothing_is_told(library, dtype):
+    """A crowd of more than there is memory for ends a run, and takes nothing from others."""
+    few, crowd = pairs(37, dtype), MOST_NEIGHBORS + 1
+    offsets = torch.cat([few.offsets, few.offsets[-1:] + crowd])
+    away = torch.from_numpy(np.random.default_rng(2).normal(0, 0.1, (crowd, 3))).to(dtype)
+    displacement = torch.cat([few.displacement, away])
+    covariance = Covariance.of_filtered_turbulence(WIDTH)
+
+    def told(offsets, displacement):
+        found = kriging_weights(library, offsets.numpy(), np.ascontiguousarray(displacement.T.numpy()), SUPPORT, NOISE,
+                                covariance.slowest, np.array(covariance.amplitudes))
+        by_torch = solved(offsets, displacement, SUPPORT, covariance)
+        return [[np.stack([torch.as_tensor(row).numpy() for row in part]) for part in way] for way in (found, by_torch)]
+
+    listed = int(few.offsets[-1])
+    for (own, others), (own_of_few, of_few) in zip(told(offsets, displacement), told(few.offsets, few.displacement)):
+        assert np.isnan(own[:, -1]).all() and np.isnan(others[:, listed:]).all()
+        # Lanes are shared out otherwise, so that sums of single precision may round otherwise.
+        assert np.allclose(own[:, :-1], own_of_few, rtol=1e-3, atol=1e-3)
+        assert np.allclose(others[:, :listed], of_few, rtol=1e-3, atol=1e-3)
 
 
 def test_arrays_of_another_kind_are_refused(library):

@@ -1,5 +1,7 @@
 """What terms ask for is built at first use and shared; what none asks for is not built."""
 
+import gc
+import weakref
 from dataclasses import dataclass
 
 import pytest
@@ -11,6 +13,7 @@ from eddies.particles import moments
 from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.rates import Rates
 from eddies.particles.resolved_velocity import ResolvedVelocity
+from eddies.particles.terms.presets import PRESETS
 from eddies.particles.terms.settings import TermSettings
 from eddies.particles.terms.term import PairTerm, Term, TermError
 from tests.particles.configurations import (
@@ -46,6 +49,29 @@ def test_terms_share_pairs_columns_and_the_resolved_velocity(comm, monkeypatch):
         dynamics.rates(particles, torch.arange(3))
     # Pairs before the density is known, and after.
     assert resolved.calls["of"] == 1 and sum(pairs.calls.values()) == 2
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("terms", [*MODELS.values(), PRESETS["local"]], ids=[*MODELS, "local"])
+def test_an_evaluation_leaves_nothing_behind(comm, monkeypatch, terms):
+    """Lists and weights are most of a run's memory: none waits for a collector."""
+    slab, particles = distributed(comm, *state())
+    dynamics, made = dynamics_of(slab, model(terms)), []
+    make = dynamics.context
+    monkeypatch.setattr(dynamics, "context", lambda *given, **named: keep(make(*given, **named)))
+
+    def keep(context):
+        made.append(weakref.ref(context))
+        return context
+
+    gc.collect()
+    gc.disable()
+    try:
+        with torch.no_grad():
+            dynamics.rates(particles)
+        assert len(made) == 1 and made[0]() is None
+    finally:
+        gc.enable()
 
 
 @pytest.mark.mpi(1, 2)

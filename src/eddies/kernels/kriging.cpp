@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <limits>
 #include <vector>
 
 #include "vectors.hpp"
@@ -31,6 +32,7 @@ using eddies::Vector;
 using Int = std::int64_t;
 
 constexpr int FUNCTIONALS = 10, SIDES = FUNCTIONALS + 1, MOST_SCALES = 8;
+constexpr Int MOST_NEIGHBORS = 1024;  // of a receiver: its equations are 64 MB then, in single precision
 // Rows and columns of the six second derivatives.
 constexpr int FIRST[6] = {0, 0, 0, 1, 1, 2}, SECOND[6] = {0, 1, 2, 1, 2, 2};
 
@@ -243,6 +245,17 @@ class Equations {
     eddies::Aligned<Real> places_, noise_, known_, rows_, inverse_;
 };
 
+// No weights, of a receiver with too many neighbours.
+template <typename Real>
+void leave_open(const Kriging& k, Int receiver) {
+    constexpr Real none = std::numeric_limits<Real>::quiet_NaN();
+    for (int f = 0; f < FUNCTIONALS; ++f) {
+        auto* weights = static_cast<Real*>(k.weights[f]);
+        static_cast<Real*>(k.own)[f * k.receivers + receiver] = none;
+        std::fill(weights + k.offsets[receiver], weights + k.offsets[receiver + 1], none);
+    }
+}
+
 template <typename Real>
 void solve(const Kriging& k) {
     constexpr int lanes = Equations<Real>::lanes;
@@ -252,14 +265,17 @@ void solve(const Kriging& k) {
     for (Int i = 0; i < k.receivers; ++i) order[i] = i;
     const auto neighbors = [&](Int i) { return k.offsets[i + 1] - k.offsets[i]; };
     std::stable_sort(order.begin(), order.end(), [&](Int a, Int b) { return neighbors(a) < neighbors(b); });
-    const Int most = k.receivers ? 1 + neighbors(order.back()) : 1, vectors = (k.receivers + lanes - 1) / lanes;
+    Int receivers = k.receivers;
+    for (; receivers > 0 && neighbors(order[receivers - 1]) > MOST_NEIGHBORS; --receivers)
+        leave_open<Real>(k, order[receivers - 1]);
+    const Int most = receivers ? 1 + neighbors(order[receivers - 1]) : 1, vectors = (receivers + lanes - 1) / lanes;
 #pragma omp parallel
     {
         Equations<Real> equations(most);
 #pragma omp for schedule(dynamic, 4)
         for (Int vector = 0; vector < vectors; ++vector) {
             const Int begin = vector * lanes;
-            equations.solve(k, covariance, order.data() + begin, static_cast<int>(std::min<Int>(lanes, k.receivers - begin)));
+            equations.solve(k, covariance, order.data() + begin, static_cast<int>(std::min<Int>(lanes, receivers - begin)));
         }
     }
 }

@@ -7,6 +7,8 @@ import ctypes
 import numpy as np
 
 MOST_SCALES = 8
+# Of a receiver; one with more has weights that are no numbers.
+MOST_NEIGHBORS = 1024
 
 
 class _Kriging(ctypes.Structure):
@@ -19,7 +21,8 @@ class _Kriging(ctypes.Structure):
 def kriging_weights(library: ctypes.CDLL, offsets: np.ndarray, displacement: np.ndarray, support: float, noise: float,
                     slowest: float, amplitudes: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
     """Weights of the receivers' own values, (10, n), and of their neighbours', ten of (m,), which are small enough for
-    memory that is kept: see `eddies.particles.kriging.solved`, which is the definition.
+    memory that is kept: see `eddies.particles.kriging.solved`, which is the definition. NaN where a receiver has more
+    than MOST_NEIGHBORS.
 
     Parameters
     ----------

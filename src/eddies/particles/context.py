@@ -92,11 +92,14 @@ class Context:
             raise TermError(UNSEEN)
         return self._neighborhood.local(self.particles)
 
-    @cached_property
+    @property
     def everywhere(self) -> Context:
         """The same where all owned particles are asked for."""
-        if self.rows is None:
-            return self
+        # Not cached: an object that holds itself stays until a collector comes by, with all lists and weights.
+        return self if self.rows is None else self._whole
+
+    @cached_property
+    def _whole(self) -> Context:
         whole = copy(self)
         whole.rows, whole._sums = None, {}
         vars(whole).pop("moments", None)
@@ -138,6 +141,10 @@ class Context:
     @cached_property
     def kriging(self) -> Kriging:
         """What neighbours tell of smooth fields at all owned particles; collective."""
+        return self.solve_kriging()
+
+    def solve_kriging(self) -> Kriging:
+        """The same, made anew."""
         from eddies.particles.kriging import Kriging
         local = self.local
         pairs = local.neighbors.pairs(local.position[: len(self.particles)].detach(), local.position.detach(),

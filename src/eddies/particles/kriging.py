@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from eddies.kernels.kriging import kriging_weights
+from eddies.kernels.kriging import MOST_NEIGHBORS, kriging_weights
 from eddies.kernels.library import library
 from eddies.particles.moments import ENTRIES
 from eddies.particles.pairs import Pairs
@@ -74,7 +74,8 @@ def weights(pairs: Pairs, support: float, covariance: Covariance) -> tuple[Tenso
     K^-1 1 what lets weights add up to nothing, so that a constant has no derivatives (ordinary kriging).
 
     Returns the particles' own weights (10, k) and the neighbours', ten of (m,), of the field itself, its first and
-    its second derivatives xx, xy, xz, yy, yz, zz.
+    its second derivatives xx, xy, xz, yy, yz, zz. They are NaN where equations cannot be solved, or there are more than
+    MOST_NEIGHBORS: what is wrong with one particle is for all ranks to say.
     """
     compiled = library() if pairs.displacement.device.type == "cpu" else None
     if compiled is not None:
@@ -87,10 +88,12 @@ def weights(pairs: Pairs, support: float, covariance: Covariance) -> tuple[Tenso
 def solved(offsets: Tensor, displacement: Tensor, support: float, covariance: Covariance) -> tuple[Tensor, Tensor]:
     """The same by torch, of displacements (m, 3) x_i - x_j of each particle's pairs: the definition."""
     count = len(offsets) - 1
-    own, found = displacement.new_empty((10, count)), displacement.new_empty((10, len(displacement)))
+    own, found = displacement.new_empty((10, count)), displacement.new_full((10, len(displacement)), torch.nan)
     for start in range(0, count, TOGETHER):
         edges = offsets[start : start + TOGETHER + 1]
         listed = edges[1:] - edges[:-1]
+        crowded = listed > MOST_NEIGHBORS
+        listed = torch.where(crowded, 0, listed)
         place = torch.arange(int(listed.max()) if len(listed) else 0, device=offsets.device)
         known = place < listed[:, None]
         pair = (edges[:-1, None] + place)[known]
@@ -103,7 +106,7 @@ def solved(offsets: Tensor, displacement: Tensor, support: float, covariance: Co
         solution = torch.cholesky_solve(right, factor)
         solution, ones = solution[..., :10], solution[..., 10:]
         solution = solution - ones * (solution.sum(1, keepdim=True) / ones.sum(1, keepdim=True))
-        own[:, start : start + len(listed)] = solution[:, 0].T
+        own[:, start : start + len(listed)] = solution[:, 0].T.masked_fill(crowded, torch.nan)
         found[:, pair] = solution[:, 1:][known[:, 1:]].T
     return own, found
 

@@ -82,6 +82,14 @@ def test_only_listed_pairs_are_kept():
     assert particle_bytes(replace(work, neighbors=1e4), SPEED, 1) == particle_bytes(work, SPEED, 1)
 
 
+def test_what_neighbours_tell_is_kept_with_their_list():
+    """Of each neighbour ten weights, a distance and three components, and three indices, at the least."""
+    work, listed = work_of(64, "local"), replace(SPEED, listed=True)
+    told = replace(listed, kriging=True)
+    apart = particle_bytes(work, told, 1) - particle_bytes(work, listed, 1)
+    assert apart >= (4 * 14 + 8 * 3) * work.particles * work.neighbors
+
+
 def test_growth_is_what_was_measured():
     assert [growth(TRANSFORM_GROWTH, cells) for cells in TRANSFORM_GROWTH] == list(TRANSFORM_GROWTH.values())
     assert growth(TRANSFORM_GROWTH, 20) == 1.0 < growth(TRANSFORM_GROWTH, 600) < growth(TRANSFORM_GROWTH, 2000)

@@ -33,11 +33,13 @@ PARTICLE_GROWTH = {14e3: 1.0, 33e3: 0.85, 110e3: 0.75, 262e3: 0.8, 885e3: 1.2}
 MIGRATION = 1.7
 # Memory of a rank: of a process with torch; of a grid point in single precision and of a particle, ghosts included,
 # from steps with 48^3 to 96^3 particles on one and two ranks; of a listed neighbour, with the compiled search and
-# without.
+# without; of a neighbour whose weights are known, in numbers and in indices: what lies between both, ten weights, and
+# what the search and their sums keep, as evaluations with 32^3 to 64^3 particles do.
 PROCESS_BYTES = 285e6
 POINT_BYTES = 160
 PARTICLE_BYTES = 800
 NEIGHBOR_BYTES = {True: 8, False: 32}
+WEIGHT_NUMBERS, WEIGHT_BYTES = 15, 32
 
 
 @dataclass(frozen=True)
@@ -168,10 +170,11 @@ def particle_bytes(work: ParticleWork, speed: ParticleSpeed, ranks: int) -> floa
     seen = work.own(ranks) + work.ghosts(ranks)
     points = work.cells**2 * work.planes(ranks) if work.wavenumber else 0
     size = PROCESS_BYTES + PARTICLE_BYTES * seen + POINT_BYTES * work.real / 4 * points
-    return size + (list_bytes(work, ranks) + speed.block_bytes if speed.listed and work.neighbors else 0.0)
+    return size + (list_bytes(work, speed, ranks) + speed.block_bytes if speed.listed and work.neighbors else 0.0)
 
 
-def list_bytes(work: ParticleWork, ranks: int) -> float:
-    """Memory of the list of neighbours, those within the skin included."""
+def list_bytes(work: ParticleWork, speed: ParticleSpeed, ranks: int) -> float:
+    """Memory of the list of neighbours, those within the skin included, and of what they tell."""
     listed = work.neighbors * (1 + work.skin / work.radius) ** 3
-    return NEIGHBOR_BYTES[library() is not None] * work.own(ranks) * listed
+    told = (WEIGHT_NUMBERS * work.real + WEIGHT_BYTES) * work.neighbors if speed.kriging else 0.0
+    return work.own(ranks) * (NEIGHBOR_BYTES[library() is not None] * listed + told)

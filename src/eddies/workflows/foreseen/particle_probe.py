@@ -68,6 +68,7 @@ class ParticleSpeed:
     calls, components : of transforms and splines in an evaluation, those of the iterations left out.
     ghost_columns : bytes of a ghost particle in each column that an evaluation sends.
     listed : whether some term's pairs are listed. block_bytes : what terms keep of the pairs that are taken together.
+    kriging : whether some term asks for what neighbours tell.
     """
 
     rates: dict[str, Rate]
@@ -76,6 +77,7 @@ class ParticleSpeed:
     ghost_columns: tuple[int, ...]
     listed: bool = False
     block_bytes: float = 0.0
+    kriging: bool = False
 
 
 class Watch:
@@ -173,6 +175,7 @@ class Probe:
 
     def _watched(self, context: Context) -> Context:
         self.watch.on(context, "sum_pairs", "pairs")
+        self.watch.on(context, "solve_kriging", "pairs", lambda: 0)
         return context
 
     def _watched_points(self, points: Points) -> Points:
@@ -225,7 +228,7 @@ class Probe:
         ghosts = (VECTOR, VECTOR, *self.columns) if self.dynamics.neighborhood else ()
         return ParticleSpeed(rates, {part: watch.calls[part] - 2 * iterations for part in SHARED},
                              {part: watch.components[part] - 6 * iterations for part in SHARED},
-                             ghosts, listed, self._block_bytes() if listed else 0.0)
+                             ghosts, listed, self._block_bytes() if listed else 0.0, watch.calls["pairs"] > 0)
 
     def _listed(self) -> bool:
         """Whether evaluations asked for the list of neighbours: where the compiled library knows what is summed, it is
