@@ -17,6 +17,7 @@ struct Kriging {
     const std::int64_t* offsets;    // (receivers + 1,)
     const void* displacement;       // (3, pairs), from a neighbour to its receiver
     double support, noise;          // the latter is that of a neighbour at the receiver's own place
+    std::int64_t most;              // neighbours of a receiver; one with more has weights that are no numbers
     std::int64_t scales;
     double slowest;                 // the covariance is sum_m amplitude_m exp(-slowest 2^m r^2), the widest first
     const double* amplitudes;       // (scales,)
@@ -32,7 +33,6 @@ using eddies::Vector;
 using Int = std::int64_t;
 
 constexpr int FUNCTIONALS = 10, SIDES = FUNCTIONALS + 1, MOST_SCALES = 8;
-constexpr Int MOST_NEIGHBORS = 1024;  // of a receiver: its equations are 64 MB then, in single precision
 // Rows and columns of the six second derivatives.
 constexpr int FIRST[6] = {0, 0, 0, 1, 1, 2}, SECOND[6] = {0, 1, 2, 1, 2, 2};
 
@@ -266,7 +266,7 @@ void solve(const Kriging& k) {
     const auto neighbors = [&](Int i) { return k.offsets[i + 1] - k.offsets[i]; };
     std::stable_sort(order.begin(), order.end(), [&](Int a, Int b) { return neighbors(a) < neighbors(b); });
     Int receivers = k.receivers;
-    for (; receivers > 0 && neighbors(order[receivers - 1]) > MOST_NEIGHBORS; --receivers)
+    for (; receivers > 0 && neighbors(order[receivers - 1]) > k.most; --receivers)
         leave_open<Real>(k, order[receivers - 1]);
     const Int most = receivers ? 1 + neighbors(order[receivers - 1]) : 1, vectors = (receivers + lanes - 1) / lanes;
 #pragma omp parallel

@@ -7,14 +7,14 @@ import ctypes
 import numpy as np
 
 MOST_SCALES = 8
-# Of a receiver; one with more has weights that are no numbers.
+# Of a receiver: its equations are 64 MB then, a vector of them in single precision.
 MOST_NEIGHBORS = 1024
 
 
 class _Kriging(ctypes.Structure):
     _fields_ = ([("receivers", ctypes.c_int64), ("pairs", ctypes.c_int64), ("offsets", ctypes.c_void_p),
                  ("displacement", ctypes.c_void_p), ("support", ctypes.c_double), ("noise", ctypes.c_double),
-                 ("scales", ctypes.c_int64), ("slowest", ctypes.c_double)]
+                 ("most", ctypes.c_int64), ("scales", ctypes.c_int64), ("slowest", ctypes.c_double)]
                 + [(name, ctypes.c_void_p) for name in ("amplitudes", "own", "weights")])
 
 
@@ -43,6 +43,6 @@ def kriging_weights(library: ctypes.CDLL, offsets: np.ndarray, displacement: np.
     own, weights = np.empty((10, len(offsets) - 1), dtype), [np.empty(pairs, dtype) for _ in range(10)]
     rows = np.array([row.ctypes.data for row in weights], np.uint64)
     given = _Kriging(len(offsets) - 1, pairs, offsets.ctypes.data, displacement.ctypes.data, support, noise,
-                     len(amplitudes), slowest, *(array.ctypes.data for array in (amplitudes, own, rows)))
+                    MOST_NEIGHBORS,  len(amplitudes), slowest, *(array.ctypes.data for array in (amplitudes, own, rows)))
     getattr(library, f"kriging_{dtype}")(ctypes.byref(given))
     return own, weights
