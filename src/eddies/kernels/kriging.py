@@ -43,6 +43,7 @@ def kriging_weights(library: ctypes.CDLL, offsets: np.ndarray, displacement: np.
     own, weights = np.empty((10, len(offsets) - 1), dtype), [np.empty(pairs, dtype) for _ in range(10)]
     rows = np.array([row.ctypes.data for row in weights], np.uint64)
     given = _Kriging(len(offsets) - 1, pairs, offsets.ctypes.data, displacement.ctypes.data, support, noise,
-                    MOST_NEIGHBORS,  len(amplitudes), slowest, *(array.ctypes.data for array in (amplitudes, own, rows)))
+                     MOST_NEIGHBORS, len(amplitudes), slowest,
+                     *(array.ctypes.data for array in (amplitudes, own, rows)))
     getattr(library, f"kriging_{dtype}")(ctypes.byref(given))
     return own, weights
