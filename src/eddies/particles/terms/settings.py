@@ -229,7 +229,7 @@ class FilteredEquations(TermSettings):
 
     sweeps: int = integer("of the pressure from neighbour to neighbour, each time that forces are asked for", default=8,
                           at_least=1, at_most=32)
-    relaxation: float = number("rate, over 2 u'/d, at which velocities relax to what neighbours tell", default=1.5,
+    relaxation: float = number("rate, over 2 u'/d, at which velocities relax to what neighbours tell", default=1.0,
                                at_least=0)
     solenoidal: float = number("rate, over 2 u'/d, at which the pressure takes out a divergence", default=3.5,
                                at_least=0)
