@@ -50,9 +50,7 @@ def _positive(values: np.ndarray) -> np.ndarray:
 
 def _errors_panel(axis: Axes, table: Mapping[str, np.ndarray]) -> None:
     delay = table["delay"]
-    axis.axhline(1, color=GUIDE, linestyle=":", linewidth=1.2)
-    axis.annotate("no model", (1, 1), xycoords=("axes fraction", "data"), xytext=(-2, 3),
-                  textcoords="offset points", ha="right", fontsize=9, color="#5a5a5a")
+    axis.axhline(1, color=GUIDE, linestyle=":", linewidth=1.2, label="no model")
     if delay.min() < 0:
         axis.axvspan(delay.min() - 0.03 * np.ptp(delay), 0, color="#eeeeee", zorder=0)
         axis.annotate("training", (delay.min(), 0.86), xycoords=("data", "axes fraction"), fontsize=9,
