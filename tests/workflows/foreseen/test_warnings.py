@@ -59,7 +59,7 @@ def test_a_flow_that_is_not_turbulent_is_told():
 
 
 def test_steps_that_relax_too_far_are_told():
-    """Runs of `hit` with C_r = 2 end in noise with velocity Verlet and steps of 0.05; those within limits are not told."""
+    """Runs of `hit` with C_r = 2 end in noise with velocity Verlet and steps of 0.05; none is told within limits."""
     changes = ["model.preset=local", "model.filtered-equations.relaxation=2"]
     for integrator, step, expected in (("verlet", 0.05, True), ("verlet", 0.01, False), ("rk3", 0.04, False)):
         lines = told(*changes, f"simulation.integrator={integrator}", f"simulation.step={step}", scene="hit")
