@@ -1,10 +1,11 @@
-"""Compiled weights of kriging against those of torch, for each instruction set that this processor runs."""
+"""Compiled weights of kriging, and what they tell, against torch and numpy, for each instruction set that this processor
+runs."""
 
 import numpy as np
 import pytest
 import torch
 
-from eddies.kernels.kriging import MOST_NEIGHBORS, kriging_weights
+from eddies.kernels.kriging import MOST_NEIGHBORS, kriging_weights, told
 from eddies.particles.kriging import NOISE, Covariance, solved
 from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.periodic_box import PeriodicBox
@@ -24,9 +25,10 @@ def pairs(count, dtype, seed=1):
 
 
 @pytest.mark.parametrize("dtype", TOLERANCE, ids=str)
-@pytest.mark.parametrize("count", [2, 37, 300])
-def test_weights_are_those_of_torch(library, count, dtype):
-    found_pairs, covariance = pairs(count, dtype), Covariance.of_filtered_turbulence(WIDTH)
+@pytest.mark.parametrize("count, width", [(2, WIDTH), (37, WIDTH), (300, WIDTH), (300, WIDTH / 2), (300, WIDTH / 30)])
+def test_weights_are_those_of_torch(library, count, width, dtype):
+    """Neighbours up to 1.2 filter widths away, where the widest Gaussian is told by its series alone, and farther."""
+    found_pairs, covariance = pairs(count, dtype), Covariance.of_filtered_turbulence(width)
     displacement = np.ascontiguousarray(found_pairs.displacement.T.numpy())
     found = kriging_weights(library, found_pairs.offsets.numpy(), displacement, SUPPORT, NOISE, covariance.slowest,
                             np.array(covariance.amplitudes))
@@ -69,3 +71,35 @@ def test_arrays_of_another_kind_are_refused(library):
             kriging_weights(library, offsets, displacement, SUPPORT, NOISE, 1.0, amplitudes)
     with pytest.raises(ValueError, match="at most 8"):
         kriging_weights(library, offsets, np.zeros((3, 2)), SUPPORT, NOISE, 1.0, np.ones(9))
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("rows", [1, 3, 10])
+def test_what_weights_tell_is_their_sum(library, rows, dtype):
+    """Of two fields, by receivers with no neighbour up to some vectors of them, one of which has weights that are no
+    numbers."""
+    random = np.random.default_rng(3)
+    counts = np.array([0, 1, 15, 16, 17, 33, 64, 7, 0])
+    offsets, seen = np.concatenate([[0], np.cumsum(counts)]), 40
+    receivers, senders = np.repeat(np.arange(9), counts), random.integers(0, seen, offsets[-1])
+    field = random.standard_normal((seen, 2)).astype(dtype)
+    own, weights = (list(random.standard_normal((rows, size)).astype(dtype)) for size in (9, len(senders)))
+    weights[-1][offsets[4] : offsets[5]] = np.nan
+    found = told(library, offsets, senders, own, weights, field)
+    assert found.shape == (9, 2, rows) and found.dtype == dtype
+    for row in range(rows):
+        expected = own[row][:, None].astype(float) * field[:9]
+        np.add.at(expected, receivers, weights[row][:, None].astype(float) * field[senders])
+        assert np.allclose(found[..., row], expected, rtol=0, atol=200 * np.finfo(dtype).eps, equal_nan=True)
+
+
+def test_weights_and_fields_that_do_not_fit_are_refused(library):
+    offsets, senders, field = np.array([0, 2]), np.array([1, 2]), np.zeros((3, 1))
+    own, weights = [np.zeros(1)], [np.zeros(2)]
+    for changed in ({"own": 2 * own, "weights": 2 * weights}, {"weights": []}, {"field": field.astype(np.float32)},
+                    {"field": np.zeros(3)}, {"field": np.zeros((3, 2))[:, ::2]}, {"senders": senders.astype(np.int32)},
+                    {"own": [np.zeros(3)[::2]]}, {"weights": [np.zeros(3)]}, {"offsets": np.array([0, 3])},
+                    {"field": np.zeros((0, 1))}):
+        arrays = {"offsets": offsets, "senders": senders, "own": own, "weights": weights, "field": field} | changed
+        with pytest.raises(ValueError, match="are needed, of the precision of the field"):
+            told(library, **arrays)

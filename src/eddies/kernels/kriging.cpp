@@ -1,5 +1,6 @@
 // Kriging: by which weights of what neighbours have a random field with a given covariance and an unknown mean, and its
-// derivatives, are told best at a point. Receivers are taken together, one in each lane of a vector.
+// derivatives, are told best at a point, and what they tell then. Equations of receivers are solved together, one in each
+// lane of a vector.
 
 #include <algorithm>
 #include <cmath>
@@ -25,6 +26,16 @@ struct Kriging {
     void* const* weights;           // ten of (pairs,)
 };
 
+// Some rows of these weights, and fields that they are applied to.
+struct Told {
+    std::int64_t receivers, rows, columns;
+    const std::int64_t *offsets, *senders;
+    const void* const* own;         // rows of (receivers,)
+    const void* const* weights;     // rows of (pairs,)
+    const void* field;              // (seen, columns), receivers first
+    void* result;                   // (receivers, columns, rows)
+};
+
 }  // extern "C"
 
 namespace {
@@ -41,11 +52,22 @@ inline Vector<Real> all(Real number) {
     return Vector<Real>{} + number;
 }
 
-// exp(-x) of 0 <= x: 2^-n times a polynomial, to some last places of single or double precision; 0 from where that has
-// no normal numbers.
+// sum_k (-x)^k / k! up to k = terms.
+template <int terms, typename Real>
+inline Vector<Real> series_of_exp_minus(Vector<Real> x) {
+    Real coefficient = 1;
+    for (int k = 1; k <= terms; ++k) coefficient /= -k;
+    Vector<Real> sum = all<Real>(coefficient);
+    for (int k = terms; k > 0; --k) sum = sum * x + (coefficient *= -k);
+    return sum;
+}
+
+// exp(-x) of 0 <= x, to some last places of single or double precision: the series where x is small, else 2^-n times that
+// of what remains, and 0 from where that has no normal numbers.
 template <typename Real>
 inline Vector<Real> exp_minus(Vector<Real> x) {
     constexpr bool single = sizeof(Real) == 4;
+    if (!eddies::bits(x > all<Real>(Real(0.75)))) return series_of_exp_minus<single ? 9 : 17, Real>(x);
     constexpr Real most = single ? 87 : 708, shift = single ? Real(12582912) : Real(6755399441055744);
     const auto beyond = x > all<Real>(most);
     x = beyond ? all<Real>(most) : x;
@@ -53,14 +75,10 @@ inline Vector<Real> exp_minus(Vector<Real> x) {
     // What remains, of at most ln 2 / 2; ln 2 in two parts, of which the first has few digits.
     constexpr Real high = single ? Real(0.693359375) : Real(0.693147180369123816490);
     constexpr Real low = single ? Real(-2.12194440e-4) : Real(1.90821492927058770002e-10);
-    const Vector<Real> y = (-x - n * high) - n * low;
-    constexpr int terms = single ? 7 : 13;
-    Vector<Real> sum = all<Real>(1);
-    for (int k = terms; k > 0; --k) sum = 1 + sum * y * (Real(1) / Real(k));
+    const Vector<Real> found = series_of_exp_minus<single ? 7 : 13, Real>((x + n * high) + n * low);
     using Bits = eddies::BitVector<Real>;
     const Bits power = __builtin_convertvector(n, Bits) << (single ? 23 : 52);
-    const Vector<Real> found = (Vector<Real>)((Bits)sum + power);
-    return beyond ? Vector<Real>{} : found;
+    return beyond ? Vector<Real>{} : (Vector<Real>)((Bits)found + power);
 }
 
 // The covariance as a function of r^2, and its first and second derivative by r^2.
@@ -113,6 +131,8 @@ class Equations {
 
    private:
     using V = Vector<Real>;
+    // Of a tile, whose entries, a row and a number of the other side are in registers: 32 of them, or 16.
+    static constexpr int TALL = eddies::VECTOR_BYTES == 64 ? 6 : 4, WIDE = eddies::VECTOR_BYTES == 64 ? 4 : 3;
 
     V& place(Int j, int axis) { return eddies::vector_at(places_.data() + (3 * j + axis) * lanes); }
     V& noise(Int j) { return eddies::vector_at(noise_.data() + j * lanes); }
@@ -156,7 +176,7 @@ class Equations {
     void fill(const Covariance<Real>& covariance) {
         for (Int i = 0; i < size_; ++i) {
             V* entries = row(i);
-            for (Int j = 0; j < i; ++j) entries[j] = covariance(square(i, j)) * known(i) * known(j);
+            for (Int j = 0; j < i; ++j) entries[j] = covariance(square(i, j)) * known(i);  // then j is known as well
             entries[i] = (covariance(V{}) + noise(i)) * known(i) + (1 - known(i));
             V first, second;
             covariance.derivatives(square(i, 0), first, second);
@@ -171,30 +191,50 @@ class Equations {
         }
     }
 
-    // The factor L of the matrix L L^T in place, and L^-1 b in place of right-hand sides b: four rows at a time against
-    // those above.
+    // The factor L of the matrix L L^T in place, and L^-1 b in place of right-hand sides b: some rows at a time against
+    // those above, in tiles of which a register holds each entry.
     void factorise() {
         const Int all_rows = size_ + SIDES;
-        for (Int begin = 0; begin < all_rows; begin += 4) {
-            V* some[4];
-            const int count = static_cast<int>(std::min<Int>(4, all_rows - begin));
-            for (int r = 0; r < 4; ++r) some[r] = row(begin + std::min(r, count - 1));
+        for (Int begin = 0; begin < all_rows; begin += TALL) {
+            V* some[TALL];
+            const int count = static_cast<int>(std::min<Int>(TALL, all_rows - begin));
+            for (int r = 0; r < TALL; ++r) some[r] = row(begin + std::min(r, count - 1));
             const Int above = std::min(begin, size_);
-            for (Int j = 0; j < above; ++j) {
-                const V* given = row(j);
-                V sum[4] = {some[0][j], some[1][j], some[2][j], some[3][j]};
-                for (Int k = 0; k < j; ++k)
-                    for (int r = 0; r < 4; ++r) sum[r] -= some[r][k] * given[k];
-                for (int r = 0; r < count; ++r) some[r][j] = sum[r] * inverse(j);
-            }
-            for (int r = 0; r < count; ++r)  // what four rows of the matrix have below each other
-                for (Int j = above; j < size_ && j <= begin + r; ++j) {
-                    V sum = some[r][j];
-                    for (Int k = 0; k < j; ++k) sum -= some[r][k] * row(j)[k];
-                    if (j == begin + r) inverse(j) = 1 / root(sum);
-                    else some[r][j] = sum * inverse(j);
-                }
+            Int j = 0;
+            for (; j + WIDE <= above; j += WIDE) tile(some, count, j);
+            for (; j < size_ && j < begin + count; ++j) column(some, count, begin, j);
         }
+    }
+
+    void tile(V* const* some, int count, Int first) {
+        const V* given[WIDE];
+        V sum[TALL][WIDE];
+        for (int c = 0; c < WIDE; ++c) {
+            given[c] = row(first + c);
+            for (int r = 0; r < TALL; ++r) sum[r][c] = some[r][first + c];
+        }
+        for (Int k = 0; k < first; ++k)
+            for (int r = 0; r < TALL; ++r)
+                for (int c = 0; c < WIDE; ++c) sum[r][c] -= some[r][k] * given[c][k];
+        for (int c = 0; c < WIDE; ++c)
+            for (int r = 0; r < TALL; ++r) {
+                for (int before = 0; before < c; ++before) sum[r][c] -= sum[r][before] * given[c][first + before];
+                sum[r][c] *= inverse(first + c);
+            }
+        for (int r = 0; r < count; ++r)
+            for (int c = 0; c < WIDE; ++c) some[r][first + c] = sum[r][c];
+    }
+
+    // One column of rows from `begin` on, of which one may end there, on its diagonal.
+    void column(V* const* some, int count, Int begin, Int j) {
+        const V* given = row(j);
+        V sum[TALL];
+        for (int r = 0; r < TALL; ++r) sum[r] = some[r][j];
+        for (Int k = 0; k < j; ++k)
+            for (int r = 0; r < TALL; ++r) sum[r] -= some[r][k] * given[k];
+        if (j >= begin) inverse(j) = 1 / root(sum[j - begin]);
+        for (int r = 0; r < count; ++r)
+            if (begin + r > j) some[r][j] = sum[r] * inverse(j);
     }
 
     static V root(V square) {
@@ -202,16 +242,41 @@ class Equations {
         return square;
     }
 
+    // L^-T of the right-hand sides, some columns at a time from the last on.
     void substitute_back() {
-        V* found[SIDES];
-        for (int f = 0; f < SIDES; ++f) found[f] = row(size_ + f);
-        for (Int k = size_ - 1; k >= 0; --k) {
-            const V* given = row(k);
-            V last[SIDES];
-            for (int f = 0; f < SIDES; ++f) last[f] = found[f][k] *= inverse(k);
-            for (Int j = 0; j < k; ++j)
-                for (int f = 0; f < SIDES; ++f) found[f][j] -= given[j] * last[f];
+        for (Int end = size_; end > 0; end -= WIDE) {
+            const Int begin = std::max<Int>(end - WIDE, 0);
+            for (int f = 0; f < SIDES; ++f) {
+                V* found = row(size_ + f);
+                for (Int k = end - 1; k >= begin; --k) {
+                    const V last = found[k] *= inverse(k);
+                    for (Int j = begin; j < k; ++j) found[j] -= row(k)[j] * last;
+                }
+            }
+            if (begin == 0) break;  // and only this one may have fewer columns
+            int f = 0;
+            for (; f + TALL <= SIDES; f += TALL) take_off<TALL>(f, begin);
+            take_off<SIDES % TALL>(f, begin);
         }
+    }
+
+    // Columns from `begin` on, which are known, off those before.
+    template <int COUNT>
+    void take_off(int f, Int begin) {
+        V* found[COUNT];
+        const V* given[WIDE];
+        V last[COUNT][WIDE];
+        for (int c = 0; c < WIDE; ++c) given[c] = row(begin + c);
+        for (int r = 0; r < COUNT; ++r) {
+            found[r] = row(size_ + f + r);
+            for (int c = 0; c < WIDE; ++c) last[r][c] = found[r][begin + c];
+        }
+        for (Int j = 0; j < begin; ++j)
+            for (int r = 0; r < COUNT; ++r) {
+                V sum = found[r][j];
+                for (int c = 0; c < WIDE; ++c) sum -= given[c][j] * last[r][c];
+                found[r][j] = sum;
+            }
     }
 
     // The mean is not known: less of K^-1 1 what lets the weights of each add up to nothing.
@@ -280,11 +345,64 @@ void solve(const Kriging& k) {
     }
 }
 
+template <typename Real>
+inline Real sum_of_lanes(Vector<Real> numbers) {
+    constexpr int lanes = eddies::VectorOf<Real>::lanes;
+    for (int apart = lanes / 2; apart > 0; apart /= 2) {
+        eddies::BitVector<Real> other;
+        for (int lane = 0; lane < lanes; ++lane) other[lane] = lane ^ apart;
+        numbers += __builtin_shuffle(numbers, other);
+    }
+    return numbers[0];
+}
+
+template <typename Real, int ROWS>
+void tell(const Told& t) {
+    constexpr int lanes = eddies::VectorOf<Real>::lanes;
+    const auto* field = static_cast<const Real*>(t.field);
+    const Real *own[ROWS], *weights[ROWS];
+    for (int r = 0; r < ROWS; ++r) {
+        own[r] = static_cast<const Real*>(t.own[r]);
+        weights[r] = static_cast<const Real*>(t.weights[r]);
+    }
+#pragma omp parallel for schedule(static)
+    for (Int i = 0; i < t.receivers; ++i)
+        for (Int c = 0; c < t.columns; ++c) {
+            Vector<Real> sums[ROWS] = {};
+            Real rest[ROWS];
+            for (int r = 0; r < ROWS; ++r) rest[r] = own[r][i] * field[i * t.columns + c];
+            Int pair = t.offsets[i];
+            const Int end = t.offsets[i + 1];
+            for (; pair + lanes <= end; pair += lanes) {
+                Vector<Real> sent;
+                for (int lane = 0; lane < lanes; ++lane) sent[lane] = field[t.senders[pair + lane] * t.columns + c];
+                for (int r = 0; r < ROWS; ++r) sums[r] += eddies::unaligned(weights[r] + pair) * sent;
+            }
+            for (; pair < end; ++pair) {
+                const Real sent = field[t.senders[pair] * t.columns + c];
+                for (int r = 0; r < ROWS; ++r) rest[r] += weights[r][pair] * sent;
+            }
+            Real* result = static_cast<Real*>(t.result) + (i * t.columns + c) * ROWS;
+            for (int r = 0; r < ROWS; ++r) result[r] = rest[r] + sum_of_lanes<Real>(sums[r]);
+        }
+}
+
+// All weights, those of a gradient, or those of one functional.
+template <typename Real>
+void tell(const Told& t) {
+    if (t.rows == FUNCTIONALS) tell<Real, FUNCTIONALS>(t);
+    else if (t.rows == 3) tell<Real, 3>(t);
+    else tell<Real, 1>(t);
+}
+
 }  // namespace
 
 extern "C" {
 
 void kriging_float32(const Kriging* k) { solve<float>(*k); }
 void kriging_float64(const Kriging* k) { solve<double>(*k); }
+
+void told_float32(const Told* t) { tell<float>(*t); }
+void told_float64(const Told* t) { tell<double>(*t); }
 
 }  // extern "C"

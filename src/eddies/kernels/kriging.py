@@ -1,8 +1,9 @@
-"""Weights of kriging by the compiled library."""
+"""Weights of kriging, and what they tell, by the compiled library."""
 
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -16,6 +17,11 @@ class _Kriging(ctypes.Structure):
                  ("displacement", ctypes.c_void_p), ("support", ctypes.c_double), ("noise", ctypes.c_double),
                  ("most", ctypes.c_int64), ("scales", ctypes.c_int64), ("slowest", ctypes.c_double)]
                 + [(name, ctypes.c_void_p) for name in ("amplitudes", "own", "weights")])
+
+
+class _Told(ctypes.Structure):
+    _fields_ = ([(name, ctypes.c_int64) for name in ("receivers", "rows", "columns")]
+                + [(name, ctypes.c_void_p) for name in ("offsets", "senders", "own", "weights", "field", "result")])
 
 
 def kriging_weights(library: ctypes.CDLL, offsets: np.ndarray, displacement: np.ndarray, support: float, noise: float,
@@ -47,3 +53,32 @@ def kriging_weights(library: ctypes.CDLL, offsets: np.ndarray, displacement: np.
                      *(array.ctypes.data for array in (amplitudes, own, rows)))
     getattr(library, f"kriging_{dtype}")(ctypes.byref(given))
     return own, weights
+
+
+def told(library: ctypes.CDLL, offsets: np.ndarray, senders: np.ndarray, own: Sequence[np.ndarray],
+         weights: Sequence[np.ndarray], field: np.ndarray) -> np.ndarray:
+    """own_i f_i + sum_j weights_ij f_j by one, three or ten rows of weights, (n, c, rows).
+
+    Parameters
+    ----------
+    offsets, senders : int64 (n + 1,) and (m,), each receiver's pairs, and who sends.
+    own, weights : rows of (n,) and of (m,), contiguous, of the precision of the field.
+    field : (s, c), contiguous, of single or double precision, the receivers first.
+
+    Raises ValueError for arrays of another kind.
+    """
+    receivers, rows, dtype = len(offsets) - 1, len(own), field.dtype
+    if (rows not in (1, 3, 10) or len(weights) != rows or dtype not in (np.float32, np.float64) or field.ndim != 2
+            or len(field) < receivers or offsets[-1] != len(senders)
+            or any(array.dtype != np.int64 or not array.flags.c_contiguous for array in (offsets, senders))
+            or any(array.dtype != dtype or not array.flags.c_contiguous for array in (field, *own, *weights))
+            or any(row.shape != (receivers,) for row in own) or any(row.shape != senders.shape for row in weights)):
+        raise ValueError(f"told: 1, 3 or 10 contiguous rows of weights of {receivers} receivers and {len(senders)} pairs "
+                         f"are needed, of the precision of the field; found {rows} and {len(weights)}, and a field "
+                         f"{dtype} {field.shape}")
+    result = np.empty((receivers, field.shape[1], rows), dtype)
+    places = [np.array([row.ctypes.data for row in some], np.uint64) for some in (own, weights)]
+    given = _Told(receivers, rows, field.shape[1], *(array.ctypes.data for array in (offsets, senders, *places, field,
+                                                                                       result)))
+    getattr(library, f"told_{dtype}")(ctypes.byref(given))
+    return result

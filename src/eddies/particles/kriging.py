@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from eddies.kernels.kriging import MOST_NEIGHBORS, kriging_weights
+from eddies.kernels.kriging import MOST_NEIGHBORS, kriging_weights, told
 from eddies.kernels.library import library
 from eddies.particles.moments import ENTRIES
 from eddies.particles.pairs import Pairs
@@ -147,37 +147,42 @@ class Kriging:
     def derivatives(self, field: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Fields (n, c) less what the neighbours alone tell of them, nothing where there are none, and their first
         (n, c, 3) and second (n, c, 3, 3) derivatives."""
-        seen = self._with_ghosts(field.to(self._own))
-        found = torch.stack([self._applied(row, seen) for row in range(SECOND.stop)], -1)
+        found = self._told(self._own, self._others, field)
         # The own weight is the inverse of a variance, 1/12 or more with one neighbour, and nothing alone.
         untold = found[..., OWN] / self._own[OWN, :, None].clamp_min(LEAST_WEIGHT)
         return untold, found[..., FIRST], found[..., SECOND][..., PLACES]
 
     def gradient(self, field: Tensor) -> Tensor:
         """(n, 3) of a field (n,)."""
-        seen = self._with_ghosts(field.to(self._own)).unsqueeze(1)
-        return torch.cat([self._applied(row, seen) for row in range(FIRST.start, FIRST.stop)], 1)
+        return self._told(self._own[FIRST], self._others[FIRST], field[:, None])[:, 0]
 
     def laplacian(self, field: Tensor) -> Tensor:
         """(n,) of a field (n,)."""
-        own, matrix = self._laplacian
-        seen = self._with_ghosts(field.to(own))
-        return own * seen[: len(own)] + (matrix @ seen.unsqueeze(1)).squeeze(1)
+        own, others = self._laplacian
+        return self._told(own[None], [others], field[:, None])[:, 0, 0]
 
     @cached_property
     def laplacian_bound(self) -> Tensor:
         """The sum of its weights' sizes, (n,), some hundred over d^2; 1/d^2 for a particle alone, which has none."""
-        own, matrix = self._laplacian
-        sizes = own.abs() + torch.segment_reduce(matrix.values().abs(), "sum", offsets=self._offsets)
+        own, others = self._laplacian
+        sizes = own.abs() + torch.segment_reduce(others.abs(), "sum", offsets=self._offsets)
         return sizes.clamp_min(self._filter_width**-2)
 
     @cached_property
     def _laplacian(self) -> tuple[Tensor, Tensor]:
-        rows = [SECOND.start + PLACES[axis][axis] for axis in range(3)]
-        return self._own[rows].sum(0), self._matrix(torch.stack([self._others[row] for row in rows]).sum(0))
+        xx, yy, zz = (SECOND.start + PLACES[axis][axis] for axis in range(3))
+        return (self._own[xx] + self._own[yy] + self._own[zz],
+                self._others[xx] + self._others[yy] + self._others[zz])
 
-    def _applied(self, row: int, seen: Tensor) -> Tensor:
-        return self._own[row, :, None] * seen[: self._own.shape[1]] + self._matrix(self._others[row]) @ seen
+    def _told(self, own: Tensor, others: Sequence[Tensor], field: Tensor) -> Tensor:
+        """What rows of weights tell of fields (n, c), (n, c, rows)."""
+        seen = self._with_ghosts(field.to(own))
+        compiled = library() if seen.device.type == "cpu" else None
+        if compiled is None or torch.is_grad_enabled() and seen.requires_grad:
+            return torch.stack([of_own[:, None] * seen[: len(of_own)] + self._matrix(of_others) @ seen
+                                for of_own, of_others in zip(own, others)], -1)
+        return torch.from_numpy(told(compiled, self._offsets.numpy(), self._senders.numpy(), own.numpy(),
+                                     [row.numpy() for row in others], seen.detach().contiguous().numpy()))
 
     def _matrix(self, values: Tensor) -> Tensor:
         with warnings.catch_warnings():  # of torch, that such matrices may change
