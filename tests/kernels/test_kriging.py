@@ -1,5 +1,5 @@
-"""Compiled weights of kriging, and what they tell, against torch and numpy, for each instruction set that this processor
-runs."""
+"""Compiled weights of kriging, and what they tell, against torch and numpy, for each instruction set that this
+processor runs."""
 
 import numpy as np
 import pytest

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from eddies.particles.context import Surroundings
 from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.terms.presets import PRESETS
 from tests.particles.configurations import MODELS, Field, by_id, distributed, dynamics_of, model, of_terms, state
@@ -52,14 +53,16 @@ def observed_order(name, force, slab, particles, total, duration, steps):
 
 
 @pytest.mark.mpi(1)
-@pytest.mark.parametrize("name, order", [("verlet", 1.9), ("rk2", 1.9), ("rk3", 2.9), ("rk4", 3.8)])
+@pytest.mark.parametrize("name, order", [("verlet", 1.9), ("corrected-verlet", 1.9), ("rk2", 1.9), ("rk3", 2.9),
+                                         ("rk4", 3.8)])
 def test_order_with_a_force_that_depends_on_velocity(comm, name, order):
     slab, particles = distributed(comm, *state(20))
     assert observed_order(name, DRAG, slab, particles, total=20, duration=1.0, steps=20) > order
 
 
 @pytest.mark.mpi(1)
-@pytest.mark.parametrize("name, order", [("verlet", 1.9), ("rk2", 1.9), ("rk3", 2.8), ("rk4", 2.8)])
+@pytest.mark.parametrize("name, order", [("verlet", 1.9), ("corrected-verlet", 1.9), ("rk2", 1.9), ("rk3", 2.8),
+                                         ("rk4", 2.8)])
 def test_order_with_the_pair_model_and_its_density(comm, name, order):
     """The second derivative of a pair's weight jumps at the cutoff, which limits the order to three; where particles
     have hardly a neighbour each one that enters shows, and the order is not seen at steps like these."""
@@ -71,10 +74,12 @@ def test_order_with_the_pair_model_and_its_density(comm, name, order):
 
 
 @pytest.mark.mpi(1)
-@pytest.mark.parametrize("name, evaluations, more", [("verlet", 11, 2), ("rk2", 20, 1), ("rk3", 30, 1), ("rk4", 40, 1)])
+@pytest.mark.parametrize("name, evaluations, more", [("verlet", 11, 2), ("corrected-verlet", 21, 0), ("rk2", 20, 1),
+                                                     ("rk3", 30, 1), ("rk4", 40, 1)])
 def test_how_often_the_rates_are_evaluated(comm, name, evaluations, more):
     """In ten steps, and where the rates are asked for after five and ten of them: the next step does not evaluate those
-    of a Runge-Kutta scheme again. What Verlet keeps belongs to another velocity, and still serves the next step."""
+    of a Runge-Kutta scheme again, and a corrected Verlet step knows them. What the plain one keeps belongs to another
+    velocity, and still serves the next step."""
     slab, particles = distributed(comm, *state(20))
     calls = []
 
@@ -125,7 +130,7 @@ def assert_rates_between_steps(comm, name, terms, strayed):
 
 
 @pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("name", ["verlet", "rk3"])
+@pytest.mark.parametrize("name", ["verlet", "corrected-verlet", "rk3"])
 @pytest.mark.parametrize("terms", ["paper", "pressure", "resolved", "without density"])
 def test_a_run_goes_on_bitwise_from_a_checkpoint(comm, name, terms):
     """Of particles, memory, and the state of the dynamics; also where terms give the density, and where there is
@@ -166,6 +171,24 @@ def test_verlet_does_not_use_its_memory_for_other_particles(comm):
     again = stepper.step(particles, 0.01)
     assert torch.equal(torch.argsort(again.id), torch.argsort(first.id))
     assert torch.equal(again.velocity, first.velocity)
+
+
+@pytest.mark.mpi(1, 2)
+def test_weights_are_solved_for_once_where_particles_stay(comm, monkeypatch):
+    """By a corrected Verlet step, which evaluates rates twice at its end, and anew after a checkpoint."""
+    position = 2 * np.pi * np.random.default_rng(4).random((300, 3))
+    columns = position, np.sin(position[:, [1, 2, 0]]), np.ones(300)
+    slab, particles = distributed(comm, *map(torch.from_numpy, columns))
+    dynamics = dynamics_of(slab, model({"filtered-equations": {}}), 0.0)
+    solved, solve = [], Surroundings.solve_kriging
+    monkeypatch.setattr(Surroundings, "solve_kriging", lambda around: solved.append(around.position) or solve(around))
+    particles = run("corrected-verlet", dynamics, particles, 0.03, 3)
+    assert dynamics.evaluations == 7 and len(solved) == 4  # the first at the start
+    with torch.no_grad():
+        again = dynamics.rates(particles).acceleration
+        assert len(solved) == 4
+        dynamics.forget()
+        assert torch.equal(dynamics.rates(particles).acceleration, again) and len(solved) == 5
 
 
 @pytest.mark.mpi(1, 2)

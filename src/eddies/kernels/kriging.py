@@ -73,12 +73,12 @@ def told(library: ctypes.CDLL, offsets: np.ndarray, senders: np.ndarray, own: Se
             or any(array.dtype != np.int64 or not array.flags.c_contiguous for array in (offsets, senders))
             or any(array.dtype != dtype or not array.flags.c_contiguous for array in (field, *own, *weights))
             or any(row.shape != (receivers,) for row in own) or any(row.shape != senders.shape for row in weights)):
-        raise ValueError(f"told: 1, 3 or 10 contiguous rows of weights of {receivers} receivers and {len(senders)} pairs "
-                         f"are needed, of the precision of the field; found {rows} and {len(weights)}, and a field "
-                         f"{dtype} {field.shape}")
+        raise ValueError(f"told: 1, 3 or 10 contiguous rows of weights of {receivers} receivers and {len(senders)} "
+                         f"pairs are needed, of the precision of the field; found {rows} and {len(weights)}, and a "
+                         f"field {dtype} {field.shape}")
     result = np.empty((receivers, field.shape[1], rows), dtype)
     places = [np.array([row.ctypes.data for row in some], np.uint64) for some in (own, weights)]
-    given = _Told(receivers, rows, field.shape[1], *(array.ctypes.data for array in (offsets, senders, *places, field,
-                                                                                       result)))
+    given = _Told(receivers, rows, field.shape[1],
+                  *(array.ctypes.data for array in (offsets, senders, *places, field, result)))
     getattr(library, f"told_{dtype}")(ctypes.byref(given))
     return result

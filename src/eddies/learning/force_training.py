@@ -91,7 +91,7 @@ class TrainingFrame:
             if found is None or found.cutoff < kernel.support * (1 - 1e-9):  # the model has no list, or a shorter one
                 found = Neighborhood(self.decomposition, self.decomposition.length, kernel.support, 0.0)
                 found.update(self.particles)
-            position = found.local(self.particles).position
+            position = found.local(self.particles.position).position
             pairs = found.neighbors.pairs(position[: len(self.particles)], position, dtype=self.acceleration.dtype)
             self._within = KernelNeighborhood(kernel, found, position, found.column(volumes(kernel, pairs)))
         return self._within

@@ -51,6 +51,43 @@ class PairSum(Protocol):
     def pair_values(self, pairs: ScaledPairs) -> Tensor: ...
 
 
+class Surroundings:
+    """What the places of particles tell, whatever their velocities: evaluations at the same places share it.
+
+    Parameters
+    ----------
+    position : (n, 3) of the owned particles. neighborhood : halo and neighbour list that fit them.
+    flow : units of the model. dtype : of the pair arithmetic.
+    """
+
+    def __init__(self, position: Tensor, neighborhood: Neighborhood, flow: FlowUnits, dtype: torch.dtype) -> None:
+        self.position, self.neighborhood, self.flow, self.dtype = position, neighborhood, flow, dtype
+        self.recorded = torch.is_grad_enabled() and position.requires_grad
+
+    def fit(self, position: Tensor) -> bool:
+        """Whether they are those of these very positions, with a gradient if one is being recorded."""
+        return self.position is position and self.recorded == (torch.is_grad_enabled() and position.requires_grad)
+
+    @cached_property
+    def local(self) -> LocalParticles:
+        """The particles that this rank sees, ghosts included, without columns; collective."""
+        return self.neighborhood.local(self.position)
+
+    @cached_property
+    def kriging(self) -> Kriging:
+        """What neighbours tell of smooth fields at all owned particles; collective."""
+        return self.solve_kriging()
+
+    def solve_kriging(self) -> Kriging:
+        """The same, made anew."""
+        from eddies.particles.kriging import Kriging
+        local = self.local
+        pairs = local.neighbors.pairs(local.position[: len(self.position)].detach(), local.position.detach(),
+                                      dtype=self.dtype)
+        return Kriging(pairs, len(local.position), self.flow.cutoff, self.flow.scales.filter_width,
+                       self.neighborhood.column)
+
+
 @dataclass(frozen=True)
 class Moments:
     """Moments of the particles' neighbourhoods: inverse (6, k), of sum_j w x x^T, and weight (1, k), sum_j w."""
@@ -67,7 +104,7 @@ class Context:
     decomposition : slabs, with the communicator.
     particles : the owned ones.
     flow : units of the model.
-    neighborhood : halo and neighbour list that fit the particles; None where no term looks at others.
+    surroundings : of the particles; None where no term looks at others.
     resolution : what resolves the particles' velocity; None where no term reads it.
     rows : (k,), the particles whose acceleration and density rate are asked for; None: all.
     dtype : of the pair arithmetic; None: that of the positions.
@@ -76,21 +113,31 @@ class Context:
     """
 
     def __init__(self, decomposition: SlabDecomposition, particles: ParticleSet, flow: FlowUnits,
-                 neighborhood: Neighborhood | None, resolution: ResolvedVelocity | None, rows: Tensor | None = None,
+                 surroundings: Surroundings | None, resolution: ResolvedVelocity | None, rows: Tensor | None = None,
                  dtype: torch.dtype | None = None, density: Tensor | None = None, time: float | None = None) -> None:
         self.decomposition, self.comm = decomposition, decomposition.comm
         self.particles, self.flow, self.rows, self.density = particles, flow, rows, density
         self.dtype = dtype or particles.position.dtype
-        self._neighborhood, self._resolution, self._time = neighborhood, resolution, time
+        self._surroundings, self._resolution, self._time = surroundings, resolution, time
         self._columns: dict[str, Tensor] = {}
         self._sums: dict[PairSum, Tensor] = {}
 
-    @cached_property
-    def local(self) -> LocalParticles:
-        """The particles that this rank sees, ghosts included, without columns."""
-        if self._neighborhood is None:
+    @property
+    def surroundings(self) -> Surroundings:
+        """What the places of the particles tell."""
+        if self._surroundings is None:
             raise TermError(UNSEEN)
-        return self._neighborhood.local(self.particles)
+        return self._surroundings
+
+    @property
+    def local(self) -> LocalParticles:
+        """The particles that this rank sees, ghosts included, without columns; collective."""
+        return self.surroundings.local
+
+    @property
+    def kriging(self) -> Kriging:
+        """What neighbours tell of smooth fields at all owned particles; collective."""
+        return self.surroundings.kriging
 
     @property
     def everywhere(self) -> Context:
@@ -107,14 +154,13 @@ class Context:
 
     def column(self, name: str) -> Tensor:
         """"velocity" (s, 3) or "density" (s,) of the particles that this rank sees, owned first; collective."""
-        if self._neighborhood is None:
-            raise TermError(UNSEEN)
+        around = self.surroundings.neighborhood
         if name not in self._columns:
             owned = self.density if name == "density" else getattr(self.particles, name)
             if owned is None:
                 raise TermError(f'no term of this model reads "{name}": add it to the `reads` of the settings; or the '
                                 "particles have none")
-            self._columns[name] = self._neighborhood.column(owned)
+            self._columns[name] = around.column(owned)
         return self._columns[name]
 
     @property
@@ -137,20 +183,6 @@ class Context:
         if self._resolution is None:
             raise TermError('no term of this model reads "resolved": add it to the `reads` of the settings')
         return self._resolution.of(self.particles, self._time)
-
-    @cached_property
-    def kriging(self) -> Kriging:
-        """What neighbours tell of smooth fields at all owned particles; collective."""
-        return self.solve_kriging()
-
-    def solve_kriging(self) -> Kriging:
-        """The same, made anew."""
-        from eddies.particles.kriging import Kriging
-        local = self.local
-        pairs = local.neighbors.pairs(local.position[: len(self.particles)].detach(), local.position.detach(),
-                                      dtype=self.dtype)
-        return Kriging(pairs, len(local.position), self.flow.cutoff, self.flow.scales.filter_width,
-                       local.neighborhood.column)
 
     def without_mean(self, rows: Tensor) -> Tensor:
         """Rows (n, c) of the owned particles less their mean over all particles of all ranks; collective."""

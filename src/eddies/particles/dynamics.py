@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from eddies.parallel.slab import SlabDecomposition
-from eddies.particles.context import Context
+from eddies.particles.context import Context, Surroundings
 from eddies.particles.model import LagrangianModel, LinearRates
 from eddies.particles.neighborhood import Neighborhood, at_home, farthest_outside
 from eddies.particles.particle_set import ParticleSet
@@ -46,6 +46,7 @@ class ParticleDynamics:
         self.box, self.time, self.evaluations = PeriodicBox(decomposition.length), 0.0, 0
         self.resolution: ResolvedVelocity | None = None
         self.neighborhood: Neighborhood | None = None
+        self._surroundings: Surroundings | None = None
         if "resolved" in model.reads:
             from eddies.particles import resolved_velocity  # pyfftw, where a transform is needed
             self.resolution = resolved_velocity.ResolvedVelocity.on_slabs(decomposition, model.flow, skin / 2 + drift,
@@ -58,6 +59,7 @@ class ParticleDynamics:
 
         A run that does so wherever it writes a checkpoint goes on bit for bit as one that starts from it.
         """
+        self._surroundings = None
         if self.neighborhood is not None:
             self.neighborhood.forget()
 
@@ -68,7 +70,7 @@ class ParticleDynamics:
     def rebuild(self, particles: ParticleSet, built_at: Tensor) -> None:
         """Have halo and list as they were built for these particles at other positions (n, 3); collective."""
         if self.neighborhood is not None:
-            self.neighborhood.forget()
+            self.forget()
             self.neighborhood.update(replace(particles, position=built_at))
 
     def begin(self) -> None:
@@ -145,7 +147,10 @@ class ParticleDynamics:
         """What terms are evaluated in at these particles; collective."""
         if self.neighborhood is not None:
             self.neighborhood.update(particles)
+            if self._surroundings is None or not self._surroundings.fit(particles.position):
+                self._surroundings = Surroundings(particles.position, self.neighborhood, self.model.flow,
+                                                  self.dtype or particles.position.dtype)
         if density is None and not self.model.density_is_given:
             density = particles.density
-        return Context(self.decomposition, particles, self.model.flow, self.neighborhood, self.resolution, rows,
+        return Context(self.decomposition, particles, self.model.flow, self._surroundings, self.resolution, rows,
                        self.dtype, density, time)

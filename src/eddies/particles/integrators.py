@@ -1,4 +1,4 @@
-"""Time steps of particles: velocity Verlet, and Runge-Kutta of second, third and fourth order."""
+"""Time steps of particles: velocity Verlet, plain and corrected, and Runge-Kutta of second, third and fourth order."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ from eddies.particles.rates import BY_PARTICLE, Rates
 class Integrator:
     """A time stepping scheme; `memory` is what it carries from one step to the next besides the particles and the
     state of the dynamics, with rows as in the particles last returned; `restore` gives it back. `dense`: whether
-    `rates` are those at the ends of steps, so that what is between can be told from them."""
+    `rates` are those at the ends of steps, so that what is between can be told from them, and the next step begins with
+    them where somebody has asked for them."""
 
-    dense = False
+    dense = True
 
     def __init__(self, dynamics: ParticleDynamics) -> None:
         self.dynamics = dynamics
@@ -30,7 +31,11 @@ class Integrator:
 
     def rates(self, particles: ParticleSet) -> tuple[ParticleSet, Rates]:
         """Particles between two steps, on the ranks of their slabs, and their rates; collective."""
-        raise NotImplementedError
+        if particles is not self._last or not self.memory:
+            particles, _ = self.dynamics.settle(particles)
+            rates = self.dynamics.rates_after(0.0, particles)
+            self.restore(particles, _remembered(rates))
+        return particles, Rates(**self.memory)
 
     def step(self, particles: ParticleSet, time_step: float) -> ParticleSet:
         """The particles one time step later; collective."""
@@ -48,25 +53,41 @@ class VelocityVerlet(Integrator):
     `memory` holds those rates. They are evaluated anew for any other particles than those last returned.
     """
 
+    dense = False
+
     def rates(self, particles: ParticleSet) -> tuple[ParticleSet, Rates]:
-        # Those of the memory belong to the predicted velocity, so they are not these.
+        """Evaluated for themselves: those of the memory belong to the predicted velocity."""
         if particles is not self._last:  # else they are where they belong, and the memory is theirs
             particles, _ = self.dynamics.settle(particles)
         return particles, self.dynamics.rates(particles, time=self.dynamics.time)
 
     def step(self, particles: ParticleSet, time_step: float) -> ParticleSet:
+        """The particles one time step later; collective."""
         if particles is self._last and self.memory:
             start = Rates(**self.memory)
         else:
             particles, _ = self.dynamics.settle(particles)
             start = self.dynamics.rates_after(0.0, particles)
-        position = particles.position + time_step * (_pace(particles, start) + 0.5 * time_step * start.velocity_rate)
-        predicted = replace(_kicked(particles, start, time_step), position=position)
-        kicked = _kicked(particles, start, 0.5 * time_step)
-        columns = {name: column for name, column in kicked.columns().items() if name not in ("id", "position")}
-        predicted, columns = self.dynamics.settle(predicted, columns)
-        end = self.dynamics.rates_after(time_step, predicted)
-        result = _kicked(replace(predicted, **columns), end, 0.5 * time_step)
+        result, end = _kick_drift_kick(self.dynamics, particles, start, time_step)
+        self.dynamics.time += time_step
+        self.restore(result, _remembered(end))
+        return result
+
+
+class CorrectedVerlet(Integrator):
+    """Velocity Verlet of which the rates at the end are evaluated again at the velocity and density that it has come
+    to, for the next step (Besold et al. 2000, DPD-VV).
+
+    Both evaluations are at the same places, so that what depends on these alone, lists and weights of neighbours,
+    serves both. For rates that depend on velocity alone it is Heun's method of second order, stable up to twice the
+    step of velocity Verlet. `memory` holds the rates at the particles last returned.
+    """
+
+    def step(self, particles: ParticleSet, time_step: float) -> ParticleSet:
+        """The particles one time step later; collective."""
+        particles, start = self.rates(particles)
+        result, _ = _kick_drift_kick(self.dynamics, particles, start, time_step)
+        end = self.dynamics.rates_after(time_step, result)
         self.dynamics.time += time_step
         self.restore(result, _remembered(end))
         return result
@@ -82,21 +103,12 @@ class RungeKutta(Integrator):
     nodes, weights : c and b.
 
     Particles change rank between stages. `memory` holds the rates at the particles last returned where `rates` was
-    asked for them: the next step does not evaluate them again.
+    asked for them.
     """
-
-    dense = True
 
     def __init__(self, dynamics: ParticleDynamics, nodes: Sequence[float], weights: Sequence[float]) -> None:
         super().__init__(dynamics)
         self.nodes, self.weights = nodes, weights
-
-    def rates(self, particles: ParticleSet) -> tuple[ParticleSet, Rates]:
-        if particles is not self._last or not self.memory:
-            particles, _ = self.dynamics.settle(particles)
-            rates = self.dynamics.rates_after(0.0, particles)
-            self.restore(particles, _remembered(rates))
-        return particles, Rates(**self.memory)
 
     def step(self, particles: ParticleSet, time_step: float) -> ParticleSet:
         stage, rates = self.rates(particles)
@@ -126,12 +138,25 @@ class RungeKutta(Integrator):
 REMEMBERED = (*BY_PARTICLE, "density")
 INTEGRATORS = {
     "verlet": VelocityVerlet,
+    "corrected-verlet": CorrectedVerlet,
     "rk2": partial(RungeKutta, nodes=(0, 1 / 2), weights=(0, 1)),
     # Heun's scheme of third order: its stages are a third of a step apart, which suits a solve that starts from what
     # the stages before foresee.
     "rk3": partial(RungeKutta, nodes=(0, 1 / 3, 2 / 3), weights=(1 / 4, 0, 3 / 4)),
     "rk4": partial(RungeKutta, nodes=(0, 1 / 2, 1 / 2, 1), weights=(1 / 6, 1 / 3, 1 / 3, 1 / 6)),
 }
+
+
+def _kick_drift_kick(dynamics: ParticleDynamics, particles: ParticleSet, start: Rates,
+                     time_step: float) -> tuple[ParticleSet, Rates]:
+    """Particles a step later, and the rates at their predicted velocity and density there; collective."""
+    position = particles.position + time_step * (_pace(particles, start) + 0.5 * time_step * start.velocity_rate)
+    predicted = replace(_kicked(particles, start, time_step), position=position)
+    kicked = _kicked(particles, start, 0.5 * time_step)
+    columns = {name: column for name, column in kicked.columns().items() if name not in ("id", "position")}
+    predicted, columns = dynamics.settle(predicted, columns)
+    end = dynamics.rates_after(time_step, predicted)
+    return _kicked(replace(predicted, **columns), end, 0.5 * time_step), end
 
 
 def _remembered(rates: Rates) -> dict[str, Tensor]:

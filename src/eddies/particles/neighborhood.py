@@ -112,10 +112,10 @@ class Neighborhood:
             self._seen = None
         return self._neighbors
 
-    def local(self, particles: ParticleSet) -> LocalParticles:
-        """Positions with ghosts, as of now."""
+    def local(self, position: Tensor) -> LocalParticles:
+        """Positions (n, 3) of the owned particles with ghosts, as of now."""
         # Stored component by component, as the gathering of pairs wants it.
-        position = self._with_ghosts(particles.position, exchange_ghost_positions).T.contiguous().T
+        position = self._with_ghosts(position, exchange_ghost_positions).T.contiguous().T
         return LocalParticles(position, self, self.halo, self.box)
 
     def column(self, owned: Tensor) -> Tensor:

@@ -162,7 +162,8 @@ class Horizons(Section):
                                        default=(1, 2, 4, 8), at_least=1)
     steps: int = integer("optimiser steps through each number of frames", at_least=1)
     time_step: float | None = number("of the simulation; absent: the interval of frames", default=None, above=0)
-    integrator: str = choice("time stepping of the simulation", "verlet", "rk2", "rk3", "rk4", default="verlet")
+    integrator: str = choice("time stepping of the simulation", "verlet", "corrected-verlet", "rk2", "rk3", "rk4",
+                             default="verlet")
     learning_rate: float = number("of the optimiser, at the start of each number of frames", default=1e-3, above=0)
     energy_weight: float = number("weight of the energies by bands of wavenumbers in the loss", default=0.1, at_least=0)
 
@@ -203,7 +204,8 @@ class Simulation(Section):
     """The run of the particles, without the direct simulation."""
 
     method: str = named("what moves the particles; see Baselines", *METHODS, default="learned")
-    integrator: str = choice("time stepping of the particles", "verlet", "rk2", "rk3", "rk4", default="rk3")
+    integrator: str = choice("time stepping of the particles", "verlet", "corrected-verlet", "rk2", "rk3", "rk4",
+                             default="rk3")
     step: float = number("longest time step; see docs/closure.md", above=0)
     turnovers: float = number("large-eddy turnovers to simulate", above=0)
     start: float | None = number("as a fraction of the ground truth; absent: where the training window ends, or at the "

@@ -76,7 +76,7 @@ def particle_cost(work: ParticleWork, speed: ParticleSpeed, ranks: int, threads:
     parts = {part: calls[part] * speed.rates[part].call
              + units[part] * speed.rates[part].unit / (threads if part in THREADED else 1) for part in PARTS}
     parts["messages"] = (transpose_seconds(work, speed, network) + ghost_plane_seconds(work, speed, network)
-                         + halo_seconds(work, speed, network) + settling_seconds(work, network)
+                         + halo_seconds(work, speed, network) + settling_seconds(work, network) / work.together
                          + sum_seconds(work, network))
     return ParticleCost(ranks, threads, network.nodes, particle_bytes(work, speed, ranks), parts)
 

@@ -89,9 +89,9 @@ class Watch:
 
     def reset(self) -> None:
         """Begin anew."""
-        self.seconds: Counter[str] = Counter()
-        self.calls: Counter[str] = Counter()
-        self.components: Counter[str] = Counter()
+        self.seconds: dict[str, float] = Counter()
+        self.calls: dict[str, float] = Counter()
+        self.components: dict[str, float] = Counter()
         self._last = time.perf_counter()
 
     def switch(self) -> None:
@@ -175,7 +175,8 @@ class Probe:
 
     def _watched(self, context: Context) -> Context:
         self.watch.on(context, "sum_pairs", "pairs")
-        self.watch.on(context, "solve_kriging", "pairs", lambda: 0)
+        if self.dynamics.neighborhood is not None:
+            self.watch.on(context.surroundings, "solve_kriging", "pairs", lambda: 0)
         return context
 
     def _watched_points(self, points: Points) -> Points:
@@ -185,17 +186,23 @@ class Probe:
 
     @torch.no_grad()
     def evaluate(self, number: int) -> None:
-        """Evaluate the rates with halo and list made anew, a moment after the evaluation before, and settle."""
-        self.watch.reset()
-        self.columns.clear()
+        """Evaluate the rates with halo and list made anew, a moment after the evaluation before, as often as at the
+        same places, and settle; what is watched is that of one evaluation."""
+        watch, together = self.watch, self.work.together
+        watch.reset()
         self.dynamics.forget()
-        self.dynamics.rates_after(1e-6 * number, self.particles)
-        self.watch.switch()
-        companions = {f"{name} {copy}": column for copy in range(2 if self.work.evaluations > 1 else 0)
+        for _ in range(together):
+            self.columns.clear()
+            self.dynamics.rates_after(1e-6 * number, self.particles)
+        watch.switch()
+        companions = {f"{name} {copy}": column for copy in range(2 if self.work.evaluations > together else 0)
                       for name, column in self.particles.columns().items() if name != "id"}
         began = time.perf_counter()
         at_home(self.slab, {**self.particles.columns(), **companions}, self.reach)
-        self.watch.seconds["settling"] = time.perf_counter() - began
+        watch.seconds["settling"] = time.perf_counter() - began
+        for watched in (watch.seconds, watch.calls, watch.components):
+            for part in watched:
+                watched[part] /= together
 
     def seconds(self) -> dict[str, float]:
         """The least over evaluations, as others on the machine may disturb some; the first plans and fills tables."""

@@ -9,10 +9,10 @@ from eddies.particles.reference_scales import ALLOWED_ANGLES
 from eddies.scene.scene import BOX_LENGTH, Scene
 from eddies.workflows.foreseen.cost_model import busiest_planes
 from eddies.workflows.foreseen.estimates import expected_turbulence, resolved_shells
-from eddies.workflows.foreseen.rollout_course import EVALUATIONS, rollout_step
+from eddies.workflows.foreseen.rollout_course import AT_THE_SAME_PLACES, EVALUATIONS, rollout_step
 
 # Of a solve that starts from what is foreseen, at about the longest steps that the flow allows: docs/closure.md.
-ITERATIONS = {"verlet": 1.0, "rk2": 1.2, "rk3": 3.0, "rk4": 6.5}
+ITERATIONS = {"verlet": 1.0, "corrected-verlet": 1.0, "rk2": 1.2, "rk3": 3.0, "rk4": 6.5}
 # Sums over ranks: of an iteration; of the rest of an evaluation with the built-in terms; of a settling.
 SUMS_OF_ITERATION, SUMS_OF_EVALUATION, SUMS_OF_SETTLING = 2, 11, 5
 VECTOR = 24                  # bytes of a vector of a particle
@@ -27,8 +27,9 @@ class ParticleWork:
     wavenumber : highest of the resolved velocity, along each axis; 0 of a model without it.
     neighbors, radius : of pairs; 0 without them. skin : by which the halo is wider.
     iterations : of the solve.
-    drift : rms distance by which particles move along z from one evaluation to the next.
-    evaluations : in a step. real : bytes of a number of grid and pairs. density : whether it is a state of its own.
+    drift : rms distance by which particles move along z from one place to the next.
+    evaluations : in a step. together : of these, at the same places.
+    real : bytes of a number of grid and pairs. density : whether it is a state of its own.
     """
 
     particles: int
@@ -40,6 +41,7 @@ class ParticleWork:
     iterations: float = 0.0
     drift: float = 0.0
     evaluations: int = 1
+    together: int = 1
     real: int = 4
     density: bool = False
 
@@ -104,8 +106,8 @@ class ParticleWork:
     @property
     def companions(self) -> tuple[float, float]:
         """Vectors and densities that settle beside the particles of a stage: of position and velocity at the start and
-        at the end of a step, but for its first stage; with one evaluation a step velocities alone."""
-        if self.evaluations == 1:
+        at the end of a step, but for its first stage; where particles move once a step velocities alone."""
+        if self.evaluations == self.together:
             return 1, self.density
         later = (self.evaluations - 1) / self.evaluations
         return 4 * later, 2 * later * self.density
@@ -134,6 +136,7 @@ def particle_work(scene: Scene) -> ParticleWork:
     turbulence = expected_turbulence(scene)
     resolved, paired, highest = scene.resolves, "pairs" in model.reads, resolved_shells(scene)
     evaluations, radius = EVALUATIONS[settings.integrator], scene.interaction_radius
+    together = AT_THE_SAME_PLACES.get(settings.integrator, 1)
     # As far as the flow may carry a particle through the highest wave, where nothing is known of it.
     way = ALLOWED_ANGLES[settings.integrator] / highest
     if turbulence:
@@ -143,4 +146,5 @@ def particle_work(scene: Scene) -> ParticleWork:
         highest if resolved else 0,
         scene.neighbors if paired else 0.0, radius if paired else 0.0,
         settings.skin * radius if paired or resolved else 0.0, ITERATIONS[settings.integrator] if resolved else 0.0,
-        way / evaluations, evaluations, 4 if settings.precision == "float32" else 8, "density_rate" in model.gives)
+        way * together / evaluations, evaluations, together, 4 if settings.precision == "float32" else 8,
+        "density_rate" in model.gives)

@@ -11,7 +11,8 @@ from eddies.scene.methods import METHODS
 from eddies.scene.scene import BOX_LENGTH, Eulerian, Scene
 from eddies.workflows.foreseen.estimates import expected_turbulence, foreseen_allowed_step, peak_speed
 
-EVALUATIONS = {"verlet": 1, "rk2": 2, "rk3": 3, "rk4": 4}  # in a step
+EVALUATIONS = {"verlet": 1, "corrected-verlet": 2, "rk2": 2, "rk3": 3, "rk4": 4}  # in a step
+AT_THE_SAME_PLACES = {"corrected-verlet": 2}  # of these, where others move particles for each
 
 
 @dataclass(frozen=True)
