@@ -1,4 +1,4 @@
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -14,12 +14,14 @@ from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.rates import Rates
 from eddies.particles.smoothing_kernels import WendlandC2
+from eddies.particles.terms.settings import TermSettings
 from eddies.particles.terms.stress import Stress
+from eddies.particles.terms.term import Term
 from eddies.report.learning import LOSSES
 from tests.learning.models import LENGTH, PER_SIDE, SPACING, Recorder, model_of, slope
 
 SUPPORT = 2.2 * SPACING
-ALL = LossWeights(1.0, 0.1, 0.1)
+ALL = LossWeights(1.0, 0.1, 0.1, 2.0)
 PRESETS = ["learned-density", "paper", "resolved + pairs", "resolved"]
 # The density that the pairs read is that of pressure and stress, and a part of it is learned.
 THROUGH_DENSITY = ("pressure", f"{__name__}:AmplifiedStress", "pairs")
@@ -38,16 +40,37 @@ class AmplifiedStress(Stress):
                      pressure_modes=self.amplitude * rates.pressure_modes)
 
 
-def frame_of(comm, model):
-    """Particles in a smooth flow whose acceleration is a pressure gradient and a drag; without a density where the
-    model does not integrate one."""
+@dataclass(frozen=True, kw_only=True)
+class ReadsNothing(TermSettings):
+    """Settings of an acceleration that looks at each particle alone."""
+
+
+class BlurredDrag(Term):
+    """-rate times a velocity that is told wrongly: with something beside it that has nothing to do with it."""
+
+    Settings = ReadsNothing
+    linear = True
+
+    def __init__(self, settings, flow):
+        super().__init__(settings, flow)
+        self.rate = torch.nn.Parameter(torch.zeros((), dtype=torch.float64))
+
+    def forward(self, context):
+        particles = context.particles
+        beside = torch.cos(9 * particles.position.roll(1, dims=1) + particles.position)
+        return Rates(acceleration=-self.rate * (particles.velocity + beside))
+
+
+def frame_of(comm, model, wind=0.0):
+    """Particles in a smooth flow whose acceleration is a pressure gradient and a drag, all of them moving with a wind
+    as well; without a density where the model does not integrate one."""
     slab = SlabDecomposition(comm, LENGTH, PER_SIDE)
     columns = release(slab, 3, PER_SIDE, "random")
     x, y, z = columns["position"].T
     velocity = np.stack([np.sin(y) + 0.4 * np.cos(z), np.sin(z), np.sin(x)], axis=1)
     density = 1 + 0.01 * np.cos(x) * np.cos(y)
     acceleration = np.stack([np.sin(x) * np.cos(y), np.cos(x) * np.sin(y), 0 * z], axis=1) - 0.3 * velocity
-    particles = ParticleSet.from_numpy({**columns, "velocity": velocity, "density": density})
+    particles = ParticleSet.from_numpy({**columns, "velocity": velocity + wind, "density": density})
     rate = torch.from_numpy(0.02 * np.sin(y))
     if not model.integrates_density:
         particles, rate = replace(particles, density=None), None
@@ -164,6 +187,27 @@ def test_training_lowers_the_error_of_a_learnable_force(comm):
     assert np.mean(losses[-20:]) < 0.15 * losses[0]
 
 
+@pytest.mark.mpi(1, 2)
+def test_with_a_loss_of_the_power_what_is_told_wrongly_still_takes_the_right_energy_out(comm):
+    """Where a drag of rate 0.3 is fitted to a velocity that is told with an error, what fits the acceleration best
+    takes too little energy out."""
+    rates = {}
+    for power in (0.0, 1e4):
+        trainer = trainer_of(comm, (f"{__name__}:BlurredDrag",), LossWeights(power=power), batch=10**6)
+        optimizer = Adam(comm, trainer.model.parameters(), 300, 3e-2, 1e-4)
+        rows = [trainer.trajectory_step(optimizer, step) for step in range(300)]
+        assert (power > 0) == ("power_loss" in rows[-1])
+        rates[power] = float(trainer.model.terms["BlurredDrag"].rate.detach())
+    told = 1 / (1 + 0.5 / (0.5 + 0.16 / 6))  # the variance of a component over that of what is told of it
+    assert rates[0.0] == pytest.approx(0.3 * told, rel=0.1)
+    assert rates[1e4] == pytest.approx(0.3, rel=0.03)
+    # The error of a step holds both losses; the velocity of all particles together does not count.
+    frame = trainer.frames[0]
+    assert trainer.one_step_error(frame, 10**6) == pytest.approx(rows[-1]["loss"] ** 0.5, rel=0.05)
+    windy = frame_of(comm, trainer.model, wind=7.0)
+    assert torch.allclose(windy.fluctuation, frame.fluctuation, rtol=0, atol=1e-12)
+
+
 @pytest.mark.mpi(1)
 def test_a_model_without_networks_trains(comm):
     trainer = trainer_of(comm, "resolved", LossWeights(), batch=10**6)
@@ -251,7 +295,7 @@ def test_of_learned_rates_of_density_only_the_paper_s_counts_in_single_frames(co
 def test_every_loss_has_a_name_that_the_learning_curves_know(comm):
     trainer = trainer_of(comm)
     row = trainer.combined_step(Adam(comm, trainer.model.parameters(), 1, 1e-2, 1e-2), 0)
-    names = {"loss", "trajectory_loss", "field_loss", "velocity_kl_loss", "acceleration_kl_loss"}
+    names = {"loss", "trajectory_loss", "field_loss", "velocity_kl_loss", "acceleration_kl_loss", "power_loss"}
     assert set(row) == names | {"gradient_norm"} and names <= {name for name, *_ in LOSSES}
     weighted = row["trajectory_loss"] + sum(weight * row[f"{name}_loss"]
                                             for name, weight in vars(trainer.weights).items())
@@ -260,7 +304,7 @@ def test_every_loss_has_a_name_that_the_learning_curves_know(comm):
 
 @pytest.mark.mpi(1, 2)
 def test_losses_without_weight_are_not_computed(comm, monkeypatch):
-    for name in ("_field_share", "_divergence"):
+    for name in ("_field_share", "_divergence", "_power_share"):
         monkeypatch.setattr(ForceTrainer, name, lambda *args: pytest.fail("an unused loss was computed"))
     rows = []
     for kind in ("trajectory_step", "combined_step"):

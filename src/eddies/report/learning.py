@@ -13,7 +13,7 @@ LOSSES = (
     ("loss", "total", DNS), ("trajectory_loss", "trajectory $L_t$", MODEL),
     ("field_loss", "field $L_f$", TRUTH), ("velocity_kl_loss", "velocity KL", SECOND),
     ("acceleration_kl_loss", "acceleration KL", FOURTH), ("rollout_loss", "velocity over the horizon", THIRD),
-    ("energy_loss", "energy over the horizon", "#56B4E9"),
+    ("energy_loss", "energy over the horizon", "#56B4E9"), ("power_loss", "power", "#8c564b"),
 )
 # Single steps see a small batch: their mean over this share of a phase's steps is drawn over them.
 SMOOTHED = 0.04

@@ -190,6 +190,8 @@ class Training(Section):
     field_weight: float = number("weight of the field loss beside the trajectory loss", default=0.0, at_least=0)
     velocity_kl_weight: float = number("weight of the divergence of velocity PDFs", default=0.0, at_least=0)
     acceleration_kl_weight: float = number("the same for acceleration PDFs", default=0.0, at_least=0)
+    power_weight: float = number("weight of the loss of the power, of all steps: what the force does to the energy, "
+                                 "in units of u'^3 over the filter width", default=0.0, at_least=0)
     combined_steps: int = integer("steps at the end that use every loss", default=0, at_least=0)
     horizons: Horizons | None = section(Horizons, default=None)
 

@@ -193,7 +193,8 @@ def _of_model(scene: Scene, alone: Comm, side: int, number: int) -> dict[str, tu
         support = scene.kernel_support * scene.tracers.particles_per_side / side
         with torch.no_grad():
             kernel = KernelNetwork(support, scene.kernel.hidden, scene.kernel.cutoff).to(torch.float32).table()
-    weights = LossWeights(settings.field_weight, settings.velocity_kl_weight, settings.acceleration_kl_weight)
+    weights = LossWeights(settings.field_weight, settings.velocity_kl_weight, settings.acceleration_kl_weight,
+                          settings.power_weight)
     batch = max(min(settings.batch, LEAST_SIDE**3) // (4 if number == 0 else 1), 1)
     trainer = ForceTrainer(model, [frame], kernel, weights, batch, scene.seed)
     optimizer = Adam(alone, model.parameters(), 2 * (1 + REPEATS), 1e-6, 1e-6)

@@ -10,7 +10,6 @@ import torch
 
 from eddies.clock import ProgressLine
 from eddies.learning.force_training import ForceTrainer, LossWeights, TrainingFrame
-from eddies.learning.losses import relative_error
 from eddies.learning.rollout_training import RolloutTrainer, TrainingWindow
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.integrators import INTEGRATORS
@@ -65,7 +64,8 @@ class TrainingData:
     def force_trainer(self, kernel: SmoothingKernel | None) -> ForceTrainer:
         """What trains the model on single frames."""
         settings = self.settings
-        weights = LossWeights(settings.field_weight, settings.velocity_kl_weight, settings.acceleration_kl_weight)
+        weights = LossWeights(settings.field_weight, settings.velocity_kl_weight, settings.acceleration_kl_weight,
+                              settings.power_weight)
         return ForceTrainer(self.model, self.frames, kernel, weights, settings.batch, self.scene.seed)
 
     def validation_frame(self) -> TrainingFrame:
@@ -121,12 +121,3 @@ def model_of(scene: Scene, truth: GroundTruth, device: torch.device,
     if like is not None:
         model.share_parameters(like)
     return model.forced(truth.forcing)
-
-
-@torch.no_grad()
-def acceleration_error(trainer: ForceTrainer, frame: TrainingFrame) -> float:
-    """Normalised L2 error of the acceleration on a fixed sample of the particles of a frame; collective."""
-    total = trainer.total
-    ids = np.random.default_rng(trainer.seed).choice(total, min(VALIDATION_PARTICLES, total), replace=False)
-    rows = frame.rows(ids)
-    return relative_error(trainer.comm, frame.errors(rows)["acceleration"], frame.acceleration[rows])

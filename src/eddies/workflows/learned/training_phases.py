@@ -14,7 +14,7 @@ from eddies.learning.training import Phase
 from eddies.particles.feature_range import FeatureRange, pair_features
 from eddies.particles.smoothing_kernels import SmoothingKernel
 from eddies.scene.scene import Scene
-from eddies.workflows.learned.training_data import COMBINED_DRAWS, TrainingData, acceleration_error
+from eddies.workflows.learned.training_data import COMBINED_DRAWS, VALIDATION_PARTICLES, TrainingData
 
 # How many validations a phase has.
 VALIDATIONS, HORIZON_VALIDATIONS = 25, 4
@@ -41,7 +41,8 @@ def one_step_phases(scene: Scene, data: Sequence[TrainingData], kernel: Smoothin
                      _mean(error, trainers, held_out), max(steps // VALIDATIONS, 1))
 
     phases = [phase("one step", alone, (settings.learning_rate, between),
-                    lambda trainer, optimizer, step: trainer.trajectory_step(optimizer, step), acceleration_error),
+                    lambda trainer, optimizer, step: trainer.trajectory_step(optimizer, step),
+                    lambda trainer, frame: trainer.one_step_error(frame, VALIDATION_PARTICLES)),
               phase("all losses", settings.combined_steps, (between, settings.final_learning_rate),
                     lambda trainer, optimizer, step: trainer.combined_step(optimizer, step),
                     lambda trainer, frame: trainer.combined_error(frame, COMBINED_DRAWS))]
