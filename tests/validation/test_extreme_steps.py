@@ -51,9 +51,11 @@ def spring(frequency=0.0, drag=0.0):
 
 def amplification(integrator, system, z):
     """Spectral radius of one step: "oscillator" x'' = -x, "drag" v' = -v, "sound" y' = iy, at the step z."""
-    if integrator.startswith("rk"):
-        z = -z if system == "drag" else 1j * z
-        return abs(sum(z**n / math.factorial(n) for n in range(int(integrator[2:]) + 1)))
+    # Where no rate depends on positions, corrected Verlet is Heun's method of second order.
+    corrected = integrator == "corrected-verlet" and system != "oscillator"
+    if corrected or integrator.startswith("rk"):
+        z, order = -z if system == "drag" else 1j * z, 2 if corrected else int(integrator[2:])
+        return abs(sum(z**n / math.factorial(n) for n in range(order + 1)))
     if system == "oscillator":  # positions and forces leapfrog
         return max(abs(np.linalg.eigvals([[1 - z**2 / 2, z], [-z + z**3 / 4, 1 - z**2 / 2]])))
     # The rate at the velocity (or density) predicted by Euler's rule, averaged with the last one so obtained: that is

@@ -11,7 +11,7 @@ from eddies.errors import UserError
 # turbulence ends; and the least that the filter may leave of a mode, as it is undone. Measured in docs/closure.md.
 BEYOND_NYQUIST, BEYOND_DISSIPATION, LEAST_TRANSFER = 1.5, 1.05, 0.02
 # k_c u' times a step, by integrator, up to which the resolved velocity follows the flow: docs/closure.md.
-ALLOWED_ANGLES = {"verlet": 0.5, "corrected-verlet": 1.2, "rk2": 1.2, "rk3": 1.2, "rk4": 1.6}
+ALLOWED_ANGLES = {"verlet": 0.5, "corrected-verlet": 0.5, "rk2": 1.2, "rk3": 1.2, "rk4": 1.6}
 MAY_VANISH = ("viscosity", "kolmogorov_length")
 
 
