@@ -194,10 +194,15 @@ def test_only_columns_that_are_read_travel(comm, monkeypatch, name, shapes):
     dynamics = dynamics_of(slab, model(PAIR_MODELS[name]))
     dynamics.rates(particles)
     recorder = Recorder(monkeypatch)
-    dynamics.rates(particles)
+    moved = replace(particles, position=particles.position.clone())
+    dynamics.rates(moved)
     # The positions' exchange is made of one of rows.
-    expected = [("forward_positions", (3,)), ("forward", (3,)), *(("forward", shape) for shape in shapes)]
-    assert sorted(recorder.sent) == sorted(expected)
+    columns = [("forward", shape) for shape in shapes]
+    assert sorted(recorder.sent) == sorted([("forward_positions", (3,)), ("forward", (3,)), *columns])
+    # At the same places once more only the columns.
+    recorder.sent.clear()
+    dynamics.rates(replace(moved, velocity=2 * moved.velocity))
+    assert sorted(recorder.sent) == sorted(columns)
 
 
 @pytest.mark.mpi(1, 2)
