@@ -42,6 +42,24 @@ def test_weights_are_those_of_torch(library, count, width, dtype):
 
 
 @pytest.mark.parametrize("dtype", TOLERANCE, ids=str)
+def test_weights_do_not_depend_on_who_is_solved_for_beside(library, dtype):
+    """Bit for bit, so that they are the same on any number of ranks."""
+    together, covariance = pairs(60, dtype), Covariance.of_filtered_turbulence(WIDTH)
+    offsets = together.offsets.numpy()
+
+    def solve(offsets, displacement):
+        return kriging_weights(library, offsets, np.ascontiguousarray(displacement.T.numpy()), SUPPORT, NOISE,
+                               covariance.slowest, np.array(covariance.amplitudes))
+
+    own, weights = solve(offsets, together.displacement)
+    for receiver in range(len(offsets) - 1):
+        listed = slice(offsets[receiver], offsets[receiver + 1])
+        own_alone, alone = solve(np.array([0, listed.stop - listed.start]), together.displacement[listed])
+        assert np.array_equal(own_alone[:, 0], own[:, receiver])
+        assert all(np.array_equal(row_alone, row[listed]) for row_alone, row in zip(alone, weights))
+
+
+@pytest.mark.parametrize("dtype", TOLERANCE, ids=str)
 def test_of_one_with_too_many_neighbours_nothing_is_told(library, dtype):
     """A crowd of more than there is memory for ends a run, and takes nothing from others."""
     few, crowd = pairs(37, dtype), MOST_NEIGHBORS + 1

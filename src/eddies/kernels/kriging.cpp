@@ -1,6 +1,6 @@
 // Kriging: by which weights of what neighbours have a random field with a given covariance and an unknown mean, and its
-// derivatives, are told best at a point, and what they tell then. Equations of receivers are solved together, one in each
-// lane of a vector.
+// derivatives, are told best at a point, and what they tell then. Equations of receivers are solved together, one in
+// each lane of a vector, and no lane's result depends on the others.
 
 #include <algorithm>
 #include <cmath>
@@ -62,12 +62,11 @@ inline Vector<Real> series_of_exp_minus(Vector<Real> x) {
     return sum;
 }
 
-// exp(-x) of 0 <= x, to some last places of single or double precision: the series where x is small, else 2^-n times that
-// of what remains, and 0 from where that has no normal numbers.
+// exp(-x) of 0 <= x, to some last places of single or double precision: 2^-n times the series of what remains, and 0
+// from where that has no normal numbers.
 template <typename Real>
 inline Vector<Real> exp_minus(Vector<Real> x) {
     constexpr bool single = sizeof(Real) == 4;
-    if (!eddies::bits(x > all<Real>(Real(0.75)))) return series_of_exp_minus<single ? 9 : 17, Real>(x);
     constexpr Real most = single ? 87 : 708, shift = single ? Real(12582912) : Real(6755399441055744);
     const auto beyond = x > all<Real>(most);
     x = beyond ? all<Real>(most) : x;
@@ -86,19 +85,27 @@ template <typename Real>
 struct Covariance {
     Real slowest, amplitudes[MOST_SCALES];
     int scales;
+    bool near;  // whether no two neighbours are so far apart that the series of the widest part does not tell it
 
-    explicit Covariance(const Kriging& k) : slowest(static_cast<Real>(k.slowest)), scales(static_cast<int>(k.scales)) {
+    explicit Covariance(const Kriging& k)
+        : slowest(static_cast<Real>(k.slowest)), scales(static_cast<int>(k.scales)),
+          near(4 * k.support * k.support * k.slowest < 1) {
         for (int m = 0; m < scales; ++m) amplitudes[m] = static_cast<Real>(k.amplitudes[m]);
     }
 
+    Vector<Real> widest(Vector<Real> square) const {
+        const Vector<Real> x = square * slowest;
+        return near ? series_of_exp_minus<sizeof(Real) == 4 ? 10 : 18, Real>(x) : exp_minus<Real>(x);
+    }
+
     Vector<Real> operator()(Vector<Real> square) const {
-        Vector<Real> power = exp_minus<Real>(square * slowest), sum{};
+        Vector<Real> power = widest(square), sum{};
         for (int m = 0; m < scales; ++m, power *= power) sum += amplitudes[m] * power;
         return sum;
     }
 
     void derivatives(Vector<Real> square, Vector<Real>& first, Vector<Real>& second) const {
-        Vector<Real> power = exp_minus<Real>(square * slowest);
+        Vector<Real> power = widest(square);
         first = second = Vector<Real>{};
         Real rate = slowest;
         for (int m = 0; m < scales; ++m, power *= power, rate *= 2) {
@@ -133,6 +140,7 @@ class Equations {
     using V = Vector<Real>;
     // Of a tile, whose entries, a row and a number of the other side are in registers: 32 of them, or 16.
     static constexpr int TALL = eddies::VECTOR_BYTES == 64 ? 6 : 4, WIDE = eddies::VECTOR_BYTES == 64 ? 4 : 3;
+    static_assert(SIDES % TALL > 0);
 
     V& place(Int j, int axis) { return eddies::vector_at(places_.data() + (3 * j + axis) * lanes); }
     V& noise(Int j) { return eddies::vector_at(noise_.data() + j * lanes); }
@@ -244,19 +252,24 @@ class Equations {
 
     // L^-T of the right-hand sides, some columns at a time from the last on.
     void substitute_back() {
-        for (Int end = size_; end > 0; end -= WIDE) {
-            const Int begin = std::max<Int>(end - WIDE, 0);
+        Int end = size_;
+        for (Int begin = (size_ - 1) / WIDE * WIDE; begin >= 0; end = begin, begin -= WIDE) {
+            const bool whole = end - begin == WIDE;  // all but the first to be solved
             for (int f = 0; f < SIDES; ++f) {
                 V* found = row(size_ + f);
                 for (Int k = end - 1; k >= begin; --k) {
                     const V last = found[k] *= inverse(k);
                     for (Int j = begin; j < k; ++j) found[j] -= row(k)[j] * last;
                 }
+                if (!whole)
+                    for (Int k = begin; k < end; ++k)
+                        for (Int j = 0; j < begin; ++j) found[j] -= row(k)[j] * found[k];
             }
-            if (begin == 0) break;  // and only this one may have fewer columns
-            int f = 0;
-            for (; f + TALL <= SIDES; f += TALL) take_off<TALL>(f, begin);
-            take_off<SIDES % TALL>(f, begin);
+            if (whole) {
+                int f = 0;
+                for (; f + TALL <= SIDES; f += TALL) take_off<TALL>(f, begin);
+                take_off<SIDES % TALL>(f, begin);
+            }
         }
     }
 
@@ -339,8 +352,8 @@ void solve(const Kriging& k) {
         Equations<Real> equations(most);
 #pragma omp for schedule(dynamic, 4)
         for (Int vector = 0; vector < vectors; ++vector) {
-            const Int begin = vector * lanes;
-            equations.solve(k, covariance, order.data() + begin, static_cast<int>(std::min<Int>(lanes, receivers - begin)));
+            const Int begin = vector * lanes, count = std::min<Int>(lanes, receivers - begin);
+            equations.solve(k, covariance, order.data() + begin, static_cast<int>(count));
         }
     }
 }

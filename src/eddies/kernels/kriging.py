@@ -63,7 +63,7 @@ def told(library: ctypes.CDLL, offsets: np.ndarray, senders: np.ndarray, own: Se
     ----------
     offsets, senders : int64 (n + 1,) and (m,), each receiver's pairs, and who sends.
     own, weights : rows of (n,) and of (m,), contiguous, of the precision of the field.
-    field : (s, c), contiguous, of single or double precision, the receivers first.
+    field : (s, c), contiguous, of single or double precision, the receivers first; no sender is beyond it.
 
     Raises ValueError for arrays of another kind.
     """

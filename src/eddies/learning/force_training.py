@@ -67,6 +67,7 @@ class TrainingFrame:
         self.dynamics, self.model, self.decomposition = dynamics, dynamics.model, dynamics.decomposition
         self.particles, self.acceleration, self.density_rate = particles, acceleration, density_rate
         self.kept = self.model.linear_rates(dynamics.context(particles))
+        dynamics.release()  # weights of neighbours, which no other term may ask for
         self.acceleration_rms, self.total = self._rms(acceleration)
         self.density_rate_rms = None if density_rate is None else self._rms(density_rate)[0]
         self._sorted_ids, self._row_of_sorted = torch.sort(particles.id)

@@ -62,11 +62,15 @@ class Surroundings:
 
     def __init__(self, position: Tensor, neighborhood: Neighborhood, flow: FlowUnits, dtype: torch.dtype) -> None:
         self.position, self.neighborhood, self.flow, self.dtype = position, neighborhood, flow, dtype
-        self.recorded = torch.is_grad_enabled() and position.requires_grad
+        self._state = self._state_with(position)
 
     def fit(self, position: Tensor) -> bool:
-        """Whether they are those of these very positions, with a gradient if one is being recorded."""
-        return self.position is position and self.recorded == (torch.is_grad_enabled() and position.requires_grad)
+        """Whether they are those of these very positions, as they are, with the present halo and list, and with a
+        gradient if one is being recorded. All ranks give either the positions of before or others."""
+        return self.position is position and self._state == self._state_with(position)
+
+    def _state_with(self, position: Tensor) -> tuple[int, int, bool]:
+        return position._version, self.neighborhood.builds, torch.is_grad_enabled() and position.requires_grad
 
     @cached_property
     def local(self) -> LocalParticles:

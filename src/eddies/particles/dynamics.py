@@ -59,9 +59,13 @@ class ParticleDynamics:
 
         A run that does so wherever it writes a checkpoint goes on bit for bit as one that starts from it.
         """
-        self._surroundings = None
+        self.release()
         if self.neighborhood is not None:
             self.neighborhood.forget()
+
+    def release(self) -> None:
+        """Let the memory go of what the places of the particles last seen tell."""
+        self._surroundings = None
 
     def built_at(self, particles: ParticleSet) -> Tensor | None:
         """Positions (n, 3) of these particles when halo and list were built for them; None without such."""

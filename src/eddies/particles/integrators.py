@@ -80,7 +80,8 @@ class CorrectedVerlet(Integrator):
 
     Both evaluations are at the same places, so that what depends on these alone, lists and weights of neighbours,
     serves both. For rates that depend on velocity alone it is Heun's method of second order, stable up to twice the
-    step of velocity Verlet. `memory` holds the rates at the particles last returned.
+    step of velocity Verlet. A shift velocity is that of the step's start, of first order. `memory` holds the rates at
+    the particles last returned.
     """
 
     def step(self, particles: ParticleSet, time_step: float) -> ParticleSet:

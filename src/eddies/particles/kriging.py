@@ -177,6 +177,7 @@ class Kriging:
     def _told(self, own: Tensor, others: Sequence[Tensor], field: Tensor) -> Tensor:
         """What rows of weights tell of fields (n, c), (n, c, rows)."""
         seen = self._with_ghosts(field.to(own))
+        assert len(seen) == self._seen, "halo and list are not those of the weights"
         compiled = library() if seen.device.type == "cpu" else None
         if compiled is None or torch.is_grad_enabled() and seen.requires_grad:
             return torch.stack([of_own[:, None] * seen[: len(of_own)] + self._matrix(of_others) @ seen

@@ -132,7 +132,8 @@ class Wind(Term):
 
 
 @pytest.mark.mpi(1)
-@pytest.mark.parametrize("name, order", [("verlet", 0.9), ("rk2", 1.9), ("rk3", 2.9), ("rk4", 3.8)])
+@pytest.mark.parametrize("name, order", [("verlet", 0.9), ("corrected-verlet", 0.9), ("rk2", 1.9), ("rk3", 2.9),
+                                         ("rk4", 3.8)])
 def test_order_with_a_shift(comm, name, order):
     """Verlet takes the shift of the step's start."""
     slab, start = alone(*state(20)[:2])

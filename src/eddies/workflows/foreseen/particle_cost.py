@@ -144,7 +144,7 @@ def halo_seconds(work: ParticleWork, speed: ParticleSpeed, network: Network) -> 
     if not speed.ghost_columns:
         return 0.0
     size = work.ghosts(network.ranks) * sum(speed.ghost_columns)
-    return network.to_neighbors(size / 2, 2 * (1 + len(speed.ghost_columns)))
+    return network.to_neighbors(size / 2, 2 * (1 + len(speed.ghost_columns))) / work.together
 
 
 def settling_seconds(work: ParticleWork, network: Network) -> float:

@@ -66,7 +66,7 @@ class ParticleSpeed:
     ----------
     rates : by part.
     calls, components : of transforms and splines in an evaluation, those of the iterations left out.
-    ghost_columns : bytes of a ghost particle in each column that an evaluation sends.
+    ghost_columns : bytes of a ghost particle in each column that the evaluations at one place send.
     listed : whether some term's pairs are listed. block_bytes : what terms keep of the pairs that are taken together.
     kriging : whether some term asks for what neighbours tell.
     """
@@ -191,8 +191,8 @@ class Probe:
         watch, together = self.watch, self.work.together
         watch.reset()
         self.dynamics.forget()
+        self.columns.clear()
         for _ in range(together):
-            self.columns.clear()
             self.dynamics.rates_after(1e-6 * number, self.particles)
         watch.switch()
         companions = {f"{name} {copy}": column for copy in range(2 if self.work.evaluations > together else 0)
