@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from eddies.particles.context import Surroundings
 from eddies.particles.integrators import INTEGRATORS
+from eddies.particles.surroundings import Surroundings
 from eddies.particles.terms.presets import PRESETS
 from tests.particles.configurations import MODELS, Field, by_id, distributed, dynamics_of, model, of_terms, state
 

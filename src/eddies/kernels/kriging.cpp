@@ -55,11 +55,11 @@ inline Vector<Real> all(Real number) {
 // sum_k (-x)^k / k! up to k = terms.
 template <int terms, typename Real>
 inline Vector<Real> series_of_exp_minus(Vector<Real> x) {
-    Real coefficient = 1;
+    double coefficient = 1;
     for (int k = 1; k <= terms; ++k) coefficient /= -k;
-    Vector<Real> sum = all<Real>(coefficient);
-    for (int k = terms; k > 0; --k) sum = sum * x + (coefficient *= -k);
-    return sum;
+    Vector<Real> sum = all<Real>(static_cast<Real>(coefficient));
+    for (int k = terms; k > 1; --k) sum = sum * x + static_cast<Real>(coefficient *= -k);
+    return 1 + sum * x;
 }
 
 // exp(-x) of 0 <= x, to some last places of single or double precision: 2^-n times the series of what remains, and 0

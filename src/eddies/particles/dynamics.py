@@ -10,12 +10,13 @@ import torch
 from torch import Tensor
 
 from eddies.parallel.slab import SlabDecomposition
-from eddies.particles.context import Context, Surroundings
+from eddies.particles.context import Context
 from eddies.particles.model import LagrangianModel, LinearRates
 from eddies.particles.neighborhood import Neighborhood, at_home, farthest_outside
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.periodic_box import PeriodicBox
 from eddies.particles.rates import Rates
+from eddies.particles.surroundings import Surroundings
 
 if TYPE_CHECKING:
     from eddies.particles.resolved_velocity import ResolvedVelocity
