@@ -59,10 +59,15 @@ def test_a_flow_that_is_not_turbulent_is_told():
 
 
 def test_steps_that_relax_too_far_are_told():
-    """Runs of `hit` with C_r = 2 end in noise with velocity Verlet and steps of 0.05; none is told within limits."""
+    """Runs of `hit` with C_r = 2 end in noise with velocity Verlet and steps of 0.05, those of `hit-256` with 100
+    neighbours in steps of 0.1; none is told within limits."""
     changes = ["model.preset=local", "model.filtered-equations.relaxation=2"]
     for integrator, step, expected in (("verlet", 0.05, True), ("verlet", 0.01, False), ("rk3", 0.04, False)):
         lines = told(*changes, f"simulation.integrator={integrator}", f"simulation.step={step}", scene="hit")
+        assert any("relaxes so fast" in line for line in lines) is expected
+    for step, expected in ((0.1, True), (0.08, False)):
+        lines = told("model.preset=local", "simulation.integrator=corrected-verlet", f"simulation.step={step}",
+                     scene="hit-256")
         assert any("relaxes so fast" in line for line in lines) is expected
     line, = (line for line in told(*changes, scene="hit") if "relaxes so fast" in line)
     remedy = re.search(r"more than about ([\d.]+);", line).group(1)
