@@ -206,6 +206,21 @@ def test_only_columns_that_are_read_travel(comm, monkeypatch, name, shapes):
 
 
 @pytest.mark.mpi(1, 2)
+@torch.no_grad()
+def test_what_places_tell_is_told_anew_when_they_are_changed_or_listed_anew(comm):
+    slab, particles = distributed(comm, *state())
+    dynamics = dynamics_of(slab, model(PAIR_MODELS["pairs"]))
+    before = dynamics.rates(particles).acceleration
+    particles.position[:, 0] *= 0.999
+    expected = dynamics_of(slab, model(PAIR_MODELS["pairs"])).rates(particles).acceleration
+    assert torch.allclose(dynamics.rates(particles).acceleration, expected, rtol=0, atol=1e-12)
+    assert not torch.allclose(before, expected, rtol=0, atol=1e-6)
+    surroundings = dynamics.context(particles).surroundings
+    assert dynamics.context(replace(particles, velocity=-particles.velocity)).surroundings is surroundings
+    assert dynamics.context(replace(particles, id=particles.id.clone())).surroundings is not surroundings
+
+
+@pytest.mark.mpi(1, 2)
 def test_without_terms_that_look_at_others_there_is_no_list_no_halo_and_no_migration(comm, monkeypatch):
     def forbidden(*arguments):
         raise AssertionError("nothing of this is needed")
