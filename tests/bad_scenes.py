@@ -22,9 +22,9 @@ BAD_TEXTS = [
     (FLOW + LEARNING + MODEL + 'terms = ["pressure", "pairs"]\n', '[model.pairs]: reads the density, which an '
      'incompressible flow does not have; leave "density" out of [model.pairs] inputs, or set [flow] fluid = '
      '"compressible" and sound_speed'),
-    (FLOW + LEARNING + MODEL + 'terms = ["eddy-viscosity", "density-transport"]\n',
-     '[model.density-transport]: reads the density, which an incompressible flow does not have; remove '
-     '"density-transport", or set [flow] fluid'),
+    (FLOW + LEARNING + MODEL + 'terms = ["eddy-viscosity", "continuity"]\n',
+     '[model.continuity]: reads the density, which an incompressible flow does not have; remove '
+     '"continuity", or set [flow] fluid'),
     (FLOW + "[tracers]\nparticles_per_side = 12\nturnovers = 1\nframe_interval = 1\n",
      "[tracers] field_cells = 18 (from particles_per_side): must be at most [flow] cells = 16"),
     (FLOW + LEARNING + "[model]\n",
@@ -77,8 +77,8 @@ BAD_OVERRIDES = [
     ("model.closure=poisson", "[model] closure: no such key; valid here: preset, terms, neighbors, path"),
     ("model.neighbors=5", "[model] neighbors = 5: must be a number at least 8"),
     ("model.neighbors=2000", "[model] neighbors = 2000: 1728 particles reach 4.5 with the skin, and half the cube"),
-    ("model.preset=wide", '[model] preset = "wide": must be one of "resolved", "resolved + pairs", "learned-density", '
-     '"paper", "local", "wcsph", "transport-velocity" ('),
+    ("model.preset=wide", '[model] preset = "wide": must be one of "resolved", "resolved + pairs", "paper", '
+     '"local", "wcsph", "transport-velocity" ('),
     ("model.preset=resolve", "did you mean resolved?"),
     ("model.pairs=3", "[model] pairs: no such key"),
     ("model.pair.hidden=[8]", "[model.pair]: no such term; did you mean pairs? the terms are pressure, stress, "

@@ -40,7 +40,7 @@ ONLY_IN = {
     "eddies.report*": ("report*", "workflows.report", "workflows.compare", "workflows.diff", "workflows.train"),
     # Scene, rules, reader, sections, model, methods, checks, comparison
     **dict.fromkeys(("eddies.scene.[srm]*", "eddies.scene.ch*", "eddies.scene.compar*"),
-                    ("scene*", "workflows*", "cli", "cli_completion", "api", "stored_run", "stages", "logs")),
+                    ("scene*", "workflows*", "cli", "api", "stored_run", "stages", "logs")),
     # Of the particles only the settings of terms declare keys of a scene.
     "eddies.scene.values*": ("scene*", "particles.terms.settings", "workflows*"),
     "eddies.import_path*": ("scene*", "particles.model", "particles.terms.pair_basis", "workflows*"),

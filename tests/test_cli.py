@@ -147,7 +147,7 @@ def test_what_is_done_is_kept_and_replaced_by_word_alone(comm, tmp_path, capfd):
         return product.stat().st_mtime_ns > before, told.err if code else told.out
 
     assert run()[0]
-    for options in ((), ("--resume",), ("--overwrite",)):
+    for options in ((), ("--overwrite",)):
         ran, output = run(*options)
         assert not ran
         skipped = "dns: skipped, ground_truth.h5 is complete and made with the same settings" in output
@@ -256,22 +256,6 @@ def test_a_quiet_command_says_where_its_product_is_and_a_verbose_one_every_step(
                          ("--verbose", r"(?s).*dns  step 1  .* s/step .*dns  step 2  .*dns: abc, after .*")):
         assert run_cli("dns", *ABC, option, "--output", tmp_path / option[2:]) == 0
         assert re.fullmatch(told if comm.rank == 0 else "", capfd.readouterr().out)
-
-
-@pytest.mark.mpi(1)
-def test_a_shell_completes_commands_options_and_names(comm, tmp_path, capfd):
-    assert run_cli("completion", "bash") == 0
-    (tmp_path / "eddies.bash").write_text(capfd.readouterr().out)
-
-    def completed(*words):
-        line = (f'source {tmp_path}/eddies.bash; COMP_WORDS=({" ".join(map(repr, words))}); '
-                f'COMP_CWORD={len(words) - 1}; _eddies; echo "${{COMPREPLY[@]}}"')
-        return subprocess.run(["bash", "-c", line], capture_output=True, text=True, check=True).stdout.split()
-
-    assert completed("eddies", "tra") == ["train-kernel", "train"] and completed("eddies", "run", "ti") == ["tiny"]
-    assert "--unset" in completed("eddies", "check", "tiny", "--") and completed("eddies", "compare", "compare-s")
-    assert completed("eddies", "export", "runs/tiny", "--format", "") == ["vtkhdf", "lagrangebench"]
-    assert completed("eddies", "run", "tiny", "--output", "") == []  # names of files, by the shell itself
 
 
 @pytest.mark.mpi(1)

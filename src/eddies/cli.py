@@ -55,10 +55,6 @@ def main(arguments: list[str] | None = None) -> int:
             sys.stderr.write(f"eddies: error: {refusal}\n")
             sys.stderr.flush()
         code = code or BAD_INPUT
-    if code == INTERRUPTED:
-        # Python notes an interrupt within code of a string, such as makes a dataclass, until the next such code runs;
-        # where it was started with -m it would end by the signal.
-        exec("")
     if usage:
         sys.exit(code)
     return code
@@ -234,13 +230,6 @@ def diff_command(options: argparse.Namespace, comm: Comm) -> None:
     import_module("eddies.workflows.diff").run(options.one, options.other, comm)
 
 
-def completion_command(options: argparse.Namespace, comm: Comm) -> None:
-    """What makes a shell complete commands."""
-    text = import_module("eddies.cli_completion").completion(options.shell)
-    if comm.rank == 0:
-        sys.stdout.write(text)
-
-
 # Those that no signal asks to stop: they take seconds.
 SHORT_COMMANDS = {"report": report_command, "export": export_command, "check": check_command, "scenes": scenes_command,
-                  "status": status_command, "diff": diff_command, "completion": completion_command}
+                  "status": status_command, "diff": diff_command}

@@ -26,7 +26,6 @@ EXAMPLES = {
     "scenes": ("eddies scenes", "eddies scenes tiny"),
     "status": ("eddies status", "eddies status runs/hit-small"),
     "diff": ("eddies diff runs/hit-small runs/second",),
-    "completion": ('eval "$(eddies completion bash)"', "eddies completion fish | source"),
 }
 
 
@@ -79,8 +78,6 @@ def build_parser() -> argparse.ArgumentParser:
     diff = add_command(commands, "diff", "what differs between two runs: settings and numbers")
     add_run(diff, "one")
     add_run(diff, "other")
-    completion = add_command(commands, "completion", "a script with which a shell completes commands of eddies")
-    completion.add_argument("shell", choices=["bash", "zsh", "fish"], help="the shell that it is for")
     return parser
 
 
@@ -136,7 +133,6 @@ def add_job_options(parser: argparse.ArgumentParser, output: str) -> None:
                         "else they are named, and nothing is touched. What fits is kept, or gone on with")
     parser.add_argument("--take-over", action="store_true",
                         help="end another job in the same directory, or one that only seems to be there")
-    parser.add_argument("--resume", action="store_true", help=argparse.SUPPRESS)  # of job scripts of eddies 0.1
     parser.add_argument("--checkpoint-minutes", type=positive, default=10.0, metavar="M",
                         help="wall time between two checkpoints (default: 10)")
     parser.add_argument("--max-minutes", type=positive, default=math.inf, metavar="M",

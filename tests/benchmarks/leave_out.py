@@ -21,6 +21,7 @@ sys.path[:0] = [str(HERE.parent / "validation"), str(HERE.parents[1])]
 from test_leave_out import CountingComm, combined_step, fluid_of, particle_step  # noqa: E402
 
 from eddies.particles.terms.presets import PRESETS  # noqa: E402
+from tests.particles.configurations import OWN_DENSITY  # noqa: E402
 
 Call = tuple[Callable[[], object], list]  # what is measured, and the list that notes its messages
 
@@ -40,7 +41,7 @@ def pairs_of_calls(comm) -> dict[str, tuple[Call, Call]]:
     """By part: the call with it, and without."""
     everything = {"field": 1.0, "velocity_kl": 0.1, "acceleration_kl": 0.1}
     without = {name: {key: weight for key, weight in everything.items() if key != name} for name in everything}
-    pressure, resolved, learned = {"pressure": {}, "pairs": {}}, PRESETS["resolved"], PRESETS["learned-density"]
+    pressure, resolved, learned = {"pressure": {}, "pairs": {}}, PRESETS["resolved"], OWN_DENSITY
     stress = {**resolved, "pairs": {}}  # told the densities, as beside the pressure alone
     steps = {
         "pair force": (learned, {}),

@@ -16,9 +16,10 @@ SCALES = ReferenceScales(filter_width=2 * SPACING, spacing=SPACING, velocity=1.0
 
 
 def model_of(preset, support, neighbors, hidden, **settings):
-    """The model of a preset or of a list of terms, with initial weights in double precision; `settings` by term, over
-    the widths of all networks."""
+    """The model of a preset, a list of terms or settings by term, with initial weights in double precision; `settings`
+    by term, over the widths of all networks."""
     listed = {"preset": preset} if isinstance(preset, str) else {"terms": tuple(preset)}
+    settings = {**(preset if isinstance(preset, dict) else {}), **settings}
     bare = Model(**listed)
     widths = {name: {"hidden": hidden} for name, declared in bare.settings.items() if hasattr(declared, "hidden")}
     wanted = Model(**listed, settings={name: {**widths.get(name, {}), **settings.get(name, {})}

@@ -19,10 +19,11 @@ from eddies.particles.terms.stress import Stress
 from eddies.particles.terms.term import Term
 from eddies.report.learning import LOSSES
 from tests.learning.models import LENGTH, PER_SIDE, SPACING, Recorder, model_of, slope
+from tests.particles.configurations import OWN_DENSITY
 
 SUPPORT = 2.2 * SPACING
 ALL = LossWeights(1.0, 0.1, 0.1, 2.0)
-PRESETS = ["learned-density", "paper", "resolved + pairs", "resolved"]
+PRESETS = [OWN_DENSITY, "paper", "resolved + pairs", "resolved"]
 # The density that the pairs read is that of pressure and stress, and a part of it is learned.
 THROUGH_DENSITY = ("pressure", f"{__name__}:AmplifiedStress", "pairs")
 
@@ -80,7 +81,7 @@ def frame_of(comm, model, wind=0.0):
     return TrainingFrame(dynamics, particles, torch.from_numpy(acceleration), rate)
 
 
-def trainer_of(comm, preset="learned-density", weights=ALL, batch=300, **settings):
+def trainer_of(comm, preset=OWN_DENSITY, weights=ALL, batch=300, **settings):
     model = model_of(preset, SUPPORT, 45, (8, 8), **settings)
     return ForceTrainer(model, [frame_of(comm, model)], WendlandC2(SUPPORT), weights, batch, seed=5)
 
@@ -91,7 +92,7 @@ def row_and_gradient(trainer, kind="combined_step"):
 
 
 @pytest.mark.mpi(2, 3)
-@pytest.mark.parametrize("preset", ["learned-density", "resolved + pairs"])
+@pytest.mark.parametrize("preset", [OWN_DENSITY, "resolved + pairs"])
 @pytest.mark.parametrize("kind", ["trajectory_step", "combined_step"])
 def test_training_is_the_same_on_any_number_of_ranks(comm, kind, preset):
     from mpi4py import MPI
@@ -279,7 +280,7 @@ def test_a_force_that_is_not_a_number_ends_the_training_on_all_ranks(comm):
 
 
 @pytest.mark.mpi(1)
-@pytest.mark.parametrize("preset, counts", [("learned-density", False), ("paper", True)])
+@pytest.mark.parametrize("preset, counts", [(OWN_DENSITY, False), ("paper", True)])
 def test_of_learned_rates_of_density_only_the_paper_s_counts_in_single_frames(comm, preset, counts):
     trainer = trainer_of(comm, preset, LossWeights())
     assert trainer.model.regresses_density == counts
@@ -287,7 +288,7 @@ def test_of_learned_rates_of_density_only_the_paper_s_counts_in_single_frames(co
     learned = {name: [p.grad is not None and bool(p.grad.any()) for p in term.parameters()]
                for name, term in trainer.model.terms.items()}
     assert any(learned["pairs"]) and any(learned["density-flux"]) == counts
-    assert not any(learned.get("density-transport", []))
+    assert not any(learned.get("continuity", []))
 
 
 @pytest.mark.mpi(1)

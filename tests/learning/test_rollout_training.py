@@ -17,13 +17,14 @@ from eddies.particles.particle_set import ParticleSet
 from eddies.particles.resolved_velocity import ResolvedVelocity
 from eddies.particles.terms.presets import PRESETS
 from tests.learning.models import LENGTH, PER_SIDE, SCALES, SPACING, Recorder, model_of, slope
+from tests.particles.configurations import OWN_DENSITY
 
 FRAMES, INTERVAL = 4, 0.06
 SUPPORT = 1.6 * SPACING
 ITERATIONS = 8  # of each solve for the resolved velocity: on any number of ranks the same ones
 # Pairs by themselves are told the densities, which here are those of pressure and stress.
 TOLD_DENSITIES = tuple(PRESETS["resolved + pairs"])
-every_preset = pytest.mark.parametrize("preset", ["resolved + pairs", TOLD_DENSITIES, "learned-density"])
+every_preset = pytest.mark.parametrize("preset", ["resolved + pairs", TOLD_DENSITIES, OWN_DENSITY])
 
 
 def resolution(slab):
@@ -95,7 +96,7 @@ def test_gradient_is_the_same_on_two_ranks(comm, preset):
 
 @pytest.mark.mpi(1)  # on others it is the same
 @pytest.mark.parametrize("preset, integrator, steps, horizon", [
-    *(("learned-density", integrator, 2, 2) for integrator in INTEGRATORS),
+    *((OWN_DENSITY, integrator, 2, 2) for integrator in INTEGRATORS),
     (TOLD_DENSITIES, "verlet", 1, 2), ("resolved + pairs", "rk3", 2, 1)])
 def test_gradient_through_several_steps_against_finite_differences(comm, preset, integrator, steps, horizon):
     trainer, model = trainer_of(comm, preset, integrator, steps, iterations=None)

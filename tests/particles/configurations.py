@@ -37,13 +37,15 @@ CONFIGURATIONS = {
     "lattice": lambda random, n: np.argwhere(np.ones((8, 8, n // 64))) * (LENGTH / 8),
     "coincident": lambda random, n: np.full((n, 3), 6.28),
 }
+#: A model with a density of its own that a term reads and changes.
+OWN_DENSITY = {"pairs": {}, "density-flux": {}, "continuity": dict(diffusion=0.1)}
 #: Models of pairs.
 PAIR_MODELS = {
     "paper": {"pairs": dict(basis="paper"), "density-flux": {},
               "eddy-viscosity": dict(form="two-sided", basis="paper")},
-    "corrected": {**PRESETS["learned-density"], "eddy-viscosity": dict(form="monaghan")},
+    "corrected": {**OWN_DENSITY, "eddy-viscosity": dict(form="monaghan")},
     "pairs": {"pairs": {}},
-    "antisymmetric": {"pairs": dict(basis="paper", symmetry="antisymmetric"), "density-transport": {},
+    "antisymmetric": {"pairs": dict(basis="paper", symmetry="antisymmetric"), "continuity": {},
                       "eddy-viscosity": dict(form="monaghan", basis="paper")},
     "without density": {"pairs": dict(inputs=("distance", "speed", "approach"))},
 }
@@ -157,6 +159,17 @@ def scaled_pairs(position, velocity, density=None, once=False, flow=FLOW):
     listed.build(position, position, exclude_self=True)
     columns = {"velocity": velocity, "density": density}
     return ScaledPairs(listed.pairs(position, position, once=once), columns.__getitem__, flow)
+
+
+def summed_density(position, kernel, mass):
+    """sum_j m W(x_i - x_j) of all particles of a periodic box, itself included."""
+    apart = position[:, None] - position
+    apart = apart - LENGTH * torch.round(apart.detach() / LENGTH)
+    square = apart.square().sum(2)
+    itself = torch.eye(len(position), dtype=torch.bool)
+    distance = torch.where(itself, torch.ones_like(square), square).sqrt()  # so that its root has a derivative
+    values = torch.where(itself, kernel.value(torch.zeros_like(square)), kernel.value(distance))
+    return mass * values.sum(1)
 
 
 def by_torch(monkeypatch):

@@ -6,8 +6,9 @@ import torch
 
 from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.surroundings import Surroundings
-from eddies.particles.terms.presets import PRESETS
-from tests.particles.configurations import MODELS, Field, by_id, distributed, dynamics_of, model, of_terms, state
+from tests.particles.configurations import (
+    MODELS, OWN_DENSITY, Field, by_id, distributed, dynamics_of, model, of_terms, state,
+)
 
 SKIN = 0.1
 every_integrator = pytest.mark.parametrize("name", INTEGRATORS)
@@ -67,9 +68,7 @@ def test_order_with_the_pair_model_and_its_density(comm, name, order):
     """The second derivative of a pair's weight jumps at the cutoff, which limits the order to three; where particles
     have hardly a neighbour each one that enters shows, and the order is not seen at steps like these."""
     slab, particles = distributed(comm, *state(250))
-    force = model(PRESETS["learned-density"])
-    with torch.no_grad():
-        force.terms["density-transport"].factors[:] = torch.tensor([1.0, 0.4])  # the sound of the fluid
+    force = model(OWN_DENSITY)
     assert observed_order(name, force, slab, particles, total=250, duration=0.1, steps=8) > order
 
 

@@ -33,8 +33,8 @@ SETTINGS = {"forcing": dict(injection_rate=0.3)}
 
 
 def test_which_terms_are_linear():
-    terms = model({word: SETTINGS.get(word, {}) for word in (*LINEAR, "pairs", "density-transport", "density-flux",
-                                                             "eddy-viscosity", "wcsph", "summation-density")}).terms
+    terms = model({word: SETTINGS.get(word, {}) for word in (*LINEAR, "pairs", "continuity", "density-flux",
+                                                             "eddy-viscosity", "wcsph", "transport-velocity")}).terms
     assert {word for word, term in terms.items() if term.linear} == set(LINEAR)
 
 

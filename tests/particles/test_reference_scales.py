@@ -24,4 +24,4 @@ def test_a_scale_of_the_density_is_wanted_where_there_is_none():
     with pytest.raises(ValueError, match="sound_speed: a flow without density has none"):
         incompressible.required("sound_speed")
     with pytest.raises(TermError, match='term "wcsph": cannot be made: .* sound_speed: a flow without density'):
-        model({"summation-density": {}, "wcsph": {}}, FlowUnits(incompressible, CUTOFF, NEIGHBORS))
+        model({"density-flux": {}, "wcsph": {}}, FlowUnits(incompressible, CUTOFF, NEIGHBORS))

@@ -7,7 +7,7 @@ from dataclasses import fields, replace
 import pytest
 
 from eddies.particles.terms.presets import DEFAULT_PRESET, PRESETS, TERMS
-from eddies.particles.terms.settings import DensityTransport, PairNetwork, Pressure, Stress
+from eddies.particles.terms.settings import Continuity, PairNetwork, Pressure, Stress
 from eddies.pipeline import STAGES as TABLE
 from eddies.scene.model import settings_class
 from eddies.scene.scene import Flow, Initial, Model, Scene, SceneError, Simulation, Time, load_scene
@@ -240,12 +240,12 @@ def test_who_reads_no_density_needs_none(tmp_path):
 
 
 def test_a_density_is_given_once(tmp_path):
-    refused('"pressure" gives the density and "density-transport" its rate, which are two densities', lambda: read(
-        tmp_path, COMPRESSIBLE + '[model]\nterms = ["pressure", "density-transport"]\n'))
+    refused('"pressure" gives the density and "continuity" its rate, which are two densities', lambda: read(
+        tmp_path, COMPRESSIBLE + '[model]\nterms = ["pressure", "continuity"]\n'))
     refused('"pairs" reads the density, which no term gives; add a term that does, such as "pressure" or '
-            '"density-transport", or leave "density" out of [model.pairs] inputs', lambda: read(
+            '"continuity", or leave "density" out of [model.pairs] inputs', lambda: read(
                 tmp_path, COMPRESSIBLE + '[model]\nterms = ["pairs"]\n'))
-    assert DensityTransport().learns_through_horizons
+    assert Continuity(diffusion=0.1).learns_through_horizons
 
 
 @pytest.mark.parametrize("key, path, message", [

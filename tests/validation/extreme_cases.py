@@ -11,7 +11,7 @@ from eddies.particles.flow_units import FlowUnits
 from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.reference_scales import ReferenceScales
 from eddies.particles.terms.presets import PRESETS
-from tests.particles.configurations import LENGTH, by_id, distributed
+from tests.particles.configurations import LENGTH, OWN_DENSITY, by_id, distributed
 from tests.particles.configurations import model as model_of
 
 TOTAL, SIDE, PLANES, SKIN = 343, 7, 12, 0.1  # of the grid 1.75 cells a particle and direction
@@ -24,9 +24,9 @@ CLOSURES = {
     "resolved + pairs": PRESETS["resolved + pairs"],
     "resolved": PRESETS["resolved"],
     "pairs without density": {"pairs": dict(inputs=("distance", "speed", "approach"))},
-    "learned-density": {**PRESETS["learned-density"], "eddy-viscosity": dict(form="monaghan")},
+    "own density": {**OWN_DENSITY, "eddy-viscosity": dict(form="monaghan")},
     "paper": PAPER,
-    "wcsph": {"summation-density": {}, "wcsph": {}},
+    "wcsph": PRESETS["wcsph"],
     "local": PRESETS["local"],
 }
 every_closure = pytest.mark.parametrize("kind", CLOSURES)

@@ -73,8 +73,8 @@ def states(comm) -> Iterator[Row]:
                f"{gained:.0e} of the sum of their sizes")
     for step in (1e-5, 1e-4, 1e-2):
         yield (f"two steps of {step:g} at 1000 c, {comm.size} rank(s)", "as at rest, or refused by all ranks",
-               shown(translated_run(comm, "learned-density", fast, step)))
-    for kind, factors in (("pressure for the density", (0.2,)), ("learned-density", (0.1, 20.0))):
+               shown(translated_run(comm, "own density", fast, step)))
+    for kind, factors in (("pressure for the density", (0.2,)), ("own density", (0.1, 20.0))):
         for mach in MACH_NUMBERS:
             for factor in factors:
                 step = 0.02 if kind.startswith("pressure") else factor * mach

@@ -86,7 +86,7 @@ def test_nearly_coincident_particles_move_as_coincident_ones(comm, kind):
 
 @pytest.mark.mpi(2)
 @pytest.mark.parametrize("name", ARRANGEMENTS)
-@pytest.mark.parametrize("kind", ["resolved + pairs", "pressure", "learned-density", "local"])
+@pytest.mark.parametrize("kind", ["resolved + pairs", "pressure", "own density", "local"])
 def test_any_arrangement_has_finite_rates_that_are_the_same_on_all_ranks(comm, kind, name):
     difference, sound = arrangement(comm, kind, name)
     assert sound and difference < 1e-9

@@ -151,11 +151,11 @@ def test_particles_may_cross_slabs_and_the_box_within_a_step(comm):
     """At 1000 c, by 0.2, 1.7 and 170; they change rank before each evaluation."""
     speed = 1000 * scales(TOTAL).sound_speed
     for step in (1e-5, 1e-4, 1e-2):
-        assert translated_run(comm, "learned-density", speed, step) < 1e-9
+        assert translated_run(comm, "own density", speed, step) < 1e-9
 
 
 @pytest.mark.mpi(2)
-@pytest.mark.parametrize("kind", ["pressure", "learned-density"])
+@pytest.mark.parametrize("kind", ["pressure", "own density"])
 @every_integrator
 def test_a_force_that_breaks_within_a_step_is_reported_by_all_ranks(comm, kind, integrator):
     """With the second rate a stage of Runge-Kutta 4 breaks, and the end of the others' steps."""
@@ -176,9 +176,9 @@ def test_a_density_from_the_pressure_is_the_same_at_any_mach_number(comm):
 @pytest.mark.mpi(1)
 @pytest.mark.parametrize("mach", MACH_NUMBERS)
 def test_a_learned_density_needs_steps_that_resolve_sound(comm, mach):
-    complaint, velocity = at_mach_number(comm, "learned-density", mach, 0.1 * mach)
+    complaint, velocity = at_mach_number(comm, "own density", mach, 0.1 * mach)
     assert complaint is None and velocity.abs().max() < 4
-    complaint, _ = at_mach_number(comm, "learned-density", mach, 20 * mach)
+    complaint, _ = at_mach_number(comm, "own density", mach, 20 * mach)
     assert re.search(r"rank 0, particle \d+: (not finite|faster than|density farther)", complaint)
 
 

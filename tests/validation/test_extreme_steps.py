@@ -19,14 +19,13 @@ NEIGHBORS = [30, 60, 120, 200]
 
 
 def sound_model(total, neighbors=24.0):
-    """Linear gas dynamics: dv/dt = -c^2 grad rho / rho_0, d rho/dt = -rho_0 div v."""
-    linear = model_of({"pairs": dict(hidden=(1,)), "density-transport": {}}, units(total, neighbors))
+    """Linear gas dynamics: dv/dt = -c^2 grad rho / rho_0 by corrected differences, d rho/dt = -rho_0 div v by SPH."""
+    linear = model_of({"pairs": dict(hidden=(1,)), "continuity": {}}, units(total, neighbors))
     flow, small, network = linear.flow.scales, 1e-3, linear.terms["pairs"].network  # tanh is linear for small arguments
     gain = flow.sound_speed**2 * flow.density / (flow.density_mean * flow.acceleration * flow.filter_width)
     with torch.no_grad():
         network.weights[0][:] = torch.tensor([[-small, small, 0, 0, 0]])
         network.weights[1][:] = torch.tensor([[gain / small], [0]])
-        linear.terms["density-transport"].factors[:] = torch.tensor([1.0, 0.0])
     return linear
 
 
@@ -84,29 +83,35 @@ def oscillator_growth(integrator, system, z, count=32):
     return (max(sizes[-quarter:]) / max(sizes[-2 * quarter : -quarter])) ** (1 / quarter)
 
 
-def sound_frequency(model, side, waves):
-    """Frequency of a wave along x on a lattice by the sums over its neighbours, c sum w x sin(kx) / sum w x^2."""
+def wavenumbers_seen(model, side, waves):
+    """What a wave along x on a lattice has for k by the sums over its neighbours: in the force
+    sum w x sin(kx) / sum w x^2, in the rate of density -m sum W' x sin(kx) / r."""
     reach = math.ceil(model.flow.cutoff / (LENGTH / side))
     offsets = np.argwhere(np.ones((2 * reach + 1,) * 3)) - reach
     x = offsets[np.any(offsets, axis=1)] * LENGTH / side
     weight = np.clip(1 - np.sum(x**2, axis=1) / model.flow.cutoff**2, 0, None) ** 2
     kept = REGULARISATION * moments.expected_moment(model.flow.neighbors, model.flow.cutoff)
-    slope = np.sum(weight * x[:, 0] * np.sin(waves * x[:, 0])) / (np.sum(weight * x[:, 0] ** 2) + kept)
-    return model.flow.scales.sound_speed * slope
+    moved = x[:, 0] * np.sin(waves * x[:, 0])
+    slope = np.sum(weight * moved) / (np.sum(weight * x[:, 0] ** 2) + kept)
+    distance = np.linalg.norm(x, axis=1)
+    fall = model.terms["continuity"].kernel.derivative(torch.from_numpy(distance)).numpy() / distance
+    return slope, -model.flow.particle_mass * np.sum(fall * moved)
 
 
 @torch.no_grad()
 def sound_growth(integrator, z, count=20, side=8, waves=2):
-    """Growth a step of a standing sound wave of the learned-density closure on a lattice; z: step times frequency."""
+    """Growth a step of a standing sound wave of pairs on a lattice; z: step times frequency."""
     model, position = sound_model(side**3), lattice(side)
     density = 1 + 1e-6 * model.flow.scales.density * torch.cos(waves * position[:, 0])
     dynamics, particles = set_up(MPI.COMM_SELF, model, position, torch.zeros_like(position), density)
-    stepper, sizes = INTEGRATORS[integrator](dynamics), []
+    stepper, sizes, c = INTEGRATORS[integrator](dynamics), [], model.flow.scales.sound_speed
+    of_force, of_density = wavenumbers_seen(model, side, waves)
     for _ in range(count):
-        particles = stepper.step(particles, z / sound_frequency(model, side, waves))
+        particles = stepper.step(particles, z / (c * math.sqrt(of_force * of_density)))
         # Other waves grow out of round-off: this one alone is measured.
         phase = waves * particles.position[:, 0]
-        sizes.append(math.hypot(float((particles.density - 1) @ torch.cos(phase)) * model.flow.scales.sound_speed,
+        contrast = float((particles.density - 1) @ torch.cos(phase))
+        sizes.append(math.hypot(contrast * c * math.sqrt(of_force / of_density),
                                 float(particles.velocity[:, 0] @ torch.sin(phase))))
     return (sizes[-1] / sizes[count // 2]) ** (1 / (count - 1 - count // 2))
 

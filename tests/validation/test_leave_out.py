@@ -26,7 +26,7 @@ from eddies.particles.smoothing_kernels import WendlandC2
 from eddies.particles.terms.eddy_viscosity import EddyViscosity
 from eddies.particles.terms.presets import PRESETS
 from eddies.spectral.spectral_grid import SpectralGrid
-from tests.particles.configurations import model
+from tests.particles.configurations import OWN_DENSITY, model
 
 LENGTH, PER_SIDE, STEP = 2 * np.pi, 9, 0.001
 SPACING = LENGTH / PER_SIDE
@@ -114,14 +114,14 @@ def messages_of(comm, terms, density=True):
 
 
 def trainer(comm, weights):
-    """A trainer of the learned-density closure on one frame."""
+    """A trainer of the model with an own density on one frame."""
     slab = SlabDecomposition(comm, LENGTH, PER_SIDE)
     position = np.random.default_rng(3).uniform(0, LENGTH, (PER_SIDE**3, 3))
     position = position[slab.owner_of(position[:, 2]) == comm.rank]
     ids = np.arange(len(position)) + (0 if comm.rank == 0 else PER_SIDE**3 - len(position))
     particles = ParticleSet.from_numpy({"id": ids, "position": position, "velocity": np.sin(position[:, [1, 2, 0]]),
                                         "density": np.ones(len(position))})
-    learned = model(PRESETS["learned-density"], FlowUnits(SCALES, 1.7 * SPACING, 20.0))
+    learned = model(OWN_DENSITY, FlowUnits(SCALES, 1.7 * SPACING, 20.0))
     truth = torch.from_numpy(np.cos(position))
     frame = TrainingFrame(ParticleDynamics(slab, learned, 0.0), particles, truth, truth[:, 0])
     return ForceTrainer(learned, [frame], WendlandC2(1.7 * SPACING), weights, 100, seed=5)
@@ -178,12 +178,11 @@ def test_one_rank_sends_nothing(comm, preset):
 @pytest.mark.mpi(2)
 def test_a_force_pays_with_messages_for_what_it_has_alone(comm):
     assert messages_of(comm, {}) == []
-    learned = messages_of(comm, PRESETS["learned-density"])
+    learned = messages_of(comm, OWN_DENSITY)
     # Votes on the list before the step and at its end; then position, velocity, density: up and down.
     assert sorted(learned) == ["Allreduce"] * 2 + ["Sendrecv"] * 6
     # Who reads no density sends none, and neither do pairs that look at distances alone send velocities.
     assert sorted(messages_of(comm, NO_DENSITY, density=False)) == ["Allreduce"] * 2 + ["Sendrecv"] * 4
-    assert sorted(messages_of(comm, {"summation-density": {}}, density=False)) == ["Allreduce"] * 2 + ["Sendrecv"] * 2
 
 
 @pytest.mark.mpi(2)
@@ -228,8 +227,8 @@ def test_without_a_pair_sum_no_neighbours_are_searched_and_no_density_travels(co
 
 @pytest.mark.mpi(1, 2)
 def test_a_model_without_pairs_has_neither_list_nor_ghosts(comm):
-    resolved, both, pairs = (set_up(comm, PRESETS[name])[0]
-                             for name in ("resolved", "resolved + pairs", "learned-density"))
+    resolved, both, pairs = (set_up(comm, terms)[0]
+                             for terms in (PRESETS["resolved"], PRESETS["resolved + pairs"], OWN_DENSITY))
     assert resolved.neighborhood is None and resolved.resolution is not None
     assert both.neighborhood.cutoff == pairs.neighborhood.cutoff == pairs.model.flow.cutoff
     assert pairs.resolution is None
@@ -266,10 +265,9 @@ def test_the_pressure_goes_to_the_particles_only_where_a_term_reads_the_density(
 
 @pytest.mark.mpi(1, 2)
 @pytest.mark.parametrize("word, parameter", [("damping", "rates"), ("relaxation", "factor"),
-                                             ("forcing", None), ("eddy-viscosity", "coefficients"),
-                                             ("density-transport", "factors")])
+                                             ("forcing", None), ("eddy-viscosity", "coefficients")])
 def test_a_term_of_zero_amplitude_gives_the_numbers_of_the_model_without_it(comm, word, parameter):
-    others = {"pressure": {}, "pairs": {}} if word != "density-transport" else {"pairs": {}}
+    others = {"pressure": {}, "pairs": {}}
     without, particles = set_up(comm, others)
     given = dict(injection_rate=0.0) if word == "forcing" else {}
     with_it, _ = set_up(comm, {**others, word: given})
@@ -279,10 +277,7 @@ def test_a_term_of_zero_amplitude_gives_the_numbers_of_the_model_without_it(comm
         expected, found = without.rates(particles), with_it.rates(particles)
         # Sums over pairs are the same to the last bit; a force on the grid is interpolated with another zero added.
         assert torch.allclose(found.acceleration, expected.acceleration, rtol=0, atol=1e-14)
-        if expected.density is not None:
-            assert torch.allclose(found.density, expected.density, rtol=0, atol=1e-15)
-        if word == "density-transport":
-            assert found.density_rate.abs().max() == 0 and expected.density_rate is None
+        assert torch.allclose(found.density, expected.density, rtol=0, atol=1e-15)
 
 
 @pytest.mark.mpi(1)

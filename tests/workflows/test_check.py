@@ -228,14 +228,15 @@ def test_what_no_term_reads_limits_no_ranks():
     from eddies.workflows.foreseen.estimates import most_ranks
     fast = ["training.horizons.steps=5", "training.horizons.frames=[12]"]
     limits = {preset: most_ranks(load_scene("tiny", [*fast, f"model.preset={preset}"]))
-              for preset in ("resolved + pairs", "resolved", "learned-density")}
+              for preset in ("resolved + pairs", "resolved", "transport-velocity")}
     found = {preset: {word for word in ("reach", "resolved") if any(word in reason for reason in reasons)}
              for preset, reasons in limits.items()}
-    assert found == {"resolved": {"resolved"}, "learned-density": {"reach"}, "resolved + pairs": {"reach", "resolved"}}
+    assert found == {"resolved": {"resolved"}, "transport-velocity": {"reach"},
+                     "resolved + pairs": {"reach", "resolved"}}
     told = {preset: [line for line in warnings(load_scene("tiny", [f"model.preset={preset}"]), 1) if "horizons" in line]
             for preset in limits}
-    assert told == {"resolved + pairs": [], "resolved": [], "learned-density": [
-        '[model] terms: "density-transport" is trained through horizons alone, and stays as it starts without them: '
+    assert told == {"resolved + pairs": [], "resolved": [], "transport-velocity": [
+        '[model] terms: "transport-velocity" is trained through horizons alone, and stays as it starts without them: '
         "add [training.horizons]"]}
 
 

@@ -25,7 +25,7 @@ MODELS = {
     "default": Model(preset="resolved + pairs"),
     "told densities": Model(preset="resolved + pairs", settings={"pairs": {
         "inputs": ("density", "distance", "speed", "approach")}}),
-    "own density": Model(preset="learned-density"),
+    "own density": Model(terms=("pairs", "density-flux", "continuity"), settings={"continuity": {"diffusion": 0.1}}),
     "local": Model(preset="local"),
 }
 # Of all networks; of each two densities, if any.

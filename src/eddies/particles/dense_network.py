@@ -34,12 +34,6 @@ class DenseNetwork(nn.Module):
         self.weights = nn.ParameterList(weights)
         self.biases = nn.ParameterList([torch.zeros(rows, 1, dtype=torch.float64) for rows, _ in shapes])
 
-    @torch.no_grad()
-    def zero_outputs(self) -> None:
-        """Let all outputs be zero, by the weights of the last layer."""
-        self.weights[-1].zero_()
-        self.biases[-1].zero_()
-
     def forward(self, features: Tensor) -> Tensor:
         """Outputs (outputs, m) of features (inputs, m).
 

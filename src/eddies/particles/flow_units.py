@@ -23,3 +23,8 @@ class FlowUnits:
     cutoff: float
     neighbors: float
     seed: int = 1
+
+    @property
+    def particle_mass(self) -> float:
+        """Mass of a particle: that of all fluid over the number of particles."""
+        return self.scales.density_mean * self.scales.spacing**3

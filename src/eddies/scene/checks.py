@@ -169,7 +169,7 @@ def model_problems(scene: Scene) -> Iterator[str]:
         for name, one in settings.items():
             if "density" in one.reads:
                 yield (f'[model] terms = {quoted(scene.model.terms)}: "{name}" reads the density, which no term gives; '
-                       'add a term that does, such as "pressure" or "density-transport", or '
+                       'add a term that does, such as "pressure" or "continuity", or '
                        f"{_without_density(name, one)}")
 
 

@@ -17,9 +17,9 @@ ANTISYMMETRIC = PAIR_MODELS["antisymmetric"]
 NO_DENSITY = dict(inputs=("distance", "speed", "approach"))
 #: Between them every term of pairs, both bases and both sets of invariants; all but the first evaluate each pair once.
 MODELS = {
-    "corrected": {"pairs": {}, "density-flux": {}, "density-transport": {}, "eddy-viscosity": {}},
+    "corrected": {"pairs": {}, "density-flux": {}, "continuity": {}, "eddy-viscosity": {}},
     "antisymmetric": ANTISYMMETRIC,
-    "summation": {"summation-density": {}, "wcsph": dict(exponent=7.0)},
+    "wcsph": {"continuity": {}, "wcsph": dict(exponent=7.0)},
     "transport velocity": {"continuity": dict(diffusion=0.1), "wcsph": {}, "transport-velocity": {}},
     "without density": {"pairs": NO_DENSITY, "density-flux": NO_DENSITY},
 }
@@ -208,7 +208,7 @@ def test_antisymmetric_forces_of_a_pair_are_opposite_to_the_last_bit():
         assert (first + second).norm() > 1e-6
 
 
-@pytest.mark.parametrize("name", ["antisymmetric", "summation", "without density"])
+@pytest.mark.parametrize("name", ["antisymmetric", "wcsph", "without density"])
 def test_one_evaluation_of_a_pair_serves_both_particles(name):
     """All pairs in both orders, and each pair once with its values times their parity for the other one."""
     terms = model(MODELS[name]).terms.values()

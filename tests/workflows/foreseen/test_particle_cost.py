@@ -23,13 +23,13 @@ def cost_of(work, ranks, threads=1, speed=SPEED):
     return particle_cost(work, speed, ranks, threads, 2e9)
 
 
-@pytest.mark.parametrize("preset", ["resolved", "resolved + pairs", "learned-density"])
+@pytest.mark.parametrize("preset", ["resolved", "resolved + pairs", "paper"])
 def test_one_rank_sends_nothing_and_more_do(preset):
     work = work_of(64, preset)
     assert cost_of(work, 1).parts["messages"] == 0 < cost_of(work, 2).parts["messages"]
 
 
-@pytest.mark.parametrize("preset", ["resolved", "resolved + pairs", "learned-density"])
+@pytest.mark.parametrize("preset", ["resolved", "resolved + pairs", "paper"])
 def test_more_ranks_never_need_more_memory_nor_work(preset):
     work = work_of(64, preset)
     rows = [cost_of(work, ranks) for ranks in range(1, 25)]
@@ -65,7 +65,7 @@ def test_rows_are_the_fastest_splits_into_ranks_and_threads(side, most):
 
 def test_a_part_that_a_model_does_not_have_takes_nothing():
     nothing = replace(SPEED, calls={"splines": 0, "transforms": 0}, components={"splines": 0, "transforms": 0})
-    pairs = cost_of(work_of(32, "learned-density"), 2, speed=nothing).parts
+    pairs = cost_of(work_of(32, "paper"), 2, speed=nothing).parts
     assert pairs["transforms"] == pairs["splines"] == pairs["modes"] == 0 < pairs["pairs"]
     alone = replace(SPEED, ghost_columns=(), rates={**SPEED.rates, "pairs": Rate(0.0, 1e-8)})
     resolved = cost_of(work_of(32, "resolved"), 1, speed=alone).parts

@@ -85,7 +85,7 @@ def counted(monkeypatch):
 @pytest.mark.usefixtures("quick_probes")
 @pytest.mark.mpi(2, 3)
 @pytest.mark.parametrize("changes", [["resolved"], ["resolved + pairs"], ["resolved + pairs", TOLD_DENSITIES],
-                                     ["learned-density"]])
+                                     ["paper"]])
 @torch.no_grad()
 def test_messages_and_bytes_are_those_of_an_evaluation(comm, changes, counted):
     messages, sizes = counted
@@ -125,7 +125,7 @@ def test_sums_over_ranks_are_those_of_an_evaluation(comm):
 
 
 @pytest.mark.mpi(2, 3)
-@pytest.mark.parametrize("preset", ["resolved", "learned-density"])
+@pytest.mark.parametrize("preset", ["resolved", "paper"])
 @pytest.mark.parametrize("integrator", EVALUATIONS)
 @torch.no_grad()
 def test_particles_settle_as_often_and_with_as_many_columns(comm, preset, integrator, counted):
@@ -148,7 +148,7 @@ def test_particles_settle_as_often_and_with_as_many_columns(comm, preset, integr
 @pytest.mark.mpi(1, 2, 3)
 @torch.no_grad()
 def test_pairs_particles_and_ghosts_of_a_rank(comm):
-    scene = scene_of("learned-density")
+    scene = scene_of("paper")
     dynamics, particles = run_of(scene, comm)
     work, around = particle_work(scene), dynamics.neighborhood
     dynamics.context(particles)

@@ -93,7 +93,7 @@ def test_particles_in_and_around_a_cube_are_those_that_a_step_takes(changes, row
 
 @pytest.mark.usefixtures("quick_probes")
 @pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("preset", ["resolved + pairs", "learned-density"])
+@pytest.mark.parametrize("preset", ["resolved + pairs", "paper"])
 def test_the_probe_of_training_leaves_nothing_behind(comm, preset):
     scene, state = load_scene("tiny", [f"model.preset={preset}"]), torch.random.get_rng_state()
     speed = probe_training(scene, comm, True)
@@ -160,7 +160,7 @@ def test_a_run_tells_the_warnings_of_its_stages_when_it_starts(comm, tmp_path, m
     from eddies.workflows.foreseen.warnings import stage_warnings
     monkeypatch.setattr(logging.getLogger("eddies"), "propagate", True)
     monkeypatch.setattr(dns, "run", lambda *given: None)
-    scene = load_scene("tiny", ["flow.sound_speed=4", "model.preset=learned-density"])
+    scene = load_scene("tiny", ["flow.sound_speed=4", "model.preset=paper"])
     with caplog.at_level(logging.WARNING, logger="eddies"):
         run_stages(["dns"], scene, comm, tmp_path, StopRequest(comm))
     shown = [record.getMessage() for record in caplog.records]

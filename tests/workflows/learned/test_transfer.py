@@ -23,7 +23,7 @@ SCALES = ReferenceScales(filter_width=BOX_LENGTH / 6, spacing=BOX_LENGTH / 12, v
 
 
 @pytest.mark.mpi(1)
-@pytest.mark.parametrize("preset, weight", [("learned-density", 1e-5), ("resolved + pairs", 1e-4), ("resolved", 1e-6)])
+@pytest.mark.parametrize("preset, weight", [("paper", 1e-5), ("resolved + pairs", 1e-4), ("resolved", 1e-6)])
 def test_the_same_flow_in_other_units_gets_the_same_force_in_those_units(comm, preset, weight):
     """Twice as fast, and with four times the fluctuations of density at the same speed of sound."""
     scene = load_scene("tiny", [f"model.preset={preset}"])

@@ -240,7 +240,7 @@ REFUSED = {
 @pytest.mark.mpi(1)
 @pytest.mark.parametrize("overrides, name, message", REFUSED.values(), ids=REFUSED)
 def test_truths_that_do_not_fit_are_refused_before_any_work(comm, tmp_path, overrides, name, message):
-    read_density = 'model={preset = "learned-density"}' if "no density" in message else "seed=1"
+    read_density = 'model={preset = "paper"}' if "no density" in message else "seed=1"
     scene = trained_on(made(comm, tmp_path, read_density, runs=()), tmp_path / "own", tmp_path / name)
     other = scene_of(tmp_path)
     if overrides[:1] == ["tracers"]:
@@ -272,8 +272,8 @@ def test_more_ranks_than_another_truth_can_be_cut_for_are_refused_before_any_wor
     assert other.tracers.planes == 8
     place = f'[training] truths: "{tmp_path / "other"}"'
     for model, most, reason in (('{terms=["viscosity"]}', 2, "ghost planes of the resolved velocity"),
-                                ('{preset="learned-density", neighbors=8}', 2, "slabs no thinner than the particles' "
-                                                                               "reach 1.95")):
+                                ('{preset="paper", neighbors=8}', 2,
+                                 "slabs no thinner than the particles' reach 1.95")):
         alone = scene_of(tmp_path, "tracers.particles_per_side=8", f"model={model}")
         alone = replace(alone, training=replace(alone.training, horizons=None))
         scene = trained_on(alone, tmp_path / "nowhere", tmp_path / "other")

@@ -11,8 +11,8 @@ from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.rates import Rates
 from eddies.particles.scaled_pairs import ScaledPairs
+from eddies.particles.smoothing_kernels import KERNELS, over_distance
 from eddies.particles.terms import settings as declared
-from eddies.particles.terms.summation_density import KERNELS, over_distance, particle_mass
 from eddies.particles.terms.term import PairTerm
 
 
@@ -32,7 +32,7 @@ class Continuity(PairTerm):
 
     def __init__(self, settings: declared.Continuity, flow: FlowUnits) -> None:
         super().__init__(settings, flow)
-        self.kernel, self.mass = KERNELS[settings.kernel](flow.cutoff), particle_mass(flow)
+        self.kernel, self.mass = KERNELS[settings.kernel](flow.cutoff), flow.particle_mass
         self.diffusivity = flow.cutoff * flow.scales.required("sound_speed")  # 2 h c
         self.delta = nn.Parameter(torch.tensor(settings.diffusion, dtype=torch.float64)) if settings.diffusion else None
         self.parity = torch.tensor([1.0] if self.delta is None else [1.0, -1.0])

@@ -6,13 +6,12 @@ from torch import Tensor
 
 from eddies.particles.compiled_pairs import CompiledSum
 from eddies.particles.context import Context
-from eddies.particles.dense_network import DenseNetwork
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.rates import Rates
 from eddies.particles.scaled_pairs import ScaledPairs
 from eddies.particles.terms import settings as declared
 from eddies.particles.terms.pair_basis import build_network, compiled_network
-from eddies.particles.terms.term import PairTerm, TermError
+from eddies.particles.terms.term import PairTerm
 
 
 class DensityFlux(PairTerm):
@@ -27,11 +26,6 @@ class DensityFlux(PairTerm):
         # Another network than that of the force, so other initial weights.
         self.network = build_network(settings, 1, flow.seed + 1)
         self.mutual, self.width = "density" not in settings.inputs, max(settings.hidden)
-        if settings.zero_at_first:
-            if not isinstance(self.network, DenseNetwork):
-                raise TermError(f'zero_at_first: needs network = "dense", not "{settings.network}", whose last '
-                                "layer is not known; leave one of the two out")
-            self.network.zero_outputs()
 
     def features(self, pairs: ScaledPairs) -> Tensor:
         """What the network is given, (features, m)."""

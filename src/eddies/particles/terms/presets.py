@@ -12,14 +12,12 @@ TERMS = {
         ("pairs", "pair_network", "PairNetwork"),
         ("eddy-viscosity", "eddy_viscosity", "EddyViscosity"),
         ("density-flux", "density_flux", "DensityFlux"),
-        ("density-transport", "density_transport", "DensityTransport"),
         ("pressure", "pressure", "Pressure"),
         ("stress", "stress", "Stress"),
         ("viscosity", "viscosity", "Viscosity"),
         ("damping", "damping", "Damping"),
         ("relaxation", "relaxation", "Relaxation"),
         ("forcing", "forcing", "Forcing"),
-        ("summation-density", "summation_density", "SummationDensity"),
         ("continuity", "continuity", "Continuity"),
         ("wcsph", "wcsph", "WCSPH"),
         ("transport-velocity", "transport_velocity", "TransportVelocity"),
@@ -38,7 +36,6 @@ PRESETS: dict[str, dict[str, Mapping[str, Any]]] = {
     # The density there is that of the pressure, whose force is given: a network that is told of it learns no more, and
     # costs twice as much, as pairs then are not opposite.
     "resolved + pairs": {**dict.fromkeys(RESOLVED, {}), "pairs": {"inputs": ("distance", "speed", "approach")}},
-    "learned-density": {"pairs": {}, "density-flux": {"zero_at_first": True}, "density-transport": {}},
     "paper": {"pairs": {"basis": "paper", "hidden": (20, 100, 20)}, "density-flux": {"hidden": (20, 100, 20)}},
     "local": {"filtered-equations": {}, "eddy-viscosity": {}},
     "wcsph": {"continuity": {}, "wcsph": LITTLE_FRICTION},

@@ -95,19 +95,7 @@ class EddyViscosity(TermSettings):
 class DensityFlux(NetworkSettings):
     """The paper's rate of density: a learned flux between pairs."""
 
-    zero_at_first: bool = boolean("begin without flux", default=False)
-
     gives = ("density_rate",)
-
-
-@dataclass(frozen=True, kw_only=True)
-class DensityTransport(TermSettings):
-    """A rate of density from the divergence of the velocity and from relaxation to the neighbours' density."""
-
-    numbers_per_pair = 8
-    reads = ("pairs", "density")
-    gives = ("density_rate",)
-    learns_through_horizons = True
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,17 +152,6 @@ class Forcing(TermSettings):
     wavenumber: float = number("modes with 0 < |k| < this are forced", default=2.0, above=1)
 
     reads = ("resolved",)
-
-
-@dataclass(frozen=True, kw_only=True)
-class SummationDensity(TermSettings):
-    """The density of smoothed particle hydrodynamics: a sum over the neighbours."""
-
-    kernel: str = choice("smoothing kernel", "cubic-spline", "wendland", default="cubic-spline")
-
-    numbers_per_pair = 8
-    reads = ("pairs",)
-    gives = ("density",)
 
 
 @dataclass(frozen=True, kw_only=True)

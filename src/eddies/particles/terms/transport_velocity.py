@@ -11,8 +11,8 @@ from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.rates import Rates
 from eddies.particles.scaled_pairs import ScaledPairs
+from eddies.particles.smoothing_kernels import KERNELS, over_distance
 from eddies.particles.terms import settings as declared
-from eddies.particles.terms.summation_density import KERNELS, over_distance, particle_mass
 from eddies.particles.terms.term import PairTerm
 
 
@@ -36,7 +36,7 @@ class TransportVelocity(PairTerm):
 
     def __init__(self, settings: declared.TransportVelocity, flow: FlowUnits) -> None:
         super().__init__(settings, flow)
-        self.kernel, self.mass = KERNELS[settings.kernel](flow.cutoff), particle_mass(flow)
+        self.kernel, self.mass = KERNELS[settings.kernel](flow.cutoff), flow.particle_mass
         self.unit = flow.scales.density_mean * flow.scales.required("sound_speed") * flow.cutoff / 2
         self.background = nn.Parameter(torch.tensor(settings.background, dtype=torch.float64))
 

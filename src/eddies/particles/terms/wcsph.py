@@ -11,8 +11,8 @@ from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.rates import Rates
 from eddies.particles.scaled_pairs import ScaledPairs
+from eddies.particles.smoothing_kernels import KERNELS, over_distance
 from eddies.particles.terms import settings as declared
-from eddies.particles.terms.summation_density import KERNELS, over_distance, particle_mass
 from eddies.particles.terms.term import PairTerm
 
 # Softens the approach rate at small distances, in squared smoothing lengths (Monaghan 1992).
@@ -45,7 +45,7 @@ class WCSPH(PairTerm):
 
     def __init__(self, settings: declared.WCSPH, flow: FlowUnits) -> None:
         super().__init__(settings, flow)
-        self.kernel, self.mass = KERNELS[settings.kernel](flow.cutoff), particle_mass(flow)
+        self.kernel, self.mass = KERNELS[settings.kernel](flow.cutoff), flow.particle_mass
         self.density = flow.scales.density_mean
         self.sound_speed, self.alpha, self.beta = (nn.Parameter(torch.tensor(value, dtype=torch.float64))
                                                    for value in (1.0, settings.alpha, settings.beta))
