@@ -41,6 +41,8 @@ ONLY_IN = {
     # Scene, rules, reader, sections, model, methods, checks, comparison
     **dict.fromkeys(("eddies.scene.[srm]*", "eddies.scene.ch*", "eddies.scene.compar*"),
                     ("scene*", "workflows*", "cli", "api", "stored_run", "stages", "logs")),
+    # Their records are known to both.
+    "eddies.scene.integrators*": ("scene*", "particles.integrators", "workflows*"),
     # Of the particles only the settings of terms declare keys of a scene.
     "eddies.scene.values*": ("scene*", "particles.terms.settings", "workflows*"),
     "eddies.import_path*": ("scene*", "particles.model", "particles.terms.pair_basis", "workflows*"),

@@ -49,7 +49,7 @@ def pairs_of_calls(comm) -> dict[str, tuple[Call, Call]]:
         "stress, viscosity, damping and relaxation": (stress, pressure),
         "pair sum beside them": (stress, resolved),
         "eddy viscosity": (pressure | {"eddy-viscosity": {}}, pressure),
-        "forcing of the particles": (pressure | {"forcing": {"injection_rate": 0.5}}, pressure),
+        "forcing of the particles": (pressure | {"injection": {"injection_rate": 0.5}}, pressure),
     }
     found = {f"step: {name}": tuple(step_of(comm, terms) for terms in pair) for name, pair in steps.items()}
     for name, others in without.items():

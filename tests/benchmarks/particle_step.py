@@ -112,7 +112,7 @@ class Run:
         if resolution is None:
             raise SystemExit("particle_step: the model has no resolved velocity, which sets the step")
         highest = resolution.grid.resolved * 2 * math.pi / self.dynamics.box.length
-        return allowed_step(INTEGRATOR, highest, resolution.speed or self.speed)
+        return allowed_step(self.integrator.scheme.angle, highest, resolution.speed or self.speed)
 
     def advance(self) -> None:
         """Take a step."""

@@ -13,7 +13,7 @@ from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.flow_units import FlowUnits
-from eddies.particles.model import LagrangianModel, build_model
+from eddies.particles.model import FORCING, LagrangianModel, build_model
 from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.periodic_box import PeriodicBox
@@ -21,7 +21,7 @@ from eddies.particles.rates import Rates
 from eddies.particles.reference_scales import ReferenceScales
 from eddies.particles.scaled_pairs import ScaledPairs
 from eddies.particles.terms.presets import PRESETS, TERMS
-from eddies.particles.terms.settings import NetworkSettings, TermSettings
+from eddies.particles.terms.settings import Forcing, NetworkSettings, TermSettings
 from eddies.particles.terms.term import Term
 
 LENGTH = 2 * math.pi
@@ -51,7 +51,6 @@ PAIR_MODELS = {
 }
 #: Models with a resolved velocity.
 RESOLVED_MODELS = {
-    "pressure for the density": {"pressure": dict(force=False), "pairs": {}},
     "pressure": {"pressure": {}, "pairs": {}},
     "told densities": {**PRESETS["resolved"], "pairs": {}},
     **{name: PRESETS[name] for name in ("resolved + pairs", "resolved")},
@@ -75,11 +74,12 @@ def state(count=200, seed=3, kind="even"):
 def model(terms=None, flow=FLOW, **more):
     """A model of terms by their words, each with its settings; with small networks, in double precision.
 
-    As keywords the words have "_" for "-".
+    As keywords the words have "_" for "-". "injection" is the forcing that rollouts of forced flows have.
     """
     given = {**(terms or {}), **{word.replace("_", "-"): settings for word, settings in more.items()}}
+    forcing = Forcing(**given.pop(FORCING)) if FORCING in given else None
     settings = {word: _settings(load(TERMS[word][1]), chosen) for word, chosen in given.items()}
-    return build_model(settings, settings, flow)
+    return build_model(settings, settings, flow).forced(forcing)
 
 
 def _settings(kind, chosen):

@@ -239,14 +239,14 @@ def test_without_terms_that_look_at_others_there_is_no_list_no_halo_and_no_migra
 def test_a_force_of_zero_amplitude_changes_nothing(comm):
     slab, particles = distributed(comm, *state())
     plain = dynamics_of(slab, model(pairs={})).rates(particles).acceleration
-    forced = dynamics_of(slab, model(pairs={}, forcing=dict(injection_rate=0.0)))
+    forced = dynamics_of(slab, model(pairs={}, injection=dict(injection_rate=0.0)))
     assert torch.equal(forced.rates(particles).acceleration, plain)
 
 
 @pytest.mark.mpi(1, 2)
 def test_terms_are_added(comm):
     slab, particles = distributed(comm, *state())
-    terms = {**MODELS["pressure"], "forcing": dict(injection_rate=0.4)}
+    terms = {**MODELS["pressure"], "injection": dict(injection_rate=0.4)}
     together = dynamics_of(slab, model(terms)).rates(particles)
     apart = [dynamics_of(slab, model({word: terms[word]})).rates(replace(particles, density=together.density))
              for word in terms]
@@ -304,14 +304,16 @@ def test_terms_read_the_density_that_others_give(comm, stored):
 def test_a_density_that_is_at_hand_stands_for_the_one_that_terms_would_give(comm):
     position, velocity, density = state()
     slab, particles = distributed(comm, position, velocity)
-    dynamics = dynamics_of(slab, model(MODELS["pressure for the density"]))
+    dynamics = dynamics_of(slab, model(MODELS["pressure"]))
     own = dynamics.rates(particles)
     again = dynamics.rates(particles, density=own.density.detach())
     assert torch.equal(again.acceleration, own.acceleration) and torch.equal(again.density, own.density)
     other = density[particles.id]
     found = dynamics.rates(particles, density=other)
-    expected = dynamics_of(slab, model(MODELS["pairs"])).rates(replace(particles, density=other))
-    assert torch.equal(found.density, other) and torch.equal(found.acceleration, expected.acceleration)
+    force = dynamics_of(slab, model(pressure={})).rates(particles).acceleration
+    expected = force + dynamics_of(slab, model(MODELS["pairs"])).rates(replace(particles, density=other)).acceleration
+    assert torch.equal(found.density, other)
+    assert_close(found.acceleration, expected)
     assert not torch.allclose(found.acceleration, own.acceleration)
 
 

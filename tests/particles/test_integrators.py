@@ -125,7 +125,7 @@ def assert_rates_between_steps(comm, name, terms, strayed):
     assert (rates.density_rate is None) == (terms != "paper")
     if terms == "paper":
         assert torch.allclose(rates.density_rate, expected.density_rate, rtol=0, atol=1e-12)
-    assert stepper.dense == (name != "verlet")
+    assert stepper.scheme.dense == (name != "verlet")
 
 
 @pytest.mark.mpi(1, 2)
@@ -194,7 +194,7 @@ def test_weights_are_solved_for_once_where_particles_stay(comm, monkeypatch):
 @every_integrator
 def test_density_that_terms_give_is_that_last_evaluated(comm, name):
     slab, particles = distributed(comm, *state())
-    dynamics = dynamics_of(slab, model(MODELS["pressure for the density"]), 0.1)
+    dynamics = dynamics_of(slab, model(MODELS["pressure"]), 0.1)
     end = run(name, dynamics, particles, 0.01, 5)
     expected = dynamics.rates(end).density.detach()
     # The step before the last evaluation is as small as the change of the density by it.
@@ -221,5 +221,5 @@ def test_particles_without_a_density_are_stepped_as_those_with_one(comm, name, t
 def test_particles_get_the_density_that_terms_give(comm, name):
     """Also those that start without one."""
     slab, particles = distributed(comm, *state()[:2])
-    end = run(name, dynamics_of(slab, model(MODELS["pressure for the density"]), 0.1), particles, 0.05, 2)
+    end = run(name, dynamics_of(slab, model(MODELS["pressure"]), 0.1), particles, 0.05, 2)
     assert end.density.shape == (len(end),) and 0 < (end.density - 1).abs().max() < 0.1

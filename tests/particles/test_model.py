@@ -28,8 +28,8 @@ def randomised(lagrangian, seed=3):
     return lagrangian
 
 
-LINEAR = ["pressure", "stress", "damping", "relaxation", "forcing", "viscosity"]
-SETTINGS = {"forcing": dict(injection_rate=0.3)}
+LINEAR = ["pressure", "stress", "damping", "relaxation", "injection", "viscosity"]
+SETTINGS = {"injection": dict(injection_rate=0.3)}
 
 
 def test_which_terms_are_linear():
@@ -63,7 +63,7 @@ def test_what_is_kept_of_a_linear_term_is_what_it_gives(comm, word):
 
 
 @pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("name", ["resolved + pairs", "told densities", "pressure for the density", "resolved"])
+@pytest.mark.parametrize("name", ["resolved + pairs", "told densities", "pressure", "resolved"])
 def test_rates_and_gradients_with_what_is_kept_are_those_without(comm, name):
     slab, particles = distributed(comm, *state())
     lagrangian = model({**MODELS[name], **SETTINGS})
@@ -159,13 +159,12 @@ def test_the_modes_of_a_force_stand_beside_the_acceleration_that_they_make(comm)
 
 def test_what_a_model_reads_and_gives_is_what_its_terms_do():
     assert model().reads == model().gives == set() and not model().reads_density
-    density, force, learned, resolved = (model(MODELS[name]) for name in (
-        "pressure for the density", "pressure", "corrected", "resolved"))
-    assert density.reads == force.reads == {"pairs", "resolved", "density"}
-    assert density.density_is_given and force.density_is_given and not learned.density_is_given
+    given, learned, resolved = (model(MODELS[name]) for name in ("pressure", "corrected", "resolved"))
+    assert given.reads == {"pairs", "resolved", "density"} and learned.reads == {"pairs", "density"}
+    assert given.density_is_given and not learned.density_is_given
     # The pressure gives a density, but nobody reads it.
     assert "density" in resolved.gives and not resolved.reads_density and not resolved.density_is_given
-    assert [len(each.networks) for each in (density, learned, resolved)] == [1, 2, 0]
+    assert [len(each.networks) for each in (given, learned, resolved)] == [1, 2, 0]
 
 
 @pytest.mark.mpi(1)

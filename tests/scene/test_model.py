@@ -98,7 +98,6 @@ def test_what_terms_read_and_give():
     assert (model.reads, model.gives) == ({"resolved", "pairs", "density"}, {"acceleration", "density"})
     alone = Model(terms=["pairs"], settings={"pairs": {"inputs": ["distance"]}})
     assert (alone.reads, alone.gives) == ({"pairs"}, {"acceleration"})
-    assert Model(terms=["pressure"], settings={"pressure": {"force": False}}).gives == {"density"}
     assert PairNetwork(hidden=(8, 8)).numbers_per_pair == 5 + 16 + 3
     assert PairNetwork(hidden=(8,), inputs=("distance", "speed")).numbers_per_pair == 2 + 8 + 3
 

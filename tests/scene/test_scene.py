@@ -6,7 +6,7 @@ import pytest
 
 from eddies.io.hdf5 import create_product
 from eddies.pipeline import STAGES as TABLE
-from eddies.scene.scene import Eulerian, Flow, Horizons, Model, Scene, SceneError, Time, builtin_scenes, load_scene
+from eddies.scene.scene import Eulerian, Flow, Horizons, Scene, SceneError, Time, builtin_scenes, load_scene
 from eddies.scene.values import rule_of
 from tests.bad_scenes import BAD_OVERRIDES, BAD_TEXTS
 
@@ -216,10 +216,6 @@ def test_the_forcing_that_stays_on_needs_one_and_no_other(tmp_path):
     dataclasses.replace(scene, spin_up=None)  # the forcing acts while tracers are followed
     with pytest.raises(SceneError, match=r"\[tracers\] forced = true: there is no \[forcing\] that could stay on"):
         dataclasses.replace(scene, forcing=None)
-    terms = Model(terms=("pressure", "forcing"), settings={"forcing": {"injection_rate": 0.5}})
-    dataclasses.replace(load_scene("tiny"), model=terms)
-    with pytest.raises(SceneError, match=r'\[model\] terms: "forcing": .* is added by itself.*remove the term'):
-        dataclasses.replace(scene, model=terms)
 
 
 def test_window_without_training_is_the_default_of_training():

@@ -19,7 +19,6 @@ ITERATIONS = 10
 PAPER = {"pairs": dict(basis="paper", hidden=(8, 8)), "density-flux": dict(hidden=(8, 8)),
          "eddy-viscosity": dict(form="two-sided", basis="paper")}
 CLOSURES = {
-    "pressure for the density": {"pressure": dict(force=False), "pairs": {}},
     "pressure": {"pressure": {}, "pairs": {}},
     "resolved + pairs": PRESETS["resolved + pairs"],
     "resolved": PRESETS["resolved"],

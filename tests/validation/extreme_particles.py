@@ -74,7 +74,7 @@ def states(comm) -> Iterator[Row]:
     for step in (1e-5, 1e-4, 1e-2):
         yield (f"two steps of {step:g} at 1000 c, {comm.size} rank(s)", "as at rest, or refused by all ranks",
                shown(translated_run(comm, "own density", fast, step)))
-    for kind, factors in (("pressure for the density", (0.2,)), ("own density", (0.1, 20.0))):
+    for kind, factors in (("pressure", (0.2,)), ("own density", (0.1, 20.0))):
         for mach in MACH_NUMBERS:
             for factor in factors:
                 step = 0.02 if kind.startswith("pressure") else factor * mach

@@ -62,7 +62,7 @@ def few_particles(comm, kind, integrator, total):
 
 def pushed_by_the_grid(kind):
     """Whether the model has a force from its grid."""
-    return "resolved" in network_model(kind, TOTAL).reads and kind != "pressure for the density"
+    return "resolved" in network_model(kind, TOTAL).reads
 
 
 def lattice_at_rest(comm, kind, dtype=torch.float64, side=SIDE, count=5):

@@ -94,7 +94,7 @@ def overdriven(comm, rate, count=4, total=TOTAL):
     position, everywhere = random_points(total), random_points(100_000)
     faster = flow_velocity(position).square().mean() / flow_velocity(everywhere).square().mean()
     slab, particles = distributed(comm, position, flow_velocity(position), planes=PLANES)
-    dynamics = ParticleDynamics(slab, model_of(forcing=dict(injection_rate=rate)), SKIN)
+    dynamics = ParticleDynamics(slab, model_of(injection=dict(injection_rate=rate)), SKIN)
     end = advance(dynamics, particles, "rk4", 0.02, count)
     energies = [0.5 * float(by_id(comm, state, state.velocity, total).square().sum(1).mean())
                 for state in (particles, end)]
@@ -168,7 +168,7 @@ def test_a_force_that_breaks_within_a_step_is_reported_by_all_ranks(comm, kind, 
 
 @pytest.mark.mpi(1)
 def test_a_density_from_the_pressure_is_the_same_at_any_mach_number(comm):
-    ends = [at_mach_number(comm, "pressure for the density", mach, 0.02, count=5) for mach in MACH_NUMBERS]
+    ends = [at_mach_number(comm, "pressure", mach, 0.02, count=5) for mach in MACH_NUMBERS]
     assert all(complaint is None for complaint, _ in ends)
     assert all(torch.allclose(velocity, ends[0][1], atol=1e-9) for _, velocity in ends)
 

@@ -32,7 +32,7 @@ LENGTH, PER_SIDE, STEP = 2 * np.pi, 9, 0.001
 SPACING = LENGTH / PER_SIDE
 SCALES = ReferenceScales(filter_width=2 * SPACING, spacing=SPACING, velocity=1.0, density_mean=1.0, density=0.01,
                          acceleration=1.0, density_rate=0.02, sound_speed=10.0, viscosity=0.01)
-FORCING = {"forcing": dict(injection_rate=0.5)}
+FORCING = {"injection": dict(injection_rate=0.5)}
 NO_DENSITY = {"pairs": dict(inputs=("distance", "speed", "approach"))}
 # The same forces without pairs, with pairs, and with pairs that are told the densities of the pressure.
 BESIDE_THE_RESOLVED = {"resolved": PRESETS["resolved"], "resolved + pairs": PRESETS["resolved + pairs"],
@@ -192,7 +192,7 @@ def test_a_model_pays_with_transposes_for_the_terms_that_it_has_alone(comm):
         return messages_of(comm, {word: settings.get(word, {}) for word in words})
 
     sent = {words: of(*words) for words in (
-        ("pairs",), ("pressure",), ("stress",), ("damping",), ("relaxation",), ("forcing",), ("pressure", "stress"),
+        ("pairs",), ("pressure",), ("stress",), ("damping",), ("relaxation",), ("injection",), ("pressure", "stress"),
         ("pressure", "stress", "damping", "relaxation"), ("pressure", "stress", "damping", "relaxation", "pairs"))}
     transposes = {words: messages.count("Alltoallv") for words, messages in sent.items()}
     # Of the resolved velocity: a solve that starts from what is foreseen, here well enough that it ends at once: what
@@ -202,7 +202,7 @@ def test_a_model_pays_with_transposes_for_the_terms_that_it_has_alone(comm):
     # the particles once; what is missed there the solve tells.
     assert transposes == {
         ("pairs",): 0, ("pressure",): resolved + 1, ("stress",): resolved + 2 + 1, ("damping",): resolved + 1,
-        ("relaxation",): resolved, ("forcing",): resolved + 1, ("pressure", "stress"): resolved + 2 + 1,
+        ("relaxation",): resolved, ("injection",): resolved + 1, ("pressure", "stress"): resolved + 2 + 1,
         ("pressure", "stress", "damping", "relaxation"): resolved + 2 + 1,
         ("pressure", "stress", "damping", "relaxation", "pairs"): resolved + 2 + 1}
     # No ghost particles, but planes of the splines: to the particles and back.
@@ -265,11 +265,11 @@ def test_the_pressure_goes_to_the_particles_only_where_a_term_reads_the_density(
 
 @pytest.mark.mpi(1, 2)
 @pytest.mark.parametrize("word, parameter", [("damping", "rates"), ("relaxation", "factor"),
-                                             ("forcing", None), ("eddy-viscosity", "coefficients")])
+                                             ("injection", None), ("eddy-viscosity", "coefficients")])
 def test_a_term_of_zero_amplitude_gives_the_numbers_of_the_model_without_it(comm, word, parameter):
     others = {"pressure": {}, "pairs": {}}
     without, particles = set_up(comm, others)
-    given = dict(injection_rate=0.0) if word == "forcing" else {}
+    given = dict(injection_rate=0.0) if word == "injection" else {}
     with_it, _ = set_up(comm, {**others, word: given})
     with torch.no_grad():
         if parameter is not None:
@@ -293,7 +293,7 @@ def test_a_term_that_is_not_there_is_not_evaluated(comm):
 
 @pytest.mark.mpi(1)
 def test_a_given_density_has_no_flux(comm):
-    given = model({"pressure": dict(force=False), "pairs": {}})
+    given = model({"pressure": {}, "pairs": {}})
     names = {name for name, _ in given.named_parameters()}
     assert names and all(name.startswith("terms.pairs.network") for name in names)
     assert len(given.terms["pairs"].network.biases[-1]) == 2

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
@@ -11,15 +11,15 @@ from torch import Tensor
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.rates import BY_PARTICLE, Rates
+from eddies.scene.integrators import SCHEMES, Scheme
 
 
 class Integrator:
     """A time stepping scheme; `memory` is what it carries from one step to the next besides the particles and the
-    state of the dynamics, with rows as in the particles last returned; `restore` gives it back. `dense`: whether
-    `rates` are those at the ends of steps, so that what is between can be told from them, and the next step begins with
-    them where somebody has asked for them."""
+    state of the dynamics, with rows as in the particles last returned; `restore` gives it back. Where the scheme is
+    dense the next step begins with the `rates` that somebody has asked for."""
 
-    dense = True
+    scheme: Scheme
 
     def __init__(self, dynamics: ParticleDynamics) -> None:
         self.dynamics = dynamics
@@ -53,7 +53,7 @@ class VelocityVerlet(Integrator):
     `memory` holds those rates. They are evaluated anew for any other particles than those last returned.
     """
 
-    dense = False
+    scheme = SCHEMES["verlet"]
 
     def rates(self, particles: ParticleSet) -> tuple[ParticleSet, Rates]:
         """Evaluated for themselves: those of the memory belong to the predicted velocity."""
@@ -84,6 +84,8 @@ class CorrectedVerlet(Integrator):
     the particles last returned.
     """
 
+    scheme = SCHEMES["corrected-verlet"]
+
     def step(self, particles: ParticleSet, time_step: float) -> ParticleSet:
         """The particles one time step later; collective."""
         particles, start = self.rates(particles)
@@ -97,24 +99,22 @@ class CorrectedVerlet(Integrator):
 class RungeKutta(Integrator):
     """An explicit Runge-Kutta scheme in which each stage goes from the step's start along the rates of the one before:
 
-        k_s = f(y + c_s dt k_(s-1)),    y + dt sum_s b_s k_s.
+        k_s = f(y + c_s dt k_(s-1)),    y + dt sum_s b_s k_s,
 
-    Parameters
-    ----------
-    nodes, weights : c and b.
+    with c and b the nodes and weights of the scheme.
 
     Particles change rank between stages. `memory` holds the rates at the particles last returned where `rates` was
     asked for them.
     """
 
-    def __init__(self, dynamics: ParticleDynamics, nodes: Sequence[float], weights: Sequence[float]) -> None:
+    def __init__(self, dynamics: ParticleDynamics, scheme: Scheme) -> None:
         super().__init__(dynamics)
-        self.nodes, self.weights = nodes, weights
+        self.scheme = scheme
 
     def step(self, particles: ParticleSet, time_step: float) -> ParticleSet:
         stage, rates = self.rates(particles)
         start = end = stage
-        for number, (node, weight) in enumerate(zip(self.nodes, self.weights)):
+        for number, (node, weight) in enumerate(zip(self.scheme.nodes, self.scheme.weights)):
             if number:
                 stage = _advanced(start, stage, rates, node * time_step)
                 stage, start, end = self._settled(stage, start, end)
@@ -137,14 +137,10 @@ class RungeKutta(Integrator):
 
 
 REMEMBERED = (*BY_PARTICLE, "density")
-INTEGRATORS = {
-    "verlet": VelocityVerlet,
-    "corrected-verlet": CorrectedVerlet,
-    "rk2": partial(RungeKutta, nodes=(0, 1 / 2), weights=(0, 1)),
-    # Heun's scheme of third order: its stages are a third of a step apart, which suits a solve that starts from what
-    # the stages before foresee.
-    "rk3": partial(RungeKutta, nodes=(0, 1 / 3, 2 / 3), weights=(1 / 4, 0, 3 / 4)),
-    "rk4": partial(RungeKutta, nodes=(0, 1 / 2, 1 / 2, 1), weights=(1 / 6, 1 / 3, 1 / 3, 1 / 6)),
+#: By the words of scenes.
+INTEGRATORS: dict[str, Callable[[ParticleDynamics], Integrator]] = {
+    **{kind.scheme.name: kind for kind in (VelocityVerlet, CorrectedVerlet)},
+    **{name: partial(RungeKutta, scheme=scheme) for name, scheme in SCHEMES.items() if scheme.nodes},
 }
 
 

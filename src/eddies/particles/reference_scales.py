@@ -10,8 +10,6 @@ from eddies.errors import UserError
 # The highest wavenumber that particles resolve: in units of their Nyquist wavenumber; in units of 1/eta, where
 # turbulence ends; and the least that the filter may leave of a mode, as it is undone. Measured in docs/closure.md.
 BEYOND_NYQUIST, BEYOND_DISSIPATION, LEAST_TRANSFER = 1.5, 1.05, 0.02
-# k_c u' times a step, by integrator, up to which the resolved velocity follows the flow: docs/closure.md.
-ALLOWED_ANGLES = {"verlet": 0.5, "corrected-verlet": 0.5, "rk2": 1.2, "rk3": 1.2, "rk4": 1.6}
 MAY_VANISH = ("viscosity", "kolmogorov_length")
 
 
@@ -82,7 +80,7 @@ def resolved_wavenumber(spacing: float, filter_width: float, kolmogorov_length: 
     return min(highest, BEYOND_DISSIPATION / kolmogorov_length) if kolmogorov_length > 0 else highest
 
 
-def allowed_step(integrator: str, highest: float, speed: float) -> float:
+def allowed_step(angle: float, highest: float, speed: float) -> float:
     """The longest time step where velocities are resolved up to a wavenumber k_c = `highest`: in it the rms `speed` u'
-    of a component carries particles by `ALLOWED_ANGLES` radians of that wave. Infinite at rest."""
-    return ALLOWED_ANGLES[integrator] / (highest * speed) if speed > 0 else math.inf
+    of a component carries particles by an `angle` of that wave, in radians. Infinite at rest."""
+    return angle / (highest * speed) if speed > 0 else math.inf

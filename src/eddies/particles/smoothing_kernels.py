@@ -7,7 +7,7 @@ r >= support.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -84,10 +84,6 @@ class WendlandC2(_Polynomial):
 
     def _slope(self, q: Tensor) -> Tensor:
         return -210 / math.pi * q * (1 - q) ** 3
-
-
-# By the words of scenes.
-KERNELS: dict[str, Callable[[float], SmoothingKernel]] = {"cubic-spline": CubicSpline, "wendland": WendlandC2}
 
 
 def over_distance(slope: Tensor, distance: Tensor) -> Tensor:

@@ -12,11 +12,10 @@ from eddies.scene.sections import Eulerian
 if TYPE_CHECKING:
     from eddies.scene.scene import Scene
 
-# Largest rate times step of what relaxes, by integrator; and how much faster than its own rate it may be, as neighbours
-# tell the noise of a particle with the wrong sign: 3.6 to 4.0 among particles at random, and in turbulence. Two fifths
-# more for what else makes noise grow: at 4.2 a flow at M_t = 0.16 ran away after a turnover, at 5.5 one of 256^3 cells
-# within steps.
-RELAXING, NOISE_AMONG_NEIGHBORS = {"verlet": 1.0, "corrected-verlet": 2.0, "rk2": 2.0, "rk3": 2.51, "rk4": 2.78}, 5.6
+# How much faster than its own rate what relaxes may be, as neighbours tell the noise of a particle with the wrong sign:
+# 3.6 to 4.0 among particles at random, and in turbulence. Two fifths more for what else makes noise grow: at 4.2 a flow
+# at M_t = 0.16 ran away after a turnover, at 5.5 one of 256^3 cells within steps.
+NOISE_AMONG_NEIGHBORS = 5.6
 
 
 def baseline_problems(scene: Scene) -> Iterator[str]:
@@ -46,4 +45,4 @@ def acoustic_step(scene: Scene, form: WCSPH) -> float:
 def relaxing_step(scene: Scene, form: FilteredEquations, speed: float) -> float:
     """The longest step of the term FilteredEquations where a component of the velocity has an rms of `speed`."""
     rate = NOISE_AMONG_NEIGHBORS * form.relaxation * 2 * speed / scene.tracers.filter_width
-    return RELAXING[scene.simulation.integrator] / rate if rate > 0 else math.inf
+    return scene.simulation.scheme.decay / rate if rate > 0 else math.inf

@@ -12,7 +12,6 @@ from itertools import chain
 from typing import TYPE_CHECKING
 
 from eddies.import_path import ImportPathError, is_path, load
-from eddies.particles.terms.settings import Forcing
 from eddies.scene.baseline_checks import baseline_problems
 from eddies.scene.rules import quoted
 from eddies.scene.values import import_paths
@@ -118,10 +117,6 @@ def tracer_problems(scene: Scene) -> Iterator[str]:
     tracers, initial = scene.tracers, scene.initial
     if tracers and tracers.forced and scene.forcing is None:
         yield "[tracers] forced = true: there is no [forcing] that could stay on; add it, or remove the key"
-    if tracers and tracers.forced and scene.model and any(
-            isinstance(settings, Forcing) for settings in scene.model.settings.values()):
-        yield ('[model] terms: "forcing": with [tracers] forced = true the forcing of the ground truth is added by '
-               "itself, and this would be another; remove the term")
     if tracers and initial.kind == "sound-wave":
         yield ('[initial] kind = "sound-wave": starts from rest, and [tracers] are followed for turnovers of a flow '
                "that moves; choose another kind, or remove [tracers]")
@@ -254,9 +249,10 @@ def simulation_problems(scene: Scene) -> Iterator[str]:
     if simulation is None or scene.tracers is None:
         return
     frame = simulation.frame_interval
-    if simulation.integrator == "verlet" and not _is_multiple(frame, simulation.step):
+    if not simulation.scheme.dense and not _is_multiple(frame, simulation.step):
         yield (f"[simulation] frame_interval = {frame:g}: must be a whole multiple of step = "
-               f'{simulation.step:g} with integrator = "verlet", which does not tell what is between steps; change any')
+               f'{simulation.step:g} with integrator = "{simulation.integrator}", which does not tell what is between '
+               "steps; change any")
     if not _is_multiple(frame, scene.tracers.frame_interval):
         yield (f"[simulation] frame_interval = {frame:g}: must be a whole multiple of [tracers] "
                f"frame_interval = {scene.tracers.frame_interval:g}, so that truth and model are stored at "

@@ -10,8 +10,9 @@ from itertools import chain
 from pathlib import Path
 
 from eddies.import_path import is_path, load
+from eddies.scene.integrators import SCHEMES, Scheme
 from eddies.scene.methods import METHODS, needs_of
-from eddies.scene.values import (KeyProblem, Section, boolean, choice, integer, integers, named, number, numbers,
+from eddies.scene.values import (KeyProblem, Section, boolean, choice, integer, integers, named, number,
                                  product_file, section, text, texts)
 
 BOX_LENGTH = 2 * math.pi
@@ -102,9 +103,6 @@ class Tracers(Section):
     field_cells: int | None = integer("grid of the stored fields; absent: 1.5 x particles_per_side, even",
                                       default=None, at_least=4)
     field_every: int = integer("frames per stored field", default=5, at_least=1)
-    states: tuple[float, ...] | None = numbers(
-        "fractions of the ground truth at which the unfiltered flow is stored too, for coarse grids to start from; "
-        "absent: 0 and where a rollout starts", default=None, at_least=0, below=1)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -162,10 +160,14 @@ class Horizons(Section):
                                        default=(1, 2, 4, 8), at_least=1)
     steps: int = integer("optimiser steps through each number of frames", at_least=1)
     time_step: float | None = number("of the simulation; absent: the interval of frames", default=None, above=0)
-    integrator: str = choice("time stepping of the simulation", "verlet", "corrected-verlet", "rk2", "rk3", "rk4",
-                             default="verlet")
+    integrator: str = choice("time stepping of the simulation", *SCHEMES, default="verlet")
     learning_rate: float = number("of the optimiser, at the start of each number of frames", default=1e-3, above=0)
     energy_weight: float = number("weight of the energies by bands of wavenumbers in the loss", default=0.1, at_least=0)
+
+    @property
+    def scheme(self) -> Scheme:
+        """What the integrator does in a step."""
+        return SCHEMES[self.integrator]
 
     @classmethod
     def section_name(cls) -> str:
@@ -186,7 +188,6 @@ class Training(Section):
     steps: int = integer("optimiser steps; 0: parameters stay as they start", at_least=0)
     learning_rate: float = number("of the optimiser, at the start", default=5e-3, above=0)
     final_learning_rate: float = number("of the optimiser, at the end", default=1e-4, above=0)
-    precision: str = choice("of the training", "float32", "float64", default="float32")
     field_weight: float = number("weight of the field loss beside the trajectory loss", default=0.0, at_least=0)
     velocity_kl_weight: float = number("weight of the divergence of velocity PDFs", default=0.0, at_least=0)
     acceleration_kl_weight: float = number("the same for acceleration PDFs", default=0.0, at_least=0)
@@ -206,8 +207,7 @@ class Simulation(Section):
     """The run of the particles, without the direct simulation."""
 
     method: str = named("what moves the particles; see Baselines", *METHODS, default="learned")
-    integrator: str = choice("time stepping of the particles", "verlet", "corrected-verlet", "rk2", "rk3", "rk4",
-                             default="rk3")
+    integrator: str = choice("time stepping of the particles", *SCHEMES, default="rk3")
     step: float = number("longest time step; see docs/closure.md", above=0)
     turnovers: float = number("large-eddy turnovers to simulate", above=0)
     start: float | None = number("as a fraction of the ground truth; absent: where the training window ends, or at the "
@@ -219,6 +219,11 @@ class Simulation(Section):
     injection: float | str = number("large-scale forcing power per mass; truth: as the ground truth was forced while "
                                     "its tracers were followed; dissipation: as the flow loses", default="truth",
                                     words=("truth", "none", "dissipation"), above=0)
+
+    @property
+    def scheme(self) -> Scheme:
+        """What the integrator does in a step."""
+        return SCHEMES[self.integrator]
 
     @property
     def needs(self) -> tuple[str, ...]:

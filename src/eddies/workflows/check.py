@@ -20,7 +20,7 @@ from eddies.workflows.foreseen.network import LATENCY, NODE_BANDWIDTH, NODE_CORE
 from eddies.workflows.foreseen.numbers import mach, numbers
 from eddies.workflows.foreseen.particle_work import particle_work
 from eddies.workflows.foreseen.refusals import refusals
-from eddies.workflows.foreseen.rollout_course import EVALUATIONS, rollout_course
+from eddies.workflows.foreseen.rollout_course import rollout_course
 from eddies.workflows.foreseen.stage_cost import Speeds, StageCost, in_units
 from eddies.workflows.foreseen.stage_costs import probe_scene, stage_costs, totals
 from eddies.workflows.foreseen.warnings import warnings
@@ -185,7 +185,7 @@ def rollout_lines(scene: Scene, rows: Sequence[ParticleCost]) -> Iterator[str]:
         return
     work, course = particle_work(scene), rollout_course(scene)
     evaluations = course.evaluations + course.evaluations_of_frames if course else None
-    per_step = EVALUATIONS[scene.simulation.integrator]
+    per_step = scene.simulation.scheme.evaluations
     steps = f"{per_step} evaluations a step" + (f", {work.iterations:g} iterations each" if work.iterations else "")
     yield f"the same for the learned model, {steps}; threads are OMP_NUM_THREADS of a rank"
     yield "cores  ranks x threads  memory a rank  s an evaluation  s a step     wall time  most of it"

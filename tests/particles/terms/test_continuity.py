@@ -9,7 +9,7 @@ import torch
 
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.integrators import INTEGRATORS
-from eddies.particles.smoothing_kernels import WendlandC2
+from eddies.particles.smoothing_kernels import CubicSpline
 from tests.particles.configurations import (
     LENGTH, SCALES, alone, assert_close, by_id, distributed, dynamics_of, model, rates, state, summed_density,
 )
@@ -19,7 +19,6 @@ SPACING = LENGTH / SIDE
 C = SCALES.sound_speed
 # As many neighbours as the default has, 57 in the lattice.
 FLOW = FlowUnits(replace(SCALES, spacing=SPACING), SPACING * (60 / (4 / 3 * math.pi)) ** (1 / 3), 60.0)
-KERNELS = pytest.mark.parametrize("kernel", ["cubic-spline", "wendland"])
 
 
 def lattice(disorder=0.0):
@@ -28,22 +27,20 @@ def lattice(disorder=0.0):
     return torch.as_tensor((np.argwhere(np.ones((SIDE,) * 3)) + 0.5 + moved) * SPACING)
 
 
-def smoothed(kernel, flow=FLOW, **more):
-    """The equation of the density, and settings of other terms with the same kernel."""
-    terms = {word.replace("_", "-"): dict(kernel=kernel, **settings) for word, settings in more.items()}
-    return model({"continuity": dict(kernel=kernel), **terms}, flow)
+def smoothed(flow=FLOW, **more):
+    """The equation of the density, and settings of other terms."""
+    return model({"continuity": {}, **more}, flow)
 
 
 @pytest.mark.mpi(1)
-@KERNELS
-def test_uniform_expansion_thins_by_three_times_its_rate(comm, kernel):
+def test_uniform_expansion_thins_by_three_times_its_rate(comm):
     """d rho/dt = -3 a rho for v = a x, of particles that do not see the ends of the box. The sum over the lattice is
     the integral of r dW/dr, -3, but for a percent."""
     position = lattice()
     inside = ((position - LENGTH / 2).abs() < LENGTH / 2 - FLOW.cutoff).all(1)
     density = torch.full((SIDE**3,), 1.3, dtype=torch.float64)
     dense = replace(FLOW, scales=replace(FLOW.scales, density_mean=1.3))
-    found = rates(smoothed(kernel, dense), position, 0.2 * (position - LENGTH / 2), density).density_rate[inside]
+    found = rates(smoothed(dense), position, 0.2 * (position - LENGTH / 2), density).density_rate[inside]
     assert len(found) > 50 and np.ptp(found.numpy()) < 1e-12
     assert found[0].item() == pytest.approx(-3 * 0.2 * 1.3, rel=0.02)
 
@@ -54,21 +51,20 @@ def test_a_summed_density_changes_alike(comm):
     position, velocity, _ = state(150)
     flow = replace(FLOW, cutoff=1.5)
     density = torch.ones(150, dtype=torch.float64)
-    found = rates(smoothed("wendland", flow), position, velocity, density).density_rate
-    ends = [summed_density((position + moved * velocity) % LENGTH, WendlandC2(1.5), flow.particle_mass)
+    found = rates(smoothed(flow), position, velocity, density).density_rate
+    ends = [summed_density((position + moved * velocity) % LENGTH, CubicSpline(1.5), flow.particle_mass)
             for moved in (1e-5, -1e-5)]
     assert torch.allclose(found, (ends[0] - ends[1]) / 2e-5, rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.mpi(1)
-@KERNELS
-def test_diffusion_smooths_at_its_rate_and_keeps_the_volume(comm, kernel):
+def test_diffusion_smooths_at_its_rate_and_keeps_the_volume(comm):
     """delta h c laplacian rho: of a wave over eight supports; its sum over rho is zero, as pairs give and take alike.
     A delta with the other sign does the same."""
     position = lattice()
     density = 1 + 1e-4 * torch.cos(position[:, 0])
     for delta in (0.1, -0.1):
-        force = smoothed(kernel, continuity=dict(diffusion=0.1))
+        force = smoothed(continuity=dict(diffusion=0.1))
         with torch.no_grad():
             force.terms["continuity"].delta.fill_(delta)
         found = rates(force, position, torch.zeros_like(position), density).density_rate.detach()
@@ -87,8 +83,7 @@ def test_without_diffusion_nothing_is_learned_and_the_rate_not_fitted(comm):
 
 
 @pytest.mark.mpi(1)
-@KERNELS
-def test_sound_has_the_frequency_c_k(comm, kernel):
+def test_sound_has_the_frequency_c_k(comm):
     """Of a standing wave with sin kx, k = 1, over three quarters of a period. Sums over the lattice are derivatives of
     what the kernel smooths, which leaves of the wave the kernel's Fourier transform, 0.92: with that the frequency is
     right to two percent, as sums over 57 neighbours are not quite integrals."""
@@ -96,7 +91,7 @@ def test_sound_has_the_frequency_c_k(comm, kernel):
     wave = 1e-4 * torch.sin(position[:, :1])
     slab, particles = distributed(comm, position, torch.cat([wave, 0 * wave, 0 * wave], 1),
                                   torch.ones(SIDE**3, dtype=torch.float64))
-    lagrangian = smoothed(kernel, wcsph=dict(alpha=0.0, beta=0.0))
+    lagrangian = smoothed(wcsph=dict(alpha=0.0, beta=0.0))
     stepper, steps = INTEGRATORS["rk4"](dynamics_of(slab, lagrangian, 0.1)), 24
     phases = []
     with torch.no_grad():
@@ -147,7 +142,7 @@ def test_a_wave_loses_what_viscosity_takes(comm):
     slab, start = alone(position, velocity, torch.ones(SIDE**3, dtype=torch.float64))
     lost = {}
     for alpha in (0.0, 1.0):
-        stepper = INTEGRATORS["rk4"](dynamics_of(slab, smoothed("wendland", wcsph=dict(alpha=alpha, beta=0.0)), 0.1))
+        stepper = INTEGRATORS["rk4"](dynamics_of(slab, smoothed(wcsph=dict(alpha=alpha, beta=0.0)), 0.1))
         particles = start
         with torch.no_grad():
             for _ in range(10):

@@ -22,7 +22,7 @@ from tests.particles.configurations import (CUTOFF, LENGTH, NEIGHBORS, SCALES, a
 
 
 def force_on(slab, particles, rate, wavenumber=2.0, tolerance=None):
-    terms = model(forcing=dict(injection_rate=rate, wavenumber=wavenumber))
+    terms = model(injection=dict(injection_rate=rate, wavenumber=wavenumber))
     return dynamics_of(slab, terms, tolerance=tolerance).rates(particles).acceleration
 
 
@@ -53,7 +53,7 @@ def test_the_force_is_that_of_the_direct_simulation_filtered(comm, wavenumber):
     exact = torch.from_numpy(field.spline.at(field.velocity_coefficients(force), columns["position"]))
 
     flow = FlowUnits(replace(SCALES, filter_width=2 * spacing, spacing=spacing), CUTOFF, NEIGHBORS)
-    terms = model({"forcing": dict(injection_rate=rate, wavenumber=wavenumber)}, flow)
+    terms = model({"injection": dict(injection_rate=rate, wavenumber=wavenumber)}, flow)
     dynamics = dynamics_of(SlabDecomposition(comm, LENGTH, 24), terms)
     found = dynamics.rates(ParticleSet.from_numpy(columns)).acceleration
     error, product, square = global_sum(comm, np.array([
@@ -105,9 +105,9 @@ def test_gradient_against_central_differences(comm):
 @pytest.mark.mpi(1)
 def test_what_cannot_be_forced_is_refused(comm):
     with pytest.raises(SceneError, match="injection_rate"):
-        model(forcing=dict(injection_rate=-1.0))
+        model(injection=dict(injection_rate=-1.0))
     with pytest.raises(SceneError, match="wavenumber"):
-        model(forcing=dict(injection_rate=1.0, wavenumber=1.0))
+        model(injection=dict(injection_rate=1.0, wavenumber=1.0))
     slab, particles = alone(torch.rand(4, 3, dtype=torch.float64), torch.zeros(4, 3, dtype=torch.float64))
     with pytest.raises(TermError, match="no energy"):
         force_on(slab, particles, 1.0)

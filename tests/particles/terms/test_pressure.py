@@ -30,15 +30,6 @@ def test_force_and_density_of_known_vortices():
     assert torch.allclose(rates.density, expected, atol=1e-14)
 
 
-def test_without_its_force_it_gives_the_density_alone():
-    position = lattice()
-    with_force, without = (evaluated(of("pressure", force=force), vortices, position, torch.zeros_like(position))
-                           for force in (True, False))
-    assert torch.equal(without.acceleration, torch.zeros_like(position))
-    assert torch.equal(without.density, with_force.density)
-    assert "acceleration" not in model(pressure=dict(force=False)).gives
-
-
 @every_form
 def test_stress_of_known_vortices(form):
     """tau is diagonal, made of cos 2y and cos 2x: its divergence vanishes, and so do force and pressure."""

@@ -73,7 +73,7 @@ def test_two_particles_push_each_other_by_the_background_pressure(comm):
     """w = p_b delta_t/m 2 V^2 dW/dr with p_b delta_t = rho_0 c h/4, away from each other."""
     r, h = 0.7, FLOW.cutoff / 2
     position = torch.tensor([[1.0, 1, 1], [1.0 + r, 1, 1]], dtype=torch.float64)
-    force = model({"transport-velocity": dict(kernel="wendland")}, FLOW)
+    force = model({"transport-velocity": {}}, FLOW)
     for sign in (1, -1):
         with torch.no_grad():
             force.terms["transport-velocity"].background.fill_(sign / 4)

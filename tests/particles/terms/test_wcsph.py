@@ -6,31 +6,30 @@ import torch
 
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.integrators import VelocityVerlet
-from eddies.particles.smoothing_kernels import CubicSpline, WendlandC2
+from eddies.particles.smoothing_kernels import CubicSpline
 from tests.particles.configurations import (
     LENGTH, SCALES, alone, by_id, distributed, dynamics_of, model, rates, state, summed_density,
 )
 
 SUPPORT, COUNT = 1.5, 200
 TRUE = {"sound_speed": 10.0, "alpha": 1.0, "beta": 2.0, "exponent": 7.0}
-KERNELS = {"cubic-spline": CubicSpline, "wendland": WendlandC2}
 
 
-def sph(kernel, spacing=LENGTH / COUNT ** (1 / 3), support=SUPPORT, sound_speed=TRUE["sound_speed"], **values):
+def sph(spacing=LENGTH / COUNT ** (1 / 3), support=SUPPORT, sound_speed=TRUE["sound_speed"], **values):
     """Continuity and forces; a particle has the mass of a cube of the spacing."""
     flow = FlowUnits(replace(SCALES, spacing=spacing, sound_speed=sound_speed), support, 20.0)
     forces = {name: TRUE[name] for name in ("alpha", "beta", "exponent")} | values
-    return model({"continuity": dict(kernel=kernel), "wcsph": dict(kernel=kernel, **forces)}, flow)
+    return model({"continuity": {}, "wcsph": forces}, flow)
 
 
-def acceleration_alone(position, velocity, density, kernel, **values):
+def acceleration_alone(position, velocity, density, **values):
     """Acceleration of particles on one rank."""
-    return rates(sph(kernel, **values), position, velocity, density).acceleration.detach()
+    return rates(sph(**values), position, velocity, density).acceleration.detach()
 
 
-def summed(position, kernel, spacing=LENGTH / COUNT ** (1 / 3)):
+def summed(position, spacing=LENGTH / COUNT ** (1 / 3)):
     """Their density by summation."""
-    return summed_density(position, KERNELS[kernel](SUPPORT), spacing**3)
+    return summed_density(position, CubicSpline(SUPPORT), spacing**3)
 
 
 MASS = LENGTH**3 / COUNT
@@ -42,25 +41,23 @@ def internal_energy(density, c, gamma):
 
 
 @pytest.mark.mpi(1)
-@pytest.mark.parametrize("kernel", KERNELS)
-def test_a_lattice_at_rest_is_not_pushed(comm, kernel):
+def test_a_lattice_at_rest_is_not_pushed(comm):
     points = torch.as_tensor(np.argwhere(np.ones((10, 10, 10))) * (LENGTH / 10))
-    density = summed(points, kernel, LENGTH / 10)
+    density = summed(points, LENGTH / 10)
     # The kernel's integral by the points of the lattice, 57 of them within the support.
     assert density.numpy() == pytest.approx(1, abs=0.02)
-    acceleration = acceleration_alone(points, torch.zeros_like(points), density, kernel, spacing=LENGTH / 10)
+    acceleration = acceleration_alone(points, torch.zeros_like(points), density, spacing=LENGTH / 10)
     assert np.ptp(density.numpy()) < 1e-12 and acceleration.abs().max() < 1e-9
 
 
 @pytest.mark.mpi(1)
 def test_pressure_is_the_gradient_of_the_internal_energy(comm):
     """Without viscosity, and with a summed density, a_i = -d/dx_i sum_j e(rho_j): the equations conserve energy."""
-    kernel = "wendland"
     position, velocity, _ = state(COUNT)
     c, gamma = 3.0, 2.5
     moved = position.clone().requires_grad_(True)
-    density = summed(moved, kernel)
-    acceleration = acceleration_alone(position, velocity, density.detach(), kernel, sound_speed=c, alpha=0.0, beta=0.0,
+    density = summed(moved)
+    acceleration = acceleration_alone(position, velocity, density.detach(), sound_speed=c, alpha=0.0, beta=0.0,
                                       exponent=gamma)
     (gradient,) = torch.autograd.grad(internal_energy(density, c, gamma).sum(), moved)
     assert (acceleration + gradient).abs().max() < 1e-11 * acceleration.abs().max()
@@ -68,23 +65,21 @@ def test_pressure_is_the_gradient_of_the_internal_energy(comm):
 
 @pytest.mark.mpi(1, 2, 3)
 def test_momentum_is_kept_and_ranks_do_not_matter(comm):
-    kernel = "cubic-spline"
     position, velocity, density = state(COUNT)
     slab, particles = distributed(comm, position, velocity, density)
-    acceleration = by_id(comm, particles, dynamics_of(slab, sph(kernel)).rates(particles).acceleration, COUNT)
+    acceleration = by_id(comm, particles, dynamics_of(slab, sph()).rates(particles).acceleration, COUNT)
     size = acceleration.abs().max()
     assert acceleration.sum(0).abs().max() < 1e-11 * size
     if comm.rank == 0:
-        expected = acceleration_alone(position, velocity, density, kernel)
+        expected = acceleration_alone(position, velocity, density)
         assert (acceleration - expected).abs().max() < 1e-11 * size
 
 
 @pytest.mark.mpi(1)
 def test_viscosity_acts_on_approaching_pairs_alone_and_takes_energy(comm):
-    kernel = "cubic-spline"
     position, velocity, density = state(COUNT)
-    inviscid = acceleration_alone(position, velocity, density, kernel, alpha=0.0, beta=0.0)
-    viscous = acceleration_alone(position, velocity, density, kernel) - inviscid
+    inviscid = acceleration_alone(position, velocity, density, alpha=0.0, beta=0.0)
+    viscous = acceleration_alone(position, velocity, density) - inviscid
     assert float((viscous * velocity).sum()) < 0
     # A pair that moves along its line, at a distance r: the closed form of Monaghan's term, or nothing.
     r, c, h = 0.4, TRUE["sound_speed"], SUPPORT / 2
@@ -92,10 +87,10 @@ def test_viscosity_acts_on_approaching_pairs_alone_and_takes_energy(comm):
     for speed in (-0.5, 0.5):
         away = torch.tensor([[0.0, 0, 0], [speed, 0, 0]], dtype=torch.float64)
         density = torch.tensor([0.9, 1.3], dtype=torch.float64)
-        moving, resting = (acceleration_alone(two, each, density, kernel) for each in (away, torch.zeros_like(two)))
+        moving, resting = (acceleration_alone(two, each, density) for each in (away, torch.zeros_like(two)))
         mu = min(h * r * speed / (r**2 + 0.01 * h**2), 0)
         expected = (-c * mu + 2 * mu**2) / 1.1
-        slope = float(KERNELS[kernel](SUPPORT).derivative(torch.tensor(r, dtype=torch.float64)))
+        slope = float(CubicSpline(SUPPORT).derivative(torch.tensor(r, dtype=torch.float64)))
         assert float((moving - resting)[1, 0]) == pytest.approx(-MASS * expected * slope, rel=1e-12, abs=1e-12)
 
 
@@ -104,8 +99,8 @@ def test_coincident_particles_do_not_push_each_other(comm):
     for distance in (0.0, 1e-300, 1e-16, 1e-8):
         # At the origin, where the smallest of these distances is one.
         position = torch.tensor([[0.0, 1, 1], [distance, 1, 1], [0.5, 1, 1]], dtype=torch.float64)
-        density = summed(position, "cubic-spline")
-        acceleration = acceleration_alone(position, torch.zeros_like(position), density, "cubic-spline")
+        density = summed(position)
+        acceleration = acceleration_alone(position, torch.zeros_like(position), density)
         assert torch.isfinite(acceleration).all()
         assert (acceleration[0] - acceleration[1]).abs().max() < 1e-6 * acceleration[2].abs().max()
 
@@ -135,8 +130,8 @@ def test_parameters_are_recovered_from_trajectories(comm):
     """Trained through steps of the integrator, from values far off, the form finds those that made the trajectories."""
     side, step, together = 5, 0.01, 2
     scales = dict(spacing=LENGTH / side, support=2.3)
-    slab, states = relaxed_states(sph("cubic-spline", **scales), side, step, 18)
-    learned = sph("cubic-spline", **scales, sound_speed=5.0, alpha=0.3, beta=0.5)  # in units of half of c
+    slab, states = relaxed_states(sph(**scales), side, step, 18)
+    learned = sph(**scales, sound_speed=5.0, alpha=0.3, beta=0.5)  # in units of half of c
     dynamics, term = dynamics_of(slab, learned, 0.0), learned.terms["wcsph"]
     optimiser = torch.optim.LBFGS(term.parameters(), max_iter=25, tolerance_change=0, line_search_fn="strong_wolfe")
 

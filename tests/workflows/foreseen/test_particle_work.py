@@ -18,13 +18,14 @@ from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.neighborhood import at_home
 from eddies.particles.particle_set import ParticleSet
+from eddies.scene.integrators import SCHEMES
 from eddies.scene.scene import BOX_LENGTH, load_scene
 from eddies.workflows.foreseen.network import Network
 from eddies.workflows.foreseen.particle_cost import components, part_calls
 from eddies.workflows.foreseen.particle_probe import probe_particles, probed_model
 from eddies.workflows.foreseen.particle_work import (SUMS_OF_EVALUATION, SUMS_OF_ITERATION, SUMS_OF_SETTLING, VECTOR,
                                                      ParticleWork, particle_work)
-from eddies.workflows.foreseen.rollout_course import EVALUATIONS, rollout_step
+from eddies.workflows.foreseen.rollout_course import rollout_step
 
 SIDE, ITERATIONS = 18, 2
 TOLD_DENSITIES = 'model.pairs.inputs=["density", "distance", "speed", "approach"]'
@@ -126,7 +127,7 @@ def test_sums_over_ranks_are_those_of_an_evaluation(comm):
 
 @pytest.mark.mpi(2, 3)
 @pytest.mark.parametrize("preset", ["resolved", "paper"])
-@pytest.mark.parametrize("integrator", EVALUATIONS)
+@pytest.mark.parametrize("integrator", SCHEMES)
 @torch.no_grad()
 def test_particles_settle_as_often_and_with_as_many_columns(comm, preset, integrator, counted):
     messages, sizes = counted
@@ -138,7 +139,7 @@ def test_particles_settle_as_often_and_with_as_many_columns(comm, preset, integr
     dynamics.evaluations = 0
     dynamics.forget()
     stepper.step(particles, 0.01)
-    assert dynamics.evaluations == EVALUATIONS[integrator]
+    assert dynamics.evaluations == SCHEMES[integrator].evaluations
     places = dynamics.evaluations / work.together
     assert messages[Redistribution] / places == pytest.approx(work.settled_columns())
     bytes_each = float(global_sum(comm, sizes[Redistribution])) / scene.tracers.particles / places

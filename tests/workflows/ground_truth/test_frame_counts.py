@@ -14,10 +14,5 @@ def test_the_whole_flow_is_stored_where_rollouts_start(changes):
     assert whole_frames(scene, FRAMES) == {every, start}
 
 
-@pytest.mark.parametrize("states, frames", [("[]", set()), ("[0]", {5}), ("[0.2, 0.501, 0.99]", {20, 50, 100})])
-def test_or_where_a_scene_says(states, frames):
-    assert whole_frames(load_scene("hit-small", [f"tracers.states={states}"]), FRAMES) == frames
-
-
 def test_nowhere_without_a_rollout():
     assert whole_frames(load_scene("tracers-only"), FRAMES) == set()

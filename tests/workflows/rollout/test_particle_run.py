@@ -4,6 +4,7 @@ class of the user's."""
 import json
 import logging
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import h5py
@@ -15,9 +16,11 @@ from eddies.io.hdf5 import open_product, read_attributes, read_table
 from eddies.io.trajectories import Trajectory
 from eddies.io.weights import save_weights
 from eddies.parallel.slab import SlabDecomposition
-from eddies.particles.reference_scales import ALLOWED_ANGLES, resolved_wavenumber
+from eddies.particles.integrators import INTEGRATORS, RungeKutta
+from eddies.particles.reference_scales import resolved_wavenumber
 from eddies.particles.resolved_velocity import ResolvedVelocity
 from eddies.particles.smoothing_kernels import KernelNetwork
+from eddies.scene.integrators import SCHEMES
 from eddies.scene.methods import METHODS, method_class
 from eddies.scene.scene import BOX_LENGTH, Model, SceneError, load_scene
 from eddies.spectral.interpolation import SplineInterpolation
@@ -168,7 +171,7 @@ def with_method(scene, method, **keys):
 @pytest.mark.mpi(1)
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_has_the_units_of_its_start_and_runs(comm, tmp_path, method):
-    scene = with_method(prepared(comm, tmp_path, overrides=["tracers.states=[0.3, 0.5]"]), method)
+    scene = with_method(prepared(comm, tmp_path, start=0.5), method)
     with open_product(comm, tmp_path / "ground_truth.h5", "ground_truth") as file:
         release = GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, 6)).scales
     write_model(comm, tmp_path, scene, release)
@@ -287,7 +290,7 @@ def test_frames_of_long_steps_are_those_of_short_ones(comm, tmp_path, monkeypatc
 @pytest.mark.mpi(1, 2)
 def test_steps_are_as_short_as_the_resolved_velocity_needs(comm, tmp_path, monkeypatch):
     """Of 0.05 radians of the highest wave by the rms velocity, which changes little."""
-    monkeypatch.setitem(ALLOWED_ANGLES, "rk3", 0.05)
+    monkeypatch.setitem(INTEGRATORS, "rk3", partial(RungeKutta, scheme=replace(SCHEMES["rk3"], angle=0.05)))
     scene = untrained(comm, tmp_path)
     attributes, closure, columns = rolled_out(comm, tmp_path, scene, step=0.5)
     with open_product(comm, tmp_path / "ground_truth.h5", "ground_truth") as file:

@@ -11,7 +11,7 @@ from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.rates import Rates
 from eddies.particles.scaled_pairs import ScaledPairs
-from eddies.particles.smoothing_kernels import KERNELS, over_distance
+from eddies.particles.smoothing_kernels import CubicSpline, over_distance
 from eddies.particles.terms import settings as declared
 from eddies.particles.terms.term import PairTerm
 
@@ -32,7 +32,7 @@ class Continuity(PairTerm):
 
     def __init__(self, settings: declared.Continuity, flow: FlowUnits) -> None:
         super().__init__(settings, flow)
-        self.kernel, self.mass = KERNELS[settings.kernel](flow.cutoff), flow.particle_mass
+        self.kernel, self.mass = CubicSpline(flow.cutoff), flow.particle_mass
         self.diffusivity = flow.cutoff * flow.scales.required("sound_speed")  # 2 h c
         self.delta = nn.Parameter(torch.tensor(settings.diffusion, dtype=torch.float64)) if settings.diffusion else None
         self.parity = torch.tensor([1.0] if self.delta is None else [1.0, -1.0])
@@ -50,7 +50,7 @@ class Continuity(PairTerm):
         """The same for the compiled library."""
         scales, support = context.flow.scales, self.kernel.support
         width, unit = scales.filter_width, self.mass / support**5
-        told = Summand("continuity", len(self.parity), (self.settings.kernel == "wendland",),
+        told = Summand("continuity", len(self.parity), (False,),
                        (support / width, unit * width * scales.velocity, unit))
         return CompiledSum(told, torch.empty(0), (context.column("density"),))
 

@@ -17,7 +17,6 @@ TERMS = {
         ("viscosity", "viscosity", "Viscosity"),
         ("damping", "damping", "Damping"),
         ("relaxation", "relaxation", "Relaxation"),
-        ("forcing", "forcing", "Forcing"),
         ("continuity", "continuity", "Continuity"),
         ("wcsph", "wcsph", "WCSPH"),
         ("transport-velocity", "transport_velocity", "TransportVelocity"),

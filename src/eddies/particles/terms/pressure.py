@@ -13,12 +13,10 @@ class Pressure(Term):
     that belongs to p: no density equation, no sound."""
 
     Settings = declared.Pressure
-    settings: declared.Pressure
     linear = True
 
     def forward(self, context: Context) -> Rates:
         """Modes of pressure and force."""
         grid = context.resolved.grid
         pressure = grid.pressure_of(context.resolved.convection)
-        force = -grid.gradient(pressure) if self.settings.force else None
-        return Rates(force_modes=force, pressure_modes=pressure)
+        return Rates(force_modes=-grid.gradient(pressure), pressure_modes=pressure)

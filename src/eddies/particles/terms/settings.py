@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from eddies.scene.values import KeyProblem, Section, boolean, choice, integer, integers, named, number, texts
+from eddies.scene.values import KeyProblem, Section, choice, integer, integers, named, number, texts
 
 READS = ("pairs", "resolved", "density")
 GIVES = ("acceleration", "density", "density_rate", "shift_velocity")
@@ -102,14 +102,8 @@ class DensityFlux(NetworkSettings):
 class Pressure(TermSettings):
     """The pressure of the resolved velocity: the density that belongs to it, and its force."""
 
-    force: bool = boolean("whether -grad p acts on the particles", default=True)
-
     reads = ("resolved",)
-
-    @property
-    def gives(self) -> tuple[str, ...]:  # type: ignore[override]
-        """The density, and the force unless it is left out."""
-        return ("acceleration", "density") if self.force else ("density",)
+    gives = ("acceleration", "density")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,7 +152,6 @@ class Forcing(TermSettings):
 class Continuity(TermSettings):
     """The continuity equation of smoothed particle hydrodynamics, from the true density on."""
 
-    kernel: str = choice("smoothing kernel", "cubic-spline", "wendland", default="cubic-spline")
     diffusion: float = number("delta of the density's diffusion (Molteni & Colagrossi 2009), at first; 0: without",
                               default=0.0, at_least=0)
 
@@ -176,7 +169,6 @@ class Continuity(TermSettings):
 class WCSPH(TermSettings):
     """Pressure and artificial viscosity of weakly compressible smoothed particle hydrodynamics."""
 
-    kernel: str = choice("smoothing kernel", "cubic-spline", "wendland", default="cubic-spline")
     alpha: float = number("linear coefficient of the artificial viscosity", default=1.0, at_least=0)
     beta: float = number("quadratic coefficient of the artificial viscosity", default=2.0, at_least=0)
     exponent: float = number("gamma of the pressure c^2 rho_0 / gamma ((rho / rho_0)^gamma - 1)", default=1.0,
@@ -189,10 +181,6 @@ class WCSPH(TermSettings):
 @dataclass(frozen=True, kw_only=True)
 class TransportVelocity(TermSettings):
     """Particles that a constant background pressure shifts to where there are fewer (Adami, Hu & Adams 2013)."""
-
-    kernel: str = choice("smoothing kernel", "cubic-spline", "wendland", default="cubic-spline")
-    background: float = number("background pressure times the time that it acts for, over rho_0 c h, at first",
-                               default=0.25, above=0)
 
     numbers_per_pair = 16
     reads = ("pairs", "density")

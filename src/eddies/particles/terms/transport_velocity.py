@@ -11,9 +11,12 @@ from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.rates import Rates
 from eddies.particles.scaled_pairs import ScaledPairs
-from eddies.particles.smoothing_kernels import KERNELS, over_distance
+from eddies.particles.smoothing_kernels import CubicSpline, over_distance
 from eddies.particles.terms import settings as declared
 from eddies.particles.terms.term import PairTerm
+
+# p_b delta_t over rho_0 c h at first.
+BACKGROUND = 0.25
 
 
 class TransportVelocity(PairTerm):
@@ -31,14 +34,13 @@ class TransportVelocity(PairTerm):
     """
 
     Settings = declared.TransportVelocity
-    settings: declared.TransportVelocity
     parity, mutual = torch.tensor([-1.0] * 3 + [1.0] * 9), True
 
     def __init__(self, settings: declared.TransportVelocity, flow: FlowUnits) -> None:
         super().__init__(settings, flow)
-        self.kernel, self.mass = KERNELS[settings.kernel](flow.cutoff), flow.particle_mass
+        self.kernel, self.mass = CubicSpline(flow.cutoff), flow.particle_mass
         self.unit = flow.scales.density_mean * flow.scales.required("sound_speed") * flow.cutoff / 2
-        self.background = nn.Parameter(torch.tensor(settings.background, dtype=torch.float64))
+        self.background = nn.Parameter(torch.tensor(BACKGROUND, dtype=torch.float64))
 
     def pair_values(self, pairs: ScaledPairs) -> Tensor:
         """-m (1/rho_i^2 + 1/rho_j^2) grad W, and the entries of -m (v_i - v_j) grad W^T/(rho_i rho_j): (12, m)."""
@@ -55,7 +57,7 @@ class TransportVelocity(PairTerm):
         scales, support = context.flow.scales, self.kernel.support
         width = scales.filter_width
         unit = self.mass * width / support**5
-        told = Summand("transport-velocity", 12, (self.settings.kernel == "wendland",),
+        told = Summand("transport-velocity", 12, (False,),
                        (support / width, unit, unit * scales.velocity))
         return CompiledSum(told, torch.empty(0), (context.column("density"),))
 

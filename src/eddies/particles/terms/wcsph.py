@@ -11,7 +11,7 @@ from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.rates import Rates
 from eddies.particles.scaled_pairs import ScaledPairs
-from eddies.particles.smoothing_kernels import KERNELS, over_distance
+from eddies.particles.smoothing_kernels import CubicSpline, over_distance
 from eddies.particles.terms import settings as declared
 from eddies.particles.terms.term import PairTerm
 
@@ -45,7 +45,7 @@ class WCSPH(PairTerm):
 
     def __init__(self, settings: declared.WCSPH, flow: FlowUnits) -> None:
         super().__init__(settings, flow)
-        self.kernel, self.mass = KERNELS[settings.kernel](flow.cutoff), flow.particle_mass
+        self.kernel, self.mass = CubicSpline(flow.cutoff), flow.particle_mass
         self.density = flow.scales.density_mean
         self.sound_speed, self.alpha, self.beta = (nn.Parameter(torch.tensor(value, dtype=torch.float64))
                                                    for value in (1.0, settings.alpha, settings.beta))
@@ -64,7 +64,7 @@ class WCSPH(PairTerm):
         """The same for the compiled library."""
         scales, density, support = context.flow.scales, context.column("density"), self.kernel.support
         width = scales.filter_width
-        options = Summand("wcsph", 3, (self.settings.kernel == "wendland",),
+        options = Summand("wcsph", 3, (False,),
                           (support / width, self.mass * width / support**5, SOFTENING * (support / (2 * width)) ** 2))
         viscosity = torch.stack([scales.velocity * self.alpha.abs() * self.c, scales.velocity**2 * self.beta.abs()])
         return CompiledSum(options, viscosity, (self.pressure(density) / density**2, density))

@@ -276,7 +276,7 @@ def foreseen_allowed_step(scene: Scene) -> float | None:
         start = scene.seen_in(scene.directory) if settings.start is None else settings.start
         turnovers = start * scene.tracers.turnovers + settings.turnovers / 2
         speed = turbulence.decayed(turnovers * turbulence.turnover_time)
-    return allowed_step(settings.integrator, resolved_shells(scene), speed)
+    return allowed_step(settings.scheme.angle, resolved_shells(scene), speed)
 
 
 def horizon_time(scene: Scene) -> float:

@@ -13,7 +13,7 @@ from eddies.workflows.foreseen.cost_model import busiest_cells, cost, flow_bytes
 from eddies.workflows.foreseen.particle_cost import (NEIGHBOR_BYTES, POINT_BYTES, PROCESS_BYTES, particle_bytes,
                                                      particle_cost)
 from eddies.workflows.foreseen.particle_work import ParticleWork, particle_work
-from eddies.workflows.foreseen.rollout_course import EVALUATIONS, rollout_course
+from eddies.workflows.foreseen.rollout_course import rollout_course
 from eddies.workflows.foreseen.stage_cost import FILE_BYTES_PER_SECOND, START_SECONDS, Speeds, StageCost
 from eddies.workflows.foreseen.stored import (kernel_bytes, model_bytes, rollout_bytes, stored_spectra,
                                               true_frames)
@@ -99,7 +99,7 @@ def horizon_seconds(scene: Scene, work: ParticleWork, ranks: int, speeds: Speeds
     rest = evaluation_seconds(scene, work, ranks, speeds, 0)
     iteration = evaluation_seconds(scene, work, ranks, speeds, 1) - rest
     interval = scene.tracers.frame_interval
-    evaluations = EVALUATIONS[settings.integrator] * round(interval / (settings.time_step or interval))  # of a frame
+    evaluations = settings.scheme.evaluations * round(interval / (settings.time_step or interval))  # of a frame
     measured = settings.energy_weight > 0
     forth = evaluations * (rest + FORESEEN * iteration) + measured * COLD * iteration
     both = (evaluations * (WITH_GRADIENT * rest + (2 * FORESEEN + ADJOINT) * iteration)

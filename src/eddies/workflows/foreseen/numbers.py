@@ -9,7 +9,7 @@ from eddies.scene.scene import Scene
 from eddies.workflows.foreseen.cost_model import costs
 from eddies.workflows.foreseen.estimates import (expected_step, expected_turbulence, flow_steps, ground_truth_alone,
                                                  largest_wavenumber, most_ranks, rms_speed)
-from eddies.workflows.foreseen.rollout_course import EVALUATIONS, RolloutCourse, rollout_course
+from eddies.workflows.foreseen.rollout_course import RolloutCourse, rollout_course
 from eddies.workflows.foreseen.stage_cost import Speeds, StageCost
 from eddies.workflows.foreseen.stage_costs import totals
 
@@ -66,6 +66,6 @@ def rollout_numbers(scene: Scene, course: RolloutCourse | None, row: ParticleCos
     """A row of the rollout's costs; `seconds` are those of its evaluations, `parts` those of one."""
     return {"ranks": row.ranks, "threads": row.threads, "cores": row.cores, "nodes": row.nodes, "memory": row.memory,
             "seconds_per_evaluation": row.seconds,
-            "seconds_per_step": EVALUATIONS[scene.simulation.integrator] * row.seconds,
+            "seconds_per_step": scene.simulation.scheme.evaluations * row.seconds,
             "seconds": course and (course.evaluations + course.evaluations_of_frames) * row.seconds,
             "parts": row.parts, "binds": row.binds}

@@ -5,14 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from eddies.particles.reference_scales import ALLOWED_ANGLES
 from eddies.scene.scene import BOX_LENGTH, Scene
 from eddies.workflows.foreseen.cost_model import busiest_planes
 from eddies.workflows.foreseen.estimates import expected_turbulence, resolved_shells
-from eddies.workflows.foreseen.rollout_course import AT_THE_SAME_PLACES, EVALUATIONS, rollout_step
+from eddies.workflows.foreseen.rollout_course import rollout_step
 
-# Of a solve that starts from what is foreseen, at about the longest steps that the flow allows: docs/closure.md.
-ITERATIONS = {"verlet": 1.0, "corrected-verlet": 1.0, "rk2": 1.2, "rk3": 3.0, "rk4": 6.5}
 # Sums over ranks: of an iteration; of the rest of an evaluation with the built-in terms; of a settling.
 SUMS_OF_ITERATION, SUMS_OF_EVALUATION, SUMS_OF_SETTLING = 2, 11, 5
 VECTOR = 24                  # bytes of a vector of a particle
@@ -135,16 +132,15 @@ def particle_work(scene: Scene) -> ParticleWork:
     tracers, model, settings = scene.tracers, scene.model, scene.simulation
     turbulence = expected_turbulence(scene)
     resolved, paired, highest = scene.resolves, "pairs" in model.reads, resolved_shells(scene)
-    evaluations, radius = EVALUATIONS[settings.integrator], scene.interaction_radius
-    together = AT_THE_SAME_PLACES.get(settings.integrator, 1)
+    scheme, radius = settings.scheme, scene.interaction_radius
     # As far as the flow may carry a particle through the highest wave, where nothing is known of it.
-    way = ALLOWED_ANGLES[settings.integrator] / highest
+    way = scheme.angle / highest
     if turbulence:
         way = turbulence.velocity_rms * rollout_step(scene)
     return ParticleWork(
         tracers.particles, tracers.planes,
         highest if resolved else 0,
         scene.neighbors if paired else 0.0, radius if paired else 0.0,
-        settings.skin * radius if paired or resolved else 0.0, ITERATIONS[settings.integrator] if resolved else 0.0,
-        way * together / evaluations, evaluations, together, 4 if settings.precision == "float32" else 8,
-        "density_rate" in model.gives)
+        settings.skin * radius if paired or resolved else 0.0, scheme.iterations if resolved else 0.0,
+        way * scheme.at_a_place / scheme.evaluations, scheme.evaluations, scheme.at_a_place,
+        4 if settings.precision == "float32" else 8, "density_rate" in model.gives)

@@ -11,9 +11,6 @@ from eddies.scene.methods import METHODS
 from eddies.scene.scene import BOX_LENGTH, Eulerian, Scene
 from eddies.workflows.foreseen.estimates import expected_turbulence, foreseen_allowed_step, peak_speed
 
-EVALUATIONS = {"verlet": 1, "corrected-verlet": 2, "rk2": 2, "rk3": 3, "rk4": 4}  # in a step
-AT_THE_SAME_PLACES = {"corrected-verlet": 2}  # of these, where others move particles for each
-
 
 @dataclass(frozen=True)
 class RolloutCourse:
@@ -92,8 +89,8 @@ def rollout_course(scene: Scene, turnover_time: float | None = None) -> RolloutC
     intervals = math.ceil(settings.turnovers * turnover_time / settings.frame_interval - 1e-9)
     on_grid = settings.method == "eulerian"
     return RolloutCourse(turnover_time, settings.frame_interval, intervals, rollout_step(scene),
-                         0 if on_grid else EVALUATIONS[settings.integrator],
-                         not on_grid and settings.integrator != "verlet")
+                         0 if on_grid else settings.scheme.evaluations,
+                         not on_grid and settings.scheme.dense)
 
 
 def rollout_step(scene: Scene) -> float:

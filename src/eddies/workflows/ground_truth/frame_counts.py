@@ -73,11 +73,9 @@ def rollout_start(scene: Scene, seen: float, frames: int, at_fields: Sequence[in
 
 
 def whole_frames(scene: Scene, frames: int) -> set[int]:
-    """The frames at which the unfiltered state is stored: the first with filtered fields at or after each of the
-    fractions that a scene names; without any, where its rollouts start, and where they start earliest."""
-    fractions: Sequence[float | None] = scene.tracers.states
-    if fractions is None:
-        fractions = () if scene.simulation is None else (0.0, scene.simulation.start)
+    """The frames at which the unfiltered state is stored, for coarse grids to start from: with filtered fields, where
+    its rollouts start, and where they start earliest."""
+    fractions = () if scene.simulation is None else (0.0, scene.simulation.start)
     # Where nothing of it is trained on, rollouts start earliest.
     every, seen = scene.tracers.field_every, scene.training.window if scene.training else 0.0
     return {math.ceil(_frame_at(fraction, seen, frames) / every) * every for fraction in fractions}

@@ -14,6 +14,10 @@ from eddies.scene.rules import quoted
 from eddies.scene.scene import Scene
 
 
+# Keys of terms in version 1.0, with the values at which they are fixed now.
+FORMER = {"force": True, "kernel": "cubic-spline", "background": 0.25}
+
+
 def describe(scene: Scene, scales: ReferenceScales) -> dict[str, Any]:
     """What is stored with the weights of a scene's model, ready for JSON: the terms with their settings, and the
     flow."""
@@ -35,7 +39,7 @@ def differences(scene: Scene, description: Mapping[str, Any]) -> Iterator[tuple[
         name = short_name(term)
         wanted = json.loads(json.dumps(asdict(scene.model.settings[name])))
         for key in wanted.keys() | trained.keys():
-            if wanted.get(key) != trained.get(key):
+            if wanted.get(key, FORMER.get(key)) != trained.get(key):
                 yield f"[model.{name}] {key}", quoted(wanted.get(key)), quoted(trained.get(key))
     if "pairs" in scene.model.reads and scene.neighbors != description["neighbors"]:
         yield "[model] neighbors", quoted(scene.neighbors), quoted(description["neighbors"])

@@ -201,7 +201,7 @@ def initial_state(truth: GroundTruth, fluid: Fluid, filter_passed: float, frame:
         raise SceneError(
             f'[simulation] method = "eulerian": the rollout starts at {truth.times[frame] / truth.times[-1]:.3g} of the'
             f" ground truth, which holds the unfiltered flow at {known}; start there ([simulation] start), or make the "
-            "ground truth again with this place in [tracers] states")
+            "ground truth again for this start")
     slab = SlabDecomposition(grid.decomposition.comm, grid.decomposition.length, series.cells)
     whole = SpectralGrid(slab, grid.precision, (series.cells - 1) // 2)
 

@@ -82,14 +82,14 @@ class ParticleRun:
         tell what was between them may go beyond that time; those of others end there.
         """
         step, left = min(self.settings.step, self._allowed_step()), until - self.time
-        if not self.integrator.dense:
+        if not self.integrator.scheme.dense:
             step = left / np.ceil(left / step - 1e-9)
         try:
             self._before = self._now() if step > left * (1 + 1e-9) else None
             self.particles = self.integrator.step(self.particles, step)
             fault = find_fault(self.particles, self.limits, self.dynamics.box, number, self.comm.rank)
             complaint = first_complaint(self.comm, fault)
-            if complaint is None and self.integrator.dense:
+            if complaint is None and self.integrator.scheme.dense:
                 complaint = self._complaint_of_rates(number)
         except HaloError as error:  # on all ranks alike: particles outrun the halo
             return f"step {number}: {error}"
@@ -101,7 +101,7 @@ class ParticleRun:
         if resolution is None:
             return np.inf
         highest = resolution.grid.resolved * 2 * np.pi / self.dynamics.box.length
-        return allowed_step(self.settings.integrator, highest, resolution.speed)
+        return allowed_step(self.integrator.scheme.angle, highest, resolution.speed)
 
     def _complaint_of_rates(self, number: int) -> str | None:
         """What is wrong with the rates at the end of a step, which a frame asks for and the next step begins with."""
