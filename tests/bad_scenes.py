@@ -210,6 +210,7 @@ BAD_OVERRIDES = [
     ("simulation.step=0", "[simulation] step = 0: must be a number above 0"),
     ("simulation.turnovers=1e300", "[simulation] turnovers = 1e+300: must be a number above 0"),
     ("simulation.integrator=euler", '[simulation] integrator = "euler": must be one of "verlet", "corrected-verlet"'),
+    ("training.precision=bfloat16", '[training] precision = "bfloat16": must be one of "float32", "float64"'),
     ("simulation.precision=half", '[simulation] precision = "half": must be one of "float32", "float64"'),
     ("a=" + 5000 * "[" + 5000 * "]", "a: no such key; valid here: name, title"),
 ]

@@ -55,6 +55,10 @@ def main(arguments: list[str] | None = None) -> int:
             sys.stderr.write(f"eddies: error: {refusal}\n")
             sys.stderr.flush()
         code = code or BAD_INPUT
+    if code == INTERRUPTED:
+        # Python notes an interrupt within code of a string, such as makes a dataclass, until the next such code runs;
+        # where it was started with -m it would end by the signal (tests/test_bad_input.py, of interrupts).
+        exec("")
     if usage:
         sys.exit(code)
     return code

@@ -188,6 +188,7 @@ class Training(Section):
     steps: int = integer("optimiser steps; 0: parameters stay as they start", at_least=0)
     learning_rate: float = number("of the optimiser, at the start", default=5e-3, above=0)
     final_learning_rate: float = number("of the optimiser, at the end", default=1e-4, above=0)
+    precision: str = choice("of the training", "float32", "float64", default="float32")
     field_weight: float = number("weight of the field loss beside the trajectory loss", default=0.0, at_least=0)
     velocity_kl_weight: float = number("weight of the divergence of velocity PDFs", default=0.0, at_least=0)
     acceleration_kl_weight: float = number("the same for acceleration PDFs", default=0.0, at_least=0)

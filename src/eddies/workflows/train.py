@@ -22,7 +22,7 @@ from eddies.workflows.learned.a_priori import evaluate, evaluation_frames
 from eddies.workflows.learned.description import describe
 from eddies.workflows.learned.kernel import load_kernel
 from eddies.workflows.learned.steps import take_all_steps
-from eddies.workflows.learned.training_data import TRAINED, model_of
+from eddies.workflows.learned.training_data import model_of
 from eddies.workflows.learned.training_phases import feature_range, horizon_phases, one_step_phases
 from eddies.workflows.learned.truths import open_truths, training_data, truth_ids
 
@@ -69,7 +69,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
             curves.draw(training)
             history = {"history": training.columns()}
         tested = model_of(scene, truth, device, model) if own is None else own
-        tables = history | evaluate(truth, tested, tests, last, TRAINED, device)
+        tables = history | evaluate(truth, tested, tests, last, data[0].dtype, device)
         if model.networks:
             tables["feature_range"] = vars(feature_range(data))
         mach, description = truth.reference.get("mach_turbulent"), describe(scene, truth.scales)

@@ -28,7 +28,6 @@ from eddies.particles.particle_set import ParticleSet
 from eddies.particles.smoothing_kernels import KernelNetwork
 from eddies.scene.scene import BOX_LENGTH, Model, Scene, Simulation
 from eddies.workflows.foreseen.particle_probe import ITERATIONS, LEAST_SIDE, ProbeError, probed_model
-from eddies.workflows.learned.training_data import TRAINED
 
 REPEATS = 2
 
@@ -112,6 +111,7 @@ def trained_scene(scene: Scene) -> Scene:
     interval, training = scene.tracers.frame_interval, scene.training
     return replace(scene, eulerian=None, simulation=Simulation(
         step=interval, frame_interval=interval, turnovers=1.0, start=0.0, skin=0.0,
+        precision=training.precision if training else "float32",
         integrator=training.horizons.integrator if training and training.horizons else "rk3"))
 
 
@@ -175,18 +175,19 @@ def _averages(slab: SlabDecomposition, kernel, position: torch.Tensor, velocity:
 def _of_model(scene: Scene, alone: Comm, side: int, number: int) -> dict[str, tuple[float, float]]:
     """Size and seconds of optimiser steps of the model among `side`^3 particles, with a quarter of the batch first."""
     settings, trained = scene.training, trained_scene(scene)
-    model = probed_model(trained, side).to(TRAINED)
+    dtype = getattr(torch, settings.precision)
+    model = probed_model(trained, side).to(dtype)
     if next(model.parameters(), None) is None:
         return {}
     slab = SlabDecomposition(alone, BOX_LENGTH, 2 * round(0.875 * side))
-    dynamics = ParticleDynamics(slab, model, 0.0, TRAINED)
+    dynamics = ParticleDynamics(slab, model, 0.0, dtype)
     if dynamics.resolution is not None:
         dynamics.resolution.iterations = ITERATIONS
     position = torch.from_numpy(_positions(side))
     velocity = torch.sin(position[:, [1, 2, 0]])
     density = torch.ones(len(position), dtype=torch.float64) if model.integrates_density else None
     frame = TrainingFrame(dynamics, ParticleSet(torch.arange(len(position)), position, velocity, density),
-                          velocity.to(TRAINED), torch.ones(len(position), dtype=TRAINED))
+                          velocity.to(dtype), torch.ones(len(position), dtype=dtype))
     kernel = None
     if settings.field_weight > 0:
         support = scene.kernel_support * scene.tracers.particles_per_side / side

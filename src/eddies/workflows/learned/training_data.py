@@ -24,7 +24,6 @@ from eddies.workflows.ground_truth.frame_counts import last_trained_on
 from eddies.workflows.ground_truth.truth import GroundTruth, load_frame
 from eddies.workflows.learned.model import scene_model
 
-TRAINED = torch.float32  # of parameters and forces, in training
 # On how many particles the error of the acceleration is measured; on how many cubes or batches that of all losses.
 VALIDATION_PARTICLES, COMBINED_DRAWS = 8192, 8
 
@@ -46,6 +45,7 @@ class TrainingData:
     def __init__(self, scene: Scene, truth: GroundTruth, count: int, device: torch.device,
                  like: LagrangianModel | None = None) -> None:
         self.scene, self.settings, self.truth, self.count, self.device = scene, scene.training, truth, count, device
+        self.dtype = getattr(torch, self.settings.precision)
         self.model = model_of(scene, truth, device, like)
         self.longest = max(self.settings.horizons.frames) if self.settings.horizons else 0
         self.last = truth.last_frame_seen(self.settings.window)
@@ -77,10 +77,10 @@ class TrainingData:
         settings, scene = self.settings.horizons, self.scene
         interval, slab = scene.tracers.frame_interval, self.truth.decomposition
         drift = ALLOWED_VELOCITY * self.model.flow.scales.velocity * interval * self.longest
-        dynamics = ParticleDynamics(slab, self.model, 0.0, TRAINED, fixed_ranks=True, drift=drift)
+        dynamics = ParticleDynamics(slab, self.model, 0.0, self.dtype, fixed_ranks=True, drift=drift)
         resolution = dynamics.resolution
         if resolution is None and settings.energy_weight > 0:
-            resolution = ResolvedVelocity.on_slabs(slab, self.model.flow, drift, TRAINED)
+            resolution = ResolvedVelocity.on_slabs(slab, self.model.flow, drift, self.dtype)
         if resolution is not None:
             # Gradients are those of the particles alone: what is foreseen may not be part of the result.
             resolution.tolerance_foreseen = resolution.tolerance
@@ -93,7 +93,7 @@ class TrainingData:
         return trainer, self._window(self.last - self.longest, resolution)
 
     def _frame(self, index: int) -> TrainingFrame:
-        return load_frame(self.truth, index, self.model, TRAINED, self.device)
+        return load_frame(self.truth, index, self.model, self.dtype, self.device)
 
     def _window(self, start: int, resolution: ResolvedVelocity | None) -> TrainingWindow:
         columns = {name: torch.from_numpy(column).to(self.device)
@@ -117,7 +117,7 @@ def model_of(scene: Scene, truth: GroundTruth, device: torch.device,
              like: LagrangianModel | None = None) -> LagrangianModel:
     """The scene's model in the units of a ground truth and with the forcing that stayed on there, in the precision of
     the training; with new parameters, or those of the same terms in the units of another."""
-    model = scene_model(scene, truth.scales).to(dtype=TRAINED, device=device)
+    model = scene_model(scene, truth.scales).to(dtype=getattr(torch, scene.training.precision), device=device)
     if like is not None:
         model.share_parameters(like)
     return model.forced(truth.forcing)
