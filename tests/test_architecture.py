@@ -1,6 +1,7 @@
 """The layers of the package: who may import what, found in the source by `ast`."""
 
 import ast
+import re
 import subprocess
 import sys
 from fnmatch import fnmatchcase
@@ -9,7 +10,8 @@ from pathlib import Path
 import pytest
 
 CHECKOUT = Path(__file__).parents[1]
-LONGEST_MODULE = 300
+# What a string is that names a module of the package.
+MODULE = re.compile(r"eddies(\.\w+)+(:\w+)?")
 
 # Packages that serve the commands, which are the modules directly in workflows/.
 ROOMS = tuple(f"workflows.{path.parent.name}*" for path in (CHECKOUT / "src/eddies/workflows").glob("*/__init__.py"))
@@ -18,9 +20,9 @@ ROOMS = tuple(f"workflows.{path.parent.name}*" for path in (CHECKOUT / "src/eddi
 LAYERS = (
     (("__init__", "__version__"), ("errors*",)),
     (("pipeline*",), ("import_path*",), ("clock*",), ("time_stepping*",), ("measures*",)),
-    (("scene*", "particles.terms.settings*", "particles.terms.presets*"),),
     (("parallel*",), ("kernels*",)),
     (("io*",),),
+    (("scene*",),),
     (("spectral*",),),
     (("flow*",), ("particles*",)),
     (("learning*",), ("analysis*",)),
@@ -38,13 +40,10 @@ ONLY_IN = {
     "torch*": ("particles*", "learning*", "workflows*"),
     "matplotlib*": ("report*",),
     "eddies.report*": ("report*", "workflows.report", "workflows.compare", "workflows.diff", "workflows.train"),
-    # Scene, rules, reader, sections, model, methods, checks, comparison
-    **dict.fromkeys(("eddies.scene.[srm]*", "eddies.scene.ch*", "eddies.scene.compar*"),
-                    ("scene*", "workflows*", "cli", "api", "stored_run", "stages", "logs")),
-    # Their records are known to both.
+    # Whoever computes knows of a scene the records of integrators and terms alone.
+    "eddies.scene.[!it]*": ("scene*", "workflows*", "cli", "api", "stored_run", "stages", "logs"),
     "eddies.scene.integrators*": ("scene*", "particles.integrators", "workflows*"),
-    # Of the particles only the settings of terms declare keys of a scene.
-    "eddies.scene.values*": ("scene*", "particles.terms.settings", "workflows*"),
+    "eddies.scene.terms*": ("scene*", "particles.context", "particles.model", "particles.terms*", "workflows*"),
     "eddies.import_path*": ("scene*", "particles.model", "particles.terms.pair_basis", "workflows*"),
     "ctypes*": ("kernels*",),
     "pickle*": (),
@@ -97,20 +96,56 @@ def violations(root: Path):
         names = {getattr(node, "attr", getattr(node, "name", None)) for node in ast.walk(tree)}
         if "COMM_WORLD" in names and module not in COMM_WORLD_IN:
             yield f"{module} uses COMM_WORLD"
-        if len(text.splitlines()) > LONGEST_MODULE:
-            yield f"{module} is longer than {LONGEST_MODULE} lines"
+        if module not in ("__init__", "pipeline"):  # which lists the public names of the package with their modules
+            for name in named(tree):
+                target_layer, target_group = position(name.removeprefix("eddies."))
+                if target_layer >= layer and target_group != group:
+                    yield f"{module} names {name}, which is not below it"
+
+
+def named(tree: ast.AST):
+    """Modules of the package that strings name, "eddies.module" or "eddies.module:name"."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and MODULE.fullmatch(node.value):
+            yield node.value.partition(":")[0]
+
+
+def circles(root: Path):
+    """Modules that import each other, by others too, and those between such; wherever in a module imports stand."""
+    paths = {".".join(["eddies", *path.relative_to(root).with_suffix("").parts]): path for path in root.rglob("*.py")
+             if path.name != "__init__.py"}
+    below = {module: {name for name in imports(ast.parse(path.read_text()), module.split(".")[:-1]) if name in paths}
+             for module, path in paths.items()}
+
+    def free():
+        used = set().union(*below.values())
+        return [module for module, names in below.items() if not names & below.keys() or module not in used]
+
+    while ends := free():
+        for module in ends:
+            del below[module]
+    return sorted(below)
 
 
 def test_package_keeps_its_layers():
     assert list(violations(CHECKOUT / "src/eddies")) == []
 
 
+def test_no_modules_import_each_other():
+    assert circles(CHECKOUT / "src/eddies") == ["eddies.scene.checks", "eddies.scene.scene"]
+
+
+def test_a_circle_is_found(tmp_path):
+    (tmp_path / "above.py").write_text("from eddies import below")
+    (tmp_path / "below.py").write_text("if TYPE_CHECKING:\n    from eddies.beside import Kind\n")
+    (tmp_path / "beside.py").write_text("def late():\n    from eddies import below\n")
+    assert circles(tmp_path) == ["eddies.below", "eddies.beside"]
+
+
 def test_tools_import_nothing_from_the_package():
     for path in CHECKOUT.glob("mpi_tools/*.py"):
-        text = path.read_text()
-        names = imports(ast.parse(text), ["mpi_tools"])
+        names = imports(ast.parse(path.read_text()), ["mpi_tools"])
         assert "eddies" not in {name.split(".")[0] for name in names}, path
-        assert len(text.splitlines()) <= LONGEST_MODULE, path
 
 
 @pytest.mark.parametrize("module, source, breach", [
@@ -138,7 +173,8 @@ def test_tools_import_nothing_from_the_package():
     ("io/hdf5", "import pickle", "imports pickle"),
     ("io/hdf5", "from mpi4py import MPI\ncomm = MPI.COMM_WORLD", "uses COMM_WORLD"),
     ("io/hdf5", "from mpi4py.MPI import COMM_WORLD", "uses COMM_WORLD"),
-    ("io/hdf5", "\n" * (LONGEST_MODULE + 1), "longer than"),
+    ("scene/methods", 'METHODS = {"none": "eddies.workflows.rollout.particle_run:BallisticRun"}', "not below it"),
+    ("flow/forcing", "if TYPE_CHECKING:\n    from eddies.workflows.dns import run", "not below it"),
 ])
 def test_a_breach_is_found(tmp_path, module, source, breach):
     path = tmp_path / f"{module}.py"

@@ -12,13 +12,13 @@ import pytest
 
 from eddies.cli import main
 from eddies.cli_options import build_parser
-from eddies.particles.terms.presets import DEFAULT_PRESET, PRESETS, TERMS
 from eddies.scene.comparison import Comparison, Variant, load_comparison
 from eddies.scene.methods import METHODS
 from eddies.scene.model import Model, settings_class
 from eddies.scene.rules import Boolean, Bounds, Choice, Integer, Integers, Number, Numbers, Texts, quoted
 from eddies.scene.scene import BOX_LENGTH, Scene, builtin_scenes, load_scene
 from eddies.scene.sections import Simulation
+from eddies.scene.terms import DEFAULT_PRESET, PRESETS, TERMS
 
 CHECKOUT = Path(__file__).parents[1]
 PAGES = [CHECKOUT / "README.md", *sorted((CHECKOUT / "docs").glob("*.md")),

@@ -20,7 +20,7 @@ sys.path[:0] = [str(HERE.parent / "validation"), str(HERE.parents[1])]
 
 from test_leave_out import CountingComm, combined_step, fluid_of, particle_step  # noqa: E402
 
-from eddies.particles.terms.presets import PRESETS  # noqa: E402
+from eddies.scene.terms import PRESETS  # noqa: E402
 from tests.particles.configurations import OWN_DENSITY  # noqa: E402
 
 Call = tuple[Callable[[], object], list]  # what is measured, and the list that notes its messages

@@ -26,7 +26,6 @@ from eddies.flow.filtering import gaussian_transfer
 from eddies.flow.initial_fields import random_velocity
 from eddies.flow.statistics import energy_spectrum, turbulence_scales
 from eddies.flow.tracers import release
-from eddies.import_path import load
 from eddies.kernels.library import library, threads
 from eddies.kernels.modes import CompiledModePasses
 from eddies.parallel.slab import SlabDecomposition
@@ -41,8 +40,8 @@ from eddies.particles.neighborhood import Neighborhood
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.reference_scales import ReferenceScales, allowed_step
 from eddies.particles.resolved_velocity import ResolvedVelocity
-from eddies.particles.terms.presets import DEFAULT_PRESET, PRESETS, TERMS
 from eddies.scene.sections import Tracers
+from eddies.scene.terms import DEFAULT_PRESET, PRESETS, TERMS
 from eddies.spectral.interpolation import SplineInterpolation
 from eddies.spectral.spectral_grid import SpectralGrid
 
@@ -91,7 +90,7 @@ class Run:
                                          sound_speed=10 * self.speed, viscosity=1e-3, kolmogorov_length=ETA / side),
                          tracers.radius_of(NEIGHBORS), NEIGHBORS)
         dtype, terms = getattr(torch, precision), PRESETS[model]
-        settings = {word: load(TERMS[word][1])(**chosen) for word, chosen in terms.items()}
+        settings = {word: TERMS[word](**chosen) for word, chosen in terms.items()}
         built = build_model(settings, terms, flow).to(dtype)
         built.terms["damping"].rates.copy_(torch.tensor(DAMPING))
         if "pairs" in built.terms:

@@ -14,10 +14,10 @@ from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.rates import Rates
 from eddies.particles.smoothing_kernels import WendlandC2
-from eddies.particles.terms.settings import TermSettings
 from eddies.particles.terms.stress import Stress
 from eddies.particles.terms.term import Term
 from eddies.report.learning import LOSSES
+from eddies.scene.terms import TermSettings
 from tests.learning.models import LENGTH, PER_SIDE, SPACING, Recorder, model_of, slope
 from tests.particles.configurations import OWN_DENSITY
 

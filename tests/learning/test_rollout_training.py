@@ -15,7 +15,7 @@ from eddies.particles.flow_units import FlowUnits
 from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.resolved_velocity import ResolvedVelocity
-from eddies.particles.terms.presets import PRESETS
+from eddies.scene.terms import PRESETS
 from tests.learning.models import LENGTH, PER_SIDE, SCALES, SPACING, Recorder, model_of, slope
 from tests.particles.configurations import OWN_DENSITY
 

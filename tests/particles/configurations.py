@@ -7,7 +7,6 @@ import numpy as np
 import torch
 from mpi4py import MPI
 
-from eddies.import_path import load
 from eddies.parallel.migration import migrate
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
@@ -20,9 +19,8 @@ from eddies.particles.periodic_box import PeriodicBox
 from eddies.particles.rates import Rates
 from eddies.particles.reference_scales import ReferenceScales
 from eddies.particles.scaled_pairs import ScaledPairs
-from eddies.particles.terms.presets import PRESETS, TERMS
-from eddies.particles.terms.settings import Forcing, NetworkSettings, TermSettings
 from eddies.particles.terms.term import Term
+from eddies.scene.terms import PRESETS, TERMS, Forcing, NetworkSettings, TermSettings
 
 LENGTH = 2 * math.pi
 SCALES = ReferenceScales(filter_width=1.2, spacing=0.6, velocity=0.9, density_mean=1.0, density=0.02, acceleration=1.7,
@@ -78,7 +76,7 @@ def model(terms=None, flow=FLOW, **more):
     """
     given = {**(terms or {}), **{word.replace("_", "-"): settings for word, settings in more.items()}}
     forcing = Forcing(**given.pop(FORCING)) if FORCING in given else None
-    settings = {word: _settings(load(TERMS[word][1]), chosen) for word, chosen in given.items()}
+    settings = {word: _settings(TERMS[word], chosen) for word, chosen in given.items()}
     return build_model(settings, settings, flow).forced(forcing)
 
 

@@ -13,9 +13,8 @@ from eddies.particles import moments
 from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.rates import Rates
 from eddies.particles.resolved_velocity import ResolvedVelocity
-from eddies.particles.terms.presets import PRESETS
-from eddies.particles.terms.settings import TermSettings
-from eddies.particles.terms.term import PairTerm, Term, TermError
+from eddies.particles.terms.term import PairTerm, Term
+from eddies.scene.terms import PRESETS, TermError, TermSettings
 from tests.particles.configurations import (
     CUTOFF, MODELS, NEIGHBORS, SCALES, ReadsNothing, alone, distributed, dynamics_of, model, of_terms, state,
 )

@@ -11,8 +11,8 @@ from eddies.particles.dense_network import DenseNetwork
 from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.rates import Rates
-from eddies.particles.terms.settings import TermSettings
 from eddies.particles.terms.term import Term
+from eddies.scene.terms import TermSettings
 from tests.particles.configurations import (
     LENGTH, MODELS, PAIR_MODELS, SCALES, alone, assert_close, by_id, by_torch, distributed, dynamics_of, given, model,
     of_terms, state,

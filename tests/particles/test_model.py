@@ -11,9 +11,8 @@ from eddies.parallel.reduction import sum_flat
 from eddies.particles import context as context_module
 from eddies.particles.model import LagrangianModel, build_model
 from eddies.particles.rates import Rates, total
-from eddies.particles.terms.presets import PRESETS
-from eddies.particles.terms.settings import TermSettings
-from eddies.particles.terms.term import PairTerm, Term, TermError
+from eddies.particles.terms.term import PairTerm, Term
+from eddies.scene.terms import PRESETS, TermError, TermSettings
 from tests.particles.configurations import (
     FLOW, MODELS, DensityReader, Field, ReadsNothing, distributed, dynamics_of, given, model, of_terms, state,
 )

@@ -4,7 +4,7 @@ import pytest
 
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.reference_scales import ReferenceScales
-from eddies.particles.terms.term import TermError
+from eddies.scene.terms import TermError
 from tests.particles.configurations import CUTOFF, NEIGHBORS, SCALES, model
 
 

@@ -6,11 +6,10 @@ from dataclasses import fields, replace
 
 import pytest
 
-from eddies.particles.terms.presets import DEFAULT_PRESET, PRESETS, TERMS
-from eddies.particles.terms.settings import Continuity, PairNetwork, Pressure, Stress
 from eddies.pipeline import STAGES as TABLE
 from eddies.scene.model import settings_class
 from eddies.scene.scene import Flow, Initial, Model, Scene, SceneError, Simulation, Time, load_scene
+from eddies.scene.terms import DEFAULT_PRESET, PRESETS, TERMS, Continuity, PairNetwork, Pressure, Stress
 
 STAGES = tuple(TABLE)
 LEARNING = """
@@ -79,7 +78,7 @@ def test_every_preset_is_a_list_of_terms_that_fit_together(tmp_path, name):
 @pytest.mark.parametrize("word", TERMS)
 def test_every_term_has_settings_that_are_explained(word):
     kind = settings_class(word)
-    assert kind.__name__ == TERMS[word][0].partition(":")[2]
+    assert kind is TERMS[word] and kind.word == word
     assert kind.__doc__ and all(field.metadata["rule"].about for field in fields(kind))
 
 

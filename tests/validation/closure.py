@@ -25,9 +25,9 @@ from eddies.particles.model import build_model
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.reference_scales import resolved_wavenumber
 from eddies.particles.resolved_velocity import WEIGHT, ResolvedVelocity
-from eddies.particles.terms.settings import Pressure, Stress, Viscosity
 from eddies.report.figures import FOURTH, GUIDE, MODEL, SECOND, TRUTH, letter, panels, png, styled
 from eddies.scene.scene import BOX_LENGTH
+from eddies.scene.terms import Pressure, Stress, Viscosity
 from eddies.workflows.ground_truth.truth import GroundTruth
 
 SHARES = (0.75, 0.875, 1.0, 1.125, 1.25, 1.375, 1.5, 1.625)

@@ -10,7 +10,7 @@ from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.reference_scales import ReferenceScales
-from eddies.particles.terms.presets import PRESETS
+from eddies.scene.terms import PRESETS
 from tests.particles.configurations import LENGTH, OWN_DENSITY, by_id, distributed
 from tests.particles.configurations import model as model_of
 

@@ -24,7 +24,7 @@ from eddies.particles.reference_scales import ReferenceScales
 from eddies.particles.resolved_velocity import ResolvedVelocity
 from eddies.particles.smoothing_kernels import WendlandC2
 from eddies.particles.terms.eddy_viscosity import EddyViscosity
-from eddies.particles.terms.presets import PRESETS
+from eddies.scene.terms import PRESETS
 from eddies.spectral.spectral_grid import SpectralGrid
 from tests.particles.configurations import OWN_DENSITY, model
 

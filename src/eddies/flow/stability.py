@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
@@ -14,9 +14,6 @@ from eddies.errors import UserError
 from eddies.flow.navier_stokes import Fluid, advective_speed
 from eddies.parallel.reduction import global_max, global_sum
 from eddies.time_stepping import RungeKutta4
-
-if TYPE_CHECKING:
-    from eddies.flow.history import FlowHistory
 
 # Where |1 + z + z^2/2 + z^3/6 + z^4/24| = 1 on the axes: the reach of a four-stage fourth-order Runge-Kutta method.
 IMAGINARY_REACH, REAL_REACH = math.sqrt(8), 2.785293563405282
@@ -131,10 +128,17 @@ def _half_square(modes: np.ndarray) -> float:
     return np.vdot(modes, modes).real - np.vdot(plane, plane).real / 2
 
 
+class Samples(Protocol):
+    """What was measured of a flow, a row for each sample, as FlowHistory has it."""
+
+    @property
+    def rows(self) -> Sequence[Mapping[str, float]]: ...
+
+
 class StabilityWatch:
     """Looks at the energy after every step of a flow, for a small message and 0.1 % of a step's work."""
 
-    def __init__(self, fluid: Fluid, stepper: Callable, history: FlowHistory) -> None:
+    def __init__(self, fluid: Fluid, stepper: Callable, history: Samples) -> None:
         self.fluid, self.stepper, self.history = fluid, stepper, history
         self._ceiling = math.inf
 

@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from eddies.parallel.slab import SlabDecomposition
 from eddies.kernels.pairs import PairSpace, Summand
+from eddies.parallel.slab import SlabDecomposition
 from eddies.particles import moments
 from eddies.particles.compiled_pairs import CompiledSum, available, compiled_sums
 from eddies.particles.flow_units import FlowUnits
@@ -22,7 +22,7 @@ from eddies.particles.particle_set import ParticleSet
 from eddies.particles.rank_sums import mean_over_ranks
 from eddies.particles.scaled_pairs import ScaledPairs
 from eddies.particles.surroundings import Surroundings
-from eddies.particles.terms.term import TermError
+from eddies.scene.terms import TermError
 
 if TYPE_CHECKING:
     from eddies.particles.kriging import Kriging

@@ -16,13 +16,26 @@ from eddies.parallel.reduction import any_rank
 from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.rates import BY_PARTICLE, Rates, total
-from eddies.particles.terms import settings as declared
+from eddies.particles.terms.continuity import Continuity
+from eddies.particles.terms.damping import Damping
+from eddies.particles.terms.density_flux import DensityFlux
+from eddies.particles.terms.eddy_viscosity import EddyViscosity
+from eddies.particles.terms.filtered_equations import FilteredEquations
 from eddies.particles.terms.forcing import Forcing
-from eddies.particles.terms.presets import TERMS
-from eddies.particles.terms.settings import TermSettings
-from eddies.particles.terms.term import PairTerm, Term, TermError
+from eddies.particles.terms.pair_network import PairNetwork
+from eddies.particles.terms.pressure import Pressure
+from eddies.particles.terms.relaxation import Relaxation
+from eddies.particles.terms.stress import Stress
+from eddies.particles.terms.term import PairTerm, Term
+from eddies.particles.terms.transport_velocity import TransportVelocity
+from eddies.particles.terms.viscosity import Viscosity
+from eddies.particles.terms.wcsph import WCSPH
+from eddies.scene.terms import TermError, TermSettings
 
-
+#: The classes behind the words of [model] terms.
+TERMS: dict[str, type[Term]] = {kind.Settings.word: kind for kind in (
+    PairNetwork, EddyViscosity, DensityFlux, Pressure, Stress, Viscosity, Damping, Relaxation, Continuity, WCSPH,
+    TransportVelocity, FilteredEquations)}
 # The name of the forcing that is added to the terms of a model.
 FORCING = "injection"
 
@@ -48,7 +61,7 @@ class LagrangianModel(nn.Module):
             if "density" in term.reads and "density" in term.gives:
                 raise TermError(f'term "{name}": reads the density and gives a part of it; it can do only one of both')
 
-    def forced(self, settings: declared.Forcing | None) -> LagrangianModel:
+    def forced(self, settings: TermSettings | None) -> LagrangianModel:
         """The same terms, not copies of them, and the known forcing of a flow, if it has one."""
         if settings is None:
             return self
@@ -263,7 +276,7 @@ def build_model(settings: Mapping[str, TermSettings], paths: Iterable[str], flow
 
 
 def _build_term(path: str, settings: TermSettings, flow: FlowUnits) -> Term:
-    kind = load(path if is_path(path) else TERMS[path][0])
+    kind = load(path) if is_path(path) else TERMS[path]
     if not (isinstance(kind, type) and issubclass(kind, Term)):
         raise TermError(f'term "{path}": must be a class derived from eddies.Term')
     if not isinstance(settings, TermSettings):

@@ -12,8 +12,8 @@ from itertools import chain
 from typing import TYPE_CHECKING
 
 from eddies.import_path import ImportPathError, is_path, load
-from eddies.scene.baseline_checks import baseline_problems
 from eddies.scene.rules import quoted
+from eddies.scene.sections import Eulerian
 from eddies.scene.values import import_paths
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ def first_inconsistency(scene: Scene) -> str | None:
     """The first problem found, or None."""
     subjects = (foreign_problems, flow_problems, initial_problems, time_problems, tracer_problems, section_problems,
                 model_problems, density_problems, support_problems, training_problems, simulation_problems,
-                baseline_problems)
+                grid_problems)
     return next(chain.from_iterable(subject(scene) for subject in subjects), None)
 
 
@@ -260,6 +260,25 @@ def simulation_problems(scene: Scene) -> Iterator[str]:
     if simulation.start is None and scene.seen_in(scene.directory) == 1:
         yield ("[simulation] start: this key is missing; the training window is the whole ground truth, so "
                "there is nothing after it; give start, or a smaller [training] window")
+
+
+def grid_problems(scene: Scene) -> Iterator[str]:
+    """[eulerian] of another method; a coarse grid finer than what it starts from, or that takes what is not there."""
+    simulation = scene.simulation
+    if scene.eulerian is not None and (simulation is None or not simulation.on_grid):
+        yield '[eulerian]: only read with [simulation] method = "eulerian"; set it, or remove [eulerian]'
+    if simulation and simulation.on_grid:
+        eulerian = scene.eulerian or Eulerian()
+        cells = eulerian.cells_for(scene.tracers.filter_width)
+        if cells > scene.flow.cells:
+            yield (f"[eulerian] cells = {cells}: must be at most the {scene.flow.cells} of the flow that it starts "
+                   "from; lower cells")
+        if eulerian.form.learned and not scene.model.damping:
+            yield ('[eulerian] closure = "learned": takes the rates of the term "damping", which [model] has not; add '
+                   "it to its terms, or choose another closure")
+        if eulerian.compressible and not scene.flow.compressible:
+            yield ('[eulerian] fluid = "compressible": [flow] fluid is incompressible and has no sound speed; set both '
+                   "to the same")
 
 
 def _is_multiple(interval: float, unit: float) -> bool:

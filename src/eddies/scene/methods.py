@@ -1,4 +1,6 @@
-"""What can move the particles of a rollout: the words of [simulation] method."""
+"""What can move the particles of a rollout, by what it needs: the words of [simulation] method."""
+
+from dataclasses import dataclass
 
 from eddies.import_path import is_path, load
 from eddies.scene.rules import quoted
@@ -6,26 +8,34 @@ from eddies.scene.values import SceneError
 
 NEEDS = ("model", "density", "pairs")
 
-#: Of each word the class behind it, and what it needs: a trained "model"; the "density" of the ground truth; "pairs",
-#: neighbours within the radius of interaction. A class of the user's says so in its attribute `needs`.
-METHODS = {
-    "learned": ("eddies.workflows.rollout.particle_run:LearnedRun", ("model",)),
-    "none": ("eddies.workflows.rollout.particle_run:BallisticRun", ()),
-    "eulerian": ("eddies.workflows.rollout.eulerian_run:EulerianRun", ()),
-}
+
+@dataclass(frozen=True)
+class Method:
+    """What is known of a method without loading it.
+
+    Parameters
+    ----------
+    needs : a trained "model"; the "density" of the ground truth; "pairs", neighbours within the radius of interaction.
+        A class of the user's says so in its attribute `needs`.
+    on_grid : whether a flow on a coarse grid moves them, as [eulerian] says, in place of rates of their own.
+    """
+
+    needs: tuple[str, ...] = ()
+    on_grid: bool = False
 
 
-def method_class(method: str) -> type:
-    """The class of a word or an import path, built as Class(scene, truth, start, directory, device)."""
-    return load(method if is_path(method) else METHODS[method][0])
+METHODS = {"learned": Method(needs=("model",)), "none": Method(), "eulerian": Method(on_grid=True)}
 
 
-def needs_of(method: str) -> tuple[str, ...]:
-    """What a method needs; its class is loaded only where it is the user's. SceneError where that is none of NEEDS."""
-    if not is_path(method):
-        return METHODS[method][1]
-    needs = getattr(load(method), "needs", ())
+def method_of(name: str) -> Method:
+    """That of a word or an import path; a class is loaded only where it is the user's.
+
+    Raises SceneError where it needs what is none of NEEDS.
+    """
+    if not is_path(name):
+        return METHODS[name]
+    needs = getattr(load(name), "needs", ())
     if isinstance(needs, str) or not set(needs) <= set(NEEDS):
-        raise SceneError(f"[simulation] method: {quoted(method)}: needs = {quoted(needs)}: must be a tuple of any of "
+        raise SceneError(f"[simulation] method: {quoted(name)}: needs = {quoted(needs)}: must be a tuple of any of "
                          f"{', '.join(map(quoted, NEEDS))}")
-    return tuple(needs)
+    return Method(tuple(needs))

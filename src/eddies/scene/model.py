@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from eddies.import_path import ImportPathError, is_path, load, short_name
-from eddies.particles.terms.presets import DEFAULT_PRESET, PRESETS, TERMS
-from eddies.particles.terms.settings import GIVES, READS, TermSettings
 from eddies.scene.reader import read_section
 from eddies.scene.rules import nearest, quoted
+from eddies.scene.terms import DEFAULT_PRESET, GIVES, PRESETS, READS, TERMS, TermBase, TermSettings
 from eddies.scene.values import (KeyProblem, SceneError, Section, choice, import_paths, number, product_file,
                                  sub_sections, text, texts)
 
@@ -87,6 +86,11 @@ class Model(Section):
         return frozenset(chain.from_iterable(settings.gives for settings in self.settings.values()))
 
     @property
+    def damping(self) -> str | None:
+        """The parameter "NAME.rates" of a term with rates of damping that a coarse grid can take; None without one."""
+        return next((f"{name}.{one.damps_by}" for name, one in self.settings.items() if one.damps_by), None)
+
+    @property
     def foreign(self) -> tuple[str, ...]:
         """The import paths that terms and networks are named by."""
         parts = [(self, "model"), *((part, name) for name, part in self.settings.items())]
@@ -115,9 +119,9 @@ def settings_class(term: str) -> type[TermSettings]:
     are no settings.
     """
     if not is_path(term):
-        return load(TERMS[term][1])
+        return TERMS[term]
     kind = load(term)
-    if not isinstance(kind, type) or not issubclass(kind, load("eddies.particles.terms.term:Term")):
+    if not isinstance(kind, type) or not issubclass(kind, TermBase):
         raise SceneError(f'"{term}": must be a class derived from eddies.Term')
     settings = getattr(kind, "Settings", TermSettings)
     if not (isinstance(settings, type) and issubclass(settings, TermSettings)

@@ -6,12 +6,11 @@ cube [0, 2 pi)^3, the mean density is 1, and times are in the unit that follows 
 
 import math
 from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
 
 from eddies.import_path import is_path, load
 from eddies.scene.integrators import SCHEMES, Scheme
-from eddies.scene.methods import METHODS, needs_of
+from eddies.scene.methods import METHODS, method_of
 from eddies.scene.values import (KeyProblem, Section, boolean, choice, integer, integers, named, number,
                                  product_file, section, text, texts)
 
@@ -229,13 +228,39 @@ class Simulation(Section):
     @property
     def needs(self) -> tuple[str, ...]:
         """What the method needs, of "model", "density" and "pairs"."""
-        return needs_of(self.method)
+        return method_of(self.method).needs
+
+    @property
+    def on_grid(self) -> bool:
+        """Whether a flow on a coarse grid moves the particles."""
+        return method_of(self.method).on_grid
 
 
-#: The closures of a coarse grid by what its equations are of.
+@dataclass(frozen=True)
+class Closure:
+    """A closure of a coarse grid.
+
+    Parameters
+    ----------
+    equations : that it is for.
+    constant : the key of [eulerian] with its constant; None: it has none.
+    learned : whether it takes the rates of damping that a model has learned.
+    """
+
+    equations: tuple[str, ...]
+    constant: str | None = None
+    learned: bool = False
+
+
+EQUATIONS = ("unfiltered", "filtered")
 CLOSURES = {
-    "unfiltered": ("none", "smagorinsky", "dynamic-smagorinsky", "spectral", "learned"),
-    "filtered": ("none", "smagorinsky", "dynamic-smagorinsky", "gradient", "dynamic-mixed"),
+    "none": Closure(EQUATIONS),
+    "smagorinsky": Closure(EQUATIONS, constant="smagorinsky"),
+    "dynamic-smagorinsky": Closure(EQUATIONS),
+    "spectral": Closure(("unfiltered",)),
+    "learned": Closure(("unfiltered",), learned=True),
+    "gradient": Closure(("filtered",)),
+    "dynamic-mixed": Closure(("filtered",)),
 }
 
 
@@ -248,17 +273,32 @@ class Eulerian(Section):
     fluid: str = choice("equations of motion on the coarse grid", "incompressible", "compressible",
                         default="incompressible")
     equations: str = choice("unfiltered: of the velocity, whose filtered part moves the particles; filtered: of the "
-                            "filtered velocity", *CLOSURES, default="unfiltered")
+                            "filtered velocity", *EQUATIONS, default="unfiltered")
     closure: str = choice("what stands for the scales that the grid, or the filter, leaves out; see Baselines",
-                          *dict.fromkeys(chain.from_iterable(CLOSURES.values())), default="none")
+                          *CLOSURES, default="none")
     smagorinsky: float = number("C_s of closure smagorinsky, the eddy viscosity (C_s Delta)^2 (2 S:S)^(1/2)",
                                 default=0.17, above=0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.closure not in CLOSURES[self.equations]:
+        if self.equations not in self.form.equations:
+            fitting = [name for name, closure in CLOSURES.items() if self.equations in closure.equations]
             raise KeyProblem("eulerian", "closure", f' = "{self.closure}": with equations = "{self.equations}" it must '
-                             f"be one of {', '.join(CLOSURES[self.equations])}; change one of the two")
+                             f"be one of {', '.join(fitting)}; change one of the two")
+
+    @property
+    def form(self) -> Closure:
+        """What is known of the closure."""
+        return CLOSURES[self.closure]
+
+    @property
+    def compressible(self) -> bool:
+        """Whether the fluid has a density, and sound."""
+        return self.fluid == "compressible"
+
+    def filter_passed(self, filter_width: float) -> float:
+        """Width of the filter that the velocity of the equations has passed: the particles' or 0."""
+        return filter_width if self.equations == "filtered" else 0.0
 
     def cells_for(self, filter_width: float) -> int:
         """Cells along each side: as given, or the fewest whose Nyquist wavenumber reaches pi / d."""

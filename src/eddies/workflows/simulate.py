@@ -3,30 +3,36 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from eddies.clock import pace_in_words
+from eddies.import_path import is_path, load
 from eddies.io.guard import Guard
 from eddies.io.hdf5 import create_product, open_product, write_attributes, write_table
 from eddies.parallel.communicator import Comm
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import StopRequest
 from eddies.particles.devices import prepare_torch
-from eddies.particles.terms.settings import Forcing
 from eddies.pipeline import STAGES
-from eddies.scene.methods import method_class
 from eddies.scene.scene import BOX_LENGTH, Scene
+from eddies.scene.terms import Forcing
 from eddies.workflows.ground_truth.frame_counts import rollout_start
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.learned.kernel import load_kernel
 from eddies.workflows.rollout.course import Course
+from eddies.workflows.rollout.eulerian_run import EulerianRun
 from eddies.workflows.rollout.frames import RolloutFrames
-from eddies.workflows.rollout.particle_run import injection
+from eddies.workflows.rollout.method import Method
+from eddies.workflows.rollout.particle_run import BallisticRun, LearnedRun, injection
 
 log = logging.getLogger("eddies")
+
+#: The classes behind the words of [simulation] method, each built as Class(scene, truth, start, directory, device).
+METHODS: dict[str, Callable[..., Method]] = {"learned": LearnedRun, "none": BallisticRun, "eulerian": EulerianRun}
 
 
 def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | None = None) -> None:
@@ -63,6 +69,11 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     pace = (pace_in_words(outcome["seconds_per_step"], outcome["storing_share"]) if "seconds_per_step" in outcome
             else "too few steps to time one")
     log.info("rollout: %s after %.2f turnovers, %s", outcome["status"], outcome["time"] / turnover, pace)
+
+
+def method_class(name: str) -> Callable[..., Method]:
+    """The class of a word or an import path."""
+    return load(name) if is_path(name) else METHODS[name]
 
 
 def forcing_rate(forcing: Forcing | None) -> float:

@@ -14,7 +14,7 @@ from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.particle_set import ParticleSet
-from eddies.particles.terms.term import TermError
+from eddies.scene.terms import TermError
 from eddies.scene.values import SceneError
 from eddies.spectral.spectral_grid import SpectralGrid
 from tests.particles.configurations import (CUTOFF, LENGTH, NEIGHBORS, SCALES, alone, along, distributed, dynamics_of,

@@ -10,9 +10,8 @@ import torch
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.rates import Rates
-from eddies.particles.terms.presets import PRESETS
-from eddies.particles.terms.settings import TermSettings
 from eddies.particles.terms.term import Term
+from eddies.scene.terms import PRESETS, TermSettings
 from tests.particles.configurations import (
     LENGTH, SCALES, alone, by_id, distributed, dynamics_of, given, model, of_terms, rates, state,
 )

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from eddies.kernels.library import library
-from eddies.particles.terms.presets import PRESETS
 from eddies.scene.scene import load_scene
+from eddies.scene.terms import PRESETS
 from eddies.workflows.foreseen.particle_probe import PARTS, ProbeError, probe_particles
 
 EXAMPLES = Path(__file__).parents[3] / "docs/examples"

@@ -9,8 +9,8 @@ import torch
 from eddies.io.hdf5 import ProductError
 from eddies.io.weights import load_weights, save_weights
 from eddies.particles.reference_scales import ReferenceScales
-from eddies.particles.terms.presets import PRESETS
 from eddies.scene.scene import Model, SceneError, load_scene
+from eddies.scene.terms import PRESETS
 from eddies.workflows.learned.description import describe, differences
 from eddies.workflows.learned.model import load_model, scene_model
 

@@ -21,7 +21,6 @@ from eddies.particles.reference_scales import resolved_wavenumber
 from eddies.particles.resolved_velocity import ResolvedVelocity
 from eddies.particles.smoothing_kernels import KernelNetwork
 from eddies.scene.integrators import SCHEMES
-from eddies.scene.methods import METHODS, method_class
 from eddies.scene.scene import BOX_LENGTH, Model, SceneError, load_scene
 from eddies.spectral.interpolation import SplineInterpolation
 from eddies.workflows import dns, report, simulate, train
@@ -29,6 +28,7 @@ from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.learned.description import describe
 from eddies.workflows.learned.model import scene_model
 from eddies.workflows.rollout.particle_run import SOLVES, LearnedRun
+from eddies.workflows.simulate import METHODS, method_class
 
 pytestmark = pytest.mark.usefixtures("quick_spectra")
 

@@ -12,8 +12,8 @@ from eddies.particles.flow_units import FlowUnits
 from eddies.particles.rates import Rates
 from eddies.particles.scaled_pairs import ScaledPairs
 from eddies.particles.smoothing_kernels import CubicSpline, over_distance
-from eddies.particles.terms import settings as declared
 from eddies.particles.terms.term import PairTerm
+from eddies.scene import terms as declared
 
 
 class Continuity(PairTerm):

@@ -11,8 +11,8 @@ from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.fourier_grid import FourierGrid
 from eddies.particles.rates import Rates
-from eddies.particles.terms import settings as declared
 from eddies.particles.terms.term import Term
+from eddies.scene import terms as declared
 
 # The rates D to begin with: as those of a small viscosity, growing as k^2.
 RATES = 0.1 * (torch.arange(1, 7, dtype=torch.float64) / 6) ** 2

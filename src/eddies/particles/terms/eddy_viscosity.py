@@ -11,9 +11,9 @@ from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.rates import Rates
 from eddies.particles.scaled_pairs import ScaledPairs
-from eddies.particles.terms import settings as declared
 from eddies.particles.terms.pair_basis import acceleration, along_separation
 from eddies.particles.terms.term import PairTerm
+from eddies.scene import terms as declared
 
 # Softens the approach speed at small distances, in squared units of the reference length.
 SOFTENING = 0.1

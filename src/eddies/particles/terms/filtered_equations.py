@@ -9,8 +9,8 @@ from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.rank_sums import mean_over_ranks
 from eddies.particles.rates import Rates
-from eddies.particles.terms import settings as declared
 from eddies.particles.terms.term import Term
+from eddies.scene import terms as declared
 
 # Two sweeps and more reduce what has eigenvalues from this over the square of their number to 1 alike, to an eighth.
 LEAST = 2.0

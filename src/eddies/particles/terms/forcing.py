@@ -6,8 +6,9 @@ import torch
 
 from eddies.particles.context import Context
 from eddies.particles.rates import Rates
-from eddies.particles.terms import settings as declared
-from eddies.particles.terms.term import Term, TermError
+from eddies.particles.terms.term import Term
+from eddies.scene import terms as declared
+from eddies.scene.terms import TermError
 
 
 class Forcing(Term):

@@ -13,8 +13,7 @@ from eddies.particles import moments
 from eddies.particles.compiled_pairs import CompiledSum
 from eddies.particles.context import Context
 from eddies.particles.dense_network import DenseNetwork
-from eddies.particles.terms.settings import NetworkSettings
-from eddies.particles.terms.term import TermError
+from eddies.scene.terms import NetworkSettings, TermError
 
 
 def along_separation(sums: Tensor, basis: str, context: Context) -> Tensor:

@@ -10,11 +10,11 @@ from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.rates import Rates
 from eddies.particles.scaled_pairs import ScaledPairs
-from eddies.particles.terms import settings as declared
 from eddies.particles.terms.pair_basis import (
     acceleration, along_separation, along_velocity, build_network, compiled_network,
 )
 from eddies.particles.terms.term import PairTerm
+from eddies.scene import terms as declared
 
 
 class PairNetwork(PairTerm):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from eddies.particles.context import Context
 from eddies.particles.rates import Rates
-from eddies.particles.terms import settings as declared
 from eddies.particles.terms.term import Term
+from eddies.scene import terms as declared
 
 
 class Pressure(Term):

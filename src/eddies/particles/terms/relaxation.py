@@ -8,8 +8,8 @@ from torch import nn
 from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.rates import Rates
-from eddies.particles.terms import settings as declared
 from eddies.particles.terms.term import Term
+from eddies.scene import terms as declared
 
 
 class Relaxation(Term):

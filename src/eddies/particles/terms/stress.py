@@ -7,8 +7,8 @@ from torch import Tensor
 from eddies.particles.context import Context
 from eddies.particles.rates import Rates
 from eddies.particles.resolved_flow import ResolvedFlow
-from eddies.particles.terms import settings as declared
 from eddies.particles.terms.term import Term
+from eddies.scene import terms as declared
 
 
 class Stress(Term):

@@ -3,26 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor, nn
 
-from eddies.errors import UserError
+from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.rates import Rates
-from eddies.particles.terms.settings import TermSettings
-
-if TYPE_CHECKING:
-    from eddies.particles.context import Context
-    from eddies.particles.scaled_pairs import ScaledPairs
+from eddies.particles.scaled_pairs import ScaledPairs
+from eddies.scene.terms import TermBase, TermSettings
 
 
-class TermError(UserError, ValueError):
-    """A term cannot be made of its settings, or does other than it declares: the text says which, and what to do."""
-
-
-class Term(nn.Module):
+class Term(nn.Module, TermBase):
     """One term of dv_i/dt or d rho_i/dt: a module with named parameters, made for a flow with its settings.
 
     Rates are in the units of `context.flow`.

@@ -16,7 +16,7 @@ def coarse_scene(scene: Scene) -> Scene:
     """A direct simulation with the grid, the fluid, the precision and the particles of a scene's coarse one."""
     eulerian, tracers = scene.eulerian or Eulerian(), scene.tracers
     cells = eulerian.cells_for(tracers.filter_width)
-    sound_speed = scene.flow.sound_speed if eulerian.fluid == "compressible" else None
+    sound_speed = scene.flow.sound_speed if eulerian.compressible else None
     flow = replace(scene.flow, cells=cells, fluid=eulerian.fluid, sound_speed=sound_speed,
                    precision=scene.simulation.precision)
     return replace(ground_truth_alone(scene), flow=flow, initial=Initial(peak_wavenumber=1.0), forcing=None,
@@ -27,7 +27,7 @@ def coarse_scene(scene: Scene) -> Scene:
 def probe_coarse(scene: Scene, comm: Comm) -> Speed:
     """The speed of the ranks at hand on the coarse grid; all ranks call it."""
     settings = scene.eulerian or Eulerian()
-    if settings.closure == "learned":  # which is not there yet; the work is that of another drag on the modes
+    if settings.form.learned:  # which is not there yet; the work is that of another drag on the modes
         settings = replace(settings, closure="spectral")
-    passed = scene.tracers.filter_width if settings.equations == "filtered" else 0.0
-    return probe(coarse_scene(scene), comm, closure=lambda grid: closure_of(settings, grid, passed, Path()))
+    passed = settings.filter_passed(scene.tracers.filter_width)
+    return probe(coarse_scene(scene), comm, closure=lambda grid: closure_of(settings, grid, passed, Path(), None))

@@ -175,7 +175,7 @@ def most_ranks(scene: Scene) -> dict[str, int]:
         limits[f"slabs no thinner than the particles' reach {reach:.3g}"] = thick_slabs(scene.tracers.planes, reach)
     if "train" in scene.stages:
         limits |= most_training_ranks(scene)
-    if scene.simulation and scene.simulation.method == "eulerian":
+    if scene.simulation and scene.simulation.on_grid:
         cells = (scene.eulerian or Eulerian()).cells_for(scene.tracers.filter_width)
         limits["ghost planes of the coarse grid"] = max(cells // GHOST_PLANES[scene.tracers.interpolation], 1)
     elif scene.injects:

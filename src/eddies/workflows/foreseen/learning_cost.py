@@ -120,7 +120,7 @@ def rollout_cost(scene: Scene, ranks: int, speeds: Speeds) -> StageCost:
                              for iterations in (work.iterations, COLD))
         memory = particle_bytes(work, speeds.particles, ranks)
     parts["steps"] = first + (course.evaluations - 1) * evaluation
-    if settings.method == "eulerian":
+    if settings.on_grid:
         coarse = coarse_scene(scene)
         moved = speeds.coarse.tracers * busiest_cells(coarse, ranks)
         parts["steps"] = course.steps * (cost(coarse, ranks, speeds.coarse).seconds + moved)
@@ -128,7 +128,7 @@ def rollout_cost(scene: Scene, ranks: int, speeds: Speeds) -> StageCost:
     frames = course.intervals + 1 + true_frames(scene, course)
     parts["frames"] = course.evaluations_of_frames * evaluation
     of_model, of_truth = stored_spectra(scene, course)
-    known = settings.method == "eulerian" or "model" in settings.needs and "resolved" in scene.model.reads
+    known = settings.on_grid or "model" in settings.needs and "resolved" in scene.model.reads
     parts["spectra"] = (of_model * spectrum_seconds(scene, ranks, speeds, NEAR if known else COLD)
                         + of_truth * spectrum_seconds(scene, ranks, speeds, NEAR))
     memory += POINT_BYTES * scene.tracers.planes**2 * math.ceil(scene.tracers.planes / ranks)

@@ -28,9 +28,9 @@ from eddies.particles.model import LagrangianModel, build_model
 from eddies.particles.neighborhood import at_home
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.reference_scales import ReferenceScales
-from eddies.particles.terms.settings import Forcing
 from eddies.particles.terms.term import PairTerm
 from eddies.scene.scene import BOX_LENGTH, Scene
+from eddies.scene.terms import Forcing
 from eddies.spectral.spectral_grid import SYMMETRIC
 from eddies.workflows.foreseen.estimates import expected_turbulence
 from eddies.workflows.foreseen.particle_work import VECTOR, particle_work

@@ -87,7 +87,7 @@ def rollout_course(scene: Scene, turnover_time: float | None = None) -> RolloutC
         return None
     turnover_time = turnover_time or turbulence.turnover_time
     intervals = math.ceil(settings.turnovers * turnover_time / settings.frame_interval - 1e-9)
-    on_grid = settings.method == "eulerian"
+    on_grid = settings.on_grid
     return RolloutCourse(turnover_time, settings.frame_interval, intervals, rollout_step(scene),
                          0 if on_grid else settings.scheme.evaluations,
                          not on_grid and settings.scheme.dense)
@@ -98,7 +98,7 @@ def rollout_step(scene: Scene) -> float:
     the Courant number on a coarse grid allows."""
     settings = scene.simulation
     allowed = None
-    if settings.method == "eulerian":
+    if settings.on_grid:
         cells, speed = (scene.eulerian or Eulerian()).cells_for(scene.tracers.filter_width), peak_speed(scene)
         allowed = speed and scene.time.courant * BOX_LENGTH / cells / speed
     elif "model" in settings.needs and scene.resolves:

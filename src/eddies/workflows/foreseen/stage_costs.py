@@ -32,7 +32,7 @@ def probe_scene(scene: Scene, comm: Comm) -> Speeds:
         from eddies.workflows.foreseen import coarse_probe, particle_probe, training_probe  # torch, which is used then
         resolved = particles is not None and training_probe.evaluated_scene(scene).resolves
         spectra = particles if resolved else particle_probe.probe_particles(training_probe.spectral_scene(scene), comm)
-        coarse = coarse_probe.probe_coarse(scene, comm) if scene.simulation.method == "eulerian" else None
+        coarse = coarse_probe.probe_coarse(scene, comm) if scene.simulation.on_grid else None
     return Speeds(flow, particles, training, missing, spectra, coarse)
 
 

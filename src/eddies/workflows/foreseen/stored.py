@@ -93,8 +93,8 @@ def rollout_bytes(scene: Scene, course: RolloutCourse) -> int:
 
 def stores_density(scene: Scene) -> bool:
     """Whether the frames of a rollout have a density."""
-    if scene.simulation.method == "eulerian":
-        return scene.eulerian is not None and scene.eulerian.fluid == "compressible"
+    if scene.simulation.on_grid:
+        return scene.eulerian is not None and scene.eulerian.compressible
     return scene.flow.compressible and ("density" in scene.simulation.needs or "model" in scene.simulation.needs
                                         and "density" in scene.model.reads)
 

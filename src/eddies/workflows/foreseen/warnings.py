@@ -7,9 +7,8 @@ import math
 from collections.abc import Callable, Iterable, Iterator
 
 from eddies.flow.stability import REMEDIES, limits_of_step
-from eddies.particles.terms.settings import WCSPH, FilteredEquations
-from eddies.scene.baseline_checks import acoustic_step, relaxing_step
 from eddies.scene.scene import BOX_LENGTH, Scene
+from eddies.scene.terms import StepUnits
 from eddies.workflows.foreseen.estimates import (courant_bound, expected_turbulence, foreseen_allowed_step,
                                                  largest_wavenumber, most_ranks, peak_speed, rms_speed)
 
@@ -131,30 +130,19 @@ def rollout_steps(scene: Scene) -> Iterator[str]:
                f"{at_most(allowed)}, in which their resolved velocity can follow the flow; lower it to that")
 
 
-def sound_steps(scene: Scene) -> Iterator[str]:
-    """Steps of smoothed particles that sound outruns."""
-    settings = scene.simulation
+def term_steps(scene: Scene) -> Iterator[str]:
+    """Steps that are too long for terms: in which sound outruns particles, or they relax too far."""
+    settings, speed = scene.simulation, rms_speed(scene)
     if "model" not in settings.needs:
         return
-    for name, form in scene.model.settings.items():
-        if isinstance(form, WCSPH) and settings.step > acoustic_step(scene, form):
-            yield (f'[simulation] step = {settings.step:g}: the term "{name}" has to resolve sound, with a step of at '
-                   f"most {at_most(acoustic_step(scene, form))} unless it learns a slower one; lower step, and use "
-                   'integrator = "verlet"')
-
-
-def relaxing_steps(scene: Scene) -> Iterator[str]:
-    """Steps in which particles relax to their neighbours too far."""
-    settings, speed = scene.simulation, rms_speed(scene)
-    if "model" not in settings.needs or speed is None:
-        return
-    for name, form in scene.model.settings.items():
-        if isinstance(form, FilteredEquations):
-            longest = relaxing_step(scene, form, speed / math.sqrt(3))
-            if settings.step > longest:
-                yield (f'[simulation] step = {settings.step:g}: noise among the particles of "{name}" relaxes so fast '
-                       f'that it grows with integrator = "{settings.integrator}" in steps of more than about '
-                       f"{at_most(longest)}; lower step to that")
+    units = StepUnits(radius=scene.interaction_radius, filter_width=scene.tracers.filter_width,
+                      sound_speed=scene.flow.sound_speed, scheme=settings.scheme,
+                      velocity=None if speed is None else speed / math.sqrt(3))
+    for name, term in scene.model.settings.items():
+        longest = term.longest_step(units)
+        if settings.step > longest:
+            yield f"[simulation] step = {settings.step:g}: " + term.too_long.format(
+                name=name, longest=at_most(longest), integrator=settings.integrator)
 
 
 def at_least(value: float) -> str:
@@ -173,4 +161,4 @@ def _second_digit(value: float) -> float:
 
 SUBJECTS: dict[str, tuple[Callable[[Scene], Iterator[str]], ...]] = {
     "dns": (resolution, compressibility, turbulence_at_all, stability, filter_width),
-    "train": (learning,), "simulate": (rollout_steps, sound_steps, relaxing_steps)}
+    "train": (learning,), "simulate": (rollout_steps, term_steps)}

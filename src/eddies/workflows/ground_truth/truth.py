@@ -22,7 +22,7 @@ from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.model import LagrangianModel
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.reference_scales import ReferenceScales
-from eddies.particles.terms.settings import Forcing
+from eddies.scene.terms import Forcing
 from eddies.workflows.ground_truth.frame_counts import last_seen
 from eddies.workflows.ground_truth.measured_scales import RATES, measured_scales
 

@@ -16,8 +16,8 @@ from eddies.particles.feature_range import FeatureRange
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.model import LagrangianModel, build_model
 from eddies.particles.reference_scales import ReferenceScales
-from eddies.particles.terms.term import TermError
 from eddies.scene.scene import Scene, SceneError
+from eddies.scene.terms import TermError
 from eddies.workflows.learned.description import differences
 
 

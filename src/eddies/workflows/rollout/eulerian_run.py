@@ -52,7 +52,8 @@ class EulerianRun:
         cells = self.settings.cells_for(width)
         grid = SpectralGrid(SlabDecomposition(comm, length, cells), scene.simulation.precision)
         # What is left for the filter to do to the fluid's velocity, and what it has done to it.
-        filter_left, filter_passed = (0.0, width) if self.settings.equations == "filtered" else (width, 0.0)
+        filter_passed = self.settings.filter_passed(width)
+        filter_left = 0.0 if filter_passed else width
         self.fluid = coarse_fluid(scene, truth, grid, filter_passed, directory)
         self.stepper, self.clock = ETDRK4(self.fluid), Clock()
         self.step_limit = CourantLimit(grid, scene.time.courant, math.inf)
@@ -148,7 +149,8 @@ class EulerianRun:
         the particles."""
         grid = self.fluid.grid
         seconds = {"flow_seconds_per_step": float(np.median(self.flow_seconds))} if self.flow_seconds else {}
-        constant = f", C_s = {self.settings.smagorinsky:g}" if self.settings.closure == "smagorinsky" else ""
+        key = self.settings.form.constant
+        constant = f", C_s = {getattr(self.settings, key):g}" if key else ""
         return {"integrator": "etdrk4", "cells": grid.cells, "largest_wavenumber": grid.cutoff,
                 "fluid": self.settings.fluid, "equations": self.settings.equations,
                 "closure": self.settings.closure + constant, **seconds}
@@ -161,31 +163,33 @@ def coarse_fluid(scene: Scene, truth: GroundTruth, grid: SpectralGrid, filter_pa
     settings, forcing = scene.eulerian or Eulerian(), None
     if (forced := injection(scene, truth)) is not None:
         forcing = LinearForcing(grid, forced.injection_rate, forced.wavenumber, filter_passed)
-    sound_speed = scene.flow.sound_speed if settings.fluid == "compressible" else math.inf
-    return FLUIDS[settings.fluid](grid, scene.flow.viscosity, sound_speed, forcing,
-                                  closure_of(settings, grid, filter_passed, directory))
+    sound_speed = scene.flow.sound_speed if settings.compressible else math.inf
+    closure = closure_of(settings, grid, filter_passed, directory, scene.model and scene.model.damping)
+    return FLUIDS[settings.fluid](grid, scene.flow.viscosity, sound_speed, forcing, closure=closure)
 
 
-def closure_of(settings: Eulerian, grid: SpectralGrid, filter_width: float, directory: Path) -> Closure | None:
+def closure_of(settings: Eulerian, grid: SpectralGrid, filter_width: float, directory: Path,
+               damping: str | None) -> Closure | None:
     """The closure of the filtered equations, or, without a filter width, of the velocity that the grid cuts off at its
-    highest wavenumber k_c; Delta is d, or pi/k_c. What is learned is read from model.h5 in the directory."""
+    highest wavenumber k_c; Delta is d, or pi/k_c. What is learned is read from model.h5 in the directory, where it is
+    the parameter `damping` of a term."""
     width = filter_width or math.pi / grid.cutoff
     made = {
         "none": lambda: None,
         "smagorinsky": lambda: StressModel(grid, mixing_length=settings.smagorinsky * width),
         "dynamic-smagorinsky": lambda: DynamicStress(grid, filter_width),
         "spectral": lambda: SpectralViscosity(grid),
-        "learned": lambda: EddyDamping(grid, learned_rates(grid.decomposition.comm, directory)),
+        "learned": lambda: EddyDamping(grid, learned_rates(grid.decomposition.comm, directory, damping)),
         "gradient": lambda: StressModel(grid, filter_width=filter_width),
         "dynamic-mixed": lambda: DynamicStress(grid, filter_width, with_gradient=True),
     }
     return made[settings.closure]()
 
 
-def learned_rates(comm: Comm, directory: Path) -> np.ndarray:
+def learned_rates(comm: Comm, directory: Path, damping: str | None) -> np.ndarray:
     """The rates of eddy damping that a model has learned."""
     _, weights = load_weights(comm, directory / "model.h5", "model")
-    return weights["terms.damping.rates"]
+    return weights[f"terms.{damping}"]
 
 
 def initial_state(truth: GroundTruth, fluid: Fluid, filter_passed: float, frame: int) -> np.ndarray:

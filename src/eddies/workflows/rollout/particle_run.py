@@ -22,8 +22,8 @@ from eddies.particles.model import LagrangianModel
 from eddies.particles.moment import Moment, between
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.reference_scales import allowed_step
-from eddies.particles.terms.settings import Forcing
 from eddies.scene.scene import Scene
+from eddies.scene.terms import Forcing
 from eddies.workflows.ground_truth.truth import GroundTruth, particles_for
 from eddies.workflows.learned.model import load_feature_range, load_model
 from eddies.workflows.rollout.method import GridModes

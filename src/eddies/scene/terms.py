@@ -1,14 +1,18 @@
-"""What a scene can say of each term, and what each term reads: known without torch, so that a scene can be read and
-checked where no particle is computed.
+"""What a scene can say of each term, what each reads, gives and asks of a step, and the lists of terms that go by a
+name: known without torch, so that a scene can be read and checked where no particle is computed.
 
 A class of settings is a frozen dataclass whose fields declare their keys as those of a scene's sections do.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
+from eddies.errors import UserError
+from eddies.scene.integrators import Scheme
 from eddies.scene.values import KeyProblem, Section, choice, integer, integers, named, number, texts
 
 READS = ("pairs", "resolved", "density")
@@ -16,6 +20,33 @@ GIVES = ("acceleration", "density", "density_rate", "shift_velocity")
 #: What a network can be told of a pair, in units of the flow: the densities of both, |x|, |v| and x.v.
 INPUTS = ("density", "distance", "speed", "approach")
 BASES = ("corrected", "paper")
+# How much faster than its own rate what relaxes may be, as neighbours tell the noise of a particle with the wrong sign:
+# 3.6 to 4.0 among particles at random, and in turbulence. Two fifths more for what else makes noise grow: at 4.2 a flow
+# at M_t = 0.16 ran away after a turnover, at 5.5 one of 256^3 cells within steps.
+NOISE_AMONG_NEIGHBORS = 5.6
+
+
+@dataclass(frozen=True, kw_only=True)
+class StepUnits:
+    """Of a rollout, what the longest step of a term may depend on: the radius of interaction, the filter width, the
+    sound speed (None: the flow has no sound), the rms of a component of the velocity (None: not foreseen), and the time
+    stepping scheme."""
+
+    radius: float
+    filter_width: float
+    sound_speed: float | None
+    velocity: float | None
+    scheme: Scheme
+
+
+class TermError(UserError, ValueError):
+    """A term cannot be made of its settings, or does other than it declares: the text says which, and what to do."""
+
+
+class TermBase:
+    """What every term derives from, so that one is known without torch: see eddies.Term."""
+
+    Settings: type["TermSettings"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,18 +55,29 @@ class TermSettings(Section):
 
     Attributes
     ----------
+    word : what a scene names it by; empty of a class of the user's.
     reads : of "pairs" (neighbours within the interaction radius, what they tell by kriging too), "resolved" (the
         velocity that a grid resolves of the particles'), "density" (so that it is computed, stored, and wanted of the
         ground truth). What no term reads is not built.
     gives : of "acceleration", "density" (a part of it), "density_rate" and "shift_velocity".
     learns_through_horizons : its parameters are trained through several steps of the simulation alone.
     numbers_per_pair : how many numbers it keeps of each pair while it is evaluated, for an estimate of the memory.
+    damps_by : its parameter with rates of damping by wavenumber, which a coarse grid can take; empty: it has none.
+    too_long : what is wrong with a step beyond `longest_step`, and the remedy, of the term's {name}, the {longest} step
+        and the {integrator}.
     """
 
+    word: ClassVar[str] = ""
     reads: ClassVar[tuple[str, ...]] = ()
     gives: ClassVar[tuple[str, ...]] = ("acceleration",)
     learns_through_horizons: ClassVar[bool] = False
     numbers_per_pair: ClassVar[int] = 0
+    damps_by: ClassVar[str] = ""
+    too_long: ClassVar[str] = ""
+
+    def longest_step(self, units: StepUnits) -> float:
+        """The longest step of a rollout that the term allows; infinite where it sets none, or none is foreseen."""
+        return math.inf
 
     @classmethod
     def section_name(cls) -> str:
@@ -66,6 +108,8 @@ class NetworkSettings(TermSettings):
 class PairNetwork(NetworkSettings):
     """The learned pair force, Eqs. 3 and 4."""
 
+    word = "pairs"
+
     basis: str = choice("of the sum over pairs; corrected: times the inverse moment matrix", *BASES,
                         default="corrected")
     symmetry: str = choice("antisymmetric: pairs get opposite forces, which keep the momentum; with basis paper only",
@@ -83,6 +127,8 @@ class PairNetwork(NetworkSettings):
 class EddyViscosity(TermSettings):
     """Explicit eddy viscosity between pairs, the term Pi of Eq. 3."""
 
+    word = "eddy-viscosity"
+
     form: str = choice("two-sided: of all pairs; monaghan: of approaching ones", "two-sided", "monaghan",
                        default="two-sided")
     basis: str = choice("of the sum over pairs, as of the pair network", *BASES, default="corrected")
@@ -95,6 +141,7 @@ class EddyViscosity(TermSettings):
 class DensityFlux(NetworkSettings):
     """The paper's rate of density: a learned flux between pairs."""
 
+    word = "density-flux"
     gives = ("density_rate",)
 
 
@@ -102,6 +149,7 @@ class DensityFlux(NetworkSettings):
 class Pressure(TermSettings):
     """The pressure of the resolved velocity: the density that belongs to it, and its force."""
 
+    word = "pressure"
     reads = ("resolved",)
     gives = ("acceleration", "density")
 
@@ -109,6 +157,8 @@ class Pressure(TermSettings):
 @dataclass(frozen=True, kw_only=True)
 class Stress(TermSettings):
     """The stress that the filter hides, and its pressure."""
+
+    word = "stress"
 
     form: str = choice("deconvolution: of the velocity with the filter undone; gradient: the leading term of its "
                        "expansion in the filter width", "deconvolution", "gradient", default="deconvolution")
@@ -121,6 +171,7 @@ class Stress(TermSettings):
 class Viscosity(TermSettings):
     """Molecular viscosity of the resolved velocity."""
 
+    word = "viscosity"
     reads = ("resolved",)
 
 
@@ -128,13 +179,16 @@ class Viscosity(TermSettings):
 class Damping(TermSettings):
     """Spectral eddy damping of the resolved velocity, learned as a function of the wavenumber."""
 
+    word = "damping"
     reads = ("resolved",)
+    damps_by = "rates"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Relaxation(TermSettings):
     """Relaxation of the particles' velocity to what the grid resolves of it."""
 
+    word = "relaxation"
     reads = ("resolved",)
 
 
@@ -151,6 +205,8 @@ class Forcing(TermSettings):
 @dataclass(frozen=True, kw_only=True)
 class Continuity(TermSettings):
     """The continuity equation of smoothed particle hydrodynamics, from the true density on."""
+
+    word = "continuity"
 
     diffusion: float = number("delta of the density's diffusion (Molteni & Colagrossi 2009), at first; 0: without",
                               default=0.0, at_least=0)
@@ -169,6 +225,8 @@ class Continuity(TermSettings):
 class WCSPH(TermSettings):
     """Pressure and artificial viscosity of weakly compressible smoothed particle hydrodynamics."""
 
+    word = "wcsph"
+
     alpha: float = number("linear coefficient of the artificial viscosity", default=1.0, at_least=0)
     beta: float = number("quadratic coefficient of the artificial viscosity", default=2.0, at_least=0)
     exponent: float = number("gamma of the pressure c^2 rho_0 / gamma ((rho / rho_0)^gamma - 1)", default=1.0,
@@ -176,12 +234,21 @@ class WCSPH(TermSettings):
 
     numbers_per_pair = 8
     reads = ("pairs", "density")
+    too_long = ('the term "{name}" has to resolve sound, with a step of at most {longest} unless it learns a slower '
+                'one; lower step, and use integrator = "verlet"')
+
+    def longest_step(self, units: StepUnits) -> float:
+        """0.4 h / (c (1 + 0.6 alpha)) (Monaghan 1992), h half the kernel's support."""
+        if units.sound_speed is None:
+            return math.inf
+        return 0.4 * units.radius / 2 / (units.sound_speed * (1 + 0.6 * self.alpha))
 
 
 @dataclass(frozen=True, kw_only=True)
 class TransportVelocity(TermSettings):
     """Particles that a constant background pressure shifts to where there are fewer (Adami, Hu & Adams 2013)."""
 
+    word = "transport-velocity"
     numbers_per_pair = 16
     reads = ("pairs", "density")
     gives = ("shift_velocity",)
@@ -191,6 +258,8 @@ class TransportVelocity(TermSettings):
 @dataclass(frozen=True, kw_only=True)
 class FilteredEquations(TermSettings):
     """The filtered equations of motion by derivatives that neighbours tell."""
+
+    word = "filtered-equations"
 
     sweeps: int = integer("of the pressure from neighbour to neighbour, each time that forces are asked for", default=8,
                           at_least=1, at_most=32)
@@ -202,3 +271,36 @@ class FilteredEquations(TermSettings):
 
     reads = ("pairs", "density")
     gives = ("acceleration", "density_rate")
+    too_long = ('noise among the particles of "{name}" relaxes so fast that it grows with integrator = "{integrator}" '
+                "in steps of more than about {longest}; lower step to that")
+
+    def longest_step(self, units: StepUnits) -> float:
+        """In which the noise of single particles relaxes as far as the scheme can take."""
+        if not units.velocity or not self.relaxation:
+            return math.inf
+        rate = NOISE_AMONG_NEIGHBORS * self.relaxation * 2 * units.velocity / units.filter_width
+        return units.scheme.decay / rate
+
+
+#: The terms that a scene can name.
+TERMS: dict[str, type[TermSettings]] = {kind.word: kind for kind in (
+    PairNetwork, EddyViscosity, DensityFlux, Pressure, Stress, Viscosity, Damping, Relaxation, Continuity, WCSPH,
+    TransportVelocity, FilteredEquations)}
+
+# Near what training finds; the method's own values are tens of times the accelerations of turbulence.
+LITTLE_FRICTION = {"alpha": 0.05, "beta": 1.5}
+
+RESOLVED = ("pressure", "stress", "viscosity", "damping", "relaxation")
+
+#: Of each preset the settings that differ from the terms' own, by term, in the order of the terms.
+PRESETS: dict[str, dict[str, Mapping[str, Any]]] = {
+    "resolved": dict.fromkeys(RESOLVED, {}),
+    # The density there is that of the pressure, whose force is given: a network that is told of it learns no more, and
+    # costs twice as much, as pairs then are not opposite.
+    "resolved + pairs": {**dict.fromkeys(RESOLVED, {}), "pairs": {"inputs": ("distance", "speed", "approach")}},
+    "paper": {"pairs": {"basis": "paper", "hidden": (20, 100, 20)}, "density-flux": {"hidden": (20, 100, 20)}},
+    "local": {"filtered-equations": {}, "eddy-viscosity": {}},
+    "wcsph": {"continuity": {}, "wcsph": LITTLE_FRICTION},
+    "transport-velocity": {"continuity": {}, "wcsph": LITTLE_FRICTION, "transport-velocity": {}},
+}
+DEFAULT_PRESET = "resolved"
