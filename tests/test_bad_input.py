@@ -196,7 +196,7 @@ def as_nobody(commands, built_in):
     """Exit codes and the error output of commands that are run by a user without rights of root, who need not be
     allowed to read this checkout: all modules are loaded before, and the folder of the built-in scenes is another."""
     code = ("import encodings.utf_8_sig, json, os, pathlib, sys, numpy.random, eddies.cli\n"
-            "import eddies.parallel.rendezvous, eddies.stages, eddies.workflows.dns, eddies.workflows.export\n"
+            "import eddies.parallel.stop, eddies.stages, eddies.workflows.dns, eddies.workflows.export\n"
             "import eddies.workflows.report\n"
             "eddies.scene.scene.BUILT_IN = pathlib.Path(sys.argv[2])\n"
             f"os.getuid() or (os.setgroups([]), os.setgid({NOBODY}), os.setuid({NOBODY}))\n"

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from vtkmodules.util.numpy_support import vtk_to_numpy
 
-from eddies.io import exported_file, room, vtkhdf
+from eddies.io import exported_file, sink, vtkhdf
 from eddies.io.fields import FieldSeries, FieldWriter
 from eddies.io.hdf5 import ProductError, create_product, open_product
 from eddies.io.provenance import read_provenance
@@ -176,7 +176,7 @@ def test_the_space_of_a_file_is_reserved_in_full(comm, tmp_path, monkeypatch):
 
     def reserve(descriptor, start, stop):
         reserved[Path(os.readlink(f"/proc/self/fd/{descriptor}")).stem] = stop
-        room.reserve(descriptor, start, stop)
+        sink.reserve(descriptor, start, stop)
 
     monkeypatch.setattr(exported_file, "reserve", reserve)
     with product(comm, tmp_path) as file:

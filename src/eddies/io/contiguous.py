@@ -14,8 +14,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from eddies.io.room import reserve
-from eddies.io.sink import Sink
+from eddies.io.sink import Sink, reserve
 
 Regions = Mapping[str, Sequence[int]]  # name: offset and number of bytes
 

@@ -13,8 +13,7 @@ import numpy as np
 
 from eddies.io.errors import NoRoom, write_error
 from eddies.io.hdf5 import write_attributes
-from eddies.io.room import reserve
-from eddies.io.sink import Sink
+from eddies.io.sink import Sink, reserve
 
 OVERHEAD_BYTES = 2**20  # of a file, above its datasets: far more than is needed
 

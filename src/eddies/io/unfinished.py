@@ -14,10 +14,9 @@ import numpy as np
 from mpi4py import MPI
 
 from eddies.io.errors import NoRoom, ProductError, WriteError, wanted_and_free, write_error
-from eddies.io.room import MARGIN_BYTES, check_limit, reserve
 from eddies.io.run_lock import RunTakenOver
 from eddies.io.single_writer import gather_frame, has_single_writer
-from eddies.io.sink import Sink
+from eddies.io.sink import MARGIN_BYTES, Sink, check_limit, reserve
 from eddies.parallel.broadcast import first_complaint
 
 # Of the index of a chunked dataset, for each chunk, and of a dataset beside its values: more than HDF5 takes.

@@ -14,12 +14,12 @@ from eddies.learning.losses import kullback_leibler, mean_square_share, relative
 from eddies.learning.optimization import Adam, shared_values
 from eddies.parallel.reduction import global_sum
 from eddies.particles.dynamics import ParticleDynamics
+from eddies.particles.exchanges import mean_over_ranks, sum_over_ranks
 from eddies.particles.model import LagrangianModel
 from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.neighborhood import Neighborhood
 from eddies.particles.particle_field import grid_points
 from eddies.particles.particle_set import ParticleSet
-from eddies.particles.rank_sums import mean_over_ranks, sum_over_ranks
 from eddies.particles.reconstruction import reconstruct, volumes
 from eddies.particles.smoothing_kernels import SmoothingKernel
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from eddies.parallel.communicator import Comm
 from eddies.parallel.reduction import global_sum
-from eddies.particles.rank_sums import sum_over_ranks
+from eddies.particles.exchanges import sum_over_ranks
 
 
 def mean_square_share(error: Tensor, scale: float, total: int) -> Tensor:

@@ -16,10 +16,10 @@ from eddies.kernels.pairs import PairSpace, Summand
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles import moments
 from eddies.particles.compiled_pairs import CompiledSum, available, compiled_sums
+from eddies.particles.exchanges import mean_over_ranks
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.neighborhood import LocalParticles
 from eddies.particles.particle_set import ParticleSet
-from eddies.particles.rank_sums import mean_over_ranks
 from eddies.particles.scaled_pairs import ScaledPairs
 from eddies.particles.surroundings import Surroundings
 from eddies.scene.terms import TermError

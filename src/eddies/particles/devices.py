@@ -6,8 +6,7 @@ import torch
 
 from eddies.errors import UserError
 from eddies.kernels.library import threads
-from eddies.parallel.communicator import Comm
-from eddies.parallel.node import node_rank
+from eddies.parallel.communicator import Comm, node_rank
 
 
 class DeviceError(UserError, RuntimeError):

@@ -14,8 +14,8 @@ from eddies.parallel.halo import HaloError, HaloExchange, require_thick_slabs
 from eddies.parallel.migration import migrate
 from eddies.parallel.reduction import any_rank, global_max
 from eddies.parallel.slab import SlabDecomposition
+from eddies.particles.exchanges import exchange_ghost_positions, exchange_ghosts
 from eddies.particles.faults import find_unplaced
-from eddies.particles.ghosts import exchange_ghost_positions, exchange_ghosts
 from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.periodic_box import PeriodicBox

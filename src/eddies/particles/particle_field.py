@@ -14,7 +14,7 @@ from eddies.kernels.reconstruction import GridPlanes, sums_on_grid, told_kernel
 from eddies.parallel.halo import HaloExchange
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.compiled_pairs import CompiledSum, available, compiled_sums
-from eddies.particles.ghosts import exchange_ghost_positions, exchange_ghosts
+from eddies.particles.exchanges import exchange_ghost_positions, exchange_ghosts
 from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.pairs import Pairs
 from eddies.particles.particle_set import as_numpy

@@ -9,8 +9,8 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from eddies.particles.exchanges import sum_over_ranks
 from eddies.particles.fourier_grid import FourierGrid, Points
-from eddies.particles.rank_sums import sum_over_ranks
 
 
 @dataclass(frozen=True)

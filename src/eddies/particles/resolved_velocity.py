@@ -13,11 +13,11 @@ from torch import Tensor
 from eddies.parallel.halo import HaloError
 from eddies.parallel.reduction import global_max, global_sum
 from eddies.parallel.slab import SlabDecomposition
+from eddies.particles.exchanges import mean_over_ranks
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.fourier_grid import FourierGrid
 from eddies.particles.least_squares import LeastSquares, Solution
 from eddies.particles.particle_set import ParticleSet, as_numpy
-from eddies.particles.rank_sums import mean_over_ranks
 from eddies.particles.reference_scales import resolved_wavenumber
 from eddies.particles.resolved_flow import ResolvedFlow
 

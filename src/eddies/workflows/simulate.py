@@ -22,7 +22,7 @@ from eddies.scene.scene import BOX_LENGTH, Scene
 from eddies.scene.terms import Forcing
 from eddies.workflows.ground_truth.frame_counts import rollout_start
 from eddies.workflows.ground_truth.truth import GroundTruth
-from eddies.workflows.learned.kernel import load_kernel
+from eddies.workflows.learned.model import load_kernel
 from eddies.workflows.rollout.course import Course
 from eddies.workflows.rollout.eulerian_run import EulerianRun
 from eddies.workflows.rollout.frames import RolloutFrames

@@ -1,4 +1,4 @@
-"""A model with the weights of a file: what is stored beside them, what is read, and what is refused."""
+"""Model and kernel with the weights of a file: what is stored beside them, what is read, and what is refused."""
 
 import json
 from dataclasses import replace
@@ -9,10 +9,11 @@ import torch
 from eddies.io.hdf5 import ProductError
 from eddies.io.weights import load_weights, save_weights
 from eddies.particles.reference_scales import ReferenceScales
+from eddies.particles.smoothing_kernels import KernelNetwork
 from eddies.scene.scene import Model, SceneError, load_scene
 from eddies.scene.terms import PRESETS
 from eddies.workflows.learned.description import describe, differences
-from eddies.workflows.learned.model import load_model, scene_model
+from eddies.workflows.learned.model import load_kernel, load_model, scene_model
 
 # Of the scene tiny: the filter is two spacings wide.
 SCALES = ReferenceScales(filter_width=1.0471975511965976, spacing=0.5235987755982988, velocity=0.9, density_mean=1.0,
@@ -118,3 +119,27 @@ def test_a_network_that_cannot_be_made_has_one_error(own):
     with pytest.raises(SceneError) as error:
         scene_model(scene, SCALES)
     assert str(error.value).startswith('[model] terms: term "pairs": network = "own_networks:mine": ' + message)
+
+
+NETWORK = KernelNetwork(0.7, [4], seed=3).float()
+
+
+def write(comm, directory, **description):
+    weights = {name: tensor.numpy() for name, tensor in NETWORK.state_dict().items()}
+    description = {"support": 0.7, "hidden": [4], "cutoff": "smooth", **description}
+    save_weights(comm, directory / "kernel.h5", "kernel", description, weights, {})
+
+
+@pytest.mark.mpi(1)
+def test_the_kernel_is_read_as_it_was_trained(comm, tmp_path):
+    write(comm, tmp_path, form=KernelNetwork.FORM)
+    distance = torch.linspace(0, 0.8, 50)
+    assert torch.equal(load_kernel(comm, tmp_path / "kernel.h5").value(distance), NETWORK.table().value(distance))
+
+
+@pytest.mark.mpi(1, 2)
+def test_weights_of_the_form_that_could_be_negative_are_refused(comm, tmp_path):
+    """Files older than the form do not name it."""
+    write(comm, tmp_path)
+    with pytest.raises(ProductError, match=r'kernel.h5: form = "NN g", .*remove it and run `eddies train-kernel`'):
+        load_kernel(comm, tmp_path / "kernel.h5")

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from eddies.particles.context import Context
+from eddies.particles.exchanges import mean_over_ranks
 from eddies.particles.flow_units import FlowUnits
-from eddies.particles.rank_sums import mean_over_ranks
 from eddies.particles.rates import Rates
 from eddies.particles.terms.term import Term
 from eddies.scene import terms as declared

@@ -10,8 +10,7 @@ from pathlib import Path
 from eddies.errors import UserError
 from eddies.io.single_writer import LARGEST_BYTES, REMEDY, has_single_writer
 from eddies.parallel.broadcast import on_first_rank
-from eddies.parallel.communicator import Comm
-from eddies.parallel.node import node_ranks
+from eddies.parallel.communicator import Comm, node_ranks
 from eddies.pipeline import STAGES
 from eddies.scene.scene import Scene
 from eddies.workflows.foreseen.stage_cost import StageCost, in_units
@@ -56,7 +55,7 @@ def weights(scene: Scene, comm: Comm) -> Iterator[str]:
     """Trained weights that are there, and of another model."""
     if scene.model is None or scene.model.path is None or not on_first_rank(comm, scene.model.weights_file.is_file):
         return
-    from eddies.workflows.learned.source import read_source  # torch, where there is a model
+    from eddies.workflows.learned.description import read_source  # torch, where there is a model
     try:
         read_source(scene, comm)
     except UserError as error:

@@ -1,18 +1,25 @@
-"""What is stored of a model beside its weights, and how a scene differs from it; known without torch."""
+"""What is stored of a model beside its weights, how a scene differs from it, and the trained weights of another run
+with it; known without torch."""
 
 from __future__ import annotations
 
 import json
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from eddies.import_path import short_name
+from eddies.io.hdf5 import ProductError, open_product
+from eddies.io.provenance import read_provenance
+from eddies.io.weights import load_tables, load_weights
+from eddies.parallel.communicator import Comm
 from eddies.particles.reference_scales import ReferenceScales
 from eddies.scene.rules import quoted
-from eddies.scene.scene import Scene
-
+from eddies.scene.scene import Scene, SceneError
 
 # Keys of terms in version 1.0, with the values at which they are fixed now.
 FORMER = {"force": True, "kernel": "cubic-spline", "background": 0.25}
@@ -47,3 +54,34 @@ def differences(scene: Scene, description: Mapping[str, Any]) -> Iterator[tuple[
     width = scales["filter_width"] / scales["spacing"] * tracers.spacing
     if not math.isclose(tracers.filter_width, width, rel_tol=1e-6):
         yield "[tracers] filter_width", f"{tracers.filter_width:.9g}", f"{width:.9g}"
+
+
+@dataclass(frozen=True)
+class ModelSource:
+    """What a model.h5 holds: description, weights and tables by name, and where it comes from."""
+
+    path: Path
+    description: dict[str, Any]
+    weights: dict[str, np.ndarray]
+    tables: dict[str, dict[str, np.ndarray]]
+    provenance: dict[str, Any]
+
+
+def read_source(scene: Scene, comm: Comm) -> ModelSource:
+    """The trained model that [model] path names; all ranks call it.
+
+    Raises:
+        ProductError: there is none, or it is damaged.
+        SceneError: it has another form, or other neighbourhoods in units of the filter width, than the scene's.
+    """
+    path = scene.model.weights_file
+    try:
+        description, weights = load_weights(comm, path, "model")
+        with open_product(comm, path, "model") as file:
+            provenance = read_provenance(file)
+    except ProductError as error:
+        raise ProductError(f"{scene.name}: [model] path = {quoted(scene.model.path)}: {error}") from None
+    for key, wanted, trained in differences(scene, description):
+        raise SceneError(f"{scene.name}: {key} = {wanted}, but {path} was trained with {trained}; set it to "
+                         "that, or give another [model] path")
+    return ModelSource(path, description, weights, load_tables(path), provenance)

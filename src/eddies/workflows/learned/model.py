@@ -1,4 +1,5 @@
-"""The model of a scene: as it is built, and as it is read from a file with what is stored beside its weights."""
+"""The model of a scene, as it is built, and model and smoothing kernel as they are read from files with what is stored
+beside their weights."""
 
 from __future__ import annotations
 
@@ -16,6 +17,7 @@ from eddies.particles.feature_range import FeatureRange
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.model import LagrangianModel, build_model
 from eddies.particles.reference_scales import ReferenceScales
+from eddies.particles.smoothing_kernels import HermiteKernel, KernelNetwork
 from eddies.scene.scene import Scene, SceneError
 from eddies.scene.terms import TermError
 from eddies.workflows.learned.description import differences
@@ -64,3 +66,20 @@ def load_feature_range(comm: Comm, path: str | Path) -> FeatureRange:
     """The range of what the networks of a file were given in training."""
     with open_product(comm, path, "model") as file:
         return FeatureRange(**read_table(file, "feature_range"))
+
+
+def load_kernel(comm: Comm, path: str | Path, device: torch.device | str = "cpu") -> HermiteKernel:
+    """The trained kernel as the table that is used at run time, in single precision.
+
+    ProductError, besides the reasons of `load_weights`, where the weights are those of another form of the kernel.
+    """
+    description, tensors = load_weights(comm, path, "kernel")
+    form = description.get("form", "NN g")
+    if form != KernelNetwork.FORM:
+        raise ProductError(f'{path}: form = "{form}", which may be negative; the kernel is now "{KernelNetwork.FORM}": '
+                           "remove it and run `eddies train-kernel` again")
+    network = KernelNetwork(description["support"], description["hidden"], description["cutoff"])
+    network = network.to(dtype=torch.float32, device=device)
+    network.load_state_dict({name: torch.from_numpy(tensor) for name, tensor in tensors.items()})
+    with torch.no_grad():
+        return network.table()

@@ -4,7 +4,7 @@ import torch
 
 from eddies.parallel.halo import HaloExchange
 from eddies.parallel.reduction import global_sum
-from eddies.particles.ghosts import exchange_ghost_positions, exchange_ghosts
+from eddies.particles.exchanges import exchange_ghost_positions, exchange_ghosts
 from tests.particles.configurations import LENGTH, distributed, state
 
 
