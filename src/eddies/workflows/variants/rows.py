@@ -101,7 +101,7 @@ def notes(comparison: Comparison) -> list[str]:
         found.append(f"{', '.join(own)}: no {blank}. These are measured on what the smoothing kernel makes of the "
                      "particles; one of other settings than the base's shows another part of the flow.")
     grids = {name: (scene.eulerian or Eulerian()).cells_for(scene.tracers.filter_width)
-             for name, scene in comparison.scenes.items() if scene.simulation.on_grid}
+             for name, scene in comparison.scenes.items() if scene.simulation.method == "eulerian"}
     if grids:
         kept = ", ".join(f"{(cells - 1) // 3} in {name}" for name, cells in grids.items())
         found.append(f"Of a grid the 2/3 rule leaves the wavenumbers |k_i| < cells/3, at most: {kept}; k_d = "
