@@ -29,7 +29,7 @@ from eddies.workflows.foreseen.estimates import ground_truth_alone, most_ranks
 from eddies.workflows.foreseen.refusals import single_writer
 from eddies.workflows.foreseen.stage_cost import in_units
 from eddies.workflows.foreseen.warnings import stage_warnings
-from eddies.workflows.learned.description import read_source
+from eddies.workflows.learned.source import read_source
 from eddies.workflows.run_directory.work import SECONDS, Work, find_work, is_done, stage_seconds
 
 log = logging.getLogger("eddies")

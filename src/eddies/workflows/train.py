@@ -19,8 +19,8 @@ from eddies.pipeline import STAGES
 from eddies.scene.scene import Scene
 from eddies.workflows.learned import transfer
 from eddies.workflows.learned.a_priori import evaluate, evaluation_frames
-from eddies.workflows.learned.description import describe
 from eddies.workflows.learned.model import load_kernel
+from eddies.workflows.learned.source import describe
 from eddies.workflows.learned.steps import take_all_steps
 from eddies.workflows.learned.training_data import model_of
 from eddies.workflows.learned.training_phases import feature_range, horizon_phases, one_step_phases

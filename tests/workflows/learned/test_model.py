@@ -12,8 +12,8 @@ from eddies.particles.reference_scales import ReferenceScales
 from eddies.particles.smoothing_kernels import KernelNetwork
 from eddies.scene.scene import Model, SceneError, load_scene
 from eddies.scene.terms import PRESETS
-from eddies.workflows.learned.description import describe, differences
 from eddies.workflows.learned.model import load_kernel, load_model, scene_model
+from eddies.workflows.learned.source import describe, differences
 
 # Of the scene tiny: the filter is two spacings wide.
 SCALES = ReferenceScales(filter_width=1.0471975511965976, spacing=0.5235987755982988, velocity=0.9, density_mean=1.0,

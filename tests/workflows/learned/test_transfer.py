@@ -12,8 +12,8 @@ from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.reference_scales import ReferenceScales
 from eddies.scene.scene import BOX_LENGTH, load_scene
-from eddies.workflows.learned.description import ModelSource, describe
 from eddies.workflows.learned.model import scene_model, with_weights
+from eddies.workflows.learned.source import ModelSource, describe
 from eddies.workflows.learned.transfer import trained_on
 
 # Of the scene tiny: filter width two spacings, whatever their number.

@@ -25,8 +25,8 @@ from eddies.scene.scene import BOX_LENGTH, Model, SceneError, load_scene
 from eddies.spectral.interpolation import SplineInterpolation
 from eddies.workflows import dns, report, simulate, train
 from eddies.workflows.ground_truth.truth import GroundTruth
-from eddies.workflows.learned.description import describe
 from eddies.workflows.learned.model import scene_model
+from eddies.workflows.learned.source import describe
 from eddies.workflows.rollout.particle_run import SOLVES, LearnedRun
 from eddies.workflows.simulate import METHODS, method_class
 

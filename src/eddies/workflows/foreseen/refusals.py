@@ -55,7 +55,7 @@ def weights(scene: Scene, comm: Comm) -> Iterator[str]:
     """Trained weights that are there, and of another model."""
     if scene.model is None or scene.model.path is None or not on_first_rank(comm, scene.model.weights_file.is_file):
         return
-    from eddies.workflows.learned.description import read_source  # torch, where there is a model
+    from eddies.workflows.learned.source import read_source  # torch, where there is a model
     try:
         read_source(scene, comm)
     except UserError as error:

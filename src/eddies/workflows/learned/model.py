@@ -20,7 +20,7 @@ from eddies.particles.reference_scales import ReferenceScales
 from eddies.particles.smoothing_kernels import HermiteKernel, KernelNetwork
 from eddies.scene.scene import Scene, SceneError
 from eddies.scene.terms import TermError
-from eddies.workflows.learned.description import differences
+from eddies.workflows.learned.source import differences
 
 
 def scene_model(scene: Scene, scales: ReferenceScales) -> LagrangianModel:

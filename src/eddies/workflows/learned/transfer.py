@@ -18,8 +18,8 @@ from eddies.particles.devices import prepare_torch
 from eddies.scene.scene import BOX_LENGTH, Scene
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.learned.a_priori import evaluate, evaluation_frames
-from eddies.workflows.learned.description import ModelSource, describe, read_source
 from eddies.workflows.learned.model import with_weights
+from eddies.workflows.learned.source import ModelSource, describe, read_source
 
 log = logging.getLogger("eddies")
 

@@ -13,7 +13,7 @@ from eddies.particles.reference_scales import ReferenceScales
 from eddies.scene.rules import quoted
 from eddies.scene.scene import Model, SceneError, load_scene
 from eddies.stages import check_inputs
-from eddies.workflows.learned.description import describe, read_source
+from eddies.workflows.learned.source import describe, read_source
 
 # Of the scene tiny: filter width two spacings, whatever their number.
 SCALES = ReferenceScales(filter_width=0.5, spacing=0.25, velocity=1.0, acceleration=2.0, density_mean=1.0,
