@@ -13,7 +13,8 @@ from eddies.particles.reference_scales import ReferenceScales
 from eddies.scene.rules import quoted
 from eddies.scene.scene import Model, SceneError, load_scene
 from eddies.stages import check_inputs
-from eddies.workflows.learned.source import describe, read_source
+from eddies.workflows.learned.model import with_weights
+from eddies.workflows.learned.source import describe, differences, read_source
 
 # Of the scene tiny: filter width two spacings, whatever their number.
 SCALES = ReferenceScales(filter_width=0.5, spacing=0.25, velocity=1.0, acceleration=2.0, density_mean=1.0,
@@ -127,3 +128,27 @@ def test_a_file_never_has_a_class_imported(comm, tmp_path, own):
     if comm.rank == 0:  # whose path leads to the module
         assert scene_with(tmp_path, "pressure", "own_source:Drag").model.foreign == ("own_source:Drag",)
         assert (tmp_path / "imported").exists()
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("name, base", [("hit", "hit"), ("hit-coarse", "hit-coarse"), ("hit-local", "hit"),
+                                        ("hit-small", "hit-small"), ("tiny", "tiny")])
+def test_weights_of_the_first_version_are_read(comm, name, base):
+    """Of a term's keys that there are no more, with the values at which they are fixed now."""
+    changes = ["model.preset=local"] if name == "hit-local" else []
+    found = load_scene(base, [*changes, f"model.path=eddies:{name}"])
+    source = read_source(found, comm)
+    scales = ReferenceScales(**source.description["scales"])
+    model = with_weights(found, source.description, source.weights, source.path, scales)
+    assert {key: value.shape for key, value in source.weights.items()} == {
+        key: tuple(value.shape) for key, value in model.state_dict().items()}
+
+
+def test_a_former_key_with_another_value_is_another_model():
+    resolved = load_scene("tiny", ["model.preset=resolved"])
+    scales = replace(SCALES, filter_width=resolved.tracers.filter_width, spacing=resolved.tracers.spacing)
+    description = json.loads(json.dumps(describe(resolved, scales)))
+    assert list(differences(resolved, description)) == []
+    for force, found in ((True, []), (False, [("[model.pressure] force", "true", "false")])):
+        description["terms"]["pressure"] = {"force": force}
+        assert [(key, *rest) for key, *rest in differences(resolved, description)] == found

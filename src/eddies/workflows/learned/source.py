@@ -46,8 +46,8 @@ def differences(scene: Scene, description: Mapping[str, Any]) -> Iterator[tuple[
         name = short_name(term)
         wanted = json.loads(json.dumps(asdict(scene.model.settings[name])))
         for key in wanted.keys() | trained.keys():
-            if wanted.get(key, FORMER.get(key)) != trained.get(key):
-                yield f"[model.{name}] {key}", quoted(wanted.get(key)), quoted(trained.get(key))
+            if (value := wanted.get(key, FORMER.get(key))) != trained.get(key):
+                yield f"[model.{name}] {key}", quoted(value), quoted(trained.get(key))
     if "pairs" in scene.model.reads and scene.neighbors != description["neighbors"]:
         yield "[model] neighbors", quoted(scene.neighbors), quoted(description["neighbors"])
     scales, tracers = description["scales"], scene.tracers
