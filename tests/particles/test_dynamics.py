@@ -11,11 +11,12 @@ from eddies.particles.dense_network import DenseNetwork
 from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.rates import Rates
-from eddies.particles.terms.term import Term
+from eddies.particles.smoothing_kernels import CubicSpline
+from eddies.particles.terms.term import PairTerm, Term
 from eddies.scene.terms import TermSettings
 from tests.particles.configurations import (
-    LENGTH, MODELS, PAIR_MODELS, SCALES, alone, assert_close, by_id, by_torch, distributed, dynamics_of, given, model,
-    of_terms, state,
+    CUTOFF, FLOW, LENGTH, MODELS, PAIR_MODELS, SCALES, alone, assert_close, by_id, by_torch, distributed, dynamics_of,
+    given, model, of_terms, state, summed_density,
 )
 
 SKIN = 0.2
@@ -298,6 +299,42 @@ def test_terms_read_the_density_that_others_give(comm, stored):
     expected = dynamics_of(whole, force).rates(everything).acceleration.detach()
     assert_close(by_id(comm, particles, rates.acceleration, 200), expected[torch.argsort(everything.id)])
     assert_close(by_id(comm, particles, rates.density, 200), sine)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SummedDensitySettings(TermSettings):
+    """Settings of a density that is a sum over neighbours."""
+
+    reads = ("pairs",)
+    gives = ("density",)
+
+
+class SummedDensity(PairTerm):
+    """sum_j m W, with the particle itself."""
+
+    mutual = True
+
+    def pair_values(self, pairs):
+        return CubicSpline(CUTOFF).value(pairs.pairs.distance).unsqueeze(0)
+
+    def rates_of(self, sums, context):
+        itself = CubicSpline(CUTOFF).value(sums.new_zeros(()))
+        return Rates(density=self.flow.particle_mass * (sums[0] + itself) - SCALES.density_mean)
+
+
+@pytest.mark.mpi(1, 2)
+def test_a_density_by_pairs_is_that_of_all_particles_whichever_are_asked_for(comm):
+    """Others read it at their neighbours."""
+    position, velocity, _ = state(120)
+    slab, particles = distributed(comm, position, velocity)
+    giving = of_terms(model(wcsph={}).terms["wcsph"], SummedDensity(SummedDensitySettings(), FLOW))
+    whole = dynamics_of(slab, giving).rates(particles)
+    assert_close(by_id(comm, particles, whole.density, 120), summed_density(position, CubicSpline(CUTOFF),
+                                                                            FLOW.particle_mass))
+    rows = torch.arange(1, len(particles), 3)
+    some = dynamics_of(slab, giving).rates(particles, rows)
+    assert_close(some.acceleration, whole.acceleration[rows], 1e-11)
+    assert_close(some.density, whole.density)
 
 
 @pytest.mark.mpi(1, 2)
