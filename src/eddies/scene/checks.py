@@ -11,19 +11,14 @@ from collections.abc import Iterator
 from itertools import chain
 from typing import TYPE_CHECKING
 
-from eddies.import_path import ImportPathError, is_path, load
+from eddies.import_path import ImportPathError, load
 from eddies.scene.rules import quoted
-from eddies.scene.sections import Eulerian
+from eddies.scene.sections import INITIAL_FLOWS, Eulerian, InitialFlow
 from eddies.scene.values import import_paths
 
 if TYPE_CHECKING:
     from eddies.scene.scene import Scene
 
-# The initial flows that read a key; the others read no such key.
-INITIAL_KEYS = {
-    "amplitude": ("random", "taylor-green", "abc", "shear-wave", "sound-wave"),
-    "peak_wavenumber": ("random",), "wavenumber": ("abc", "shear-wave", "sound-wave"), "path": ("file",),
-    "state": ("file",)}
 # What a class of the user's must have, by the key that names it.
 REQUIRED = {"fluid": ("nonlinear", "linear", "linear_function", "combine", "compressible"), "kind": ("__call__",),
             "method": ("advance", "frame", "status", "series", "description", "has_density"), "network": ("forward",)}
@@ -77,16 +72,16 @@ def flow_problems(scene: Scene) -> Iterator[str]:
 def initial_problems(scene: Scene) -> Iterator[str]:
     """Keys that only some initial flows read; waves within the resolved scales."""
     initial, defaults = scene.initial, type(scene.initial)()
-    if initial.kind == "file" and initial.path is None:
+    if initial.flow.from_file and initial.path is None:
         yield '[initial] path: this key is missing; kind = "file" needs the path of an HDF5 file'
-    if initial.kind == "sound-wave" and not scene.flow.compressible:
+    if initial.flow.sound and not scene.flow.compressible:
         yield '[initial] kind = "sound-wave": needs sound; set [flow] fluid = "compressible"'
-    for key, kinds in INITIAL_KEYS.items() if not is_path(initial.kind) else ():
-        value = getattr(initial, key)
-        if value != getattr(defaults, key) and initial.kind not in kinds:
+    for key in InitialFlow().keys:
+        value, kinds = getattr(initial, key), [kind for kind, flow in INITIAL_FLOWS.items() if key in flow.keys]
+        if value != getattr(defaults, key) and key not in initial.flow.keys:
             yield (f'[initial] {key} = {value}: only read with kind = {" or ".join(kinds)}, not '
                    f'"{initial.kind}"; remove the key')
-    highest = {"random": initial.peak_wavenumber}.get(initial.kind, initial.wavenumber)
+    highest = initial.peak_wavenumber if initial.flow.turbulent else initial.wavenumber
     if highest > scene.flow.cells / 3:
         yield (f"[initial] wavenumber {highest:g}: {scene.flow.cells} cells resolve wavenumbers up to "
                f"{scene.flow.cells / 3:.3g}; lower it or raise [flow] cells")
@@ -117,10 +112,10 @@ def tracer_problems(scene: Scene) -> Iterator[str]:
     tracers, initial = scene.tracers, scene.initial
     if tracers and tracers.forced and scene.forcing is None:
         yield "[tracers] forced = true: there is no [forcing] that could stay on; add it, or remove the key"
-    if tracers and initial.kind == "sound-wave":
+    if tracers and initial.flow.sound:
         yield ('[initial] kind = "sound-wave": starts from rest, and [tracers] are followed for turnovers of a flow '
                "that moves; choose another kind, or remove [tracers]")
-    if scene.model and initial.kind == "shear-wave" and scene.flow.viscosity == 0 and scene.forcing is None:
+    if scene.model and initial.flow.steady and scene.flow.viscosity == 0 and scene.forcing is None:
         yield ('[initial] kind = "shear-wave": without viscosity nothing in it is accelerated, and a model is made '
                "dimensionless by the acceleration; choose another kind, or raise [flow] viscosity")
     if tracers and tracers.cells > scene.flow.cells:

@@ -38,12 +38,49 @@ class Flow(Section):
         return load(self.fluid).compressible if is_path(self.fluid) else self.fluid == "compressible"
 
 
+@dataclass(frozen=True)
+class InitialFlow:
+    """What is known of an initial flow before it is made.
+
+    Parameters
+    ----------
+    keys : of [initial] that it reads; all for a function of the user's.
+    rms, peak : root mean square of |u| and largest |u| + |v| + |w|, over the amplitude; None: unknown, or at rest.
+    wave : |k| of its modes over `wavenumber`; None: there are many.
+    turbulent : whether it is of many scales, with the spectrum's peak at `peak_wavenumber`.
+    sound : whether it is at rest but for sound.
+    steady : whether nothing in it is accelerated without viscosity.
+    """
+
+    keys: tuple[str, ...] = ("amplitude", "peak_wavenumber", "wavenumber", "path", "state")
+    rms: float | None = None
+    peak: float | None = None
+    wave: float | None = None
+    turbulent: bool = False
+    sound: bool = False
+    steady: bool = False
+
+    @property
+    def from_file(self) -> bool:
+        """Whether a file holds it, which has to be named."""
+        return self.keys == ("path", "state")
+
+
+INITIAL_FLOWS = {
+    "random": InitialFlow(("amplitude", "peak_wavenumber"), rms=math.sqrt(3), turbulent=True),
+    "taylor-green": InitialFlow(("amplitude",), rms=0.5, peak=1.0, wave=math.sqrt(3)),
+    "abc": InitialFlow(("amplitude", "wavenumber"), rms=math.sqrt(3), peak=3 * math.sqrt(2), wave=1.0),
+    "shear-wave": InitialFlow(("amplitude", "wavenumber"), rms=math.sqrt(0.5), peak=1.0, wave=1.0, steady=True),
+    "sound-wave": InitialFlow(("amplitude", "wavenumber"), sound=True),
+    "file": InitialFlow(("path", "state")),
+}
+
+
 @dataclass(frozen=True, kw_only=True)
 class Initial(Section):
     """The velocity, and with a compressible fluid the density, at time 0."""
 
-    kind: str = named("initial flow", "random", "taylor-green", "abc", "shear-wave", "sound-wave", "file",
-                      default="random")
+    kind: str = named("initial flow", *INITIAL_FLOWS, default="random")
     amplitude: float = number("of velocity, random: rms of a component; sound-wave: of ln density",
                               default=1.0, above=0)
     peak_wavenumber: float = number("wavenumber of the spectrum's peak, random only", default=3.0, above=0)
@@ -52,6 +89,11 @@ class Initial(Section):
                             "grid may be another", default=None)
     state: int = integer("which of the states of the whole flow that the file holds, in time: fields/final, with "
                          "tracers fields/unfiltered, of a cutout Velocity_####", default=0, at_least=0)
+
+    @property
+    def flow(self) -> InitialFlow:
+        """What is known of the kind."""
+        return INITIAL_FLOWS.get(self.kind, InitialFlow())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,6 +113,11 @@ class Time(Section):
     max_step: float = number("largest step; smaller ones are this over a power of two", default=0.05, above=0)
     step: float | None = number("fixed step instead", default=None, above=0)
     duration: float | None = number("run time after spin-up, without tracers only", default=None, above=0)
+
+    @property
+    def explicit(self) -> bool:
+        """Whether the stepper has to resolve sound and viscosity."""
+        return self.stepper == "rk4"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,7 +16,7 @@ from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.reference_scales import ScaleError
 from eddies.pipeline import STAGES
 from eddies.scene.scene import BOX_LENGTH, Scene, SceneError
-from eddies.workflows.foreseen.estimates import RMS_SPEED, expected_step, expected_turbulence, run_time
+from eddies.workflows.foreseen.estimates import expected_step, expected_turbulence, run_time
 from eddies.workflows.ground_truth.frame_counts import check_frames
 
 # Of the direct simulation, of the rollout, and frames of the tracers: at a microsecond each a quarter of an hour, and
@@ -94,10 +94,10 @@ def problems(stages: Sequence[str], scene: Scene, seen: float) -> Iterator[str]:
 def forcing_problems(scene: Scene) -> Iterator[str]:
     """A start so weak that one step of the forcing multiplies it: its power is prescribed."""
     forcing, initial = scene.forcing, scene.initial
-    if forcing is None or initial.kind not in RMS_SPEED:
+    if forcing is None or initial.flow.rms is None:
         return
     step = scene.time.step or scene.time.max_step  # the weaker the flow, the longer its step
-    unit = RMS_SPEED[initial.kind]**2 / 2  # energy over the square of the amplitude
+    unit = initial.flow.rms**2 / 2  # energy over the square of the amplitude
     energy, gained = unit * initial.amplitude**2, forcing.injection_rate * step
     if gained > MOST_FORCED * energy:
         least = math.sqrt(gained / MOST_FORCED / unit)

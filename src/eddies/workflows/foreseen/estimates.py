@@ -14,9 +14,6 @@ DECAY_EXPONENT = 1.2         # of the energy of turbulence that nothing forces (
 PEAK_VELOCITY = 4.0          # largest component of the velocity of a particle over u'
 ALLOWED_VELOCITY = 6.0       # the same, for which there are ghost planes in the training through horizons
 PEAK_SPEED = 7.0             # max(|u| + |v| + |w|) over u' in turbulence: four rms in each component at worst
-EXACT_PEAK_SPEED = {"taylor-green": 1.0, "abc": 3 * math.sqrt(2), "shear-wave": 1.0}  # over the amplitude
-# Root mean square of |u| over the amplitude.
-RMS_SPEED = {"random": math.sqrt(3), "taylor-green": 0.5, "abc": math.sqrt(3), "shear-wave": math.sqrt(0.5)}
 GHOST_PLANES = {"cubic": 3, "quintic": 4}
 
 
@@ -73,7 +70,7 @@ def expected_turbulence(scene: Scene) -> ExpectedTurbulence | None:
         dissipation_rate = scene.forcing.injection_rate
         velocity_rms = (dissipation_rate * integral_scale / DISSIPATION_CONSTANT) ** (1 / 3)
         return ExpectedTurbulence(velocity_rms, dissipation_rate, scene.flow.viscosity)
-    if scene.initial.kind == "random":
+    if scene.initial.flow.turbulent:
         integral_scale = math.sqrt(2 * math.pi) / scene.initial.peak_wavenumber
         dissipation_rate = DISSIPATION_CONSTANT * scene.initial.amplitude**3 / integral_scale
         return ExpectedTurbulence(scene.initial.amplitude, dissipation_rate, scene.flow.viscosity)
@@ -85,11 +82,11 @@ def peak_speed(scene: Scene) -> float | None:
     initial, turbulence = scene.initial, expected_turbulence(scene)
     if turbulence:
         return PEAK_SPEED * turbulence.velocity_rms
-    if initial.kind == "random":
+    if initial.flow.turbulent:
         return PEAK_SPEED * initial.amplitude
-    if initial.kind == "sound-wave":
+    if initial.flow.sound:
         return initial.amplitude * scene.flow.sound_speed
-    return EXACT_PEAK_SPEED[initial.kind] * initial.amplitude if initial.kind in EXACT_PEAK_SPEED else None
+    return initial.flow.peak and initial.flow.peak * initial.amplitude
 
 
 def rms_speed(scene: Scene) -> float | None:
@@ -98,7 +95,7 @@ def rms_speed(scene: Scene) -> float | None:
     initial, turbulence = scene.initial, expected_turbulence(scene)
     if turbulence:
         return math.sqrt(3) * turbulence.velocity_rms
-    return RMS_SPEED[initial.kind] * initial.amplitude if initial.kind in RMS_SPEED else None
+    return initial.flow.rms and initial.flow.rms * initial.amplitude
 
 
 def expected_step(scene: Scene) -> tuple[float, str] | None:
@@ -123,7 +120,7 @@ def courant_bound(scene: Scene) -> float | None:
 
 def explicit_sound(scene: Scene) -> float:
     """sqrt(3) c where the stepper must resolve sound, else 0."""
-    return math.sqrt(3) * scene.flow.sound_speed if scene.time.stepper == "rk4" and scene.flow.sound_speed else 0.0
+    return math.sqrt(3) * scene.flow.sound_speed if scene.time.explicit and scene.flow.sound_speed else 0.0
 
 
 def run_time(scene: Scene) -> float | None:

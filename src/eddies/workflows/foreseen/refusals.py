@@ -18,9 +18,6 @@ from eddies.workflows.foreseen.stage_costs import totals
 from eddies.workflows.foreseen.stored import product_bytes
 from eddies.workflows.ground_truth.scene_flow import stored_states
 
-# |k| of the initial flows of a few waves, over their wavenumber; sound has no solenoidal velocity to force.
-WAVES = {"taylor-green": 3**0.5, "abc": 1.0, "shear-wave": 1.0, "sound-wave": float("inf")}
-
 
 def refusals(scene: Scene, comm: Comm, costs: Sequence[StageCost]) -> list[str]:
     """A line for each; all ranks call it and get the same."""
@@ -30,7 +27,7 @@ def refusals(scene: Scene, comm: Comm, costs: Sequence[StageCost]) -> list[str]:
 
 def start_file(scene: Scene, comm: Comm) -> Iterator[str]:
     """A file to start from that is not there, or without a state to start from."""
-    if scene.initial.kind != "file":
+    if not scene.initial.flow.from_file:
         return
     try:
         with stored_states(scene.initial, comm):
@@ -42,10 +39,10 @@ def start_file(scene: Scene, comm: Comm) -> Iterator[str]:
 def forced_modes(scene: Scene) -> Iterator[str]:
     """A start without energy at the modes that linear forcing amplifies."""
     initial, forcing = scene.initial, scene.forcing
-    if forcing is None or forcing.injection_rate == 0 or initial.kind not in WAVES:
+    if forcing is None or forcing.injection_rate == 0:
         return
-    wave = WAVES[initial.kind] * initial.wavenumber
-    if wave >= forcing.wavenumber:
+    wave = initial.flow.wave and initial.flow.wave * initial.wavenumber
+    if initial.flow.sound or wave and wave >= forcing.wavenumber:
         yield (f'[forcing] wavenumber = {forcing.wavenumber:g}: [initial] kind = "{initial.kind}" has no energy at '
                "0 < |k| < wavenumber, which linear forcing could amplify; start from another flow, raise wavenumber, "
                "or remove [forcing]")

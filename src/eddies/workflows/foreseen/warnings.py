@@ -81,7 +81,7 @@ def stability(scene: Scene) -> Iterator[str]:
     settings, bound = scene.time, courant_bound(scene)
     step = settings.step or min(bound or 0.0, settings.max_step)
     limits = limits_of_step(largest_wavenumber(scene), step, peak_speed(scene) or 0.0, scene.flow.viscosity,
-                            settings.stepper == "rk4", scene.flow.sound_speed)
+                            settings.explicit, scene.flow.sound_speed)
     for limit in limits:
         if limit.exceeded:
             key = "step" if settings.step else "max_step" if limit.name == "viscosity" else "courant"
@@ -97,7 +97,7 @@ def filter_width(scene: Scene) -> Iterator[str]:
         yield (f"[tracers] filter_width = {width:.3g}: the filter is narrower than a cell of the grid, it filters "
                f"nothing; raise it to {at_least(BOX_LENGTH / scene.flow.cells)} or more, or lower [tracers] "
                "particles_per_side")
-    if forcing is None and scene.initial.kind != "random":
+    if forcing is None and not scene.initial.flow.turbulent:
         return
     highest, holds = ((forcing.wavenumber, "that are forced") if forcing else
                       (scene.initial.peak_wavenumber, "that hold the energy"))

@@ -42,20 +42,20 @@ def build_step_limit(scene: Scene, grid: SpectralGrid) -> CourantLimit | FixedSt
     time = scene.time
     if time.step is not None:
         return FixedStep(time.step)
-    explicit_sound = scene.flow.sound_speed if time.stepper == "rk4" and scene.flow.compressible else 0.0
+    explicit_sound = scene.flow.sound_speed if time.explicit and scene.flow.compressible else 0.0
     return CourantLimit(grid, time.courant, time.max_step, explicit_sound)
 
 
 def initial_state(scene: Scene, fluid: Fluid) -> np.ndarray:
     """The state at time 0: velocity, and for a compressible fluid s = ln(rho / rho_0)."""
     initial, grid = scene.initial, fluid.grid
-    if initial.kind == "file":
+    if initial.flow.from_file:
         return _state_from_file(scene, fluid)
     velocity = _own_velocity(scene, grid) if is_path(initial.kind) else INITIAL_FLOWS[initial.kind](
         grid, initial, scene.seed)
     if not fluid.compressible:
         return velocity
-    if initial.kind == "sound-wave":
+    if initial.flow.sound:
         density = sound_wave_density(grid, initial.amplitude, initial.wavenumber)
     else:
         density = balanced_density(grid, velocity, fluid.sound_speed)
