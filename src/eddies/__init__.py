@@ -20,8 +20,7 @@ _HOMES = {
     "eddies.particles.terms.term": ("PairTerm", "Term"),
     "eddies.particles.rates": ("Rates",),
     "eddies.particles.model": ("LagrangianModel", "build_model"),
-    "eddies.particles.flow_units": ("FlowUnits",),
-    "eddies.particles.reference_scales": ("ReferenceScales",),
+    "eddies.particles.flow_units": ("FlowUnits", "ReferenceScales"),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 __all__ = [*_HOME_OF]

@@ -31,14 +31,13 @@ from eddies.kernels.modes import CompiledModePasses
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.context import Context
 from eddies.particles.dynamics import ParticleDynamics
-from eddies.particles.flow_units import FlowUnits
+from eddies.particles.flow_units import FlowUnits, ReferenceScales, allowed_step
 from eddies.particles.fourier_grid import Points
 from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.least_squares import LeastSquares, ModePasses
 from eddies.particles.model import build_model
 from eddies.particles.neighborhood import Neighborhood
 from eddies.particles.particle_set import ParticleSet
-from eddies.particles.reference_scales import ReferenceScales, allowed_step
 from eddies.particles.resolved_velocity import ResolvedVelocity
 from eddies.scene.sections import Tracers
 from eddies.scene.terms import DEFAULT_PRESET, PRESETS, TERMS

@@ -4,9 +4,8 @@ import numpy as np
 import torch
 
 from eddies.parallel.reduction import global_sum
-from eddies.particles.flow_units import FlowUnits
+from eddies.particles.flow_units import FlowUnits, ReferenceScales
 from eddies.particles.model import build_model
-from eddies.particles.reference_scales import ReferenceScales
 from eddies.scene.model import Model
 
 LENGTH, PER_SIDE = 2 * np.pi, 12

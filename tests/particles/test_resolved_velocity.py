@@ -10,9 +10,8 @@ from mpi4py import MPI
 from eddies.parallel.halo import HaloError
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
-from eddies.particles.flow_units import FlowUnits
+from eddies.particles.flow_units import FlowUnits, ReferenceScales
 from eddies.particles.particle_set import ParticleSet
-from eddies.particles.reference_scales import ReferenceScales
 from eddies.particles.resolved_velocity import ResolvedVelocity, dissipation_range
 from tests.particles.configurations import (
     CONFIGURATIONS, LENGTH, DensityReader, along, assert_close, by_id, distributed, dynamics_of, model, of_terms,

@@ -19,11 +19,10 @@ from mpi4py import MPI
 from eddies.io.hdf5 import open_product
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.dynamics import ParticleDynamics
-from eddies.particles.flow_units import FlowUnits
+from eddies.particles.flow_units import FlowUnits, resolved_wavenumber
 from eddies.particles.fourier_grid import FourierGrid
 from eddies.particles.model import build_model
 from eddies.particles.particle_set import ParticleSet
-from eddies.particles.reference_scales import resolved_wavenumber
 from eddies.particles.resolved_velocity import WEIGHT, ResolvedVelocity
 from eddies.report.figures import FOURTH, GUIDE, MODEL, SECOND, TRUTH, letter, panels, png, styled
 from eddies.scene.scene import BOX_LENGTH

@@ -7,9 +7,8 @@ import pytest
 import torch
 
 from eddies.particles.dynamics import ParticleDynamics
-from eddies.particles.flow_units import FlowUnits
+from eddies.particles.flow_units import FlowUnits, ReferenceScales
 from eddies.particles.integrators import INTEGRATORS
-from eddies.particles.reference_scales import ReferenceScales
 from eddies.scene.terms import PRESETS
 from tests.particles.configurations import LENGTH, OWN_DENSITY, by_id, distributed
 from tests.particles.configurations import model as model_of

@@ -15,9 +15,8 @@ from eddies.flow.navier_stokes import IncompressibleFluid
 from eddies.flow.tracers import FilteredField, TracerParticles, release
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.dynamics import ParticleDynamics
-from eddies.particles.flow_units import FlowUnits
+from eddies.particles.flow_units import FlowUnits, ReferenceScales
 from eddies.particles.particle_set import ParticleSet
-from eddies.particles.reference_scales import ReferenceScales
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.time_stepping import ETDRK4
 from tests.particles.configurations import LENGTH, model

@@ -15,12 +15,11 @@ from eddies.learning.optimization import Adam
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.context import Context
 from eddies.particles.dynamics import ParticleDynamics
-from eddies.particles.flow_units import FlowUnits
+from eddies.particles.flow_units import FlowUnits, ReferenceScales
 from eddies.particles.fourier_grid import FourierGrid
 from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.neighborhood import Neighborhood
 from eddies.particles.particle_set import ParticleSet
-from eddies.particles.reference_scales import ReferenceScales
 from eddies.particles.resolved_velocity import ResolvedVelocity
 from eddies.particles.smoothing_kernels import WendlandC2
 from eddies.particles.terms.eddy_viscosity import EddyViscosity

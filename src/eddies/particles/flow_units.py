@@ -1,10 +1,90 @@
-"""What a model is told of the flow that it is used on."""
+"""What a model is told of the flow that it is used on: measured scales, by which it is made dimensionless, and the
+neighbourhoods of particles."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import asdict, dataclass
 
-from eddies.particles.reference_scales import ReferenceScales
+from eddies.errors import UserError
+
+# The highest wavenumber that particles resolve: in units of their Nyquist wavenumber; in units of 1/eta, where
+# turbulence ends; and the least that the filter may leave of a mode, as it is undone. Measured in docs/closure.md.
+BEYOND_NYQUIST, BEYOND_DISSIPATION, LEAST_TRANSFER = 1.5, 1.05, 0.02
+MAY_VANISH = ("viscosity", "kolmogorov_length")
+
+
+class ScaleError(UserError, ValueError):
+    """A scale vanishes by which a model would divide."""
+
+
+@dataclass(frozen=True)
+class ReferenceScales:
+    """Scales of one flow, all measured on its filtered ground truth, in the units of the simulation.
+
+    Parameters
+    ----------
+    filter_width : d of the filter, the unit of length in Eq. 4.
+    spacing : mean distance of particles, (box volume / particles)^(1/3).
+    velocity : rms of one velocity component, its mean not subtracted.
+    acceleration : rms of one component of the acceleration along trajectories.
+    density_mean : mean density rho_0.
+    viscosity : kinematic viscosity nu of the fluid; may be 0.
+    density : rms of the density fluctuation rho - rho_0.
+    density_rate : rms of the rate of change of density along trajectories.
+    sound_speed : speed of sound c.
+    kolmogorov_length : eta of the flow that was filtered, beyond whose wavenumber there is next to nothing; 0 without
+        viscosity.
+
+    Those of density and sound are None for a ground truth without density, that of an incompressible fluid. A flow at
+    another Mach number supplies its own scales to the same network. Raises ScaleError unless all that are given are
+    finite and positive.
+    """
+
+    filter_width: float
+    spacing: float
+    velocity: float
+    acceleration: float
+    density_mean: float
+    viscosity: float
+    density: float | None = None
+    density_rate: float | None = None
+    sound_speed: float | None = None
+    kolmogorov_length: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in MAY_VANISH:
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0):
+                raise ScaleError(f"reference scale {name} = {value}: must be finite and not negative; start from "
+                                 "another flow ([initial])")
+        for name, value in asdict(self).items():
+            if name not in MAY_VANISH and value is not None and not (math.isfinite(value) and value > 0):
+                raise ScaleError(f"reference scale {name} = {value}: must be finite and positive, as a model is made "
+                                 "dimensionless by it; start from a flow that moves and changes ([initial], [forcing])")
+
+    def required(self, name: str) -> float:
+        """A scale that must be there; ValueError where the flow has no density, and so none of it or of sound."""
+        value = getattr(self, name)
+        if value is None:
+            raise ValueError(f"reference scale {name}: a flow without density has none")
+        return value
+
+    def to_dict(self) -> dict[str, float | None]:
+        """The scales by name, ready for JSON."""
+        return {name: None if value is None else float(value) for name, value in asdict(self).items()}
+
+
+def resolved_wavenumber(spacing: float, filter_width: float, kolmogorov_length: float) -> float:
+    """k_c, the highest wavenumber of a filtered velocity that particles so far apart resolve."""
+    highest = min(BEYOND_NYQUIST * math.pi / spacing, math.sqrt(-24 * math.log(LEAST_TRANSFER)) / filter_width)
+    return min(highest, BEYOND_DISSIPATION / kolmogorov_length) if kolmogorov_length > 0 else highest
+
+
+def allowed_step(angle: float, highest: float, speed: float) -> float:
+    """The longest time step where velocities are resolved up to a wavenumber k_c = `highest`: in it the rms `speed` u'
+    of a component carries particles by an `angle` of that wave, in radians. Infinite at rest."""
+    return angle / (highest * speed) if speed > 0 else math.inf
 
 
 @dataclass(frozen=True)

@@ -14,11 +14,10 @@ from eddies.parallel.halo import HaloError
 from eddies.parallel.reduction import global_max, global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.exchanges import mean_over_ranks
-from eddies.particles.flow_units import FlowUnits
+from eddies.particles.flow_units import FlowUnits, resolved_wavenumber
 from eddies.particles.fourier_grid import FourierGrid
 from eddies.particles.least_squares import LeastSquares, Solution
 from eddies.particles.particle_set import ParticleSet, as_numpy
-from eddies.particles.reference_scales import resolved_wavenumber
 from eddies.particles.resolved_flow import ResolvedFlow
 
 # The exponent of the prior's power law, how it ends in the dissipation range (Pope 2000, Eq. 6.248), and how many

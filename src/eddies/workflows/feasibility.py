@@ -13,7 +13,7 @@ from eddies.io.trajectories import Trajectory
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm
 from eddies.parallel.slab import SlabDecomposition
-from eddies.particles.reference_scales import ScaleError
+from eddies.particles.flow_units import ScaleError
 from eddies.pipeline import STAGES
 from eddies.scene.scene import BOX_LENGTH, Scene, SceneError
 from eddies.workflows.foreseen.estimates import expected_step, expected_turbulence, run_time

@@ -8,7 +8,7 @@ import torch
 
 from eddies.io.hdf5 import ProductError
 from eddies.io.weights import load_weights, save_weights
-from eddies.particles.reference_scales import ReferenceScales
+from eddies.particles.flow_units import ReferenceScales
 from eddies.particles.smoothing_kernels import KernelNetwork
 from eddies.scene.scene import Model, SceneError, load_scene
 from eddies.scene.terms import PRESETS

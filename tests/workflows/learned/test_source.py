@@ -9,7 +9,7 @@ import pytest
 
 from eddies.io.hdf5 import ProductError
 from eddies.io.weights import save_weights
-from eddies.particles.reference_scales import ReferenceScales
+from eddies.particles.flow_units import ReferenceScales
 from eddies.scene.rules import quoted
 from eddies.scene.scene import Model, SceneError, load_scene
 from eddies.stages import check_inputs

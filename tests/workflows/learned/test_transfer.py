@@ -9,8 +9,8 @@ import torch
 
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.dynamics import ParticleDynamics
+from eddies.particles.flow_units import ReferenceScales
 from eddies.particles.particle_set import ParticleSet
-from eddies.particles.reference_scales import ReferenceScales
 from eddies.scene.scene import BOX_LENGTH, load_scene
 from eddies.workflows.learned.model import scene_model, with_weights
 from eddies.workflows.learned.source import ModelSource, describe

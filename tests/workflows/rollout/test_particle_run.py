@@ -16,8 +16,8 @@ from eddies.io.hdf5 import open_product, read_attributes, read_table
 from eddies.io.trajectories import Trajectory
 from eddies.io.weights import save_weights
 from eddies.parallel.slab import SlabDecomposition
+from eddies.particles.flow_units import resolved_wavenumber
 from eddies.particles.integrators import INTEGRATORS, RungeKutta
-from eddies.particles.reference_scales import resolved_wavenumber
 from eddies.particles.resolved_velocity import ResolvedVelocity
 from eddies.particles.smoothing_kernels import KernelNetwork
 from eddies.scene.integrators import SCHEMES

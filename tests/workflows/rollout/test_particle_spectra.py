@@ -8,7 +8,7 @@ import pytest
 
 from eddies.io.hdf5 import create_product, open_product, read_table
 from eddies.parallel.slab import SlabDecomposition
-from eddies.particles.reference_scales import ReferenceScales
+from eddies.particles.flow_units import ReferenceScales
 from eddies.particles.resolved_velocity import ResolvedVelocity
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.workflows.rollout.particle_spectra import ParticleSpectra

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 from eddies.clock import ladder_step
 from eddies.io.provenance import product_attributes
-from eddies.particles.reference_scales import allowed_step, resolved_wavenumber
+from eddies.particles.flow_units import allowed_step, resolved_wavenumber
 from eddies.scene.rules import quoted
 from eddies.scene.scene import BOX_LENGTH, Eulerian, Scene, Tracers
 

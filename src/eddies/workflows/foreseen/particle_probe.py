@@ -22,12 +22,11 @@ from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.context import PAIR_VALUES_TOGETHER, Context
 from eddies.particles.devices import prepare_torch
 from eddies.particles.dynamics import ParticleDynamics
-from eddies.particles.flow_units import FlowUnits
+from eddies.particles.flow_units import FlowUnits, ReferenceScales
 from eddies.particles.fourier_grid import Points
 from eddies.particles.model import LagrangianModel, build_model
 from eddies.particles.neighborhood import at_home
 from eddies.particles.particle_set import ParticleSet
-from eddies.particles.reference_scales import ReferenceScales
 from eddies.particles.terms.term import PairTerm
 from eddies.scene.scene import BOX_LENGTH, Scene
 from eddies.scene.terms import Forcing

@@ -14,9 +14,8 @@ from eddies.io.hdf5 import ProductError, open_product, read_table
 from eddies.io.weights import load_weights
 from eddies.parallel.communicator import Comm
 from eddies.particles.feature_range import FeatureRange
-from eddies.particles.flow_units import FlowUnits
+from eddies.particles.flow_units import FlowUnits, ReferenceScales
 from eddies.particles.model import LagrangianModel, build_model
-from eddies.particles.reference_scales import ReferenceScales
 from eddies.particles.smoothing_kernels import HermiteKernel, KernelNetwork
 from eddies.scene.scene import Scene, SceneError
 from eddies.scene.terms import TermError

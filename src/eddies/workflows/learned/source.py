@@ -17,7 +17,7 @@ from eddies.io.hdf5 import ProductError, open_product
 from eddies.io.provenance import read_provenance
 from eddies.io.weights import load_tables, load_weights
 from eddies.parallel.communicator import Comm
-from eddies.particles.reference_scales import ReferenceScales
+from eddies.particles.flow_units import ReferenceScales
 from eddies.scene.rules import quoted
 from eddies.scene.scene import Scene, SceneError
 

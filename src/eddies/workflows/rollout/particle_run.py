@@ -16,12 +16,11 @@ from eddies.parallel.halo import HaloError
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.faults import Limits, find_fault
 from eddies.particles.feature_range import FeatureRange, pair_features
-from eddies.particles.flow_units import FlowUnits
+from eddies.particles.flow_units import FlowUnits, allowed_step
 from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.model import LagrangianModel
 from eddies.particles.moment import Moment, between
 from eddies.particles.particle_set import ParticleSet
-from eddies.particles.reference_scales import allowed_step
 from eddies.scene.scene import Scene
 from eddies.scene.terms import Forcing
 from eddies.workflows.ground_truth.truth import GroundTruth, particles_for

@@ -2,8 +2,7 @@ from dataclasses import replace
 
 import pytest
 
-from eddies.particles.flow_units import FlowUnits
-from eddies.particles.reference_scales import ReferenceScales
+from eddies.particles.flow_units import FlowUnits, ReferenceScales
 from eddies.scene.terms import TermError
 from tests.particles.configurations import CUTOFF, NEIGHBORS, SCALES, model
 
