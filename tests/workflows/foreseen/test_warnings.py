@@ -112,3 +112,30 @@ def test_speeds_and_mach_numbers_are_those_of_the_flow(comm):
         assert mach(scene) == pytest.approx(np.sqrt(2 * energy) / 10, rel=1e-6)
     turbulence = expected_turbulence(load_scene("tiny"))
     assert mach(load_scene("tiny")) == pytest.approx(np.sqrt(3) * turbulence.velocity_rms / 22.5)
+
+
+def test_a_term_of_the_users_says_which_steps_are_too_long(tmp_path):
+    (tmp_path / "own_stiff.py").write_text("""
+from dataclasses import dataclass
+
+import eddies
+
+
+@dataclass(frozen=True)
+class Stiff(eddies.TermSettings):
+    too_long = 'the term "{name}" wants at most {longest}'
+
+    def longest_step(self, units):
+        return 0.08 * units.filter_width / units.velocity
+
+
+class Spring(eddies.Term):
+    Settings = Stiff
+""")
+    own = tmp_path / "own.toml"
+    own.write_text(load_scene("tiny").to_toml())
+    terms = 'model={terms=["viscosity", "own_stiff:Spring"]}'
+    line, = told(terms, "simulation.step=0.1", scene=own)
+    longest = float(line.rpartition(" ")[2])
+    assert line == f'[simulation] step = 0.1: the term "Spring" wants at most {longest:g}' and longest < 0.1
+    assert told(terms, f"simulation.step={longest}", scene=own) == []
