@@ -4,14 +4,25 @@ neighbourhoods of particles."""
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 
+import numpy as np
+
 from eddies.errors import UserError
+from eddies.parallel.communicator import Comm
+from eddies.parallel.reduction import global_sum
 
 # The highest wavenumber that particles resolve: in units of their Nyquist wavenumber; in units of 1/eta, where
 # turbulence ends; and the least that the filter may leave of a mode, as it is undone. Measured in docs/closure.md.
 BEYOND_NYQUIST, BEYOND_DISSIPATION, LEAST_TRANSFER = 1.5, 1.05, 0.02
 MAY_VANISH = ("viscosity", "kolmogorov_length")
+MEAN_DENSITY = 1.0
+# What changes along a trajectory, and the name of its rate of change.
+RATES = {"velocity": "acceleration", "density": "density_rate"}
+MEANS = {"velocity": 0.0, "density": MEAN_DENSITY}
+
+Columns = Mapping[str, np.ndarray]
 
 
 class ScaleError(UserError, ValueError):
@@ -108,3 +119,23 @@ class FlowUnits:
     def particle_mass(self) -> float:
         """Mass of a particle: that of all fluid over the number of particles."""
         return self.scales.density_mean * self.scales.spacing**3
+
+
+def measured_scales(comm: Comm, at: Columns, before: Columns, after: Columns, interval: float) -> dict[str, float]:
+    """Root mean squares over all particles, of one component where there are three; collective.
+
+    velocity_rms and acceleration_rms, and with a density density_rms (of its fluctuation) and density_rate_rms: values
+    of the frame `at`, rates from the difference of two frames that are `interval` apart. Frames are this rank's rows of
+    `velocity` (n, 3) and, or not, `density` (n,), the same particles in all of them.
+    """
+    scales = {}
+    for name, rate in RATES.items():
+        if name in at:
+            scales[f"{name}_rms"] = _rms(comm, at[name] - MEANS[name])
+            scales[f"{rate}_rms"] = _rms(comm, (after[name] - before[name]) / interval)
+    return scales
+
+
+def _rms(comm: Comm, values: np.ndarray) -> float:
+    square, count = global_sum(comm, np.array([np.sum(values**2), values.size]))
+    return float(np.sqrt(square / count))

@@ -20,9 +20,9 @@ from eddies.io.contiguous import Block
 from eddies.io.frame_segments import FrameSegments
 from eddies.io.guard import Guard
 from eddies.parallel.migration import IdOrder, id_block, migrate
+from eddies.particles.flow_units import MEAN_DENSITY, measured_scales
 from eddies.scene.scene import Scene
 from eddies.workflows.ground_truth.frame_counts import whole_frames
-from eddies.workflows.ground_truth.measured_scales import MEAN_DENSITY, measured_scales
 from eddies.workflows.ground_truth.tracer_frames import TracerFrames
 
 

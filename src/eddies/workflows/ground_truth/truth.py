@@ -19,12 +19,11 @@ from eddies.parallel.broadcast import on_all_ranks
 from eddies.parallel.migration import id_block, migrate
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.dynamics import ParticleDynamics
-from eddies.particles.flow_units import ReferenceScales
+from eddies.particles.flow_units import RATES, ReferenceScales, measured_scales
 from eddies.particles.model import LagrangianModel
 from eddies.particles.particle_set import ParticleSet
 from eddies.scene.terms import Forcing
 from eddies.workflows.ground_truth.frame_counts import last_seen
-from eddies.workflows.ground_truth.measured_scales import RATES, measured_scales
 
 log = logging.getLogger("eddies")
 
