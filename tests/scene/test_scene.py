@@ -7,6 +7,7 @@ import pytest
 from eddies.io.hdf5 import create_product
 from eddies.pipeline import STAGES as TABLE
 from eddies.scene.scene import Eulerian, Flow, Horizons, Scene, SceneError, Time, builtin_scenes, load_scene
+from eddies.scene.sections import CLOSURES
 from eddies.scene.values import rule_of
 from tests.bad_scenes import BAD_OVERRIDES, BAD_TEXTS
 
@@ -295,3 +296,15 @@ def test_every_key_is_explained():
 def test_a_rollout_is_made_from_what_its_scene_asks_for(overrides, kinds):
     """A model that lies beside a rollout without one is none of its business."""
     assert load_scene("tiny", overrides).provenance("simulate")["made_from"] == kinds
+
+
+@pytest.mark.parametrize("equations, closures", [
+    ("unfiltered", ("none", "smagorinsky", "dynamic-smagorinsky", "spectral", "learned")),
+    ("filtered", ("none", "smagorinsky", "dynamic-smagorinsky", "gradient", "dynamic-mixed"))])
+def test_each_closure_is_for_its_equations_alone(equations, closures):
+    for closure in CLOSURES:
+        if closure in closures:
+            assert Eulerian(equations=equations, closure=closure).closure == closure
+        else:
+            with pytest.raises(SceneError, match=f"it must be one of {', '.join(closures)}; change one of the two"):
+                Eulerian(equations=equations, closure=closure)

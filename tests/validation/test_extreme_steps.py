@@ -12,6 +12,7 @@ from eddies.particles import moments
 from eddies.particles.context import REGULARISATION
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.integrators import INTEGRATORS
+from eddies.scene.integrators import SCHEMES
 from tests.particles.configurations import LENGTH, Field, distributed, of_terms
 from tests.particles.configurations import model as model_of
 
@@ -147,3 +148,8 @@ def test_a_step_beyond_the_stability_boundary_grows_as_theory_says(comm, integra
     if system != "oscillator":
         grown = SYSTEMS[system](integrator, 1.1 * limit)
         assert grown == pytest.approx(amplification(integrator, system, 1.1 * limit), rel=1e-4)
+
+
+@every_integrator
+def test_what_relaxes_may_go_as_far_in_a_step_as_the_record_says(integrator):
+    assert SCHEMES[integrator].decay == pytest.approx(boundary(integrator, "drag", 1e-9), rel=2e-3)

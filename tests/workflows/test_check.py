@@ -247,6 +247,10 @@ def test_steps_that_sound_outruns_are_told():
             for changes in (("model.preset=wcsph",), ("model.preset=wcsph", "simulation.step=0.001"), ())}
     (line,) = told.pop(("model.preset=wcsph",))
     assert line.startswith('[simulation] step = 0.08: the term "wcsph" has to resolve sound, with a step of at most')
+    scene = load_scene("tiny", ["model.preset=wcsph"])
+    # Of Monaghan (1992), with an alpha of 0.05.
+    longest = 0.4 * scene.interaction_radius / 2 / (scene.flow.sound_speed * 1.03)
+    assert float(line.partition("at most ")[2].split()[0]) == pytest.approx(longest, rel=0.1)
     assert list(told.values()) == [[], []]
 
 

@@ -75,7 +75,7 @@ def test_two_particles_push_each_other_by_the_background_pressure(comm):
     force = model({"transport-velocity": {}}, FLOW)
     for sign in (1, -1):
         with torch.no_grad():
-            force.terms["transport-velocity"].background.fill_(sign / 4)
+            force.terms["transport-velocity"].background.mul_(sign)  # its first value is 1/4
         shift = rates(force, position, torch.zeros_like(position), ONES[:2]).shift_velocity
         slope = float(force.terms["transport-velocity"].kernel.derivative(torch.tensor(r, dtype=torch.float64)))
         away = SCALES.sound_speed * h / 4 * 2 * SPACING**3 * -slope
