@@ -30,11 +30,6 @@ def products(a: Tensor, b: Tensor) -> list[Tensor]:
     return [a[i] * b[j] for i, j in ENTRIES]
 
 
-def symmetric_products(a: Tensor, b: Tensor) -> list[Tensor]:
-    """The entries of (a b^T + b a^T)/2 for any vectors (3, m): six (m,)."""
-    return [a[i] * b[j] if i == j else 0.5 * (a[i] * b[j] + a[j] * b[i]) for i, j in ENTRIES]
-
-
 def invert_symmetric(matrix: Tensor) -> Tensor:
     """Inverses of symmetric positive definite 3 x 3 matrices, as six entries (6, n) each, in closed form."""
     xx, xy, xz, yy, yz, zz = matrix
@@ -56,9 +51,3 @@ def apply_symmetric(matrix: Tensor, vectors: Tensor) -> Tensor:
     xx, xy, xz, yy, yz, zz = matrix
     x, y, z = vectors
     return torch.stack([xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z])
-
-
-def contract_symmetric(a: Tensor, b: Tensor) -> Tensor:
-    """Full contraction a_ij b_ij of symmetric matrices (6, n): (n,)."""
-    product = a * b
-    return product[0] + product[3] + product[5] + 2 * (product[1] + product[2] + product[4])
