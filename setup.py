@@ -1,7 +1,4 @@
-"""Builds the compiled library, once for each instruction set; everything else of the package stands in setup.cfg.
-
-What the compiler cannot build is left out, and without any of it the package runs by numpy and torch.
-"""
+"""Builds the compiled library, once for each instruction set; everything else of the package stands in setup.cfg."""
 
 import copy
 import platform
@@ -9,6 +6,7 @@ from pathlib import Path
 
 from setuptools import Extension, setup
 from setuptools.command.build_ext import build_ext
+from setuptools.errors import CCompilerError, ExecError, PlatformError
 
 KERNELS = Path("src/eddies/kernels")
 # Many a Python asks for what a debugger needs, which takes a third of a compiler's time: -g0.
@@ -37,18 +35,19 @@ class BuildKernels(build_ext):
         build_ext.build_extension(own, extension)
 
     def run(self) -> None:
-        super().run()
-        missing = [extension.name for extension in self.extensions
-                   if not Path(self.get_ext_fullpath(extension.name)).exists()]
-        if missing:
-            self.warn(f"not built: {', '.join(missing)}, for want of a C++17 compiler with OpenMP; the package works "
-                      "without, several times slower")
+        try:
+            super().run()
+        except (CCompilerError, ExecError, OSError) as error:
+            # Pip shows the end of what a build says: the last line is what to do.
+            raise PlatformError(f"{error}\neddies needs a C++17 compiler with OpenMP for its kernels; CXX names one\n"
+                                "install g++ (Debian, Ubuntu: apt-get install g++; Fedora, RHEL: dnf install gcc-c++; "
+                                "conda: conda install gxx)") from None
 
 
 setup(
     ext_modules=[Extension(f"eddies.kernels.{name}", sorted(map(str, KERNELS.glob("*.cpp"))),
                            depends=sorted(map(str, KERNELS.glob("*.hpp"))), extra_compile_args=FLAGS + more,
-                           extra_link_args=["-fopenmp"], language="c++", optional=True)
+                           extra_link_args=["-fopenmp"], language="c++")
                  for name, more in INSTRUCTION_SETS.items()],
     cmdclass={"build_ext": BuildKernels},
 )

@@ -61,7 +61,7 @@ missing_packages() {
     python=$(find_python)
     if ! have mpicc || ! have mpirun; then echo openmpi-bin libopenmpi-dev libhdf5-openmpi-dev
     elif [ -z "$(find_hdf5)" ]; then echo "libhdf5-$(mpi_flavour)-dev"; fi
-    if ! have gcc; then echo gcc g++ libc6-dev; fi
+    if ! have gcc || ! have "${CXX:-g++}"; then echo gcc g++ libc6-dev; fi
     if [ -z "$python" ]; then echo python3 python3-venv python3-dev; return; fi
     if ! "$python" -c 'import venv, ensurepip' 2> /dev/null; then echo python3-venv; fi
     if [ ! -e "$("$python" -c 'import sysconfig; print(sysconfig.get_path("include"))')/Python.h" ]; then
@@ -149,9 +149,8 @@ say "installing Python packages (torch is large)"
 install setuptools wheel cython pkgconfig numpy mpi4py
 install_h5py
 rm -f src/eddies/kernels/*.so  # not written over: a job may have them loaded
-install --no-build-isolation --editable '.[test,docs]'
-if ! [ -e src/eddies/kernels/plain.so ]; then
-    say "no C++17 compiler with OpenMP (CXX=${CXX:-g++}): without compiled kernels everything runs, several times slower"
+if ! install --no-build-isolation --editable '.[test,docs]'; then
+    fail "eddies could not be installed, see above; its kernels need a C++17 compiler with OpenMP: install g++"
 fi
 fingerprint > "$venv/set-up"
 say "done: .venv/bin/eddies"

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Builds the sdist, and from it the wheel; installs that in an environment of its own, and runs a scene there, shortened,
-# away from the checkout.
+# away from the checkout. Without a compiler the build of the wheel must end with what to install.
 # The environment has nothing of its own but the wheel, with --no-deps: a .pth file shows it the packages of .venv, so
 # that torch is not fetched and unpacked once more. The eddies of .venv stays out of sight, as that is itself a .pth
 # file, which Python reads in an environment's own folder alone.
@@ -12,6 +12,13 @@ work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 
 "$shared/bin/python" -m build --no-isolation --outdir "$work" . > "$work/log" 2>&1 || { cat "$work/log" >&2; exit 1; }
+if CXX=/nowhere/c++ "$shared/bin/python" -m pip wheel --no-build-isolation --no-deps --no-index --wheel-dir "$work/none" \
+        "$work"/eddies-*.tar.gz > "$work/without" 2>&1; then
+    echo "package_test: a wheel without kernels was built" >&2
+    exit 1
+fi
+last=$(grep -B 1 -F '[end of output]' "$work/without" | head -1)
+case $last in *"install g++ "*) ;; *) echo "package_test: without a compiler the last line is: $last" >&2; exit 1 ;; esac
 "$shared/bin/python" -m venv "$work/clean"
 packages='import sysconfig; print(sysconfig.get_path("purelib"))'
 "$shared/bin/python" -c "$packages" > "$("$work/clean/bin/python" -c "$packages")/shared.pth"

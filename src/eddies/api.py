@@ -113,14 +113,14 @@ def _job(comm: Comm | None) -> Iterator[Comm]:
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # else torch takes a thread for every core, in every rank
     from mpi4py import MPI
 
-    from eddies.kernels.library import share_threads
+    from eddies.kernels.library import library
     from eddies.parallel.rendezvous import all_arrive
     comm = MPI.COMM_WORLD if comm is None else comm
     if not logging.getLogger("eddies").hasHandlers():
         configure_logging(comm.rank)
     errors = comm.Dup()
     try:
-        share_threads()
+        library()  # and with it the threads that torch shares
         yield comm
     except Exception:
         if comm.size > 1 and not all_arrive(errors):

@@ -78,12 +78,12 @@ def run(arguments: list[str] | None) -> int:
                          "load the module of your cluster, or install one (libopenmpi-dev on Debian)\n")
         return BAD_INPUT
     comm, exit_comm = MPI.COMM_WORLD, MPI.COMM_WORLD.Dup()
-    from eddies.kernels.library import share_threads
+    from eddies.kernels.library import library
     from eddies.parallel.stop import Stopped
     try:
         options = parse_arguments(arguments, comm.rank)
         configure_logging(comm.rank, getattr(options, "log", None))
-        share_threads()
+        library()  # and with it the threads that torch shares
         if options.command in SHORT_COMMANDS:
             release_signals(signals)
             SHORT_COMMANDS[options.command](options, comm)

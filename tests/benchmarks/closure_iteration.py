@@ -1,11 +1,10 @@
-"""One iteration of the closure's conjugate gradients and its parts, and splines by the compiled library and by numpy.
+"""One iteration of the closure's conjugate gradients and its parts.
 
-    mpirun -n 2 .venv/bin/python -m mpi4py tests/benchmarks/closure_iteration.py [PARTICLES A SIDE] [--numpy]
+    mpirun -n 2 .venv/bin/python -m mpi4py tests/benchmarks/closure_iteration.py [PARTICLES A SIDE]
         [--precision float64]
 
 Random particles on a grid of 1.75 planes a particle, modes up to 1.5 times their Nyquist wavenumber, in single
-precision unless asked otherwise, as in a rollout. `--numpy` leaves the compiled library aside. Prints a JSON line with
-medians of seconds, of the slowest rank.
+precision unless asked otherwise, as in a rollout. Prints a JSON line with medians of seconds, of the slowest rank.
 """
 
 import argparse
@@ -19,8 +18,6 @@ import numpy as np
 import torch
 from mpi4py import MPI
 
-import eddies.particles.least_squares
-import eddies.spectral.interpolation
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.fourier_grid import FourierGrid
 from eddies.particles.resolved_velocity import ResolvedVelocity
@@ -74,18 +71,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("side", nargs="?", type=int, default=64)
     parser.add_argument("--precision", choices=("float32", "float64"), default="float32")
-    parser.add_argument("--numpy", action="store_true", help="without the compiled library")
     options, comm = parser.parse_args(), MPI.COMM_WORLD
     torch.set_num_threads(1)
-    if options.numpy:
-        for module in (eddies.spectral.interpolation, eddies.particles.least_squares):
-            module.library = lambda: None
     with torch.no_grad():
         found = measure(comm, options.side, getattr(torch, options.precision))
     if comm.rank == 0:
         rate = {name: options.side**3 / found[name] for name in ("interpolation", "spreading")}
         print(json.dumps({"particles": options.side, "ranks": comm.size, "precision": options.precision,
-                          "compiled": not options.numpy, "seconds": found, "points_per_second": rate}))
+                          "seconds": found, "points_per_second": rate}))
 
 
 if __name__ == "__main__":

@@ -27,14 +27,14 @@ from eddies.flow.initial_fields import random_velocity
 from eddies.flow.statistics import energy_spectrum, turbulence_scales
 from eddies.flow.tracers import release
 from eddies.kernels.library import library, threads
-from eddies.kernels.modes import CompiledModePasses
+from eddies.kernels.modes import ModePasses
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.context import Context
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.flow_units import FlowUnits, ReferenceScales, allowed_step
 from eddies.particles.fourier_grid import Points
 from eddies.particles.integrators import INTEGRATORS
-from eddies.particles.least_squares import LeastSquares, ModePasses
+from eddies.particles.least_squares import LeastSquares
 from eddies.particles.model import build_model
 from eddies.particles.neighborhood import Neighborhood
 from eddies.particles.particle_set import ParticleSet
@@ -51,7 +51,7 @@ ETA = 1.5
 PARTS = {
     "transforms": [(SpectralGrid, name) for name in ("forward", "backward", "squares")],
     "splines": [(Points, "at"), (Points, "spread"), (SplineInterpolation, "with_ghosts")],
-    "vectors": [(passes, name) for passes in (ModePasses, CompiledModePasses) for name in ("image", "descend", "turn")],
+    "vectors": [(ModePasses, name) for name in ("image", "descend", "turn")],
     "solve, the rest": [(LeastSquares, "solve")],
     "closure, the rest": [(ResolvedVelocity, "of"), (ResolvedVelocity, "remember")],
     "pairs": [(Context, "sum_pairs"), (Neighborhood, "update")],
@@ -151,7 +151,7 @@ def main() -> None:
     parser.add_argument("--precision", choices=("float32", "float64"), default="float32")
     options, comm = parser.parse_args(), MPI.COMM_WORLD
     os.environ["OMP_NUM_THREADS"] = str(options.threads)  # for what is loaded and planned from here on
-    for runtime in (torch.set_num_threads, *([] if library() is None else [library().omp_set_num_threads])):
+    for runtime in (torch.set_num_threads, library().omp_set_num_threads):
         runtime(options.threads)
     with torch.no_grad():
         run = Run(comm, options.side, options.model, options.precision)

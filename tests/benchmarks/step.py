@@ -27,11 +27,9 @@ from mpi4py import MPI
 
 from eddies.flow.initial_fields import balanced_density, random_velocity
 from eddies.flow.navier_stokes import CompressibleFluid
-from eddies.kernels.copies import CompiledPlaneCopies
-from eddies.kernels.library import library
+from eddies.kernels.copies import PlaneCopies
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.transpose import TransposeBuffers
-from eddies.spectral.copies import PlaneCopies
 from eddies.spectral.fourier_passes import PlanePass
 from eddies.spectral.spectral_grid import Collector, SpectralGrid
 from eddies.time_stepping import ETDRK4
@@ -40,13 +38,12 @@ EVALUATIONS = 4              # of the nonlinear term in a step
 BACKWARD, SENT, FORWARD = 15, 8, 4  # transforms of an evaluation, of those back the ones that are sent
 RING_BYTES, RING_ROUNDS = 2**23, 10
 TRIAD_BYTES = 2**25          # of an array that no cache holds
-COPIES = PlaneCopies if library() is None else CompiledPlaneCopies
 # What belongs to a part: owner and name. What a call of one part makes of another counts for the other alone.
 PARTS = {
     "plane transforms": [(PlanePass, "to_physical"), (PlanePass, "to_modes")],
     "column transforms": [(SpectralGrid, "_columns_to_planes"), (Collector, "modes")],
     "transposes": [(TransposeBuffers, "to_planes"), (TransposeBuffers, "to_columns")],
-    "pairs of planes": [(COPIES, "pack"), (COPIES, "unpack")],
+    "pairs of planes": [(PlaneCopies, "pack"), (PlaneCopies, "unpack")],
     "products": [(CompressibleFluid, "_advection")],
     "linear operators": [(CompressibleFluid, "combine")],
 }

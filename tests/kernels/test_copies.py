@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from eddies.kernels.copies import CompiledColumnCopies, CompiledPlaneCopies
-from eddies.spectral.copies import ColumnCopies, PlaneCopies
+from eddies.kernels.copies import ColumnCopies, PlaneCopies
+from tests.kernels import reference_copies
 
 TOLERANCE = {np.complex128: 1e-14, np.complex64: 1e-6}
 # Cells, cutoff, and how an axis is cut among ranks, of which some have nothing.
@@ -18,8 +18,8 @@ def noise(seed, dtype, *shape):
 
 
 def both(library, kind, cells, cutoff, dtype):
-    definition, compiled = {"planes": (PlaneCopies, CompiledPlaneCopies),
-                            "columns": (ColumnCopies, CompiledColumnCopies)}[kind]
+    definition, compiled = {"planes": (reference_copies.PlaneCopies, PlaneCopies),
+                            "columns": (reference_copies.ColumnCopies, ColumnCopies)}[kind]
     return definition(cells, cutoff, dtype), compiled(library, cells, cutoff, dtype)
 
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from eddies.flow.formulas import Formulas
-from eddies.kernels.flow import CompiledFormulas
+from eddies.kernels.flow import Formulas
 from eddies.parallel.slab import SlabDecomposition
 from eddies.spectral.spectral_grid import SpectralGrid
+from tests.kernels import reference_formulas
 
 TOLERANCE = {"float64": 1e-13, "float32": 3e-6}
 SHAPES = [(3, 5, 14), (1, 1, 1), (0, 4, 8)]
@@ -21,7 +21,7 @@ class Rank:
 
 def both(library, precision, cells=10, rank=0, ranks=1):
     grid = SpectralGrid(SlabDecomposition(Rank(rank, ranks), 5.0, cells), precision)
-    return grid, Formulas(grid), CompiledFormulas(library, grid.wavevector)
+    return grid, reference_formulas.Formulas(grid), Formulas(library, grid.wavevector)
 
 
 def fields(grid, count, shape, apart=0):

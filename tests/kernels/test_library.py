@@ -1,6 +1,5 @@
-"""The library is found and built for, or said to be missing."""
+"""The library is found, or the way to it told."""
 
-import logging
 import os
 import subprocess
 import sys
@@ -9,6 +8,7 @@ from pathlib import Path
 import pyfftw
 import pytest
 
+from eddies.errors import UserError
 from eddies.kernels import library as module
 
 
@@ -16,26 +16,30 @@ from eddies.kernels import library as module
 def elsewhere(tmp_path, monkeypatch):
     """No library where it is looked for."""
     monkeypatch.setattr(module, "__file__", str(tmp_path / "library.py"))
-    module.library.cache_clear()
+    for cached in (module.library, module.load):
+        cached.cache_clear()
     yield tmp_path
-    module.library.cache_clear()
+    for cached in (module.library, module.load):
+        cached.cache_clear()
 
 
-def test_without_a_library_one_line_says_so(elsewhere, caplog):
-    with caplog.at_level(logging.INFO, "eddies"):
-        assert [module.library() for _ in range(3)] == [None] * 3
-    assert [record.message for record in caplog.records] == [module.MISSING]
-
-
-def test_without_the_plain_one_none_is_trusted_to_run(elsewhere):
+def test_without_the_plain_one_none_is_trusted_to_run_and_a_line_tells_the_way_to_it(elsewhere):
     (elsewhere / "avx2.so").write_bytes(b"")
     assert module.instruction_sets() == []
+    for ask in (module.library, module.in_use):
+        with pytest.raises(UserError, match=r"no compiled kernels in .*: install .* \(g\+\+\)") as raised:
+            ask()
+        assert "\n" not in str(raised.value)
+
+
+def test_one_that_does_not_load_is_told(elsewhere):
+    (elsewhere / "plain.so").write_bytes(b"no library")
+    with pytest.raises(UserError, match=r"do not load \(.*plain.so: .*\): install .* \(g\+\+\)"):
+        module.library()
 
 
 def test_the_best_that_the_processor_runs_is_taken():
     found = module.instruction_sets()
-    if not found:
-        pytest.skip("the library is not compiled")
     assert found[0] == "plain" and module.library() is module.load(found[-1])
 
 
@@ -72,8 +76,6 @@ for line in open("/proc/self/maps"):
 @pytest.mark.skipif(not (Path(pyfftw.__file__).parents[1] / "pyfftw.libs").exists(), reason="pyfftw brings no OpenMP")
 @pytest.mark.parametrize("threads, runtime", [("1", ""), ("2", "pyfftw.libs")])
 def test_kernels_take_the_threads_of_the_transforms(threads, runtime):
-    if module.library() is None:
-        pytest.skip("the library is not compiled")
     found = subprocess.run([sys.executable, "-c", RUNTIME], timeout=60, check=True, capture_output=True, text=True,
                            env={**os.environ, "OMP_NUM_THREADS": threads}).stdout.strip()
     assert Path(found).parent.name == runtime

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from eddies.kernels.modes import CompiledModePasses
-from eddies.particles.least_squares import ModePasses
+from eddies.kernels.modes import ModePasses
+from tests.kernels import reference_modes
 
 SHAPES = [(9, 5, 5), (7, 0, 4), (33, 17, 17), (1, 1, 1)]
 VECTORS = ("given", "modes", "direction", "image", "found", "residual")
@@ -21,7 +21,8 @@ def passes(library, shape, seed=1, kind=np.float64):
     given = wavevector, random.integers(1, 3, (1, 1, x)).astype(float), *weights
     vectors = {name: (random.standard_normal((3, *shape)) + 1j * random.standard_normal((3, *shape))).astype(
         np.result_type(kind, np.complex64)) for name in VECTORS}
-    return (ModePasses(*given), CompiledModePasses(library, *given), random.uniform(0, 1, shape).astype(kind), vectors)
+    return (reference_modes.ModePasses(*given), ModePasses(library, *given),
+            random.uniform(0, 1, shape).astype(kind), vectors)
 
 
 def run(made, inverse, vectors):
@@ -62,4 +63,4 @@ def test_arrays_of_another_kind_are_refused(library):
         with pytest.raises(ValueError, match="is needed"):
             compiled.turn(1.0, inverse, vectors["residual"], spoiled)
     with pytest.raises(ValueError, match="weights of sizes"):
-        CompiledModePasses(library, [np.ones(5)] * 3, np.ones(5), *[np.ones((9, 5, 5))] * 3)
+        ModePasses(library, [np.ones(5)] * 3, np.ones(5), *[np.ones((9, 5, 5))] * 3)

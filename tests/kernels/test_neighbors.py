@@ -9,11 +9,17 @@ from eddies.particles.periodic_box import PeriodicBox
 from tests.particles.configurations import CONFIGURATIONS, LENGTH, positions
 
 
+def serve(monkeypatch, compiled):
+    """Let lists be made by the library, or by torch."""
+    monkeypatch.setattr("eddies.particles.neighbor_list.kernels_serve", lambda device: compiled)
+
+
 def both(monkeypatch, library, box, radius, skin, *given, exclude_self):
     """Lists by torch and by the library."""
     made = []
-    for served in (None, library):
-        monkeypatch.setattr("eddies.particles.neighbor_list.library", lambda served=served: served)
+    monkeypatch.setattr("eddies.particles.neighbor_list.library", lambda: library)
+    for compiled in (False, True):
+        serve(monkeypatch, compiled)
         made.append(NeighborList(box, radius, skin))
         made[-1].build(*given, exclude_self=exclude_self)
     return made
@@ -45,8 +51,8 @@ def test_neighbours_are_those_of_torch(library, monkeypatch, kind, radius, perio
             for once in (False, True) if exclude_self else (False,):
                 for dtype in (torch.float64, torch.float32):
                     pairs = []
-                    for served, listed in zip((None, library), lists):
-                        monkeypatch.setattr("eddies.particles.neighbor_list.library", lambda served=served: served)
+                    for compiled, listed in zip((False, True), lists):
+                        serve(monkeypatch, compiled)
                         pairs.append(listed.pairs(moved, moved if exclude_self else points, rows, dtype, once))
                     one, other = map(sorted_pairs, pairs)
                     assert pairs[0].count == pairs[1].count

@@ -52,7 +52,7 @@ def test_averages_are_those_of_torch(comm, library, monkeypatch, kind, dtype, ro
     monkeypatch.setattr("eddies.particles.compiled_pairs.library", lambda: library)
     monkeypatch.setattr("eddies.particles.particle_field.library", lambda: library)
     found = averages(field, kernel)
-    monkeypatch.setattr("eddies.particles.particle_field.available", lambda device: False)
+    monkeypatch.setattr("eddies.particles.particle_field.kernels_serve", lambda device: False)
     expected = averages(field, kernel)
     for one, other in zip(found, expected, strict=True):
         assert one.shape == other.shape

@@ -5,8 +5,8 @@ import functools
 import numpy as np
 import pytest
 
-from eddies.kernels.splines import CompiledSplines, MisplacedPoint, PaddedPlanes
-from eddies.spectral.splines import Splines
+from eddies.kernels.splines import MisplacedPoint, PaddedPlanes, Splines
+from tests.kernels import reference_splines
 
 SPACING, BELOW, ABOVE = 0.3, 3, 4
 # With fewer cells than splines are wide and than columns are moved together, with one chunk of lines and with many.
@@ -43,7 +43,7 @@ def made_once(cells, components, seed, kind):
 
 def both(library, degree, positions, cells):
     padded = padded_planes(cells)
-    return Splines(degree, positions, padded), CompiledSplines(library, degree, positions, padded)
+    return reference_splines.Splines(degree, positions, padded), Splines(library, degree, positions, padded)
 
 
 def assert_close(found, expected, relative=1e-12):
@@ -116,7 +116,7 @@ def test_slopes_are_those_of_finite_differences(library, degree):
 def test_a_position_without_a_cell_is_told(library, wrong, axis):
     positions = np.ones((5000, 3))
     positions[[3777, 4999], axis] = wrong
-    for splines in (Splines, lambda *given: CompiledSplines(library, *given)):
+    for splines in (reference_splines.Splines, lambda *given: Splines(library, *given)):
         with pytest.raises(MisplacedPoint) as raised:
             splines(3, positions, padded_planes(11))
         assert raised.value.number == 3777
@@ -125,7 +125,7 @@ def test_a_position_without_a_cell_is_told(library, wrong, axis):
 def test_a_position_too_far_from_the_planes_is_told(library):
     padded = PaddedPlanes(20, 1.0, 8, 7)  # planes 8 ... 14: splines of points from 9 on, and below 13
     for z, placed in ((8.999, False), (9.0, True), (12.999, True), (13.0, False), (32.9, True), (-10.9, True)):
-        for splines in (Splines, lambda *given: CompiledSplines(library, *given)):
+        for splines in (reference_splines.Splines, lambda *given: Splines(library, *given)):
             try:
                 splines(3, np.array([[0.0, 0.0, z]]), padded)
             except MisplacedPoint:

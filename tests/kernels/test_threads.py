@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from eddies.kernels.copies import CompiledColumnCopies, CompiledPlaneCopies
+from eddies.kernels.copies import ColumnCopies, PlaneCopies
 from eddies.kernels.kriging import kriging_weights
 from eddies.kernels.library import instruction_sets, load
-from eddies.kernels.modes import CompiledModePasses
+from eddies.kernels.modes import ModePasses
 from eddies.kernels.pairs import CompiledPairs, PairSpace, Summand
-from eddies.kernels.splines import CompiledSplines
+from eddies.kernels.splines import Splines
 from tests.kernels import test_flow as flow
 from tests.kernels.test_copies import noise
 from tests.kernels.test_splines import padded_planes, parts
@@ -26,7 +26,7 @@ PROGRAM = "import json\nfrom tests.kernels.test_threads import digests\nprint(js
 
 def copied(library):
     size = (144, 47, np.complex128)
-    planes, columns = (kind(library, *size) for kind in (CompiledPlaneCopies, CompiledColumnCopies))
+    planes, columns = (kind(library, *size) for kind in (PlaneCopies, ColumnCopies))
     arrays = [noise(1, complex, 2, 4, 95, 48), noise(2, complex, 2, 144, 98), noise(3, complex, 144, 20, 48),
               noise(4, complex, 1, 95, 40, 48), noise(5, complex, 95)]
     blocks, column = planes.described_blocks(arrays[:1]), columns.described_column(arrays[2])
@@ -58,8 +58,8 @@ def mode_passes(library):
         inverse, *weights = (random.uniform(0, 1, shape).astype(kind) for _ in range(3))
         given, modes, direction, image, found, residual = (
             noise(seed, np.result_type(kind, np.complex64), 3, *shape) for seed in range(6))
-        compiled = CompiledModePasses(library, wavevector, random.integers(1, 3, (1, 1, 17)).astype(float),
-                                      random.uniform(0, 1, shape), *weights)
+        compiled = ModePasses(library, wavevector, random.integers(1, 3, (1, 1, 17)).astype(float),
+                              random.uniform(0, 1, shape), *weights)
         made, product = compiled.image(given, modes)
         square = compiled.descend(0.7, inverse, direction, image, found, residual)
         compiled.turn(-0.3, inverse, residual, direction)
@@ -86,7 +86,7 @@ def splines(library):
     random = np.random.default_rng(7)
     for degree, cells, kind in ((3, 41, "f8"), (5, 18, "f8"), (3, 11, "f8"), (3, 41, "f4"), (5, 41, "f4")):
         positions, values = random.uniform(0, 20, (30000, 3)), random.standard_normal((30000, 3))
-        compiled, planes = CompiledSplines(library, degree, positions, padded_planes(cells)), parts(cells, kind=kind)
+        compiled, planes = Splines(library, degree, positions, padded_planes(cells)), parts(cells, kind=kind)
         compiled.spread(values, planes)
         yield from (compiled.at(planes), compiled.slope(planes, values), *planes)
 

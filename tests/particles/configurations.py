@@ -171,7 +171,7 @@ def summed_density(position, kernel, mass):
 
 def by_torch(monkeypatch):
     """Let sums over pairs be taken by the expressions of the terms, not by the compiled library."""
-    monkeypatch.setattr("eddies.particles.context.available", lambda device: False)
+    monkeypatch.setattr("eddies.particles.context.kernels_serve", lambda device: False)
 
 
 def distributed(comm, position, velocity, density=None, planes=13):

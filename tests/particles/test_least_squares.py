@@ -1,16 +1,12 @@
-"""Conjugate gradients find the modes that solve the equations, with compiled passes and without."""
+"""Conjugate gradients find the modes that solve the equations."""
 
 import numpy as np
 import pytest
 import torch
 
-from eddies.kernels.library import library
-from eddies.kernels.modes import CompiledModePasses
 from eddies.parallel.slab import SlabDecomposition
-from eddies.particles import least_squares
 from eddies.particles.fourier_grid import FourierGrid
-from eddies.particles.least_squares import LeastSquares, ModePasses
-from eddies.spectral import interpolation
+from eddies.particles.least_squares import LeastSquares
 
 
 def equations_on(comm):
@@ -24,13 +20,8 @@ def equations_on(comm):
 
 
 @pytest.mark.mpi(1, 2, 3)
-@pytest.mark.parametrize("compiled", [True, False])
-def test_what_is_found_solves_the_equations(comm, monkeypatch, compiled):
-    if not compiled:
-        for module in (least_squares, interpolation):
-            monkeypatch.setattr(module, "library", lambda: None)
+def test_what_is_found_solves_the_equations(comm):
     equations, points, values = equations_on(comm)
-    assert isinstance(equations._passes, CompiledModePasses if compiled and library() else ModePasses)
     right = equations.gathered(values, points)
     count = 300.0 * comm.size
     size = equations.size(right, count)

@@ -1,24 +1,18 @@
-"""Values at points and sums of splines around them on slabs: by the compiled library as by numpy."""
+"""Values at points and sums of splines around them on slabs: as by numpy."""
 
 import numpy as np
 import pytest
 
-from eddies.kernels.library import library
-from eddies.kernels.splines import CompiledSplines
 from eddies.parallel.halo import HaloError
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.spectral import interpolation
 from eddies.spectral.interpolation import SplineInterpolation
 from eddies.spectral.spectral_grid import SpectralGrid
-from eddies.spectral.splines import Splines
+from tests.kernels import reference_splines
 
 LENGTH, CELLS = 5.0, 19
 KINDS = ("cubic", "quintic")
-
-
-def without_library(monkeypatch):
-    monkeypatch.setattr(interpolation, "library", lambda: None)
 
 
 def interpolation_on(comm, kind, precision="float64"):
@@ -45,9 +39,8 @@ def test_compiled_and_numpy_are_the_same(comm, monkeypatch, kind, precision):
     found = []
     for compiled in (True, False):
         if not compiled:
-            without_library(monkeypatch)
+            monkeypatch.setattr(interpolation, "Splines", lambda library, *given: reference_splines.Splines(*given))
         splines = spline.around(position)
-        assert isinstance(splines, CompiledSplines if compiled and library() else Splines)
         found.append((spline.at(spline.with_ghosts(fields), position), spline.spread(values, splines)))
     (values, sums), expected = found
     assert values.dtype == np.float64 and sums.dtype == spline.grid.real
@@ -58,11 +51,8 @@ def test_compiled_and_numpy_are_the_same(comm, monkeypatch, kind, precision):
 
 
 @pytest.mark.mpi(1, 2, 3)
-@pytest.mark.parametrize("compiled", [True, False])
 @pytest.mark.parametrize("kind", KINDS)
-def test_spreading_over_slabs_is_the_transpose_of_values_at_points(comm, monkeypatch, kind, compiled):
-    if not compiled:
-        without_library(monkeypatch)
+def test_spreading_over_slabs_is_the_transpose_of_values_at_points(comm, kind):
     spline = interpolation_on(comm, kind)
     position, random = points(comm, spline), np.random.default_rng(comm.rank)
     fields = random.standard_normal((2, *spline.grid.physical_shape))
@@ -74,10 +64,7 @@ def test_spreading_over_slabs_is_the_transpose_of_values_at_points(comm, monkeyp
 
 
 @pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("compiled", [True, False])
-def test_positions_without_a_place_are_told(comm, monkeypatch, compiled):
-    if not compiled:
-        without_library(monkeypatch)
+def test_positions_without_a_place_are_told(comm):
     spline = interpolation_on(comm, "cubic")
     slab = spline.grid.decomposition
     position = np.full((3, 3), slab.lower)

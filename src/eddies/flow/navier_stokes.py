@@ -8,10 +8,11 @@ from typing import Any, Protocol
 import numpy as np
 
 from eddies.flow.forcing import LinearForcing
-from eddies.flow.formulas import formulas
 from eddies.flow.linear_operators import AcousticBlock, Decay
 from eddies.flow.operators import divergence, dot_wavevector
 from eddies.flow.subgrid import Closure
+from eddies.kernels.flow import Formulas
+from eddies.kernels.library import library
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.time_stepping import ScalarFunction, divided_difference
 
@@ -56,7 +57,7 @@ class IncompressibleFluid:
     def __init__(self, grid: SpectralGrid, viscosity: float, sound_speed: float = math.inf,
                  forcing: LinearForcing | None = None, closure: Closure | None = None) -> None:
         self.grid, self.viscosity, self.sound_speed = grid, viscosity, sound_speed
-        self.forcing, self.closure, self._formulas = forcing, closure, formulas(grid)
+        self.forcing, self.closure, self._formulas = forcing, closure, Formulas(library(), grid.wavevector)
 
     def nonlinear(self, state: np.ndarray) -> np.ndarray:
         """P[u x omega + f]."""
@@ -105,7 +106,7 @@ class CompressibleFluid:
     def __init__(self, grid: SpectralGrid, viscosity: float, sound_speed: float,
                  forcing: LinearForcing | None = None, closure: Closure | None = None) -> None:
         self.grid, self.viscosity, self.sound_speed = grid, viscosity, sound_speed
-        self.forcing, self.closure, self._formulas = forcing, closure, formulas(grid)
+        self.forcing, self.closure, self._formulas = forcing, closure, Formulas(library(), grid.wavevector)
 
     def nonlinear(self, state: np.ndarray) -> np.ndarray:
         """-u.grad u + 2 nu (S - 1/3 div u).grad s + f, and -u.grad s."""

@@ -1,4 +1,9 @@
-"""What is copied around the one-dimensional passes of a slab transform, by the compiled library."""
+"""What is copied around the one-dimensional passes of a slab transform, by the compiled library.
+
+Of an axis of `cells` a transform keeps the modes 0 ... K, -K ... -1, which stand at the ends of its arrays; what lies
+between them is a gap that stays zero. Arrays are `described` once, as they are used many times; contiguous ones of the
+given precision are needed, ValueError otherwise.
+"""
 
 from __future__ import annotations
 
@@ -55,9 +60,10 @@ class _Column(_Array):
             raise ValueError(f"a column {self.dtype} {self.shape}: {dtype} {shape} is needed")
 
 
-class CompiledColumnCopies:
-    """Copies around transforms along z: see `eddies.spectral.copies.ColumnCopies`, which is the definition and has the
-    same methods. Arrays that lie as they do there, contiguous and of its precision, are needed: ValueError otherwise.
+class ColumnCopies:
+    """Copies between modes (c, kz, y, x), columns (z, rows, x) of one component that are transformed along z, and the
+    blocks (c, z, y, x) of columns that ranks exchange, which follow each other in z. `rows` are those of y in a column,
+    which is contiguous but for what may lie between one z and the next.
     """
 
     def __init__(self, library: ctypes.CDLL, cells: int, cutoff: int, dtype: np.dtype) -> None:
@@ -118,9 +124,13 @@ class CompiledColumnCopies:
         function(ctypes.byref(blocks), component, rows.start, rows.stop - rows.start, column.apart, column.address)
 
 
-class CompiledPlaneCopies:
-    """Copies around transforms in planes: see `eddies.spectral.copies.PlaneCopies`, which is the definition and has the
-    same methods. Arrays that lie as they do there, contiguous and of its precision, are needed: ValueError otherwise.
+class PlaneCopies:
+    """Copies between modes of planes in blocks (c, planes, y, x), kx >= 0, that ranks exchange and that follow each
+    other in y, packed modes (c, pairs, ky, kx), and the arrays of transforms.
+
+    Two real planes f and g, one half of a block of planes apart, are transformed as one complex plane f + i g, of which
+    packed modes hold kx = 0 ... K, -K ... -1. Planes are an even number, or a single one, which is its own partner.
+    Where modes of kx = 0 and their mirror images are not conjugate, by round-off, their mean counts.
     """
 
     def __init__(self, library: ctypes.CDLL, cells: int, cutoff: int, dtype: np.dtype) -> None:

@@ -19,10 +19,12 @@ class _Modes(ctypes.Structure):
     _fields_ = [("cutoff", INT), ("lines", INT), ("kx", ADDRESS), ("ky", ADDRESS), ("kz", ADDRESS)]
 
 
-class CompiledFormulas:
-    """Formulas for the fields at grid points and for the modes of a grid: see `eddies.flow.formulas.Formulas`, which is
-    the definition and has the same methods. Arrays of the precision of the grid are needed, modes contiguous, fields
-    each contiguous and any distance apart: ValueError otherwise.
+class Formulas:
+    """What is done to fields (c, ...) at grid points and to modes (c, kz, ky, kx) of a grid with these wavevectors.
+
+    Terms of a sum are pairs of factors (kz >= 0, ky, n, kx), which are the same for -kz, and of a state. Arrays of the
+    precision of the grid are needed, modes contiguous, fields each contiguous and any distance apart: ValueError
+    otherwise.
     """
 
     def __init__(self, library: ctypes.CDLL, wavevector: Sequence[np.ndarray]) -> None:
@@ -36,12 +38,13 @@ class CompiledFormulas:
             setattr(self, f"_{name}", function)
 
     def advection(self, fields: np.ndarray, viscosity: float, out: np.ndarray) -> None:
-        """-u.grad u + 2 nu (S - 1/3 div u).grad s  and  -u.grad s."""
+        """-u.grad u + 2 nu (S - 1/3 div u).grad s  and  -u.grad s  (4, ...) of u, and the derivatives of (u, v, w, s)
+        along x, along y and along z (15, ...)."""
         size = fields[0].size
         self._advection(size, *self._place(fields, 15, size), viscosity, *self._place(out, 4, size))
 
     def cross(self, fields: np.ndarray, out: np.ndarray) -> None:
-        """u x omega."""
+        """u x omega (3, ...) of both, (6, ...)."""
         size = fields[0].size
         self._cross(size, *self._place(fields, 6, size), *self._place(out, 3, size))
 
@@ -53,12 +56,12 @@ class CompiledFormulas:
         return result
 
     def sum_of_decays(self, terms: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-        """The sum of factors times states."""
+        """The sum of factors, n = 1, times states."""
         components = len(terms[0][1])
         return self._sum(self._decays, [components], components, 1, terms)
 
     def sum_of_acoustic_blocks(self, terms: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-        """The sum of acoustic blocks applied to states, factors in the order of `AcousticBlock`."""
+        """The sum of states (4, ...), to each of which the `AcousticBlock` of its factors is applied, n = 5."""
         return self._sum(self._acoustic_blocks, [], 4, 5, terms)
 
     def _sum(self, function: Callable[..., None], counts: list[int], components: int, factors: int,

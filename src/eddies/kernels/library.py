@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import functools
-import logging
 import os
 from pathlib import Path
 
@@ -12,12 +11,12 @@ from eddies.errors import UserError
 
 # As setup.py has them; a processor that runs one runs those before it.
 INSTRUCTION_SETS = ("plain", "avx2", "avx512")
-MISSING = ("no compiled kernels (no C++ compiler at installation?): everything runs by numpy and torch, several times "
-           "slower")
+REMEDY = ("install a C++ compiler (g++), then eddies anew: `pip install --force-reinstall --no-deps .` in its sources, "
+          "or `bash mpi_tools/bootstrap.sh`")
 
-Library = ctypes.CDLL
 
-log = logging.getLogger("eddies")
+class MissingLibraryError(UserError):
+    """The compiled library is not there, or does not load."""
 
 
 class ThreadsError(UserError, ValueError):
@@ -25,13 +24,9 @@ class ThreadsError(UserError, ValueError):
 
 
 @functools.cache
-def library() -> ctypes.CDLL | None:
-    """The library for this processor; None, and a line in the log the first time, where there is none."""
-    found = instruction_sets()
-    if not found:
-        log.info(MISSING)
-        return None
-    return load(found[-1])
+def library() -> ctypes.CDLL:
+    """The library for this processor. Raises MissingLibraryError where there is none."""
+    return load(in_use())
 
 
 def instruction_sets() -> list[str]:
@@ -44,15 +39,21 @@ def instruction_sets() -> list[str]:
 
 
 def in_use() -> str:
-    """The instruction set of the library that serves this process, or "none"."""
-    return (instruction_sets() or ["none"])[-1]
+    """The instruction set of the library that serves this process. Raises MissingLibraryError where there is none."""
+    found = instruction_sets()
+    if not found:
+        raise MissingLibraryError(f"no compiled kernels in {_path('plain').parent}: {REMEDY}")
+    return found[-1]
 
 
 @functools.cache
 def load(instruction_set: str) -> ctypes.CDLL:
-    """The library for an instruction set that it is built for."""
+    """The library for an instruction set that it is built for. Raises MissingLibraryError where it does not load."""
     share_threads()
-    return ctypes.CDLL(str(_path(instruction_set)))
+    try:
+        return ctypes.CDLL(str(_path(instruction_set)))
+    except OSError as error:
+        raise MissingLibraryError(f"the compiled kernels do not load ({error}): {REMEDY}") from error
 
 
 def threads() -> int:

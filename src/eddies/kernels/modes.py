@@ -16,9 +16,10 @@ class _Weights(ctypes.Structure):
                                                         "penalty")])
 
 
-class CompiledModePasses:
-    """What one iteration does to modes (3, kz, ky, kx): see `eddies.particles.least_squares.ModePasses`, which is the
-    definition and has the same methods.
+class ModePasses:
+    """What one iteration does to modes (3, kz, ky, kx).
+
+    Real fields have inner products by their modes, of which each counts by its `multiplicity`.
 
     Parameters
     ----------
@@ -37,13 +38,15 @@ class CompiledModePasses:
         self._shape, self._weights = shape, _Weights(*shape, *(array.ctypes.data for array in self._arrays))
 
     def image(self, given: np.ndarray, modes: np.ndarray) -> tuple[np.ndarray, float]:
-        """P (scale given) + penalty modes, and the sum of its products with `modes`, of this rank."""
+        """P (scale given) + penalty modes, P the projection on solenoidal modes, and the inner product of that with
+        `modes`, of this rank."""
         image = np.empty_like(modes)
         return image, self._call("modes_image", ctypes.c_double, [], [given, modes, image])
 
     def descend(self, length: float, inverse: np.ndarray, direction: np.ndarray, image: np.ndarray, found: np.ndarray,
                 residual: np.ndarray) -> float:
-        """found += length direction, residual -= length image, and the sum of inverse residual^2, of this rank."""
+        """found += length direction, residual -= length image, and the inner product of the residual with
+        `inverse` times it, of this rank."""
         return self._call("modes_descend", ctypes.c_double, [length, inverse], [direction, image, found, residual])
 
     def turn(self, share: float, inverse: np.ndarray, residual: np.ndarray, direction: np.ndarray) -> None:

@@ -39,11 +39,11 @@ class _Cloud(ctypes.Structure):
                 + [(name, ctypes.c_void_p) for name in ("order", "first", "fraction", "starts")])
 
 
-class CompiledSplines:
-    """The (degree + 1)^3 B-splines around each of some points (n, 3), of degree 3 or 5: see
-    `eddies.spectral.splines.Splines`, which is the definition and has the same methods.
+class Splines:
+    """The (degree + 1)^3 tensor-product B-splines around each of some points (n, 3), of degree 3 or 5.
 
-    Points are put in order of place here, once. Raises MisplacedPoint.
+    x and y are periodic; z, periodically, must be where there are planes. Planes are given as parts that follow each
+    other, (c, planes, y, x) each. Points are put in order of place here, once. Raises MisplacedPoint.
     """
 
     def __init__(self, library: ctypes.CDLL, degree: int, positions: np.ndarray, padded: PaddedPlanes) -> None:

@@ -30,11 +30,6 @@ class CompiledSum:
     reads_velocity: bool = True
 
 
-def available(device: torch.device) -> bool:
-    """Whether the library serves tensors on a device."""
-    return device.type == "cpu" and library() is not None
-
-
 def compiled_sums(space: PairSpace, summands: Sequence[CompiledSum], position: Tensor,
                   velocity: Tensor | None, wanted: np.ndarray, dtype: torch.dtype) -> tuple[Tensor, ...]:
     """The sums (components, s) of each summand at the particles `wanted`, bool (s,), over those within the radius;
@@ -67,10 +62,8 @@ class _PairSums(torch.autograd.Function):
     @staticmethod
     def forward(ctx, space: PairSpace, summands: list[Summand], wanted: np.ndarray, dtype: torch.dtype,
                 position: Tensor, velocity: Tensor, scalars: Tensor, *parameters: Tensor) -> tuple[Tensor, ...]:
-        compiled = library()
-        assert compiled is not None
         kind = np.dtype(str(dtype).removeprefix("torch."))
-        ctx.pairs = CompiledPairs(compiled, space, *map(_numbers, (position, velocity, scalars)), wanted, kind)
+        ctx.pairs = CompiledPairs(library(), space, *map(_numbers, (position, velocity, scalars)), wanted, kind)
         ctx.summands = summands
         ctx.save_for_backward(position, velocity, scalars, *parameters)
         return tuple(map(torch.from_numpy, ctx.pairs.sums(summands, list(map(_numbers, parameters)))))

@@ -15,7 +15,8 @@ from torch import Tensor
 from eddies.kernels.pairs import PairSpace, Summand
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles import moments
-from eddies.particles.compiled_pairs import CompiledSum, available, compiled_sums
+from eddies.particles.compiled_pairs import CompiledSum, compiled_sums
+from eddies.particles.devices import kernels_serve
 from eddies.particles.exchanges import mean_over_ranks
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.neighborhood import LocalParticles
@@ -189,7 +190,7 @@ class Context:
     def _told(self, summand: PairSum) -> CompiledSum | None:
         """What the compiled library is told of a summand; None where it does not know it, or serves no such device."""
         tell = vars(type(summand)).get("compiled")
-        return tell(summand, self) if tell and available(self.particles.position.device) else None
+        return tell(summand, self) if tell and kernels_serve(self.particles.position.device) else None
 
     def _compiled_sums(self, summands: Sequence[CompiledSum], mutual: bool) -> list[Tensor]:
         local, flow, owned = self.local, self.flow, len(self.particles)

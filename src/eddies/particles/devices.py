@@ -24,3 +24,8 @@ def prepare_torch(device: str, comm: Comm) -> torch.device:
     if not torch.cuda.is_available():
         raise DeviceError('device = "cuda": torch finds no GPU here; set device = "cpu"')
     return torch.device("cuda", node_rank(comm) % torch.cuda.device_count())
+
+
+def kernels_serve(device: torch.device) -> bool:
+    """Whether the compiled library takes tensors on a device; on others torch's expressions do the same."""
+    return device.type == "cpu"

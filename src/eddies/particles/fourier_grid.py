@@ -12,13 +12,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from eddies.kernels.splines import CompiledSplines
+from eddies.kernels.splines import Splines
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.particle_set import as_numpy
 from eddies.particles.rates import Rates
 from eddies.spectral.interpolation import SplineInterpolation
 from eddies.spectral.spectral_grid import SYMMETRIC, SpectralGrid
-from eddies.spectral.splines import Splines
 
 
 class FourierGrid:
@@ -156,7 +155,7 @@ class Points:
         self.spline, self.position = spline, position
 
     @functools.cached_property
-    def _splines(self) -> Splines | CompiledSplines:
+    def _splines(self) -> Splines:
         return self.spline.around(as_numpy(self.position))
 
     def at(self, parts: Sequence[np.ndarray]) -> Tensor:

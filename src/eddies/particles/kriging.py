@@ -13,6 +13,7 @@ from torch import Tensor
 
 from eddies.kernels.kriging import MOST_NEIGHBORS, kriging_weights, told
 from eddies.kernels.library import library
+from eddies.particles.devices import kernels_serve
 from eddies.particles.moments import ENTRIES
 from eddies.particles.pairs import Pairs
 
@@ -77,16 +78,15 @@ def weights(pairs: Pairs, support: float, covariance: Covariance) -> tuple[Tenso
     its second derivatives xx, xy, xz, yy, yz, zz. They are NaN where equations cannot be solved, or there are more than
     MOST_NEIGHBORS: what is wrong with one particle is for all ranks to say.
     """
-    compiled = library() if pairs.displacement.device.type == "cpu" else None
-    if compiled is not None:
-        found = kriging_weights(compiled, pairs.offsets.numpy(), np.ascontiguousarray(pairs.displacement.T.numpy()),
+    if kernels_serve(pairs.displacement.device):
+        found = kriging_weights(library(), pairs.offsets.numpy(), np.ascontiguousarray(pairs.displacement.T.numpy()),
                                 support, NOISE, covariance.slowest, np.array(covariance.amplitudes))
         return torch.from_numpy(found[0]), [torch.from_numpy(row) for row in found[1]]
     return solved(pairs.offsets, pairs.displacement, support, covariance)
 
 
 def solved(offsets: Tensor, displacement: Tensor, support: float, covariance: Covariance) -> tuple[Tensor, Tensor]:
-    """The same by torch, of displacements (m, 3) x_i - x_j of each particle's pairs: the definition."""
+    """The same by torch, of displacements (m, 3) x_i - x_j of each particle's pairs."""
     count = len(offsets) - 1
     own, found = displacement.new_empty((10, count)), displacement.new_full((10, len(displacement)), torch.nan)
     for start in range(0, count, TOGETHER):
@@ -178,11 +178,10 @@ class Kriging:
         """What rows of weights tell of fields (n, c), (n, c, rows)."""
         seen = self._with_ghosts(field.to(own))
         assert len(seen) == self._seen, "halo and list are not those of the weights"
-        compiled = library() if seen.device.type == "cpu" else None
-        if compiled is None or torch.is_grad_enabled() and seen.requires_grad:
+        if not kernels_serve(seen.device) or torch.is_grad_enabled() and seen.requires_grad:
             return torch.stack([of_own[:, None] * seen[: len(of_own)] + self._matrix(of_others) @ seen
                                 for of_own, of_others in zip(own, others)], -1)
-        return torch.from_numpy(told(compiled, self._offsets.numpy(), self._senders.numpy(), own.numpy(),
+        return torch.from_numpy(told(library(), self._offsets.numpy(), self._senders.numpy(), own.numpy(),
                                      [row.numpy() for row in others], seen.detach().contiguous().numpy()))
 
     def _matrix(self, values: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from eddies.kernels.library import library
-from eddies.kernels.modes import CompiledModePasses
+from eddies.kernels.modes import ModePasses
 from eddies.parallel.reduction import global_sum
 from eddies.particles.fourier_grid import FourierGrid, Points
 
@@ -47,8 +47,7 @@ class LeastSquares:
         scale = torch.where(inside, grid.prefilter * grid.spectral.cells**3, 0.0)
         weights = (grid.spectral.wavevector, grid.spectral.multiplicity, grid.inverse_squared.numpy(), scale.numpy(),
                    self.penalty.numpy())
-        compiled = library()
-        self._passes = ModePasses(*weights) if compiled is None else CompiledModePasses(compiled, *weights)
+        self._passes = ModePasses(library(), *weights)
 
     def gathered(self, values: Tensor, points: Points) -> Tensor:
         """P B^T of values (n, 3) at points; collective, differentiable."""
@@ -97,39 +96,3 @@ class LeastSquares:
 
     def _over_ranks(self, value: float) -> float:
         return float(global_sum(self.grid.decomposition.comm, value))
-
-
-class ModePasses:
-    """What an iteration does to modes (3, kz, ky, kx), by numpy: the definition of `CompiledModePasses`.
-
-    Real fields have inner products by their modes, of which each counts by its `multiplicity`.
-    """
-
-    def __init__(self, wavevector: tuple[np.ndarray, ...], multiplicity: np.ndarray, inverse_squared: np.ndarray,
-                 scale: np.ndarray, penalty: np.ndarray) -> None:
-        self.wavevector, self.multiplicity, self.inverse_squared = wavevector, multiplicity, inverse_squared
-        self.scale, self.penalty = scale, penalty
-
-    def image(self, given: np.ndarray, modes: np.ndarray) -> tuple[np.ndarray, float]:
-        """P (scale given) + penalty modes, and the inner product of that with `modes`, of this rank."""
-        scaled = self.scale * given
-        along = sum(k * component for k, component in zip(self.wavevector, scaled)) * self.inverse_squared
-        image = scaled - np.stack([k * along for k in self.wavevector]) + self.penalty * modes
-        return image, self._product(image, modes)
-
-    def descend(self, length: float, inverse: np.ndarray, direction: np.ndarray, image: np.ndarray, found: np.ndarray,
-                residual: np.ndarray) -> float:
-        """found += length direction, residual -= length image, and the inner product of the residual with `inverse`
-        times it, of this rank."""
-        found += length * direction
-        residual -= length * image
-        return self._product(residual, inverse * residual)
-
-    def turn(self, share: float, inverse: np.ndarray, residual: np.ndarray, direction: np.ndarray) -> None:
-        """direction = inverse residual + share direction."""
-        direction *= share
-        direction += inverse * residual
-
-    def _product(self, first: np.ndarray, second: np.ndarray) -> float:
-        products = self.multiplicity * (first.real * second.real + first.imag * second.imag)
-        return float(np.sum(products, dtype=np.float64))

@@ -8,9 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from eddies.kernels.library import Library, library
+from eddies.kernels.library import library
 from eddies.kernels.neighbors import Box, neighbors_within, pairs_within
 from eddies.particles.cell_grid import CellGrid, blocks_of
+from eddies.particles.devices import kernels_serve
 from eddies.particles.pairs import Pairs, gather_rows
 from eddies.particles.periodic_box import PeriodicBox, safe_norm
 
@@ -55,8 +56,8 @@ class NeighborList:
         reach = (self.cutoff + self.skin) * (1 + 1e-9)
         self.builds += 1
         self._receivers = None
-        if (compiled := self._compiled(receivers)) is not None:
-            found = neighbors_within(compiled, self._space, reach, receivers.numpy(), senders.numpy(), exclude_self)
+        if kernels_serve(receivers.device):
+            found = neighbors_within(library(), self._space, reach, receivers.numpy(), senders.numpy(), exclude_self)
             self.offsets, self.senders = map(torch.from_numpy, found)
             return
         grid = CellGrid(self.box, senders, reach)
@@ -97,9 +98,8 @@ class NeighborList:
             receivers, then others.
         """
         recorded = torch.is_grad_enabled() and (receivers.requires_grad or senders.requires_grad)
-        compiled = self._compiled(receivers)
-        if compiled is not None and not recorded:
-            return self._compiled_pairs(compiled, receivers, senders, rows, dtype or receivers.dtype, once)
+        if kernels_serve(receivers.device) and not recorded:
+            return self._compiled_pairs(receivers, senders, rows, dtype or receivers.dtype, once)
         receiver, segment, sender, count = self._listed(rows)
         if once:
             first = torch.nonzero(receiver < sender).squeeze(1)
@@ -122,17 +122,14 @@ class NeighborList:
     def _space(self) -> Box:
         return Box(self.box.length, self.box.periodic_z)
 
-    def _compiled(self, points: Tensor) -> Library | None:
-        return library() if points.device.type == "cpu" else None
-
-    def _compiled_pairs(self, compiled: Library, receivers: Tensor, senders: Tensor, rows: Tensor | slice | None,
-                        dtype: torch.dtype, once: bool) -> Pairs:
+    def _compiled_pairs(self, receivers: Tensor, senders: Tensor, rows: Tensor | slice | None, dtype: torch.dtype,
+                        once: bool) -> Pairs:
         total = len(self.offsets) - 1
         if isinstance(rows, Tensor):
             numbers = rows.numpy()
         else:
             numbers = np.arange(*(rows or slice(None)).indices(total))
-        found = pairs_within(compiled, self._space, self.cutoff, receivers.detach().numpy(), senders.detach().numpy(),
+        found = pairs_within(library(), self._space, self.cutoff, receivers.detach().numpy(), senders.detach().numpy(),
                              self.offsets.numpy(), self.senders.numpy(), numbers, once,
                              np.dtype(str(dtype).removeprefix("torch.")))
         receiver, segment, sender, displacement, distance = map(torch.from_numpy, found)

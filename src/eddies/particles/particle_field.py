@@ -13,7 +13,8 @@ from eddies.kernels.pairs import PairSpace, Summand
 from eddies.kernels.reconstruction import GridPlanes, sums_on_grid, told_kernel
 from eddies.parallel.halo import HaloExchange
 from eddies.parallel.slab import SlabDecomposition
-from eddies.particles.compiled_pairs import CompiledSum, available, compiled_sums
+from eddies.particles.compiled_pairs import CompiledSum, compiled_sums
+from eddies.particles.devices import kernels_serve
 from eddies.particles.exchanges import exchange_ghost_positions, exchange_ghosts
 from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.pairs import Pairs
@@ -49,7 +50,7 @@ class ParticleField:
 
     def volumes(self, kernel: SmoothingKernel) -> Tensor:
         """Volumes 1 / sum_j W(x_i - x_j), i itself counted, of all local particles (s,); collective, differentiable."""
-        if self._served and not torch.is_grad_enabled():
+        if kernels_serve(self.owned.device) and not torch.is_grad_enabled():
             sums, = self._sums(kernel, "kernel-sum", 1, self._position, len(self.owned))
             return self._with_ghosts(1 / (sums[0] + kernel.value(sums.new_zeros(()))))
         return self._with_ghosts(torch.cat([1 / pairs.sum(kernel.value(pairs.distance)) for pairs in self._own_pairs]))
@@ -80,7 +81,7 @@ class ParticleField:
     @torch.no_grad()
     def on_whole_grid(self, kernel: SmoothingKernel, volume: Tensor) -> tuple[Tensor, Tensor]:
         """Velocity (m, 3) and gradient (m, 3, 3) at all of this rank's grid points, by the kernel's `volumes`."""
-        if self._served:
+        if kernels_serve(self.owned.device):
             none = self._velocity.new_zeros(len(self._points), 4)
             return self._averages(kernel, torch.cat([self._points, self._position]),
                                   torch.cat([none, self._columns(volume)]), none)
@@ -90,7 +91,7 @@ class ParticleField:
     def velocity_on_whole_grid(self, kernel: SmoothingKernel, volume: Tensor) -> Tensor:
         """Velocity (m, 3) at all of this rank's grid points, cheaper than with its gradient; not differentiable."""
         slab = self.decomposition
-        if self._served:
+        if kernels_serve(self.owned.device):
             weighted = volume.unsqueeze(1) * torch.cat([torch.ones_like(volume).unsqueeze(1), self._velocity], dim=1)
             planes = GridPlanes(slab.planes, slab.spacing, slab.start, slab.count, slab.size == 1)
             sums = torch.from_numpy(sums_on_grid(library(), planes, kernel.support, kernel.pieces.numpy(),
@@ -101,7 +102,7 @@ class ParticleField:
     @torch.no_grad()
     def at_particles(self, kernel: SmoothingKernel, volume: Tensor) -> tuple[Tensor, Tensor]:
         """Velocity (n, 3) and gradient (n, 3, 3) [component, direction] at the owned particles."""
-        if self._served:
+        if kernels_serve(self.owned.device):
             columns = self._columns(volume)
             itself = columns[: len(self.owned)].clone()
             itself[:, :1] *= kernel.value(itself.new_zeros(()))
@@ -109,10 +110,6 @@ class ParticleField:
         return _joined(reconstruct_with_gradient(kernel, pairs, volume, self._velocity) for pairs in self._own_pairs)
 
     # ---- by the compiled library
-
-    @property
-    def _served(self) -> bool:
-        return available(self.owned.device)
 
     def _columns(self, volume: Tensor) -> Tensor:
         """Volume and velocity of each particle, (s, 4)."""

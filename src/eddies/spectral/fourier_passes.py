@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 import pyfftw
 
-from eddies.kernels.copies import CompiledColumnCopies, CompiledPlaneCopies
+from eddies.kernels.copies import ColumnCopies, PlaneCopies
 from eddies.kernels.library import library, threads
-from eddies.spectral.copies import ColumnCopies, PlaneCopies
 
 BLOCK_BYTES = 2**18  # of one component and thread in a pass: a few of them fit the second-level cache of a core
 CACHE_LINE = 64
@@ -35,8 +34,7 @@ class ColumnPass:
 
     def __init__(self, cells: int, cutoff: int, dtype: np.dtype) -> None:
         self.cells, self.width, self.dtype = cells, cutoff + 1, np.dtype(dtype)
-        given, compiled = (cells, cutoff, self.dtype), library()
-        self.copies = ColumnCopies(*given) if compiled is None else CompiledColumnCopies(compiled, *given)
+        self.copies = ColumnCopies(library(), cells, cutoff, self.dtype)
         self._plans: dict[tuple[str, int], ColumnPlan] = {}
 
     def rows(self, count: int) -> list[slice]:
@@ -92,8 +90,7 @@ class PlanePass:
 
     def __init__(self, cells: int, cutoff: int, dtype: np.dtype) -> None:
         self.cells, self.cutoff, self.dtype = cells, cutoff, np.dtype(dtype)
-        given, compiled = (cells, cutoff, self.dtype), library()
-        self.copies = PlaneCopies(*given) if compiled is None else CompiledPlaneCopies(compiled, *given)
+        self.copies = PlaneCopies(library(), cells, cutoff, self.dtype)
         self._plans: dict[tuple[str, int, int], PlanePlans] = {}
 
     def blocks(self, count: int) -> list[slice]:

@@ -7,11 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from eddies.kernels.library import library
-from eddies.kernels.splines import CompiledSplines, MisplacedPoint, PaddedPlanes
+from eddies.kernels.splines import MisplacedPoint, PaddedPlanes, Splines
 from eddies.parallel.halo import HaloError
 from eddies.parallel.plane_halo import PlaneHalo
 from eddies.spectral.spectral_grid import SpectralGrid
-from eddies.spectral.splines import Splines
 
 ORDERS = {"cubic": 3, "quintic": 5}
 
@@ -53,19 +52,15 @@ class SplineInterpolation:
         """Values (n, c) at positions (n, 3), x and y anywhere, z within the slab and the margin (periodically).
 
         Errors are those of `around`."""
-        return self.around(positions, once=True).at(coefficients)
+        return self.around(positions).at(coefficients)
 
-    def around(self, positions: np.ndarray, once: bool = False) -> Splines | CompiledSplines:
-        """The splines around positions (n, 3), for values, slopes and sums of splines at the same points; to be used
-        again, or but `once`.
+    def around(self, positions: np.ndarray) -> Splines:
+        """The splines around positions (n, 3), for values, slopes and sums of splines at the same points.
 
         Raises HaloError where one is outside the slab and the margin, ValueError where one is not finite.
         """
-        compiled, padded = library(), self._padded
         try:
-            if compiled is None:
-                return Splines(self.degree, positions, padded, held=not once)
-            return CompiledSplines(compiled, self.degree, positions, padded)
+            return Splines(library(), self.degree, positions, self._padded)
         except MisplacedPoint as error:
             position = np.asarray(positions)[error.number]
         if not np.isfinite(position).all():
@@ -73,7 +68,7 @@ class SplineInterpolation:
         raise HaloError("a particle moves farther out of its slab in one step than the ghost planes reach: "
                         "lower step, courant or max_step")
 
-    def spread(self, values: np.ndarray, splines: Splines | CompiledSplines) -> np.ndarray:
+    def spread(self, values: np.ndarray, splines: Splines) -> np.ndarray:
         """The transpose of `with_ghosts` and values at points: planes (c, z_local, y, x) of values (n, c) times the
         splines around them."""
         parts = self._halo.parts(np.zeros((values.shape[1], *self.grid.physical_shape), self.grid.real))

@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from eddies.kernels.library import library
 from eddies.scene.scene import load_scene
 from eddies.scene.terms import PRESETS
 from eddies.workflows.foreseen.particle_probe import PARTS, ProbeError, probe_particles
@@ -33,7 +32,7 @@ def test_every_preset_is_probed(comm, preset):
     assert set(speed.rates) == set(PARTS)
     assert all(rate.call >= 0 and rate.unit >= 0 for rate in speed.rates.values())
     # What is told by kriging wants the pairs themselves.
-    assert speed.listed is (pairs and (library() is None or preset == "local"))
+    assert speed.listed is (preset == "local")
     assert speed.kriging is (preset == "local")
     # The residual that a solve starts from and the products are two transforms each, the stress two, the force one.
     expected = (7, 27) if "pressure" in PRESETS[preset] else (0, 0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from eddies.kernels.library import library, threads
+from eddies.kernels.library import threads
 from eddies.particles.smoothing_kernels import KNOTS
 from eddies.scene.scene import BOX_LENGTH, Scene
 from eddies.workflows.foreseen.coarse_probe import coarse_scene
@@ -45,7 +45,7 @@ def kernel_cost(scene: Scene, ranks: int, speeds: Speeds) -> StageCost:
     parts = {"start": START_SECONDS + TORCH_SECONDS, "tables": SAMPLES * speed.kernel_tables.at(own),
              "steps": 2 * settings.steps * speed.kernel_step.at(own), "averages": 4 * speed.averages.at(own)}
     tables = 8 * KNOTS * own
-    lists = NEIGHBOR_BYTES[library() is not None] * settings.neighbors * points
+    lists = NEIGHBOR_BYTES * settings.neighbors * points
     memory = (PROCESS_BYTES + SAMPLES * (tables + lists)
               + (SAMPLES + 1) * SAMPLE_BYTES * (own + points)
               + PAIR_BYTES * settings.neighbors * min(settings.points, points))
@@ -156,6 +156,6 @@ def frame_bytes(scene: Scene, work: ParticleWork, ranks: int, speeds: Speeds) ->
     """Memory of a rank for a frame that is trained on: a halo, lists and a grid of its own."""
     size = particle_bytes(work, speeds.particles, ranks) - PROCESS_BYTES
     if scene.training and scene.training.field_weight > 0:
-        neighbors = NEIGHBOR_BYTES[library() is not None] * scene.kernel.neighbors
+        neighbors = NEIGHBOR_BYTES * scene.kernel.neighbors
         size += (FRAME_BYTES + neighbors) * scene.tracers.particles / ranks
     return size

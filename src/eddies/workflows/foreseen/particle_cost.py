@@ -15,7 +15,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from eddies.kernels.library import library
 from eddies.workflows.foreseen.network import NODE_CORES, Network
 from eddies.workflows.foreseen.particle_probe import PARTS, THREADED, ParticleSpeed
 from eddies.workflows.foreseen.particle_work import (SUMS_OF_EVALUATION, SUMS_OF_ITERATION, SUMS_OF_SETTLING,
@@ -32,13 +31,13 @@ PARTICLE_GROWTH = {14e3: 1.0, 33e3: 0.85, 110e3: 0.75, 262e3: 0.8, 885e3: 1.2}
 # Settling on several ranks over that on one: rows are put in order of ranks and copied as well. From the same, on two.
 MIGRATION = 1.7
 # Memory of a rank: of a process with torch; of a grid point in single precision and of a particle, ghosts included,
-# from steps with 48^3 to 96^3 particles on one and two ranks; of a listed neighbour, with the compiled search and
-# without; of a neighbour whose weights are known, in numbers and in indices: what lies between both, ten weights, and
-# what the search and their sums keep, as evaluations with 32^3 to 64^3 particles do.
+# from steps with 48^3 to 96^3 particles on one and two ranks; of a listed neighbour; of a neighbour whose weights are
+# known, in numbers and in indices: what lies between both, ten weights, and what the search and their sums keep, as
+# evaluations with 32^3 to 64^3 particles do.
 PROCESS_BYTES = 285e6
 POINT_BYTES = 160
 PARTICLE_BYTES = 800
-NEIGHBOR_BYTES = {True: 8, False: 32}
+NEIGHBOR_BYTES = 8
 WEIGHT_NUMBERS, WEIGHT_BYTES = 15, 32
 
 
@@ -177,4 +176,4 @@ def list_bytes(work: ParticleWork, speed: ParticleSpeed, ranks: int) -> float:
     """Memory of the list of neighbours, those within the skin included, and of what they tell."""
     listed = work.neighbors * (1 + work.skin / work.radius) ** 3
     told = (WEIGHT_NUMBERS * work.real + WEIGHT_BYTES) * work.neighbors if speed.kriging else 0.0
-    return work.own(ranks) * (NEIGHBOR_BYTES[library() is not None] * listed + told)
+    return work.own(ranks) * (NEIGHBOR_BYTES * listed + told)

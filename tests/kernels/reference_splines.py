@@ -1,8 +1,8 @@
-"""B-splines around points, between these and the planes of a grid, by numpy: what the compiled ones compute."""
+"""What `eddies.kernels.splines` computes, by numpy: a class with the same methods."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -13,15 +13,10 @@ FARTHEST = 1e15   # in cells; beyond, numbers do not tell one from the next
 
 
 class Splines:
-    """The s = (degree + 1)^3 tensor-product B-splines around each of some points (n, 3), of degree 3 or 5.
+    """The s = (degree + 1)^3 tensor-product B-splines around each of some points (n, 3), of degree 3 or 5."""
 
-    x and y are periodic; z, periodically, must be where there are planes. Planes are given as parts that follow each
-    other, (c, planes, y, x) each. `held`: keep the splines, 16 s bytes a point, for further calls. Raises
-    MisplacedPoint.
-    """
-
-    def __init__(self, degree: int, positions: np.ndarray, padded: PaddedPlanes, held: bool = False) -> None:
-        self.degree, self._padded, self._held = degree, padded, {} if held else None
+    def __init__(self, degree: int, positions: np.ndarray, padded: PaddedPlanes) -> None:
+        self.degree, self._padded = degree, padded
         scaled = np.asarray(positions, np.float64) / padded.spacing
         cell = np.floor(scaled)
         placed = (np.abs(cell) < FARTHEST).all(1)
@@ -60,14 +55,7 @@ class Splines:
             values[block] = np.matmul(weights[:, None], flat[rows])[:, 0]
         return values
 
-    def _stencils(self, derivative: int | None = None) -> Iterable[tuple[slice, np.ndarray, np.ndarray]]:
-        if self._held is None:
-            return self._made(derivative)
-        if derivative not in self._held:
-            self._held[derivative] = list(self._made(derivative))
-        return self._held[derivative]
-
-    def _made(self, derivative: int | None) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
+    def _stencils(self, derivative: int | None = None) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
         """Block by block of points, the splines around them: their rows (n, s) in the flattened planes, and their
         values (n, s) at the points, or the derivatives of these along one axis."""
         cells, width = self._padded.cells, self.degree + 1

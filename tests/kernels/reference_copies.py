@@ -1,9 +1,4 @@
-"""What is copied around the one-dimensional passes of a slab transform, by numpy: definitions.
-
-Of an axis of `cells` a transform keeps the modes 0 ... K, -K ... -1, which stand at the ends of its arrays; what lies
-between them is a gap that stays zero. `kernels/copies.py` has compiled classes with the same methods, which want arrays
-`described` once, as they are used many times.
-"""
+"""What `eddies.kernels.copies` copies, by numpy: classes with the same methods."""
 
 from __future__ import annotations
 
@@ -15,10 +10,7 @@ Blocks = Sequence[np.ndarray]
 
 
 class ColumnCopies:
-    """Copies between modes (c, kz, y, x), columns (z, rows, x) of one component that are transformed along z, and the
-    blocks (c, z, y, x) of columns that ranks exchange, which follow each other in z. `rows` are those of y in a column,
-    which is contiguous but for what may lie between one z and the next.
-    """
+    """Copies around transforms along z."""
 
     def __init__(self, cells: int, cutoff: int, dtype: np.dtype) -> None:
         K = cutoff
@@ -61,12 +53,7 @@ class ColumnCopies:
 
 
 class PlaneCopies:
-    """Copies between modes of planes in blocks (c, planes, y, x), kx >= 0, that ranks exchange and that follow each
-    other in y, packed modes (c, pairs, ky, kx), and the arrays of transforms.
-
-    Two real planes f and g, one half of a block of planes apart, are transformed as one complex plane f + i g, of which
-    packed modes hold kx = 0 ... K, -K ... -1. Planes are an even number, or a single one, which is its own partner.
-    """
+    """Copies around transforms in planes."""
 
     def __init__(self, cells: int, cutoff: int, dtype: np.dtype) -> None:
         self.cutoff, self.dtype = cutoff, np.dtype(dtype)

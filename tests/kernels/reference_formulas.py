@@ -1,4 +1,4 @@
-"""The pointwise formulas of the fluids, at grid points and on modes, by numpy: definitions of what is compiled."""
+"""What `eddies.kernels.flow` computes, by numpy: a class with the same methods."""
 
 from __future__ import annotations
 
@@ -7,25 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from eddies.flow.operators import dot_wavevector, project
-from eddies.kernels.flow import CompiledFormulas
-from eddies.kernels.library import library
 from eddies.spectral.spectral_grid import SpectralGrid
 
 Terms = Sequence[tuple[np.ndarray, np.ndarray]]
 
 
-def formulas(grid: SpectralGrid) -> Formulas | CompiledFormulas:
-    """The compiled ones where they are."""
-    compiled = library()
-    return Formulas(grid) if compiled is None else CompiledFormulas(compiled, grid.wavevector)
-
-
 class Formulas:
-    """What is done to fields (c, ...) at grid points and to modes (c, kz, ky, kx); `CompiledFormulas` has the same
-    methods.
-
-    Terms of a sum are pairs of factors (kz >= 0, ky, n, kx), which are the same for -kz, and of a state.
-    """
+    """What is done to fields (c, ...) at grid points and to modes (c, kz, ky, kx)."""
 
     def __init__(self, grid: SpectralGrid) -> None:
         self.grid = grid
