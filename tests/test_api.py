@@ -17,7 +17,7 @@ def test_importing_is_cheap_and_names_are_loaded_when_asked_for():
 
 
 def test_names():
-    assert {"load_scene", "Scene", "check", "run", "train", "simulate", "compare", "Term", "PairTerm", "TermSettings",
+    assert {"load_scene", "Scene", "check", "run", "train", "simulate", "Term", "PairTerm", "TermSettings",
             "Rates", "LagrangianModel", "number", "boolean", "__version__"} <= set(dir(eddies))
     with pytest.raises(AttributeError, match="module 'eddies' has no attribute 'simulte'"):
         eddies.simulte
@@ -65,20 +65,6 @@ def test_some_stages(comm, tmp_path):
     assert (tmp_path / "ground_truth.h5").exists() and not (tmp_path / "report").exists()
     with pytest.raises(eddies.UserError, match='stages: there is no "dsn"; there are: dns, train-kernel, train, sim'):
         eddies.run(scene, stages=["dsn"], output=tmp_path, comm=comm)
-
-
-@pytest.mark.mpi(1, 2)
-def test_a_comparison_from_a_program(comm, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    comparison = eddies.Comparison(name="mine", base="tiny", variant=(eddies.Variant(name="learned"),))
-    with pytest.raises(eddies.UserError, match="make it with `eddies dns tiny --output runs/tiny`"):
-        eddies.compare(comparison, comm=comm)
-    done = []
-    monkeypatch.setattr("eddies.workflows.compare.run", lambda *given: done.append(given[:4]))
-    assert eddies.compare(comparison, comm=comm) == comparison.directory
-    assert eddies.compare("compare-small", output=tmp_path, overwrite=True, comm=comm) == tmp_path
-    assert done == [(comparison, comm, comparison.directory, False),
-                    (eddies.load_comparison("compare-small"), comm, tmp_path, True)]
 
 
 @pytest.mark.mpi(1)

@@ -39,7 +39,7 @@ ONLY_IN = {
     "pyfftw*": ("spectral*", "kernels.library"),
     "torch*": ("particles*", "learning*", "workflows*"),
     "matplotlib*": ("report*",),
-    "eddies.report*": ("report*", "workflows.report", "workflows.compare", "workflows.diff", "workflows.train"),
+    "eddies.report*": ("report*", "workflows.report", "workflows.diff", "workflows.train"),
     # Whoever computes knows of a scene the records of integrators and terms alone.
     "eddies.scene.[!it]*": ("scene*", "workflows*", "cli", "api", "stored_run", "stages", "logs"),
     "eddies.scene.integrators*": ("scene*", "particles.integrators", "workflows*"),

@@ -128,7 +128,8 @@ def test_list_of_scenes(comm, capfd):
     assert run_cli("scenes") == 0
     lines = capfd.readouterr().out.splitlines()
     assert sorted(line.split()[0] for line in lines) == ([] if comm.rank else [
-        "abc", "hit", "hit-256", "hit-coarse", "hit-mt004", "hit-mt008", "hit-mt016", "hit-paper", "hit-small",
+        "abc", "compare-256", "compare-coarse", "compare-hit", "compare-small", "hit", "hit-256", "hit-coarse",
+        "hit-mt004", "hit-mt008", "hit-mt016", "hit-paper", "hit-small",
         "shear-wave", "sound-wave", "taylor-green", "tiny", "tracers-only"])
     assert run_cli("scenes", "abc") == 0
     assert ("viscosity = 0.1  # " in capfd.readouterr().out) == (comm.rank == 0)
@@ -371,17 +372,6 @@ def test_a_limit_of_wall_time_or_a_file_stops_the_job(comm, tmp_path, capfd):
     comm.Barrier()
     assert run_cli("dns", *ABC, "--output", tmp_path) == 2
     assert comm.rank > 0 or "STOP: asks the job to stop before it begins; remove" in capfd.readouterr().err
-
-
-@pytest.mark.mpi(1)
-@pytest.mark.parametrize("options, seconds", [([], 600), (["--checkpoint-minutes", "3"], 180)])
-def test_a_comparison_makes_checkpoints_of_its_trainings(comm, tmp_path, monkeypatch, options, seconds):
-    from eddies.parallel import stop
-    made, StopRequest = [], stop.StopRequest
-    monkeypatch.setattr(stop, "StopRequest", lambda *given: made.append(given) or StopRequest(comm))
-    monkeypatch.setattr("eddies.workflows.compare.run", lambda *_: None)
-    assert run_cli("compare", "compare-small", "--output", tmp_path, *options) == 0
-    assert [given[4] for given in made] == [seconds]
 
 
 @pytest.mark.mpi(1)

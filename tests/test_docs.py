@@ -12,7 +12,6 @@ import pytest
 
 from eddies.cli import main
 from eddies.cli_options import build_parser
-from eddies.scene.comparison import Comparison, Variant, load_comparison
 from eddies.scene.methods import METHODS
 from eddies.scene.model import Model, settings_class
 from eddies.scene.rules import Boolean, Bounds, Choice, Integer, Integers, Number, Numbers, Texts, quoted
@@ -79,8 +78,6 @@ def words_of(command):
 def check_eddies(arguments):
     """The command line is accepted, and its scene passes its checks."""
     options = build_parser().parse_args(arguments)
-    if getattr(options, "comparison", None):
-        load_comparison(options.comparison)
     if getattr(options, "scene", None):
         load_scene(options.scene, getattr(options, "overrides", []), getattr(options, "removals", []))
 
@@ -235,19 +232,10 @@ def test_every_term_is_in_the_table():
     assert set(named) == {*TERMS, '"module:name"'}
 
 
-def comparison_reference():
-    """The keys of a comparison, from their declarations."""
-    lines = ["| key | default | values | meaning |", "|---|---|---|---|"]
-    lines += [key_row(field) for field in dataclasses.fields(Comparison) if "rule" in field.metadata]
-    lines.append(f"| **`[[variant]]`**, one or more | | | *{Variant.__doc__.splitlines()[0]}* |")
-    return "\n".join(lines + [key_row(field) for field in dataclasses.fields(Variant)])
-
-
-def test_comparison_reference(tmp_path):
-    assert marked("comparison reference") == comparison_reference()
-    example = next(block for block in blocks("toml") if "[[variant]]" in block)
+def test_example_with_variants(tmp_path):
+    example = next(block for block in blocks("toml") if "[variant." in block)
     (tmp_path / "example.toml").write_text(example, encoding="utf-8")
-    assert list(load_comparison(tmp_path / "example.toml").scenes) == ["learned", "small", "no-force"]
+    assert list(load_scene(tmp_path / "example.toml").variant) == ["learned", "small", "no-force"]
 
 
 def slug(heading):

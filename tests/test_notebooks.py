@@ -104,7 +104,7 @@ def test_another_flow(execute):
 def test_error_against_run_time(execute, folder):
     cells, (front, rows) = execute("error-against-run-time", "[list(front.index), table.to_dict('index')]",
                                    changes=SMALLER, turnovers=0.15, repeats=1)
-    assert set(figures(cells)) == {"front"} and (folder / "runs/cost/index.html").exists()
+    assert set(figures(cells)) == {"front"} and (folder / "runs/cost/report/index.html").exists()
     assert {row["status"] for row in rows.values()} == {"complete"}
     cost, error = ([row[key] for row in rows.values()] for key in ("wall_seconds", "velocity_error_end"))
     assert front == [[*rows][number] for number in pareto_front(cost, error)]

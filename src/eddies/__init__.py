@@ -3,18 +3,17 @@
 from importlib import import_module
 from typing import Any
 
-__version__ = "1.0.0"
+__version__ = "2.0.0"
 
 # What a program uses, by the module that it comes from. Each is imported when it is first asked for: a program that
 # reads a scene starts neither MPI nor torch.
 _HOMES = {
-    "eddies.api": ("check", "compare", "run", "simulate", "train"),
+    "eddies.api": ("check", "run", "simulate", "train"),
     "eddies.stored_run": ("StoredRun", "open_run"),
     "eddies.errors": ("UserError",),
     "eddies.import_path": ("ImportPathError",),
     "eddies.scene.scene": ("Scene", "SceneError", "load_scene", "Eulerian", "Flow", "Forcing", "Horizons", "Initial",
                            "Kernel", "Model", "Simulation", "SpinUp", "Time", "Tracers", "Training"),
-    "eddies.scene.comparison": ("Comparison", "Variant", "load_comparison"),
     "eddies.scene.values": ("boolean", "choice", "integer", "integers", "named", "number", "text", "texts"),
     "eddies.scene.terms": ("TermError", "TermSettings"),
     "eddies.particles.terms.term": ("PairTerm", "Term"),

@@ -1,4 +1,4 @@
-"""What the commands do, for programs: every function takes a scene or comparison, its name or its path, and returns
+"""What the commands do, for programs: every function takes a scene, its name or its path, and returns
 when all is done.
 
 This is the other place, beside the command line, where the communicator of the job enters. All ranks call.
@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING
 from eddies.errors import UserError
 from eddies.logs import configure_logging
 from eddies.pipeline import STAGES
-from eddies.scene.comparison import Comparison, load_comparison
 from eddies.scene.scene import Scene, load_scene
 
 if TYPE_CHECKING:
@@ -39,16 +38,16 @@ def check(scene: Scene | str | Path, *, comm: Comm | None = None) -> None:
 
 
 def run(scene: Scene | str | Path, *, stages: Sequence[str] | None = None, output: str | Path | None = None,
-        overwrite: bool = False, comm: Comm | None = None) -> Path:
+        overwrite: bool = False, variants: Sequence[str] = (), comm: Comm | None = None) -> Path:
     """Run the stages of a scene, all that it has unless some are named, such as "dns" and "train-kernel", in order;
-    returns the run directory, `output` or runs/NAME.
+    returns the run directory, `output` or runs/NAME. Of a scene with variants all are run, or those named.
 
     Stages whose product is complete and was made with the same settings are skipped; work of other settings is replaced
     with `overwrite` alone.
 
     Raises UserError where a stage is named that there is not, and as `stages.run_stages`.
     """
-    return _run(scene, stages, output, overwrite, comm)
+    return _run(scene, stages, output, overwrite, comm, variants)
 
 
 def train(scene: Scene | str | Path, *, output: str | Path | None = None, overwrite: bool = False,
@@ -64,30 +63,12 @@ def simulate(scene: Scene | str | Path, *, output: str | Path | None = None, ove
     return _run(scene, ("simulate",), output, overwrite, comm)
 
 
-def compare(comparison: Comparison | str | Path, *, output: str | Path | None = None, overwrite: bool = False,
-            comm: Comm | None = None) -> Path:
-    """Run the variants of a comparison, or of its name or path, on a ground truth that is there; returns the directory
-    with comparison.csv and comparison.json, `output` or runs/NAME.
-
-    Rollouts that are complete and were made with the same settings are kept; work of other settings is replaced with
-    `overwrite` alone.
-
-    Raises as `stages.run_comparison`.
-    """
-    with _job(comm) as comm:
-        comparison = comparison if isinstance(comparison, Comparison) else load_comparison(comparison)
-        directory = Path(output) if output is not None else comparison.directory
-        from eddies.stages import run_comparison
-        run_comparison(comparison, comm, directory, _stop(comm, directory), overwrite)
-    return directory
-
-
 def _scene(scene: Scene | str | Path) -> Scene:
     return scene if isinstance(scene, Scene) else load_scene(scene)
 
 
 def _run(scene: Scene | str | Path, stages: Sequence[str] | None, output: str | Path | None, overwrite: bool,
-         comm: Comm | None) -> Path:
+         comm: Comm | None, variants: Sequence[str] = ()) -> Path:
     unknown = [name for name in stages or () if name not in STAGES]
     if unknown:
         raise UserError(f'stages: there is no "{unknown[0]}"; there are: {", ".join(STAGES)}')
@@ -96,7 +77,8 @@ def _run(scene: Scene | str | Path, stages: Sequence[str] | None, output: str | 
         directory = Path(output) if output is not None else scene.directory
         from eddies.stages import run_stages
         in_order = [name for name in STAGES if name in (stages or ())]
-        run_stages(in_order or scene.stages, scene, comm, directory, _stop(comm, directory), overwrite)
+        run_stages(in_order or scene.stages, scene, comm, directory, _stop(comm, directory), overwrite,
+                   variants=variants)
     return directory
 
 

@@ -17,7 +17,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from eddies.cli_options import parse_arguments
+from eddies.cli_options import OptionError, parse_arguments
 from eddies.clock import duration
 from eddies.errors import UserError
 from eddies.logs import OUTCOME, Output, configure_logging, show_warnings
@@ -88,7 +88,7 @@ def run(arguments: list[str] | None) -> int:
             release_signals(signals)
             SHORT_COMMANDS[options.command](options, comm)
         else:
-            (compare_command if options.command == "compare" else run_command)(options, comm, signals)
+            run_command(options, comm, signals)
         return 0
     except Stopped as stopped:
         if comm.rank == 0:
@@ -168,7 +168,8 @@ def run_command(options: argparse.Namespace, comm: Comm, signals: list[int]) -> 
     stop = StopRequest(comm, signals, directory / "STOP", 60 * options.max_minutes,
                        60 * options.checkpoint_minutes)
     stages = scene.stages if options.command == "run" else (options.command,)
-    run_stages(stages, scene, comm, directory, stop, options.overwrite, options.take_over)
+    run_stages(stages, scene, comm, directory, stop, options.overwrite, options.take_over,
+               getattr(options, "variants", ()))
     last = STAGES[stages[-1]]
     made = directory / (last.file if last.product else REPORT)
     log.log(OUTCOME, "%s: %s, after %s: %s", options.command, scene.name, duration(time.perf_counter() - start), made)
@@ -178,38 +179,31 @@ def report_command(options: argparse.Namespace, comm: Comm) -> None:
     """The report of a run directory."""
     if not options.run.is_dir():
         raise SceneError(f"{options.run}: no such directory; give a run directory, such as runs/tiny")
-    import_module("eddies.workflows.report").run(options.run, comm)
+    import_module("eddies.workflows.report").run(options.run, comm, options.variants)
     log.log(OUTCOME, "report: %s", options.run / REPORT)
     if options.open and comm.rank == 0:
         import webbrowser
         webbrowser.open((options.run / REPORT).resolve().as_uri())
 
 
-def compare_command(options: argparse.Namespace, comm: Comm, signals: list[int]) -> None:
-    """Variants of a scene, one after the other, until a signal, a file STOP or the limit of wall time ends it."""
-    from eddies.parallel.stop import StopRequest
-    from eddies.scene.comparison import load_comparison
-    from eddies.stages import run_comparison
-    comparison = load_comparison(options.comparison, options.run)
-    directory = options.output or comparison.directory
-    stop = StopRequest(comm, signals, directory / "STOP", 60 * options.max_minutes, 60 * options.checkpoint_minutes)
-    run_comparison(comparison, comm, directory, stop, options.overwrite, options.take_over)
-    log.log(OUTCOME, "compare: %s", directory / "index.html")
-
-
 def export_command(options: argparse.Namespace, comm: Comm) -> None:
     """The fields and particles of a run directory in another format."""
-    output = options.output or options.run / options.format
-    import_module("eddies.workflows.export").run(options.run, output, comm, options.format)
+    from eddies.stored_run import variant_directory
+    where = options.run if options.variant is None else variant_directory(options.run, options.variant)
+    output = options.output or where / options.format
+    import_module("eddies.workflows.export").run(where, output, comm, options.format)
     log.log(OUTCOME, "export: %s", output)
 
 
 def check_command(options: argparse.Namespace, comm: Comm) -> None:
     """Derived numbers and estimates of a scene."""
     from eddies.workflows.feasibility import check_feasible
-    scene = load_scene(options.scene, options.overrides, options.removals)
-    check_feasible(scene.stages, scene, comm)
-    import_module("eddies.workflows.check").run(scene, comm, options.json)
+    whole = load_scene(options.scene, options.overrides, options.removals)
+    whole.check_variants(options.variants)
+    for scene in [whole.variant[name] for name in options.variants] or [whole]:
+        for each in (scene, *scene.variant.values()):
+            check_feasible(each.stages, each, comm)
+        import_module("eddies.workflows.check").run(scene, comm, options.json)
 
 
 def scenes_command(options: argparse.Namespace, comm: Comm) -> None:
@@ -231,7 +225,14 @@ def status_command(options: argparse.Namespace, comm: Comm) -> None:
 
 def diff_command(options: argparse.Namespace, comm: Comm) -> None:
     """What differs between two runs."""
-    import_module("eddies.workflows.diff").run(options.one, options.other, comm)
+    from eddies.stored_run import variant_directory
+    runs = [run for run in (options.one, options.other) if run is not None]
+    names = options.variants
+    if names:
+        runs = [variant_directory(run, name) for run in runs for name in names]
+    if len(runs) != 2:
+        raise OptionError("diff: give two runs, or one run and --variant twice, or two runs and --variant once")
+    import_module("eddies.workflows.diff").run(*runs, comm)
 
 
 # Those that no signal asks to stop: they take seconds.

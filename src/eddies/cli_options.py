@@ -20,12 +20,11 @@ EXAMPLES = {
     "train": ("eddies train hit-small", "eddies train hit-mt016 --set model.path=runs/hit"),
     "simulate": ("eddies simulate hit-small --overwrite --set simulation.method=none",),
     "report": ("eddies report runs/hit-small --open",),
-    "compare": ("eddies compare compare-small", "eddies compare mine.toml --run runs/hit --output runs/cost"),
     "export": ("eddies export runs/tiny --format vtkhdf", "eddies export runs/hit --format lagrangebench"),
     "check": ("eddies check hit", "eddies check mine.toml --set flow.cells=256 --unset forcing --json"),
     "scenes": ("eddies scenes", "eddies scenes tiny"),
     "status": ("eddies status", "eddies status runs/hit-small"),
-    "diff": ("eddies diff runs/hit-small runs/second",),
+    "diff": ("eddies diff runs/hit-small runs/second", "eddies diff runs/cost --variant learned --variant paper"),
 }
 
 
@@ -50,25 +49,24 @@ def build_parser() -> argparse.ArgumentParser:
                         **{stage.name: stage.about for stage in STAGES.values() if stage.product is not None}}.items():
         command = add_command(commands, name, about)
         add_scene_options(command)
+        if name in ("run", "train", "simulate"):
+            add_variants(command, "work on this variant of the scene alone; repeatable")
         add_job_options(command, "run directory (default: runs/NAME)")
     report = add_command(commands, "report", STAGES["report"].about)
     add_run(report, "run")
+    add_variants(report, "show this variant after the table of all; repeatable, the first counts")
     add_log_options(report)
     report.add_argument("--open", action="store_true", help="show the page in a browser")
-    compare = add_command(commands, "compare", "error against run time of variants of a scene")
-    compare.add_argument("comparison", metavar="COMPARISON",
-                         help="name of a built-in comparison, or path of a TOML file")
-    compare.add_argument("--run", type=directory, metavar="DIR",
-                         help="run directory with the ground truth (default: the comparison's, or runs/BASE)")
-    add_job_options(compare, "directory of the comparison (default: runs/NAME)")
     export = add_command(commands, "export", "fields and particles of a run directory, for other programs")
     add_run(export, "run")
+    export.add_argument("--variant", metavar="NAME", help="export the rollout of this variant")
     export.add_argument("--format", choices=["vtkhdf", "lagrangebench"], default="vtkhdf",
                         help="for ParaView, or particles as learned simulators read them (default: vtkhdf)")
     export.add_argument("--output", type=directory, metavar="DIR", help="where the files go (default: RUN/FORMAT)")
     add_log_options(export)
     check = add_command(commands, "check", "derived numbers, memory, ranks and time; writes nothing")
     add_scene_options(check)
+    add_variants(check, "check this variant in place of the scene; repeatable")
     check.add_argument("--json", action="store_true", help="the numbers as JSON, for programs")
     scenes = add_command(commands, "scenes", "the built-in scenes, a line each; or one with all settings")
     scenes.add_argument("scene", nargs="?", metavar="SCENE", help="print this scene, defaults included")
@@ -77,7 +75,8 @@ def build_parser() -> argparse.ArgumentParser:
                         help="a run directory, or one of several (default: runs)")
     diff = add_command(commands, "diff", "what differs between two runs: settings and numbers")
     add_run(diff, "one")
-    add_run(diff, "other")
+    add_run(diff, "other", nargs="?")
+    add_variants(diff, "of both runs; or, given twice, of one run")
     return parser
 
 
@@ -88,9 +87,9 @@ def add_command(commands: argparse._SubParsersAction, name: str, about: str) -> 
                                epilog="\n  ".join(["examples:", *EXAMPLES[name]]))
 
 
-def add_run(parser: argparse.ArgumentParser, name: str) -> None:
+def add_run(parser: argparse.ArgumentParser, name: str, nargs: str | None = None) -> None:
     """A run directory."""
-    parser.add_argument(name, type=directory, metavar="RUN", help="a run directory, such as runs/tiny")
+    parser.add_argument(name, type=directory, metavar="RUN", nargs=nargs, help="a run directory, such as runs/tiny")
 
 
 class OptionError(UserError):
@@ -124,6 +123,11 @@ def add_scene_options(parser: argparse.ArgumentParser) -> None:
                         help="change a key of the scene; repeatable")
     parser.add_argument("--unset", action="append", default=[], metavar="SECTION[.KEY]", dest="removals",
                         help="leave a key or a section of the scene out, before any --set; repeatable")
+
+
+def add_variants(parser: argparse.ArgumentParser, about: str) -> None:
+    """Variants of a scene by name."""
+    parser.add_argument("--variant", action="append", default=[], metavar="NAME", dest="variants", help=about)
 
 
 def add_job_options(parser: argparse.ArgumentParser, output: str) -> None:

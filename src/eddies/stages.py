@@ -7,22 +7,25 @@ import logging
 import os
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
 from importlib import import_module
 from pathlib import Path
 
 from eddies.clock import duration
+from eddies.errors import UserError
 from eddies.io.checkpoint import CheckpointDirectory
+from eddies.io.errors import WriteError
 from eddies.io.hdf5 import in_files, open_product
-from eddies.io.run_lock import lock_directory, refuse_if_held
+from eddies.io.run_lock import RunInUse, RunTakenOver, lock_directory, refuse_if_held
 from eddies.io.single_writer import LARGEST_BYTES, has_single_writer
 from eddies.io.whole_files import write_files
 from eddies.parallel.broadcast import on_first_rank
+from eddies.logs import OUTCOME
 from eddies.parallel.communicator import Comm
+from eddies.parallel.rendezvous import all_arrive
 from eddies.parallel.stop import Stopped, StopRequest
 from eddies.pipeline import STAGES, Stage
-from eddies.scene.comparison import Comparison
 from eddies.scene.scene import Scene, SceneError
 from eddies.workflows.feasibility import check_feasible, check_ground_truth, check_places
 from eddies.workflows.foreseen.estimates import ground_truth_alone, most_ranks
@@ -30,18 +33,24 @@ from eddies.workflows.foreseen.refusals import single_writer
 from eddies.workflows.foreseen.stage_cost import in_units
 from eddies.workflows.foreseen.warnings import stage_warnings
 from eddies.workflows.learned.source import read_source
-from eddies.workflows.run_directory.work import SECONDS, Work, find_work, is_done, stage_seconds
+from eddies.workflows.run_directory.work import FAILURE, SECONDS, Work, find_work, is_done, stage_seconds
+from eddies.workflows.variants import Step, check_unseen, link, steps
 
 log = logging.getLogger("eddies")
 
 
+class VariantsFailed(UserError):
+    """Some variants of a scene did not come to their end."""
+
+
 def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path, stop: StopRequest,
-               overwrite: bool = False, take_over: bool = False) -> None:
-    """Run stages of a scene, all ranks together, and record the wall time of each in stage_seconds.json.
+               overwrite: bool = False, take_over: bool = False, variants: Sequence[str] = ()) -> None:
+    """Run stages of a scene, of all its variants or of those named, all ranks together.
 
     Stages whose product is complete and was made with the same settings are skipped; one with a checkpoint of the same
-    settings goes on from it. Work of other settings is replaced with `overwrite` alone. Meanwhile no other job works in
-    the directory; one that seems to is ended with `take_over`.
+    settings goes on from it. Work of other settings is replaced with `overwrite` alone. The wall time of each stage is
+    recorded in stage_seconds.json. Meanwhile no other job works in the directory; one that seems to is ended with
+    `take_over`. A variant that fails does not keep the others from their end.
 
     Raises:
         Stopped: `stop` found a reason to; the running stage has kept what the next run needs.
@@ -52,56 +61,110 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
         WorkAtStake: work of other settings would be replaced.
         WriteError: the directory cannot be written.
         ProductError: a stage that is not among `stages` has not left the product that they start from.
+        VariantsFailed: variants failed; what the others made is there.
     """
-    check_feasible(stages, scene, comm, directory)
-    check_ranks(stages, scene, comm)
-    for problem in single_writer(stages, scene, comm):
-        raise SceneError(f"{scene.name}: {problem}")
-    check_places(stages, comm, directory)
+    scene.check_variants(variants)
+    check_unseen(scene, directory)
+    planned, reported = steps(scene, stages, directory, variants), "report" in stages
+    if not planned and not reported:
+        check_sections(stages, scene)
+    for step in planned:
+        check_feasible(step.stages, step.scene, comm, step.directory)
+        check_ranks(step.stages, step.scene, comm)
+        for problem in single_writer(step.stages, step.scene, comm):
+            raise SceneError(f"{step.scene.name}: {problem}")
+        check_places(step.stages, comm, step.directory)
+    if reported:
+        check_places(("report",), comm, directory)
     if take_over:
-        look_at_work(stages, scene, comm, directory, overwrite)  # a command that is refused ends no other job
+        for step in planned:
+            look_at_work(step, comm, overwrite)  # a command that is refused ends no other job
     else:
         refuse_if_held(comm, directory)
-    check_inputs(stages, scene, comm, directory)
+    check_made(planned, comm)
     check_stop_file(comm, directory)
     with working_in(comm, directory, stop, take_over):
-        work = look_at_work(stages, scene, comm, directory, overwrite)
+        for step in planned:
+            look_at_work(step, comm, overwrite)
         prepare_directory(scene, comm, directory)
-        tell(stages, scene, comm)
-        known = False  # that the ground truth is what the other stages need
-        for stage in [STAGES[name] for name in stages]:
-            if stage.name in work.useless:
-                remove_checkpoints(stage, comm, directory)
-            if stage.name in work.done:
-                log.info("%s: skipped, %s is complete and made with the same settings", stage.name, stage.file)
-                continue
-            if "dns" in stage.depends_on and stage.product is not None and not known:
-                rest, known = stages[stages.index(stage.name):], True
-                check_ground_truth(rest, scene, comm, directory)
-            run_stage(stage, scene, comm, directory, stop, stage.name in work.begun)
+        failures = run_steps(planned, comm, directory, stop, overwrite, take_over)
+        if reported:
+            run_stage(STAGES["report"], scene, comm, directory, stop, False)
+    if failures:
+        raise VariantsFailed(f"{scene.name}: variants failed: " + "; ".join(
+            f"{name} ({failure})" for name, failure in failures.items()))
 
 
-def run_comparison(comparison: Comparison, comm: Comm, directory: Path, stop: StopRequest, overwrite: bool = False,
-                   take_over: bool = False) -> None:
-    """Run the variants of a comparison, one after the other on all ranks, and write their errors and run times.
+def run_steps(planned: Sequence[Step], comm: Comm, directory: Path, stop: StopRequest, overwrite: bool,
+              take_over: bool) -> dict[str, str]:
+    """Run the steps of a run directory, which is held, one after the other; returns why variants failed, by name."""
+    failures: dict[str, str] = {}
+    errors = comm.Dup()  # ranks that do not know of a failure may wait for a message on the other one
+    for number, step in enumerate(planned, 1):
+        if step.variant in failures:
+            continue
+        if len(planned) > 1:
+            log.info("%s, %d of %d: %s", step.directory, number, len(planned), ", ".join(step.stages))
+        if step.directory == directory:
+            holding: AbstractContextManager[None] = nullcontext()
+        else:
+            holding = working_in(comm, step.directory, stop, take_over)
+        try:
+            with holding:
+                in_files(comm, step.directory, lambda: link(step))
+                if step.directory != directory:
+                    prepare_directory(step.scene, comm, step.directory)
+                run_step(step, comm, stop, overwrite)
+        except (WriteError, RunInUse, RunTakenOver):  # these concern all variants
+            raise
+        except UserError as error:
+            if step.variant is None or not all_arrive(errors):
+                raise
+            failures[step.variant] = str(error)
+            log.log(OUTCOME, "variant %s failed: %s", step.variant, error)
+            text = f"{error}\n"
+            in_files(comm, step.directory, lambda: write_files({step.directory / FAILURE: text}))
+    errors.Free()
+    return failures
 
-    Raises as `run_stages` and `workflows.compare.run`.
-    """
-    for scene in comparison.scenes.values():
-        check_ranks(scene.stages, scene, comm)
-        check_feasible([stage for stage in scene.stages if stage != "dns"], scene, comm)  # the ground truth is there
-    check_stop_file(comm, directory)
-    import_module("eddies.workflows.compare").run(
-        comparison, comm, directory, overwrite, take_over, lambda: working_in(comm, directory, stop, take_over),
-        lambda stages, scene, where: run_stages(stages, scene, comm, where, stop, True, take_over))
+
+def run_step(step: Step, comm: Comm, stop: StopRequest, overwrite: bool) -> None:
+    """Run the stages of a step that are not done, in its directory, which is held."""
+    if step.links:  # else checked before any step
+        check_inputs(step.stages, step.scene, comm, step.directory)
+    work = look_at_work(step, comm, overwrite)
+    tell(step.stages, step.scene, comm)
+    known = False  # that the ground truth is what the other stages need
+    for stage in [STAGES[name] for name in step.stages]:
+        if stage.name in work.useless:
+            remove_checkpoints(stage, comm, step.directory)
+        if stage.name in work.done:
+            log.info("%s: skipped, %s is complete and made with the same settings", stage.name, stage.file)
+            continue
+        if "dns" in stage.depends_on and not known:
+            rest, known = step.stages[step.stages.index(stage.name):], True
+            check_ground_truth(rest, step.scene, comm, step.directory)
+        run_stage(stage, step.scene, comm, step.directory, stop, stage.name in work.begun)
 
 
-def look_at_work(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path, overwrite: bool) -> Work:
-    """What the stages find in the run directory; WorkAtStake where they would replace it and may not `overwrite`."""
-    work = in_files(comm, directory, lambda: find_work(stages, scene, directory))
+def look_at_work(step: Step, comm: Comm, overwrite: bool) -> Work:
+    """What a step finds in its directory; WorkAtStake where it would replace it and may not `overwrite`."""
+    work = in_files(comm, step.directory, lambda: find_work([*step.links, *step.stages], step.scene, step.directory))
     if not overwrite:
         work.refuse_to_lose()
     return work
+
+
+def check_made(planned: Sequence[Step], comm: Comm) -> None:
+    """Refuse steps that start from a product which neither they make nor an earlier job has made."""
+    making = {(stage, step.directory) for step in planned for stage in step.stages}
+    for step in planned:
+        if not step.links:
+            check_inputs(step.stages, step.scene, comm, step.directory)
+        for name, holder in step.links.items():
+            if (name, holder) not in making:
+                with open_product(comm, holder / STAGES[name].file, STAGES[name].product):
+                    pass
 
 
 @contextmanager
@@ -154,25 +217,27 @@ def check_ranks(stages: Sequence[str], scene: Scene, comm: Comm) -> None:
                          f"({reason}); start at most {limits[reason]}, `eddies check` gives all limits")
 
 
-def check_inputs(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path) -> None:
-    """Refuse stages that the scene lacks, and inputs that are missing or of other settings or another form than the
-    scene's."""
+def check_sections(stages: Sequence[str], scene: Scene) -> None:
+    """Refuse stages that the scene lacks."""
     for stage in stages:
         if stage not in scene.stages:
             if stage == "train" and scene.model is not None and scene.simulation is not None:
                 raise SceneError(f'{scene.name}: [simulation] method = "{scene.simulation.method}" needs no trained '
                                  'model; set method = "learned" to train one')
             raise SceneError(f"{scene.name}: has no [{STAGES[stage].section}], which `eddies {stage}` is about; add it")
+
+
+def check_inputs(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path) -> None:
+    """Refuse stages that the scene lacks, and inputs that are missing or of other settings or another form than the
+    scene's."""
+    check_sections(stages, scene)
     if "train" in stages and scene.model is not None and scene.model.path is not None:
         read_source(scene, comm)
     if "train" in stages and scene.training is not None and scene.training.truths is not None:
         from eddies.workflows.learned.truths import truth_problems  # torch, only here
         for problem in truth_problems(scene, comm, directory):
             raise SceneError(f"{scene.name}: {problem}")
-    first = STAGES[stages[0]]
-    if first.product is None:  # it works with what there is
-        return
-    for needed in scene.inputs(first.name):
+    for needed in scene.inputs(stages[0]):
         with open_product(comm, directory / needed.file, needed.product):
             pass
         if not on_first_rank(comm, partial(is_done, needed.name, scene, directory)):
@@ -193,6 +258,7 @@ def prepare_directory(scene: Scene, comm: Comm, directory: Path) -> None:
     def write() -> None:
         for leftover in directory.glob("*.partial"):
             leftover.unlink()
+        (directory / FAILURE).unlink(missing_ok=True)
         write_files({directory / "scene.toml": scene.to_toml()})
 
     in_files(comm, directory, write)

@@ -62,6 +62,10 @@ class StoredRun:
         """The scene as it was run."""
         return load_scene(self.path / "scene.toml")
 
+    def variant(self, name: str) -> StoredRun:
+        """The run of a variant: its model and rollout, with realisations those of the first one."""
+        return StoredRun(variant_directory(self.path, name))
+
     @property
     def metrics(self) -> dict[str, Any]:
         """The numbers of the report, by section."""
@@ -127,6 +131,14 @@ class StoredRun:
 def open_run(path: str | Path) -> StoredRun:
     """A run directory, for programs and notebooks."""
     return StoredRun(path)
+
+
+def variant_directory(path: Path, name: str) -> Path:
+    """The directory of a variant in a run directory; SceneError where the scene has no such variant."""
+    from eddies.workflows.variants import rollouts
+    scene = load_scene(path / "scene.toml")
+    scene.check_variants([name])
+    return rollouts(scene, path)[name][0].directory
 
 
 def chosen(table: dict[str, Any], of: str) -> Any:

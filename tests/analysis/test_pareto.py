@@ -42,16 +42,16 @@ WORDS = {"early": "early error", "late": "late error"}
 
 def test_verdict_names_where_a_model_is_worth_its_cost_and_where_not():
     worth, not_worth = verdict(row("learned", 8, 0.1, 0.2), BASELINES, "seconds", WORDS)
-    assert worth == ("learned is worth its cost in early error (0.1, 3 of 3 baselines beaten; the best of them: grid, "
-                     "0.3 in 0.5 of its time): no baseline that is as fast is as accurate.")
-    assert not_worth == ("It is not in late error (0.2, 2 of 3 baselines beaten; as accurate and no slower: grid, 0.1 "
+    assert worth == ("learned is worth its cost in early error (0.1, 3 of 3 others beaten; the best of them: grid, "
+                     "0.3 in 0.5 of its time): nothing that is as fast is as accurate.")
+    assert not_worth == ("It is not in late error (0.2, 2 of 3 others beaten; as accurate and no slower: grid, 0.1 "
                          "in 0.5 of its time).")
 
 
 def test_a_more_accurate_baseline_that_is_slower_leaves_a_model_its_worth():
     worth, not_worth = verdict(row("learned", 2, 0.1, 0.2), BASELINES, "seconds", WORDS)
-    assert "late error (0.2, 2 of 3 baselines beaten; the best of them: grid, 0.1 in 2 of its time)" in worth
-    assert not_worth == "There is no measure in which a baseline is as accurate and no slower."
+    assert "late error (0.2, 2 of 3 others beaten; the best of them: grid, 0.1 in 2 of its time)" in worth
+    assert not_worth == "There is no measure in which another method is as accurate and no slower."
 
 
 def test_a_model_without_numbers_is_worth_its_cost_in_nothing():
@@ -64,9 +64,9 @@ def test_what_differs_by_less_than_the_spread_of_realisations_is_as_accurate():
     learned = row("learned", 8, 0.1, 0.2) | {"early_spread": 0.02}
     close, far = (row(name, 4, error, 0.5) for name, error in (("close", 0.115), ("far", 0.125)))
     worth, not_worth = verdict(learned, [close, far], "seconds", WORDS)
-    assert "early error (0.1, 1 of 2 baselines beaten; as accurate and no slower: close, 0.115" in not_worth
+    assert "early error (0.1, 1 of 2 others beaten; as accurate and no slower: close, 0.115" in not_worth
     worth, not_worth = verdict(learned, [close, far | {"early_spread": 0.03}], "seconds", WORDS)
-    assert "0 of 2 baselines beaten" in not_worth and "late error" in worth
+    assert "0 of 2 others beaten" in not_worth and "late error" in worth
 
 
 GRIDS = [row("grid-24", 1, 0.3, 0.4), row("grid-48", 4, 0.1, 0.15), row("grid-40", 3, 0.05, 0.3), row("dns", 9, 0, 0),

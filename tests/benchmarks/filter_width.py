@@ -17,7 +17,7 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from eddies.measures import MEASURES
-from eddies.report.comparison import in_symbols, is_stable
+from eddies.report.variants import in_symbols, is_stable
 from eddies.report.figures import DNS, FILTERED, FOURTH, MODEL, SECOND, THIRD, TRUTH, letter, panels, png, styled
 
 DRAWN = ("velocity_error_half", "acceleration_kl")

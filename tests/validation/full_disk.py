@@ -29,17 +29,11 @@ SMALL = ["flow.cells=16", "flow.viscosity=0.1", "spin_up.turnovers=0.3", "tracer
          "tracers.field_cells=12", "tracers.frame_interval=0.1", "tracers.field_every=1", "kernel.neighbors=30",
          "kernel.steps=4", "training.steps=6", "training.combined_steps=2", "training.batch=64", "training.frames=3",
          "simulation.step=0.05", "simulation.frame_interval=0.2", "name=small"]
-COMPARISON = """
-title = "small"
+VARIANTS = """
 base = "small.toml"
-run = "run"
-turnovers = 0.25
-[[variant]]
-name = "learned"
-[[variant]]
-name = "no-force"
-set = ["simulation.method=none"]
-group = "baseline"
+[variant.learned]
+[variant.no-force]
+simulation.method = "none"
 """
 STAGES = {"dns": "ground_truth.h5", "train-kernel": "kernel.h5", "train": "model.h5", "simulate": "rollout.h5"}
 TO_A_CHECKPOINT = """
@@ -57,7 +51,7 @@ except Stopped:
     sys.exit()
 sys.exit("not stopped")
 """
-COMMANDS = (*STAGES, "report", "export", "compare")
+COMMANDS = (*STAGES, "report", "export", "run")
 DISK_BYTES = 2**26
 SECONDS = 120  # for a command: a hang is longer
 
@@ -101,16 +95,16 @@ def run_all(commands, rank_counts, levels, plenty, disk):
 
 
 def write_inputs(place):
-    """The scene and the comparison."""
+    """The scene, and the same with variants."""
     (place / "small.toml").write_text(load_scene("tiny", SMALL).to_toml())
-    (place / "comparison.toml").write_text(COMPARISON)
+    (place / "variants.toml").write_text(VARIANTS)
 
 
 def arguments(command):
     """The command line of a command."""
     if command in STAGES:
         return [command, "small.toml", "--output", "run", "--checkpoint-minutes", "1e-9"]
-    return [command, "comparison.toml", "--output", "out"] if command == "compare" else [command, "run"]
+    return [command, "variants.toml", "--output", "out"] if command == "run" else [command, "run"]
 
 
 def replacing(command):
@@ -143,8 +137,8 @@ def begin(command, plenty, disk):
         (run / STAGES[command]).write_text("old")
     else:
         shutil.copytree(plenty / "run", run)
-        old = {"report": run / "report/index.html", "export": run / "vtkhdf/old", "compare": disk / "out/index.html"}
-        old[command].parent.mkdir(exist_ok=True)
+        old = {"report": run / "report/index.html", "export": run / "vtkhdf/old", "run": disk / "out/report/index.html"}
+        old[command].parent.mkdir(parents=True, exist_ok=True)
         old[command].write_text("old")
 
 
@@ -222,10 +216,10 @@ def is_whole(command, disk):
         return (disk / "run" / STAGES[command]).stat().st_size > 1000
     if command == "export":
         return len(list((disk / "run/vtkhdf").glob("*.vtkhdf"))) > 2
-    page = disk / ("out/index.html" if command == "compare" else "run/report/index.html")
+    page = disk / ("out" if command == "run" else "run") / "report/index.html"
     return "</html>" in page.read_text() and all(
-        row["status"] == "complete" for row in (json.loads((disk / "out/comparison.json").read_text())["rows"]
-                                                if command == "compare" else ()))
+        row["status"] == "complete" for row in (json.loads((page.parent / "variants.json").read_text())["rows"]
+                                                if command == "run" else ()))
 
 
 if __name__ == "__main__":

@@ -63,3 +63,19 @@ def test_settings_and_numbers_that_differ(tmp_path):
     lines = [line.split() for line in diff_lines(one, other)]
     assert ["rollout.error", "0.2", "0.1", "0.5"] in lines and not any("rollout.same" in line for line in lines)
     assert list(diff_lines(one, one)) == ["no setting differs", "", "no number differs"]
+
+
+@pytest.mark.mpi(1)
+def test_variants_of_one_run_are_told_apart(comm, tmp_path, capfd):
+    (tmp_path / "scene.toml").write_text('base = "tiny"\n[variant.a]\n[variant.b]\nsimulation.step = 0.05\n')
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        scene = load_scene(tmp_path / "scene.toml").variant[name]
+        (tmp_path / name / "scene.toml").write_text(scene.to_toml())
+    assert main(["diff", str(tmp_path), "--variant", "a", "--variant", "b"]) == 0
+    assert ["simulation.step", "0.08", "0.05"] in [line.split() for line in capfd.readouterr().out.splitlines()]
+    assert main(["diff", str(tmp_path)]) == 2
+    assert "give two runs, or one run and --variant twice" in capfd.readouterr().err
+    assert main(["status", str(tmp_path)]) == 0
+    lines = [line.split() for line in capfd.readouterr().out.splitlines()]
+    assert ["b:", "simulate", "to", "do"] in lines and ["dns", "to", "do"] in lines and len(lines) == 7

@@ -76,7 +76,9 @@ def _at_the_end(run: StoredRollout, common: CommonFrames) -> Mapping[str, float 
     # Only where a filtered field is stored is there a spectrum.
     at_the_end = abs(spectra.time - common.times[last]) <= 1e-6 * max(1.0, spectra.time)
     final = CommonFrames(common.model[-1:], common.truth[-1:], common.times[-1:])
-    invariants = invariant_statistics(run.model, run.truth, final)
+    # Without a kernel there are no gradients.
+    known = "velocity_gradient" in run.model.columns
+    invariants = invariant_statistics(run.model, run.truth, final) if known else None
     return {
         "velocity_error_end": float(normalized_l2(velocity.model, velocity.truth)),
         "spectrum_error": spectra.error("model", run.filter_wavenumber) if at_the_end else None,
@@ -86,8 +88,8 @@ def _at_the_end(run: StoredRollout, common: CommonFrames) -> Mapping[str, float 
         "velocity_kl_floor": sampling_floor(velocity, EDGES["velocity"]),
         "acceleration_kl": pdf_divergence(acceleration, EDGES["acceleration"]),
         "acceleration_kl_floor": sampling_floor(acceleration, EDGES["acceleration"]),
-        "qr_kl": invariants.divergence,
-        "qr_kl_floor": invariants.floor,
+        "qr_kl": invariants and invariants.divergence,
+        "qr_kl_floor": invariants and invariants.floor,
         "count_variance_ratio": (count_variance(position.model, run.length)
                                  / count_variance(position.truth, run.length)),
         **differences(*of_both(run.model, run.truth, common, run.length)),

@@ -22,24 +22,26 @@ def pareto_front(cost: np.ndarray, error: np.ndarray) -> np.ndarray:
     return np.array(sorted(front, key=lambda index: (cost[index], error[index])), dtype=int)
 
 
-def verdict(model: Mapping[str, Any], baselines: Sequence[Mapping[str, Any]], cost: str,
+def verdict(model: Mapping[str, Any], others: Sequence[Mapping[str, Any]], cost: str,
             measures: Mapping[str, str]) -> list[str]:
-    """Two sentences: in which measures a model is worth its cost beside its baselines, and in which it is not.
+    """Two sentences: in which measures a method is worth its cost beside others, and in which it is not.
 
-    It is worth it where no baseline that costs no more is as accurate. Rows hold `name`, `cost` and the measures by
+    It is worth it where no other one that costs no more is as accurate. Rows hold `name`, `cost` and the measures by
     key, None where there is no number, and may hold their standard deviations over realisations as `KEY_spread`: what
-    differs by less than the larger of two is as accurate. `measures` gives their names in words. A baseline without a
+    differs by less than the larger of two is as accurate. `measures` gives their names in words. A row without a
     number counts as beaten.
     """
+    if not others:
+        return ["No other method was run."]
     worth, not_worth = [], []
     for key, words in measures.items():
         if None in (model[key], model[cost]):
             not_worth.append(f"{words} (no number)")
             continue
-        known = [row for row in baselines if None not in (row[key], row[cost])]
+        known = [row for row in others if None not in (row[key], row[cost])]
         rivals = [row for row in known if row[cost] <= model[cost] and not _worse(row, model, key)]
-        beaten = sum(row not in known or _worse(row, model, key) for row in baselines)
-        score = f"{words} ({model[key]:.3g}, {beaten} of {len(baselines)} baselines beaten; "
+        beaten = sum(row not in known or _worse(row, model, key) for row in others)
+        score = f"{words} ({model[key]:.3g}, {beaten} of {len(others)} others beaten; "
         if rivals:
             named = ", ".join(_compared(row, model, key, cost) for row in rivals)
             not_worth.append(f"{score}as accurate and no slower: {named})")
@@ -49,10 +51,10 @@ def verdict(model: Mapping[str, Any], baselines: Sequence[Mapping[str, Any]], co
         else:
             worth.append(f"{score}none of them has a number)")
     name = model["name"]
-    return [f"{name} is worth its cost in {', '.join(worth)}: no baseline that is as fast is as accurate." if worth else
+    return [f"{name} is worth its cost in {', '.join(worth)}: nothing that is as fast is as accurate." if worth else
             f"{name} is worth its cost in no measure.",
             f"It is not in {', '.join(not_worth)}." if not_worth else
-            "There is no measure in which a baseline is as accurate and no slower."]
+            "There is no measure in which another method is as accurate and no slower."]
 
 
 def cheapest_grid(model: Mapping[str, Any], grids: Sequence[Mapping[str, Any]], cost: str,

@@ -93,14 +93,15 @@ class Section:
 
 @dataclass(frozen=True)
 class RunRecord:
-    """What the run was: name, one line on it, the scene's text, a row per product (header first), and what is wrong
-    with these, in sentences."""
+    """What the run was: name, one line on it, the scene's text, a row per product (header first), what is wrong with
+    these, in sentences, and other pages, each with its title and its path from this page."""
 
     name: str
     summary: str
     scene: str
     products: Sequence[Sequence[str]]
     warnings: Sequence[str] = ()
+    links: Sequence[tuple[str, str]] = ()
 
 
 def metrics_json(run: RunRecord, sections: Sequence[Section]) -> str:
@@ -134,12 +135,14 @@ def render_page(run: RunRecord, sections: Sequence[Section]) -> str:
     """The whole page as HTML text that needs no other file."""
     links = "".join(f'<a href="#{section.key}">{_text(section.title)}</a>' for section in sections)
     body = "".join(_section(section) for section in sections)
+    pages = "".join(f'<a href="{_text(path)}">{_text(title)}</a>' for title, path in run.links)
+    pages = f'<nav class="pages">Other pages: {pages}</nav>' if pages else ""
     return (
         '<!DOCTYPE html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width,initial-scale=1">'
         f"<title>{_text(run.name)}</title><style>{CSS}</style></head><body>"
         f'<header><h1>{_text(run.name)}</h1><div class="title">{_text(run.summary)}</div><nav>{links}'
-        f'<a href="#run">The run</a></nav></header><main>{_warnings(run)}{body}{_run(run)}</main>'
+        f'<a href="#run">The run</a></nav>{pages}</header><main>{_warnings(run)}{body}{_run(run)}</main>'
         "</body></html>\n"
     )
 

@@ -13,8 +13,8 @@ from eddies.report.page import Metric, Section
 GOOD, FAIR, POOR = "good", "fair", "poor"
 KEY = "verdict"
 #: In this order the sections stand on the page; open are those that say how good the run is.
-ORDER = (KEY, "rollout", "forced", "model", "kernel", "cost", "ground_truth", "stationary", "tracers")
-OPEN = (KEY, "rollout", "forced")
+ORDER = ("variants", KEY, "rollout", "forced", "model", "kernel", "cost", "ground_truth", "stationary", "tracers")
+OPEN = ("variants", KEY, "rollout", "forced")
 
 #: Up to which part of the baseline's error an error is good, and fair; beyond them it is poor.
 BESIDE_NO_FORCE = BESIDE_GRADIENT = (0.2, 0.5)

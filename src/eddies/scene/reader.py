@@ -1,4 +1,4 @@
-"""Turns a TOML document and the user's `--set` and `--unset` into sections, and sections into TOML.
+"""Turns a TOML document into sections, and sections into TOML.
 
 Nothing here knows a particular section or key: what is allowed stands beside the fields of the dataclasses
 (`scene/values.py`), which check their values themselves.
@@ -6,7 +6,6 @@ Nothing here knows a particular section or key: what is allowed stands beside th
 
 import dataclasses
 import tomllib
-from collections.abc import Sequence
 from dataclasses import MISSING
 from pathlib import Path
 from typing import Any
@@ -15,13 +14,16 @@ from eddies.scene.rules import nearest, quoted, shortened
 from eddies.scene.values import KeyProblem, SceneError, Section, rule_of
 
 
-def find_document(name_or_path: str, built_in: Path, what: str) -> Path:
-    """The file of a built-in name (a TOML file in the folder `built_in`), or of a path; SceneError lists the names."""
+def find_document(name_or_path: str, built_in: Path, beside: Path | None = None) -> Path:
+    """The file of a built-in scene (a TOML file in the folder `built_in`), or of a path, from the folder `beside` or
+    else from the working directory; SceneError lists the names."""
     names = sorted(path.stem for path in built_in.glob("*.toml"))
     if name_or_path in names:
         return built_in / f"{name_or_path}.toml"
+    path = Path(name_or_path)
     try:
-        path = Path(name_or_path)
+        if beside is not None and (beside / path).is_file():
+            return beside / path
         if path.is_file():
             return path
         is_directory = path.is_dir()
@@ -29,9 +31,9 @@ def find_document(name_or_path: str, built_in: Path, what: str) -> Path:
         raise SceneError(f"{shortened(name_or_path)}: cannot be read: {error.strerror}; give the path of a TOML "
                          f"file, or one of {', '.join(names)}") from None
     if is_directory:
-        raise SceneError(f"{name_or_path}: is a directory, not a {what}; give the path of a TOML file in it")
+        raise SceneError(f"{name_or_path}: is a directory, not a scene; give the path of a TOML file in it")
     hint = f"{nearest(name_or_path, names)} ".lstrip()
-    raise SceneError(f"{shortened(name_or_path)}: no such {what}; {hint}give the path of a TOML file, or one of "
+    raise SceneError(f"{shortened(name_or_path)}: no such scene; {hint}give the path of a TOML file, or one of "
                      f"{', '.join(names)}")
 
 
@@ -58,49 +60,6 @@ def read_text(path: Path) -> str:
         raise SceneError(f"cannot be read: {reason}; give the path of a scene, a TOML file") from None
 
 
-def remove(document: dict[str, Any], removals: Sequence[str]) -> None:
-    """Take each "key", "section", "section.key", ... out of the document, with all that is in it.
-
-    Raises:
-        SceneError: the document has no such thing; what it has is named.
-    """
-    for removal in removals:
-        table: Any = document
-        *outer, last = removal.strip().split(".")
-        try:
-            for name in outer:
-                table = table[name]
-            del table[last]
-        except (KeyError, TypeError):
-            known = table if isinstance(table, dict) else document
-            raise SceneError(f"--unset {shortened(removal)}: the file has no such key or section, so there is nothing "
-                             f"to leave out; there are: {', '.join(known) or 'none'}") from None
-
-
-def apply_overrides(document: dict[str, Any], overrides: Sequence[str]) -> set[str]:
-    """Write each "section.key=value" (or "key=value", or "section.sub.key=value") over the document; returns the keys
-    written, with the sections that hold them.
-
-    The value is read as TOML; what is not TOML, such as a bare word, is a string. A section that the document
-    lacks is made.
-    """
-    keys = set()
-    for override in overrides:
-        path, equals, value = (part.strip() for part in override.partition("="))
-        *outer, last = names = path.split(".")
-        if not equals or not value or len(names) > 3 or not all(names):
-            raise SceneError(f"--set {shortened(override)}: must be section.key=value, or key=value outside "
-                             "sections, or section.name.key=value in a section of a section")
-        table = document
-        for name in outer:
-            table = table.setdefault(name, {})
-            if not isinstance(table, dict):
-                raise SceneError(f"--set {shortened(override)}: {name} is a value, not a section")
-        table[last] = _override_value(value)
-        keys |= {".".join(names[:depth]) for depth in range(1, len(names) + 1)}
-    return keys
-
-
 def read_section(kind: type[Section], table: Any, name: str = "") -> Any:
     """The dataclass `kind` filled from a TOML table; `name` is the section's, empty for the whole document.
 
@@ -111,8 +70,8 @@ def read_section(kind: type[Section], table: Any, name: str = "") -> Any:
         message = f"{name} = {shortened(quoted(table))}: must be a section; write [{name}] and its keys below"
         raise SceneError(message, name)
     every = {field.name: field for field in dataclasses.fields(kind)}
-    fields = {key: field for key, field in every.items() if "sub_sections" not in field.metadata}
-    holder = next((key for key in every if key not in fields), None)
+    fields = {key: field for key, field in every.items() if not field.metadata.keys() & {"sub_sections", "scenes"}}
+    holder = next((key for key, field in every.items() if "sub_sections" in field.metadata), None)
     values, inner = {}, {}
     for key, value in table.items():
         if key in fields:
@@ -148,14 +107,6 @@ def write_section(section: Section, name: str = "") -> list[str]:
     return lines + inner
 
 
-def _override_value(value: str) -> Any:
-    try:
-        parsed = tomllib.loads(f"value = {value}")
-    except (ValueError, RecursionError):
-        return value
-    return parsed["value"] if len(parsed) == 1 else value
-
-
 def _within(section: str, name: str) -> str:
     """The name of a section's own section."""
     return f"{section}.{name}" if section else name
@@ -164,23 +115,7 @@ def _within(section: str, name: str) -> str:
 def _read_value(field: dataclasses.Field, value: Any, name: str) -> Any:
     if "section" in field.metadata:
         return read_section(field.metadata["section"], value, name)
-    if "sections" in field.metadata:
-        return _read_sections(field.metadata["sections"], value, name)
     return value
-
-
-def _read_sections(kind: type[Section], tables: Any, name: str) -> tuple:
-    """A dataclass for each [[name]]; an error says which by its number, and by its name if it has one."""
-    if not isinstance(tables, list):
-        raise SceneError(f"{name} = {quoted(tables)}: must be sections; write [[{name}]] before each", name)
-    read = []
-    for number, table in enumerate(tables, 1):
-        try:
-            read.append(read_section(kind, table, name))
-        except SceneError as error:
-            own = f' ("{table["name"]}")' if isinstance(table, dict) and "name" in table else ""
-            raise SceneError(f"[[{name}]] number {number}{own}: {error}", error.key) from None
-    return tuple(read)
 
 
 def _unknown(key: str, value: Any, section: str, fields: dict[str, dataclasses.Field]) -> SceneError:

@@ -1,12 +1,16 @@
 """A scene: the description of a flow and of what is to be learned from it, as read from one TOML file.
 
-A section that is optional and absent is None, and then nothing is built for it.
+A section that is optional and absent is None, and then nothing is built for it. Variants of a scene are scenes that
+differ from it in some keys.
 """
 
+import copy
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+import re
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -14,28 +18,41 @@ from typing import Any
 from eddies.import_path import load, origins, search_in
 from eddies.pipeline import STAGES, Stage
 from eddies.scene.checks import first_inconsistency
-from eddies.scene.model import Model, replace_terms
-from eddies.scene.reader import (apply_overrides, find_document, parse_document, read_section, read_text, remove,
-                                 write_section)
+from eddies.scene.layers import BUILT_IN, VARIANT, Layer, command_line, dotted, read_document, refuse_keys_of_variants
+from eddies.scene.model import Model
+from eddies.scene.reader import read_section, write_section
+from eddies.scene.rules import nearest, quoted
 from eddies.scene.sections import (BOX_LENGTH, DEFAULT_WINDOW, NEIGHBORS, Eulerian, Flow, Forcing, Horizons, Initial,
                                    Kernel, Simulation, SpinUp, Time, Tracers, Training)
-from eddies.scene.values import Document, SceneError, choice, directory_name, import_paths, integer, section, text
+from eddies.scene.values import (SceneError, Section, choice, directory_name, import_paths, integer, integers, scenes,
+                                 section, text)
 
 __all__ = ["BOX_LENGTH", "Scene", "SceneError", "builtin_scenes", "load_scene", "Eulerian", "Flow", "Forcing",
            "Horizons", "Initial", "Kernel", "Model", "Simulation", "SpinUp", "Time", "Tracers", "Training"]
 
 # Sections that may name classes and functions of the user's.
 FOREIGN_IN = ("flow", "initial", "model", "simulation")
-BUILT_IN = Path(__file__).parents[1] / "scenes"
+# Keys of a scene that a variant cannot change.
+OF_THE_WHOLE = ("name", "base", "realisations", VARIANT)
+# In a run directory: what is no name of a variant, beside the products and directories of the stages.
+RESERVED = ("report", "vtkhdf", "lagrangebench", "STOP")
+REALISATION = "realisation-"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scene(Document):
-    """A whole scene; making one checks its values and that its sections fit together (SceneError)."""
+class Scene(Section):
+    """A whole scene; making one checks its values and that its sections fit together (SceneError).
+
+    `variant` has the scenes of the variants by name, each whole and without variants of its own.
+    """
 
     name: str = directory_name("names the run; absent: the file's name", default="scene")
     title: str = text("one line for lists and reports", default="untitled scene")
+    label: str | None = text("of a variant in tables and figures; absent: its name", default=None)
     seed: int = integer("of every random number", default=1, at_least=0, at_most=10**18)
+    realisations: tuple[int, ...] | None = integers(
+        "seeds of further ground truths, which no training sees: rollouts are made on each from its beginning; absent: "
+        "on the ground truth of the scene, after the training window", default=None, at_least=0)
     device: str = choice("where particles are computed", "cpu", "cuda", default="cpu")
     flow: Flow = section(Flow)
     initial: Initial = section(Initial, default=Initial())
@@ -48,12 +65,31 @@ class Scene(Document):
     training: Training | None = section(Training, default=None)
     simulation: Simulation | None = section(Simulation, default=None)
     eulerian: Eulerian | None = section(Eulerian, default=None)
+    variant: "Mapping[str, Scene]" = scenes()
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        problem = first_inconsistency(self)
+        problem = first_inconsistency(self) or next(_problems_of_variants(self), None)
         if problem:
             raise SceneError(problem)
+
+    @classmethod
+    def section_name(cls) -> str:
+        """None: the keys of a scene stand outside all sections."""
+        return ""
+
+    def check_variants(self, names: Sequence[str]) -> None:
+        """Refuse names that no variant of the scene has."""
+        for name in names:
+            if name not in self.variant:
+                hint = f"{nearest(name, self.variant)} ".lstrip()
+                raise SceneError(f'{self.name}: there is no variant "{name}"; {hint}there are: '
+                                 f"{', '.join(self.variant) or 'none'}")
+
+    @property
+    def without_variants(self) -> "Scene":
+        """The scene alone, without variants and realisations."""
+        return replace(self, variant={}, realisations=None) if self.variant or self.realisations else self
 
     @property
     def stages(self) -> tuple[str, ...]:
@@ -129,8 +165,25 @@ class Scene(Document):
                                    for path in self._foreign_in(name)))
 
     def to_toml(self) -> str:
-        """The scene as a TOML text with a comment on every key; reading it back gives an equal scene."""
-        return "\n".join(write_section(self)) + "\n"
+        """The scene as a TOML text with a comment on every key, and with the keys in which each variant differs;
+        reading it back gives an equal scene."""
+        lines = write_section(self)
+        for name, scene in self.variant.items():
+            lines += ["", f"[{VARIANT}.{name}]", *self.differences(scene)]
+        return "\n".join(lines) + "\n"
+
+    def differences(self, variant: "Scene") -> Iterator[str]:
+        """The lines of a variant's table: the keys in which it differs, `key = value`."""
+        own, other = (dict(dotted(tomllib.loads("\n".join(write_section(scene)))))
+                      for scene in (self.without_variants, variant))
+        for name in set(OF_THE_WHOLE) & {*own, *other}:
+            own.pop(name, None), other.pop(name, None)
+        absent = {section for key in own if (section := key.partition(".")[0]) not in {
+            held.partition(".")[0] for held in other}}
+        removed = [*sorted(absent), *(key for key in own if key not in other and key.partition(".")[0] not in absent)]
+        if removed:
+            yield f"unset = {quoted(removed)}"
+        yield from (f"{key} = {quoted(value)}" for key, value in other.items() if own.get(key) != value)
 
     def fingerprint(self, stage: str) -> str:
         """SHA-256 over what a stage's product depends on: its own settings and those of the earlier stages that
@@ -160,8 +213,8 @@ class Scene(Document):
 
 
 def load_scene(name_or_path: str | Path, overrides: Sequence[str] = (), removals: Sequence[str] = ()) -> Scene:
-    """Read a built-in scene by name, or a TOML file by path, take the `removals` "section.key" or "section" out of it,
-    and write overrides "section.key=value" over what is left.
+    """Read a built-in scene by name, or a TOML file by path, with its variants; take the `removals` "section.key" or
+    "section" out of it, and write overrides "section.key=value" over what is left.
 
     Modules of the classes that it names are looked for where Python looks, then beside the file, then in the working
     directory.
@@ -169,26 +222,101 @@ def load_scene(name_or_path: str | Path, overrides: Sequence[str] = (), removals
     Raises:
         SceneError: names the file (or --set, --unset), the section and the key, what is allowed and what to do.
     """
-    path = find_document(str(name_or_path), BUILT_IN, "scene")
+    path, document = read_document(str(name_or_path))
     search_in(path.parent)
     search_in(Path())
-    keys: set[str] = set()
+    given = Layer({})
     try:
-        document = parse_document(read_text(path))
-        remove(document, removals)
-        document = {"name": path.stem, **document}
-        keys = apply_overrides(document, overrides)
-        if isinstance(document.get("model"), dict):
-            replace_terms(document["model"], keys)
-        return read_section(Scene, document)
+        given = command_line(overrides, removals)
+        _check_names_of_variants(given, document.get(VARIANT, {}))
+        given.apply(document)
+        document.setdefault("name", path.stem)
+        tables = document.pop(VARIANT, {})
+        variants = {name: Layer.of_table(table) for name, table in tables.items()}
+        refuse_keys_of_variants(given, variants)
+        scene = read_section(Scene, document)
+        return replace(scene, variant={name: _variant(document, name, layer) for name, layer in variants.items()})
     except SceneError as error:
-        option = ", --set" if error.key in keys else ", --unset" if error.key in removals else ""
+        option = ", --set" if error.key in given.keys else ", --unset" if error.key in removals else ""
         raise SceneError(f"{path}{option}: {error}", error.key) from None
+
+
+def _check_names_of_variants(given: Layer, tables: Any) -> None:
+    """Refuse what is no table of tables of keys, and changes of a variant that the scene has not."""
+    if not isinstance(tables, dict) or not all(isinstance(table, dict) for table in tables.values()):
+        raise SceneError(f"{VARIANT}: must be sections; write [{VARIANT}.NAME] and the changed keys below", VARIANT)
+    for key in (*given.values, *given.unset):
+        whole, _, rest = key.partition(".")
+        name = rest.partition(".")[0]
+        if whole == VARIANT and name not in ("", *tables):
+            hint = f"{nearest(name, tables)} ".lstrip()
+            raise SceneError(f'{key}: there is no variant "{name}"; {hint}there are: {", ".join(tables) or "none"}')
+
+
+def _variant(document: dict[str, Any], name: str, layer: Layer) -> Scene:
+    """The scene of a variant: the document with the variant's changes."""
+    try:
+        for key in layer.values:
+            if key.partition(".")[0] in OF_THE_WHOLE:
+                raise SceneError(f"{key}: a variant cannot change this key; remove it", key)
+        changed = {key: copy.deepcopy(value) for key, value in document.items() if key != "realisations"}
+        layer.apply(changed)
+        return read_section(Scene, {**changed, "name": name})
+    except SceneError as error:
+        raise SceneError(f'variant "{name}": {error}', error.key) from None
+
+
+def _problems_of_variants(scene: Scene) -> Iterator[str]:
+    """What keeps variants and realisations of a scene from being run and compared."""
+    stages = STAGES.values()
+    reserved = {*RESERVED, *(stage.product for stage in stages), *(stage.checkpoints for stage in stages)}
+    for name, variant in scene.variant.items():
+        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{,99}", name):
+            yield (f'variant "{name}": a name has at most 100 letters, digits, "_" and "-", the first a letter or a '
+                   'digit; choose another')
+        elif name in reserved or name.startswith(REALISATION):
+            yield f'variant "{name}": a run directory uses this name for something else; choose another'
+        elif not isinstance(variant, Scene) or variant.variant or variant.realisations:
+            yield f'variant "{name}": must be a scene without variants and realisations of its own'
+        else:
+            yield from (f'variant "{name}": {problem}' for problem in _differing_start(scene, variant))
+    seeds = scene.realisations or ()
+    if scene.realisations is not None and scene.simulation is None and not scene.variant:
+        yield "realisations: the scene has no [simulation], so nothing is rolled out on them; add it, or remove the key"
+    for seed in seeds:
+        if seeds.count(seed) > 1:
+            yield f"realisations = {quoted(seeds)}: {seed} stands there more than once; name each seed once"
+        if seed == scene.seed:
+            yield (f"realisations = {quoted(seeds)}: {seed} is the seed of the scene, whose ground truth models are "
+                   "trained on; leave it out")
+
+
+def _differing_start(scene: Scene, variant: Scene) -> Iterator[str]:
+    """Why the rollout of a variant cannot be compared with that of the scene: another start, or other times."""
+    if variant.simulation is None or scene.simulation is None:
+        which = "the scene" if scene.simulation is None else "it"
+        yield f"{which} has no [simulation], and variants are compared by their rollouts; add it"
+        return
+    for key in ("turnovers", "start", "frame_interval"):
+        ours, theirs = (getattr(other.simulation, key) for other in (variant, scene))
+        if ours != theirs:
+            yield (f"[simulation] {key} = {ours} where the scene has {theirs}: all variants start at the same moment "
+                   "and are compared at the same times; change it for the whole scene")
+    if scene.realisations is None and variant.simulation.start is None:
+        ours, theirs = (other.training and other.training.window for other in (variant, scene))
+        if ours != theirs:
+            yield (f"[training] window = {ours} where the scene has {theirs}: rollouts start where it ends, and all "
+                   "must start at the same moment; give [simulation] start for the whole scene")
+        ours, theirs = (other.training and other.training.truths for other in (variant, scene))
+        if ours != theirs:
+            yield (f"[training] truths = {quoted(ours)} where the scene has {quoted(theirs)}: where rollouts start "
+                   "depends on them, and all must start at the same moment; give [simulation] start for the whole "
+                   "scene")
 
 
 def builtin_scenes() -> list[tuple[str, str]]:
     """Name and title of every scene that comes with the package, by name."""
-    return [(path.stem, parse_document(read_text(path))["title"]) for path in sorted(BUILT_IN.glob("*.toml"))]
+    return [(path.stem, read_document(path.stem)[1]["title"]) for path in sorted(BUILT_IN.glob("*.toml"))]
 
 
 def _fingerprints(paths: Sequence[Path]) -> list[str | None]:

@@ -66,14 +66,6 @@ class Section:
         return re.sub(r"(?<!^)(?=[A-Z])", "_", cls.__name__).lower()
 
 
-class Document(Section):
-    """Base of what a whole TOML file describes: its keys stand outside all sections."""
-
-    @classmethod
-    def section_name(cls) -> str:
-        return ""
-
-
 def number(about: str, default: Any = MISSING, words: tuple[str, ...] = (), **bounds: float) -> Any:
     """Declare a dataclass field that holds a real number (or one of `words`)."""
     return _declare(Number(about, Bounds(**bounds), words), default)
@@ -130,11 +122,6 @@ def section(kind: type, default: Any = MISSING) -> Any:
     return dataclasses.field(default=default, metadata={"section": kind})
 
 
-def sections(kind: type) -> Any:
-    """Declare a dataclass field that holds a tuple of dataclasses `kind`, one for each [[section]] of its name."""
-    return dataclasses.field(default=(), metadata={"sections": kind})
-
-
 def sub_sections() -> Any:
     """Declare a dataclass field that holds a dict of the section's own sections [section.NAME], by NAME.
 
@@ -143,12 +130,17 @@ def sub_sections() -> Any:
     return dataclasses.field(default_factory=dict, metadata={"sub_sections": True})
 
 
+def scenes() -> Any:
+    """Declare a dataclass field that holds a dict of whole scenes by name."""
+    return dataclasses.field(default_factory=dict, metadata={"scenes": True})
+
+
 def rule_of(kind: type, field: dataclasses.Field) -> Any:
     """The rule of a field: as declared, or else that of its annotation; None for a field that holds sections.
 
     Raises SceneError where there is neither.
     """
-    if field.metadata.keys() & {"section", "sections", "sub_sections"}:
+    if field.metadata.keys() & {"section", "sub_sections", "scenes"}:
         return None
     if "rule" in field.metadata:
         return field.metadata["rule"]
@@ -191,16 +183,12 @@ def _accepted(kind: type[Section], field: dataclasses.Field, value: Any) -> Any:
         return KeyProblem(kind.section_name(), field.name,
                           f" = {shortened(quoted(value))}: must be {allowed}" + (f"; {hint}" if hint else ""))
 
-    if "sub_sections" in field.metadata:
+    if field.metadata.keys() & {"sub_sections", "scenes"}:
         return value
     if "section" in field.metadata:
         if not isinstance(value, field.metadata["section"]):
             raise refusal(f"a {field.metadata['section'].__name__}")
         return value
-    if "sections" in field.metadata:
-        if not all(isinstance(entry, field.metadata["sections"]) for entry in value):
-            raise refusal(f"a list of {field.metadata['sections'].__name__}")
-        return tuple(value)
     rule = rule_of(kind, field)
     try:
         return rule.accept(value)

@@ -47,6 +47,9 @@ def run(scene: Scene, comm: Comm, as_json: bool = False) -> None:
                 "ranks": rank_lines(scene, comm), "stages": stage_lines(scene, comm.size, speeds, stages),
                 "fails here": refused, "more ranks": cost_lines(scene, speeds.flow), "": rollout_lines(scene, rollout)}
     log.info("%s: %s", scene.name, scene.title)
+    if scene.variant:
+        log.info("%-12s%s; these numbers are those of the scene, --variant NAME gives others", "variants",
+                 ", ".join(scene.variant))
     for title, lines in subjects.items():
         for index, line in enumerate(lines):
             log.info("%-12s%s", "" if index else title, line)

@@ -6,12 +6,17 @@ Every product is optional; a section appears for what there is. Each rank makes 
 from __future__ import annotations
 
 import contextlib
+import csv
+import io
+import json
 import logging
+import os
 import time
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -21,7 +26,7 @@ from eddies.analysis.spectra import energy_spectrum, vorticity
 from eddies.analysis.tracer_statistics import tracer_statistics
 from eddies.io.fields import FieldSeries
 from eddies.io.hdf5 import File, ProductError, in_files, open_product, read_attributes, read_table
-from eddies.io.provenance import others_trained_on, read_json, read_provenance
+from eddies.io.provenance import others_trained_on, product_attributes, read_json, read_provenance
 from eddies.io.trajectories import Trajectory
 from eddies.parallel.broadcast import on_all_ranks
 from eddies.parallel.communicator import Comm
@@ -33,13 +38,18 @@ from eddies.report.model import section as model_section
 from eddies.report.page import Metric, RunRecord, Section, metrics_json, shown, write_page
 from eddies.report.rollout import Rollout
 from eddies.report.rollout import section as rollout_section
+from eddies.report.variants import KEY as VARIANTS
+from eddies.report.variants import ErrorAgainstTime
+from eddies.report.variants import section as section_on_variants
 from eddies.report.verdict import KEY as VERDICT
 from eddies.report.verdict import arranged
-from eddies.scene.scene import Scene
+from eddies.scene.scene import Scene, SceneError, load_scene
 from eddies.workflows.feasibility import check_places
 from eddies.workflows.product_warnings import changed_truths, mixed_products, not_finite
 from eddies.workflows.rollout.stored_spectra import read_spectra
 from eddies.workflows.run_directory.work import read_stage_seconds
+from eddies.workflows.variant_rows import COLUMNS, ROLLOUT, finite, machine, notes, row
+from eddies.workflows.variants import Place, rollouts
 
 log = logging.getLogger("eddies")
 
@@ -70,33 +80,112 @@ def run_stage(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest
     run(directory, comm)
 
 
-def run(directory: str | Path, comm: Comm) -> None:
-    """Write report/index.html, report/figures/*.png and report/metrics.json of a run directory; all ranks
-    call it.
+def run(directory: str | Path, comm: Comm, variants: Sequence[str] = ()) -> None:
+    """Write report/index.html, report/figures/*.png and report/metrics.json of a run directory; all ranks call it.
 
-    Raises ProductError if the directory holds no product, or a damaged one, or the report cannot be written.
+    Of a scene with variants the page begins with their table and goes on with the first of `variants` or, where none is
+    named, of all that were run; every other one has a page of its own, one click away.
+
+    Raises ProductError if the directory holds no product, or a damaged one, or the report cannot be written; SceneError
+    if a variant is named that the scene has not.
     """
-    directory, began = Path(directory), time.perf_counter()
+    directory = Path(directory)
     check_places(("report",), comm, directory)
+    scene, places = in_files(comm, directory, lambda: stored_rollouts(directory))
+    if scene is not None:
+        scene.check_variants(variants)
+    ran = {name: where[0].directory for name, where in places.items() if (where[0].directory / ROLLOUT).exists()}
+    chosen = next(iter([*variants, *ran]), None)
+    main = places[chosen][0].directory if chosen in ran else directory
+    pages = {name: where for name, where in ran.items() if where != directory}
     alone = comm.Split(comm.rank)
     try:
-        record = in_files(comm, directory, lambda: _survey(directory, alone))
-        own = on_all_ranks(comm, lambda: in_files(alone, directory,
-                                                  lambda: _read_share(directory, comm, alone, record)), ProductError)
+        for name, where in pages.items():
+            if where != main:
+                record, sections = _made(where, comm, alone, own=True)
+                _write_report(comm, where / "report", record, sections, _links(scene, directory, where, pages))
+                log.info("report: variant %s: %s", name, where / "report" / "index.html")
+        table = _table(scene, places, chosen, comm, alone) if chosen in ran else None
+        record, sections = _made(main, comm, alone, first=[section_on_variants(table, notes(scene))] if table else [])
     finally:
         alone.Free()
+    if main != directory:  # the variant that is shown has a page of its own too
+        own = [section for section in sections if section.key != VARIANTS]
+        _write_report(comm, main / "report", record, own, _links(scene, directory, main, pages))
+        record.seconds = {**read_stage_seconds(directory), **record.seconds}
+    beside = _files_of(scene, table, directory, comm) if table else {}
+    links = _links(scene, directory, directory, pages, chosen)
+    _write_report(comm, directory / "report", record, sections, links, beside, scene)
+    if comm.rank == 0:
+        _tell(record, sections)
+
+
+def stored_rollouts(directory: Path) -> tuple[Scene | None, dict[str, list[Place]]]:
+    """The scene that a run directory was made with, and the rollouts of its variants by name; None and no rollouts
+    where there is no scene that this version reads."""
+    try:
+        scene = load_scene(directory / "scene.toml")
+    except SceneError:
+        return None, {}
+    return scene, rollouts(scene, directory) if scene.simulation is not None else {}
+
+
+def _made(directory: Path, comm: Comm, alone: Comm, own: bool = False,
+          first: Sequence[Section] = ()) -> tuple[Run, list[Section]]:
+    """All sections on a run directory, with those that come `first`, their figures drawn, on rank 0; with `own` only
+    those on products that were made there."""
+    began = time.perf_counter()
+    record = in_files(comm, directory, lambda: _survey(directory, alone))
+    kinds = [kind for kind in record.provenance if not (own and (directory / f"{kind}.h5").is_symlink())]
+    found = on_all_ranks(comm, lambda: in_files(
+        alone, directory, lambda: _read_share(directory, comm, alone, record, kinds)), ProductError)
+    if comm.rank == 0:
+        found = [*first, *found]
     read = time.perf_counter()
-    draw(comm, own)
+    draw(comm, found)
     log.debug("report: read and measured in %.1f s, drawn in %.1f s", read - began, time.perf_counter() - read)
-    gathered = comm.gather(own) or []
-    sections = [section for own in gathered for section in own] + [_cost_section(record)]
-    in_files(comm, directory / "report", lambda: _write_report(directory, record, sections))
+    gathered = comm.gather(found) or []
+    sections = [section for part in gathered for section in part] + [_cost_section(record)]
+    return record, arranged(sections, bool(record.warnings))
+
+
+def _table(scene: Scene, places: Mapping[str, Sequence[Place]], subject: str, comm: Comm,
+           alone: Comm) -> ErrorAgainstTime:
+    """The rows of all variants; each rank measures some of them."""
+    names = list(places)
+    own = on_all_ranks(comm, lambda: {name: in_files(alone, places[name][0].directory, lambda: row(
+        scene, name, places[name], alone)) for name in names[comm.rank::comm.size]}, ProductError)
+    rows = {name: found for part in comm.allgather(own) for name, found in part.items()}
+    return ErrorAgainstTime([rows[name] for name in names], subject)
+
+
+def _files_of(scene: Scene, table: ErrorAgainstTime, directory: Path, comm: Comm) -> dict[Path, str]:
+    """The rows as CSV and JSON, by their paths."""
+    lines = io.StringIO(newline="")
+    writer = csv.DictWriter(lines, COLUMNS)
+    writer.writeheader()
+    writer.writerows(table.rows)
+    first = next(each for each in stored_rollouts(directory)[1][table.subject])
+    reference = product_attributes(first.directory / "ground_truth.h5", "reference")
+    known = {key: finite(float(value)) for key, value in reference.items() if isinstance(value, (float, np.number))}
+    record = {"name": scene.name, "title": scene.title, "machine": machine(scene.device, comm.size), "flow": known,
+              "rows": table.rows, "summary": table.summary}
+    return {directory / "report" / "variants.csv": lines.getvalue(),
+            directory / "report" / "variants.json": json.dumps(record, indent=2, allow_nan=False) + "\n"}
+
+
+def _links(scene: Scene | None, directory: Path, page: Path, pages: Mapping[str, Path],
+           shown: str | None = None) -> list[tuple[str, str]]:
+    """The other pages of a run directory, as they are reached from that in `page`."""
+    found = [] if page == directory else [(f"all of {scene.name}", directory)]
+    found += [(name, where) for name, where in pages.items() if where != page and name != shown]
+    return [(title, os.path.relpath(where / "report" / "index.html", page / "report")) for title, where in found]
 
 
 def sections_of(directory: Path, alone: Comm) -> list[Section]:
     """All sections that one rank reads, their figures not yet drawn."""
     record = _survey(directory, alone)
-    return [*_read_share(directory, alone, alone, record), _cost_section(record)]
+    return [*_read_share(directory, alone, alone, record, list(record.provenance)), _cost_section(record)]
 
 
 def _survey(directory: Path, alone: Comm) -> Run:
@@ -143,11 +232,11 @@ def _survey_rollout(file: File, record: Run) -> None:
                                   attributes["evaluations"] / attributes["turnovers"]))
 
 
-def _read_share(directory: Path, comm: Comm, alone: Comm, record: Run) -> list[Section]:
-    """The sections of this rank, neighbours on the page, without that on the cost."""
+def _read_share(directory: Path, comm: Comm, alone: Comm, record: Run, kinds: Sequence[str]) -> list[Section]:
+    """The sections of this rank on products of these kinds, neighbours on the page, without that on the cost."""
     readers = {"ground_truth": (_read_flow, _read_tracers), "kernel": (_read_kernel,), "model": (_read_model,),
                "rollout": (_read_rollout,)}
-    parts = [(kind, read) for kind in record.provenance for read in readers[kind]]
+    parts = [(kind, read) for kind in kinds for read in readers[kind]]
     sections = []
     for index in np.array_split(np.arange(len(parts)), comm.size)[comm.rank]:
         kind, read = parts[index]
@@ -167,12 +256,19 @@ def _read_part(kind: str, file: File, record: Run, read: Callable[[File, Run], l
         return [Section(kind, title, notices=[f"Not shown ({error}): {'; '.join(record.not_finite.values())}"])]
 
 
-def _write_report(directory: Path, record: Run, sections: Sequence[Section]) -> None:
-    sections = arranged(sections, bool(record.warnings))
-    _write_files(directory / "report", _run_record(directory, record), sections)
+def _write_report(comm: Comm, output: Path, record: Run, sections: Sequence[Section],
+                  links: Sequence[tuple[str, str]], beside: Mapping[Path, str] = MappingProxyType({}),
+                  scene: Scene | None = None) -> None:
+    """Write the page and the numbers; `scene`: the whole scene, where the page is about it; all ranks call it."""
+    in_files(comm, output, lambda: _write_files(
+        output, _run_record(output.parent, record, links, scene), sections, beside))
+
+
+def _tell(record: Run, sections: Sequence[Section]) -> None:
+    """Log the titles of sections, what the first ones say, and the main numbers."""
     for section in sections:
         log.info("report: %s, %d figures", section.title, len(section.illustrations))
-        if section.key == VERDICT:
+        if section.key in (VERDICT, VARIANTS):
             log.info("  %s", section.text)
         for metric in section.metrics:
             if metric.key in section.main:
@@ -275,7 +371,8 @@ def _cost_section(record: Run) -> Section:
                    main=("seconds_per_step",))
 
 
-def _run_record(directory: Path, record: Run) -> RunRecord:
+def _run_record(directory: Path, record: Run, links: Sequence[tuple[str, str]],
+                scene: Scene | None) -> RunRecord:
     rows = [("stage", "ranks", "wall time (s)", "date", "eddies", "commit", "libraries")]
     for kind, origin in record.provenance.items():
         stage = MAKER_OF[kind].name
@@ -285,13 +382,14 @@ def _run_record(directory: Path, record: Run) -> RunRecord:
         ranks = str(origin["ranks"])
         rows.append((stage, ranks, seconds, origin["date"], origin["eddies"], commit, libraries))
     newest = list(record.provenance.values())[-1]
-    title = tomllib.loads(newest["scene"]).get("title", "untitled scene")
-    return RunRecord(directory.resolve().name, title, newest["scene"], rows, record.warnings)
+    text = scene.to_toml() if scene is not None and scene.variant else newest["scene"]
+    title = tomllib.loads(text).get("title", "untitled scene")
+    return RunRecord(directory.resolve().name, title, text, rows, record.warnings, links)
 
 
-def _write_files(output: Path, record: RunRecord, sections: Sequence[Section]) -> None:
+def _write_files(output: Path, record: RunRecord, sections: Sequence[Section], beside: Mapping[Path, str]) -> None:
     drawn = {f"{illustration.name}.png" for section in sections for illustration in section.illustrations}
-    write_page(output, record, sections, {output / "metrics.json": metrics_json(record, sections)})
+    write_page(output, record, sections, {output / "metrics.json": metrics_json(record, sections), **beside})
     for stale in (output / "figures").glob("*.png"):
         if stale.name not in drawn:
             stale.unlink()

@@ -17,6 +17,7 @@ from eddies.pipeline import STAGES, Stage
 from eddies.scene.scene import Scene, SceneError, load_scene
 from eddies.workflows.foreseen.stage_cost import in_units
 from eddies.workflows.run_directory.work import changed_settings, is_done, of_other_settings, stage_seconds
+from eddies.workflows.variants import steps
 
 SCENE, PAGE = "scene.toml", Path("report") / "index.html"
 
@@ -30,11 +31,13 @@ def run(directory: Path, comm: Comm) -> None:
 
 def status_lines(directory: Path) -> Iterator[str]:
     """Those of all runs, in order of their names; UserError where there is none."""
-    runs = [directory] if is_run(directory) else sorted(path.parent for path in directory.glob(f"**/{SCENE}"))
-    if not runs:
+    found = [directory] if is_run(directory) else sorted(path.parent for path in directory.glob(f"**/{SCENE}"))
+    if not found:
         raise UserError(f"{directory}: holds no run; make one with `eddies run SCENE`, or give the directory of one")
-    for path in runs:
-        yield from run_lines(path)
+    inner: set[Path] = set()
+    for path in found:
+        if path not in inner:
+            yield from run_lines(path, inner)
 
 
 def is_run(directory: Path) -> bool:
@@ -42,8 +45,8 @@ def is_run(directory: Path) -> bool:
     return (directory / SCENE).is_file() or any((directory / stage.file).is_file() for stage in STAGES.values())
 
 
-def run_lines(directory: Path) -> Iterator[str]:
-    """Its name, size and job, then its stages."""
+def run_lines(directory: Path, inner: set[Path]) -> Iterator[str]:
+    """Its name, size and job, then its stages, those of variants in their directories, which are added to `inner`."""
     files = [path for path in directory.rglob("*") if path.is_file() and not path.is_symlink()]
     size, held = in_units(sum(path.stat().st_size for path in files)), find_lock(directory)
     job = "" if held is None else f", {held.holder}{', without a sign of life' if held.stale else ''}"
@@ -53,16 +56,22 @@ def run_lines(directory: Path) -> Iterator[str]:
         yield f"{directory}  {size}{job}: {error}"
         return
     yield f"{directory}  {size}{job}: {scene.title}"
-    seconds = stage_seconds(directory)
-    for name in scene.stages:
+    planned = steps(scene, tuple(STAGES), directory)
+    inner |= {step.directory for step in planned}
+    found = [(step, name) for step in planned for name in step.stages if name in step.scene.stages]
+    titles = [name if step.directory == directory else f"{step.directory.relative_to(directory)}: {name}"
+              for step, name in found]
+    width = max(map(len, [*titles, "train-kernel"]))
+    for title, (step, name) in zip(titles, found):
+        seconds, state = stage_seconds(step.directory), stage_state(STAGES[name], step.scene, step.directory)
         took = duration(seconds[name]) if name in seconds else ""
-        yield f"  {name:13}  {took:>12}  {stage_state(STAGES[name], scene, directory)}".rstrip()
+        yield f"  {title:{width}}  {took:>12}  {state}".rstrip()
+    took = duration(seconds["report"]) if "report" in (seconds := stage_seconds(directory)) else ""
+    yield f"  {'report':{width}}  {took:>12}  {page_state(directory)}"
 
 
 def stage_state(stage: Stage, scene: Scene, directory: Path) -> str:
     """What there is of a stage, in words."""
-    if stage.product is None:
-        return page_state(directory)
     product, found = directory / stage.file, checkpoints_in(directory / stage.checkpoints) if stage.checkpoints else []
     if is_done(stage.name, scene, directory):
         return f"complete, {in_units(product.stat().st_size)}"

@@ -220,6 +220,6 @@ def small_flow(scene: Scene, ranks: int) -> Scene:
     initial = Initial(amplitude=turbulence.velocity_rms if turbulence else 1.0, peak_wavenumber=min(3.0, cells / 3))
     if forcing:
         forcing = replace(forcing, wavenumber=min(forcing.wavenumber, cells / 3))
-    return replace(scene, flow=replace(scene.flow, cells=cells), initial=initial, forcing=forcing,
+    return replace(scene.without_variants, flow=replace(scene.flow, cells=cells), initial=initial, forcing=forcing,
                    time=replace(scene.time, duration=1.0), spin_up=None, tracers=None, kernel=None, model=None,
                    training=None, simulation=None, eulerian=None)

@@ -178,7 +178,9 @@ def most_ranks(scene: Scene) -> dict[str, int]:
     elif scene.injects:
         reach = scene.simulation.skin * scene.interaction_radius / 2
         limits["ghost planes of the resolved velocity"] = ranks_of_resolved_grid(scene.tracers, reach)
-    return limits
+    fewest = min(limits.values())
+    return limits | {f"variant {name}: {reason}": ranks for name, variant in scene.variant.items()
+                     for reason, ranks in most_ranks(variant).items() if ranks < fewest}
 
 
 def most_training_ranks(scene: Scene) -> dict[str, int]:
@@ -240,7 +242,7 @@ def sees_pairs(scene: Scene) -> bool:
 
 def ground_truth_alone(scene: Scene) -> Scene:
     """The scene without what learns of its ground truth, which may use more ranks."""
-    return replace(scene, kernel=None, model=None, training=None, simulation=None, eulerian=None)
+    return replace(scene.without_variants, kernel=None, model=None, training=None, simulation=None, eulerian=None)
 
 
 def thick_slabs(planes: int, width: float) -> int:

@@ -109,7 +109,7 @@ def trained_scene(scene: Scene) -> Scene:
     """The scene with a rollout that evaluates the model as its training does: without skin and forcing, in its
     precision."""
     interval, training = scene.tracers.frame_interval, scene.training
-    return replace(scene, eulerian=None, simulation=Simulation(
+    return replace(scene.without_variants, eulerian=None, simulation=Simulation(
         step=interval, frame_interval=interval, turnovers=1.0, start=0.0, skin=0.0,
         precision=training.precision if training else "float32",
         integrator=training.horizons.integrator if training and training.horizons else "rk3"))
@@ -118,7 +118,8 @@ def trained_scene(scene: Scene) -> Scene:
 def spectral_scene(scene: Scene) -> Scene:
     """The scene with a rollout that does no more than find the resolved velocity of its particles."""
     interval = scene.tracers.frame_interval
-    return replace(scene, model=Model(terms=("relaxation",), path="nowhere"), training=None, eulerian=None,
+    return replace(scene.without_variants, training=None, eulerian=None,
+                   model=Model(terms=("relaxation",), path="nowhere"),
                    simulation=Simulation(step=interval, frame_interval=interval, turnovers=1.0, start=0.0, skin=0.0))
 
 

@@ -20,6 +20,7 @@ from eddies.scene.rules import quoted
 from eddies.scene.scene import Scene
 
 SECONDS = "stage_seconds.json"
+FAILURE = "failure.txt"  # why a variant failed
 MOST_CHANGES = 3  # that a refusal lists
 
 
@@ -57,11 +58,8 @@ class Work:
                               "--output")
 
 
-def find_work(stages: Sequence[str], scene: Scene, directory: Path, ranks: int | None = None) -> Work:
-    """What stages of a scene find in a run directory. One rank calls it, the directory being locked.
-
-    With `ranks`, a rollout on another number of them is no longer of use: its times are to be compared.
-    """
+def find_work(stages: Sequence[str], scene: Scene, directory: Path) -> Work:
+    """What stages of a scene find in a run directory. One rank calls it, the directory being locked."""
     done, begun, useless, lost, changes = set(), set(), set(), [], {}
     seconds = stage_seconds(directory)
     for stage in [STAGES[name] for name in stages if STAGES[name].product is not None]:
@@ -69,18 +67,14 @@ def find_work(stages: Sequence[str], scene: Scene, directory: Path, ranks: int |
         checkpoints = checkpoints_in(directory / stage.checkpoints) if stage.checkpoints else []
         of_others = checkpoints and scene.fingerprint(stage.name) not in [fingerprint for _, fingerprint in checkpoints]
         origin = product_provenance(product)
-        other_ranks = stage.name == "simulate" and ranks not in (None, origin.get("ranks"))
-        if _fits(origin, stage.name, scene) and not other_ranks:
+        if _fits(origin, stage.name, scene):
             done.add(stage.name)
             if not of_others:  # those may be gone on with by whoever wants to replace the product
                 useless.add(stage.name)
             continue
         if product.is_file() and not product.is_symlink():
             lost.append(stage.file + _cost(origin, seconds.get(stage.name)))
-            differ = changed_settings(stage, origin.get("scene"), scene.to_toml())
-            if origin and other_ranks:
-                differ.append(f"ranks = {origin['ranks']}, now {ranks}")
-            changes |= dict.fromkeys(differ)
+            changes |= dict.fromkeys(changed_settings(stage, origin.get("scene"), scene.to_toml()))
         if checkpoints and not of_others:
             begun.add(stage.name)
         if of_others:

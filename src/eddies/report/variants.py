@@ -1,4 +1,4 @@
-"""The page of a comparison: error against run time, with what nothing else beats, and all numbers in tables."""
+"""Error against run time of the variants of a scene: what nothing else beats, and all numbers in tables."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,49 +11,46 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
 from eddies.analysis.pareto import cheapest_grid, pareto_front, verdict
-from eddies.measures import DRAWN, MEASURES, SHOWN, is_error
+from eddies.measures import DRAWN, MEASURES, SHOWN
 from eddies.report.figures import DNS, FILTERED, FOURTH, GUIDE, MODEL, SECOND, THIRD, TRUTH, letter, panels, styled
 from eddies.report.labels import fix_layout, place_labels
-from eddies.report.page import Metric, RunRecord, Section
+from eddies.report.page import Metric, Section
 
 Row = Mapping[str, Any]
 
+KEY = "variants"
 COST = "wall_seconds"
 LOOKS = list(zip((MODEL, TRUTH, SECOND, FOURTH, THIRD, DNS, FILTERED), "os^DvPX"))
+# Of [simulation] method, in the legend of figures.
+METHODS = {"learned": "particle model", "eulerian": "coarse grid", "none": "no force"}
 # Columns of the tables of the page: key in the rows, words. Measures come before them.
 COSTS = {"wall_seconds": "wall s per T", "wall_seconds_low": "lower quartile", "wall_seconds_high": "upper quartile",
          "core_seconds": "core s per T", "seconds_per_step": "s per step", "time_step": "time step",
-         "training_seconds": "training (s)"}
+         "ranks": "ranks", "training_seconds": "training (s)"}
 
 
 @dataclass(frozen=True)
 class ErrorAgainstTime:
     """What is drawn: a row of numbers by key for every variant, None where there is none.
 
-    subject: name of the variant that the summary is about; baselines: the group that it is measured against; columns:
-    the measures that are asked for, if any are.
+    subject: name of the variant that is looked at; every other one is a rival.
     """
 
     rows: Sequence[Row]
     subject: str
-    baselines: str
-    columns: Sequence[str] | None = None
-
-    @property
-    def measures(self) -> dict[str, str]:
-        """Those of the table, with their words."""
-        return {name: MEASURES[name] for name in self.columns or SHOWN}
 
     @property
     def drawn(self) -> list[str]:
-        """Those of the figures: what is asked for and an error."""
-        return [name for name in self.columns or DRAWN if is_error(name)]
+        """Those of the measures DRAWN that a row has; of rollouts shorter than T/2 the velocity error at their end."""
+        short = not self.finished("velocity_error_half")
+        wanted = ["velocity_error_end" if short and name == "velocity_error_half" else name for name in DRAWN]
+        return [name for name in wanted if self.finished(name)]
 
     @property
     def looks(self) -> dict[str, tuple[str, str]]:
-        """Colour and marker of every group, in order of appearance."""
-        groups = dict.fromkeys(row["group"] for row in self.rows)
-        return {group: LOOKS[number % len(LOOKS)] for number, group in enumerate(groups)}
+        """Colour and marker of every method, in order of appearance."""
+        methods = dict.fromkeys(row["method"] for row in self.rows)
+        return {method: LOOKS[number % len(LOOKS)] for number, method in enumerate(methods)}
 
     @property
     def summary(self) -> list[str]:
@@ -61,9 +58,9 @@ class ErrorAgainstTime:
         unstable counts as without numbers."""
         numbers = [row if is_stable(row) else {**row, **dict.fromkeys(self.drawn)} for row in self.rows]
         subject = next(row for row in numbers if row["name"] == self.subject)
-        others = [row for row in numbers if row["group"] == self.baselines and row is not subject]
+        others = [row for row in numbers if row is not subject]
         sentences = verdict(subject, others, COST, {key: MEASURES[key] for key in self.drawn})
-        grids = [row for row in numbers if row["method"] == "eulerian" and is_stable(row) and row is not subject]
+        grids = [row for row in others if row["method"] == "eulerian" and is_stable(row)]
         if grids and is_stable(subject):
             sentences.append(cheapest_grid(subject, grids, COST, _times_of_errors(subject)))
         return [sentence for sentence in sentences if sentence]
@@ -89,54 +86,35 @@ def is_stable(row: Row) -> bool:
     return row["status"] == "complete"
 
 
-def sections(table: ErrorAgainstTime, turnovers: float) -> list[Section]:
-    """The parts of the page: figures with the summary, then tables."""
-    first = Section(
-        "error-against-time", "Error against run time", " ".join(table.summary),
-        notices=[_notice(row) for row in table.rows if not is_stable(row) or row[COST] is None])
-    note = ("Wall seconds of a turnover T, with quartiles of the time of a step as bars; errors with their standard "
-            "deviation over realisations, if there are several. Line: what nothing else beats in both. Crosses at the "
-            "top: became unstable, at the time given. ")
-    for measure in table.drawn:
-        first.add_figure(measure.replace("_", "-"), f"Run time and {MEASURES[measure]}",
-                         scatter(table, [measure]), note + _caption(table, measure))
-    overview = Section("overview", "All of these measures")
-    if table.drawn:
-        overview.add_figure("error-against-run-time", "Error against run time", scatter(table, table.drawn), note)
-    errors = {**table.measures, "end": "time of the end (T)", "stopped_at": "unstable at (T)"}
-    return [first, overview, _table("errors", "Errors", table.rows, errors,
-                                    "Spectrum, energy, counts and KL divergences (nats) are those at the end, "
-                                    "Lagrangian statistics those until then, of the stable variants alone; "
-                                    f"{turnovers:g} turnovers were asked for."),
-            _table("cost", "Cost", table.rows, COSTS, "T is the eddy turnover time when the tracers start.")]
+def section(table: ErrorAgainstTime, notes: Sequence[str] = ()) -> Section:
+    """The part of the page: what the subject is worth, the figure, a table of errors and costs.
+
+    notes: sentences that a reader has to know of the numbers.
+    """
+    shown = [key for key in SHOWN if any(row[key] is not None for row in table.rows)]
+    columns = {**{key: MEASURES[key] for key in shown}, "end": "time of the end (T)", "stopped_at": "unstable at (T)",
+               **COSTS}
+    metrics = [Metric(row["name"], row["label"], {words: _with_spread(row, key) for key, words in columns.items()})
+               for row in table.rows]
+    unfinished = [_notice(row) for row in table.rows if not is_stable(row) or row[COST] is None]
+    part = Section(KEY, "Error against run time", " ".join([*table.summary, *notes, CAPTION]), notices=unfinished,
+                   metrics=metrics)
+    if len(table.rows) > 1 and table.drawn:
+        part.add_figure("error-against-run-time", "Error against run time", scatter(table, table.drawn), LEGEND)
+    return part
 
 
-def run_record(name: str, title: str, text: str, machine: Mapping[str, Any]) -> RunRecord:
-    """What was compared where: one line for the machine."""
-    libraries = ", ".join(f"{library} {version}" for library, version in machine["libraries"].items())
-    keys = {"processor": "processor", "cores": "cores", "ranks": "ranks", "threads_per_rank": "threads a rank",
-            "device": "device", "date": "date", "eddies": "eddies", "commit": "commit"}
-    row = [str(machine[key]) for key in keys]
-    return RunRecord(name, title, text, [(*keys.values(), "libraries"), (*row, libraries)])
+LEGEND = ("Wall seconds of a turnover T, with quartiles of the time of a step as bars; errors with their standard "
+          "deviation over realisations, if there are several. Line: what nothing else beats in both. Crosses at the "
+          "top: became unstable, at the time given.")
+CAPTION = ("In the table, spectrum, energy and KL divergences (nats) are those at the end of the rollout, of stable "
+           "variants alone; T is the eddy turnover time when the tracers start.")
 
 
 def _notice(row: Row) -> str:
     when = "" if row["stopped_at"] is None else f" (at {row['stopped_at']:.3g} T)"
     untimed = "; too few steps to time one" if row[COST] is None and not row["status"].startswith("failed") else ""
     return f"{row['name']}{when}: {row['status']}{untimed}"
-
-
-def _caption(table: ErrorAgainstTime, measure: str) -> str:
-    rows = table.finished(measure)
-    front = pareto_front([row[COST] for row in rows], [row[measure] for row in rows])
-    named = ", ".join(f"{row['name']} ({row[COST]:.3g} s, {row[measure]:.3g})" for row in (rows[i] for i in front))
-    return f"On it: {named}." if named else "No variant has a number."
-
-
-def _table(key: str, title: str, rows: Sequence[Row], columns: Mapping[str, str], text: str) -> Section:
-    metrics = [Metric(row["name"], row["name"], {words: _with_spread(row, column) for column, words in columns.items()})
-               for row in rows]
-    return Section(key, title, text, metrics=metrics)
 
 
 def _with_spread(row: Row, column: str) -> Any:
@@ -156,8 +134,8 @@ def scatter(table: ErrorAgainstTime, measures: Sequence[str]) -> Figure:
     for axis, measure in zip(axes.flat, measures):
         _draw_panel(axis, table, measure)
     letter(axes.flat[:len(measures)])
-    styles = [Line2D([], [], color=colour, marker=marker, linestyle="", label=group)
-              for group, (colour, marker) in table.looks.items()]
+    styles = [Line2D([], [], color=colour, marker=marker, linestyle="", label=METHODS.get(method, method))
+              for method, (colour, marker) in table.looks.items()]
     if table.stopped():
         styles.append(Line2D([], [], color=DNS, marker="x", linestyle="", label="unstable, at this time"))
     styles.append(Line2D([], [], color=GUIDE, linestyle="--", label="Pareto front"))
@@ -174,7 +152,7 @@ def _draw_panel(axis: Axes, table: ErrorAgainstTime, measure: str) -> None:
     axis.set_yscale("log")
     _set_limits(axis, rows, stopped, measure)
     for row in rows:
-        colour, marker = table.looks[row["group"]]
+        colour, marker = table.looks[row["method"]]
         chosen = row["name"] == table.subject
         bars = [[row[COST] - row["wall_seconds_low"]], [row["wall_seconds_high"] - row[COST]]]
         spread = row.get(f"{measure}_spread") or 0.0
@@ -183,7 +161,7 @@ def _draw_panel(axis: Axes, table: ErrorAgainstTime, measure: str) -> None:
         axis.errorbar(row[COST], row[measure], [[down], [spread]], np.maximum(bars, 0), color=colour, marker=marker,
                       elinewidth=1, markersize=9 if chosen else 6, markeredgecolor=DNS if chosen else colour, zorder=4)
     for row in stopped:
-        axis.plot(row[COST], _top(axis), color=table.looks[row["group"]][0], marker="x", markersize=7,
+        axis.plot(row[COST], _top(axis), color=table.looks[row["method"]][0], marker="x", markersize=7,
                   markeredgewidth=1.8, zorder=4)
     front = pareto_front([row[COST] for row in rows], [row[measure] for row in rows])
     axis.plot([rows[index][COST] for index in front], [rows[index][measure] for index in front], color=GUIDE,

@@ -4,22 +4,23 @@ import numpy as np
 import pytest
 
 from eddies.measures import DRAWN, MEASURES, SHOWN
-from eddies.report.comparison import ErrorAgainstTime, in_symbols, scatter, sections
+from eddies.report.variants import ErrorAgainstTime, in_symbols, scatter, section
 from eddies.report.figures import panels, styled
 from eddies.report.labels import fix_layout, place_labels
 
 
-def row(name, seconds, error, group="model", status="complete", stopped_at=None, method="learned"):
-    return {"name": name, "group": group, "method": method, "status": status, "stopped_at": stopped_at, "end": 1.0,
+def row(name, seconds, error, status="complete", stopped_at=None, method="learned"):
+    return {"name": name, "label": name, "method": method, "ranks": 1,
+            "status": status, "stopped_at": stopped_at, "end": 1.0,
             "wall_seconds": seconds, "wall_seconds_low": seconds and 0.9 * seconds,
             "wall_seconds_high": seconds and 1.2 * seconds, "core_seconds": seconds,
             "seconds_per_step": 0.1, "time_step": 0.02, "training_seconds": None, **dict.fromkeys(MEASURES, error)}
 
 
-ROWS = [row("learned", 20.0, 0.1), row("none", 1.0, 0.5, "baseline"), row("slow", 90.0, 0.2),
-        row("sph", 50.0, None, "baseline", "stopped: step 9, rank 0", 0.37),
-        row("refused", None, None, "baseline", "failed: too few slabs")]
-TABLE = ErrorAgainstTime(ROWS, "learned", "baseline")
+ROWS = [row("learned", 20.0, 0.1), row("none", 1.0, 0.5), row("slow", 90.0, 0.2),
+        row("sph", 50.0, None, "stopped: step 9, rank 0", 0.37),
+        row("refused", None, None, "failed: too few slabs")]
+TABLE = ErrorAgainstTime(ROWS, "learned")
 
 
 @styled
@@ -67,53 +68,54 @@ def test_front_joins_what_nothing_beats():
 
 def test_a_measure_that_nobody_has_leaves_an_empty_panel():
     rows = [row("learned", 20.0, None)]
-    assert texts(scatter(ErrorAgainstTime(rows, "learned", "baseline"), DRAWN).axes[0]) == set()
+    assert texts(scatter(ErrorAgainstTime(rows, "learned"), DRAWN).axes[0]) == set()
 
 
 def test_page_tells_what_failed_and_what_the_model_is_worth():
-    first, _, errors, cost = sections(TABLE, 1.0)
-    assert first.notices == ["sph (at 0.37 T): stopped: step 9, rank 0", "refused: failed: too few slabs"]
-    assert "learned is worth its cost in velocity error at t_η (0.1, 3 of 3 baselines beaten" in first.text
-    assert [metric.label for metric in errors.metrics] == [r["name"] for r in ROWS]
-    assert cost.metrics[0].value["wall s per T"] == 20.0
-    assert list(errors.metrics[0].value)[:-2] == [MEASURES[name] for name in SHOWN]
+    part = section(TABLE, ["A note."])
+    assert part.notices == ["sph (at 0.37 T): stopped: step 9, rank 0", "refused: failed: too few slabs"]
+    assert "learned is worth its cost in velocity error at t_η (0.1, 4 of 4 others beaten" in part.text
+    assert "A note." in part.text and [figure.name for figure in part.illustrations] == ["error-against-run-time"]
+    assert [metric.label for metric in part.metrics] == [r["name"] for r in ROWS]
+    assert part.metrics[0].value["wall s per T"] == 20.0
+    assert list(part.metrics[0].value)[:len(SHOWN)] == [MEASURES[name] for name in SHOWN]
 
 
-def test_measures_that_are_asked_for_are_shown_and_of_them_errors_drawn():
-    asked = ["tetrad_size_error", "count_variance_ratio", "qr_kl", "qr_kl_floor", "velocity_kl"]
-    first, overview, errors, _ = sections(ErrorAgainstTime(ROWS, "learned", "baseline", asked), 1.0)
-    assert list(errors.metrics[0].value)[:-2] == [MEASURES[name] for name in asked]
-    assert [figure.name for figure in first.illustrations] == ["tetrad-size-error", "qr-kl", "velocity-kl"]
-    assert len(overview.illustrations[0].image.axes) == 3 and "in size of tetrads" in first.text
-    first, overview, *_ = sections(ErrorAgainstTime(ROWS, "learned", "baseline", ["energy_ratio"]), 1.0)
-    assert not first.illustrations and not overview.illustrations
+def test_a_measure_that_no_variant_has_is_no_column():
+    rows = [{**each, "qr_kl": None} for each in ROWS]
+    assert MEASURES["qr_kl"] not in section(ErrorAgainstTime(rows, "learned")).metrics[0].value
+
+
+def test_one_variant_has_a_row_and_no_figure():
+    part = section(ErrorAgainstTime(ROWS[:1], "learned"))
+    assert part.text.startswith("No other method was run.") and not part.illustrations and len(part.metrics) == 1
 
 
 def test_rows_without_a_time_say_why():
-    untimed = [row("learned", None, 0.1), row("sph", None, None, "baseline", "stopped: step 1", 0.0)]
-    first, *_ = sections(ErrorAgainstTime(untimed, "learned", "baseline"), 1.0)
-    assert first.notices == ["learned: complete; too few steps to time one",
-                             "sph (at 0 T): stopped: step 1; too few steps to time one"]
+    untimed = [row("learned", None, 0.1), row("sph", None, None, "stopped: step 1", 0.0)]
+    part = section(ErrorAgainstTime(untimed, "learned"))
+    assert part.notices == ["learned: complete; too few steps to time one",
+                            "sph (at 0 T): stopped: step 1; too few steps to time one"]
 
 
 def test_an_unstable_model_is_worth_nothing():
     unstable = [{**ROWS[0], "status": "stopped: step 9", "stopped_at": 0.8}, *ROWS[1:]]
-    grid = row("grid", 9.0, 0.1, "baseline", method="eulerian")
-    summary = ErrorAgainstTime([*unstable, grid], "learned", "baseline").summary
+    grid = row("grid", 9.0, 0.1, method="eulerian")
+    summary = ErrorAgainstTime([*unstable, grid], "learned").summary
     assert summary[0] == "learned is worth its cost in no measure." and len(summary) == 2
 
 
 def test_the_summary_names_the_cheapest_grid_that_would_do():
     """Complete grids alone, at T/2 and at the end; where that is T/2 too it is said once."""
-    grids = [row("grid-24", 2.0, 0.2, "baseline", method="eulerian"),
-             row("grid-48", 9.0, 0.1, "grid", method="eulerian"),
-             row("unstable", 1.0, 0.05, "baseline", "stopped: step 9", 0.8, method="eulerian")]
-    found = ErrorAgainstTime(ROWS + grids, "learned", "baseline").summary
+    grids = [row("grid-24", 2.0, 0.2, method="eulerian"),
+             row("grid-48", 9.0, 0.1, method="eulerian"),
+             row("unstable", 1.0, 0.05, "stopped: step 9", 0.8, method="eulerian")]
+    found = ErrorAgainstTime(ROWS + grids, "learned").summary
     assert len(found) == 3 and found[2] == (
         "The cheapest grid that keeps the velocity error after T/2 and 1 T at or below that of learned (0.1, 0.1) is "
         "grid-48 (0.1, 0.1), at 0.45 of its cost.")
     halves = [{**each, "end": 0.501} for each in ROWS + grids[:1]]
-    assert ErrorAgainstTime(halves, "learned", "baseline").summary[2] == (
+    assert ErrorAgainstTime(halves, "learned").summary[2] == (
         "No grid keeps the velocity error after T/2 at or below that of learned (0.1).")
     assert len(TABLE.summary) == 2
 
@@ -125,10 +127,9 @@ def test_symbols_are_drawn_as_formulas(measure):
 
 def test_spreads_are_bars_and_stand_in_the_table():
     rows = [{**ROWS[0], "velocity_error_early_spread": 0.04}, ROWS[1]]
-    table = ErrorAgainstTime(rows, "learned", "baseline")
+    table = ErrorAgainstTime(rows, "learned")
     bars = [bar.get_segments()[0][:, 1] for container in scatter(table, ["velocity_error_early"]).axes[0].containers
             for bar in container.lines[2][1:]]
     assert bars[0].tolist() == pytest.approx([0.06, 0.14]) and bars[1].tolist() == pytest.approx([0.5, 0.5])
-    (errors,) = (part for part in sections(table, 1.0) if part.key == "errors")
-    shown = [metric.value["velocity error at t_η"] for metric in errors.metrics]
+    shown = [metric.value["velocity error at t_η"] for metric in section(table).metrics]
     assert shown == ["0.1 ± 0.04", 0.5]

@@ -1,0 +1,220 @@
+"""A scene with variants from end to end, on a scene even smaller than tiny; and the plan of its steps."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+import eddies
+from eddies.io.hdf5 import open_product, read_attributes
+from eddies.io.trajectories import Trajectory
+from eddies.io.weights import load_weights
+from eddies.scene.scene import load_scene
+from eddies.workflows.variants import rollouts, steps
+
+SMALLER = ["flow.cells=16", "flow.viscosity=0.1", "spin_up.turnovers=0.3", "tracers.particles_per_side=8",
+           "tracers.field_cells=12", "tracers.frame_interval=0.1", "tracers.field_every=1", "kernel.neighbors=30",
+           "kernel.steps=4", "training.frames=3", "training.steps=6", "training.combined_steps=2", "training.batch=64",
+           "simulation.step=0.05", "simulation.frame_interval=0.2", "simulation.turnovers=0.25"]
+VARIANTS = """
+[variant.learned]
+[variant.longer-steps]
+simulation.step = 0.1
+[variant.no-force]
+simulation.method = "none"
+[variant.stops]
+simulation.method = "none"
+simulation.injection = 1e5
+"""
+UNSEEN = """
+[variant.learned]
+[variant.grid]
+simulation.method = "eulerian"
+eulerian.cells = 12
+"""
+
+
+def run_cli(*arguments):
+    from eddies.cli import main
+    return main([str(argument) for argument in arguments])
+
+
+@pytest.fixture
+def folder(comm, tmp_path, monkeypatch):
+    """A folder with a scene to be the base, to work in."""
+    if comm.rank == 0:
+        (tmp_path / "base.toml").write_text(load_scene("tiny", [*SMALLER, "name=base"]).to_toml())
+        (tmp_path / "small.toml").write_text('base = "base.toml"\ntitle = "small"\n' + VARIANTS)
+        (tmp_path / "unseen.toml").write_text('base = "base.toml"\nrealisations = [5, 6]\n' + UNSEEN)
+    comm.Barrier()
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def rows_of(output):
+    record = json.loads((output / "report/variants.json").read_text())
+    with open(output / "report/variants.csv", newline="") as file:
+        assert [row["name"] for row in csv.DictReader(file)] == [row["name"] for row in record["rows"]]
+    return record, {row["name"]: row for row in record["rows"]}
+
+
+def planned(scene, stages, names=()):
+    return [(str(step.directory), step.stages, {stage: str(holder) for stage, holder in step.links.items()})
+            for step in steps(scene, stages, scene.directory, names)]
+
+
+@pytest.mark.mpi(1)
+def test_steps_of_a_scene(folder):
+    plain, small, unseen = (load_scene(f"{name}.toml") for name in ("base", "small", "unseen"))
+    every = ("dns", "train-kernel", "train", "simulate", "report")
+    assert planned(plain, every) == [("runs/base", every[:-1], {})]
+    shared = {"dns": "runs/small", "train-kernel": "runs/small"}
+    assert planned(small, every) == [
+        ("runs/small", ("dns", "train-kernel"), {}), ("runs/small/learned", ("train",), shared),
+        ("runs/small/learned", ("simulate",), shared),
+        ("runs/small/longer-steps", ("simulate",), {**shared, "train": "runs/small/learned"}),
+        ("runs/small/no-force", ("simulate",), shared), ("runs/small/stops", ("simulate",), shared)]
+    assert planned(small, ("train",), ["longer-steps"]) == [("runs/small/longer-steps", ("train",), shared)]
+    where = [(str(directory), stages) for directory, stages, _ in planned(unseen, every)]
+    assert where == [
+        ("runs/unseen", ("dns", "train-kernel")), ("runs/unseen/realisation-5", ("dns", "train-kernel")),
+        ("runs/unseen/realisation-6", ("dns", "train-kernel")), ("runs/unseen/learned", ("train",)),
+        ("runs/unseen/learned/realisation-5", ("train", "simulate")),
+        ("runs/unseen/grid/realisation-5", ("simulate",)),
+        ("runs/unseen/learned/realisation-6", ("train", "simulate")),
+        ("runs/unseen/grid/realisation-6", ("simulate",))]
+
+
+@pytest.mark.mpi(1)
+def test_a_variant_in_another_flow_makes_its_own_ground_truth(folder):
+    (folder / "own.toml").write_text('base = "base.toml"\n[variant.a]\n[variant.b]\nflow.viscosity = 0.2\n')
+    scene = load_scene("own.toml")
+    assert ("runs/own/b", ("dns", "train-kernel", "train"), {}) in planned(scene, ("dns", "train-kernel", "train"))
+    assert [place.scene.flow.viscosity for (place,) in rollouts(scene, folder).values()] == [0.1, 0.2]
+
+
+@pytest.mark.mpi(2, timeout=300)
+@pytest.mark.usefixtures("undrawn")
+def test_variants_are_run_measured_and_kept(comm, folder, capfd):
+    out = folder / "out"
+    assert run_cli("run", "small.toml", "--output", "out") == 0
+    comm.Barrier()
+    record, rows = rows_of(out)
+    check_rows(rows)
+    assert record["machine"]["ranks"] == 2 and record["machine"]["cores"] >= 1 and record["machine"]["processor"]
+    assert 0 < record["flow"]["kolmogorov_length"] < record["flow"]["filter_width"]
+    for name in rows:
+        assert (out / name / "kernel.h5").resolve() == out / "kernel.h5" and (out / name / "scene.toml").exists()
+        assert (out / name / "report/index.html").exists()
+    assert (out / "longer-steps/model.h5").resolve() == out / "learned/model.h5"
+    assert not (out / "no-force/model.h5").exists()
+    page = (out / "report/index.html").read_text()
+    assert "stops (at 0 T): stopped: step 1" in page and "learned is worth its cost in" in page
+    assert 'href="../no-force/report/index.html"' in page
+    assert 'href="../../report/index.html"' in (out / "no-force/report/index.html").read_text()
+    metrics = eddies.open_run(out).variant("no-force").metrics
+    assert metrics["rollout"]["energy_ratio"] == pytest.approx(rows["no-force"]["energy_ratio"], rel=1e-6)
+    before = {path: path.stat().st_mtime_ns for path in out.glob("*/*.h5")}
+    capfd.readouterr()
+    comm.Barrier()
+    if comm.rank == 0:
+        (out / "no-force/rollout.h5").unlink()
+    comm.Barrier()
+    assert run_cli("run", "small.toml", "--set", "variant.longer-steps.simulation.step=0.12", "--output", "out") == 2
+    told = "longer-steps: holds work of other settings (simulation.step = 0.1, now 0.12) that would be replaced"
+    assert comm.rank > 0 or told in capfd.readouterr().err
+    assert run_cli("run", "small.toml", "--variant", "no-force", "--output", "out") == 0
+    comm.Barrier()
+    assert [str(path.relative_to(out)) for path, time in before.items() if path.stat().st_mtime_ns != time] == [
+        "no-force/rollout.h5"]
+    again = rows_of(out)[1]
+    assert all(again[name]["velocity_error_early"] == rows[name]["velocity_error_early"] for name in rows)
+
+
+def check_rows(rows):
+    learned, longer, none, stops = (rows[name] for name in ("learned", "longer-steps", "no-force", "stops"))
+    assert {row["status"] for row in (learned, longer, none)} == {"complete"}
+    assert stops["status"].startswith("stopped: step 1") and stops["stopped_at"] == 0
+    assert stops["velocity_kl"] is stops["wall_seconds"] is None
+    for row in (learned, longer, none):
+        # Of the velocity itself; the particles start from it.
+        assert 0 < row["velocity_error_early"] < 0.5 and 0.5 < row["energy_ratio"] < 2
+        assert row["wall_seconds_low"] <= row["wall_seconds"] <= row["wall_seconds_high"]
+        assert row["core_seconds"] == pytest.approx(2 * row["wall_seconds"])
+        # Of the particles that all are compared with.
+        assert row["spectrum_error_floor"] == learned["spectrum_error_floor"] < row["spectrum_error"]
+        assert row["velocity_kl_floor"] == learned["velocity_kl_floor"] and row["tetrad_size_error"] > 0
+    assert none["acceleration_error"] == 1 and none["training_seconds"] is None
+    assert learned["training_seconds"] == longer["training_seconds"] > 0
+    assert (learned["time_step"], longer["time_step"]) == (pytest.approx(0.05), pytest.approx(0.1))
+
+
+@pytest.mark.mpi(1, timeout=300)
+@pytest.mark.usefixtures("undrawn", "quick_spectra")
+def test_realisations_that_no_training_has_seen(comm, folder):
+    """One training, a rollout on each; mean and spread of two numbers are half of their sum and difference."""
+    assert run_cli("run", "unseen.toml", "--output", "out") == 0
+    out = folder / "out"
+    assert sorted(str(path.relative_to(out)) for path in out.glob("**/model.h5")) == [
+        "learned/model.h5", "learned/realisation-5/model.h5", "learned/realisation-6/model.h5"]
+    assert not (out / "learned/rollout.h5").exists()
+    weights = [load_weights(comm, path, "model")[1] for path in out.glob("**/model.h5")]
+    assert all(np.array_equal(one[name], values) for one in weights for name, values in weights[0].items())
+    record, rows = rows_of(out)
+    (summary,) = (sentence for sentence in record["summary"] if "keeps the velocity error after" in sentence)
+    assert summary in (out / "report/index.html").read_text() and rows["grid"]["method"] == "eulerian"
+    assert rows["learned"]["training_seconds"] > 0 and rows["grid"]["training_seconds"] is None
+    for name, row in rows.items():
+        assert row["realisations"] == 2 and row["status"] == "complete"
+        both = []
+        for seed in (5, 6):
+            with open_product(comm, out / name / f"realisation-{seed}/rollout.h5", "rollout") as file:
+                model, truth = (Trajectory(file, which).read(-1, "velocity") for which in ("model", "truth"))
+                # From the first frame with a filtered field on.
+                assert read_attributes(file, "rollout")["start_time"] == pytest.approx(0.1)
+            both.append(np.sum(model**2, dtype=float) / np.sum(truth**2, dtype=float))
+        assert row["energy_ratio"] == pytest.approx(np.mean(both), rel=1e-6)
+        assert row["energy_ratio_spread"] == pytest.approx(abs(both[0] - both[1]) / 2**0.5, rel=1e-4)
+        assert both[0] != both[1]
+
+
+@pytest.mark.mpi(1, 2)
+def test_variants_without_their_ground_truth_write_nothing(comm, folder, capfd):
+    assert run_cli("simulate", "small.toml", "--output", "out") == 2
+    assert comm.rank > 0 or "out/ground_truth.h5: no such file; run `eddies dns SCENE` first" in capfd.readouterr().err
+    assert not (folder / "out").exists()
+
+
+@pytest.mark.mpi(1)
+def test_realisations_that_a_variant_is_trained_on_are_refused(comm, folder, capfd):
+    truths = ["--set", 'variant.learned.training.truths=["out/realisation-5"]', "--set", "simulation.start=0.5",
+              "--set", "variant.grid.training.truths=none"]
+    assert run_cli("run", "unseen.toml", "--output", "out", *truths) == 2
+    told = "learned: is trained on out/realisation-5/ground_truth.h5, by [training] truths; leave 5 out of realisations"
+    assert told in capfd.readouterr().err
+
+
+@pytest.mark.mpi(1, 2)
+def test_a_name_that_no_variant_has_is_refused(comm, folder, capfd):
+    assert run_cli("run", "small.toml", "--variant", "no-forces", "--output", "out") == 2
+    told = 'there is no variant "no-forces"; did you mean no-force? there are: learned, longer-steps, no-force, stops'
+    assert comm.rank > 0 or told in capfd.readouterr().err
+
+
+@pytest.mark.mpi(1, 2, timeout=120)
+def test_a_variant_that_fails_does_not_end_the_others(comm, folder, capfd, monkeypatch):
+    from eddies.workflows import simulate
+    whole = simulate.run
+
+    def failing(scene, *rest):
+        if scene.name == "longer-steps":
+            raise eddies.SceneError("no such thing")
+        whole(scene, *rest)
+
+    monkeypatch.setattr(simulate, "run", failing)
+    assert run_cli("run", "small.toml", "--output", "out", "--unset", "variant.stops") == 2
+    assert comm.rank > 0 or "variants failed: longer-steps (no such thing)" in capfd.readouterr().err
+    comm.Barrier()
+    rows = rows_of(folder / "out")[1]
+    assert rows["longer-steps"]["status"] == "failed: no such thing" and rows["no-force"]["status"] == "complete"
