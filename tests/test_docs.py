@@ -14,7 +14,7 @@ from eddies.cli import main
 from eddies.cli_options import build_parser
 from eddies.scene.methods import METHODS
 from eddies.scene.model import Model, settings_class
-from eddies.scene.rules import Boolean, Bounds, Choice, Integer, Integers, Number, Numbers, Texts, quoted
+from eddies.scene.rules import Boolean, Bounds, Choice, Integer, Integers, Number, Texts, quoted
 from eddies.scene.scene import BOX_LENGTH, Scene, builtin_scenes, load_scene
 from eddies.scene.sections import Simulation
 from eddies.scene.terms import DEFAULT_PRESET, PRESETS, TERMS
@@ -154,8 +154,7 @@ def allowed(rule):
         return "`true`, `false`"
     if isinstance(rule, Texts) and words:
         return f"list of {', '.join(words)}{path}"
-    nouns = {Number: "number", Integer: "integer", Integers: "list of integers", Numbers: "list of numbers",
-             Texts: "list of texts"}
+    nouns = {Number: "number", Integer: "integer", Integers: "list of integers", Texts: "list of texts"}
     noun = nouns.get(type(rule), "text")
     symbols = {"above": ">", "at_least": "≥", "below": "<", "at_most": "≤"}
     bounds = getattr(rule, "bounds", Bounds())

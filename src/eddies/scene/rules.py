@@ -105,23 +105,6 @@ class Integers:
 
 
 @dataclass(frozen=True)
-class Numbers:
-    """A list of numbers, each within bounds; held as a tuple."""
-
-    about: str
-    bounds: Bounds = Bounds()
-
-    def accept(self, value: Any) -> tuple[float | str, ...]:
-        if not isinstance(value, (list, tuple)):
-            raise ValueError
-        return tuple(Number(self.about, self.bounds).accept(entry) for entry in value)
-
-    @property
-    def allowed(self) -> str:
-        return f"a list such as [0, 0.5] of numbers, each {self.bounds}".removesuffix(", each ")
-
-
-@dataclass(frozen=True)
 class Boolean:
     """True or false."""
 

@@ -1,7 +1,7 @@
 """What a section of a scene is: a frozen dataclass whose fields declare their keys.
 
 Every key of a scene is declared once, beside the dataclass field that holds it, by one of the functions `number`,
-`integer`, `integers`, `numbers`, `boolean`, `choice`, `named`, `text`, `directory_name` and `texts`. The declaration
+`integer`, `integers`, `boolean`, `choice`, `named`, `text`, `directory_name` and `texts`. The declaration
 carries a line on what the key means, which values it accepts, and its default; the reader, the error messages and the
 written scene all use that one declaration. It is applied where an object is made, from a TOML file or in a program.
 """
@@ -15,8 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from eddies.errors import UserError
-from eddies.scene.rules import (Boolean, Bounds, Choice, Integer, Integers, Name, Number, Numbers, Text, Texts, quoted,
-                                shortened)
+from eddies.scene.rules import Boolean, Bounds, Choice, Integer, Integers, Name, Number, Text, Texts, quoted, shortened
 
 
 # Of a key that may be left out, in place of its value: as if it were.
@@ -79,11 +78,6 @@ def integer(about: str, default: Any = MISSING, **bounds: float) -> Any:
 def integers(about: str, default: Any = MISSING, **bounds: float) -> Any:
     """Declare a dataclass field that holds a tuple of whole numbers."""
     return _declare(Integers(about, Bounds(**bounds)), default)
-
-
-def numbers(about: str, default: Any = MISSING, **bounds: float) -> Any:
-    """Declare a dataclass field that holds a tuple of real numbers."""
-    return _declare(Numbers(about, Bounds(**bounds)), default)
 
 
 def boolean(about: str, default: Any = MISSING) -> Any:
