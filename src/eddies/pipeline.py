@@ -18,7 +18,6 @@ class Stage:
         `Scene.fingerprint`.
     depends_on : all stages that its product depends on, those of its inputs included, of those that a scene has.
     checkpoints : the directory within the run directory where its checkpoints lie; None: it makes none.
-    run : where the function is that does it, run(scene, comm, directory, stop).
     """
 
     name: str
@@ -28,7 +27,6 @@ class Stage:
     reads: tuple[str, ...]
     depends_on: tuple[str, ...]
     checkpoints: str | None
-    run: str
 
     @property
     def file(self) -> str:
@@ -39,17 +37,17 @@ class Stage:
 STAGES = {stage.name: stage for stage in (
     Stage("dns", "ground truth: direct simulation, filter, tracers", "flow", "ground_truth",
           ("seed", "flow", "initial", "start", "forcing", "time", "spin_up", "tracers", "own_flow", "own_initial"),
-          (), "checkpoints", "eddies.workflows.dns:run"),
+          (), "checkpoints"),
     Stage("train-kernel", "the smoothing kernel", "kernel", "kernel", ("kernel", "window"),
-          ("dns",), "checkpoints-kernel", "eddies.workflows.train_kernel:run"),
+          ("dns",), "checkpoints-kernel"),
     Stage("train", "the model of the particles", "model", "model",
           ("device", "model", "weights", "training", "truths", "own_model"),
-          ("dns", "train-kernel"), "checkpoints-train", "eddies.workflows.train:run"),
+          ("dns", "train-kernel"), "checkpoints-train"),
     Stage("simulate", "the trained model, without the direct simulation", "simulation", "rollout",
           ("device", "simulation", "window", "truths", "eulerian", "own_simulation"),
-          ("dns", "train-kernel", "train"), "checkpoints-rollout", "eddies.workflows.simulate:run"),
+          ("dns", "train-kernel", "train"), "checkpoints-rollout"),
     Stage("report", "figures, one page and metrics.json of a run directory", None, None,
-          (), ("dns", "train-kernel", "train", "simulate"), None, "eddies.workflows.report:run_stage"),
+          (), ("dns", "train-kernel", "train", "simulate"), None),
 )}
 #: The stage that makes a kind of product.
 MAKER_OF = {stage.product: stage for stage in STAGES.values() if stage.product is not None}

@@ -38,6 +38,11 @@ from eddies.workflows.variants import Step, check_unseen, link, steps
 
 log = logging.getLogger("eddies")
 
+# Where the functions are that do the stages, each as run(scene, comm, directory, stop); imported once it is their turn.
+RUN = {"dns": "eddies.workflows.dns:run", "train-kernel": "eddies.workflows.train_kernel:run",
+       "train": "eddies.workflows.train:run", "simulate": "eddies.workflows.simulate:run",
+       "report": "eddies.workflows.report:run_stage"}
+
 
 class VariantsFailed(UserError):
     """Some variants of a scene did not come to their end."""
@@ -189,7 +194,7 @@ def run_stage(stage: Stage, scene: Scene, comm: Comm, directory: Path, stop: Sto
     """Run one stage, and record its wall time, also when it is stopped: if it was `begun` before, that is added."""
     log.info("%s: starts on %d %s", stage.name, comm.size, "rank" if comm.size == 1 else "ranks")
     start = time.perf_counter()
-    module, _, function = stage.run.partition(":")
+    module, _, function = RUN[stage.name].partition(":")
     run = getattr(import_module(module), function)
     stop.check()
     try:

@@ -9,6 +9,7 @@ from eddies.io.checkpoint import CheckpointDirectory
 from eddies.io.hdf5 import create_product
 from eddies.pipeline import STAGES
 from eddies.scene.scene import load_scene
+from eddies.stages import RUN
 from eddies.workflows.run_directory.work import WorkAtStake, find_work
 
 MAKING = ("dns", "train-kernel", "train", "simulate")
@@ -128,4 +129,4 @@ def test_a_link_is_no_work(comm, tmp_path, scene):
 def test_every_maker_has_checkpoints_of_its_own():
     folders = [STAGES[stage].checkpoints for stage in MAKING]
     assert len({*folders}) == len(MAKING) and None not in folders
-    assert all(import_module(STAGES[stage].run.partition(":")[0]) for stage in MAKING)
+    assert all(import_module(RUN[stage].partition(":")[0]) for stage in MAKING)
