@@ -9,22 +9,19 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from itertools import chain
-from typing import TYPE_CHECKING
 
 from eddies.import_path import ImportPathError, load
+from eddies.scene.parts import Parts
 from eddies.scene.rules import quoted
 from eddies.scene.sections import INITIAL_FLOWS, Eulerian, InitialFlow
 from eddies.scene.values import import_paths
-
-if TYPE_CHECKING:
-    from eddies.scene.scene import Scene
 
 # What a class of the user's must have, by the key that names it.
 REQUIRED = {"fluid": ("nonlinear", "linear", "linear_function", "combine", "compressible"), "kind": ("__call__",),
             "method": ("advance", "frame", "status", "series", "description", "has_density"), "network": ("forward",)}
 
 
-def first_inconsistency(scene: Scene) -> str | None:
+def first_inconsistency(scene: Parts) -> str | None:
     """The first problem found, or None."""
     subjects = (foreign_problems, flow_problems, initial_problems, time_problems, tracer_problems, section_problems,
                 model_problems, density_problems, support_problems, training_problems, simulation_problems,
@@ -32,7 +29,7 @@ def first_inconsistency(scene: Scene) -> str | None:
     return next(chain.from_iterable(subject(scene) for subject in subjects), None)
 
 
-def foreign_problems(scene: Scene) -> Iterator[str]:
+def foreign_problems(scene: Parts) -> Iterator[str]:
     """Import paths that lead nowhere, or to what cannot do what it is named for; those of terms are checked before."""
     sections = {"flow": scene.flow, "initial": scene.initial, "simulation": scene.simulation}
     if scene.model:
@@ -56,7 +53,7 @@ def _is_class_of(found: object, path: str) -> bool:
     return isinstance(found, type) and issubclass(found, load(path))
 
 
-def flow_problems(scene: Scene) -> Iterator[str]:
+def flow_problems(scene: Parts) -> Iterator[str]:
     """The fluid and its sound speed; forcing within the resolved scales."""
     flow = scene.flow
     if flow.compressible and flow.sound_speed is None:
@@ -69,7 +66,7 @@ def flow_problems(scene: Scene) -> Iterator[str]:
                f"up to {flow.cells / 3:.3g}; lower it or raise [flow] cells")
 
 
-def initial_problems(scene: Scene) -> Iterator[str]:
+def initial_problems(scene: Parts) -> Iterator[str]:
     """Keys that only some initial flows read; waves within the resolved scales."""
     initial, defaults = scene.initial, type(scene.initial)()
     if initial.flow.from_file and initial.path is None:
@@ -87,7 +84,7 @@ def initial_problems(scene: Scene) -> Iterator[str]:
                f"{scene.flow.cells / 3:.3g}; lower it or raise [flow] cells")
 
 
-def time_problems(scene: Scene) -> Iterator[str]:
+def time_problems(scene: Parts) -> Iterator[str]:
     """One run time, and a forcing that acts in it."""
     duration = scene.time.duration
     if scene.tracers is None and duration is None:
@@ -107,7 +104,7 @@ def time_problems(scene: Scene) -> Iterator[str]:
                "turnovers, set [tracers] forced = true, or remove [forcing]")
 
 
-def tracer_problems(scene: Scene) -> Iterator[str]:
+def tracer_problems(scene: Parts) -> Iterator[str]:
     """Stored fields no finer than the simulation; a flow that moves, and for a model one that changes."""
     tracers, initial = scene.tracers, scene.initial
     if tracers and tracers.forced and scene.forcing is None:
@@ -124,7 +121,7 @@ def tracer_problems(scene: Scene) -> Iterator[str]:
                f"{scene.flow.cells}; lower field_cells or raise cells")
 
 
-def section_problems(scene: Scene) -> Iterator[str]:
+def section_problems(scene: Parts) -> Iterator[str]:
     """Which sections need which others."""
     needs = {"kernel": ("tracers",), "model": ("tracers",), "training": ("model",), "simulation": ("tracers",)}
     if scene.needs_model:
@@ -138,7 +135,7 @@ def section_problems(scene: Scene) -> Iterator[str]:
                "with trained weights, or remove [model]")
 
 
-def model_problems(scene: Scene) -> Iterator[str]:
+def model_problems(scene: Parts) -> Iterator[str]:
     """Terms that read a density which no term gives, or that give it twice."""
     if scene.model is None:
         return
@@ -163,7 +160,7 @@ def model_problems(scene: Scene) -> Iterator[str]:
                        f"{_without_density(name, one)}")
 
 
-def density_problems(scene: Scene) -> Iterator[str]:
+def density_problems(scene: Parts) -> Iterator[str]:
     """What reads a density in an incompressible flow, which has none."""
     if scene.flow.compressible:
         return
@@ -187,7 +184,7 @@ def _without_density(name: str, settings) -> str:
     return f'remove "{name}"'
 
 
-def support_problems(scene: Scene) -> Iterator[str]:
+def support_problems(scene: Parts) -> Iterator[str]:
     """A particle must not see another one and its image: support and skin stay below half the cube."""
     if scene.tracers is None:
         return
@@ -201,7 +198,7 @@ def support_problems(scene: Scene) -> Iterator[str]:
                    "raise [tracers] particles_per_side")
 
 
-def training_problems(scene: Scene) -> Iterator[str]:
+def training_problems(scene: Parts) -> Iterator[str]:
     """Steps, rates and weights that contradict each other."""
     training = scene.training
     if training is None:
@@ -238,7 +235,7 @@ def training_problems(scene: Scene) -> Iterator[str]:
                "weight above 0, or neither")
 
 
-def simulation_problems(scene: Scene) -> Iterator[str]:
+def simulation_problems(scene: Parts) -> Iterator[str]:
     """Frames that fall on the frames of the ground truth, and on steps or between those that tell what is there."""
     simulation = scene.simulation
     if simulation is None or scene.tracers is None:
@@ -257,7 +254,7 @@ def simulation_problems(scene: Scene) -> Iterator[str]:
                "there is nothing after it; give start, or a smaller [training] window")
 
 
-def grid_problems(scene: Scene) -> Iterator[str]:
+def grid_problems(scene: Parts) -> Iterator[str]:
     """[eulerian] of another method; a coarse grid finer than what it starts from, or that takes what is not there."""
     simulation = scene.simulation
     if scene.eulerian is not None and (simulation is None or not simulation.on_grid):

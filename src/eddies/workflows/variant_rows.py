@@ -105,7 +105,7 @@ def notes(scene: Scene) -> list[str]:
         found.append(f"{', '.join(own)}: no {blank}. These are measured on what the smoothing kernel makes of the "
                      "particles; a kernel of other settings than the scene's shows another part of the flow.")
     grids = {name: (variant.eulerian or Eulerian()).cells_for(variant.tracers.filter_width)
-             for name, variant in variants.items() if variant.simulation.method == "eulerian"}
+             for name, variant in variants.items() if variant.simulation.on_grid}
     if grids:
         kept = ", ".join(f"{(cells - 1) // 3} in {name}" for name, cells in grids.items())
         found.append(f"Of a grid the 2/3 rule leaves the wavenumbers |k_i| < cells/3, at most: {kept}; k_d = "

@@ -1,0 +1,106 @@
+"""What a scene holds: its sections, and what follows from them together."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from eddies.pipeline import STAGES, Stage
+from eddies.scene.model import Model
+from eddies.scene.sections import (DEFAULT_WINDOW, NEIGHBORS, Eulerian, Flow, Forcing, Initial, Kernel, Simulation,
+                                   SpinUp, Time, Tracers, Training)
+from eddies.scene.values import Section, choice, directory_name, integer, integers, section, text
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parts(Section):
+    """The keys and sections of a scene; see Scene."""
+
+    name: str = directory_name("names the run; absent: the file's name", default="scene")
+    title: str = text("one line for lists and reports", default="untitled scene")
+    label: str | None = text("of a variant in tables and figures; absent: its name", default=None)
+    seed: int = integer("of every random number", default=1, at_least=0, at_most=10**18)
+    realisations: tuple[int, ...] | None = integers(
+        "seeds of further ground truths, which no training sees: rollouts are made on each from its beginning; absent: "
+        "on the ground truth of the scene, after the training window", default=None, at_least=0)
+    device: str = choice("where particles are computed", "cpu", "cuda", default="cpu")
+    flow: Flow = section(Flow)
+    initial: Initial = section(Initial, default=Initial())
+    forcing: Forcing | None = section(Forcing, default=None)
+    time: Time = section(Time, default=Time())
+    spin_up: SpinUp | None = section(SpinUp, default=None)
+    tracers: Tracers | None = section(Tracers, default=None)
+    kernel: Kernel | None = section(Kernel, default=None)
+    model: Model | None = section(Model, default=None)
+    training: Training | None = section(Training, default=None)
+    simulation: Simulation | None = section(Simulation, default=None)
+    eulerian: Eulerian | None = section(Eulerian, default=None)
+
+    @classmethod
+    def section_name(cls) -> str:
+        """None: the keys of a scene stand outside all sections."""
+        return ""
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """The stages that this scene asks for, in the order in which they run."""
+        learned = self.simulation is None or self.needs_model
+        return tuple(stage.name for stage in STAGES.values() if (learned or stage.name != "train")
+                     and (stage.section is None or getattr(self, stage.section) is not None))
+
+    @property
+    def needs_model(self) -> bool:
+        """Whether the rollout needs a trained model: to be moved by it, or for a coefficient of a coarse grid."""
+        on_grid = self.eulerian is not None and self.eulerian.form.learned
+        return self.simulation is not None and ("model" in self.simulation.needs or on_grid)
+
+    def inputs(self, stage: str) -> tuple[Stage, ...]:
+        """The stages from whose products a stage makes its own: of those that it depends on the ones the scene has."""
+        return tuple(STAGES[name] for name in STAGES[stage].depends_on if name in self.stages)
+
+    @property
+    def window(self) -> float:
+        """Fraction of the ground truth that kernel and model may see; with a kernel alone the default of [training]."""
+        return self.training.window if self.training else DEFAULT_WINDOW
+
+    @property
+    def directory(self) -> Path:
+        """The run directory, unless another is given."""
+        return Path("runs") / self.name
+
+    def seen_in(self, directory: Path) -> float:
+        """Fraction of the ground truth of a run directory that the model was trained on; 0 without [training], as with
+        [model] path, and where other ground truths are."""
+        if self.training is None:
+            return 0.0
+        own = (directory / STAGES["dns"].file).resolve()
+        others = self.training.truths is not None and own not in [path.resolve() for path in self.training.truth_files]
+        return 0.0 if others else self.training.window
+
+    @property
+    def injects(self) -> bool:
+        """Whether there is a rollout whose particles are forced."""
+        injection = self.simulation.injection if self.simulation else "none"
+        return bool(self.tracers and self.tracers.forced) if injection == "truth" else injection != "none"
+
+    @property
+    def resolves(self) -> bool:
+        """Whether the model is evaluated with what a grid resolves of the velocity: its terms read that, or it is
+        forced."""
+        return bool(self.model and "resolved" in self.model.reads or self.tracers and self.tracers.forced
+                    or self.injects)
+
+    @property
+    def kernel_support(self) -> float | None:
+        """Radius h of the smoothing kernel; None without [kernel]."""
+        return self.tracers.radius_of(self.kernel.neighbors) if self.kernel and self.tracers else None
+
+    @property
+    def neighbors(self) -> float:
+        """Mean number of particles within the radius of interaction of pairs."""
+        if self.model and self.model.neighbors is not None:
+            return self.model.neighbors
+        return self.kernel.neighbors if self.kernel else NEIGHBORS
+
+    @property
+    def interaction_radius(self) -> float:
+        """Radius within which pairs of particles act on each other; 0 without [tracers]."""
+        return self.tracers.radius_of(self.neighbors) if self.tracers else 0.0
