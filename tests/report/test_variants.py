@@ -9,8 +9,8 @@ from eddies.report.figures import panels, styled
 from eddies.report.labels import fix_layout, place_labels
 
 
-def row(name, seconds, error, status="complete", stopped_at=None, method="learned"):
-    return {"name": name, "label": name, "method": method, "ranks": 1,
+def row(name, seconds, error, status="complete", stopped_at=None, kind="particle model"):
+    return {"name": name, "label": name, "kind": kind, "on_grid": kind == "coarse grid", "ranks": 1,
             "status": status, "stopped_at": stopped_at, "end": 1.0,
             "wall_seconds": seconds, "wall_seconds_low": seconds and 0.9 * seconds,
             "wall_seconds_high": seconds and 1.2 * seconds, "core_seconds": seconds,
@@ -100,16 +100,16 @@ def test_rows_without_a_time_say_why():
 
 def test_an_unstable_model_is_worth_nothing():
     unstable = [{**ROWS[0], "status": "stopped: step 9", "stopped_at": 0.8}, *ROWS[1:]]
-    grid = row("grid", 9.0, 0.1, method="eulerian")
+    grid = row("grid", 9.0, 0.1, kind="coarse grid")
     summary = ErrorAgainstTime([*unstable, grid], "learned").summary
     assert summary[0] == "learned is worth its cost in no measure." and len(summary) == 2
 
 
 def test_the_summary_names_the_cheapest_grid_that_would_do():
     """Complete grids alone, at T/2 and at the end; where that is T/2 too it is said once."""
-    grids = [row("grid-24", 2.0, 0.2, method="eulerian"),
-             row("grid-48", 9.0, 0.1, method="eulerian"),
-             row("unstable", 1.0, 0.05, "stopped: step 9", 0.8, method="eulerian")]
+    grids = [row("grid-24", 2.0, 0.2, kind="coarse grid"),
+             row("grid-48", 9.0, 0.1, kind="coarse grid"),
+             row("unstable", 1.0, 0.05, "stopped: step 9", 0.8, kind="coarse grid")]
     found = ErrorAgainstTime(ROWS + grids, "learned").summary
     assert len(found) == 3 and found[2] == (
         "The cheapest grid that keeps the velocity error after T/2 and 1 T at or below that of learned (0.1, 0.1) is "

@@ -21,8 +21,6 @@ Row = Mapping[str, Any]
 KEY = "variants"
 COST = "wall_seconds"
 LOOKS = list(zip((MODEL, TRUTH, SECOND, FOURTH, THIRD, DNS, FILTERED), "os^DvPX"))
-# Of [simulation] method, in the legend of figures.
-METHODS = {"learned": "particle model", "eulerian": "coarse grid", "none": "no force"}
 # Columns of the tables of the page: key in the rows, words. Measures come before them.
 COSTS = {"wall_seconds": "wall s per T", "wall_seconds_low": "lower quartile", "wall_seconds_high": "upper quartile",
          "core_seconds": "core s per T", "seconds_per_step": "s per step", "time_step": "time step",
@@ -48,9 +46,9 @@ class ErrorAgainstTime:
 
     @property
     def looks(self) -> dict[str, tuple[str, str]]:
-        """Colour and marker of every method, in order of appearance."""
-        methods = dict.fromkeys(row["method"] for row in self.rows)
-        return {method: LOOKS[number % len(LOOKS)] for number, method in enumerate(methods)}
+        """Colour and marker of every kind of method, in order of appearance."""
+        kinds = dict.fromkeys(row["kind"] for row in self.rows)
+        return {kind: LOOKS[number % len(LOOKS)] for number, kind in enumerate(kinds)}
 
     @property
     def summary(self) -> list[str]:
@@ -60,7 +58,7 @@ class ErrorAgainstTime:
         subject = next(row for row in numbers if row["name"] == self.subject)
         others = [row for row in numbers if row is not subject]
         sentences = verdict(subject, others, COST, {key: MEASURES[key] for key in self.drawn})
-        grids = [row for row in others if row["method"] == "eulerian" and is_stable(row)]
+        grids = [row for row in others if row["on_grid"] and is_stable(row)]
         if grids and is_stable(subject):
             sentences.append(cheapest_grid(subject, grids, COST, _times_of_errors(subject)))
         return [sentence for sentence in sentences if sentence]
@@ -134,8 +132,8 @@ def scatter(table: ErrorAgainstTime, measures: Sequence[str]) -> Figure:
     for axis, measure in zip(axes.flat, measures):
         _draw_panel(axis, table, measure)
     letter(axes.flat[:len(measures)])
-    styles = [Line2D([], [], color=colour, marker=marker, linestyle="", label=METHODS.get(method, method))
-              for method, (colour, marker) in table.looks.items()]
+    styles = [Line2D([], [], color=colour, marker=marker, linestyle="", label=kind)
+              for kind, (colour, marker) in table.looks.items()]
     if table.stopped():
         styles.append(Line2D([], [], color=DNS, marker="x", linestyle="", label="unstable, at this time"))
     styles.append(Line2D([], [], color=GUIDE, linestyle="--", label="Pareto front"))
@@ -152,7 +150,7 @@ def _draw_panel(axis: Axes, table: ErrorAgainstTime, measure: str) -> None:
     axis.set_yscale("log")
     _set_limits(axis, rows, stopped, measure)
     for row in rows:
-        colour, marker = table.looks[row["method"]]
+        colour, marker = table.looks[row["kind"]]
         chosen = row["name"] == table.subject
         bars = [[row[COST] - row["wall_seconds_low"]], [row["wall_seconds_high"] - row[COST]]]
         spread = row.get(f"{measure}_spread") or 0.0
@@ -161,7 +159,7 @@ def _draw_panel(axis: Axes, table: ErrorAgainstTime, measure: str) -> None:
         axis.errorbar(row[COST], row[measure], [[down], [spread]], np.maximum(bars, 0), color=colour, marker=marker,
                       elinewidth=1, markersize=9 if chosen else 6, markeredgecolor=DNS if chosen else colour, zorder=4)
     for row in stopped:
-        axis.plot(row[COST], _top(axis), color=table.looks[row["method"]][0], marker="x", markersize=7,
+        axis.plot(row[COST], _top(axis), color=table.looks[row["kind"]][0], marker="x", markersize=7,
                   markeredgewidth=1.8, zorder=4)
     front = pareto_front([row[COST] for row in rows], [row[measure] for row in rows])
     axis.plot([rows[index][COST] for index in front], [rows[index][measure] for index in front], color=GUIDE,

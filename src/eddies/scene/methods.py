@@ -17,14 +17,20 @@ class Method:
     ----------
     needs : a trained "model"; the "density" of the ground truth; "pairs", neighbours within the radius of interaction.
         A class of the user's says so in its attribute `needs`.
+    title : in tables and figures.
     on_grid : whether a flow on a coarse grid moves them, as [eulerian] says, in place of rates of their own.
     """
 
     needs: tuple[str, ...] = ()
+    title: str = "own method"
     on_grid: bool = False
 
 
-METHODS = {"learned": Method(needs=("model",)), "none": Method(), "eulerian": Method(on_grid=True)}
+METHODS = {
+    "learned": Method(needs=("model",), title="particle model"),
+    "none": Method(title="no force"),
+    "eulerian": Method(title="coarse grid", on_grid=True),
+}
 
 
 def method_of(name: str) -> Method:
@@ -38,4 +44,4 @@ def method_of(name: str) -> Method:
     if isinstance(needs, str) or not set(needs) <= set(NEEDS):
         raise SceneError(f"[simulation] method: {quoted(name)}: needs = {quoted(needs)}: must be a tuple of any of "
                          f"{', '.join(map(quoted, NEEDS))}")
-    return Method(tuple(needs))
+    return Method(tuple(needs), title=name.rpartition(":")[2])

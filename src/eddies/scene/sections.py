@@ -278,6 +278,11 @@ class Simulation(Section):
         return method_of(self.method).needs
 
     @property
+    def title(self) -> str:
+        """The method in tables and figures."""
+        return method_of(self.method).title
+
+    @property
     def on_grid(self) -> bool:
         """Whether a flow on a coarse grid moves the particles."""
         return method_of(self.method).on_grid

@@ -27,8 +27,8 @@ COST = ("seconds_per_step", "time_step", "wall_seconds", "wall_seconds_low", "wa
         "ranks")
 # Measured on gradients that the kernel makes of the particles, of the model and of the truth.
 THROUGH_KERNEL = ("qr_kl", "qr_kl_floor")
-COLUMNS = ("name", "label", "method", "status", "stopped_at", "realisations", *MEASURES, "end", *COST,
-           "training_seconds", *(f"{measure}_spread" for measure in MEASURES), "settings")
+COLUMNS = ("name", "label", "method", "kind", "on_grid", "status", "stopped_at", "realisations", *MEASURES, "end",
+           *COST, "training_seconds", *(f"{measure}_spread" for measure in MEASURES), "settings")
 MODEL, ROLLOUT = STAGES["train"].file, STAGES["simulate"].file
 
 
@@ -40,6 +40,7 @@ def row(scene: Scene, name: str, places: Sequence[Place], alone: Comm) -> dict[s
     variant = scene.variant.get(name, scene)
     found: dict[str, Any] = dict.fromkeys(COLUMNS)
     found |= {"name": name, "label": variant.label or name, "method": variant.simulation.method,
+              "kind": variant.simulation.title, "on_grid": variant.simulation.on_grid,
               "settings": "; ".join(scene.differences(variant)) if scene.variant else ""}
     missing = [place.directory for place in places if not (place.directory / ROLLOUT).exists()]
     if missing:
