@@ -98,6 +98,8 @@ BAD = [
     (HEAD + "[variant.a]\nsimulation.turnovers = 0.1\n", "[simulation] turnovers = 0.1 where the scene has 0.25"),
     (HEAD + "[variant.a]\nsimulation.start = 0.6\n", "[simulation] start = 0.6 where the scene has None"),
     (HEAD + "[variant.a]\ntraining.window = 0.4\n", "[training] window = 0.4 where the scene has 0.5: rollouts start"),
+    (HEAD + "[varaint.a]\n", "[varaint]: no such section; did you mean variant?"),
+    ('bas = "tiny"\n', "bas: no such key; did you mean base?"),
     (HEAD + "realisations = [3, 1]\n", "realisations = [3, 1]: 1 is the seed of the scene"),
     (HEAD + "realisations = [3, 3]\n", "realisations = [3, 3]: 3 stands there more than once"),
     ('base = "taylor-green"\n[variant.a]\n', 'variant "a": the scene has no [simulation]'),

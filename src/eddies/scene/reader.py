@@ -6,6 +6,7 @@ Nothing here knows a particular section or key: what is allowed stands beside th
 
 import dataclasses
 import tomllib
+from collections.abc import Sequence
 from dataclasses import MISSING
 from pathlib import Path
 from typing import Any
@@ -79,7 +80,7 @@ def read_section(kind: type[Section], table: Any, name: str = "") -> Any:
         elif holder and isinstance(value, dict):
             inner[key] = value
         else:
-            raise _unknown(key, value, name, fields)
+            raise _unknown(key, value, name, [*fields, *kind.of_the_file])
     for key, field in fields.items():
         if key not in values and field.default is field.default_factory is MISSING:
             raise _missing(kind, field, name)
@@ -118,10 +119,10 @@ def _read_value(field: dataclasses.Field, value: Any, name: str) -> Any:
     return value
 
 
-def _unknown(key: str, value: Any, section: str, fields: dict[str, dataclasses.Field]) -> SceneError:
-    hint = f"{nearest(key, fields, cutoff=0.5)} ".lstrip()
+def _unknown(key: str, value: Any, section: str, valid: Sequence[str]) -> SceneError:
+    hint = f"{nearest(key, valid, cutoff=0.5)} ".lstrip()
     is_section = isinstance(value, dict) and not section
-    problem = f": no such {'section' if is_section else 'key'}; {hint}valid here: {', '.join(fields) or 'no key'}"
+    problem = f": no such {'section' if is_section else 'key'}; {hint}valid here: {', '.join(valid) or 'no key'}"
     return SceneError(f"[{key}]{problem}", key) if is_section else KeyProblem(section, key, problem)
 
 

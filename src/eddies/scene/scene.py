@@ -47,6 +47,7 @@ class Scene(Parts):
     """
 
     variant: "Mapping[str, Scene]" = scenes()
+    of_the_file = ("base", "unset", VARIANT)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -12,7 +12,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import MISSING
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from eddies.errors import UserError
 from eddies.scene.rules import Boolean, Bounds, Choice, Integer, Integers, Name, Number, Text, Texts, quoted, shortened
@@ -49,7 +49,13 @@ class Section:
     """Base of the dataclasses of a scene: making one checks every value, and holds it in the form of its rule.
 
     Raises KeyProblem for a value that its declaration refuses.
+
+    Attributes
+    ----------
+    of_the_file : keys that a file may have beside those of the fields.
     """
+
+    of_the_file: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):  # type: ignore[arg-type]
