@@ -33,7 +33,7 @@ def test_no_point_of_the_front_is_dominated_and_every_other_one_is():
 
 
 def row(name, seconds, early, late):
-    return {"name": name, "seconds": seconds, "early": early, "late": late}
+    return {"label": name, "seconds": seconds, "early": early, "late": late}
 
 
 BASELINES = [row("none", 1, 0.5, 0.9), row("grid", 4, 0.3, 0.1), row("sph", 20, None, None)]

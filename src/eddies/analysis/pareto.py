@@ -26,7 +26,7 @@ def verdict(model: Mapping[str, Any], others: Sequence[Mapping[str, Any]], cost:
             measures: Mapping[str, str]) -> list[str]:
     """Two sentences: in which measures a method is worth its cost beside others, and in which it is not.
 
-    It is worth it where no other one that costs no more is as accurate. Rows hold `name`, `cost` and the measures by
+    It is worth it where no other one that costs no more is as accurate. Rows hold `label`, `cost` and the measures by
     key, None where there is no number, and may hold their standard deviations over realisations as `KEY_spread`: what
     differs by less than the larger of two is as accurate. `measures` gives their names in words. A row without a
     number counts as beaten.
@@ -50,7 +50,7 @@ def verdict(model: Mapping[str, Any], others: Sequence[Mapping[str, Any]], cost:
             worth.append(f"{score}the best of them: {_compared(best, model, key, cost)})")
         else:
             worth.append(f"{score}none of them has a number)")
-    name = model["name"]
+    name = model["label"]
     return [f"{name} is worth its cost in {', '.join(worth)}: nothing that is as fast is as accurate." if worth else
             f"{name} is worth its cost in no measure.",
             f"It is not in {', '.join(not_worth)}." if not_worth else
@@ -67,13 +67,13 @@ def cheapest_grid(model: Mapping[str, Any], grids: Sequence[Mapping[str, Any]], 
 
     if not times or None in [model[key] for key in (cost, *times)]:
         return ""
-    limit = f"keeps the velocity error after {' and '.join(times.values())} at or below that of {model['name']}"
+    limit = f"keeps the velocity error after {' and '.join(times.values())} at or below that of {model['label']}"
     kept = [row for row in grids if None not in [row[key] for key in (cost, *times)]
             and all(row[key] <= model[key] for key in times)]
     if not kept:
         return f"No grid {limit} ({errors(model)})."
     best = min(kept, key=lambda row: row[cost])
-    return (f"The cheapest grid that {limit} ({errors(model)}) is {best['name']} ({errors(best)}), at "
+    return (f"The cheapest grid that {limit} ({errors(model)}) is {best['label']} ({errors(best)}), at "
             f"{best[cost] / model[cost]:.2g} of its cost.")
 
 
@@ -84,4 +84,4 @@ def _worse(row: Mapping[str, Any], model: Mapping[str, Any], key: str) -> bool:
 
 
 def _compared(row: Mapping[str, Any], model: Mapping[str, Any], key: str, cost: str) -> str:
-    return f"{row['name']}, {row[key]:.3g} in {row[cost] / model[cost]:.2g} of its time"
+    return f"{row['label']}, {row[key]:.3g} in {row[cost] / model[cost]:.2g} of its time"

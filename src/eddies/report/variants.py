@@ -112,7 +112,7 @@ CAPTION = ("In the table, spectrum, energy and KL divergences (nats) are those a
 def _notice(row: Row) -> str:
     when = "" if row["stopped_at"] is None else f" (at {row['stopped_at']:.3g} T)"
     untimed = "; too few steps to time one" if row[COST] is None and not row["status"].startswith("failed") else ""
-    return f"{row['name']}{when}: {row['status']}{untimed}"
+    return f"{row['label']}{when}: {row['status']}{untimed}"
 
 
 def _with_spread(row: Row, column: str) -> Any:
@@ -197,6 +197,6 @@ def _name_points(axis: Axes, table: ErrorAgainstTime, measure: str) -> None:
     places = [(row[COST], row[measure]) for row in rows] + [(row[COST], _top(axis)) for row in stopped]
     if not places:
         return
-    names = [row["name"] for row in rows] + [f"{row['name']} {row['stopped_at']:.2g} T" for row in stopped]
+    names = [row["label"] for row in rows] + [f"{row['label']} {row['stopped_at']:.2g} T" for row in stopped]
     bold = [row["name"] == table.subject for row in [*rows, *stopped]]
     place_labels(axis, axis.transData.transform(places), names, bold)
