@@ -1,16 +1,16 @@
 """A training that is stopped and goes on is the one that was never stopped."""
 
+import sys
 from dataclasses import replace
 from itertools import pairwise
-from types import SimpleNamespace
 
 import h5py
+import matplotlib
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from eddies import stages
-from eddies.io.hdf5 import ProductError, open_product, read_table
+from eddies.io.hdf5 import open_product, read_table
 from eddies.io.weights import load_weights
 from eddies.parallel.stop import Stopped, StopRequest
 from eddies.scene.scene import SceneError, load_scene
@@ -111,15 +111,21 @@ def test_a_kernel_that_diverges_is_told_with_the_remedy(comm, tmp_path):
         train_kernel.run(wild, comm, tmp_path)
 
 
-@pytest.mark.mpi(1, 2, timeout=30)
-def test_curves_that_cannot_be_written_are_told_by_all(comm, tmp_path, monkeypatch):
-    """At the same step, though the clocks of the ranks differ."""
-    monkeypatch.setattr("eddies.report.learning.curves", lambda history: Figure())
-    training, curves = SimpleNamespace(columns=dict), train.LearningCurves(comm, tmp_path / "nowhere/learning.png")
-    curves(training)
-    monkeypatch.setattr(train, "DRAWING_SECONDS", -1.0 if comm.rank == comm.size - 1 else 1e9)
-    with pytest.raises(ProductError, match="nowhere/learning.png: No such file or directory; check the file"):
-        curves(training)
+@pytest.mark.mpi(1, 2)
+@pytest.mark.parametrize("fault", ["a directory is in its place", "nonsense as backend", "no matplotlib"])
+def test_a_training_is_not_lost_to_a_picture(comm, tmp_path, monkeypatch, caplog, fault):
+    scene = prepared(comm, tmp_path)
+    if fault.startswith("a directory") and comm.rank == 0:
+        (tmp_path / "learning.png").mkdir()
+    elif fault.startswith("nonsense"):
+        monkeypatch.setattr("eddies.report.figures.png", lambda figure: matplotlib.use("nonsense"))
+    elif fault.startswith("no"):
+        monkeypatch.setitem(sys.modules, "eddies.report.learning", None)
+    monkeypatch.setattr(train, "DRAWING_SECONDS", -1.0)  # draw after each step, too
+    train.run(scene, comm, tmp_path)
+    told = [record.getMessage() for record in caplog.records if "learning.png cannot be drawn (" in record.getMessage()]
+    assert len(told) == (comm.rank == 0)
+    assert trained(comm, tmp_path)
 
 
 @pytest.mark.mpi(2)

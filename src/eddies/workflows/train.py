@@ -7,12 +7,10 @@ import time
 from pathlib import Path
 
 from eddies.io.guard import Guard
-from eddies.io.hdf5 import in_files
 from eddies.io.weights import save_weights
 from eddies.io.whole_files import write_files
 from eddies.learning.training import Training
 from eddies.parallel.communicator import Comm
-from eddies.parallel.reduction import any_rank
 from eddies.parallel.stop import StopRequest
 from eddies.particles.devices import prepare_torch
 from eddies.pipeline import STAGES
@@ -56,7 +54,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         last = truth.last_frame_seen(scene.training.window if own is not None else 0.0)
         guard = Guard(comm, directory / STAGES["train"].checkpoints, scene.fingerprint("train"), stop,
                       " of the training")
-        history = {}
+        history, curves = {}, None
         phases = []
         if next(model.parameters(), None) is not None:
             phases = [*one_step_phases(scene, data, kernel), *horizon_phases(scene, data)]
@@ -66,7 +64,6 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
             training, curves = Training(comm, model, phases), LearningCurves(comm, directory / "learning.png")
             take_all_steps(training, guard, "train", "training", "lower learning_rate here or in [training.horizons], "
                            "or shorten time_step there", curves)
-            curves.draw(training)
             history = {"history": training.columns()}
         tested = model_of(scene, truth, device, model) if own is None else own
         tables = history | evaluate(truth, tested, tests, last, data[0].dtype, device)
@@ -80,6 +77,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                  {**scene.provenance("train"), "mach_turbulent": mach, "truths": truth_ids(scene),
                   "mach_of_truths": mach_of_truths}, tables)
     guard.checkpoints.remove()
+    if curves is not None:  # after the product, which no picture may cost
+        curves.draw(training)
     errors = tables["a_priori"]
     beside = (f" (exact filtered pressure gradient {errors['pressure_gradient_error'][-1]:.3f})"
               if "pressure_gradient_error" in errors else "")
@@ -89,23 +88,26 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
 
 
 class LearningCurves:
-    """Draws the history of a training to a file now and then; rank 0 does it, and all ranks raise a ProductError where
-    it cannot."""
+    """Draws the history of a training to a file now and then, on rank 0. A picture that fails is a warning, once."""
 
     def __init__(self, comm: Comm, path: Path) -> None:
-        self.comm, self.path, self._drawn = comm, path, time.monotonic()
+        self.comm, self.path, self._drawn, self._failed = comm, path, time.monotonic(), False
 
     def __call__(self, training: Training) -> None:
-        """Draw if it is time; all ranks call it, with one small message."""
-        if any_rank(self.comm, time.monotonic() - self._drawn > DRAWING_SECONDS):
+        """Draw if it is time."""
+        if time.monotonic() - self._drawn > DRAWING_SECONDS:
             self.draw(training)
 
     def draw(self, training: Training) -> None:
-        """Draw now; all ranks call it."""
-        def write() -> None:
+        """Draw now, on rank 0."""
+        self._drawn = time.monotonic()
+        if self.comm.rank > 0 or self._failed:
+            return
+        try:
             from eddies.report import figures  # matplotlib takes a while to start
             from eddies.report.learning import curves
             write_files({self.path: figures.png(curves(training.columns()))})
-
-        in_files(self.comm, self.path, write)
-        self._drawn = time.monotonic()
+        except Exception as error:  # of matplotlib, its settings, the disk: no reason to lose a training
+            self._failed = True
+            log.warning("train: %s cannot be drawn (%s: %s); the training goes on without it", self.path,
+                        type(error).__name__, error)
