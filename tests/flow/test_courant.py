@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 
 from eddies.clock import Clock
@@ -32,6 +33,16 @@ def test_up_to_a_courant_number_of_1_3_no_limit_of_the_explicit_stepper_is_broke
     step = CourantLimit(grid, 1.3, 1.0, sound_speed).bound(velocity, Clock())
     limits = step_limits(fluid, RungeKutta4(fluid), step, advective_speed(grid, velocity))
     assert not any(limit.exceeded for limit in limits) and limits[1].number > 2.5
+
+
+@pytest.mark.mpi(1, 2, 3)
+def test_the_fastest_point_of_any_rank_limits_the_step_of_all(comm):
+    grid = SpectralGrid(SlabDecomposition(comm, 6.283185307179586, 8))
+    spacing, (_, _, z) = grid.decomposition.spacing, grid.coordinates()
+    velocity = np.zeros((3, *grid.physical_shape))
+    velocity[0] = 1 + np.cos(z + spacing)  # 2 in the last plane of the last rank, at most 1.71 on the others
+    bound = CourantLimit(grid, 0.5, 1.0).bound(grid.forward(velocity), Clock())
+    assert bound == pytest.approx(0.5 * spacing / 2, rel=1e-12)  # rounding of the transforms
 
 
 @pytest.mark.mpi(1, 2)

@@ -125,6 +125,19 @@ def test_tracers_follow_the_filtered_abc_flow_at_second_order_across_slabs_and_f
 
 
 @pytest.mark.mpi(1, 2)
+def test_the_velocity_of_a_tracer_is_that_of_the_field_where_it_is(comm):
+    """After a step, too: not that at the predicted position."""
+    grid = make_grid(comm, 16)
+    start, end = (initial_fields.abc(grid, amplitude, 1) for amplitude in (1.0, 0.8))
+    field = FilteredField(grid, 1.0, "quintic")
+    tracers = TracerParticles(field, release(grid.decomposition, 3, 4, "random"), start)
+    tracers.advance(end, 0.2)
+    there = field.spline.at(field.velocity_coefficients(end), tracers.columns["position"])
+    # Positions have been wrapped since, which changes them by rounding.
+    assert np.allclose(tracers.columns["velocity"], there, rtol=0, atol=1e-13)
+
+
+@pytest.mark.mpi(1, 2)
 def test_density_at_the_particles_is_the_filtered_exponential(comm):
     grid = make_grid(comm, 24)
     s = initial_fields.sound_wave_density(grid, 1e-4, 2)

@@ -40,15 +40,18 @@ def numbers(training):
 
 
 @pytest.mark.mpi(1, 2)
-def test_a_training_restored_at_any_step_is_bitwise_the_one_never_stopped(comm):
-    whole = numbers(finished(training_of(comm)))
+@pytest.mark.parametrize("best", [None, 2], ids=["best at the end", "best after two steps"])
+def test_a_training_restored_at_any_step_is_bitwise_the_one_never_stopped(comm, best):
+    def begun():
+        training = training_of(comm, best and (lambda: abs(training.optimizer.taken - best)))
+        return training
+
+    whole = numbers(finished(begun()))
     for split in range(11):
-        first = training_of(comm)
+        first, second = begun(), begun()
         for _ in range(split):
             first.step()
-        state = first.state_dict()
-        second = training_of(comm)
-        second.load_state_dict(state)
+        second.load_state_dict(first.state_dict())
         again = numbers(finished(second))
         assert whole.keys() == again.keys()
         for name, values in whole.items():

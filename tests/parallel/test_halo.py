@@ -35,10 +35,13 @@ def test_ghosts_are_exactly_the_images_within_the_width(comm, squeeze):
 
 
 @pytest.mark.mpi(1, 2, 3)
-@pytest.mark.parametrize("squeeze", [1.0, 0.2], ids=["everywhere", "on one rank"])
-def test_adjoint_identity(comm, squeeze):
+@pytest.mark.parametrize("squeeze, width", [(1.0, WIDTH), (0.2, WIDTH), (1.0, 4.9 * LENGTH / 17)],
+                         ids=["everywhere", "on one rank", "seen from both sides"])
+def test_adjoint_identity(comm, squeeze, width):
+    """The thinnest slab is 5/17 of the box on three ranks and 8/17 on two: with the last width many particles have an
+    image on both sides, whose gradients are added."""
     slab, particles, _ = slab_particles(comm, squeeze=squeeze)
-    halo = HaloExchange(slab, particles["position"], WIDTH)
+    halo = HaloExchange(slab, particles["position"], width)
     random = np.random.default_rng(comm.rank)
     x, y = random.standard_normal((len(particles["id"]), 2)), random.standard_normal((halo.count, 2))
     left, right = global_sum(comm, np.array([np.vdot(halo.forward(x), y), np.vdot(x, halo.adjoint(y))]))

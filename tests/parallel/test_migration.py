@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from eddies.parallel.migration import IdOrder, ParticleLossError, census, migrate, wrap
+from eddies.parallel import migration
+from eddies.parallel.migration import IdOrder, Migration, ParticleLossError, census, migrate, wrap
 from eddies.parallel.slab import SlabDecomposition
 
 LENGTH = 2 * np.pi
@@ -46,6 +47,24 @@ def test_a_missing_particle_is_noticed(comm):
 def _on_all(comm, ids):
     # The ids of both ranks are spoiled, so that both raise and neither is left waiting.
     IdOrder(comm, np.where(ids == 2 + comm.rank, 7 - comm.rank, ids), 10)
+
+
+@pytest.mark.mpi(2, 3)
+@pytest.mark.parametrize("spoil", [
+    lambda ids: ids[ids != 4],
+    lambda ids: np.where(ids == 4, 5, ids),
+    lambda ids: np.where(ids == 1, 2, np.where(ids == 4, 3, ids)),
+], ids=["lost", "replaced", "two replaced by two of the same sum"])
+def test_what_happens_to_a_particle_on_its_way_is_noticed_by_all_ranks(comm, monkeypatch, spoil):
+    class Spoiled(Migration):
+        def apply(self, column):
+            moved = super().apply(column)
+            return spoil(moved) if moved.dtype == np.int64 else moved
+
+    monkeypatch.setattr(migration, "Migration", Spoiled)
+    columns, _ = scattered(comm, 40)
+    with pytest.raises(ParticleLossError, match="id parity"):
+        migrate(SlabDecomposition(comm, LENGTH, 7), columns)
 
 
 def test_wrapping_never_returns_the_upper_bound():

@@ -1,5 +1,6 @@
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from eddies.io.provenance import read_provenance
 from eddies.io.trajectories import Trajectory
 from eddies.parallel.slab import SlabDecomposition
 from eddies.scene.scene import BOX_LENGTH, SceneError, load_scene
+from eddies.scene.sections import SpinUp
 from eddies.workflows import dns
 from eddies.workflows.ground_truth.scene_flow import build_fluid, initial_state
 
@@ -165,6 +167,13 @@ def test_statistics_are_sampled_every_few_steps_at_the_release_and_at_the_end(co
     steps = round(end / 0.01)
     assert len(statistics["time"]) <= steps // 4 + 3
     assert "density_rate_rms" in reference
+
+
+def test_the_stationary_span_is_the_last_turnovers_of_the_spin_up():
+    """Nine turnovers of a time of 2, four samples in each, and what follows: the turnovers from 4 to 9 are averaged."""
+    rows = [{"turnovers": sample / 4, "time": sample / 2} for sample in range(50)]
+    span = dns.stationary_span(SpinUp(turnovers=9, stationary=5), SimpleNamespace(rows=rows))
+    assert span == {"start": 8.0, "end": 18.0}
 
 
 @pytest.mark.mpi(1, 2)

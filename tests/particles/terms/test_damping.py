@@ -129,3 +129,13 @@ def test_relaxation_takes_what_is_not_resolved_and_keeps_the_momentum():
     rate = 1.5 * 2 * rms / SCALES.filter_width
     assert torch.allclose(force, -rate * (missing - missing.mean(0)), atol=1e-12)
     assert force.sum(0).abs().max() < 1e-12 * force.abs().sum()
+
+
+def test_relaxation_keeps_the_momentum_of_scattered_particles():
+    """Over the points of a grid a wave has no mean; over these points what is missing of it has one."""
+    generator = torch.Generator().manual_seed(1)
+    position = LENGTH * torch.rand((300, 3), dtype=torch.float64, generator=generator)
+    missing = 0.1 * torch.randn(position.shape, dtype=torch.float64, generator=generator)
+    force = acceleration(model(relaxation={}), waves, position, torch.stack(waves(*position.T), dim=1) + missing)
+    assert force.abs().mean() > 0.01
+    assert force.sum(0).abs().max() < 1e-12 * force.abs().sum()  # rounding of 300 summands
