@@ -28,7 +28,7 @@ def with_terms(*terms):
 def saved(comm, directory, scene=None, change=lambda weights: weights):
     """A model and the file of its weights, changed."""
     scene = scene or load_scene("tiny", [SMALL])
-    model = scene_model(scene, SCALES).float()
+    model = scene_model(scene, SCALES, comm).float()
     with torch.no_grad():
         for parameter in model.parameters():
             parameter += 0.1
@@ -98,27 +98,63 @@ def test_no_key_of_a_term_s_settings_goes_unnoticed():
     assert {key for key, *_ in differences(scene, stored)} == {"[model.pairs] depth", "[model.pairs] symmetry"}
 
 
+@pytest.mark.mpi(1)
 @pytest.mark.parametrize("body, message", [
     ("class Mine(Term):\n    def __init__(self, settings): pass\n", "cannot be made: "),
     ("class Mine(Term):\n    def __init__(self, settings, flow): self.factor = nn.Parameter(torch.ones(1))\n",
      "cannot be made: AttributeError: cannot assign parameters before Module.__init__"),
 ])
-def test_a_term_that_cannot_be_made_has_one_error(own, body, message):
+def test_a_term_that_cannot_be_made_has_one_error(comm, own, body, message):
     own("own_terms", f"import torch\nfrom torch import nn\nfrom eddies import Term\n{body}")
     scene = with_terms("pressure", "own_terms:Mine")
     with pytest.raises(SceneError) as error:
-        scene_model(scene, SCALES)
+        scene_model(scene, SCALES, comm)
     assert str(error.value).startswith('[model] terms: term "own_terms:Mine": ') and message in str(error.value)
 
 
-def test_a_network_that_cannot_be_made_has_one_error(own):
+@pytest.mark.mpi(1)
+def test_a_network_that_cannot_be_made_has_one_error(comm, own):
     own("own_networks", "from torch import nn\nclass mine(nn.Module):\n    def __init__(self, inputs): pass\n"
                         "    def forward(self, features): pass\n")
     message = "cannot be made with (inputs, hidden, outputs, seed): "
     scene = load_scene("tiny", ["model.pairs.network=own_networks:mine"])
     with pytest.raises(SceneError) as error:
-        scene_model(scene, SCALES)
+        scene_model(scene, SCALES, comm)
     assert str(error.value).startswith('[model] terms: term "pairs": network = "own_networks:mine": ' + message)
+
+
+OWN = """import torch
+from mpi4py import MPI
+from torch import nn
+from eddies import Term
+class Mine(Term):
+    def __init__(self, settings, flow):
+        super().__init__(settings, flow)
+        self.kept = nn.Parameter(torch.ones(2))
+        self.drawn = nn.Parameter(torch.rand(RANKS if MPI.COMM_WORLD.rank else 2, 3))
+        self.register_buffer("noise", torch.rand(1))
+"""
+
+
+@pytest.mark.mpi(2, 3)
+def test_all_ranks_take_what_the_first_has_drawn(comm, own, caplog):
+    own("own_terms", OWN.replace("RANKS", "2"))
+    torch.manual_seed(comm.rank)
+    model = scene_model(with_terms("pressure", "own_terms:Mine"), SCALES, comm)
+    drawn = comm.allgather([tensor.tolist() for tensor in (*model.parameters(), *model.buffers())])
+    assert all(values == drawn[0] for values in drawn)
+    told = [record.getMessage() for record in caplog.records]
+    assert len(told) == (comm.rank == 0) and all(
+        "terms.Mine.drawn, terms.Mine.noise: other values on other ranks; all take those of rank 0" in line
+        for line in told)
+
+
+@pytest.mark.mpi(2)
+def test_parameters_of_another_shape_on_a_rank_are_refused(comm, own):
+    own("own_terms", OWN.replace("RANKS", "5"))
+    with pytest.raises(SceneError, match=r"terms.Mine.drawn is torch.float64 \[5, 3\] on rank 1 and torch.float64 "
+                                         r"\[2, 3\] on rank 0; make it the same on all ranks"):
+        scene_model(with_terms("pressure", "own_terms:Mine"), SCALES, comm)
 
 
 NETWORK = KernelNetwork(0.7, [4], seed=3).float()

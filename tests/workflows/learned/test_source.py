@@ -139,7 +139,7 @@ def test_weights_of_the_first_version_are_read(comm, name, base):
     found = load_scene(base, [*changes, f"model.path=eddies:{name}"])
     source = read_source(found, comm)
     scales = ReferenceScales(**source.description["scales"])
-    model = with_weights(found, source.description, source.weights, source.path, scales)
+    model = with_weights(found, comm, source.description, source.weights, source.path, scales)
     assert {key: value.shape for key, value in source.weights.items()} == {
         key: tuple(value.shape) for key, value in model.state_dict().items()}
 

@@ -26,11 +26,11 @@ SCALES = ReferenceScales(filter_width=BOX_LENGTH / 6, spacing=BOX_LENGTH / 12, v
 def test_the_same_flow_in_other_units_gets_the_same_force_in_those_units(comm, preset, weight):
     """Twice as fast, and with four times the fluctuations of density at the same speed of sound."""
     scene = load_scene("tiny", [f"model.preset={preset}"])
-    model = scene_model(scene, SCALES).float()
+    model = scene_model(scene, SCALES, comm).float()
     weights = {name: tensor.numpy() for name, tensor in model.state_dict().items()}
     other = replace(SCALES, velocity=1.8, density=0.08, acceleration=6.8, density_rate=0.4,
                     viscosity=2 * SCALES.viscosity)
-    adopted = with_weights(scene, json.loads(json.dumps(describe(scene, SCALES))), weights, "model.h5", other)
+    adopted = with_weights(scene, comm, json.loads(json.dumps(describe(scene, SCALES))), weights, "model.h5", other)
     assert adopted.flow.scales == other and adopted.flow.cutoff == model.flow.cutoff
     assert all(parameter.dtype == torch.float32 for parameter in adopted.parameters())
 

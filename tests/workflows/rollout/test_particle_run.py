@@ -131,7 +131,7 @@ def prepared(comm, directory, fluid="compressible", model=MODEL, start=0.3, turn
 
 def write_model(comm, directory, scene, scales, bound=1e3, features=5):
     """The model as training begins with it, all of whose inputs were seen up to a bound."""
-    weights = {name: tensor.float().numpy() for name, tensor in scene_model(scene, scales).state_dict().items()}
+    weights = {name: tensor.float().numpy() for name, tensor in scene_model(scene, scales, comm).state_dict().items()}
     ranges = {"low": np.full(features, -bound), "high": np.full(features, bound)}
     save_weights(comm, directory / "model.h5", "model", describe(scene, scales), weights, {}, {"feature_range": ranges})
 

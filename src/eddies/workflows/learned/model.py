@@ -3,37 +3,75 @@ beside their weights."""
 
 from __future__ import annotations
 
+import json
+import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from torch import nn
 
 from eddies.io.hdf5 import ProductError, open_product, read_table
 from eddies.io.weights import load_weights
+from eddies.parallel.broadcast import first_complaint, share_text
 from eddies.parallel.communicator import Comm
+from eddies.parallel.reduction import any_rank
 from eddies.particles.feature_range import FeatureRange
 from eddies.particles.flow_units import FlowUnits, ReferenceScales
 from eddies.particles.model import LagrangianModel, build_model
+from eddies.particles.particle_set import as_numpy
 from eddies.particles.smoothing_kernels import HermiteKernel, KernelNetwork
 from eddies.scene.scene import Scene, SceneError
 from eddies.scene.terms import TermError
 from eddies.workflows.learned.source import differences
 
+log = logging.getLogger("eddies")
 
-def scene_model(scene: Scene, scales: ReferenceScales) -> LagrangianModel:
-    """The terms of a scene with initial parameters, for a flow of these scales.
 
-    Raises SceneError where a class of the user's is no term, or cannot be made.
+def scene_model(scene: Scene, scales: ReferenceScales, comm: Comm) -> LagrangianModel:
+    """The terms of a scene with initial parameters, the same on all ranks, for a flow of these scales; collective.
+
+    Raises SceneError where a class of the user's is no term, or cannot be made, or differs between ranks.
     """
     # As many neighbours among particles of another mean distance than the scene's.
     radius = scene.interaction_radius * (scales.spacing / scene.tracers.spacing)
     flow = FlowUnits(scales, radius, scene.neighbors, scene.seed)
     try:
-        return build_model(scene.model.settings, scene.model.terms, flow)
+        model = build_model(scene.model.settings, scene.model.terms, flow)
     except TermError as error:
         raise SceneError(f"[model] terms: {error}") from None
+    take_from_first_rank(model, comm)
+    return model
+
+
+def take_from_first_rank(model: nn.Module, comm: Comm) -> None:
+    """Give parameters and buffers the values of rank 0 on all ranks, with a warning where they differed; collective.
+
+    Raises SceneError, on all ranks, where a rank has others than rank 0, or of another shape or type.
+    """
+    own = {**dict(model.named_parameters()), **dict(model.named_buffers())}
+    forms = {name: f"{tensor.dtype} {list(tensor.shape)}" for name, tensor in own.items()}
+    first = json.loads(share_text(comm, json.dumps(forms)))
+    wrong = next((name for name in {**first, **forms} if first.get(name) != forms.get(name)), None)
+    complaint = first_complaint(comm, wrong and (
+        f"[model] terms: {wrong} is {forms.get(wrong, 'missing')} on rank {comm.rank} and "
+        f"{first.get(wrong, 'missing')} on rank 0; make it the same on all ranks"))
+    if complaint is not None:
+        raise SceneError(complaint)
+    differing = []
+    for name, tensor in own.items():
+        values = np.ascontiguousarray(as_numpy(tensor.detach()))
+        given = values.copy()
+        comm.Bcast(given)
+        if any_rank(comm, given.tobytes() != values.tobytes()):
+            differing.append(name)
+            with torch.no_grad():
+                tensor.copy_(torch.from_numpy(given))
+    if differing and comm.rank == 0:
+        log.warning("model: %s: other values on other ranks; all take those of rank 0. Draw random numbers from a "
+                    "generator with the seed of the flow (flow.seed)", ", ".join(differing))
 
 
 def load_model(scene: Scene, comm: Comm, path: str | Path, scales: ReferenceScales) -> LagrangianModel:
@@ -41,16 +79,16 @@ def load_model(scene: Scene, comm: Comm, path: str | Path, scales: ReferenceScal
 
     Raises ProductError as `load_weights`, and where the file holds weights of another model.
     """
-    return with_weights(scene, *load_weights(comm, path, "model"), path, scales)
+    return with_weights(scene, comm, *load_weights(comm, path, "model"), path, scales)
 
 
-def with_weights(scene: Scene, description: Mapping[str, Any], weights: Mapping[str, np.ndarray], path: str | Path,
-                 scales: ReferenceScales) -> LagrangianModel:
-    """The scene's model with weights that were stored with a description, in their precision."""
+def with_weights(scene: Scene, comm: Comm, description: Mapping[str, Any], weights: Mapping[str, np.ndarray],
+                 path: str | Path, scales: ReferenceScales) -> LagrangianModel:
+    """The scene's model with weights that were stored with a description, in their precision; collective."""
     for key, wanted, trained in differences(scene, description):
         raise ProductError(f"{path}: was trained with {key} = {trained}, and the scene has {wanted}; run "
                            "`eddies train` again, or set the key to that")
-    model = scene_model(scene, scales)
+    model = scene_model(scene, scales, comm)
     expected = {name: tuple(tensor.shape) for name, tensor in model.state_dict().items()}
     if expected != {name: tensor.shape for name, tensor in weights.items()}:
         raise ProductError(f"{path}: its terms have other parameters now than when this was written; "

@@ -117,7 +117,8 @@ def model_of(scene: Scene, truth: GroundTruth, device: torch.device,
              like: LagrangianModel | None = None) -> LagrangianModel:
     """The scene's model in the units of a ground truth and with the forcing that stayed on there, in the precision of
     the training; with new parameters, or those of the same terms in the units of another."""
-    model = scene_model(scene, truth.scales).to(dtype=getattr(torch, scene.training.precision), device=device)
+    model = scene_model(scene, truth.scales, truth.decomposition.comm)
+    model = model.to(dtype=getattr(torch, scene.training.precision), device=device)
     if like is not None:
         model.share_parameters(like)
     return model.forced(truth.forcing)

@@ -35,7 +35,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path) -> None:
     slab = SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes)
     with open_product(comm, Path(directory) / "ground_truth.h5", "ground_truth") as file:
         truth = GroundTruth(file, slab)
-        model = with_weights(scene, source.description, source.weights, source.path, truth.scales).to(device)
+        model = with_weights(scene, comm, source.description, source.weights, source.path, truth.scales).to(device)
         model = model.forced(truth.forcing)
         dtype = next((parameter.dtype for parameter in model.parameters()), torch.float64)
         last = truth.last_frame_seen(scene.seen_in(Path(directory)))
