@@ -1,4 +1,5 @@
-"""Run by test_cli.py under mpirun: `eddies dns DIRECTORY`, whose rank 1 meets a mistake while its product is open."""
+"""Run by test_cli.py under mpirun with DIRECTORY and KIND: `eddies dns`, whose rank 1 ends while its product is open,
+by a "mistake" of the user or by "exit"."""
 
 import sys
 import time
@@ -14,6 +15,8 @@ def failing_run(scene, comm, directory, stop):
     with create_product(comm, directory / "ground_truth.h5", "ground_truth", {}):
         if comm.rank == 1:
             (Path(sys.argv[1]) / "refused").write_text(f"{time.time():.6f}")
+            if sys.argv[2] == "exit":
+                sys.exit(3)
             raise SceneError("no such reactor")
         comm.Barrier()
 

@@ -281,10 +281,34 @@ def test_threads_per_rank(comm, monkeypatch):
         assert run_cli("scenes") == 0 and os.environ["OMP_NUM_THREADS"] == used
 
 
-def test_mistake_met_by_one_rank_ends_the_job(tmp_path):
-    code, _, errors = start(2, FAILING, tmp_path)
-    assert code == 2 and time.time() - float((tmp_path / "refused").read_text()) < 10
-    assert "rank 1: eddies: error: no such reactor" in errors and "Traceback" not in errors
+@pytest.mark.parametrize("kind, code, told", [("mistake", 2, "rank 1: eddies: error: no such reactor"),
+                                              ("exit", 1, "rank 1: SystemExit: 3")])
+def test_what_ends_one_rank_ends_the_job(tmp_path, kind, code, told):
+    ended, _, errors = start(2, FAILING, tmp_path, kind)
+    assert ended == code and time.time() - float((tmp_path / "refused").read_text()) < 10
+    assert told in errors and ("Traceback" in errors) == (kind == "exit")
+
+
+@pytest.mark.mpi(2, 3, timeout=30)
+@pytest.mark.parametrize("other", [["check", "tiny"], ["dns", "abc", "--set", "seed=2"], ["dns"],
+                                   ["dns", "abc", "--output", "b"], ["--version"]])
+def test_ranks_of_different_commands_are_refused(comm, tmp_path, monkeypatch, capfd, other):
+    monkeypatch.chdir(tmp_path)
+    assert run_cli(*(other if comm.rank == comm.size - 1 else ["dns", "abc"])) == 2
+    told = f"rank {comm.size - 1} was started with the arguments {' '.join(other)}, rank 0 with the arguments dns abc"
+    assert told_once(comm, capfd, told) and not (tmp_path / "runs").exists()
+
+
+@pytest.mark.mpi(2, timeout=30)
+def test_ranks_of_different_scenes_are_refused(comm, tmp_path, monkeypatch, capfd):
+    """The same path, and another file there: node-local directories."""
+    folder = tmp_path / f"node-{comm.rank}"
+    folder.mkdir(exist_ok=True)
+    monkeypatch.chdir(folder)
+    (folder / "mine.toml").write_text(f'base = "abc"\nseed = {comm.rank}\n')
+    assert run_cli("dns", "mine.toml", "--output", tmp_path / "run") == 2
+    assert told_once(comm, capfd, "rank 1 was started with a scene, stages and a directory of which the SHA-256 is ")
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.mpi(2)

@@ -104,7 +104,7 @@ def _job(comm: Comm | None) -> Iterator[Comm]:
     try:
         library()  # and with it the threads that torch shares
         yield comm
-    except Exception:
+    except BaseException:
         if comm.size > 1 and not all_arrive(errors):
             traceback.print_exc()
             sys.stderr.flush()

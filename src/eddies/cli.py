@@ -9,6 +9,7 @@ import argparse
 import contextlib
 import logging
 import os
+import shlex
 import signal
 import sys
 import time
@@ -79,8 +80,11 @@ def run(arguments: list[str] | None) -> int:
         return BAD_INPUT
     comm, exit_comm = MPI.COMM_WORLD, MPI.COMM_WORLD.Dup()
     from eddies.kernels.library import library
+    from eddies.parallel.broadcast import require_same
     from eddies.parallel.stop import Stopped
+    options = None
     try:
+        require_same(comm, shlex.join(sys.argv[1:] if arguments is None else arguments), "the arguments {}")
         options = parse_arguments(arguments, comm.rank)
         configure_logging(comm.rank, getattr(options, "log", None))
         library()  # and with it the threads that torch shares
@@ -97,7 +101,9 @@ def run(arguments: list[str] | None) -> int:
                 sys.stderr.write(f"eddies: {stopped}\n")
                 sys.stderr.flush()
         return STOPPED
-    except (Exception, KeyboardInterrupt) as error:
+    except BaseException as error:  # SystemExit, too, by whoever calls it on one rank
+        if options is None and isinstance(error, SystemExit):  # of the parser, on all ranks
+            raise
         return end_with_error(error, exit_comm)
 
 

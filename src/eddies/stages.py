@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import logging
 import os
@@ -20,7 +21,7 @@ from eddies.io.hdf5 import in_files, open_product
 from eddies.io.run_lock import RunInUse, RunTakenOver, lock_directory, refuse_if_held
 from eddies.io.single_writer import LARGEST_BYTES, has_single_writer
 from eddies.io.whole_files import write_files
-from eddies.parallel.broadcast import on_first_rank
+from eddies.parallel.broadcast import on_first_rank, require_same
 from eddies.logs import OUTCOME
 from eddies.parallel.communicator import Comm
 from eddies.parallel.rendezvous import all_arrive
@@ -68,6 +69,9 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
         ProductError: a stage that is not among `stages` has not left the product that they start from.
         VariantsFailed: variants failed; what the others made is there.
     """
+    settings = [scene.to_toml(), *map(scene.fingerprint, scene.stages), str(directory), *stages, *variants]
+    require_same(comm, hashlib.sha256(json.dumps(settings).encode()).hexdigest()[:16],
+                 "a scene, stages and a directory of which the SHA-256 is {}")
     scene.check_variants(variants)
     check_unseen(scene, directory)
     planned, reported = steps(scene, stages, directory, variants), "report" in stages

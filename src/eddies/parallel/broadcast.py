@@ -32,6 +32,19 @@ def first_complaint(comm: MPI.Comm, complaint: str | None) -> str | None:
     return None if rank == comm.size else share_text(comm, complaint or "", rank)
 
 
+def require_same(comm: MPI.Comm, own: str, words: str) -> None:
+    """Refuse ranks that were started with something else than rank 0; `words` say what, with a place {} for it.
+
+    Raises UserError, on all ranks.
+    """
+    first = share_text(comm, own)
+    complaint = first_complaint(comm, None if own == first else (
+        f"rank {comm.rank} was started with {words.format(own)}, rank 0 with {words.format(first)}; start all ranks "
+        "alike"))
+    if complaint is not None:
+        raise UserError(complaint)
+
+
 def on_first_rank(comm: MPI.Comm, action: Callable[[], Result]) -> Result:
     """What an action gives on rank 0, the only one that does it, on every rank. All ranks raise
     the UserError or OSError that it raises there. One rank sends nothing."""
