@@ -64,6 +64,24 @@ def test_a_job_elsewhere_is_believed_to_live_for_five_minutes(comm, tmp_path, el
 
 
 @pytest.mark.mpi(1)
+def test_the_clock_of_the_file_system_counts(comm, tmp_path, elsewhere, monkeypatch):
+    put(tmp_path, elsewhere)
+    ahead = time.time() + 400
+    monkeypatch.setattr(time, "time", lambda: ahead)
+    with pytest.raises(RunInUse):
+        refuse_if_held(comm, tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["LOCK"]
+
+
+@pytest.mark.mpi(1)
+def test_a_process_that_is_seen_alive_has_not_ended(comm, tmp_path):
+    """However long ago its last sign of life was, as on a file system that does not take it."""
+    put(tmp_path, replace(Holder.this_job(), job="another"), silent=3600.0)
+    with pytest.raises(RunInUse, match="its last sign of life was 1 h 00 min ago"):
+        refuse_if_held(comm, tmp_path)
+
+
+@pytest.mark.mpi(1)
 def test_a_job_of_this_machine_that_has_ended_holds_nothing(comm, tmp_path):
     process = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
     own = Holder.this_job()

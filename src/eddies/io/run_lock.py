@@ -11,6 +11,7 @@ import json
 import logging
 import os
 import socket
+import tempfile
 import threading
 import time
 import uuid
@@ -75,21 +76,24 @@ class Holder:
                    os.environ.get("SLURM_JOB_ID", ""), int(restarts) if restarts.isdecimal() else 0,
                    datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"))
 
-    def has_ended(self) -> bool:
-        """Whether it is known that the job is gone: to a later life of the same batch job, as after a node that failed,
-        and to its own machine."""
+    def lives(self) -> bool | None:
+        """Whether the job is still there; None where this machine cannot know.
+
+        A later life of the same batch job, as after a node that failed, knows that it is gone; its own machine knows
+        both.
+        """
         own = self.this_job()
         if self.batch and self.batch == own.batch and self.restarts < own.restarts:
-            return True
-        if not self.machine or self.machine != own.machine:
             return False
+        if not self.machine or self.machine != own.machine:
+            return None
         try:
             os.kill(self.pid, 0)
         except ProcessLookupError:
-            return True
-        except PermissionError:  # another user's
             return False
-        return bool(self.born) and _born(self.pid) != self.born
+        except PermissionError:  # another user's
+            return True
+        return _born(self.pid) == self.born if self.born else None
 
     def __str__(self) -> str:
         return f"process {self.pid} on {self.host}, since {self.start}"
@@ -97,14 +101,22 @@ class Holder:
 
 @dataclass(frozen=True)
 class _Found:
-    """A lock that was found: whose it is, and the seconds since the last sign of life."""
+    """A lock that was found: whose it is, where, and the last sign of life by the clock of that file system."""
 
     holder: Holder
-    silent: float
+    directory: Path
+    sign: float
+
+    @property
+    def silent(self) -> float:
+        """Seconds since the last sign of life."""
+        return _now(self.directory) - self.sign
 
     @property
     def stale(self) -> bool:
-        return self.silent > STALE_SECONDS or self.holder.has_ended()
+        """Whether the job has ended, or has given no sign of life for long where nothing else is known of it."""
+        lives = self.holder.lives()
+        return self.silent > STALE_SECONDS if lives is None else not lives
 
 
 class RunLock:
@@ -194,7 +206,7 @@ def find_lock(directory: Path) -> _Found | None:
     """The lock in a directory, by whoever holds it; OSError where the file system does not tell."""
     path = directory / LOCK
     try:
-        return _Found(_read(path), time.time() - path.stat().st_mtime)
+        return _Found(_read(path), directory, path.stat().st_mtime)
     except (FileNotFoundError, NotADirectoryError):
         return None
 
@@ -215,7 +227,8 @@ def _take(directory: Path, take_over: bool) -> RunLock:
     if found is not None:
         _remove(directory, found.holder)
         log.warning("%s: takes over from a job that %s (%s)", directory,
-                    "has ended" if found.stale else "may still work there", found.holder)
+                    "has ended" if found.stale and found.holder.lives() is False else
+                    "has given no sign of life" if found.stale else "may still work there", found.holder)
     try:
         _write(directory / LOCK, holder)
     except FileExistsError:  # another job was quicker
@@ -246,8 +259,19 @@ def _remove(directory: Path, holder: Holder) -> None:
         if not mine:
             with contextlib.suppress(OSError):  # of a job that gives itself a new one with its next sign of life
                 os.link(aside, directory / LOCK)
-        if not mine or holder.job == UNREADABLE or holder.has_ended():
+        if not mine or holder.job == UNREADABLE or holder.lives() is False:
             aside.unlink()
+
+
+def _now(directory: Path) -> float:
+    """The time by the clock that stamps files there, or by that of this machine where no file can be written."""
+    try:
+        with tempfile.TemporaryFile(dir=directory) as file:
+            file.write(b"now")
+            file.flush()
+            return os.fstat(file.fileno()).st_mtime
+    except OSError:
+        return time.time()
 
 
 def _aside(directory: Path, holder: Holder) -> Path:
