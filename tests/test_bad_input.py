@@ -277,12 +277,30 @@ def a_simulation(directory, *before):
         job.communicate()
 
 
-def test_an_interrupt_is_a_line_and_leaves_nothing_half_written(tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
+def test_an_interrupt_stops_at_the_next_step(tmp_path, number):
     with a_simulation(tmp_path) as job:
-        job.send_signal(signal.SIGINT)
-        errors = job.communicate(timeout=30)[1]
-    assert (job.returncode, errors) == (130, "eddies: interrupted\n")
+        job.send_signal(number)
+        errors = job.communicate(timeout=30)[1].splitlines()
+    assert job.returncode == 75 and errors[-1].startswith(f"eddies: stopped by {number.name}; the same command goes on")
+    assert errors[:-1] == ["eddies: stops after this step; a second interrupt ends it at once"] * (
+        number == signal.SIGINT)
     assert not list(tmp_path.rglob("*.partial"))
+
+
+def test_a_second_interrupt_ends_at_once():
+    code = ("import signal, time\nfrom eddies import cli\ncli.catch_signals()\nsignal.raise_signal(signal.SIGINT)\n"
+            "print('goes on', flush=True)\nsignal.raise_signal(signal.SIGINT)\ntime.sleep(30)\n")
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=20)
+    assert (ended.returncode, ended.stdout) == (-signal.SIGINT, "goes on\n")
+
+
+def test_a_signal_that_is_ignored_stays_ignored():
+    """As by nohup, and by a shell that starts a job in the background."""
+    code = ("import signal\nfrom eddies import cli\nsignal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
+            "received = cli.catch_signals()\nsignal.raise_signal(signal.SIGHUP)\nprint(received)\n")
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (ended.returncode, ended.stdout) == (0, "[]\n")
 
 
 def test_an_interrupt_within_code_of_a_string_is_one_like_others(tmp_path):

@@ -34,7 +34,8 @@ BAD_INPUT = 2
 INTERRUPTED = 128 + signal.SIGINT
 STOPPED = 75  # EX_TEMPFAIL: the same command goes on
 REPORT = Path("report") / "index.html"
-STOP_SIGNALS = (signal.SIGUSR1, signal.SIGTERM)
+STOP_SIGNALS = (signal.SIGUSR1, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+STOPPING = b"eddies: stops after this step; a second interrupt ends it at once\n"
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -108,26 +109,31 @@ def run(arguments: list[str] | None) -> int:
 
 
 def catch_signals() -> list[int]:
-    """The list to which SIGUSR1 and SIGTERM, as schedulers send before the time limit, add their numbers from now on.
+    """The list to which signals that ask for a stop add their numbers from now on; the stages look at it at every step.
 
-    The stages look at it at every step. A second SIGTERM ends the process at once.
+    Schedulers send SIGUSR1 or SIGTERM before the time limit, the keyboard SIGINT, a terminal that closes SIGHUP. One
+    that is ignored, as by nohup, stays so. A second one of the same kind, but for SIGUSR1, ends the process at once.
     """
     received: list[int] = []
 
     def note(number: int, frame: object) -> None:
         received.append(number)
-        if number == signal.SIGTERM:
-            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        if number != signal.SIGUSR1:
+            signal.signal(number, signal.SIG_DFL)
+        if number == signal.SIGINT:
+            os.write(sys.__stderr__.fileno() if sys.__stderr__ else 2, STOPPING)
 
     for number in STOP_SIGNALS:
-        signal.signal(number, note)
+        if signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, note)
     return received
 
 
 def release_signals(received: list[int]) -> None:
     """Let signals end the process, for commands that nobody resumes; also those that came so far."""
     for number in STOP_SIGNALS:
-        signal.signal(number, signal.SIG_DFL)
+        if signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
     for number in received:
         signal.raise_signal(number)
 
