@@ -22,7 +22,6 @@ import torch
 from mpi4py import MPI
 from step import Stopwatch
 
-from eddies.flow.filtering import gaussian_transfer
 from eddies.flow.initial_fields import random_velocity
 from eddies.flow.statistics import energy_spectrum, turbulence_scales
 from eddies.flow.tracers import release
@@ -42,6 +41,7 @@ from eddies.particles.resolved_velocity import ResolvedVelocity
 from eddies.scene.sections import Tracers
 from eddies.scene.terms import DEFAULT_PRESET, PRESETS, TERMS
 from eddies.spectral.interpolation import SplineInterpolation
+from eddies.spectral.mode_operators import gaussian_transfer
 from eddies.spectral.spectral_grid import SpectralGrid
 
 WARM_UP, STEPS, INTEGRATOR, NEIGHBORS = 10, 6, "rk3", 60.0

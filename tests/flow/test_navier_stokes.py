@@ -3,14 +3,13 @@ import pytest
 
 from eddies.clock import Clock
 from eddies.flow import initial_fields
-from eddies.flow.filtering import gaussian_transfer
 from eddies.flow.forcing import ForcingError, LinearForcing
 from eddies.flow.history import FlowHistory
 from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid
-from eddies.flow.operators import divergence, gradient
 from eddies.flow.statistics import compressible_budget, gradient_moments
 from eddies.parallel.migration import Redistribution
 from eddies.parallel.slab import SlabDecomposition
+from eddies.spectral.mode_operators import gaussian_transfer
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.time_stepping import ETDRK4
 
@@ -52,7 +51,7 @@ def test_nonlinear_terms_against_derivatives_in_physical_space(comm):
     fluid, state = forced_fluid(comm, rate=0.0)
     grid, nu = fluid.grid, fluid.viscosity
     # The start is solenoidal; with a gradient added to the velocity, terms with the dilatation count as well.
-    state[:3] += gradient(grid, state[3])
+    state[:3] += grid.gradient(state[3])
     derivative = [[grid.backward((1j * k * component)[None])[0] for k in grid.wavevector] for component in state]
     u, A, G = grid.backward(state[:3]), np.array(derivative[:3]), np.array(derivative[3])
     S = (A + A.transpose(1, 0, 2, 3, 4)) / 2
@@ -82,7 +81,7 @@ def test_incompressible_flow_stays_solenoidal_and_single_precision_follows(comm)
         fluid = IncompressibleFluid(grid, 0.02, forcing=LinearForcing(grid, 0.5, 2.0))
         ends[precision] = march(fluid, initial_fields.random_velocity(grid, 3, 1.0, 2.0), 0.02, 20)
         assert ends[precision].dtype == grid.complex
-        assert np.abs(divergence(grid, ends[precision])).max() < (1e-15 if precision == "float64" else 1e-6)
+        assert np.abs(grid.divergence(ends[precision])).max() < (1e-15 if precision == "float64" else 1e-6)
     assert np.abs(ends["float32"] - ends["float64"]).max() < 1e-5
 
 
@@ -170,7 +169,7 @@ def test_a_flow_without_energy_at_the_forced_modes_is_refused(comm, precision):
 def test_dissipation_against_all_nine_gradients(comm):
     fluid, state = forced_fluid(comm)
     grid = fluid.grid
-    A = np.array([grid.backward(gradient(grid, component)) for component in state[:3]])
+    A = np.array([grid.backward(grid.gradient(component)) for component in state[:3]])
     rho, S = np.exp(grid.backward(state[3:])[0]), (A + A.transpose(1, 0, 2, 3, 4)) / 2
     friction = rho * (2 * (S**2).sum(axis=(0, 1)) - 2 / 3 * np.einsum("iizyx->zyx", A) ** 2)
     budget = compressible_budget(grid, state, 0.05, 8.0)

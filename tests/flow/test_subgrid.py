@@ -5,15 +5,14 @@ import pytest
 import torch
 
 from eddies.flow import initial_fields
-from eddies.flow.filtering import gaussian_transfer
 from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid
-from eddies.flow.operators import gradient, project
 from eddies.flow.statistics import energy_spectrum
 from eddies.flow.subgrid import DynamicStress, EddyDamping, SpectralViscosity, StressModel
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.fourier_grid import FourierGrid
 from eddies.particles.resolved_flow import ResolvedFlow
 from eddies.particles.terms.damping import Damping
+from eddies.spectral.mode_operators import gaussian_transfer
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.time_stepping import ETDRK4
 
@@ -62,7 +61,7 @@ def test_it_takes_the_energy_that_the_stress_dissipates(comm):
     grid = coarse_grid(comm)
     velocity, force = turbulent_velocity(grid), np.zeros((3, *grid.spectral_shape), complex)
     StressModel(grid, CONSTANT * WIDTH).add(velocity, force)
-    A = np.array([grid.backward(gradient(grid, component)) for component in velocity])
+    A = np.array([grid.backward(grid.gradient(component)) for component in velocity])
     S = (A + A.transpose(1, 0, 2, 3, 4)) / 2
     squared = np.einsum("ijzyx,ijzyx->zyx", S, S)
     dissipation = grid.mean((2 * (CONSTANT * WIDTH) ** 2 * np.sqrt(2 * squared) * squared)[None])[0]
@@ -84,7 +83,7 @@ def test_a_closure_acts_on_the_velocity_alone_and_keeps_an_incompressible_one_so
     assert np.array_equal(with_model[3], without[3])
     with_model, without = (IncompressibleFluid(grid, 0.05, closure=closure).nonlinear(velocity)
                            for closure in (model, None))
-    assert np.abs(with_model - without - project(grid, force)).max() < 1e-14
+    assert np.abs(with_model - without - grid.solenoidal(force)).max() < 1e-14
 
 
 def hidden_stress(grid, velocity, width):

@@ -2,12 +2,12 @@ import numpy as np
 import pytest
 
 from eddies.flow import initial_fields
-from eddies.flow.filtering import gaussian_transfer
 from eddies.flow.tracers import FilteredField, TracerParticles, lattice_positions, random_positions, release
 from eddies.parallel.migration import IdOrder, census
 from eddies.parallel.reduction import global_max
 from eddies.parallel.slab import SlabDecomposition
 from eddies.spectral.interpolation import SplineInterpolation
+from eddies.spectral.mode_operators import gaussian_transfer
 from eddies.spectral.spectral_grid import SpectralGrid
 
 LENGTH = 2 * np.pi

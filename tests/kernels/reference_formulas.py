@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from eddies.flow.operators import dot_wavevector, project
 from eddies.spectral.spectral_grid import SpectralGrid
 
 Terms = Sequence[tuple[np.ndarray, np.ndarray]]
@@ -37,7 +36,7 @@ class Formulas:
 
     def project(self, vector: np.ndarray) -> np.ndarray:
         """u - k (k.u) / k^2."""
-        return project(self.grid, vector)
+        return self.grid.solenoidal(vector)
 
     def sum_of_decays(self, terms: Terms) -> np.ndarray:
         """The sum of factors, n = 1, times states."""
@@ -48,7 +47,7 @@ class Formulas:
         result = np.zeros_like(terms[0][1])
         for factors, state in terms:
             transverse, excess, elastic, identity, coupling = _at_all_kz(factors)
-            dotted, sigma = dot_wavevector(self.grid, state[:3]), -1j * state[3]
+            dotted, sigma = self.grid.along_wavevector(state[:3]), -1j * state[3]
             along = excess * dotted + elastic * sigma
             for component, k, u in zip(result, self.grid.wavevector, state):
                 component += transverse * u + k * along

@@ -20,7 +20,6 @@ from eddies.analysis.errors import normalized_l2
 from eddies.clock import ProgressLine
 from eddies.flow import initial_fields
 from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid, advective_speed
-from eddies.flow.operators import project
 from eddies.flow.statistics import compressible_budget, energy_spectrum, gradient_moments, turbulence_scales
 from eddies.logs import configure_logging
 from eddies.parallel.reduction import global_max
@@ -87,7 +86,7 @@ def describe(fluid, state):
 
 def vortex_density(fluid, state):
     """s = ln(rho / rho_0) as the pressure of the solenoidal velocity makes it, without sound."""
-    return initial_fields.balanced_density(fluid.grid, project(fluid.grid, state[:3]), fluid.sound_speed)
+    return initial_fields.balanced_density(fluid.grid, fluid.grid.solenoidal(state[:3]), fluid.sound_speed)
 
 
 def kinetic_energy(grid, state):

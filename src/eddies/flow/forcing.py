@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from eddies.errors import UserError
-from eddies.flow.filtering import gaussian_transfer
 from eddies.parallel.reduction import global_sum
+from eddies.spectral.mode_operators import ModeOperators, gaussian_transfer
 from eddies.spectral.spectral_grid import SpectralGrid
 
 # Share of the kinetic energy at the forced modes that round-off alone may leave there.
@@ -36,10 +36,9 @@ class LinearForcing:
         self.reach = reach = min(int(np.ceil(wavenumber)) - 1, grid.cutoff)
         signed = np.arange(-reach, reach + 1)
         kx, ky, kz = np.arange(reach + 1)[None, None, :], signed[None, :, None], signed[:, None, None]
-        self._wavevector = [np.broadcast_to(axis, (len(signed), len(signed), reach + 1)) for axis in (kx, ky, kz)]
         squared = kx**2 + ky**2 + kz**2
+        self._operators = ModeOperators((kx, ky, kz), squared, np.stack)
         self._forced = (squared > 0) & (squared < wavenumber**2)
-        self._inverse_squared = 1.0 / np.where(squared > 0, squared, 1)
         unit = 2 * np.pi / grid.decomposition.length
         self._weights = np.where(kx == 0, 1, 2) / gaussian_transfer(unit**2 * squared, filter_width) ** 2
         # Where the forced modes of this rank stand in its spectral array, and in the small block.
@@ -76,6 +75,4 @@ class LinearForcing:
         block[:, :, self._block_rows] = own
         block = global_sum(self.grid.decomposition.comm, block)
         block[..., 0] = (block[..., 0] + block[:, ::-1, ::-1, 0].conj()) / 2
-        along = sum(k * component for k, component in zip(self._wavevector, block)) * self._inverse_squared
-        block -= np.stack([k * along for k in self._wavevector])
-        return block * self._forced
+        return self._operators.solenoidal(block) * self._forced

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from eddies.flow.operators import pressure, project
+from eddies.flow.operators import pressure
 from eddies.parallel.reduction import global_sum
 from eddies.spectral.spectral_grid import SpectralGrid
 
@@ -15,7 +15,7 @@ def random_velocity(grid: SpectralGrid, seed: int, amplitude: float, peak_wavenu
     `amplitude` is the rms of one component. Random numbers are keyed by (seed, ky, kz) and drawn along kx, so the
     field depends neither on the number of ranks nor on the resolution. Every shell carries exactly its energy.
     """
-    velocity = project(grid, _gaussian_modes(grid, seed))
+    velocity = grid.solenoidal(_gaussian_modes(grid, seed))
     velocity[:, grid.index_squared == 0] = 0
     shell = np.rint(np.sqrt(grid.index_squared)).astype(int)
     shells = int(np.ceil(np.sqrt(3) * grid.cutoff)) + 1

@@ -9,7 +9,6 @@ import numpy as np
 
 from eddies.flow.forcing import LinearForcing
 from eddies.flow.linear_operators import AcousticBlock, Decay
-from eddies.flow.operators import divergence, dot_wavevector
 from eddies.flow.subgrid import Closure
 from eddies.kernels.flow import Formulas
 from eddies.kernels.library import library
@@ -129,12 +128,12 @@ class CompressibleFluid:
         """-c^2 grad s - nu (k^2 u + 1/3 k (k.u)), and -div u."""
         grid, nu = self.grid, self.viscosity
         velocity, s = state[:3], state[3]
-        longitudinal = dot_wavevector(grid, velocity)
+        longitudinal = grid.along_wavevector(velocity)
         result = np.empty_like(state)
         for i, k in enumerate(grid.wavevector):
             viscous = grid.wavenumber_squared * velocity[i] + k * longitudinal / 3
             result[i] = -1j * self.sound_speed**2 * k * s - nu * viscous
-        result[3] = -divergence(grid, velocity)
+        result[3] = -grid.divergence(velocity)
         return result
 
     def linear_function(self, function: ScalarFunction, step: float) -> AcousticBlock:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from eddies.flow.operators import dot_wavevector, inverse_wavenumber_squared
 from eddies.parallel.reduction import global_sum
 from eddies.spectral.spectral_grid import SpectralGrid
 
@@ -105,7 +104,7 @@ def compressible_budget(grid: SpectralGrid, state: np.ndarray, viscosity: float,
         sums += [part.sum(dtype=float) for part in (energy, friction, rho, rho**2)]
         powers += _powers(diagonal)
     total = global_sum(grid.decomposition.comm, np.concatenate([sums, powers.ravel()])) / grid.cells**3
-    along = np.abs(dot_wavevector(grid, state[:3])) ** 2 * inverse_wavenumber_squared(grid)
+    along = np.abs(grid.along_wavevector(state[:3])) ** 2 * grid.inverse_squared
     kinetic = grid.sum_modes((np.abs(state[:3]) ** 2).sum(axis=0))
     skewness, flatness = _skewness_and_flatness(total[4:].reshape(3, 3))
     return {"total_energy": float(total[0]),

@@ -10,14 +10,11 @@ from typing import Protocol
 
 import numpy as np
 
-from eddies.flow.filtering import gaussian_transfer
-from eddies.flow.operators import dot_wavevector
 from eddies.flow.statistics import energy_spectrum
+from eddies.spectral.mode_operators import gaussian_transfer
 from eddies.spectral.spectral_grid import SpectralGrid
 
-# Rows of a symmetric matrix xx, yy, zz, xy, xz, yz that make up the row of each component, and how often each stands
-# in the matrix.
-ROWS = ((0, 3, 4), (3, 1, 5), (4, 5, 2))
+# How often each entry xx, yy, zz, xy, xz, yz stands in a symmetric matrix.
 TIMES = np.array([1, 1, 1, 2, 2, 2])
 # nu_t (k_c / E(k_c))^(1/2) far below k_c, its growth towards k_c, and how fast it grows (Chollet and Lesieur 1981, in
 # the form of Lesieur and Metais 1996, Kolmogorov constant 1.4).
@@ -59,9 +56,7 @@ class StressModel:
 
     def add(self, velocity: np.ndarray, tendency: np.ndarray) -> None:
         """Add the force to the velocity's tendency in place; both (3, kz, ky, kx), Fourier space."""
-        stress = self.stress(velocity)
-        for component, row in zip(tendency, ROWS):
-            component -= 1j * dot_wavevector(self.grid, stress[list(row)])
+        tendency -= self.grid.stress_divergence(self.stress(velocity))
 
     def stress(self, velocity: np.ndarray) -> np.ndarray:
         """Modes of tau, (6, kz, ky, kx) in the order xx, yy, zz, xy, xz, yz."""

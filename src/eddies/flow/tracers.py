@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from eddies.flow.filtering import gaussian_transfer
 from eddies.parallel.migration import id_block, migrate, wrap
 from eddies.parallel.slab import SlabDecomposition
 from eddies.spectral.interpolation import SplineInterpolation
+from eddies.spectral.mode_operators import gaussian_transfer
 from eddies.spectral.spectral_grid import SpectralGrid
 
 

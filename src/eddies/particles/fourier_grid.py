@@ -17,17 +17,17 @@ from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.particle_set import as_numpy
 from eddies.particles.rates import Rates
 from eddies.spectral.interpolation import SplineInterpolation
+from eddies.spectral.mode_operators import ModeOperators
 from eddies.spectral.spectral_grid import SYMMETRIC, SpectralGrid
 
 
-class FourierGrid:
+class FourierGrid(ModeOperators):
     """A periodic grid of one cell for each plane of the slabs, with the modes |k_i| <= `resolved`.
 
     Fields are real tensors (c, z_local, y, x), modes complex ones (c, kz, ky, kx) as in `SpectralGrid`; both are on the
-    host and of the precision of `dtype`, single or double. Values at positions are in double precision. Vectors have
-    the order x, y, z, symmetric matrices xx, yy, zz, xy, xz, yz. Positions (n, 3) lie in this rank's slab or at most
-    `reach` outside, which is `margin` grid planes. All methods that change between particles, fields and modes are
-    collective, also on the way back of a gradient.
+    host and of the precision of `dtype`, single or double. Values at positions are in double precision. Positions
+    (n, 3) lie in this rank's slab or at most `reach` outside, which is `margin` grid planes. All methods that change
+    between particles, fields and modes are collective, also on the way back of a gradient.
     """
 
     def __init__(self, decomposition: SlabDecomposition, resolved: int, margin: int = 1,
@@ -36,14 +36,10 @@ class FourierGrid:
         self.spectral = SpectralGrid(decomposition, str(dtype).removeprefix("torch."), cutoff=resolved)
         self.spline = SplineInterpolation(self.spectral, "cubic", margin)
         self.reach = margin * decomposition.spacing
-        #: kx, ky, kz, to broadcast over (kz, ky, kx)
-        self.wavevector = tuple(torch.from_numpy(axis) for axis in self.spectral.wavevector)
-        self._derivatives = tuple(1j * k for k in self.wavevector)
+        super().__init__([torch.from_numpy(axis) for axis in self.spectral.wavevector],
+                         torch.from_numpy(self.spectral.wavenumber_squared), torch.stack)
         #: |k|, in units of the smallest one
         self.shell = torch.from_numpy(np.sqrt(self.spectral.index_squared))
-        self.wavenumber_squared = torch.from_numpy(self.spectral.wavenumber_squared)
-        #: 1/k^2, 0 for k = 0
-        self.inverse_squared = torch.where(self.shell > 0, 1 / self.wavenumber_squared, 0.0)
         #: by which modes become those of spline coefficients
         self.prefilter = torch.from_numpy(self.spline.inverse)
         #: how often a stored mode stands in the full sum
@@ -91,29 +87,6 @@ class FourierGrid:
             self._transfers[width] = torch.exp(-self.wavenumber_squared * (width**2 / 24))
         return self._transfers[width]
 
-    def gradient(self, scalar: Tensor) -> Tensor:
-        """i k f of one component (kz, ky, kx): (3, kz, ky, kx)."""
-        return torch.stack([derivative * scalar for derivative in self._derivatives])
-
-    def divergence(self, vector: Tensor) -> Tensor:
-        """i k.u of a vector: (kz, ky, kx)."""
-        return _dot(self._derivatives, vector)
-
-    def solenoidal(self, vector: Tensor) -> Tensor:
-        """u - k (k.u) / k^2, the projection of a vector on solenoidal fields."""
-        longitudinal = _dot(self.wavevector, vector) * self.inverse_squared
-        return vector - torch.stack([k * longitudinal for k in self.wavevector])
-
-    def stress_divergence(self, stress: Tensor) -> Tensor:
-        """d_j tau_ij of a symmetric matrix (6, kz, ky, kx): (3, kz, ky, kx)."""
-        xx, yy, zz, xy, xz, yz = stress
-        return torch.stack([_dot(self._derivatives, row) for row in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))])
-
-    def pressure_of(self, vector: Tensor) -> Tensor:
-        """p (kz, ky, kx) with  laplacian p = -div f  and mean zero, of a vector f (3, kz, ky, kx), such as the
-        divergence of a stress: f + grad p is solenoidal."""
-        return self.divergence(vector) * self.inverse_squared
-
     def hidden_stress(self, stress: Tensor) -> Rates:
         """What a stress tau that the filter hides does to the filtered flow, of (6, kz, ky, kx): its divergence and the
         gradient of its pressure p_tau (`pressure_of`), which together are the force
@@ -141,11 +114,6 @@ class FourierGrid:
     def within(self, vector: Tensor) -> Tensor:
         """The modes with |k| <= `resolved` of a vector."""
         return vector * self._sphere
-
-
-def _dot(wavevector: Sequence[Tensor], vector: Tensor) -> Tensor:
-    kx, ky, kz = wavevector
-    return kx * vector[0] + ky * vector[1] + kz * vector[2]
 
 
 class Points:

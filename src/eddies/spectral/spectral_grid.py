@@ -12,6 +12,7 @@ from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.transpose import Transpose, TransposeBuffers
 from eddies.spectral.fourier_passes import ColumnPass, Part, PlanePass, PlanePlans
+from eddies.spectral.mode_operators import ModeOperators
 
 REAL = {"float64": np.float64, "float32": np.float32}
 COMPLEX = {"float64": np.complex128, "float32": np.complex64}
@@ -22,7 +23,7 @@ SYMMETRIC = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 Expansion = Callable[[np.ndarray], Sequence[Part]]
 
 
-class SpectralGrid:
+class SpectralGrid(ModeOperators):
     """Fourier transforms on a periodic cube of `cells`^3 points, slab-decomposed, with the modes |k_i| <= cutoff.
 
     Physical arrays are (components, z_local, y, x), real. Spectral arrays are (components, kz, ky_local, kx), complex,
@@ -58,9 +59,9 @@ class SpectralGrid:
         local = signed[start : start + self._transpose.y_count]
         #: integer wavenumbers of each axis, shaped to broadcast over (kz, ky, kx)
         self.index = (np.arange(self.cutoff + 1)[None, None, :], local[None, :, None], signed[:, None, None])
-        self.wavevector = tuple((unit * axis).astype(self.real) for axis in self.index)
         self.index_squared = sum(axis.astype(np.int64) ** 2 for axis in self.index)
-        self.wavenumber_squared = (unit**2 * self.index_squared).astype(self.real)
+        super().__init__([(unit * axis).astype(self.real) for axis in self.index],
+                         (unit**2 * self.index_squared).astype(self.real), np.stack)
         #: i kx and i ky for the modes in (ky, kx) that an `expand` of `blocks` gets, all of them in storage order
         self.d_dx = (1j * unit * signed).astype(self.complex)[None, None, None, :]
         self.d_dy = (1j * unit * signed).astype(self.complex)[None, None, :, None]

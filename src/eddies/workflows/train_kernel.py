@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from torch import nn
 
-from eddies.flow.operators import gradient
 from eddies.io.guard import Guard
 from eddies.io.hdf5 import open_product
 from eddies.io.weights import save_weights
@@ -79,7 +78,7 @@ def load_sample(truth: GroundTruth, index: int, support: float) -> KernelSample:
     slab = truth.decomposition
     velocity = truth.field(index, "velocity")
     grid = SpectralGrid(slab, cutoff=(slab.planes - 1) // 2)
-    derivatives = np.stack([grid.backward(gradient(grid, component)) for component in grid.forward(velocity)])
+    derivatives = np.stack([grid.backward(grid.gradient(component)) for component in grid.forward(velocity)])
     # Without the density, which an incompressible ground truth has not.
     columns = migrate(slab, truth.block(truth.frame_of_field(index), ("position", "velocity")))
     by_point = [torch.from_numpy(np.ascontiguousarray(np.moveaxis(values.reshape(*values.shape[:-3], -1), -1, 0)))

@@ -13,7 +13,6 @@ from eddies.flow.courant import CourantLimit, FixedStep
 from eddies.flow.forcing import LinearForcing
 from eddies.flow.initial_fields import INITIAL_FLOWS, balanced_density, sound_wave_density
 from eddies.flow.navier_stokes import FLUIDS, Fluid
-from eddies.flow.operators import project
 from eddies.import_path import is_path, load
 from eddies.io.errors import ProductError
 from eddies.io.flow_states import StoredStates, VelocityCubes, open_states
@@ -70,7 +69,7 @@ def _own_velocity(scene: Scene, grid: SpectralGrid) -> np.ndarray:
         found = f"an array {velocity.shape}" if isinstance(velocity, np.ndarray) else f"a {type(velocity).__name__}"
         raise SceneError(f'[initial] kind = "{initial.kind}": returned {found}; must be the modes (3, kz, ky, kx) = '
                          f"{shape} of the velocity on this rank, such as grid.forward(velocity) gives")
-    return project(grid, velocity.astype(grid.complex))
+    return grid.solenoidal(velocity.astype(grid.complex))
 
 
 @contextmanager
@@ -108,7 +107,7 @@ def _state_from_file(scene: Scene, fluid: Fluid) -> np.ndarray:
                          (stored_speed / fluid.sound_speed) ** 2)
         return np.concatenate([velocity, density])
     # A velocity of a compressible flow, in single precision, or of every second point alone, is not solenoidal.
-    velocity = project(grid, velocity)
+    velocity = grid.solenoidal(velocity)
     if not fluid.compressible:
         return velocity
     return np.concatenate([velocity, balanced_density(grid, velocity, fluid.sound_speed)[None]])

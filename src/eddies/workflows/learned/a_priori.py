@@ -6,7 +6,6 @@ import numpy as np
 import torch
 
 from eddies.clock import ProgressLine
-from eddies.flow.operators import gradient
 from eddies.learning.force_training import TrainingFrame
 from eddies.learning.losses import relative_error
 from eddies.parallel.communicator import Comm
@@ -98,7 +97,7 @@ def _pressure_force(truth: GroundTruth, index: int, particles: ParticleSet) -> t
     slab = SlabDecomposition(truth.decomposition.comm, truth.decomposition.length, truth.fields.cells)
     grid = SpectralGrid(slab, cutoff=(slab.planes - 1) // 2)
     planes = truth.field(at, "density", slab)
-    force = -truth.scales.sound_speed**2 * gradient(grid, grid.forward(np.log(planes))[0])
+    force = -truth.scales.sound_speed**2 * grid.gradient(grid.forward(np.log(planes))[0])
     spline = SplineInterpolation(grid, "quintic")
     columns = migrate(slab, {name: as_numpy(getattr(particles, name)) for name in ("id", "position")})
     values = spline.at(spline.coefficients(force), columns["position"])

@@ -12,11 +12,9 @@ import torch
 
 from eddies.clock import Clock
 from eddies.flow.courant import CourantLimit
-from eddies.flow.filtering import gaussian_transfer
 from eddies.flow.forcing import LinearForcing
 from eddies.flow.initial_fields import balanced_density
 from eddies.flow.navier_stokes import FLUIDS, Fluid
-from eddies.flow.operators import gradient, project
 from eddies.flow.stability import quadratic_energy
 from eddies.flow.subgrid import Closure, DynamicStress, EddyDamping, SpectralViscosity, StressModel
 from eddies.flow.tracers import FilteredField, TracerParticles
@@ -28,6 +26,7 @@ from eddies.parallel.migration import migrate
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.particle_set import ParticleSet
 from eddies.scene.scene import Eulerian, Scene, SceneError
+from eddies.spectral.mode_operators import gaussian_transfer
 from eddies.spectral.spectral_grid import SpectralGrid, regrid
 from eddies.time_stepping import ETDRK4
 from eddies.workflows.ground_truth.truth import GroundTruth
@@ -113,7 +112,7 @@ class EulerianRun:
         if fluid.closure is not None:
             fluid.closure.begin_step(self.state[:3])
         change = transfer * (fluid.linear(self.state) + fluid.nonlinear(self.state))[:3]
-        gradients = [gradient(fluid.grid, component) for component in velocity]
+        gradients = [fluid.grid.gradient(component) for component in velocity]
         spline = self.tracers.field.spline
         values = spline.at(spline.coefficients(np.concatenate([change, *gradients])), self.tracers.columns["position"])
         along = np.einsum("nij,nj->ni", values[:, 3:].reshape(-1, 3, 3), self.tracers.columns["velocity"])
@@ -215,7 +214,7 @@ def initial_state(truth: GroundTruth, fluid: Fluid, filter_passed: float, frame:
     velocity = kept(truth.state(at[0], "velocity", slab))
     velocity *= gaussian_transfer(grid.wavenumber_squared, filter_passed).astype(grid.real)
     if not fluid.compressible:
-        return project(grid, velocity)
+        return grid.solenoidal(velocity)
     if filter_passed:
         return np.concatenate([velocity, balanced_density(grid, velocity, fluid.sound_speed)[None]])
     return np.concatenate([velocity, kept(np.log(truth.state(at[0], "density", slab)))])

@@ -1,0 +1,66 @@
+"""Operators on modes of fields, for numpy arrays and torch tensors alike; those of tensors differentiate themselves.
+
+Modes are (..., kz, ky, kx). Vectors have the order x, y, z, symmetric matrices xx, yy, zz, xy, xz, yz.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+#: A numpy array or a torch tensor.
+Modes = Any
+
+
+class ModeOperators:
+    """Derivatives and projections of the modes of given wavevectors.
+
+    Parameters
+    ----------
+    wavevector : kx, ky, kz, to broadcast over (kz, ky, kx). wavenumber_squared : k^2 (kz, ky, kx).
+    stack : numpy.stack or torch.stack.
+    """
+
+    def __init__(self, wavevector: Sequence[Modes], wavenumber_squared: Modes,
+                 stack: Callable[[Sequence[Modes]], Modes]) -> None:
+        self.wavevector, self.wavenumber_squared, self._stack = tuple(wavevector), wavenumber_squared, stack
+        mean = wavenumber_squared == 0
+        #: 1/k^2, 0 for k = 0
+        self.inverse_squared = (1 / (wavenumber_squared + mean)) * ~mean
+
+    def along_wavevector(self, vector: Modes) -> Modes:
+        """k.u of a vector (3, kz, ky, kx): (kz, ky, kx)."""
+        kx, ky, kz = self.wavevector
+        return kx * vector[0] + ky * vector[1] + kz * vector[2]
+
+    def gradient(self, scalar: Modes) -> Modes:
+        """i k f of one component (kz, ky, kx): (3, kz, ky, kx)."""
+        return self._stack([1j * k * scalar for k in self.wavevector])
+
+    def divergence(self, vector: Modes) -> Modes:
+        """i k.u of a vector (3, kz, ky, kx): (kz, ky, kx)."""
+        return 1j * self.along_wavevector(vector)
+
+    def solenoidal(self, vector: Modes) -> Modes:
+        """u - k (k.u) / k^2, the projection of a vector (3, kz, ky, kx) on solenoidal fields."""
+        along = self.along_wavevector(vector) * self.inverse_squared
+        return self._stack([component - k * along for k, component in zip(self.wavevector, vector)])
+
+    def stress_divergence(self, stress: Modes) -> Modes:
+        """d_j tau_ij of a symmetric matrix (6, kz, ky, kx): (3, kz, ky, kx)."""
+        xx, yy, zz, xy, xz, yz = stress
+        return self._stack([self.divergence(row) for row in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))])
+
+    def pressure_of(self, vector: Modes) -> Modes:
+        """p (kz, ky, kx) with  laplacian p = -div f  and mean zero, of a vector f (3, kz, ky, kx), such as the
+        divergence of a stress: f + grad p is solenoidal. Of f = d_j (u_i u_j) it is the kinematic pressure of an
+        incompressible flow u."""
+        return self.divergence(vector) * self.inverse_squared
+
+
+def gaussian_transfer(wavenumber_squared: np.ndarray | float, width: float) -> np.ndarray:
+    """exp(-k^2 d^2 / 24): Fourier transform of the Gaussian filter of width d, whose second moment is that of a box
+    filter of the same width (Pope 2000, Table 13.2)."""
+    return np.exp(-np.asarray(wavenumber_squared) * width**2 / 24)
