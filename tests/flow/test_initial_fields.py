@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 
 from eddies.flow import initial_fields
-from eddies.flow.operators import pressure
 from eddies.flow.statistics import energy_spectrum, gradient_moments
 from eddies.parallel.slab import SlabDecomposition
 from eddies.spectral.spectral_grid import SpectralGrid, regrid
@@ -47,5 +46,5 @@ def test_pressure_of_the_taylor_green_vortex(comm):
     grid = make_grid(comm, 16)
     x, y, z = grid.coordinates()
     exact = (np.cos(2 * x) + np.cos(2 * y)) * (np.cos(2 * z) + 2) / 16
-    found = grid.backward(pressure(grid, initial_fields.taylor_green(grid, 1.0))[None])[0]
+    found = grid.backward(initial_fields.balanced_density(grid, initial_fields.taylor_green(grid, 1.0), 1.0)[None])[0]
     assert np.abs(found - exact).max(initial=0) < 1e-15

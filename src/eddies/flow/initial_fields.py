@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from eddies.flow.operators import pressure
 from eddies.parallel.reduction import global_sum
 from eddies.spectral.spectral_grid import SpectralGrid
 
@@ -73,7 +72,7 @@ def sound_wave_density(grid: SpectralGrid, amplitude: float, wavenumber: int) ->
 
 def balanced_density(grid: SpectralGrid, velocity: np.ndarray, sound_speed: float) -> np.ndarray:
     """s = p / c^2 with the incompressible pressure of the velocity, so that the start makes no sound; (kz, ky, kx)."""
-    return pressure(grid, velocity) / sound_speed**2
+    return grid.pressure_of(grid.squares(velocity)) / sound_speed**2
 
 
 #: Initial velocities by the words of [initial] kind, from the grid, the section's values and the seed: (3, kz, ky, kx).

@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 
 from eddies.flow.statistics import energy_spectrum
-from eddies.spectral.mode_operators import gaussian_transfer
+from eddies.spectral.mode_operators import gaussian_transfer, rising
 from eddies.spectral.spectral_grid import SpectralGrid
 
 # How often each entry xx, yy, zz, xy, xz, yz stands in a symmetric matrix.
@@ -151,8 +151,7 @@ class EddyDamping:
 
     def __init__(self, grid: SpectralGrid, rates: np.ndarray) -> None:
         self.grid, self._small = grid, grid.index_squared > (grid.cutoff / 2) ** 2
-        place = np.sqrt(grid.index_squared) / grid.cutoff
-        self._shape = grid.cutoff * np.interp(place, np.linspace(0, 1, len(rates) + 1), [0.0, *rates])
+        self._shape = grid.cutoff * rising(np.sqrt(grid.index_squared), grid.cutoff, rates)
         self._speed = 0.0
 
     def begin_step(self, velocity: np.ndarray) -> None:

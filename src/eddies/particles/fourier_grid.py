@@ -17,7 +17,7 @@ from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.particle_set import as_numpy
 from eddies.particles.rates import Rates
 from eddies.spectral.interpolation import SplineInterpolation
-from eddies.spectral.mode_operators import ModeOperators
+from eddies.spectral.mode_operators import ModeOperators, gaussian_transfer
 from eddies.spectral.spectral_grid import SYMMETRIC, SpectralGrid
 
 
@@ -82,9 +82,9 @@ class FourierGrid(ModeOperators):
     # ---- formulas on modes
 
     def filter_transfer(self, width: float) -> Tensor:
-        """G = exp(-k^2 d^2 / 24) of each mode (kz, ky, kx), of the Gaussian filter of width d; made once."""
+        """`gaussian_transfer` G of each mode (kz, ky, kx), made once."""
         if width not in self._transfers:
-            self._transfers[width] = torch.exp(-self.wavenumber_squared * (width**2 / 24))
+            self._transfers[width] = torch.from_numpy(gaussian_transfer(self.spectral.wavenumber_squared, width))
         return self._transfers[width]
 
     def hidden_stress(self, stress: Tensor) -> Rates:
@@ -93,7 +93,7 @@ class FourierGrid(ModeOperators):
 
             -grad p_tau - div tau = -P[div tau],   P the projection on solenoidal fields."""
         divergence = self.stress_divergence(stress)
-        pressure = self.pressure_of(divergence)
+        pressure = self.pressure_of(stress)
         return Rates(force_modes=-(divergence + self.gradient(pressure)), pressure_modes=pressure)
 
     def slopes(self, vector: Tensor) -> Tensor:

@@ -73,7 +73,7 @@ class ResolvedFlow:
 
     @property
     def filter_transfer(self) -> Tensor:
-        """G = exp(-k^2 d^2 / 24) of each mode (kz, ky, kx)."""
+        """The filter's G of each mode (kz, ky, kx)."""
         return self.grid.filter_transfer(self.filter_width)
 
     @cached_property

@@ -19,6 +19,7 @@ from eddies.particles.fourier_grid import FourierGrid
 from eddies.particles.least_squares import LeastSquares, Solution
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.resolved_flow import ResolvedFlow
+from eddies.spectral.mode_operators import gaussian_transfer
 
 # The exponent of the prior's power law, how it ends in the dissipation range (Pope 2000, Eq. 6.248), and how many
 # times the energy that it expects beyond the resolved modes is taken for noise. The latter measured in docs/closure.md.
@@ -278,7 +279,7 @@ def _prior(grid: FourierGrid, filter_width: float, kolmogorov_length: float,
 
     def law(shell):
         k = unit * shell
-        return shell**-EXPONENT * dissipation_range(k * kolmogorov_length) * np.exp(-((k * filter_width) ** 2) / 12)
+        return shell**-EXPONENT * dissipation_range(k * kolmogorov_length) * gaussian_transfer(k**2, filter_width) ** 2
 
     modes = torch.where(inside, torch.from_numpy(law(grid.shell.clamp_min(1).numpy())), 0.0)
     total = float(global_sum(grid.decomposition.comm, float(2 * (modes * grid.multiplicity).sum())))

@@ -16,6 +16,7 @@ from eddies.analysis.velocity_gradients import InvariantBins, enstrophy_scale
 from eddies.report.figures import GUIDE, MODEL, TRUTH, letter, number_wavenumbers, panels, styled
 from eddies.report.page import Metric, Section
 from eddies.report.rollout import WITHOUT_KERNEL, Rollout
+from eddies.spectral.mode_operators import gaussian_transfer
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,7 @@ class ForcedStatistics:
         times = run.model.times[frames]
         late = frames[times >= times[-1] / 2]
         shells = np.arange(span.spectra.shape[1])
-        transfer = np.exp(-((shells * run.filter_width) ** 2) / 12)
+        transfer = gaussian_transfer(shells**2, run.filter_width) ** 2
         flow_energy = span.spectra @ transfer
         measured = run.spectra.model
         known, chosen = min(measured["wavenumber"].size, len(shells)), _between(measured["time"], times[-1])

@@ -11,6 +11,7 @@ from eddies.report.figures import (DNS, FILTERED, FOURTH, GUIDE, MODEL, POSITIVE
                                    guide_power_law, largest, legend_below, letter, mark_time, number_wavenumbers,
                                    panels, show_plane, styled)
 from eddies.report.page import Metric, Section
+from eddies.spectral.mode_operators import gaussian_transfer
 
 # Panels of the history: title, axis label, and the columns with their labels, colours and line styles.
 HISTORY = (
@@ -142,7 +143,7 @@ def _compensated_panel(axis: Axes, k: np.ndarray, energy: np.ndarray, scales: Ma
 
 
 def _transfer_panel(axis: Axes, k: np.ndarray, ratio: np.ndarray, width: float) -> None:
-    axis.semilogx(k, np.exp(-(k**2) * width**2 / 12), color=FILTERED, label=r"$\exp(-k^2d^2/12)$")
+    axis.semilogx(k, gaussian_transfer(k**2, width) ** 2, color=FILTERED, label=r"$\exp(-k^2d^2/12)$")
     axis.semilogx(k, ratio, "o", color=TRUTH, markersize=4, markerfacecolor="none", label="measured")
     axis.axvline(np.pi / width, color=GUIDE, linestyle=":", linewidth=1)
     axis.annotate(r"$k=\pi/d$", (np.pi / width, 0.02), xycoords=("data", "axes fraction"), xytext=(3, 2),

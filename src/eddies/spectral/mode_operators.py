@@ -53,11 +53,23 @@ class ModeOperators:
         xx, yy, zz, xy, xz, yz = stress
         return self._stack([self.divergence(row) for row in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))])
 
-    def pressure_of(self, vector: Modes) -> Modes:
-        """p (kz, ky, kx) with  laplacian p = -div f  and mean zero, of a vector f (3, kz, ky, kx), such as the
-        divergence of a stress: f + grad p is solenoidal. Of f = d_j (u_i u_j) it is the kinematic pressure of an
-        incompressible flow u."""
-        return self.divergence(vector) * self.inverse_squared
+    def pressure_of(self, stress: Modes) -> Modes:
+        """p (kz, ky, kx) with  laplacian p = -d_i d_j tau_ij  and mean zero, of a symmetric matrix (6, kz, ky, kx):
+        div tau + grad p is solenoidal. Of tau = u u it is the kinematic pressure of an incompressible flow u."""
+        kx, ky, kz = self.wavevector
+        xx, yy, zz, xy, xz, yz = stress
+        along = kx * kx * xx + ky * ky * yy + kz * kz * zz + 2 * (kx * ky * xy + kx * kz * xz + ky * kz * yz)
+        return -along * self.inverse_squared
+
+
+def rising(shell: Modes, highest: float, values: Modes) -> Modes:
+    """A function of |k| = `shell` that has `values` (n,) at n wavenumbers equally spaced up to the `highest`, is 0 at
+    0, linear between them and constant beyond: a learned damping rate."""
+    place, found, before = shell * (len(values) / highest), 0.0, 0.0
+    for number, value in enumerate(values):
+        found = found + (value - before) * (place - number).clip(0, 1)
+        before = value
+    return found
 
 
 def gaussian_transfer(wavenumber_squared: np.ndarray | float, width: float) -> np.ndarray:

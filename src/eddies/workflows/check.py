@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import math
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
@@ -13,6 +12,7 @@ from eddies.io.single_writer import LARGEST_BYTES, has_single_writer
 from eddies.kernels.library import threads
 from eddies.parallel.communicator import Comm
 from eddies.scene.scene import BOX_LENGTH, Scene
+from eddies.spectral.mode_operators import gaussian_transfer
 from eddies.workflows.foreseen.cost_model import Speed, cost, costs
 from eddies.workflows.foreseen.estimates import (expected_step, expected_turbulence, flow_steps, ground_truth_alone,
                                                  largest_wavenumber, most_ranks, particle_reach, run_time, sees_pairs)
@@ -96,7 +96,7 @@ def particle_lines(scene: Scene) -> Iterator[str]:
         yield "none"
         return
     k_max, nyquist = largest_wavenumber(scene), tracers.particles_per_side / 2
-    k_max_transfer, nyquist_transfer = (math.exp(-(k * tracers.filter_width) ** 2 / 24) for k in (k_max, nyquist))
+    k_max_transfer, nyquist_transfer = (gaussian_transfer(k**2, tracers.filter_width) for k in (k_max, nyquist))
     yield (f"{tracers.particles_per_side}^3 = {tracers.particles}, mean spacing {tracers.spacing:.4g} = "
            f"{tracers.spacing * scene.flow.cells / BOX_LENGTH:.3g} cells")
     yield (f"filter width {tracers.filter_width:.4g}, passes {k_max_transfer:.2g} of the amplitude at k_max and "

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
-from eddies.particles.fourier_grid import FourierGrid
 from eddies.particles.rates import Rates
 from eddies.particles.terms.term import Term
 from eddies.scene import terms as declared
+from eddies.spectral.mode_operators import rising
 
 # The rates D to begin with: as those of a small viscosity, growing as k^2.
 RATES = 0.1 * (torch.arange(1, 7, dtype=torch.float64) / 6) ** 2
@@ -37,12 +37,5 @@ class Damping(Term):
         """Modes of the force."""
         flow = context.resolved
         highest = 2 * math.pi / context.decomposition.length * flow.grid.resolved
-        return Rates(force_modes=-highest * flow.smallest_rms * self._damping(flow.grid) * flow.velocity)
-
-    def _damping(self, grid: FourierGrid) -> Tensor:
-        """D of each mode (kz, ky, kx), in units of k_c u_c."""
-        rates = torch.cat([self.rates.new_zeros(1), self.rates]).double().cpu()
-        place = grid.shell * (len(self.rates) / grid.resolved)
-        below = place.long().clamp_max(len(self.rates) - 1)
-        fraction = (place - below).clamp_max(1.0)
-        return ((1 - fraction) * rates[below] + fraction * rates[below + 1]).to(grid.dtype)
+        rates = rising(flow.grid.shell, flow.grid.resolved, self.rates.double().cpu()).to(flow.grid.dtype)
+        return Rates(force_modes=-highest * flow.smallest_rms * rates * flow.velocity)

@@ -18,5 +18,5 @@ class Pressure(Term):
     def forward(self, context: Context) -> Rates:
         """Modes of pressure and force."""
         grid = context.resolved.grid
-        pressure = grid.pressure_of(context.resolved.convection)
+        pressure = grid.pressure_of(context.resolved.products)
         return Rates(force_modes=-grid.gradient(pressure), pressure_modes=pressure)
