@@ -3,18 +3,18 @@
 import numpy as np
 import pytest
 import torch
-from mpi4py import MPI
 
 from eddies.parallel.slab import SlabDecomposition
 from eddies.spectral.mode_operators import ModeOperators, gaussian_transfer, rising
 from eddies.spectral.spectral_grid import SpectralGrid
 
 LENGTH = 5.0
+pytestmark = pytest.mark.mpi(1)
 
 
 @pytest.fixture
-def grid():
-    return SpectralGrid(SlabDecomposition(MPI.COMM_SELF, LENGTH, 14))
+def grid(comm):
+    return SpectralGrid(SlabDecomposition(comm, LENGTH, 14))
 
 
 def modes(grid, components):
@@ -70,7 +70,7 @@ def test_rates_rise_from_one_wavenumber_to_the_next(grid):
         assert float(slopes[number]) == pytest.approx(float(expected))
 
 
-def test_the_filter_has_the_second_moment_of_a_box():
+def test_the_filter_has_the_second_moment_of_a_box(comm):
     """G = 1 - k^2 d^2/24 + ...: the transform of a box, sin(a)/a with a = k d/2, has the same slope in k^2."""
     small = 1e-3
     assert (1 - gaussian_transfer(small**2, 0.7)) / small**2 == pytest.approx(0.7**2 / 24, rel=1e-6)
