@@ -231,6 +231,12 @@ def test_every_term_is_in_the_table():
     assert set(named) == {*TERMS, '"module:name"'}
 
 
+def test_formulas_shown_are_those_of_the_library():
+    source = (CHECKOUT / "src/eddies/kernels/summands.hpp").read_text()
+    shown = blocks("cpp")
+    assert shown and all(block.strip() in source for block in shown)
+
+
 def test_example_with_variants(tmp_path):
     example = next(block for block in blocks("toml") if "[variant." in block)
     (tmp_path / "example.toml").write_text(example, encoding="utf-8")

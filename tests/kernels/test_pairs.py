@@ -6,15 +6,21 @@ import numpy as np
 import pytest
 import torch
 
-from eddies.kernels.pairs import CompiledPairs, PairSpace, Summand
+from eddies.kernels.pairs import CompiledPairs, PairSpace, Summand, kinds
+from eddies.kernels.reconstruction import told_kernel
+from eddies.particles import context
+from eddies.particles.compiled_pairs import compiled_sums
 from eddies.particles.flow_units import FlowUnits
+from eddies.particles.model import TERMS as BUILT_IN
 from eddies.particles.smoothing_kernels import CubicSpline, WendlandC2
+from eddies.particles.terms.term import PairTerm
 from tests.particles.configurations import (
     CONFIGURATIONS, CUTOFF, FLOW, LENGTH, NEIGHBORS, PAIR_MODELS, SCALES, alone, by_torch, dynamics_of, given, model,
     state,
 )
 
-TERMS = PAIR_MODELS | {
+# Every term over pairs as it is without settings, and others.
+TERMS = {word: {word: {}} for word, kind in BUILT_IN.items() if issubclass(kind, PairTerm)} | PAIR_MODELS | {
     "wide and deep": {"pairs": dict(hidden=(7, 33, 4)), "density-flux": dict(hidden=(9,))},
     "flux and friction": {"pairs": {}, "density-flux": {}, "eddy-viscosity": dict(form="monaghan")},
     "antisymmetric alone": {"pairs": dict(basis="paper", symmetry="antisymmetric")},
@@ -67,6 +73,13 @@ def compare(monkeypatch, dynamics, particles, relative, rows=None):
     assert_same(found, expected, relative)
 
 
+def told(dynamics, particles):
+    """What the library is told of each term over pairs of a model, and of the moments, with its parity."""
+    given = dynamics.context(particles)
+    terms = [*(term for term in dynamics.model.terms.values() if isinstance(term, PairTerm)), context._MOMENTS]
+    return [(term.compiled(given), term) for term in terms]
+
+
 # The gradient of a force of particles in one place, W'(r)/r x, is what torch's quotient 0/0 does not tell.
 CASES = [(name, kind) for name in TERMS for kind in CONFIGURATIONS
          if not (kind == "coincident" and {"continuity", "wcsph", "transport-velocity"} & set(TERMS[name]))]
@@ -94,12 +107,60 @@ def test_single_precision_differs_by_its_rounding(comm, served, monkeypatch, nam
     compare(monkeypatch, *set_up(TERMS[name], "even", dtype=torch.float32), 3e-5)
 
 
-def sums(library, position, kind="summation-density", radius=CUTOFF, wanted=None, dtype=np.float64):
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("name", TERMS)
+def test_gradients_are_those_of_differences(comm, served, name):
+    """By positions, velocities, numbers of particles and parameters, of every summand of the library that has one: one
+    that is new is among them, as terms are."""
+    dynamics, particles = set_up(TERMS[name], "cluster across a corner", count=14)
+    for summand, term in told(dynamics, particles):
+        parameters = torch.empty(0, dtype=torch.float64) if summand.parameters is None else summand.parameters
+        inputs = [value.detach().clone().requires_grad_() for value in
+                  (particles.position, particles.velocity, parameters, *summand.scalars)]
+        for mutual in {False, term.mutual}:
+            space = PairSpace(LENGTH, True, CUTOFF, SCALES.filter_width, SCALES.velocity, mutual)
+
+            def number(position, velocity, parameters, *scalars):
+                given = replace(summand, parameters=parameters, scalars=scalars)
+                sums, = compiled_sums(space, [given], [term.parity], position, velocity, np.ones(14, bool),
+                                      torch.float64)
+                return (sums * torch.linspace(1, 2, sums.numel()).reshape(sums.shape)).sum() / scale
+
+            scale = 1.0
+            scale = max(float(by.abs().max()) for by in torch.autograd.grad(number(*inputs), inputs) if by.numel())
+            # Differences are of second order, and of round-off over the step.
+            assert scale > 0 and torch.autograd.gradcheck(number, inputs, eps=1e-6, atol=1e-8, rtol=1e-6)
+
+
+@pytest.mark.mpi(1)
+def test_every_summand_with_a_gradient_is_one_of_a_term(comm, library):
+    found = {summand.kind for terms in TERMS.values() for summand, _ in told(*set_up(terms, "even"))}
+    assert found | {"kernel-sum", "kernel-average"} == set(kinds(library))
+
+
+@pytest.mark.parametrize("kind, numbers, parity, parameters, scalar", [
+    ("unheard-of", (), 1, 0, 0), ("moments", (), 6, 0, 0), ("moments", (), 7, 1, 0),
+    ("wcsph", (1.0, 1.0, 0.1), 3, 2, 1), ("pair-network", (2, 0, 0, 1, 0, 0, 3), 6, 13, 0)])
+def test_what_a_summand_does_not_take_is_told(library, kind, numbers, parity, parameters, scalar):
+    """A name, components, parameters and columns of numbers."""
+    space = PairSpace(LENGTH, True, 1.0, 1.0, 1.0, mutual=False)
+    pairs = CompiledPairs(library, space, np.zeros((2, 3)), np.zeros((2, 3)), np.zeros((2, 2)), np.ones(2, bool),
+                          np.float64)
+    with pytest.raises(ValueError, match=f"no such summands.*{kind}"):
+        pairs.sums([Summand(kind, numbers, (1.0,) * parity, scalar)], [np.zeros(parameters)])
+
+
+def kernel_sum(kernel):
+    return Summand("kernel-sum", told_kernel(kernel.support, kernel.pieces.numpy()), (1.0,))
+
+
+def sums(library, position, radius=CUTOFF, wanted=None, dtype=np.float64):
+    """Of a cubic spline that ends at the radius."""
     space = PairSpace(LENGTH, True, radius, 1.0, 1.0, mutual=True)
     wanted = np.ones(len(position), bool) if wanted is None else wanted
     pairs = CompiledPairs(library, space, position, np.zeros_like(position), np.zeros((0, len(position))), wanted,
                           dtype)
-    return pairs.sums([Summand(kind, 1, (0,), (radius, radius**-3))], [np.zeros(0)])[0][0]
+    return pairs.sums([kernel_sum(CubicSpline(radius))], [np.zeros(0)])[0][0]
 
 
 def value(kernel, distance, support=CUTOFF):
@@ -138,16 +199,16 @@ def test_sums_without_a_gradient_say_so(library):
     space = PairSpace(LENGTH, True, 1.0, 1.0, 1.0, mutual=False)
     pairs = CompiledPairs(library, space, np.zeros((2, 3)), np.zeros((2, 3)), np.zeros((0, 2)), np.ones(2, bool),
                           np.float64)
-    with pytest.raises(ValueError, match="no compiled gradient"):
-        pairs.gradients([Summand("kernel-sum", 1)], [np.zeros(0)], [np.zeros((1, 2))], True)
+    with pytest.raises(ValueError, match="without a gradient"):
+        pairs.gradients([kernel_sum(CubicSpline(1.0))], [np.zeros(0)], [np.zeros((1, 2))], True)
 
 
 def test_kernels_end_where_they_should(library):
-    for kind, kernel in ((0, CubicSpline), (1, WendlandC2)):
+    for kernel in (CubicSpline, WendlandC2):
         for distance in (0.0, 0.1, 0.49, 0.51, 0.99):
             position = np.array([[1.0, 2, 3], [1.0, 2 + distance, 3]])
             space = PairSpace(LENGTH, True, 1.0, 1.0, 1.0, mutual=True)
             pairs = CompiledPairs(library, space, position, np.zeros_like(position), np.zeros((0, 2)),
                                   np.ones(2, bool), np.float64)
-            found = pairs.sums([Summand("summation-density", 1, (kind,), (1.0, 1.0))], [np.zeros(0)])[0]
+            found = pairs.sums([kernel_sum(kernel(1.0))], [np.zeros(0)])[0]
             assert found == pytest.approx(value(kernel, distance, 1.0))

@@ -4,6 +4,7 @@
 #pragma once
 
 #include <cstddef>
+#include <stdexcept>
 #include <vector>
 
 #include "vectors.hpp"
@@ -122,7 +123,10 @@ inline void add_rows_of_products(int inputs, const Real* delta, const Real* give
 template <typename Real>
 class Network {
    public:
-    Network(std::vector<int> widths, const double* parameters) : widths_(std::move(widths)) {
+    // Throws std::invalid_argument where the count is another than that of the parameters.
+    Network(std::vector<int> widths, const double* parameters, std::int64_t count) : widths_(std::move(widths)) {
+        for (int layer = 0; layer < layers(); ++layer) count -= (widths_[layer] + 1) * widths_[layer + 1];
+        if (count != 0) throw std::invalid_argument("parameters of a network");
         for (int layer = 0; layer < layers(); ++layer) {
             const int inputs = widths_[layer], outputs = widths_[layer + 1];
             weights_.emplace_back(parameters, parameters + inputs * outputs);

@@ -22,16 +22,6 @@ struct Particles {
     std::int64_t mutual;                // whether all summands are, and each pair is evaluated once
 };
 
-// A summand, its sums and gradients. Those that are not asked for are null.
-struct Given {
-    std::int64_t kind, options_count, parameters_count, components, scalar;  // the first scalar that it reads
-    const std::int64_t* options;
-    const double *constants, *parameters;
-    void* sums;                // (components, count)
-    const void* by_sums;       // (components, count)
-    double* by_parameters;     // (parameters)
-};
-
 struct Gradients {
     double *position, *velocity;  // (count, 3)
     double* scalar;               // (scalars, count)
@@ -45,40 +35,28 @@ using namespace eddies;
 
 constexpr int ROWS_TOGETHER = 4;  // of a colour, for one thread
 
-// In the order of kernels/pairs.py.
-enum Kind {
-    PAIR_NETWORK, MOMENTS, EDDY_VISCOSITY, DENSITY_TRANSPORT, SUMMATION_DENSITY, CONTINUITY, TRANSPORT_VELOCITY, WCSPH,
-    KERNEL_SUM, KERNEL_AVERAGE
-};
+// The results of calls: else the first particle whose position is not finite.
+constexpr std::int64_t DONE = -1, UNKNOWN = -2, NO_GRADIENT = -3;
 
 template <typename Real>
-std::unique_ptr<Summand<Real>> make(const Given& given) {
-    const std::int64_t* options = given.options;
-    const int scalar = static_cast<int>(given.scalar);
-    switch (given.kind) {
-        case PAIR_NETWORK:
-            return std::make_unique<PairNetwork<Real>>(options, static_cast<int>(given.options_count), scalar,
-                                                       given.parameters);
-        case MOMENTS:
-            return std::make_unique<Moments<Real>>();
-        case EDDY_VISCOSITY:
-            return std::make_unique<EddyViscosity<Real>>(options[0], given.constants, given.parameters);
-        case DENSITY_TRANSPORT:
-            return std::make_unique<DensityTransport<Real>>(scalar);
-        case SUMMATION_DENSITY:
-            return std::make_unique<SummationDensity<Real>>(options[0], given.constants);
-        case CONTINUITY:
-            return std::make_unique<Continuity<Real>>(options[0], static_cast<int>(given.components), scalar,
-                                                      given.constants);
-        case TRANSPORT_VELOCITY:
-            return std::make_unique<TransportVelocity<Real>>(options[0], scalar, given.constants);
-        case KERNEL_SUM:
-            return std::make_unique<KernelSum<Real>>(given.constants);
-        case KERNEL_AVERAGE:
-            return std::make_unique<KernelAverage<Real>>(scalar, given.constants);
-        default:
-            return std::make_unique<Wcsph<Real>>(options[0], scalar, given.constants, given.parameters);
+std::unique_ptr<Summand<Real>> summand(const Given& given) {
+    const Kind& kind = kinds().at(given.kind);
+    if constexpr (std::is_same_v<Real, float>) return kind.single(given);
+    else return kind.full(given);
+}
+
+// Whether all kinds of summands are known, and what is given is what they want; DONE, or what is wrong.
+std::int64_t check(const Particles& particles, std::int64_t number, const Given* given, bool gradients) try {
+    for (std::int64_t s = 0; s < number; ++s) {
+        const auto one = summand<double>(given[s]);
+        if (one->components != given[s].components || one->parameters != given[s].parameters_count ||
+            given[s].scalar + one->scalars > particles.scalars)
+            return UNKNOWN;
+        if (gradients && !one->differentiable) return NO_GRADIENT;
     }
+    return DONE;
+} catch (const std::logic_error&) {  // no such name, or not the parameters of such a network
+    return UNKNOWN;
 }
 
 // A bit for each of some things.
@@ -131,7 +109,7 @@ struct Sorted {
         for (std::int64_t p = 0; p < given.count; ++p)
             if (given.wanted[cells.order[p]]) wanted.set(p);
         colour_rows();
-        return -1;
+        return DONE;
     }
 
    private:
@@ -189,11 +167,11 @@ class Worker {
     // `results` (count, width) in order of place are added to: sums, or where their gradients `by_sums` (count, width
     // of sums) are given, those by position, velocity and scalars, unless null.
     Worker(const Sorted<Real>& sorted, std::int64_t number, const Given* given, Real* results, const Real* by_sums)
-        : sorted_(sorted), cells_(sorted.cells), results_(results), by_sums_(by_sums),
+        : given_(given), sorted_(sorted), cells_(sorted.cells), results_(results), by_sums_(by_sums),
           by_pairs_(sorted.width), first_(sorted.width), second_(sorted.width),
           width_(padded<Real>(components_of(number, given))), sums_(width_), others_(width_) {
         for (std::int64_t s = 0; s < number; ++s) {
-            summands.push_back(make<Real>(given[s]));
+            summands.push_back(summand<Real>(given[s]));
             by_parameters.emplace_back(given[s].parameters_count * VectorOf<Real>::lanes);
         }
         const Particles& particles = sorted.given;
@@ -230,6 +208,7 @@ class Worker {
     }
 
    private:
+    const Given* given_;
     const Sorted<Real>& sorted_;
     const Cells<Real>& cells_;
     Real* results_;
@@ -306,9 +285,9 @@ class Worker {
     // What second particles get of mutual summands.
     void turn_sums() {
         int column = 0;
-        for (auto& summand : summands)
-            for (int c = 0; c < summand->components; ++c, ++column) {
-                Real *row = sums_[column], parity = summand->parity[c];
+        for (std::size_t s = 0; s < summands.size(); ++s)
+            for (int c = 0; c < summands[s]->components; ++c, ++column) {
+                Real *row = sums_[column], parity = given_[s].parity[c];
 #pragma omp simd
                 for (int p = 0; p < BLOCK; ++p) row[p] *= parity;
             }
@@ -373,7 +352,7 @@ class Worker {
             for (int c = 0; c < summand.components; ++c) {
                 Real* given = sums_[column + c];
                 if (mutual) {
-                    const Real *other = others_[column + c], parity = summand.parity[c];
+                    const Real *other = others_[column + c], parity = given_[s].parity[c];
 #pragma omp simd
                     for (int p = 0; p < BLOCK; ++p) given[p] += parity * other[p];
                 }
@@ -468,9 +447,9 @@ void each_column(const Sorted<Real>& sorted, std::int64_t number, const Given* g
 
 template <typename Real>
 std::int64_t sums(const Particles& particles, std::int64_t number, const Given* given) {
+    if (const std::int64_t wrong = check(particles, number, given, false); wrong != DONE) return wrong;
     Sorted<Real> sorted(particles);
-    const std::int64_t misplaced = sorted.arrange();
-    if (misplaced >= 0) return misplaced;
+    if (const std::int64_t misplaced = sorted.arrange(); misplaced != DONE) return misplaced;
     const int width = padded<Real>(components_of(number, given));
     Aligned<Real> results(particles.count * width);
     take_all<Real>(sorted, number, given, results.data(), nullptr);
@@ -478,14 +457,14 @@ std::int64_t sums(const Particles& particles, std::int64_t number, const Given* 
                                            std::int64_t column) {
         static_cast<Real*>(one.sums)[row] = results.data()[place * width + column];
     });
-    return -1;
+    return DONE;
 }
 
 template <typename Real>
 std::int64_t gradients(const Particles& particles, std::int64_t number, const Given* given, const Gradients& by) {
+    if (const std::int64_t wrong = check(particles, number, given, true); wrong != DONE) return wrong;
     Sorted<Real> sorted(particles);
-    const std::int64_t misplaced = sorted.arrange();
-    if (misplaced >= 0) return misplaced;
+    if (const std::int64_t misplaced = sorted.arrange(); misplaced != DONE) return misplaced;
     const int width = padded<Real>(components_of(number, given));
     Aligned<Real> by_sums(particles.count * width), results(by.position ? particles.count * sorted.width : 0);
     each_column(sorted, number, given, [&](const Given& one, std::int64_t row, std::int64_t place,
@@ -493,7 +472,7 @@ std::int64_t gradients(const Particles& particles, std::int64_t number, const Gi
         by_sums.data()[place * width + column] = static_cast<const Real*>(one.by_sums)[row];
     });
     take_all<Real>(sorted, number, given, by.position ? results.data() : nullptr, by_sums.data());
-    if (!by.position) return -1;
+    if (!by.position) return DONE;
     for (std::int64_t p = 0; p < particles.count; ++p) {
         const Real* found = results.data() + p * sorted.width;
         const std::int64_t row = sorted.cells.order[p];
@@ -503,14 +482,20 @@ std::int64_t gradients(const Particles& particles, std::int64_t number, const Gi
         }
         for (std::int64_t s = 0; s < particles.scalars; ++s) by.scalar[s * particles.count + row] = found[6 + s];
     }
-    return -1;
+    return DONE;
 }
 
 }  // namespace
 
 extern "C" {
 
-// Sums of all summands; -1, or the first particle whose position is not finite, and then nothing is found.
+// The name of a kind of summand, in the order of their names; null beyond the last.
+const char* pair_summand(std::int64_t number) {
+    if (number >= std::int64_t(kinds().size())) return nullptr;
+    return std::next(kinds().begin(), number)->first.c_str();
+}
+
+// Sums of all summands; DONE, or what is wrong, and then nothing is found.
 
 std::int64_t pair_sums_float32(const Particles* particles, std::int64_t number, const Given* given) {
     return sums<float>(*particles, number, given);

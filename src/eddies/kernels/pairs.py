@@ -8,22 +8,30 @@ from dataclasses import dataclass
 
 import numpy as np
 
-#: What is summed, as pairs.cpp numbers it; the terms of eddies.particles are the definitions.
-KINDS = ("pair-network", "moments", "eddy-viscosity", "density-transport", "summation-density", "continuity",
-         "transport-velocity", "wcsph", "kernel-sum", "kernel-average")
 MOST_SCALARS = 4
+# What calls return: else the first particle whose position is not finite.
+DONE, UNKNOWN, NO_GRADIENT = -1, -2, -3
 
 
 @dataclass(frozen=True)
 class Summand:
-    """One thing to sum: what `kind`, how many `components` it has, whole numbers and numbers that it takes, and the
-    first of those columns of numbers of particles that it reads."""
+    """One thing to sum: its `kind`, by the name that summands.hpp declares; the numbers that it takes; what the second
+    particle of a mutual pair gets of each component, times that of the first; and the first of those columns of numbers
+    of particles that it reads."""
 
     kind: str
-    components: int
-    options: tuple[int, ...] = ()
-    constants: tuple[float, ...] = ()
+    numbers: tuple[float, ...]
+    parity: tuple[float, ...]
     scalar: int = 0
+
+
+def kinds(library: ctypes.CDLL) -> list[str]:
+    """Names of the summands that the library has."""
+    library.pair_summand.restype = ctypes.c_char_p
+    found: list[str] = []
+    while name := library.pair_summand(ctypes.c_int64(len(found))):
+        found.append(name.decode())
+    return found
 
 
 @dataclass(frozen=True)
@@ -49,9 +57,9 @@ class _Particles(ctypes.Structure):
 
 
 class _Given(ctypes.Structure):
-    _fields_ = ([(name, ctypes.c_int64) for name in ("kind", "options_count", "parameters_count", "components",
-                                                     "scalar")]
-                + [(name, ctypes.c_void_p) for name in ("options", "constants", "parameters", "sums", "by_sums",
+    _fields_ = ([("kind", ctypes.c_char_p)]
+                + [(name, ctypes.c_int64) for name in ("numbers_count", "parameters_count", "components", "scalar")]
+                + [(name, ctypes.c_void_p) for name in ("numbers", "parameters", "parity", "sums", "by_sums",
                                                         "by_parameters")])
 
 
@@ -81,17 +89,15 @@ class CompiledPairs:
 
     def sums(self, summands: Sequence[Summand], parameters: Sequence[np.ndarray]) -> list[np.ndarray]:
         """The sums of each summand with its parameters, (components, n): only of those wanted to be used. Raises
-        ValueError where a position is not finite."""
-        found = [np.empty((summand.components, self._count), self._kind) for summand in summands]
+        ValueError where a position is not finite, and where the library has no such summand."""
+        found = [np.empty((len(summand.parity), self._count), self._kind) for summand in summands]
         self._call("pair_sums", summands, parameters, "sums", found)
         return found
 
     def gradients(self, summands: Sequence[Summand], parameters: Sequence[np.ndarray], by_sums: Sequence[np.ndarray],
                   columns: bool) -> tuple[list[np.ndarray], tuple[np.ndarray, ...]]:
         """From gradients by the sums, zero where none are wanted: those by the parameters, and, if asked for, by
-        position, velocity and scalars. Raises ValueError for averages by a kernel, which have none."""
-        if any(summand.kind.startswith("kernel-") for summand in summands):
-            raise ValueError("sums of a smoothing kernel have no compiled gradient")
+        position, velocity and scalars. Raises ValueError as `sums`, and where a summand has none."""
         by_parameters = [np.zeros(len(values)) for values in parameters]
         by_columns = tuple(np.empty_like(column) for column in self._columns[:3]) if columns else ()
         given = (ctypes.c_void_p * 3)(*map(_address, by_columns))
@@ -103,22 +109,21 @@ class CompiledPairs:
               sums: Sequence[np.ndarray], by_parameters: Sequence[np.ndarray] = (), *more: object) -> None:
         structures, held = (_Given * len(summands))(), []
         for number, (summand, values, columns) in enumerate(zip(summands, parameters, sums)):
-            arrays = (np.array(summand.options, np.int64), np.array(summand.constants),
-                      np.ascontiguousarray(values, np.float64))
+            arrays = [np.ascontiguousarray(given, np.float64) for given in (summand.numbers, values, summand.parity)]
             held.append(arrays)
             given = structures[number]
-            given.kind, given.options_count, given.components = (KINDS.index(summand.kind), len(summand.options),
-                                                                 summand.components)
-            given.scalar, given.parameters_count = summand.scalar, len(values)
-            given.options, given.constants, given.parameters = map(_address, arrays)
+            given.kind, given.scalar = summand.kind.encode(), summand.scalar
+            given.numbers_count, given.parameters_count, given.components = map(len, arrays)
+            given.numbers, given.parameters, given.parity = map(_address, arrays)
             setattr(given, field, _address(columns))
             if by_parameters:
                 given.by_parameters = _address(by_parameters[number])
         function = getattr(self._library, f"{name}_{self._kind}")
         function.restype = ctypes.c_int64
-        misplaced = function(ctypes.byref(self._particles), ctypes.c_int64(len(summands)), structures, *more)
-        if misplaced >= 0:
-            raise ValueError(f"pairs: the position of particle {misplaced} is not finite")
+        result = function(ctypes.byref(self._particles), ctypes.c_int64(len(summands)), structures, *more)
+        if result != DONE:
+            told = {UNKNOWN: f"no such summands: {summands}", NO_GRADIENT: f"one without a gradient of {summands}"}
+            raise ValueError(f"pairs: {told.get(result, f'the position of particle {result} is not finite')}")
 
 
 def _address(array: np.ndarray) -> int:

@@ -1,16 +1,36 @@
-// What is summed over pairs of particles: the terms of eddies/particles/terms, which are the definitions.
+// What is summed over pairs of particles: the terms of eddies/particles/terms, which are the definitions. Each is declared
+// once, by name, where it is defined: a formula, of which the gradient is derived (adjoint.hpp), or a class of its own.
 
 #pragma once
 
+#include <cmath>
+#include <limits>
+#include <map>
 #include <memory>
+#include <string>
 
+#include "adjoint.hpp"
 #include "network.hpp"
 #include "smoothing.hpp"
 
+extern "C" {
+
+// A summand, its sums and gradients. Those that are not asked for are null; kernels/pairs.py has the same structure.
+struct Given {
+    const char* kind;
+    std::int64_t numbers_count, parameters_count, components, scalar;  // the first scalar that it reads
+    const double *numbers, *parameters;
+    const double* parity;      // (components): what the second particle of a mutual pair gets is that times the first's
+    void* sums;                // (components, count)
+    const void* by_sums;       // (components, count)
+    double* by_parameters;     // (parameters)
+};
+
+}  // extern "C"
+
 namespace eddies {
 
-constexpr int MOST_SCALARS = 4;     // columns of numbers that particles carry
-constexpr int MOST_COMPONENTS = 16;  // of what one summand gives
+constexpr int MOST_SCALARS = 4;  // columns of numbers that particles carry
 
 // Pairs: the separation in filter widths and the velocity difference in units of the velocity, first less second
 // particle; length of the separation, weight (1 - q^2)^2, and numbers of first and second.
@@ -55,16 +75,14 @@ using Components = Real (*)[BLOCK];
 template <typename Real>
 using GivenComponents = const Real (*)[BLOCK];
 
-// `mutual`: what the second particle gets of the first is what that gets times `parity` of each component.
 template <typename Real>
 class Summand {
    public:
-    int components;
-    Real parity[MOST_COMPONENTS];
+    const int components;
+    int scalars = 0, parameters = 0;  // that it reads
+    bool differentiable = true;
 
-    Summand(int components, Real all) : components(components) {
-        for (Real& one : parity) one = all;
-    }
+    explicit Summand(int components) : components(components) {}
     virtual ~Summand() = default;
 
     // Components of pairs.
@@ -72,9 +90,124 @@ class Summand {
 
     // From the gradient by components: to be added to that by what the pairs carry, unless that is null, and to that by
     // parameters, a vector for each.
-    virtual void gradients(const Block<Real>& pairs, GivenComponents<Real> given, ByPairs<Real>* by_pairs,
-                           Real* by_parameters) = 0;
+    virtual void gradients(const Block<Real>&, GivenComponents<Real>, ByPairs<Real>*, Real*) {}
 };
+
+// Kinds of summands by name. Of this library alone: other instruction sets may be loaded beside it.
+struct Kind {
+    std::unique_ptr<Summand<float>> (*single)(const Given&);
+    std::unique_ptr<Summand<double>> (*full)(const Given&);
+};
+
+static std::map<std::string, Kind>& kinds() {
+    static std::map<std::string, Kind> all;
+    return all;
+}
+
+template <typename Made, typename Real>
+std::unique_ptr<Summand<Real>> make(const Given& given) {
+    return std::make_unique<Made>(given);
+}
+
+template <template <typename> class Class>
+bool declare(const char* name) {
+    return kinds().insert({name, {make<Class<float>, float>, make<Class<double>, double>}}).second;
+}
+
+// What a formula sees of a vector of pairs: each a `Vector`, a `Place` or a `Constant`.
+template <typename Real, template <typename> class Column, template <typename> class Parameter, int scalars,
+          int parameters>
+struct Pairs {
+    Column<Real> x[3], v[3], distance, weight, own[scalars + 1], other[scalars + 1];
+    Parameter<Real> parameter[parameters + 1];
+
+    void read(const Block<Real>& pairs, int scalar, int p) {
+        for (int axis = 0; axis < 3; ++axis) {
+            x[axis] = vector_at(pairs.x[axis] + p);
+            v[axis] = vector_at(pairs.v[axis] + p);
+        }
+        distance = vector_at(pairs.distance + p);
+        weight = vector_at(pairs.weight + p);
+        for (int s = 0; s < scalars; ++s) {
+            own[s] = vector_at(pairs.scalar[0][scalar + s] + p);
+            other[s] = vector_at(pairs.scalar[1][scalar + s] + p);
+        }
+    }
+
+    void add_to(ByPairs<Real>& by, int scalar, int p) const {
+        for (int axis = 0; axis < 3; ++axis) {
+            vector_at(by.x[axis] + p) += x[axis].by;
+            vector_at(by.v[axis] + p) += v[axis].by;
+        }
+        vector_at(by.distance + p) += distance.by;
+        vector_at(by.weight + p) += weight.by;
+        for (int s = 0; s < scalars; ++s) {
+            vector_at(by.scalar[0][scalar + s] + p) += own[s].by;
+            vector_at(by.scalar[1][scalar + s] + p) += other[s].by;
+        }
+    }
+};
+
+// The summand of a formula. It is made of what is given; called with `Pairs` and a function that takes the number of a
+// component and what it is.
+template <typename Real, template <typename> class Formula>
+class FormulaSummand : public Summand<Real> {
+    using V = Vector<Real>;
+    static constexpr int lanes = VectorOf<Real>::lanes, columns = Formula<Real>::scalars,
+                         factors = Formula<Real>::parameters;
+
+   public:
+    explicit FormulaSummand(const Given& given)
+        : Summand<Real>(Formula<Real>(given).components), formula_(given), scalar_(static_cast<int>(given.scalar)) {
+        this->scalars = columns;
+        this->parameters = factors;
+        std::copy_n(given.parameters, std::min<std::int64_t>(factors, given.parameters_count), parameters_);
+    }
+
+    void values(const Block<Real>& pairs, Components<Real> found) override {
+        Pairs<Real, Vector, Vector, columns, factors> some;
+        for (int k = 0; k < factors; ++k) some.parameter[k] = V{} + parameters_[k];
+        for (int p = 0; p < BLOCK; p += lanes) {
+            some.read(pairs, scalar_, p);
+            formula_(some, [&](int c, const V& value) { vector_at(found[c] + p) = value; });
+        }
+    }
+
+    void gradients(const Block<Real>& pairs, GivenComponents<Real> given, ByPairs<Real>* by,
+                   Real* by_parameters) override {
+        if (by) back<Place>(pairs, given, by, by_parameters);
+        else if (factors) back<Constant>(pairs, given, by, by_parameters);
+    }
+
+   private:
+    Formula<Real> formula_;
+    int scalar_;
+    Real parameters_[factors + 1];
+
+    template <template <typename> class Column>
+    void back(const Block<Real>& pairs, GivenComponents<Real> given, ByPairs<Real>* by, Real* by_parameters) {
+        V sums[factors + 1]{};
+        for (int p = 0; p < BLOCK; p += lanes) {
+            Pairs<Real, Column, Place, columns, factors> some;
+            some.read(pairs, scalar_, p);
+            for (int k = 0; k < factors; ++k) some.parameter[k] = V{} + parameters_[k];
+            formula_(some, [&](int c, const auto& value) { value.back(vector_at(given[c] + p)); });
+            for (int k = 0; k < factors; ++k) sums[k] += some.parameter[k].by;
+            if constexpr (std::is_same_v<Column<Real>, Place<Real>>) some.add_to(*by, scalar_, p);
+        }
+        for (int k = 0; k < factors; ++k) vector_at(by_parameters + k * lanes) += sums[k];
+    }
+};
+
+template <typename Real, template <typename> class Formula>
+std::unique_ptr<Summand<Real>> make_formula(const Given& given) {
+    return std::make_unique<FormulaSummand<Real, Formula>>(given);
+}
+
+template <template <typename> class Formula>
+bool declare_formula(const char* name) {
+    return kinds().insert({name, {make_formula<float, Formula>, make_formula<double, Formula>}}).second;
+}
 
 // One lane after the other, for the compiler to take several together.
 #define EDDIES_PAIRS _Pragma("omp simd") for (int p = 0; p < BLOCK; ++p)
@@ -89,12 +222,16 @@ inline Real dot(const Real (*a)[BLOCK], const Real (*b)[BLOCK], int p) {
 template <typename Real>
 class PairNetwork : public Summand<Real> {
    public:
-    // Options: outputs, whether densities enter as sum and square of the difference, whether the network is told
+    // Numbers: outputs, whether densities enter as sum and square of the difference, whether the network is told
     // density (the scalar), distance, speed, approach; widths of hidden layers.
-    PairNetwork(const std::int64_t* options, int count, int scalar, const double* parameters)
-        : Summand<Real>(options[0] == 2 ? 6 : 1, Real(options[0] == 2 ? -1 : 1)),
-          symmetric_(options[1]), density_(options[2] ? scalar : -1), distance_(options[3]), speed_(options[4]),
-          approach_(options[5]), network_(widths(options, count), parameters) {}
+    explicit PairNetwork(const Given& given)
+        : Summand<Real>(given.numbers[0] == 2 ? 6 : 1), symmetric_(given.numbers[1]),
+          density_(given.numbers[2] ? static_cast<int>(given.scalar) : -1), distance_(given.numbers[3]),
+          speed_(given.numbers[4]), approach_(given.numbers[5]),
+          network_(widths(given), given.parameters, given.parameters_count) {
+        this->scalars = density_ >= 0;
+        this->parameters = static_cast<int>(given.parameters_count);
+    }
 
     void values(const Block<Real>& pairs, Components<Real> found) override {
         evaluate(pairs);
@@ -134,14 +271,16 @@ class PairNetwork : public Summand<Real> {
     Network<Real> network_;
     alignas(64) Real speed_of_[BLOCK];
 
-    static std::vector<int> widths(const std::int64_t* options, int count) {
-        std::vector<int> found(1, static_cast<int>(2 * options[2] + options[3] + options[4] + options[5]));
-        found.insert(found.end(), options + 6, options + count);
-        found.push_back(static_cast<int>(options[0]));
+    static std::vector<int> widths(const Given& given) {
+        const double* told = given.numbers;
+        std::vector<int> found(1, static_cast<int>(2 * told[2] + told[3] + told[4] + told[5]));
+        found.insert(found.end(), told + 6, told + given.numbers_count);
+        found.push_back(static_cast<int>(told[0]));
         return found;
     }
 
-    void evaluate(const Block<Real>& pairs) {
+    // Taken into both of its callers it is slower by up to a twentieth.
+    __attribute__((noinline)) void evaluate(const Block<Real>& pairs) {
         Rows<Real>& features = network_.features();
         int row = 0;
         if (density_ >= 0) {
@@ -214,399 +353,167 @@ class PairNetwork : public Summand<Real> {
     }
 };
 
+static const bool pair_network = declare<PairNetwork>("pair-network");
+
 // w, and the entries xx, xy, xz, yy, yz, zz of w x x^T.
 template <typename Real>
-class Moments : public Summand<Real> {
-   public:
-    Moments() : Summand<Real>(7, Real(1)) {}
+struct Moments {
+    static constexpr int components = 7, scalars = 0, parameters = 0;
 
-    void values(const Block<Real>& pairs, Components<Real> found) override {
-        const auto& x = pairs.x;
-        EDDIES_PAIRS {
-            const Real w = pairs.weight[p], wx = w * x[0][p], wy = w * x[1][p];
-            found[0][p] = w;
-            found[1][p] = wx * x[0][p];
-            found[2][p] = wx * x[1][p];
-            found[3][p] = wx * x[2][p];
-            found[4][p] = wy * x[1][p];
-            found[5][p] = wy * x[2][p];
-            found[6][p] = w * x[2][p] * x[2][p];
-        }
-    }
+    explicit Moments(const Given&) {}
 
-    void gradients(const Block<Real>& pairs, GivenComponents<Real> given, ByPairs<Real>* by, Real*) override {
-        if (!by) return;
-        EDDIES_PAIRS {
-            const Real x = pairs.x[0][p], y = pairs.x[1][p], z = pairs.x[2][p], w = pairs.weight[p];
-            const Real xx = given[1][p], xy = given[2][p], xz = given[3][p], yy = given[4][p], yz = given[5][p],
-                       zz = given[6][p];
-            const Real dx = 2 * xx * x + xy * y + xz * z, dy = xy * x + 2 * yy * y + yz * z,
-                       dz = xz * x + yz * y + 2 * zz * z;
-            by->weight[p] += given[0][p] + (x * dx + y * dy + z * dz) / 2;
-            by->x[0][p] += w * dx;
-            by->x[1][p] += w * dy;
-            by->x[2][p] += w * dz;
+    template <typename Pairs, typename Give>
+    void operator()(const Pairs& pairs, const Give& give) const {
+        const auto &x = pairs.x, &w = pairs.weight;
+        int c = 0;
+        give(c++, w);
+        for (int i = 0; i < 3; ++i) {
+            const auto weighted = let(w * x[i]);
+            for (int j = i; j < 3; ++j) give(c++, weighted * x[j]);
         }
     }
 };
 
-// w Pi x with Pi = mu (|a_2| mu - |a_1|), mu = x.v / (|x|^2 + softening); or of approaching pairs alone.
+static const bool moments = declare_formula<Moments>("moments");
+
+// w Pi x with Pi = mu (|a_2| mu - |a_1|), mu = x.v / (|x|^2 + softening), or of approaching pairs alone. Numbers: whether
+// so, and the softening. Parameters: |a_1| and |a_2|.
 template <typename Real>
-class EddyViscosity : public Summand<Real> {
-   public:
-    EddyViscosity(bool approaching, const double* constants, const double* parameters)
-        : Summand<Real>(3, Real(-1)), approaching_(approaching), softening_(constants[0]), linear_(parameters[0]),
-          quadratic_(parameters[1]) {}
+struct EddyViscosity {
+    static constexpr int components = 3, scalars = 0, parameters = 2;
+    Real limit, softening;
 
-    void values(const Block<Real>& pairs, Components<Real> found) override {
-        EDDIES_PAIRS {
-            const Real mu = rate(pairs, p), strength = pairs.weight[p] * mu * (quadratic_ * mu - linear_);
-            for (int c = 0; c < 3; ++c) found[c][p] = strength * pairs.x[c][p];
-        }
-    }
+    explicit EddyViscosity(const Given& given)
+        : limit(given.numbers[0] ? Real(0) : std::numeric_limits<Real>::infinity()), softening(given.numbers[1]) {}
 
-    void gradients(const Block<Real>& pairs, GivenComponents<Real> given, ByPairs<Real>* by,
-                   Real* by_parameters) override {
-        alignas(64) Real by_linear[BLOCK], by_quadratic[BLOCK];
-        EDDIES_PAIRS {
-            const Real x = pairs.x[0][p], y = pairs.x[1][p], z = pairs.x[2][p], w = pairs.weight[p];
-            const Real along = given[0][p] * x + given[1][p] * y + given[2][p] * z, mu = rate(pairs, p);
-            by_linear[p] = -w * along * mu;
-            by_quadratic[p] = w * along * mu * mu;
-        }
-        add_lanes(by_linear, by_parameters);
-        add_lanes(by_quadratic, by_parameters + VectorOf<Real>::lanes);
-        if (!by) return;
-        EDDIES_PAIRS {
-            const Real r = pairs.distance[p], w = pairs.weight[p], mu = rate(pairs, p);
-            const Real below = 1 / (r * r + softening_);
-            const Real strength = mu * (quadratic_ * mu - linear_);
-            const Real along = dot(given, pairs.x, p);
-            const Real by_mu = approaching_ && mu >= 0 ? Real(0) : w * along * (2 * quadratic_ * mu - linear_);
-            by->weight[p] += along * strength;
-            by->distance[p] -= by_mu * mu * 2 * r * below;
-            for (int c = 0; c < 3; ++c) {
-                by->x[c][p] += w * strength * given[c][p] + by_mu * below * pairs.v[c][p];
-                by->v[c][p] += by_mu * below * pairs.x[c][p];
-            }
-        }
-    }
-
-   private:
-    bool approaching_;
-    Real softening_, linear_, quadratic_;
-
-    Real rate(const Block<Real>& pairs, int p) const {
-        const Real r = pairs.distance[p];
-        const Real mu = dot(pairs.x, pairs.v, p) /
-                        (r * r + softening_);
-        return approaching_ && mu > 0 ? Real(0) : mu;
+    template <typename Pairs, typename Give>
+    void operator()(const Pairs& pairs, const Give& give) const {
+        const auto &x = pairs.x, &r = pairs.distance, &linear = pairs.parameter[0], &quadratic = pairs.parameter[1];
+        const auto rate = let(product(x, pairs.v) / (r * r + softening));
+        const auto mu = let(at_most(rate, limit));
+        const auto strength = let(pairs.weight * mu * (quadratic * mu - linear));
+        for (int c = 0; c < 3; ++c) give(c, strength * x[c]);
     }
 };
 
-// The entries of w (x v^T + v x^T)/2, and w (rho'_j - rho'_i).
+static const bool eddy_viscosity = declare_formula<EddyViscosity>("eddy-viscosity");
+
+// -W'/q h^4 of the cubic spline W as a function of q = r/h <= 1.
+template <typename Q>
+inline auto spline_fall(const Q& q) {
+    using Real = std::decay_t<decltype(value_of(q)[0])>;
+    const auto inner = value_of(q) < Real(0.5);
+    return Real(48 / M_PI) *
+           where(inner, Real(2) - Real(3) * q, (Real(1) - q) * (Real(1) - q) / where(inner, Real(1), q));
+}
+
+// What weakly compressible smoothed particle hydrodynamics sums, (P_i/rho_i^2 + P_j/rho_j^2 + Pi) (-W'/r) x, in filter
+// widths and units of the velocity. Numbers: the distance at which W ends, the unit of the result, and the softening.
+// Parameters: alpha c and beta of Pi. Scalars: P/rho^2 and rho.
 template <typename Real>
-class DensityTransport : public Summand<Real> {
-   public:
-    explicit DensityTransport(int density) : Summand<Real>(7, Real(1)), density_(density) { this->parity[6] = -1; }
+struct Wcsph {
+    static constexpr int components = 3, scalars = 2, parameters = 2;
+    Real support, unit, softening;
 
-    void values(const Block<Real>& pairs, Components<Real> found) override {
-        const auto &x = pairs.x, &v = pairs.v;
-        const Real *own = pairs.scalar[0][density_], *other = pairs.scalar[1][density_];
-        EDDIES_PAIRS {
-            const Real w = pairs.weight[p], half = w / 2;
-            found[0][p] = w * x[0][p] * v[0][p];
-            found[1][p] = half * (x[0][p] * v[1][p] + x[1][p] * v[0][p]);
-            found[2][p] = half * (x[0][p] * v[2][p] + x[2][p] * v[0][p]);
-            found[3][p] = w * x[1][p] * v[1][p];
-            found[4][p] = half * (x[1][p] * v[2][p] + x[2][p] * v[1][p]);
-            found[5][p] = w * x[2][p] * v[2][p];
-            found[6][p] = w * (other[p] - own[p]);
-        }
-    }
+    explicit Wcsph(const Given& given)
+        : support(given.numbers[0]), unit(given.numbers[1]), softening(given.numbers[2]) {}
 
-    void gradients(const Block<Real>& pairs, GivenComponents<Real> given, ByPairs<Real>* by, Real*) override {
-        if (!by) return;
-        const auto &x = pairs.x, &v = pairs.v;
-        const Real *own = pairs.scalar[0][density_], *other = pairs.scalar[1][density_];
-        EDDIES_PAIRS {
-            const Real w = pairs.weight[p];
-            const Real xx = given[0][p], xy = given[1][p] / 2, xz = given[2][p] / 2, yy = given[3][p],
-                       yz = given[4][p] / 2, zz = given[5][p];
-            // The symmetric matrix of the gradient times x, and times v.
-            const Real x0 = xx * x[0][p] + xy * x[1][p] + xz * x[2][p], x1 = xy * x[0][p] + yy * x[1][p] + yz * x[2][p],
-                       x2 = xz * x[0][p] + yz * x[1][p] + zz * x[2][p];
-            const Real v0 = xx * v[0][p] + xy * v[1][p] + xz * v[2][p], v1 = xy * v[0][p] + yy * v[1][p] + yz * v[2][p],
-                       v2 = xz * v[0][p] + yz * v[1][p] + zz * v[2][p];
-            by->weight[p] += v[0][p] * x0 + v[1][p] * x1 + v[2][p] * x2 + given[6][p] * (other[p] - own[p]);
-            by->x[0][p] += w * v0;
-            by->x[1][p] += w * v1;
-            by->x[2][p] += w * v2;
-            by->v[0][p] += w * x0;
-            by->v[1][p] += w * x1;
-            by->v[2][p] += w * x2;
-            by->scalar[0][density_][p] -= w * given[6][p];
-            by->scalar[1][density_][p] += w * given[6][p];
-        }
-    }
-
-   private:
-    int density_;
-};
-
-// Kernels of smoothed particle hydrodynamics as functions of q = r/h <= 1, and their slopes over q: W h^3, W'/q h^4.
-template <typename Real>
-struct SmoothingKernel {
-    bool wendland;
-
-    Real value(Real q) const {
-        const Real left = 1 - q;
-        if (wendland) return Real(21 / (2 * M_PI)) * left * left * left * left * (1 + 4 * q);
-        return Real(8 / M_PI) * (q < Real(0.5) ? 1 - 6 * q * q * left : 2 * left * left * left);
-    }
-
-    Real slope_over_q(Real q) const {
-        const Real left = 1 - q;
-        if (wendland) return Real(-210 / M_PI) * left * left * left;
-        return Real(48 / M_PI) * (q < Real(0.5) ? 3 * q - 2 : -left * left / (q > 0 ? q : Real(1)));
-    }
-
-    // Derivative of that by q.
-    Real bend(Real q) const {
-        const Real left = 1 - q;
-        if (wendland) return Real(630 / M_PI) * left * left;
-        return Real(48 / M_PI) * (q < Real(0.5) ? 3 : (1 - q * q) / (q > 0 ? q * q : Real(1)));
+    template <typename Pairs, typename Give>
+    void operator()(const Pairs& pairs, const Give& give) const {
+        const auto &x = pairs.x, &r = pairs.distance, &linear = pairs.parameter[0], &quadratic = pairs.parameter[1];
+        const auto q = let(r * (1 / support));
+        const auto rate = let(support / 2 * product(x, pairs.v) / (r * r + softening));
+        const auto mu = let(at_most(rate, Real(0)));
+        const auto viscous = Real(2) * mu * (quadratic * mu - linear) / (pairs.own[1] + pairs.other[1]);
+        const auto strength = let(unit * (pairs.own[0] + pairs.other[0] + viscous) * spline_fall(q));
+        for (int c = 0; c < 3; ++c) give(c, strength * x[c]);
     }
 };
 
-// W of the distance, in units of `constants`: the distance at which it ends, in filter widths, and W h^3 to W.
-template <typename Real>
-class SummationDensity : public Summand<Real> {
-   public:
-    SummationDensity(bool wendland, const double* constants)
-        : Summand<Real>(1, Real(1)), kernel_{wendland}, support_(constants[0]), unit_(constants[1]) {}
-
-    void values(const Block<Real>& pairs, Components<Real> found) override {
-        EDDIES_PAIRS found[0][p] = unit_ * kernel_.value(pairs.distance[p] / support_);
-    }
-
-    void gradients(const Block<Real>& pairs, GivenComponents<Real> given, ByPairs<Real>* by, Real*) override {
-        if (!by) return;
-        EDDIES_PAIRS {
-            const Real q = pairs.distance[p] / support_;
-            by->distance[p] += given[0][p] * unit_ / support_ * kernel_.slope_over_q(q) * q;
-        }
-    }
-
-   private:
-    SmoothingKernel<Real> kernel_;
-    Real support_, unit_;
-};
-
-// -(P_i/rho_i^2 + P_j/rho_j^2 + Pi) W'/r x of weakly compressible smoothed particle hydrodynamics, in filter widths and
-// units of the velocity. Parameters: alpha c and beta of Pi. Constants: the distance at which W ends, the unit of the
-// result, and the softening. Two scalars: P/rho^2 and rho.
-template <typename Real>
-class Wcsph : public Summand<Real> {
-   public:
-    Wcsph(bool wendland, int scalar, const double* constants, const double* parameters)
-        : Summand<Real>(3, Real(-1)), kernel_{wendland}, push_(scalar), density_(scalar + 1),
-          support_(constants[0]), unit_(constants[1]), softening_(constants[2]),
-          linear_(parameters[0]), quadratic_(parameters[1]) {}
-
-    void values(const Block<Real>& pairs, Components<Real> found) override {
-        EDDIES_PAIRS {
-            const Real strength = -unit_ * total(pairs, p) * kernel_.slope_over_q(pairs.distance[p] / support_);
-            for (int c = 0; c < 3; ++c) found[c][p] = strength * pairs.x[c][p];
-        }
-    }
-
-    void gradients(const Block<Real>& pairs, GivenComponents<Real> given, ByPairs<Real>* by,
-                   Real* by_parameters) override {
-        alignas(64) Real by_linear[BLOCK], by_quadratic[BLOCK], by_total[BLOCK];
-        EDDIES_PAIRS {
-            const Real slope = -unit_ * kernel_.slope_over_q(pairs.distance[p] / support_), mu = rate(pairs, p);
-            const Real along = dot(given, pairs.x, p);
-            by_total[p] = along * slope;
-            by_linear[p] = -by_total[p] * mu / mean(pairs, p);
-            by_quadratic[p] = by_total[p] * mu * mu / mean(pairs, p);
-        }
-        add_lanes(by_linear, by_parameters);
-        add_lanes(by_quadratic, by_parameters + VectorOf<Real>::lanes);
-        if (!by) return;
-        EDDIES_PAIRS {
-            const Real r = pairs.distance[p], q = r / support_, mu = rate(pairs, p), average = mean(pairs, p);
-            const Real along = dot(given, pairs.x, p);
-            const Real slope = -unit_ * kernel_.slope_over_q(q), strength = total(pairs, p);
-            const Real viscous = mu * (quadratic_ * mu - linear_) / average;
-            const Real below = 1 / (r * r + softening_);
-            const Real by_mu = mu >= 0 ? Real(0) : by_total[p] * (2 * quadratic_ * mu - linear_) / average;
-            by->distance[p] += -along * unit_ * strength * kernel_.bend(q) / support_ - by_mu * mu * 2 * r * below;
-            for (int c = 0; c < 3; ++c) {
-                by->x[c][p] += slope * strength * given[c][p] + by_mu * half_support() * below * pairs.v[c][p];
-                by->v[c][p] += by_mu * half_support() * below * pairs.x[c][p];
-            }
-            for (int side = 0; side < 2; ++side) {
-                by->scalar[side][push_][p] += by_total[p];
-                by->scalar[side][density_][p] -= by_total[p] * viscous / (2 * average);
-            }
-        }
-    }
-
-   private:
-    SmoothingKernel<Real> kernel_;
-    int push_, density_;
-    Real support_, unit_, softening_, linear_, quadratic_;
-
-    Real half_support() const { return support_ / 2; }
-
-    Real mean(const Block<Real>& pairs, int p) const {
-        return (pairs.scalar[0][density_][p] + pairs.scalar[1][density_][p]) / 2;
-    }
-
-    Real rate(const Block<Real>& pairs, int p) const {
-        const Real r = pairs.distance[p];
-        const Real approach = dot(pairs.x, pairs.v, p);
-        const Real mu = half_support() * approach / (r * r + softening_);
-        return mu > 0 ? Real(0) : mu;
-    }
-
-    Real total(const Block<Real>& pairs, int p) const {
-        const Real mu = rate(pairs, p);
-        return pairs.scalar[0][push_][p] + pairs.scalar[1][push_][p] +
-               mu * (quadratic_ * mu - linear_) / mean(pairs, p);
-    }
-};
+static const bool wcsph = declare_formula<Wcsph>("wcsph");
 
 // What makes the rate of density of smoothed particle hydrodynamics: v.x W'/r, and, with two components, (rho_j - rho_i)
-// W'/r, both over rho_i rho_j. Constants: the distance at which W ends, in filter widths, and the units of both. The
+// W'/r, both over rho_i rho_j. Numbers: the distance at which W ends, in filter widths, and the units of both. The
 // scalar: rho.
 template <typename Real>
-class Continuity : public Summand<Real> {
-   public:
-    Continuity(bool wendland, int components, int density, const double* constants)
-        : Summand<Real>(components, Real(1)), kernel_{wendland}, density_(density), support_(constants[0]),
-          units_{static_cast<Real>(constants[1]), static_cast<Real>(constants[2])} {
-        this->parity[1] = -1;
-    }
+struct Continuity {
+    static constexpr int scalars = 1, parameters = 0;
+    int components;
+    Real support, units[2];
 
-    void values(const Block<Real>& pairs, Components<Real> found) override {
-        const Real *own = pairs.scalar[0][density_], *other = pairs.scalar[1][density_];
-        EDDIES_PAIRS found[0][p] = units_[0] * slope(pairs, p) * dot(pairs.x, pairs.v, p);
-        if (this->components == 2)
-            EDDIES_PAIRS found[1][p] = units_[1] * slope(pairs, p) * (other[p] - own[p]);
-    }
+    explicit Continuity(const Given& given)
+        : components(given.components == 2 ? 2 : 1), support(given.numbers[0]),
+          units{static_cast<Real>(given.numbers[1]), static_cast<Real>(given.numbers[2])} {}
 
-    void gradients(const Block<Real>& pairs, GivenComponents<Real> given, ByPairs<Real>* by, Real*) override {
-        if (!by) return;
-        const Real *own = pairs.scalar[0][density_], *other = pairs.scalar[1][density_];
-        const bool diffusive = this->components == 2;
-        EDDIES_PAIRS {
-            const Real q = pairs.distance[p] / support_, below = 1 / (own[p] * other[p]);
-            const Real first = units_[0] * given[0][p], second = diffusive ? units_[1] * given[1][p] : Real(0);
-            const Real by_slope = first * dot(pairs.x, pairs.v, p) + second * (other[p] - own[p]);
-            const Real steep = slope(pairs, p), along = first * steep, across = second * steep;
-            by->distance[p] += by_slope * below * kernel_.bend(q) / support_;
-            for (int c = 0; c < 3; ++c) {
-                by->x[c][p] += along * pairs.v[c][p];
-                by->v[c][p] += along * pairs.x[c][p];
-            }
-            by->scalar[0][density_][p] -= across + by_slope * steep / own[p];
-            by->scalar[1][density_][p] += across - by_slope * steep / other[p];
-        }
-    }
-
-   private:
-    SmoothingKernel<Real> kernel_;
-    int density_;
-    Real support_, units_[2];
-
-    // W'/r over both densities.
-    Real slope(const Block<Real>& pairs, int p) const {
-        return kernel_.slope_over_q(pairs.distance[p] / support_) /
-               (pairs.scalar[0][density_][p] * pairs.scalar[1][density_][p]);
+    template <typename Pairs, typename Give>
+    void operator()(const Pairs& pairs, const Give& give) const {
+        const auto &own = pairs.own[0], &other = pairs.other[0];
+        const auto q = let(pairs.distance * (1 / support));
+        const auto fall = let(spline_fall(q) / (own * other));
+        give(0, -units[0] * fall * product(pairs.x, pairs.v));
+        if (components == 2) give(1, units[1] * fall * (own - other));
     }
 };
 
-// -(1/rho_i^2 + 1/rho_j^2) W'/r x, and the entries of -v x^T W'/r over rho_i rho_j. Constants: the distance at which W
+static const bool continuity = declare_formula<Continuity>("continuity");
+
+// -(1/rho_i^2 + 1/rho_j^2) W'/r x, and the entries of -v x^T W'/r over rho_i rho_j. Numbers: the distance at which W
 // ends, in filter widths, and the units of both. The scalar: rho.
 template <typename Real>
-class TransportVelocity : public Summand<Real> {
-   public:
-    TransportVelocity(bool wendland, int density, const double* constants)
-        : Summand<Real>(12, Real(1)), kernel_{wendland}, density_(density), support_(constants[0]),
-          push_(constants[1]), carry_(constants[2]) {
-        for (int c = 0; c < 3; ++c) this->parity[c] = -1;
-    }
+struct TransportVelocity {
+    static constexpr int components = 12, scalars = 1, parameters = 0;
+    Real support, push_unit, carry_unit;
 
-    void values(const Block<Real>& pairs, Components<Real> found) override {
-        const Real *own = pairs.scalar[0][density_], *other = pairs.scalar[1][density_];
-        EDDIES_PAIRS {
-            const Real slope = -kernel_.slope_over_q(pairs.distance[p] / support_);
-            const Real first = 1 / own[p], second = 1 / other[p];
-            const Real push = push_ * slope * (first * first + second * second), carry = carry_ * slope * first * second;
-            for (int c = 0; c < 3; ++c) {
-                found[c][p] = push * pairs.x[c][p];
-                for (int a = 0; a < 3; ++a) found[3 + 3 * a + c][p] = carry * pairs.v[a][p] * pairs.x[c][p];
-            }
+    explicit TransportVelocity(const Given& given)
+        : support(given.numbers[0]), push_unit(given.numbers[1]), carry_unit(given.numbers[2]) {}
+
+    template <typename Pairs, typename Give>
+    void operator()(const Pairs& pairs, const Give& give) const {
+        const auto &x = pairs.x, &v = pairs.v;
+        const auto q = let(pairs.distance * (1 / support));
+        const auto fall = let(spline_fall(q));
+        const auto first = let(Real(1) / pairs.own[0]), second = let(Real(1) / pairs.other[0]);
+        const auto push = let(push_unit * fall * (first * first + second * second));
+        const auto carry = let(carry_unit * fall * first * second);
+        for (int c = 0; c < 3; ++c) {
+            give(c, push * x[c]);
+            const auto along = let(carry * x[c]);
+            for (int a = 0; a < 3; ++a) give(3 + 3 * a + c, along * v[a]);
         }
     }
-
-    void gradients(const Block<Real>& pairs, GivenComponents<Real> given, ByPairs<Real>* by, Real*) override {
-        if (!by) return;
-        const Real *own = pairs.scalar[0][density_], *other = pairs.scalar[1][density_];
-        EDDIES_PAIRS {
-            const Real q = pairs.distance[p] / support_, slope = -kernel_.slope_over_q(q);
-            const Real first = 1 / own[p], second = 1 / other[p];
-            const Real push = push_ * (first * first + second * second), carry = carry_ * first * second;
-            Real along = 0, across = 0;  // the gradients of the two by the slope, over push and carry
-            for (int c = 0; c < 3; ++c) {
-                along += given[c][p] * pairs.x[c][p];
-                Real by_x = push * given[c][p];
-                for (int a = 0; a < 3; ++a) {
-                    const Real one = given[3 + 3 * a + c][p];
-                    across += one * pairs.v[a][p] * pairs.x[c][p];
-                    by_x += carry * one * pairs.v[a][p];
-                    by->v[a][p] += slope * carry * one * pairs.x[c][p];
-                }
-                by->x[c][p] += slope * by_x;
-            }
-            by->distance[p] -= (push * along + carry * across) * kernel_.bend(q) / support_;
-            by->scalar[0][density_][p] -= slope * first * (2 * push_ * along * first * first + carry * across);
-            by->scalar[1][density_][p] -= slope * second * (2 * push_ * along * second * second + carry * across);
-        }
-    }
-
-   private:
-    SmoothingKernel<Real> kernel_;
-    int density_;
-    Real support_, push_, carry_;
 };
+
+static const bool transport_velocity = declare_formula<TransportVelocity>("transport-velocity");
 
 // W of the distance, in units of length.
 template <typename Real>
 class KernelSum : public Summand<Real> {
    public:
-    explicit KernelSum(const double* constants) : Summand<Real>(1, Real(1)), kernel_(constants) {}
+    explicit KernelSum(const Given& given) : Summand<Real>(1), kernel_(given.numbers) {
+        this->differentiable = false;
+    }
 
     void values(const Block<Real>& pairs, Components<Real> found) override {
         for (int p = 0; p < BLOCK; p += VectorOf<Real>::lanes)
             vector_at(found[0] + p) = kernel_.value(vector_at(pairs.distance + p));
     }
 
-    void gradients(const Block<Real>&, GivenComponents<Real>, ByPairs<Real>*, Real*) override {}
-
    private:
     Smoothing<Real> kernel_;
 };
+
+static const bool kernel_sum = declare<KernelSum>("kernel-sum");
 
 // What makes the average of a vector a and its gradient, relative to the first particle's own: V W, V W a', V grad W
 // and V a'_c grad_d W with a' = a_j - a_i. Scalars: V, and the components of a.
 template <typename Real>
 class KernelAverage : public Summand<Real> {
    public:
-    KernelAverage(int scalar, const double* constants)
-        : Summand<Real>(16, Real(1)), scalar_(scalar), kernel_(constants) {}
+    explicit KernelAverage(const Given& given)
+        : Summand<Real>(16), scalar_(static_cast<int>(given.scalar)), kernel_(given.numbers) {
+        this->scalars = 4;
+        this->differentiable = false;
+    }
 
     void values(const Block<Real>& pairs, Components<Real> found) override {
         const Real* volume = pairs.scalar[1][scalar_];
@@ -629,12 +536,12 @@ class KernelAverage : public Summand<Real> {
         }
     }
 
-    void gradients(const Block<Real>&, GivenComponents<Real>, ByPairs<Real>*, Real*) override {}
-
    private:
     int scalar_;
     Smoothing<Real> kernel_;
 };
+
+static const bool kernel_average = declare<KernelAverage>("kernel-average");
 
 #undef EDDIES_PAIRS
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -19,24 +19,27 @@ class CompiledSum:
 
     Parameters
     ----------
-    summand : kind and options.
-    parameters : (p,), differentiable. scalars : columns (s,) of all particles that this rank sees, likewise.
+    kind : its name in the library (kernels/summands.hpp). numbers : that it takes there.
+    parameters : (p,), differentiable; none unless given.
+    scalars : columns (s,) of all particles that this rank sees, likewise.
     reads_velocity : whether velocities matter.
     """
 
-    summand: Summand
-    parameters: Tensor
+    kind: str
+    numbers: tuple[float, ...] = ()
+    parameters: Tensor | None = None
     scalars: tuple[Tensor, ...] = ()
     reads_velocity: bool = True
 
 
-def compiled_sums(space: PairSpace, summands: Sequence[CompiledSum], position: Tensor,
+def compiled_sums(space: PairSpace, summands: Sequence[CompiledSum], parities: Sequence[Tensor], position: Tensor,
                   velocity: Tensor | None, wanted: np.ndarray, dtype: torch.dtype) -> tuple[Tensor, ...]:
     """The sums (components, s) of each summand at the particles `wanted`, bool (s,), over those within the radius;
     elsewhere they mean nothing. Differentiable.
 
     Parameters
     ----------
+    parities : of each summand, (components,), as those of pair terms.
     position, velocity : (s, 3), of all particles that this rank sees; no velocity where no summand reads it.
     dtype : of the arithmetic.
 
@@ -44,16 +47,17 @@ def compiled_sums(space: PairSpace, summands: Sequence[CompiledSum], position: T
     """
     columns: list[Tensor] = []
     placed = []
-    for summand in summands:
+    for summand, parity in zip(summands, parities, strict=True):
         known = next((place for place in range(len(columns) - len(summand.scalars) + 1)
                       if all(a is b for a, b in zip(columns[place:], summand.scalars))), len(columns))
         if known == len(columns):
             columns += summand.scalars
-        placed.append(replace(summand.summand, scalar=known))
+        placed.append(Summand(summand.kind, summand.numbers, tuple(parity.tolist()), known))
     scalars = torch.stack(columns).double() if columns else position.new_zeros(0, len(position))
     velocity = torch.zeros_like(position) if velocity is None else velocity
     return _PairSums.apply(space, placed, wanted, dtype, position, velocity, scalars,
-                           *(summand.parameters for summand in summands))
+                           *(position.new_empty(0) if summand.parameters is None else summand.parameters
+                             for summand in summands))
 
 
 class _PairSums(torch.autograd.Function):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from eddies.kernels.pairs import PairSpace, Summand
+from eddies.kernels.pairs import PairSpace
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles import moments
 from eddies.particles.compiled_pairs import CompiledSum, compiled_sums
@@ -183,7 +183,7 @@ class Context:
         mutual = self.rows is None and all(summand.mutual for summand in summands)
         told = {summand: self._told(summand) for summand in summands}
         if compiled := {summand: known for summand, known in told.items() if known is not None}:
-            self._sums |= zip(compiled, self._compiled_sums(list(compiled.values()), mutual))
+            self._sums |= zip(compiled, self._compiled_sums(compiled, mutual))
         if rest := [summand for summand in summands if told[summand] is None]:
             self._sums |= zip(rest, self._mutual_sums(rest) if mutual else self._sums_of(rest))
 
@@ -192,7 +192,7 @@ class Context:
         tell = vars(type(summand)).get("compiled")
         return tell(summand, self) if tell and kernels_serve(self.particles.position.device) else None
 
-    def _compiled_sums(self, summands: Sequence[CompiledSum], mutual: bool) -> list[Tensor]:
+    def _compiled_sums(self, summands: Mapping[PairSum, CompiledSum], mutual: bool) -> list[Tensor]:
         local, flow, owned = self.local, self.flow, len(self.particles)
         wanted = np.zeros(len(local.position), bool)
         wanted[: owned if self.rows is None else 0] = True
@@ -200,8 +200,9 @@ class Context:
             wanted[self.rows.numpy()] = True
         space = PairSpace(local.box.length, local.box.periodic_z, flow.cutoff, flow.scales.filter_width,
                           flow.scales.velocity, mutual)
-        velocity = self.column("velocity") if any(summand.reads_velocity for summand in summands) else None
-        found = compiled_sums(space, summands, local.position, velocity, wanted, self.dtype)
+        velocity = self.column("velocity") if any(told.reads_velocity for told in summands.values()) else None
+        found = compiled_sums(space, list(summands.values()), [summand.parity for summand in summands], local.position,
+                              velocity, wanted, self.dtype)
         return [sums[:, :owned] if self.rows is None else sums.index_select(1, self.rows) for sums in found]
 
     def _sums_of(self, summands: Sequence[PairSum]) -> Sequence[Tensor]:
@@ -257,7 +258,7 @@ class _SharedMoments:
 
     def compiled(self, context: Context) -> CompiledSum:
         """The same for the compiled library."""
-        return CompiledSum(Summand("moments", 7), torch.empty(0), reads_velocity=False)
+        return CompiledSum("moments", reads_velocity=False)
 
 
 _MOMENTS = _SharedMoments()

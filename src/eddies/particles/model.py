@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib import import_module
+from pkgutil import iter_modules
 from typing import cast
 
 import torch
@@ -13,29 +15,20 @@ from torch.func import functional_call
 from eddies.errors import UserError
 from eddies.import_path import is_path, load, short_name
 from eddies.parallel.reduction import any_rank
+from eddies.particles import terms as built_in
 from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.rates import BY_PARTICLE, Rates, total
-from eddies.particles.terms.continuity import Continuity
-from eddies.particles.terms.damping import Damping
-from eddies.particles.terms.density_flux import DensityFlux
-from eddies.particles.terms.eddy_viscosity import EddyViscosity
-from eddies.particles.terms.filtered_equations import FilteredEquations
 from eddies.particles.terms.forcing import Forcing
-from eddies.particles.terms.pair_network import PairNetwork
-from eddies.particles.terms.pressure import Pressure
-from eddies.particles.terms.relaxation import Relaxation
-from eddies.particles.terms.stress import Stress
 from eddies.particles.terms.term import PairTerm, Term
-from eddies.particles.terms.transport_velocity import TransportVelocity
-from eddies.particles.terms.viscosity import Viscosity
-from eddies.particles.terms.wcsph import WCSPH
 from eddies.scene.terms import TermError, TermSettings
 
-#: The classes behind the words of [model] terms.
-TERMS: dict[str, type[Term]] = {kind.Settings.word: kind for kind in (
-    PairNetwork, EddyViscosity, DensityFlux, Pressure, Stress, Viscosity, Damping, Relaxation, Continuity, WCSPH,
-    TransportVelocity, FilteredEquations)}
+#: The classes behind the words of [model] terms: those in the modules of eddies.particles.terms.
+TERMS: dict[str, type[Term]] = {
+    kind.Settings.word: kind
+    for found in iter_modules(built_in.__path__)
+    for kind in vars(import_module(f"{built_in.__name__}.{found.name}")).values()
+    if isinstance(kind, type) and issubclass(kind, Term) and kind.Settings.word}
 # The name of the forcing that is added to the terms of a model.
 FORCING = "injection"
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from eddies.kernels.library import library
-from eddies.kernels.pairs import PairSpace, Summand
+from eddies.kernels.pairs import PairSpace
 from eddies.kernels.reconstruction import GridPlanes, sums_on_grid, told_kernel
 from eddies.parallel.halo import HaloExchange
 from eddies.parallel.slab import SlabDecomposition
@@ -129,11 +129,11 @@ class ParticleField:
     def _sums(self, kernel: SmoothingKernel, kind: str, components: int, position: Tensor, count: int,
               scalars: tuple[Tensor, ...] = ()) -> tuple[Tensor, ...]:
         """Sums over the particles within the support, (components, count), of the first `count` positions."""
-        told = Summand(kind, components, constants=told_kernel(kernel.support, kernel.pieces.numpy()))
         space = PairSpace(self.decomposition.length, self.decomposition.size == 1, kernel.support, 1.0, 1.0, False)
         wanted = np.arange(len(position)) < count
-        summand = CompiledSum(told, torch.empty(0), scalars, reads_velocity=False)
-        found = compiled_sums(space, [summand], position, None, wanted, self.dtype)
+        told = CompiledSum(kind, told_kernel(kernel.support, kernel.pieces.numpy()), scalars=scalars,
+                           reads_velocity=False)
+        found = compiled_sums(space, [told], [torch.ones(components)], position, None, wanted, self.dtype)
         return tuple(sums[:, :count] for sums in found)
 
     @cached_property

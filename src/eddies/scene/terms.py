@@ -282,10 +282,9 @@ class FilteredEquations(TermSettings):
         return units.scheme.decay / rate
 
 
-#: The terms that a scene can name.
-TERMS: dict[str, type[TermSettings]] = {kind.word: kind for kind in (
-    PairNetwork, EddyViscosity, DensityFlux, Pressure, Stress, Viscosity, Damping, Relaxation, Continuity, WCSPH,
-    TransportVelocity, FilteredEquations)}
+#: The terms that a scene can name: the classes above that have a word.
+TERMS: dict[str, type[TermSettings]] = {kind.word: kind for kind in list(globals().values())
+                                        if isinstance(kind, type) and issubclass(kind, TermSettings) and kind.word}
 
 # Near what training finds; the method's own values are tens of times the accelerations of turbulence.
 LITTLE_FRICTION = {"alpha": 0.05, "beta": 1.5}

@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from eddies.kernels.pairs import Summand
 from eddies.particles.compiled_pairs import CompiledSum
 from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
@@ -50,9 +49,8 @@ class Continuity(PairTerm):
         """The same for the compiled library."""
         scales, support = context.flow.scales, self.kernel.support
         width, unit = scales.filter_width, self.mass / support**5
-        told = Summand("continuity", len(self.parity), (False,),
-                       (support / width, unit * width * scales.velocity, unit))
-        return CompiledSum(told, torch.empty(0), (context.column("density"),))
+        return CompiledSum("continuity", (support / width, unit * width * scales.velocity, unit),
+                           scalars=(context.column("density"),))
 
     def rates_of(self, sums: Tensor, context: Context) -> Rates:
         """The rate of density."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from eddies.kernels.pairs import Summand
 from eddies.particles.compiled_pairs import CompiledSum
 from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
@@ -51,8 +50,7 @@ class EddyViscosity(PairTerm):
 
     def compiled(self, context: Context) -> CompiledSum:
         """The same for the compiled library."""
-        return CompiledSum(Summand("eddy-viscosity", 3, (self.settings.form == "monaghan",), (SOFTENING,)),
-                           self.coefficients.abs())
+        return CompiledSum("eddy-viscosity", (self.settings.form == "monaghan", SOFTENING), self.coefficients.abs())
 
     def rates_of(self, sums: Tensor, context: Context) -> Rates:
         """The acceleration."""

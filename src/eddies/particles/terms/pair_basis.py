@@ -8,7 +8,6 @@ import torch
 from torch import Tensor, nn
 
 from eddies.import_path import is_path, load
-from eddies.kernels.pairs import Summand
 from eddies.particles import moments
 from eddies.particles.compiled_pairs import CompiledSum
 from eddies.particles.context import Context
@@ -42,8 +41,7 @@ def compiled_network(network: nn.Module, inputs: Sequence[str], outputs: int, sy
         return None
     layers = list(zip(network.weights, network.biases))
     told = [name in inputs for name in ("density", "distance", "speed", "approach")]
-    options = outputs, symmetric, *told, *(len(bias) for _, bias in layers[:-1])
-    return CompiledSum(Summand("pair-network", 6 if outputs == 2 else 1, options),
+    return CompiledSum("pair-network", (outputs, symmetric, *told, *(len(bias) for _, bias in layers[:-1])),
                        torch.cat([parameter.flatten() for layer in layers for parameter in layer]),
                        (context.density_fluctuation,) if "density" in inputs else ())
 

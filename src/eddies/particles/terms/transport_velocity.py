@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from eddies.kernels.pairs import Summand
 from eddies.particles.compiled_pairs import CompiledSum
 from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
@@ -57,9 +56,8 @@ class TransportVelocity(PairTerm):
         scales, support = context.flow.scales, self.kernel.support
         width = scales.filter_width
         unit = self.mass * width / support**5
-        told = Summand("transport-velocity", 12, (False,),
-                       (support / width, unit, unit * scales.velocity))
-        return CompiledSum(told, torch.empty(0), (context.column("density"),))
+        return CompiledSum("transport-velocity", (support / width, unit, unit * scales.velocity),
+                           scalars=(context.column("density"),))
 
     def rates_of(self, sums: Tensor, context: Context) -> Rates:
         """Shift velocity and shift acceleration."""

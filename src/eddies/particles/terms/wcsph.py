@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from eddies.kernels.pairs import Summand
 from eddies.particles.compiled_pairs import CompiledSum
 from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
@@ -64,10 +63,9 @@ class WCSPH(PairTerm):
         """The same for the compiled library."""
         scales, density, support = context.flow.scales, context.column("density"), self.kernel.support
         width = scales.filter_width
-        options = Summand("wcsph", 3, (False,),
-                          (support / width, self.mass * width / support**5, SOFTENING * (support / (2 * width)) ** 2))
+        numbers = support / width, self.mass * width / support**5, SOFTENING * (support / (2 * width)) ** 2
         viscosity = torch.stack([scales.velocity * self.alpha.abs() * self.c, scales.velocity**2 * self.beta.abs()])
-        return CompiledSum(options, viscosity, (self.pressure(density) / density**2, density))
+        return CompiledSum("wcsph", numbers, viscosity, (self.pressure(density) / density**2, density))
 
     def rates_of(self, sums: Tensor, context: Context) -> Rates:
         """The acceleration."""
