@@ -151,7 +151,7 @@ def test_tools_import_nothing_from_the_package():
 @pytest.mark.parametrize("module, source, breach", [
     ("flow/forcing", "from eddies.particles.pairs import Pairs", "not below it"),
     ("flow/forcing", "from ..particles import pairs", "not below it"),
-    ("parallel/slab", "import eddies.flow.operators", "not below it"),
+    ("parallel/slab", "import eddies.flow.forcing", "not below it"),
     ("clock", "from eddies import scene", "not below it"),
     ("workflows/foreseen/cost_model", "from eddies.workflows.dns import run", "not below it"),
     ("workflows/learned/model", "from eddies.workflows import train", "not below it"),
