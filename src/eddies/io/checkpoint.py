@@ -16,7 +16,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from mpi4py import MPI
 
@@ -24,6 +23,7 @@ from eddies.io.contiguous import Block, lay_out, total_bytes, write_arrays
 from eddies.io.errors import WriteError, wanted_and_free
 from eddies.io.hdf5 import in_files
 from eddies.io.manifest import find_damage, hash_file, manifest_text, parse_manifest
+from eddies.io.reading import open_to_read
 from eddies.kernels.library import in_use, threads
 from eddies.parallel.broadcast import first_complaint, on_all_ranks, on_first_rank
 
@@ -58,7 +58,7 @@ class Checkpoint(Mapping):
         return self._plain[name] if name in self._plain else self.read(name)
 
     def __iter__(self) -> Iterator[str]:
-        with h5py.File(self.path / STATE, "r") as file:
+        with open_to_read(self.path / STATE) as file:
             yield from [*self._plain, *(name for name in file if name != PLAIN)]
 
     def __len__(self) -> int:
@@ -66,7 +66,7 @@ class Checkpoint(Mapping):
 
     def read(self, name: str, start: int = 0, stop: int | None = None, axis: int = 0) -> np.ndarray:
         """Rows start to stop of an array along an axis; every rank reads what it needs."""
-        with h5py.File(self.path / STATE, "r") as file:
+        with open_to_read(self.path / STATE) as file:
             return file[name][(slice(None),) * axis + (slice(start, stop),)]
 
 

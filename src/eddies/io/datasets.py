@@ -12,6 +12,7 @@ import h5py
 import numpy as np
 
 from eddies.io.errors import ProductError
+from eddies.io.reading import open_to_read
 
 try:
     import xarray
@@ -57,7 +58,7 @@ def groups_in(file: h5py.File) -> list[str]:
 def opened(path: Path) -> h5py.File:
     """A product, for one process; ProductError where there is none."""
     try:
-        return h5py.File(path, "r")
+        return open_to_read(path)
     except OSError as error:
         raise ProductError(f"{path}: cannot be opened ({error}); make it with the stage of this name") from None
 

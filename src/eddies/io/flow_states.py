@@ -26,6 +26,7 @@ from eddies.io.errors import ProductError
 from eddies.io.fields import FieldSeries
 from eddies.io.hdf5 import open_product
 from eddies.io.provenance import read_provenance
+from eddies.io.reading import open_to_read
 from eddies.parallel.broadcast import on_all_ranks, on_first_rank
 
 CUTOUT_EDGE = 2 * math.pi
@@ -97,7 +98,7 @@ def open_states(comm: MPI.Comm, path: str | Path) -> Iterator[StoredStates | Vel
 def _is_product(path: Path) -> bool:
     """Whether a file is one of eddies; or none of HDF5 at all, of which `open_product` knows what to say."""
     try:
-        with h5py.File(path, "r") as file:
+        with open_to_read(path) as file:
             return "kind" in file.attrs
     except OSError:
         return True
@@ -105,7 +106,7 @@ def _is_product(path: Path) -> bool:
 
 def _open(path: str | Path) -> h5py.File:
     try:
-        return h5py.File(path, "r")
+        return open_to_read(path)
     except OSError as error:
         raise ProductError(f"{path}: cannot be opened ({error}); put it where all ranks can read it") from None
 

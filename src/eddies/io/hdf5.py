@@ -5,10 +5,8 @@ uses parallel HDF5 on several ranks, or rank 0 where there is none (io/single_wr
 (io/unfinished.py); every rank reads by itself.
 """
 
-import errno
 import json
 import math
-import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,6 +19,7 @@ from mpi4py import MPI
 from eddies.io.errors import ProductError, WriteError, write_error
 from eddies.io.provenance import FORMAT, environment, has_this_format, identity, read_json, read_provenance
 from eddies.io.quantities import conventions, describe
+from eddies.io.reading import open_to_read, why_unreadable
 from eddies.io.run_lock import RunTakenOver
 from eddies.io.unfinished import HEADER_BYTES, Unfinished, frame_bytes, writing, written_here
 from eddies.parallel.broadcast import on_first_rank, share_text
@@ -28,8 +27,6 @@ from eddies.parallel.stop import Stopped
 from eddies.pipeline import MAKER_OF
 
 CHUNK_BYTES = 2**20
-# Why the operating system does not let a file be read that may be sound.
-UNREADABLE = (errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.EMFILE, errno.ENFILE, errno.EIO)
 # The type of an open product.
 File = h5py.File
 Result = TypeVar("Result")
@@ -217,11 +214,11 @@ def _open_checked(path: Path, kind: str | None) -> h5py.File:
             raise ProductError(f"{path}: is a directory, not a file; move it away, then {remedy}")
         if not path.is_file():
             raise ProductError(f"{path}: no such file; {remedy}")
-        file = h5py.File(path, "r")
+        file = open_to_read(path)
     except OSError as error:
-        if error.errno in UNREADABLE:
-            raise ProductError(f"{path}: cannot be read: {os.strerror(error.errno)}; change its permissions or those "
-                               "of its directory, or give another path") from None
+        if reason := why_unreadable(error):
+            raise ProductError(f"{path}: cannot be read: {reason}; check its permissions, its directory and the file "
+                               "system, or give another path") from None
         message = f"{path}: damaged or not an HDF5 file ({error}); delete it and make it again"
         raise ProductError(message) from None
     try:

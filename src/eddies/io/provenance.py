@@ -16,6 +16,7 @@ from mpi4py import MPI
 
 import eddies
 from eddies.io.errors import ProductError
+from eddies.io.reading import open_to_read
 from eddies.kernels.library import in_use
 from eddies.pipeline import MAKER_OF
 
@@ -113,7 +114,7 @@ def read_json(file: h5py.File, name: str) -> dict[str, Any]:
 def _read_sound(path: str | Path, read: Callable[[h5py.File], dict[str, Any]]) -> dict[str, Any]:
     """What is read of a complete product of this format; empty if there is none."""
     try:
-        with h5py.File(path, "r") as file:
+        with open_to_read(path) as file:
             return read(file) if file.attrs.get("complete", False) and has_this_format(file) else {}
     except (OSError, ValueError, KeyError, TypeError, RuntimeError):  # ProductError is one of the last
         return {}
