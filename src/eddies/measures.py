@@ -24,13 +24,8 @@ MEASURES = {
     "tetrad_shape_error": "shape of tetrads, rms of logarithms",
     "count_variance_ratio": "variance of counts, model / truth",
 }
-#: Those that a comparison shows unless it asks for others, and of them those that it draws.
+#: Those that the table of variants shows, and of them those that are drawn.
 DRAWN = ("velocity_error_early", "velocity_error_half", "spectrum_error", "acceleration_kl")
 SHOWN = ("velocity_error_early", "velocity_error_half", "velocity_error_end", "spectrum_error", "energy_ratio",
          "velocity_kl", "velocity_kl_floor", "acceleration_kl", "acceleration_kl_floor", "qr_kl", "qr_kl_floor",
          "acceleration_error")
-
-
-def is_error(name: str) -> bool:
-    """Whether less of a measure is better: not of a ratio, nor of a floor, which is the truth's own."""
-    return not name.endswith(("_ratio", "_floor"))
