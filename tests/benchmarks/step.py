@@ -26,7 +26,7 @@ import numpy as np
 from mpi4py import MPI
 
 from eddies.flow.initial_fields import balanced_density, random_velocity
-from eddies.flow.navier_stokes import CompressibleFluid
+from eddies.flow.navier_stokes import AcousticBlock, CompressibleFluid, Decay
 from eddies.kernels.copies import PlaneCopies
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.transpose import TransposeBuffers
@@ -92,7 +92,7 @@ def arrays_in(items: object) -> Iterable[np.ndarray]:
     elif isinstance(items, (tuple, list)):
         for item in items:
             yield from arrays_in(item)
-    elif type(items).__module__ == "eddies.flow.linear_operators":
+    elif isinstance(items, (AcousticBlock, Decay)):
         yield from arrays_in(list(vars(items).values()))
 
 

@@ -9,9 +9,9 @@ import torch
 from eddies.kernels.pairs import CompiledPairs, PairSpace, Summand, kinds
 from eddies.kernels.reconstruction import told_kernel
 from eddies.particles import context
-from eddies.particles.compiled_pairs import compiled_sums
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.model import TERMS as BUILT_IN
+from eddies.particles.pairs import compiled_sums
 from eddies.particles.smoothing_kernels import CubicSpline, WendlandC2
 from eddies.particles.terms.term import PairTerm
 from tests.particles.configurations import (
@@ -36,7 +36,7 @@ CUTOFFS = {"large": 3.0, "half": 2.2, "third": CUTOFF, "small": 0.7}
 @pytest.fixture
 def served(library, monkeypatch):
     """Let dynamics use that library."""
-    monkeypatch.setattr("eddies.particles.compiled_pairs.library", lambda: library)
+    monkeypatch.setattr("eddies.particles.pairs.library", lambda: library)
 
 
 def set_up(terms, kind, cutoff=CUTOFF, count=128, dtype=torch.float64):

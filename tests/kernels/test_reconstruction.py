@@ -49,7 +49,7 @@ def test_averages_are_those_of_torch(comm, library, monkeypatch, kind, dtype, ro
     field = ParticleField(slab, 1.2 * support, position, torch.sin(2 * position), dtype)
     with torch.no_grad():
         kernel = KERNELS[kind](support)
-    monkeypatch.setattr("eddies.particles.compiled_pairs.library", lambda: library)
+    monkeypatch.setattr("eddies.particles.pairs.library", lambda: library)
     monkeypatch.setattr("eddies.particles.particle_field.library", lambda: library)
     found = averages(field, kernel)
     monkeypatch.setattr("eddies.particles.particle_field.kernels_serve", lambda device: False)

@@ -14,10 +14,10 @@ from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.flow_units import FlowUnits, ReferenceScales
 from eddies.particles.model import FORCING, LagrangianModel, build_model
 from eddies.particles.neighbor_list import NeighborList
+from eddies.particles.pairs import ScaledPairs
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.periodic_box import PeriodicBox
 from eddies.particles.rates import Rates
-from eddies.particles.scaled_pairs import ScaledPairs
 from eddies.particles.terms.term import Term
 from eddies.scene.terms import PRESETS, TERMS, Forcing, NetworkSettings, TermSettings
 

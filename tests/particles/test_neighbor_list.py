@@ -3,7 +3,7 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from eddies.particles import cell_grid
+from eddies.particles import neighbor_list
 from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.periodic_box import PeriodicBox
 from tests.particles.configurations import CONFIGURATIONS, LENGTH, positions
@@ -69,8 +69,8 @@ def test_few_or_no_particles(receivers, senders):
 def test_pairs_do_not_depend_on_how_many_are_searched_together(monkeypatch, together):
     position = positions("uneven", 150)
     whole = listed(position, position, 0.7)
-    monkeypatch.setitem(cell_grid.RECEIVERS_TOGETHER, "cpu", together)
-    monkeypatch.setitem(cell_grid.CANDIDATES_TOGETHER, "cpu", together)
+    monkeypatch.setitem(neighbor_list.RECEIVERS_TOGETHER, "cpu", together)
+    monkeypatch.setitem(neighbor_list.CANDIDATES_TOGETHER, "cpu", together)
     parts = listed(position, position, 0.7)
     assert torch.equal(whole.senders, parts.senders) and torch.equal(whole.offsets, parts.offsets)
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
 
 from eddies.flow.forcing import LinearForcing
-from eddies.flow.linear_operators import AcousticBlock, Decay
 from eddies.flow.subgrid import Closure
 from eddies.kernels.flow import Formulas
 from eddies.kernels.library import library
@@ -171,6 +171,40 @@ class CompressibleFluid:
 def advective_speed(grid: SpectralGrid, velocity: np.ndarray) -> float:
     """Largest |u| + |v| + |w| on this rank's grid points: the speed of the advective Courant number."""
     return float(np.max([np.abs(u).sum(axis=0).max() for u in grid.blocks(velocity, fields=3)], initial=0.0))
+
+
+class Decay:
+    """Multiplies each mode by a real function of k^2. As all factors here, that depends on |k| only, so planes kz < 0
+    share those of kz > 0."""
+
+    def __init__(self, grid: SpectralGrid, function: Callable[[np.ndarray], np.ndarray]) -> None:
+        #: (kz >= 0, ky, 1, kx)
+        self.factors = by_wavenumber(grid, function)[:, :, None]
+
+
+class AcousticBlock:
+    """Acts on (u, v, w, s) as a scalar on the transverse velocity and as a real 2 x 2 matrix on (k.u, s):
+
+        u' = transverse u + k (excess k.u + elastic sigma),   sigma' = identity sigma - coupling k.u,   sigma = -i s.
+
+    All factors are real functions of k^2.
+    """
+
+    def __init__(self, grid: SpectralGrid, **factors: Callable[[np.ndarray], np.ndarray]) -> None:
+        names = ("transverse", "excess", "elastic", "identity", "coupling")
+        #: (kz >= 0, ky, 5, kx)
+        self.factors = np.stack([by_wavenumber(grid, factors[name]) for name in names], axis=2)
+
+
+def by_wavenumber(grid: SpectralGrid, function: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """A real function of k^2, evaluated once for each integer |k|^2, for kz >= 0: (kz, ky, kx)."""
+    unit = 2 * np.pi / grid.decomposition.length
+    index_squared = grid.index_squared[: grid.cutoff + 1]
+    distinct = np.unique(index_squared)
+    table = np.zeros(3 * grid.cutoff**2 + 1)
+    if len(distinct):
+        table[distinct] = function(unit**2 * distinct)
+    return table[index_squared].astype(grid.real)
 
 
 #: The fluids that [flow] fluid names by a word.

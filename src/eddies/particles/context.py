@@ -15,13 +15,12 @@ from torch import Tensor
 from eddies.kernels.pairs import PairSpace
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles import moments
-from eddies.particles.compiled_pairs import CompiledSum, compiled_sums
 from eddies.particles.devices import kernels_serve
 from eddies.particles.exchanges import mean_over_ranks
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.neighborhood import LocalParticles
+from eddies.particles.pairs import CompiledSum, ScaledPairs, compiled_sums
 from eddies.particles.particle_set import ParticleSet
-from eddies.particles.scaled_pairs import ScaledPairs
 from eddies.particles.surroundings import Surroundings
 from eddies.scene.terms import TermError
 

@@ -1,13 +1,21 @@
-"""Pairs of neighbouring particles, and sums over each particle's neighbours."""
+"""Pairs of neighbouring particles, what they carry in the units of a model, and sums over each particle's neighbours:
+of values by torch, or by the compiled library."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import torch
 from torch import Tensor
+
+from eddies.kernels.library import library
+from eddies.kernels.pairs import CompiledPairs, PairSpace, Summand
+from eddies.particles import moments
+from eddies.particles.flow_units import FlowUnits
+from eddies.particles.periodic_box import safe_norm
 
 
 @dataclass(frozen=True)
@@ -98,3 +106,153 @@ class _SegmentSum(torch.autograd.Function):
         (segment,) = ctx.saved_tensors
         components = [component.index_select(0, segment) for component in gradient.unbind(0)]
         return torch.stack(components), None, None
+
+
+class ScaledPairs:
+    """Some pairs (i, j) with what they carry, computed where it is asked for first.
+
+    Lengths are in units of the filter width d, velocities of v_rms, density fluctuations of rho_rms:
+    x = (x_i - x_j)/d, v = (v_i - v_j)/v_rms, rho' = (rho - rho_0)/rho_rms.
+
+    Parameters
+    ----------
+    pairs : as listed, in the units of the simulation.
+    column : gives a column (s, ...), "velocity" or "density", of the particles that the pairs number, ghosts included.
+    flow : the units, and the radius of interaction.
+    """
+
+    def __init__(self, pairs: Pairs, column: Callable[[str], Tensor], flow: FlowUnits) -> None:
+        self.pairs, self.column, self.flow = pairs, column, flow
+
+    @cached_property
+    def x(self) -> Tensor:
+        """(3, m)."""
+        return self.pairs.displacement.T / self.flow.scales.filter_width
+
+    @cached_property
+    def v(self) -> Tensor:
+        """(3, m)."""
+        return self.velocity_difference / self.flow.scales.velocity
+
+    @cached_property
+    def velocity_difference(self) -> Tensor:
+        """v_i - v_j (3, m) in the units of the simulation."""
+        velocity = self.column("velocity")
+        return (self.pairs.at_receivers(velocity) - self.pairs.at_senders(velocity)).T.to(self.pairs.displacement)
+
+    @cached_property
+    def densities(self) -> tuple[Tensor, Tensor]:
+        """rho'_i and rho'_j (m,)."""
+        scales, density = self.flow.scales, self.column("density")
+        own, other = (((column - scales.density_mean) / scales.density).to(self.pairs.displacement)
+                      for column in (self.pairs.at_receivers(density), self.pairs.at_senders(density)))
+        return own, other
+
+    @cached_property
+    def distance(self) -> Tensor:
+        """|x| (m,)."""
+        return self.pairs.distance / self.flow.scales.filter_width
+
+    @cached_property
+    def approach(self) -> Tensor:
+        """x.v (m,), negative where particles approach each other."""
+        return (self.x * self.v).sum(0)
+
+    @cached_property
+    def weight(self) -> Tensor:
+        """w = (1 - q^2)^2 (m,), q the distance over the radius of interaction: rates are smooth where a neighbour
+        enters or leaves."""
+        return moments.weight(self.pairs.distance, self.flow.cutoff)
+
+    def invariants(self, names: Sequence[str], symmetric: bool) -> Tensor:
+        """What a network is told of the pairs, (features, m), in the order of INPUTS of the settings.
+
+        "density" makes two features: rho'_i and rho'_j, or, `symmetric`, rho'_i + rho'_j and (rho'_i - rho'_j)^2, which
+        are the same for (i, j) and (j, i) as all others are.
+        """
+        features: list[Tensor] = []
+        if "density" in names:
+            own, other = self.densities
+            features += [own + other, (own - other).square()] if symmetric else [own, other]
+        if "distance" in names:
+            features.append(self.distance)
+        if "speed" in names:
+            features.append(safe_norm(self.v, dim=0))
+        if "approach" in names:
+            features.append(self.approach)
+        return torch.stack(features)
+
+
+@dataclass(frozen=True)
+class CompiledSum:
+    """What a term sums over pairs, as the library is told of it.
+
+    Parameters
+    ----------
+    kind : its name in the library (kernels/summands.hpp). numbers : that it takes there.
+    parameters : (p,), differentiable; none unless given.
+    scalars : columns (s,) of all particles that this rank sees, likewise.
+    reads_velocity : whether velocities matter.
+    """
+
+    kind: str
+    numbers: tuple[float, ...] = ()
+    parameters: Tensor | None = None
+    scalars: tuple[Tensor, ...] = ()
+    reads_velocity: bool = True
+
+
+def compiled_sums(space: PairSpace, summands: Sequence[CompiledSum], parities: Sequence[Tensor], position: Tensor,
+                  velocity: Tensor | None, wanted: np.ndarray, dtype: torch.dtype) -> tuple[Tensor, ...]:
+    """The sums (components, s) of each summand at the particles `wanted`, bool (s,), over those within the radius;
+    elsewhere they mean nothing. Differentiable.
+
+    Parameters
+    ----------
+    parities : of each summand, (components,), as those of pair terms.
+    position, velocity : (s, 3), of all particles that this rank sees; no velocity where no summand reads it.
+    dtype : of the arithmetic.
+
+    Raises ValueError where a position is not finite.
+    """
+    columns: list[Tensor] = []
+    placed = []
+    for summand, parity in zip(summands, parities, strict=True):
+        known = next((place for place in range(len(columns) - len(summand.scalars) + 1)
+                      if all(a is b for a, b in zip(columns[place:], summand.scalars))), len(columns))
+        if known == len(columns):
+            columns += summand.scalars
+        placed.append(Summand(summand.kind, summand.numbers, tuple(parity.tolist()), known))
+    scalars = torch.stack(columns).double() if columns else position.new_zeros(0, len(position))
+    velocity = torch.zeros_like(position) if velocity is None else velocity
+    return _PairSums.apply(space, placed, wanted, dtype, position, velocity, scalars,
+                           *(position.new_empty(0) if summand.parameters is None else summand.parameters
+                             for summand in summands))
+
+
+class _PairSums(torch.autograd.Function):
+    """The sums; on the way back all pairs are evaluated anew."""
+
+    @staticmethod
+    def forward(ctx, space: PairSpace, summands: list[Summand], wanted: np.ndarray, dtype: torch.dtype,
+                position: Tensor, velocity: Tensor, scalars: Tensor, *parameters: Tensor) -> tuple[Tensor, ...]:
+        kind = np.dtype(str(dtype).removeprefix("torch."))
+        ctx.pairs = CompiledPairs(library(), space, *map(_numbers, (position, velocity, scalars)), wanted, kind)
+        ctx.summands = summands
+        ctx.save_for_backward(position, velocity, scalars, *parameters)
+        return tuple(map(torch.from_numpy, ctx.pairs.sums(summands, list(map(_numbers, parameters)))))
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, *by_sums: Tensor) -> tuple[Tensor | None, ...]:
+        columns = any(ctx.needs_input_grad[4:7])
+        given = ctx.saved_tensors
+        by_parameters, by_columns = ctx.pairs.gradients(ctx.summands, list(map(_numbers, given[3:])),
+                                                        [by.numpy() for by in by_sums], columns)
+        found = [*(by_columns or (None, None, None)), *by_parameters]
+        return (None, None, None, None, *(None if by is None else torch.from_numpy(by).to(tensor)
+                                          for by, tensor in zip(found, given)))
+
+
+def _numbers(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().numpy()

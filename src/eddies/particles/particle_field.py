@@ -13,11 +13,10 @@ from eddies.kernels.pairs import PairSpace
 from eddies.kernels.reconstruction import GridPlanes, sums_on_grid, told_kernel
 from eddies.parallel.halo import HaloExchange
 from eddies.parallel.slab import SlabDecomposition
-from eddies.particles.compiled_pairs import CompiledSum, compiled_sums
 from eddies.particles.devices import kernels_serve
 from eddies.particles.exchanges import exchange_ghost_positions, exchange_ghosts
 from eddies.particles.neighbor_list import NeighborList
-from eddies.particles.pairs import Pairs
+from eddies.particles.pairs import CompiledSum, Pairs, compiled_sums
 from eddies.particles.particle_set import as_numpy
 from eddies.particles.periodic_box import PeriodicBox
 from eddies.particles.reconstruction import reciprocal, reconstruct_on_grid, reconstruct_with_gradient

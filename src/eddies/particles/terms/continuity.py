@@ -5,11 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from eddies.particles.compiled_pairs import CompiledSum
 from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
+from eddies.particles.pairs import CompiledSum, ScaledPairs
 from eddies.particles.rates import Rates
-from eddies.particles.scaled_pairs import ScaledPairs
 from eddies.particles.smoothing_kernels import CubicSpline, over_distance
 from eddies.particles.terms.term import PairTerm
 from eddies.scene import terms as declared

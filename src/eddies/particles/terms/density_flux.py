@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from eddies.particles.compiled_pairs import CompiledSum
 from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
+from eddies.particles.pairs import CompiledSum, ScaledPairs
 from eddies.particles.rates import Rates
-from eddies.particles.scaled_pairs import ScaledPairs
 from eddies.particles.terms.pair_basis import build_network, compiled_network
 from eddies.particles.terms.term import PairTerm
 from eddies.scene import terms as declared

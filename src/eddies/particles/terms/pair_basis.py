@@ -9,9 +9,9 @@ from torch import Tensor, nn
 
 from eddies.import_path import is_path, load
 from eddies.particles import moments
-from eddies.particles.compiled_pairs import CompiledSum
 from eddies.particles.context import Context
 from eddies.particles.dense_network import DenseNetwork
+from eddies.particles.pairs import CompiledSum
 from eddies.scene.terms import NetworkSettings, TermError
 
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from eddies.particles.compiled_pairs import CompiledSum
 from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
+from eddies.particles.pairs import CompiledSum, ScaledPairs
 from eddies.particles.rates import Rates
-from eddies.particles.scaled_pairs import ScaledPairs
 from eddies.particles.terms.pair_basis import (
     acceleration, along_separation, along_velocity, build_network, compiled_network,
 )

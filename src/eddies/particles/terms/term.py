@@ -8,8 +8,8 @@ from torch import Tensor, nn
 
 from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
+from eddies.particles.pairs import ScaledPairs
 from eddies.particles.rates import Rates
-from eddies.particles.scaled_pairs import ScaledPairs
 from eddies.scene.terms import TermBase, TermSettings
 
 
