@@ -1,6 +1,7 @@
 """Builds the compiled library, once for each instruction set; everything else of the package stands in setup.cfg."""
 
 import copy
+import hashlib
 import platform
 from pathlib import Path
 
@@ -11,6 +12,8 @@ from setuptools.errors import CCompilerError, ExecError, PlatformError
 KERNELS = Path("src/eddies/kernels")
 # Many a Python asks for what a debugger needs, which takes a third of a compiler's time: -g0.
 FLAGS = ["-std=c++17", "-O3", "-g0", "-fno-math-errno", "-fno-trapping-math", "-Wno-psabi", "-fopenmp"]
+# Which sources the library is built from, as src/eddies/kernels/library.py tells them.
+SOURCES = hashlib.sha256(b"".join(path.read_bytes() for path in sorted(KERNELS.glob("*.?pp")))).hexdigest()
 # As src/eddies/kernels/library.py has them.
 INSTRUCTION_SETS = {"plain": []}
 if platform.machine() in ("x86_64", "AMD64"):
@@ -46,7 +49,8 @@ class BuildKernels(build_ext):
 
 setup(
     ext_modules=[Extension(f"eddies.kernels.{name}", sorted(map(str, KERNELS.glob("*.cpp"))),
-                           depends=sorted(map(str, KERNELS.glob("*.hpp"))), extra_compile_args=FLAGS + more,
+                           depends=sorted(map(str, KERNELS.glob("*.hpp"))),
+                           extra_compile_args=[*FLAGS, *more, f'-DEDDIES_SOURCES="{SOURCES}"'],
                            extra_link_args=["-fopenmp"], language="c++")
                  for name, more in INSTRUCTION_SETS.items()],
     cmdclass={"build_ext": BuildKernels},

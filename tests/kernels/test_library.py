@@ -1,6 +1,7 @@
 """The library is found, or the way to it told."""
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -8,6 +9,7 @@ from pathlib import Path
 import pyfftw
 import pytest
 
+from eddies import errors
 from eddies.errors import UserError
 from eddies.kernels import library as module
 
@@ -35,6 +37,19 @@ def test_without_the_plain_one_none_is_trusted_to_run_and_a_line_tells_the_way_t
 def test_one_that_does_not_load_is_told(elsewhere):
     (elsewhere / "plain.so").write_bytes(b"no library")
     with pytest.raises(UserError, match=r"do not load \(.*plain.so: .*\): install .* \(g\+\+\)"):
+        module.library()
+
+
+def test_one_of_other_sources_than_lie_beside_it_is_refused(elsewhere):
+    kernels = Path(errors.__file__).parent / "kernels"
+    shutil.copy(kernels / "plain.so", elsewhere)
+    for source in kernels.glob("*.?pp"):
+        shutil.copy(source, elsewhere)
+    assert module.library()
+    for cached in (module.library, module.load):
+        cached.cache_clear()
+    (elsewhere / "pairs.cpp").write_text("")
+    with pytest.raises(UserError, match="of other sources than lie there: build them anew"):
         module.library()
 
 

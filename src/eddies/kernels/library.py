@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import hashlib
 import os
 from pathlib import Path
 
@@ -16,7 +17,7 @@ REMEDY = ("install a C++ compiler (g++), then eddies anew: `pip install --force-
 
 
 class MissingLibraryError(UserError):
-    """The compiled library is not there, or does not load."""
+    """The compiled library is not there, does not load, or is not of the sources beside it."""
 
 
 class ThreadsError(UserError, ValueError):
@@ -48,12 +49,23 @@ def in_use() -> str:
 
 @functools.cache
 def load(instruction_set: str) -> ctypes.CDLL:
-    """The library for an instruction set that it is built for. Raises MissingLibraryError where it does not load."""
+    """The library for an instruction set that it is built for. Raises MissingLibraryError where it does not load, and
+    where it was built from other sources than lie beside it, as they do in a checkout: what it is called with may have
+    changed."""
     share_threads()
     try:
-        return ctypes.CDLL(str(_path(instruction_set)))
+        found = ctypes.CDLL(str(_path(instruction_set)))
     except OSError as error:
         raise MissingLibraryError(f"the compiled kernels do not load ({error}): {REMEDY}") from error
+    sources = sorted(_path("plain").parent.glob("*.?pp"))
+    built_from = getattr(found, "kernel_sources", None)
+    if built_from is not None:
+        built_from.restype = ctypes.c_char_p
+    told = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest().encode()
+    if sources and (built_from is None or built_from() != told):
+        raise MissingLibraryError(f"the compiled kernels in {sources[0].parent} are of other sources than lie there: "
+                                  "build them anew with `python setup.py build_ext --inplace`")
+    return found
 
 
 def threads() -> int:

@@ -15,4 +15,7 @@ int best_instruction_set() {
 #endif
 }
 
+// The SHA-256 of the sources that it was built from.
+const char* kernel_sources() { return EDDIES_SOURCES; }
+
 }  // extern "C"
