@@ -51,10 +51,9 @@ def quick_solves(monkeypatch):
 
 @pytest.fixture
 def quick_spectra(monkeypatch):
-    """Three iterations for each spectrum that a rollout stores, which is half of a short one's time, where nobody looks
-    at them."""
-    from eddies.workflows.rollout import particle_spectra
-    monkeypatch.setattr(particle_spectra, "MOST_ITERATIONS", 3)
+    """Three iterations for each spectrum of particles, where nobody looks at them."""
+    from eddies.workflows.rollout import particle_measures
+    monkeypatch.setattr(particle_measures, "MOST_ITERATIONS", 3)
 
 
 @pytest.fixture

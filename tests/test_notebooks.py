@@ -21,9 +21,9 @@ TRAINED_LESS = ["training.steps=8", "training.combined_steps=2", "training.frame
 # As quick_spectra and undrawn, but in the notebook's process. Of the figures that of PDFs is shown.
 QUICK = """
 from eddies.report import figures
-from eddies.workflows.rollout import particle_spectra
+from eddies.workflows.rollout import particle_measures
 
-particle_spectra.MOST_ITERATIONS = 3
+particle_measures.MOST_ITERATIONS = 3
 png = figures.png
 figures.png = lambda figure: png(figure) if "KL" in figure.axes[0].get_title("left") else b""
 """

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from functools import cached_property
+from collections.abc import Sequence
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,9 @@ TRAJECTORIES = {"tracers": "ground_truth/particles/tracers", "model": "rollout/p
                 "truth": "rollout/particles/truth"}
 FIELDS = {"filtered": "ground_truth/fields/filtered", "unfiltered": "ground_truth/fields/unfiltered",
           "final": "ground_truth/fields/final", "model": "rollout/fields/model", "truth": "rollout/fields/truth"}
+#: What is not stored, but made of the rollout and its truth when it is asked for.
+MADE = tuple(f"rollout/{group}" for group in ("particles/truth", "gradients/model", "gradients/truth", "fields/model",
+                                              "fields/truth", "spectra_of_model", "spectra_of_truth"))
 SPECTRA = {"flow": ("ground_truth/spectra", "energy"), "filtered": ("ground_truth/spectra", "filtered"),
            "model": ("rollout/spectra_of_model", "energy"), "truth": ("rollout/spectra_of_truth", "energy")}
 
@@ -47,7 +51,7 @@ class StoredRun:
         for product in self.products:
             with opened(self.path / self._files[product]) as file:
                 found += [f"{product}/{group}" for group in groups_in(file)]
-        return found
+        return found + [name for name in MADE if name not in found and "rollout" in self.products]
 
     def __getitem__(self, name: str) -> Any:
         """A group of arrays: "PRODUCT/GROUP"."""
@@ -55,7 +59,35 @@ class StoredRun:
         product, _, group = name.partition("/")
         if product not in self.products:
             raise UserError(f"{self.path}: holds no {product}; it holds: {', '.join(self.products)}")
-        return open_group(self.path / self._files[product], group)
+        return self._made(group) if name in MADE else open_group(self.path / self._files[product], group)
+
+    def _made(self, group: str) -> Any:
+        """What is made of the rollout, read or measured frame by frame."""
+        from mpi4py import MPI
+
+        from eddies.io.datasets import MadeArray, made_group
+        from eddies.workflows.rollout.measured import open_rollout
+
+        def make(column: str, frames: Sequence[int]) -> list[np.ndarray]:
+            with open_rollout(self.path, MPI.COMM_SELF) as measured:
+                return [measured.groups[group].read(frame, column) for frame in frames]
+
+        with open_rollout(self.path, MPI.COMM_SELF) as measured:
+            if group not in measured.groups:
+                raise UserError(f"{self.path}: no {group} can be made of rollout.h5 without its ground_truth.h5, or "
+                                "kernel.h5 for fields and gradients")
+            times = measured.groups[group].times
+            samples = {column: measured.groups[group].read(0, column) for column in measured.groups[group].columns}
+        arrays = {"time": MadeArray.of(f"{group}/time", times)}
+        size = np.arange(len(next(iter(samples.values()))))
+        if group.startswith("spectra"):
+            arrays["wavenumber"] = MadeArray.of(f"{group}/wavenumber", size)
+        elif not group.startswith("fields"):
+            arrays["id"] = MadeArray.of("particles/truth/id", size)
+        for column, sample in samples.items():
+            place = f"{group}/{column}" + "/value" * group.startswith("particles")
+            arrays[column] = MadeArray(place, (len(times), *sample.shape), sample.dtype, partial(make, column))
+        return made_group(arrays)
 
     @cached_property
     def scene(self) -> Scene:

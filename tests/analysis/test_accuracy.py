@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from eddies.analysis.accuracy import StoredRollout, accuracy
-from eddies.analysis.rollout_spectra import RolloutSpectra
+from eddies.analysis.accuracy import accuracy
+from eddies.analysis.rollout import Reconstruction, Rollout
+from eddies.analysis.velocity_gradients import Invariants
 from eddies.measures import MEASURES
 
 TURNOVER, TIMES = 1.2, np.linspace(0, 1.2, 7)
@@ -33,22 +34,20 @@ class Stored:
         return factor * self.columns[column][start:stop]
 
 
-PARTICLES = {"acceleration": ACCELERATION, "velocity_gradient": GRADIENT}
-
-
-def spectra(growth, times):
-    """Of truth and flow alike, at every other time; of a model whose velocities grow."""
-    def table(times, growth, name="energy"):
-        energies = np.outer((1 + growth * times) ** 2, SPECTRUM)
-        return {"time": times, "wavenumber": np.arange(9), name: energies}
-
-    return RolloutSpectra(table(times[::2], growth), table(TIMES[::2], 0.0), table(TIMES + 3.0, 0.0, "filtered"), 3.0)
+PARTICLES = {"acceleration": ACCELERATION}
 
 
 def measured(growth, complete=True, model_times=TIMES, broken=None):
-    run = StoredRollout(Stored(PARTICLES, growth, model_times, broken), Stored(PARTICLES), spectra(growth, model_times),
-                        LENGTH, TURNOVER, 0.15, filter_wavenumber=6.0)
-    return accuracy(run, complete)
+    """Velocities of a model that grow, of which its spectra and gradients know; of the flow at every other time."""
+    attributes = {"eddy_turnover_time": TURNOVER, "start_time": 3.0, "status": "complete" if complete else "stopped: x"}
+    runs = {"model": Stored(PARTICLES, growth, model_times, broken), "truth": Stored(PARTICLES)}
+    flow = {"time": TIMES[::2] + 3.0, "wavenumber": np.arange(9), "filtered": np.tile(SPECTRUM, (4, 1))}
+    factors = {name: 1 + run.growth * run.times for name, run in runs.items()}
+    spectra = {name: dict(enumerate(np.outer(factor**2, SPECTRUM))) for name, factor in factors.items()}
+    reconstructions = {name: {frame: Reconstruction(Invariants.of(one * GRADIENT), *[None] * 3)
+                              for frame, one in enumerate(factor)} for name, factor in factors.items()}
+    return accuracy(Rollout(attributes, *runs.values(), LENGTH, flow, {
+        "kolmogorov_time": 0.15, "filter_width": np.pi / 6.0}, spectra, reconstructions))
 
 
 def test_the_truth_itself_has_no_error():

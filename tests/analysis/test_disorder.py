@@ -3,7 +3,7 @@ import pytest
 
 from eddies.analysis import disorder
 from eddies.analysis.disorder import (
-    count_variance, distance_probabilities, energy_above, mean_spacing, nearest_distances, random_distance_density,
+    count_variance, distance_probabilities, mean_spacing, nearest_distances, random_distance_density,
 )
 from eddies.analysis.lagrangian import minimum_image
 
@@ -76,19 +76,3 @@ def test_clustered_points_vary_more():
     single = random_points(4000)
     assert count_variance(np.repeat(single, 2, axis=0), LENGTH) == pytest.approx(2, rel=0.2)
     assert np.isnan(count_variance(random_points(20), LENGTH))
-
-
-class Fields:
-    """Waves of wavenumbers 2 and 6, the second growing in time."""
-
-    times = np.array([0.0, 1.0, 2.0])
-
-    def read(self, frame, column):
-        x = LENGTH * np.arange(16) / 16 * np.ones((16, 16, 1))
-        return np.stack([0 * x, np.cos(2 * x) + self.times[frame] * np.cos(6 * x), 0 * x])
-
-
-def test_energy_above_a_wavenumber():
-    found = energy_above(Fields(), [0, 2], 4.0)
-    assert found["time"].tolist() == [0, 2] and found["energy"] == pytest.approx([0, 1], abs=1e-12)
-    assert energy_above(Fields(), [2], 1.5)["energy"] == pytest.approx([1.25])

@@ -31,7 +31,7 @@ from eddies.workflows.foreseen.estimates import most_ranks
 from eddies.workflows.foreseen.particle_cost import components, particle_cost, particle_costs
 from eddies.workflows.foreseen.particle_probe import probe_particles
 from eddies.workflows.foreseen.particle_work import particle_work
-from eddies.workflows.variants.rows import processor
+from eddies.workflows.variant_rows import processor
 
 HERE = Path(__file__).parent
 LAYOUTS, MODELS, SIDES = ((1, 1), (1, 2), (2, 1)), ("resolved", "resolved + pairs"), (16, 24, 32, 48, 64, 96)

@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 
 from eddies.analysis.isotropic_turbulence import StationarySpan
-from eddies.analysis.rollout_spectra import RolloutSpectra
+from eddies.analysis.rollout import Reconstruction, Rollout
+from eddies.analysis.velocity_gradients import Invariants
 from eddies.report.figures import png
 from eddies.report.forced import ForcedStatistics, section
-from eddies.report.rollout import Rollout
 
 WIDTH, SPECTRUM = np.pi / 4, np.exp(-0.5 * np.arange(10))
 # Of the model's velocity over that of the flow, by frame, two frames a turnover: late ones are the last seven.
@@ -25,14 +25,16 @@ class Stored:
 def rollout(factors=FACTORS):
     """A model that is the flow at its start times factors, and so are its spectra."""
     random = np.random.default_rng(3)
-    columns = {name: random.standard_normal((500, *shape)) for name, shape in
-               (("velocity", (3,)), ("acceleration", (3,)), ("velocity_gradient", (3, 3)))}
-    attributes = {"eddy_turnover_time": 1.0, "injection_rate": 0.5}
-    model = Stored(columns, factors)
-    spectra = [{"time": times, "wavenumber": np.arange(8), "energy": np.outer(amplitudes**2, SPECTRUM[:8])}
-               for times, amplitudes in ((model.times, factors), (model.times[:1], np.ones(1)))]
-    return Rollout(attributes, model, Stored(columns, np.ones(1)), RolloutSpectra(*spectra, None, 0.0), {}, 2 * np.pi,
-                   WIDTH), columns
+    columns = {name: random.standard_normal((500, 3)) for name in ("velocity", "acceleration")}
+    gradient = random.standard_normal((500, 3, 3))
+    attributes = {"eddy_turnover_time": 1.0, "injection_rate": 0.5, "start_time": 0.0}
+    runs = {"model": Stored(columns, factors), "truth": Stored(columns, np.ones(1))}
+    spectra = {name: dict(enumerate(np.outer(run.factors**2, SPECTRUM[:8]))) for name, run in runs.items()}
+    reconstructions = {name: {frame: Reconstruction(Invariants.of(factor * gradient), *[None] * 3)
+                              for frame, factor in enumerate(run.factors)} for name, run in runs.items()}
+    flow = {"time": runs["model"].times}
+    return Rollout(attributes, *runs.values(), 2 * np.pi, flow, {"filter_width": WIDTH}, spectra,
+                   reconstructions), columns
 
 
 def stationary():

@@ -6,9 +6,10 @@ from eddies.io.fields import FieldWriter
 from eddies.io.hdf5 import create_product, write_attributes, write_table
 from eddies.io.trajectories import TrajectoryWriter
 from eddies.io.weights import save_weights
+from eddies.particles.smoothing_kernels import KernelNetwork
 
 LENGTH = 2 * np.pi
-TURNOVER = 1.2
+TURNOVER, START = 1.2, 0.6  # when the rollout starts, after the release of the tracers
 WIDTH = np.pi / 4
 SCALES = {
     "energy": 1.5, "dissipation_rate": 0.5, "injection_rate": 0.5, "total_energy": 1.6, "taylor_scale": 0.6,
@@ -59,9 +60,9 @@ def provenance(*made_from, seed=1, forcing=""):
 
 
 def write_ground_truth(comm, directory, tracers=True, cells=16, frames=0, stationary=False, density=True, seed=1,
-                       forced=False):
-    """With `frames` of the tracers, and with a span over which the stationary state is averaged; without `density` as
-    of an incompressible fluid."""
+                       forced=False, total=600):
+    """With `frames` of the tracers, of which 13 are at the times of the rollout, and with a span over which the
+    stationary state is averaged; without `density` as of an incompressible fluid."""
     flow, origin = RandomFlow(seed), provenance(seed=seed, forcing='[forcing]\nwavenumber = 2.0\n' * stationary)
     with create_product(comm, directory / "ground_truth.h5", "ground_truth", origin) as file:
         time = np.linspace(0, 4, 81)
@@ -73,12 +74,12 @@ def write_ground_truth(comm, directory, tracers=True, cells=16, frames=0, statio
         series = FieldWriter(file, "filtered" if tracers else "final", cells, {"velocity": 3})
         series.append(0.0, 0, {"velocity": flow.field(cells, 0.0)})
         if tracers:
-            reference |= {"released_at": 2.0, "filter_width": WIDTH, "spacing": WIDTH / 2, "acceleration_rms": 1.4,
-                          "density_mean": 1.0, "sound_speed": 20.0 if density else np.inf}
+            reference |= {"released_at": 2.0, "filter_width": WIDTH, "spacing": LENGTH / total ** (1 / 3),
+                          "acceleration_rms": 1.4, "density_mean": 1.0, "sound_speed": 20.0 if density else np.inf}
             reference |= {"density_rate_rms": 0.01} if density else {}
             write_table(file, "spectra", decaying_spectra())
         if frames:
-            write_tracers(file, frames, density)
+            write_tracers(file, frames, density, total)
         if forced:
             write_attributes(file.create_group("forcing"), {"injection_rate": 0.5, "wavenumber": 2.0})
         if stationary:
@@ -88,24 +89,29 @@ def write_ground_truth(comm, directory, tracers=True, cells=16, frames=0, statio
         write_attributes(file.create_group("reference"), reference)
 
 
-def write_tracers(file, frames, density, total=600):
-    """Frames of tracers until the last of the spectra."""
+def write_tracers(file, frames, density, total):
+    """Frames of tracers until the last of the spectra, which are at their places when the rollout starts."""
     shapes = {"position": (3,), "velocity": (3,)} | ({"density": ()} if density else {})
-    flow, start = PerturbedFlow(0.0), np.random.default_rng(6).uniform(0, LENGTH, (total, 3))
+    flow, start = PerturbedFlow(0.0), places(total)
     writer = TrajectoryWriter(file, "tracers", total, LENGTH, shapes, np.float64, images=True)
     for step, time in enumerate(np.linspace(0, 1.2, frames)):
-        writer.append(step, time, 0, flow.particles(start, time))
+        writer.append(step, time, 0, flow.particles(start, time - START))
+
+
+def places(total):
+    """Of particles when the rollout starts."""
+    return np.random.default_rng(5).uniform(0, LENGTH, (total, 3))
 
 
 def decaying_spectra():
-    k, time = np.arange(28), np.linspace(0, 1.2, 5)
+    k, time = np.arange(28), np.linspace(0, 1.2, 7)
     shape = np.exp(-0.05 * k**1.5) * np.maximum(k, 1.0) ** (-5 / 3) * (k > 0)
     energy = np.exp(-0.4 * time)[:, None] * shape
     filtered = energy * np.exp(-k**2 * WIDTH**2 / 12)
     return {"time": time, "wavenumber": k, "energy": energy, "filtered": filtered}
 
 
-def write_kernel(comm, directory, cells=32):
+def write_kernel(comm, directory, cells=32, seed=1):
     r = np.linspace(0, 1, 101)
     shapes = {"learned": np.exp(-5 * r**2) * (1 - r) ** 2,
               "learned_no_gradient": np.exp(-9 * (r - 0.4) ** 2) * (1 - r),
@@ -126,8 +132,10 @@ def write_kernel(comm, directory, cells=32):
                "velocity_learned": 0.4 * np.exp(-step / 60), "gradient_learned": 0.6 * np.exp(-step / 60),
                "loss_learned_no_gradient": np.exp(-step / 40)}
     tables = {"kernels": kernels, "slices": slices, "errors": errors, "history": history}
-    save_weights(comm, directory / "kernel.h5", "kernel", {"support": 0.9}, {"weight": np.ones(3)},
-                 provenance("ground_truth"), tables)
+    network = KernelNetwork(1.4, [4], "smooth", seed)
+    description = {"form": network.FORM, "support": 1.4, "hidden": [4], "cutoff": "smooth"}
+    weights = {name: tensor.numpy() for name, tensor in network.float().state_dict().items()}
+    save_weights(comm, directory / "kernel.h5", "kernel", description, weights, provenance("ground_truth"), tables)
 
 
 def write_model(comm, directory, terms=("pressure", "pairs"), source=None):
@@ -173,18 +181,16 @@ class PerturbedFlow:
         """All columns of particles that moved from `start` with their present velocity."""
         velocity = self.velocity(start, time)
         return {"position": (start + time * velocity) % LENGTH, "velocity": velocity,
-                "density": 1 + 0.01 * velocity[:, 0], "acceleration": self.acceleration(start, time),
-                "velocity_gradient": self.gradient(start, time)}
+                "density": 1 + 0.01 * velocity[:, 0], "acceleration": self.acceleration(start, time)}
 
 
-def write_rollout(comm, directory, status="complete", total=600, cells=16, frames=9, broken=None, injection_rate=0.0,
+def write_rollout(comm, directory, status="complete", total=600, frames=9, broken=None, injection_rate=0.0,
                   truth_injection_rate=0.0, density=True):
-    """The truth ends three frames before the model. Velocities of the model's frame `broken` are NaN."""
-    start = np.random.default_rng(5).uniform(0, LENGTH, (total, 3))
-    shapes = {"position": (3,), "velocity": (3,), "acceleration": (3,), "velocity_gradient": (3, 3)}
-    shapes |= {"density": ()} if density else {}
+    """The tracers of the ground truth end three frames before the model. Velocities of the model's frame `broken` are
+    NaN."""
+    shapes = {"position": (3,), "velocity": (3,), "acceleration": (3,)} | ({"density": ()} if density else {})
     times = 0.1 * np.arange(frames)
-    attributes = {"status": status, "start_time": 0.6, "time_step": 0.02, "integrator": "verlet",
+    attributes = {"status": status, "start_time": START, "time_step": 0.02, "integrator": "verlet",
                   "method": "learned", "terms": "pressure, pairs", "turnovers": times[-1] / TURNOVER,
                   "seconds_per_step": 0.031, "particles": total, "ranks": 1, "eddy_turnover_time": TURNOVER,
                   "injection_rate": injection_rate, "truth_injection_rate": truth_injection_rate}
@@ -196,36 +202,19 @@ def write_rollout(comm, directory, status="complete", total=600, cells=16, frame
         write_table(file, "closure", {"time": times, "solves": 4.0 * late, "iterations": np.where(late, 10.0, 40.0),
                                       "most_iterations": np.where(late, 4.0, 40.0),
                                       "residual": np.full(len(times), 1e-3), "not_converged": 1.0 * ~late})
-        runs = (("truth", times[:-3], PerturbedFlow(0.0)), ("model", times, PerturbedFlow(0.4)))
-        for name, own, flow in runs:
-            writer = TrajectoryWriter(file, name, total, LENGTH, shapes, np.float64, images=True)
-            fields = FieldWriter(file, name, cells, {"velocity": 3})
-            for step, time in enumerate(own):
-                columns = flow.particles(start, time)
-                if step == broken and name == "model":
-                    columns["velocity"] = np.full((total, 3), np.nan)
-                writer.append(step, time, 0, columns)
-                if step % 2 == 0:
-                    fields.append(time, 0, {"velocity": flow.field(cells, time)})
-        write_spectra(file, times, attributes["start_time"])
-        filtered = FieldWriter(file, "filtered", cells, {"velocity": 3})
-        for time in times[:-3:2]:
-            filtered.append(time, 0, {"velocity": 1.02 * RandomFlow(1).field(cells, time)})
-
-
-def write_spectra(file, times, start, shells=12, excess=0.1):
-    """Of true particles that show the filtered flow as it is, and of a model with e^`excess` times its energies."""
-    known = decaying_spectra()
-    for name, own, factor in (("truth", times[:-3], 1.0), ("model", times, np.exp(excess))):
-        nearest = [np.argmin(np.abs(known["time"] - start - time)) for time in own[::2]]
-        write_table(file, f"spectra_of_{name}", {"time": own[::2], "wavenumber": np.arange(shells),
-                                                 "energy": factor * known["filtered"][nearest, :shells]})
+        writer = TrajectoryWriter(file, "model", total, LENGTH, shapes, np.float32, images=True)
+        for step, time in enumerate(times):
+            columns = PerturbedFlow(0.4).particles(places(total), time)
+            if step == broken:
+                columns["velocity"] = np.full((total, 3), np.nan)
+            writer.append(step, time, 0, columns)
 
 
 def write_run(comm, directory, truth=None, **rollout):
     """All four products; `truth` holds arguments of the first, the others are those of the rollout."""
     directory.mkdir(parents=True, exist_ok=True)
-    write_ground_truth(comm, directory, **(truth or {}))
+    same = {name: rollout[name] for name in ("total", "density") if name in rollout}
+    write_ground_truth(comm, directory, **{"frames": 13, **same, **(truth or {})})
     write_kernel(comm, directory)
     write_model(comm, directory)
     write_rollout(comm, directory, **rollout)

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from eddies.io.fields import FieldSeries
-from eddies.io.hdf5 import open_product, read_attributes
-from eddies.io.trajectories import Trajectory
+from eddies.io.hdf5 import open_product
 from eddies.io.weights import save_weights
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.smoothing_kernels import KernelNetwork
+from eddies.report.rollout import moved_by
 from eddies.scene.scene import BOX_LENGTH, SceneError, load_scene
+from eddies.workflows.rollout.measured import open_rollout
 
 pytestmark = pytest.mark.usefixtures("quick_spectra")
 
@@ -87,18 +87,12 @@ def read(folder):
     """Attributes, times, and columns (frames, particles, ...) of model and truth by name, on rank 0."""
     from mpi4py import MPI
 
-    with open_product(MPI.COMM_SELF, folder / "rollout.h5", "rollout") as file:
-        runs = {name: Trajectory(file, name) for name in ("model", "truth")}
+    with open_rollout(folder, MPI.COMM_SELF) as measured:
+        runs = measured.particles
         columns = {name: {column: np.array([run.read(frame, column) for frame in range(len(run.times))])
                           for column in run.columns} for name, run in runs.items()}
-        assert len(FieldSeries(file, "model").times) == len(runs["model"].times)
-        assert "outside_training" not in file  # a matter of networks
-        return read_attributes(file, "rollout"), runs["model"].times, columns
-
-
-def said_in_the_report(attributes):
-    from eddies.report.rollout import Rollout
-    return Rollout(attributes, None, None, {}, BOX_LENGTH, None, None).method
+        assert measured.rollout.outside_training is None  # a matter of networks
+        return measured.rollout.attributes, runs["model"].times, columns
 
 
 def energy(columns):
@@ -111,7 +105,7 @@ def test_particles_without_a_force_keep_their_velocity(comm, folder):
     if comm.rank == 0:
         attributes, times, columns = read(folder)
         model, truth = columns["model"], columns["truth"]
-        assert attributes["status"] == "complete" and said_in_the_report(attributes).startswith("no force")
+        assert attributes["status"] == "complete" and moved_by(attributes).startswith("no force")
         assert np.array_equal(model["velocity"], np.broadcast_to(truth["velocity"][0], model["velocity"].shape))
         assert not model["acceleration"].any() and "density" not in model
         path = truth["position"][0] + times[-1] * truth["velocity"][0] - model["position"][-1]
@@ -145,7 +139,7 @@ def test_an_untrained_model_of_smoothed_particles_keeps_momentum_and_integrates_
         attributes, _, columns = read(folder)
         model = columns["model"]
         assert attributes["status"] == "complete"
-        assert said_in_the_report(attributes) == "the model, terms continuity, wcsph"
+        assert moved_by(attributes) == "the model, terms continuity, wcsph"
         momentum = model["velocity"].mean(axis=1)
         assert len(momentum) > 1 and np.abs(momentum - momentum[0]).max() < 1e-6
         # Random places disturb the density, which starts as the true one and is integrated.
@@ -193,7 +187,7 @@ def test_particles_follow_the_coarse_flow(comm, folder, equations, closure):
         attributes, times, columns = read(folder)
         model = columns["model"]
         assert attributes["status"] == "complete"
-        assert said_in_the_report(attributes).endswith(
+        assert moved_by(attributes).endswith(
             f"on 12³ cells, |kᵢ| ≤ 3, incompressible, {equations} velocity, closure: {closure}")
         # It resolves |k| <= 3 of a flow that has most of its energy there.
         assert 0 < velocity_error(columns, 0) < 0.2 and velocity_error(columns, -1) < 0.35

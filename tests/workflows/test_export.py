@@ -3,60 +3,72 @@
 import h5py
 import numpy as np
 import pytest
+from mpi4py import MPI
 from vtkmodules.util.numpy_support import vtk_to_numpy
 
-from eddies.io.fields import FieldWriter
-from eddies.io.hdf5 import ProductError, create_product, write_table
+from eddies.io.fields import FieldSeries, FieldWriter
+from eddies.io.hdf5 import ProductError, create_product, open_product, write_table
+from eddies.io.trajectories import Trajectory
 from eddies.workflows import export
+from eddies.workflows.rollout.measured import open_rollout
 
 from tests.vtk_reader import VtkFile
-from tests.workflows.synthetic_run import write_ground_truth, write_kernel, write_rollout
+from tests.workflows.synthetic_run import write_ground_truth, write_kernel, write_run
 
-SERIES = {"ground_truth-fields-filtered", "rollout-fields-model", "rollout-fields-truth", "rollout-fields-filtered",
-          "rollout-particles-model", "rollout-particles-truth"}
+SERIES = {"ground_truth": {"fields": ["filtered"], "particles": ["tracers"]},
+          "rollout": {"fields": ["model", "truth"], "particles": ["model", "truth"]}}
 
 
 def exported(directory):
     return {path.name for path in directory.iterdir()}
 
 
-def compare(path, product):
-    """Check the first and the last step of a file against the product."""
-    group, name = path.stem.split("-")[1:]
+def compare(path, group, source):
+    """Check the first and the last step of a file against a series."""
     read = VtkFile(path)
-    with h5py.File(product) as file:
-        source = file[group][name]
-        assert read.times == (tuple(source["time"]) if len(source["time"]) > 1 else None)
-        for frame in (len(source["time"]) - 1, 0):
-            data, arrays = read.step(frame)
-            if group == "particles":
-                assert np.array_equal(vtk_to_numpy(data.GetPoints().GetData()), source["position/value"][frame])
-                assert np.array_equal(arrays["id"], source["id"])
-                assert ("density" in arrays) == ("density" in source)
-                if "density" in source:
-                    assert np.array_equal(arrays["density"], source["density/value"][frame])
-                assert np.array_equal(arrays["velocity"], source["velocity/value"][frame])
-            else:
-                assert np.allclose(data.GetBounds(), [0, 2 * np.pi] * 3)
-                points = source.attrs["cells"] + 1
-                velocity = np.moveaxis(arrays["velocity"].reshape(points, points, points, 3), -1, 0)
-                assert np.array_equal(velocity[:, :-1, :-1, :-1], source["velocity"][frame])
+    assert read.times == (tuple(source.times) if len(source.times) > 1 else None)
+    for frame in (len(source.times) - 1, 0):
+        data, arrays = read.step(frame)
+        if group == "particles":
+            position = vtk_to_numpy(data.GetPoints().GetData())
+            assert np.array_equal(position, source.read(frame, "position").astype(position.dtype))
+            assert np.array_equal(arrays["id"], np.arange(source.total))
+            assert set(arrays) == {"id", *source.columns} - {"position"}
+            for column in set(source.columns) - {"position"}:
+                values = source.read(frame, column)
+                assert np.array_equal(arrays[column], values.reshape(len(values), -1).squeeze()), column
+        else:
+            assert np.allclose(data.GetBounds(), [0, 2 * np.pi] * 3)
+            field = source.read(frame, "velocity")
+            points = field.shape[1] + 1
+            velocity = np.moveaxis(arrays["velocity"].reshape(points, points, points, 3), -1, 0)
+            assert np.array_equal(velocity[:, :-1, :-1, :-1], field)
 
 
 @pytest.mark.mpi(1, 2)
 @pytest.mark.parametrize("density", [True, False])
 def test_every_series_of_a_run(comm, tmp_path, density):
+    """Of the rollout as it is stored, and as it is measured."""
     if comm.rank == 0:
-        alone = comm.Create_group(comm.group.Incl([0]))
-        write_ground_truth(alone, tmp_path, cells=8)
-        write_rollout(alone, tmp_path, total=20, cells=6, frames=6, density=density)
+        write_run(comm.Create_group(comm.group.Incl([0])), tmp_path, truth={"cells": 8}, total=100, frames=6,
+                  density=density)
     comm.Barrier()
     for _ in range(2):  # the second export replaces the first
         export.run(tmp_path, tmp_path / "vtkhdf", comm)
     if comm.rank == 0:
-        assert exported(tmp_path / "vtkhdf") == {f"{name}.vtkhdf" for name in SERIES}
-        for path in (tmp_path / "vtkhdf").iterdir():
-            compare(path, tmp_path / f"{path.stem.split('-')[0]}.h5")
+        names = {(product, group, name) for product, groups in SERIES.items() for group in groups
+                 for name in groups[group]}
+        assert exported(tmp_path / "vtkhdf") == {f"{'-'.join(parts)}.vtkhdf" for parts in names}
+        alone = MPI.COMM_SELF
+        with open_product(alone, tmp_path / "ground_truth.h5", "ground_truth") as truth, open_rollout(
+                tmp_path, alone) as measured:
+            tracers = Trajectory(truth, "tracers")
+            assert ("density" in tracers.columns) == ("density" in measured.rollout.model.columns) == density
+            stored = {"fields": {"filtered": FieldSeries(truth, "filtered")}, "particles": {"tracers": tracers}}
+            for product, group, name in names:
+                compare(tmp_path / "vtkhdf" / f"{product}-{group}-{name}.vtkhdf", group, (
+                    stored if product == "ground_truth" else measured.exported)[group][name])
+    comm.Barrier()
 
 
 @pytest.mark.mpi(1)
@@ -70,12 +82,12 @@ def test_a_run_without_tracers_has_its_last_field(comm, tmp_path):
 def test_particles_as_data_sets(comm, tmp_path, caplog):
     """Of a rollout; its truth, three frames shorter, is too short."""
     if comm.rank == 0:
-        write_rollout(comm.Create_group(comm.group.Incl([0])), tmp_path, total=20, cells=6, frames=11)
+        write_run(comm.Create_group(comm.group.Incl([0])), tmp_path, total=100, frames=11)
     comm.Barrier()
     export.run(tmp_path, tmp_path / "sets", comm, "lagrangebench")
     if comm.rank == 0:
-        assert exported(tmp_path / "sets") == {"rollout-particles-model"}
-        assert "particles/truth of rollout.h5 is left out: has 8 frames" in caplog.text
+        assert exported(tmp_path / "sets") == {"ground_truth-particles-tracers", "rollout-particles-model"}
+        assert "rollout-particles-truth is left out: has 6 frames" in caplog.text
         with h5py.File(tmp_path / "sets/rollout-particles-model/valid.h5") as copy, h5py.File(
                 tmp_path / "rollout.h5") as file:
             stored = file["particles/model/position/value"][5:8]
@@ -93,12 +105,11 @@ def test_a_run_without_tracers_makes_no_data_set(comm, tmp_path):
 
 @pytest.mark.mpi(1)
 def test_a_series_without_frames_is_left_out(comm, tmp_path):
-    """As the filtered fields of a rollout whose times fall between those of the ground truth's fields."""
-    with create_product(comm, tmp_path / "rollout.h5", "rollout", {}) as file:
+    with create_product(comm, tmp_path / "ground_truth.h5", "ground_truth", {}) as file:
         FieldWriter(file, "filtered", 4, {"velocity": 3})
-        FieldWriter(file, "model", 4, {"velocity": 3}).append(0.0, 0, {"velocity": np.ones((3, 4, 4, 4))})
+        FieldWriter(file, "final", 4, {"velocity": 3}).append(0.0, 0, {"velocity": np.ones((3, 4, 4, 4))})
     export.run(tmp_path, tmp_path / "vtkhdf", comm)
-    assert exported(tmp_path / "vtkhdf") == {"rollout-fields-model.vtkhdf"}
+    assert exported(tmp_path / "vtkhdf") == {"ground_truth-fields-final.vtkhdf"}
 
 
 @pytest.mark.mpi(1, 2)

@@ -2,15 +2,17 @@
 
 import csv
 import json
+import os
 
 import numpy as np
 import pytest
 
 import eddies
-from eddies.io.hdf5 import open_product, read_attributes
-from eddies.io.trajectories import Trajectory
 from eddies.io.weights import load_weights
 from eddies.scene.scene import load_scene
+from eddies.workflows import product_warnings
+from eddies.workflows.rollout.measured import TrueParticles, open_rollout
+from eddies.workflows.rollout.particle_measures import KernelAverages, ParticleSpectra
 from eddies.workflows.variants import rollouts, steps
 
 SMALLER = ["flow.cells=16", "flow.viscosity=0.1", "spin_up.turnovers=0.3", "tracers.particles_per_side=8",
@@ -150,6 +152,32 @@ def check_rows(rows):
     assert (learned["time_step"], longer["time_step"]) == (pytest.approx(0.05), pytest.approx(0.1))
 
 
+@pytest.mark.mpi(2, timeout=300)
+@pytest.mark.usefixtures("undrawn", "quick_spectra")
+@pytest.mark.parametrize("scene, truths", [("small", 1), ("unseen", 2)])
+def test_each_truth_is_measured_and_read_through_once(comm, folder, monkeypatch, scene, truths):
+    """Whatever the number of variants and pages, on all ranks together."""
+    measured, scanned = [], []
+
+    def counted(method):
+        def measure(self, particles, frame, *more):
+            if isinstance(particles, TrueParticles):
+                path = os.path.realpath(particles._tracers._group.file.filename)
+                measured.append((type(self).__name__, path, int(particles.frames[frame])))
+            return method(self, particles, frame, *more)
+        return measure
+
+    for cls in (KernelAverages, ParticleSpectra):
+        monkeypatch.setattr(cls, "of", counted(cls.of))
+    monkeypatch.setattr(product_warnings, "stored_numbers", lambda file: scanned.append(file.filename) or ())
+    assert run_cli("run", f"{scene}.toml", "--output", "out") == 0
+    together = [each for some in comm.allgather(measured) for each in some]
+    assert len(set(together)) == len(together) and len({path for _, path, _ in together}) == truths
+    assert {name for name, *_ in together} == {"KernelAverages", "ParticleSpectra"}
+    read = [os.path.realpath(path) for path in scanned]
+    assert len(set(read)) == len(read) and (len(read) > truths) == (comm.rank == 0)
+
+
 @pytest.mark.mpi(1, timeout=300)
 @pytest.mark.usefixtures("undrawn", "quick_spectra")
 def test_realisations_that_no_training_has_seen(comm, folder):
@@ -169,10 +197,11 @@ def test_realisations_that_no_training_has_seen(comm, folder):
         assert row["realisations"] == 2 and row["status"] == "complete"
         both = []
         for seed in (5, 6):
-            with open_product(comm, out / name / f"realisation-{seed}/rollout.h5", "rollout") as file:
-                model, truth = (Trajectory(file, which).read(-1, "velocity") for which in ("model", "truth"))
+            with open_rollout(out / name / f"realisation-{seed}", comm) as measured:
+                pair = measured.rollout.pair(-1, "velocity")
+                model, truth = pair.model, pair.truth
                 # From the first frame with a filtered field on.
-                assert read_attributes(file, "rollout")["start_time"] == pytest.approx(0.1)
+                assert measured.rollout.start_time == pytest.approx(0.1)
             both.append(np.sum(model**2, dtype=float) / np.sum(truth**2, dtype=float))
         assert row["energy_ratio"] == pytest.approx(np.mean(both), rel=1e-6)
         assert row["energy_ratio_spread"] == pytest.approx(abs(both[0] - both[1]) / 2**0.5, rel=1e-4)

@@ -8,10 +8,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from eddies.analysis.against_truth import Frames
 from eddies.analysis.lagrangian import minimum_image
 from eddies.analysis.pdfs import bin_probabilities
-from eddies.analysis.spectra import energy_spectrum
+from eddies.analysis.rollout import Frames
 
 # Bins of the PDF of nearest-neighbour distances, in mean spacings; of random points exp(-14) lie beyond.
 DISTANCE_EDGES = np.linspace(0, 1.5, 31)
@@ -110,12 +109,3 @@ def count_variance_series(frames: Frames, chosen: Sequence[int], length: float) 
     return {"time": frames.times[np.asarray(chosen)],
             "count_variance": np.array([count_variance(frames.read(int(frame), "position"), length)
                                         for frame in chosen])}
-
-
-def energy_above(fields: Frames, chosen: Sequence[int], wavenumber: float) -> dict[str, np.ndarray]:
-    """Columns time and energy (of the shells k > wavenumber) over the chosen frames of a series of velocity fields."""
-    energies = []
-    for frame in chosen:
-        shells, energy = energy_spectrum(fields.read(int(frame), "velocity"))
-        energies.append(energy[shells > wavenumber].sum())
-    return {"time": fields.times[np.asarray(chosen)], "energy": np.array(energies)}

@@ -27,6 +27,25 @@ def enstrophy_scale(gradient: np.ndarray) -> float:
     return float(np.mean(np.sum(rotation**2, axis=(-2, -1))) / 2)
 
 
+@dataclass(frozen=True)
+class Invariants:
+    """Q and R (n,) of particles at a moment, in single precision, with <Q_w>, the unit of Q."""
+
+    second: np.ndarray
+    third: np.ndarray
+    scale: float
+
+    @classmethod
+    def of(cls, gradient: np.ndarray) -> "Invariants":
+        """Of velocity gradients (n, 3, 3)."""
+        second, third = invariants(gradient)
+        return cls(second.astype(np.float32), third.astype(np.float32), enstrophy_scale(gradient))
+
+    def normalized(self, scale: float) -> tuple[np.ndarray, np.ndarray]:
+        """Q and R in units of <Q_w> = `scale`."""
+        return self.second.astype(float) / scale, self.third.astype(float) / scale**1.5
+
+
 def vieillefosse_line(third_invariant: np.ndarray) -> np.ndarray:
     """Q of the zero-discriminant line 27/4 R^2 + Q^3 = 0, for given R."""
     return -np.cbrt(27 / 4 * np.asarray(third_invariant) ** 2)
@@ -77,15 +96,13 @@ class ConditionalVelocity:
         shape = (self.bins.second.size - 1, self.bins.third.size - 1)
         self.count, self.second_rate, self.third_rate = np.zeros(shape), np.zeros(shape), np.zeros(shape)
 
-    def add(self, before: tuple[np.ndarray, np.ndarray], after: tuple[np.ndarray, np.ndarray], interval: float,
-            scale: float) -> None:
-        """Add the particles of two successive frames: their invariants Q and R (n,) in the same order, `interval`
-        apart.
+    def add(self, before: Invariants, after: Invariants, interval: float, scale: float) -> None:
+        """Add the same particles at two successive moments, `interval` apart.
 
-        The rate is the difference over the interval and belongs to the mean of both frames (second order).
+        The rate is the difference over the interval and belongs to the mean of both moments (second order).
         `scale` is <Q_w>.
         """
-        (q0, r0), (q1, r1) = before, after
+        q0, r0, q1, r1 = (values.astype(float) for values in (before.second, before.third, after.second, after.third))
         middle = (q0 + q1) / 2 / scale, (r0 + r1) / 2 / scale**1.5
         edges = (self.bins.second, self.bins.third)
         rates = (q1 - q0) / interval / scale**1.5, (r1 - r0) / interval / scale**2

@@ -4,7 +4,8 @@ xarray, as a dictionary of numpy arrays."""
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import h5py
 import numpy as np
 
 from eddies.io.errors import ProductError
+from eddies.io.quantities import words_on
 from eddies.io.reading import open_to_read
 
 try:
@@ -24,6 +26,46 @@ except ImportError:
 
 AXES = {"xyz": ["x", "y", "z"], "component": ["x", "y", "z"]}
 EDGE = 2 * math.pi  # of the cube, in units of L
+
+
+@dataclass(frozen=True)
+class MadeArray:
+    """An array that no file holds: what is asked of it is made then, frame by frame along its first axis.
+
+    Parameters
+    ----------
+    place : where a rollout.h5 would have it, which says what it is.
+    shape, dtype : of the whole.
+    make : what it is at frames, one array each.
+    """
+
+    place: str
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    make: Callable[[Sequence[int]], Sequence[np.ndarray]]
+
+    @classmethod
+    def of(cls, place: str, values: np.ndarray) -> MadeArray:
+        """Of values that are known."""
+        return cls(place, values.shape, values.dtype, lambda frames: [values[frame] for frame in frames])
+
+    @property
+    def ndim(self) -> int:
+        """Number of axes."""
+        return len(self.shape)
+
+    @property
+    def attrs(self) -> dict[str, str]:
+        """Units, axes, description."""
+        return words_on("rollout", self.place)
+
+    def __getitem__(self, key: Any) -> np.ndarray:
+        first, *others = (key if isinstance(key, tuple) else (key,)) or (slice(None),)
+        frames = np.arange(self.shape[0])[first]
+        made = [np.asarray(values[tuple(others)]) for values in self.make(np.atleast_1d(frames).tolist())]
+        if not frames.ndim:
+            return made[0]
+        return np.stack(made) if made else np.zeros((0, *self.shape[1:]), self.dtype)
 
 
 def open_group(path: Path, name: str) -> Any:
@@ -39,7 +81,14 @@ def open_group(path: Path, name: str) -> Any:
         arrays = {key: item for key, item in elements.items() if isinstance(item, h5py.Dataset)}
         if xarray is None:
             return {key: array[()] for key, array in arrays.items()}
-        return dataset_of(path, arrays, dict(group.attrs))
+        return dataset_of({key: (array, StoredArray(path, array)) for key, array in arrays.items()}, dict(group.attrs))
+
+
+def made_group(arrays: Mapping[str, MadeArray]) -> Any:
+    """Arrays that are made when they are asked for, as those of a group that is stored."""
+    if xarray is None:
+        return {key: array[:] for key, array in arrays.items()}
+    return dataset_of({key: (array, LazyArray(array)) for key, array in arrays.items()}, {})
 
 
 def groups_in(file: h5py.File) -> list[str]:
@@ -63,10 +112,11 @@ def opened(path: Path) -> h5py.File:
         raise ProductError(f"{path}: cannot be opened ({error}); make it with the stage of this name") from None
 
 
-def dataset_of(path: Path, arrays: Mapping[str, h5py.Dataset], attributes: Mapping[str, Any]) -> Any:
-    """An xarray Dataset with the axes that the arrays name; times, ids, wavenumbers and points are its coordinates."""
+def dataset_of(arrays: Mapping[str, tuple[Any, Any]], attributes: Mapping[str, Any]) -> Any:
+    """An xarray Dataset with the axes that the arrays name, each with what reads it when it is used; times, ids,
+    wavenumbers and points are its coordinates."""
     variables, coordinates = {}, {}
-    for key, array in arrays.items():
+    for key, (array, lazy) in arrays.items():
         axes = array.attrs.get("axes", "").split()
         axes = axes if len(axes) == array.ndim else [f"{key}_{axis}" for axis in range(array.ndim)]
         words = {name: array.attrs[name] for name in ("units", "description") if name in array.attrs}
@@ -74,7 +124,7 @@ def dataset_of(path: Path, arrays: Mapping[str, h5py.Dataset], attributes: Mappi
         if own:
             coordinates[axes[0]] = (axes, array[()], words)
         else:
-            found = xarray.Variable(axes, LazilyIndexedArray(StoredArray(path, array)), words)
+            found = xarray.Variable(axes, LazilyIndexedArray(lazy), words)
             # A scalar has no components.
             scalar = "component" in axes and array.shape[axes.index("component")] == 1
             variables[key] = found.isel(component=0) if scalar else found
@@ -111,3 +161,12 @@ if xarray is not None:
                 values = file[self.name][(*key[:vector], wanted, *key[vector + 1:])]
                 dropped = sum(isinstance(index, int | np.integer) for index in key[:vector])
                 return np.take(values, back, axis=vector - dropped)
+
+    class LazyArray(BackendArray):
+        """A made array."""
+
+        def __init__(self, array: MadeArray) -> None:
+            self.array, self.shape, self.dtype = array, array.shape, array.dtype
+
+        def __getitem__(self, key: BasicIndexer | OuterIndexer) -> np.ndarray:
+            return explicit_indexing_adapter(key, self.shape, IndexingSupport.BASIC, self.array.__getitem__)

@@ -46,7 +46,7 @@ QUANTITIES = {
     "particles/*/velocity/value": Quantity("L/T", f"{PARTICLES} xyz", "of the particles"),
     "particles/*/acceleration/value": Quantity("L/T^2", f"{PARTICLES} xyz", "of the particles"),
     "particles/*/density/value": Quantity("M/L^3", PARTICLES, "at the particles"),
-    "particles/*/velocity_gradient/value": Quantity("1/T", f"{PARTICLES} i j", "dv_i/dx_j through the kernel"),
+    "gradients/*/velocity_gradient": Quantity("1/T", f"{PARTICLES} i j", "dv_i/dx_j through the kernel"),
     "fields/*/velocity": Quantity("L/T", FIELD, f"components x, y, z {POINTS}"),
     "fields/*/density": Quantity("M/L^3", FIELD, POINTS),
     "spectra*/wavenumber": Quantity("1/L", "wavenumber", "shell of the modes with this |k|, rounded"),
@@ -55,6 +55,13 @@ QUANTITIES = {
     "spectra/filtered": Quantity("L^2/T^2", "time wavenumber", "energy of each shell of the filtered flow"),
     "spectra_of_*/energy": Quantity("L^2/T^2", "time wavenumber",
                                     "energy of each shell that least squares find in the particles' velocities"),
+    "*/frame": Quantity("1", "time", "number of the frame in the ground truth"),
+    "reconstructions*/second": Quantity("1/T^2", PARTICLES, "Q of the velocity gradient through the kernel"),
+    "reconstructions*/third": Quantity("1/T^3", PARTICLES, "R of the velocity gradient through the kernel"),
+    "reconstructions*/scale": Quantity("1/T^2", "time", "<Q_w>, half the mean square of the rotation"),
+    "reconstructions*/velocity": Quantity("L/T", "time component y x", "through the kernel, in the plane z = pi"),
+    "reconstructions*/vorticity": Quantity("1/T", "time y x", "magnitude, through the kernel, in the plane z = pi"),
+    "reconstructions*/energy": Quantity("L^2/T^2", "time wavenumber", "energy of each shell through the kernel"),
     "statistics/time": Quantity("T", ROW, "since the start of the simulation"),
     "statistics/time_step": Quantity("T", ROW, "length of a time step"),
     "statistics/turnovers": Quantity("1", ROW, "eddy turnovers since the start of the simulation"),
@@ -108,12 +115,16 @@ def conventions(kind: str) -> dict[str, str]:
 
 def describe(dataset: h5py.Dataset) -> None:
     """Write the attributes `units`, `axes` and `description`; nothing of a dataset that no rule knows. Collective."""
-    kind, path = dataset.file.attrs.get("kind", ""), dataset.name.strip("/")
+    for name, words in words_on(dataset.file.attrs.get("kind", ""), dataset.name.strip("/")).items():
+        dataset.attrs[name] = words
+
+
+def words_on(kind: str, path: str) -> dict[str, str]:
+    """These attributes of what a product of a kind has at a path; empty of what no rule knows."""
     group, _, name = path.rpartition("/")
     known = next((known for pattern, known in QUANTITIES.items() if fnmatchcase(path, pattern)), None)
     if known is None and name == "time":
         beginning = "since the start of the simulation" if group == "fields/final" else BEGINNING.get(kind, "")
         known = Quantity("T", "time", beginning)
-    if known is not None:
-        dataset.attrs["units"], dataset.attrs["axes"] = known.units, known.axes
-        dataset.attrs["description"] = known.description.format(name=name.replace("_", " "))
+    return {} if known is None else {"units": known.units, "axes": known.axes,
+                                     "description": known.description.format(name=name.replace("_", " "))}

@@ -7,8 +7,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from eddies.analysis import disorder
-from eddies.analysis.against_truth import CommonFrames, Frames
 from eddies.analysis.pdfs import kl_divergence
+from eddies.analysis.rollout import Rollout
 from eddies.report.figures import GUIDE, letter, panels, styled
 from eddies.report.page import Metric, Section
 from eddies.report.rollout_figures import LINES
@@ -21,7 +21,7 @@ class Disorder:
     """Shares of nearest-neighbour distances at one time, and series over time, of "truth" and "model".
 
     distances: (bins,) each, on disorder.DISTANCE_EDGES; counts: columns time, count_variance; energies: columns time,
-    energy (of the reconstructed velocity beyond the filter wavenumber), or None where that is not known.
+    energy (of the reconstructed velocity beyond the filter wavenumber), or None without a kernel.
     """
 
     time: float
@@ -34,25 +34,25 @@ class Disorder:
         """Forward KL divergence of the PDFs of nearest-neighbour distances."""
         return kl_divergence(self.distances["truth"], self.distances["model"])
 
+    @classmethod
+    def of(cls, run: Rollout) -> "Disorder":
+        """Distances at the last common frame, series over all frames before the model broke, if it did."""
+        both = {"model": run.model, "truth": run.truth}
+        position = run.pair(-1, "position")
+        distances = {name: disorder.distance_probabilities(getattr(position, name), run.length) for name in both}
+        counts = {name: disorder.count_variance_series(frames, run.before_broken(name), run.length)
+                  for name, frames in both.items()}
+        energies = None
+        if run.reconstructions is not None:
+            energies = {name: {"time": counts[name]["time"], "energy": np.array([
+                run.reconstructions[name][int(frame)].energy_above(run.filter_wavenumber)
+                for frame in run.before_broken(name)])} for name in both}
+        return cls(position.time, distances, counts, energies)
 
-def measure(trajectories: Mapping[str, Frames], fields: Mapping[str, Frames] | None, common: CommonFrames,
-            length: float, broken: float, wavenumber: float | None) -> Disorder:
-    """Measure model and truth, named so in both mappings: distances at the last common frame, series over all frames
-    before `broken`."""
-    last = {"model": int(common.model[-1]), "truth": int(common.truth[-1])}
-    before = {name: np.flatnonzero(run.times < broken) for name, run in trajectories.items()}
-    distances = {name: disorder.distance_probabilities(run.read(last[name], "position"), length)
-                 for name, run in trajectories.items()}
-    counts = {name: disorder.count_variance_series(run, before[name], length) for name, run in trajectories.items()}
-    energies = None
-    if fields is not None and wavenumber is not None:
-        energies = {name: disorder.energy_above(fields[name], np.flatnonzero(fields[name].times < broken), wavenumber)
-                    for name in trajectories}
-    return Disorder(float(common.times[-1]), distances, counts, energies)
 
-
-def add(shown: Section, found: Disorder, turnover: float) -> None:
+def add(shown: Section, run: Rollout) -> None:
     """Put the figure and its three numbers, all at the last common time, into the section of the rollout."""
+    found, turnover = Disorder.of(run), run.turnover
     variance = {name: _at(series, found.time)["count_variance"] for name, series in found.counts.items()}
     ratio, caption = None, ""
     if found.energies is not None:
@@ -64,7 +64,7 @@ def add(shown: Section, found: Disorder, turnover: float) -> None:
         Metric("count_variance_ratio", "variance of particle counts, model / truth",
                variance["model"] / variance["truth"], "too few particles to be counted in cells"),
         Metric("high_wavenumber_energy_ratio", "energy at k > k_d, model / truth", ratio,
-               "the filter width is in ground_truth.h5, which is not here, or there was no kernel"),
+               "measured through the smoothing kernel, and there is no kernel.h5"),
     ]
     shown.add_figure(
         "particle-disorder", "Disorder of the particles", draw(found, turnover),

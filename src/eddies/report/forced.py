@@ -7,15 +7,16 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from eddies.analysis.against_truth import EDGES, ParticleFrames, first_broken_time, normalized_invariants
+from eddies.analysis.against_truth import EDGES, mean_energy
 from eddies.analysis.block_averages import Blocks, Estimate
 from eddies.analysis.isotropic_turbulence import StationarySpan
 from eddies.analysis.pdfs import bin_probabilities, gaussian, kl_divergence, pdf, standardized
+from eddies.analysis.rollout import Frames, Rollout, second_half
 from eddies.analysis.spectra import spectrum_error
-from eddies.analysis.velocity_gradients import InvariantBins, enstrophy_scale
+from eddies.analysis.velocity_gradients import InvariantBins, Invariants
 from eddies.report.figures import GUIDE, MODEL, TRUTH, letter, number_wavenumbers, panels, styled
 from eddies.report.page import Metric, Section
-from eddies.report.rollout import WITHOUT_KERNEL, Rollout
+from eddies.report.rollout import WITHOUT_KERNEL
 from eddies.spectral.mode_operators import gaussian_transfer
 
 
@@ -29,7 +30,7 @@ class LateFrames:
     acceleration_rms: np.ndarray
 
     @classmethod
-    def of(cls, run: ParticleFrames, frames: np.ndarray, turnover: float) -> "LateFrames":
+    def of(cls, run: Frames, frames: np.ndarray, turnover: float) -> "LateFrames":
         """Of frames of a trajectory."""
         return cls(Blocks.of(run.times[frames] / turnover, 1.0),
                    np.array([mean_energy(run, frame) for frame in frames]),
@@ -84,11 +85,11 @@ class ForcedStatistics:
 
     @classmethod
     def of(cls, run: Rollout, span: StationarySpan) -> "ForcedStatistics":
-        """The statistics of a rollout whose filter width is known; the frames before it broke, if it did.
+        """The statistics of a rollout with its truth; the frames before it broke, if it did.
 
         Raises ValueError if there is no such frame.
         """
-        frames = np.flatnonzero(run.model.times < first_broken_time(run.model))
+        frames = run.before_broken("model")
         if not len(frames):
             raise ValueError("the model has no finite frame")
         times = run.model.times[frames]
@@ -96,23 +97,24 @@ class ForcedStatistics:
         shells = np.arange(span.spectra.shape[1])
         transfer = gaussian_transfer(shells**2, run.filter_width) ** 2
         flow_energy = span.spectra @ transfer
-        measured = run.spectra.model
-        known, chosen = min(measured["wavenumber"].size, len(shells)), _between(measured["time"], times[-1])
+        chosen = run.late_spectra()
+        spectra = np.array([run.spectra["model"][int(frame)] for frame in chosen])
+        known = min(spectra.shape[1], len(shells))
         flow = {name: run.truth.read(0, name) for name in ("velocity", "acceleration")}
         return cls(
             times, np.array([mean_energy(run.model, frame) for frame in frames]), late,
             LateFrames.of(run.model, late, run.turnover), _late_truth(run, times[-1]),
             span.block_mean(flow_energy), span.average(flow_energy)[1],
             shells[:known], (transfer * span.spectrum)[:known],
-            Blocks.of(measured["time"][chosen] / run.turnover, 1.0), measured["energy"][chosen, :known],
+            Blocks.of(run.model.times[chosen] / run.turnover, 1.0), spectra[:, :known],
             min(np.pi / run.filter_width, known - 1.0),
             np.concatenate([standardized(run.model.read(frame, "velocity")) for frame in late]),
             standardized(flow["velocity"]),
             np.concatenate([standardized(run.model.read(frame, "acceleration")) for frame in late]),
             standardized(flow["acceleration"]), float(np.std(flow["acceleration"])),
-            None if run.fields is None else invariant_divergence(
-                [run.model.read(frame, "velocity_gradient") for frame in late],
-                run.truth.read(0, "velocity_gradient")))
+            None if run.reconstructions is None else invariant_divergence(
+                [run.reconstructions["model"][int(frame)].invariants for frame in late],
+                run.reconstructions["truth"][0].invariants))
 
     @property
     def spectrum(self) -> np.ndarray:
@@ -132,26 +134,16 @@ class ForcedStatistics:
         return kl_divergence(flow, model)
 
 
-def mean_energy(run: ParticleFrames, frame: int) -> float:
-    """<v.v>/2 of a frame."""
-    return 0.5 * float(np.mean(np.sum(run.read(frame, "velocity") ** 2, axis=1)))
-
-
 def _late_truth(run: Rollout, end: float) -> LateFrames | None:
     """The true tracers in the second half of what ends at a time, if they are forced and last until then."""
     reached = run.powers[1] > 0 and run.truth.times[-1] >= end * (1 - 1e-9)
-    return LateFrames.of(run.truth, _between(run.truth.times, end), run.turnover) if reached else None
+    return LateFrames.of(run.truth, second_half(run.truth.times, end), run.turnover) if reached else None
 
 
-def _between(times: np.ndarray, end: float) -> np.ndarray:
-    """Rows of the second half of what ends at a time; the last row before it, where there is none."""
-    rows = np.flatnonzero((times >= end / 2) & (times <= end * (1 + 1e-9)))
-    return rows if rows.size else np.array([max(int(np.searchsorted(times, end, "right")) - 1, 0)])
-
-
-def invariant_divergence(model: Sequence[np.ndarray], flow: np.ndarray) -> float:
-    """Forward KL divergence of the joint PDFs of Q and R, of all frames of the model together."""
-    true_plane, *planes = (normalized_invariants(gradient, enstrophy_scale(gradient)) for gradient in (flow, *model))
+def invariant_divergence(model: Sequence[Invariants], flow: Invariants) -> float:
+    """Forward KL divergence of the joint PDFs of Q and R, of all frames of the model together, each in units of its own
+    <Q_w>."""
+    true_plane, *planes = (found.normalized(found.scale) for found in (flow, *model))
     bins = InvariantBins.covering(*true_plane)
     return kl_divergence(bins.probabilities(*true_plane), bins.probabilities(*np.concatenate(planes, axis=1)))
 

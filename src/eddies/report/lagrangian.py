@@ -2,7 +2,7 @@
 
 from matplotlib.figure import Figure
 
-from eddies.analysis.path_statistics import PathStatistics, differences
+from eddies.analysis.lagrangian import PathStatistics, differences
 from eddies.measures import MEASURES
 from eddies.report.figures import GUIDE, letter, number_wavenumbers, panels, styled
 from eddies.report.page import Metric, Section

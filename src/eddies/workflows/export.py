@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from eddies.io.fields import FieldSeries
-from eddies.io.hdf5 import File, ProductError, open_product
+from eddies.io.hdf5 import ProductError, open_product
 from eddies.io.lagrangebench import shortcoming, write_dataset
 from eddies.io.provenance import read_provenance
 from eddies.io.trajectories import Trajectory
@@ -18,6 +21,8 @@ from eddies.scene.sections import BOX_LENGTH
 log = logging.getLogger("eddies")
 
 PRODUCTS = ("ground_truth", "rollout")
+Provenance = Mapping[str, Any]
+Series = Mapping[str, Mapping[str, Any]]  # of fields and particles, by group and name
 
 
 def run(run_directory: Path, output: Path, comm: Comm, layout: str = "vtkhdf") -> None:
@@ -40,50 +45,60 @@ def run(run_directory: Path, output: Path, comm: Comm, layout: str = "vtkhdf") -
 
 def _export(run_directory: Path, output: Path, alone: Comm, layout: str) -> None:
     written, (export, what, maker) = 0, LAYOUTS[layout]
-    for kind in PRODUCTS:
-        path = run_directory / f"{kind}.h5"
-        if path.exists():
-            with open_product(alone, path, kind) as file:
-                written += export(file, kind, output)
+    for kind, opened in (("ground_truth", _ground_truth), ("rollout", _rollout)):
+        if (run_directory / f"{kind}.h5").exists():
+            with opened(run_directory, alone) as (series, provenance):
+                for group, name in ((group, name) for group in series for name in series[group]):
+                    case = f"{kind}-{group}-{name}"
+                    if not len(series[group][name].times):
+                        log.info("export: %s/%s of %s.h5 has no frames", group, name, kind)
+                    else:
+                        written += export(output, case, group, series[group][name], provenance)
     if not written:
         raise ProductError(f"{run_directory}: holds no {what}, which would be in "
                            f"{' and '.join(f'{kind}.h5' for kind in PRODUCTS)}; run {maker} first")
 
 
-def _write_vtkhdf(file: File, kind: str, output: Path) -> int:
-    """Write the series of a product; returns how many have been written."""
-    provenance, written = read_provenance(file), 0
-    for group, reader in (("fields", FieldSeries), ("particles", Trajectory)):
-        for name in file.get(group, ()):
-            series, path = reader(file, name), output / f"{kind}-{group}-{name}.vtkhdf"
-            if not len(series.times):
-                log.info("export: %s/%s of %s.h5 has no frames", group, name, kind)
-                continue
-            if group == "fields":
-                write_images(path, series, BOX_LENGTH, provenance)
-            else:
-                write_points(path, series, provenance)
-            log.info("export: %s, %d steps", path, len(series.times))
-            written += 1
-    return written
+@contextmanager
+def _ground_truth(run_directory: Path, alone: Comm) -> Iterator[tuple[Series, Provenance]]:
+    """All series of the ground truth."""
+    with open_product(alone, run_directory / "ground_truth.h5", "ground_truth") as file:
+        yield {group: {name: reader(file, name) for name in file.get(group, ())}
+               for group, reader in (("fields", FieldSeries), ("particles", Trajectory))}, read_provenance(file)
 
 
-def _write_datasets(file: File, kind: str, output: Path) -> int:
-    """Write the particles of a product as data sets; returns how many have been written."""
-    provenance, written = read_provenance(file), 0
-    for name in file.get("particles", ()):
-        trajectory, case = Trajectory(file, name), f"{kind}-particles-{name}"
-        problem = shortcoming(trajectory)
-        if problem:
-            log.warning("export: particles/%s of %s.h5 is left out: %s", name, kind, problem)
-            continue
-        write_dataset(output / case, trajectory, case, provenance)
-        log.info("export: %s, %d frames", output / case, len(trajectory.times))
-        written += 1
-    return written
+@contextmanager
+def _rollout(run_directory: Path, alone: Comm) -> Iterator[tuple[Series, Provenance]]:
+    """Those of the rollout, as they are stored or made of it."""
+    from eddies.workflows.rollout.measured import open_rollout  # torch
+    with open_rollout(run_directory, alone) as measured:
+        yield measured.exported, measured.provenance
 
 
-# What writes a product in a layout, what of it, and where that comes from.
+def _write_vtkhdf(output: Path, case: str, group: str, series: Any, provenance: Provenance) -> bool:
+    """Write a series as a VTKHDF file; whether it has been written."""
+    path = output / f"{case}.vtkhdf"
+    if group == "fields":
+        write_images(path, series, BOX_LENGTH, provenance)
+    else:
+        write_points(path, series, provenance)
+    log.info("export: %s, %d steps", path, len(series.times))
+    return True
+
+
+def _write_dataset(output: Path, case: str, group: str, series: Any, provenance: Provenance) -> bool:
+    """Write particles as a data set; whether that has been done."""
+    if group == "fields":
+        return False
+    if problem := shortcoming(series):
+        log.warning("export: %s is left out: %s", case, problem)
+        return False
+    write_dataset(output / case, series, case, provenance)
+    log.info("export: %s, %d frames", output / case, len(series.times))
+    return True
+
+
+# What writes a series in a layout, what of a run, and where that comes from.
 LAYOUTS = {"vtkhdf": (_write_vtkhdf, "fields or particles", "`eddies dns SCENE`"),
-           "lagrangebench": (_write_datasets, "particles that make a data set",
+           "lagrangebench": (_write_dataset, "particles that make a data set",
                              "`eddies dns SCENE` with a scene that has [tracers]")}

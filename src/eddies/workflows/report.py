@@ -14,6 +14,7 @@ import os
 import time
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -22,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from eddies.analysis.isotropic_turbulence import StationarySpan
+from eddies.analysis.rollout import Rollout
 from eddies.analysis.spectra import energy_spectrum, vorticity
 from eddies.analysis.tracer_statistics import tracer_statistics
 from eddies.io.fields import FieldSeries
@@ -36,7 +38,6 @@ from eddies.report import forced, ground_truth, kernel, mach, stationary, tracer
 from eddies.report.figures import draw
 from eddies.report.model import section as model_section
 from eddies.report.page import Metric, RunRecord, Section, metrics_json, shown, write_page
-from eddies.report.rollout import Rollout
 from eddies.report.rollout import section as rollout_section
 from eddies.report.variants import KEY as VARIANTS
 from eddies.report.variants import ErrorAgainstTime
@@ -46,7 +47,6 @@ from eddies.report.verdict import arranged
 from eddies.scene.scene import Scene, SceneError, load_scene
 from eddies.workflows.feasibility import check_places
 from eddies.workflows.product_warnings import changed_truths, mixed_products, not_finite
-from eddies.workflows.rollout.stored_spectra import read_spectra
 from eddies.workflows.run_directory.work import read_stage_seconds
 from eddies.workflows.variant_rows import COLUMNS, ROLLOUT, finite, machine, notes, row
 from eddies.workflows.variants import Place, rollouts
@@ -54,7 +54,6 @@ from eddies.workflows.variants import Place, rollouts
 log = logging.getLogger("eddies")
 
 KINDS = "ground_truth", "kernel", "model", "rollout"  # products, in the order of the page
-FIELDS = "model", "truth", "filtered"  # of a rollout, as workflows/rollout/frames.py has them, which imports torch
 ROLLOUT_COST = {"seconds_per_step": "rollout: seconds of a step (median, without storing)",
                 "particles": "particles of the rollout",
                 "ranks": "ranks of the rollout"}
@@ -70,9 +69,9 @@ class Run:
     not_finite: dict[str, str] = field(default_factory=dict)
     provenance: dict[str, dict[str, Any]] = field(default_factory=dict)
     cost: list[Metric] = field(default_factory=list)
-    filter_width: float | None = None
     eulerian: dict[str, np.ndarray] | None = None
     stationary: StationarySpan | None = None
+    forced: bool = False
 
 
 def run_stage(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | None = None) -> None:
@@ -89,7 +88,7 @@ def run(directory: str | Path, comm: Comm, variants: Sequence[str] = ()) -> None
     Raises ProductError if the directory holds no product, or a damaged one, or the report cannot be written; SceneError
     if a variant is named that the scene has not.
     """
-    directory = Path(directory)
+    directory, scanned = Path(directory), {}
     check_places(("report",), comm, directory)
     scene, places = in_files(comm, directory, lambda: stored_rollouts(directory))
     if scene is not None:
@@ -102,11 +101,12 @@ def run(directory: str | Path, comm: Comm, variants: Sequence[str] = ()) -> None
     try:
         for name, where in pages.items():
             if where != main:
-                record, sections = _made(where, comm, alone, own=True)
+                record, sections = _made(where, comm, alone, scanned, own=True)
                 _write_report(comm, where / "report", record, sections, _links(scene, directory, where, pages))
                 log.info("report: variant %s: %s", name, where / "report" / "index.html")
         table = _table(scene, places, chosen, comm, alone) if chosen in ran else None
-        record, sections = _made(main, comm, alone, first=[section_on_variants(table, notes(scene))] if table else [])
+        first = [section_on_variants(table, notes(scene))] if table else []
+        record, sections = _made(main, comm, alone, scanned, first=first)
     finally:
         alone.Free()
     if main != directory:  # the variant that is shown has a page of its own too
@@ -130,15 +130,14 @@ def stored_rollouts(directory: Path) -> tuple[Scene | None, dict[str, list[Place
     return scene, rollouts(scene, directory) if scene.simulation is not None else {}
 
 
-def _made(directory: Path, comm: Comm, alone: Comm, own: bool = False,
+def _made(directory: Path, comm: Comm, alone: Comm, scanned: dict[Path, str], own: bool = False,
           first: Sequence[Section] = ()) -> tuple[Run, list[Section]]:
     """All sections on a run directory, with those that come `first`, their figures drawn, on rank 0; with `own` only
     those on products that were made there."""
     began = time.perf_counter()
-    record = in_files(comm, directory, lambda: _survey(directory, alone))
+    record = in_files(comm, directory, lambda: _survey(directory, alone, scanned))
     kinds = [kind for kind in record.provenance if not (own and (directory / f"{kind}.h5").is_symlink())]
-    found = on_all_ranks(comm, lambda: in_files(
-        alone, directory, lambda: _read_share(directory, comm, alone, record, kinds)), ProductError)
+    found = _read_share(directory, comm, alone, record, kinds)
     if comm.rank == 0:
         found = [*first, *found]
     read = time.perf_counter()
@@ -151,7 +150,13 @@ def _made(directory: Path, comm: Comm, alone: Comm, own: bool = False,
 
 def _table(scene: Scene, places: Mapping[str, Sequence[Place]], subject: str, comm: Comm,
            alone: Comm) -> ErrorAgainstTime:
-    """The rows of all variants; each rank measures some of them."""
+    """The rows of all variants; each rank measures some of them. The truths come first, with the help of all ranks, so
+    that none is measured again for another variant."""
+    from eddies.workflows.rollout.measured import open_together  # torch
+    for place in places[subject]:
+        if (place.directory / ROLLOUT).exists():
+            with open_together(place.directory, comm, alone) as measured:
+                measured.measure(comm, whole=False)
     names = list(places)
     own = on_all_ranks(comm, lambda: {name: in_files(alone, places[name][0].directory, lambda: row(
         scene, name, places[name], alone)) for name in names[comm.rank::comm.size]}, ProductError)
@@ -184,19 +189,22 @@ def _links(scene: Scene | None, directory: Path, page: Path, pages: Mapping[str,
 
 def sections_of(directory: Path, alone: Comm) -> list[Section]:
     """All sections that one rank reads, their figures not yet drawn."""
-    record = _survey(directory, alone)
+    record = _survey(directory, alone, {})
     return [*_read_share(directory, alone, alone, record, list(record.provenance)), _cost_section(record)]
 
 
-def _survey(directory: Path, alone: Comm) -> Run:
-    """What the sections have in common."""
+def _survey(directory: Path, alone: Comm, scanned: dict[Path, str]) -> Run:
+    """What the sections have in common. `scanned`: what is known of numbers that are not finite, by file, so that one
+    that several directories link to is read through once."""
     record = Run(seconds=read_stage_seconds(directory))
     for kind in KINDS:
         path = directory / f"{kind}.h5"
         if path.exists():
             with open_product(alone, path, kind) as file:
                 record.provenance[kind] = read_provenance(file)
-                if found := not_finite(file, kind):
+                if path.resolve() not in scanned:
+                    scanned[path.resolve()] = not_finite(file, kind)
+                if found := scanned[path.resolve()]:
                     record.not_finite[kind] = found
                 if kind == "ground_truth":
                     _survey_ground_truth(file, record)
@@ -215,7 +223,7 @@ def _survey_ground_truth(file: File, record: Run) -> None:
     record.cost.append(Metric("dns_seconds_per_step", "DNS: seconds of a step (median, without storing)",
                               float(np.median(statistics["seconds_per_step"]))))
     if "released_at" in reference:
-        record.eulerian, record.filter_width = read_table(file, "spectra"), reference["filter_width"]
+        record.eulerian = read_table(file, "spectra")
     if "stationary" in file:
         with contextlib.suppress(ProductError):  # told in its section
             record.stationary = read_stationary_span(file)
@@ -225,6 +233,7 @@ def _survey_rollout(file: File, record: Run) -> None:
     attributes = read_attributes(file, "rollout")
     untimed = "too few steps to time one: the first two, and the first two after a restart, are left out"
     record.cost += [Metric(key, label, attributes.get(key), untimed) for key, label in ROLLOUT_COST.items()]
+    record.forced = attributes.get("injection_rate", 0.0) > 0
     if "evaluations" in attributes and attributes["turnovers"] > 0:
         record.cost.append(Metric("storing_share", "rollout: share of the wall time that storing took",
                                   attributes.get("storing_share"), "made by an earlier version"))
@@ -233,22 +242,35 @@ def _survey_rollout(file: File, record: Run) -> None:
 
 
 def _read_share(directory: Path, comm: Comm, alone: Comm, record: Run, kinds: Sequence[str]) -> list[Section]:
-    """The sections of this rank on products of these kinds, neighbours on the page, without that on the cost."""
+    """The sections of this rank on products of these kinds, neighbours on the page, without that on the cost; all ranks
+    measure the rollout."""
     readers = {"ground_truth": (_read_flow, _read_tracers), "kernel": (_read_kernel,), "model": (_read_model,),
-               "rollout": (_read_rollout,)}
+               "rollout": (None,)}
     parts = [(kind, read) for kind in kinds for read in readers[kind]]
-    sections = []
-    for index in np.array_split(np.arange(len(parts)), comm.size)[comm.rank]:
-        kind, read = parts[index]
-        with open_product(alone, directory / f"{kind}.h5", kind) as file:
-            sections += _read_part(kind, file, record, read)
-    return sections
+
+    def sections() -> list[Section]:
+        found = []
+        for index in np.array_split(np.arange(len(parts)), comm.size)[comm.rank]:
+            kind, read = parts[index]
+            if kind == "rollout":
+                found += _read_part(kind, record, lambda: _rollout_sections(measured.rollout, record))
+                continue
+            with open_product(alone, directory / f"{kind}.h5", kind) as file:
+                found += _read_part(kind, record, lambda: read(file, record))
+        return found
+
+    with ExitStack() as files:
+        if "rollout" in kinds:
+            from eddies.workflows.rollout.measured import open_together  # torch, which all else does without
+            measured = files.enter_context(open_together(directory, comm, alone))
+            measured.measure(comm, min(comm.size, len(parts)) - 1, late=record.forced and record.stationary is not None)
+        return on_all_ranks(comm, lambda: in_files(alone, directory, sections), ProductError)
 
 
-def _read_part(kind: str, file: File, record: Run, read: Callable[[File, Run], list[Section]]) -> list[Section]:
-    """Sections on an open product; where its numbers are not finite and forbid them, one that says so."""
+def _read_part(kind: str, record: Run, read: Callable[[], list[Section]]) -> list[Section]:
+    """Sections on a product; where its numbers are not finite and forbid them, one that says so."""
     try:
-        return read(file, record)
+        return read()
     except (ValueError, OverflowError) as error:  # of a figure's limits, of a PDF, of a number of times
         if not record.not_finite:  # of this product, or of the ground truth, which sections on others take from
             raise
@@ -347,16 +369,9 @@ def _read_model(file: File, record: Run) -> list[Section]:
     return [shown]
 
 
-def _read_rollout(file: File, record: Run) -> list[Section]:
-    attributes = read_attributes(file, "rollout")
-    model, truth = Trajectory(file, "model"), Trajectory(file, "truth")
-    fields = {name: FieldSeries(file, name) for name in FIELDS} if "fields" in file else None
-    outside = read_table(file, "outside_training")["share"] if "outside_training" in file else None
-    closure = read_table(file, "closure") if "closure" in file else None
-    rollout = Rollout(attributes, model, truth, read_spectra(file, record.eulerian), fields, model.length,
-                      record.filter_width, outside, closure)
+def _rollout_sections(rollout: Rollout, record: Run) -> list[Section]:
     sections = [rollout_section(rollout)]
-    if rollout.forced and record.stationary is not None and record.filter_width is not None:
+    if rollout.forced and record.stationary is not None and len(rollout.truth.times):
         sections.append(forced.section(rollout, record.stationary))
     return sections
 

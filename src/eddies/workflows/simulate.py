@@ -11,6 +11,7 @@ import torch
 
 from eddies.clock import pace_in_words
 from eddies.import_path import is_path, load
+from eddies.io.frame_segments import FrameSegments
 from eddies.io.guard import Guard
 from eddies.io.hdf5 import create_product, open_product, write_attributes, write_table
 from eddies.parallel.communicator import Comm
@@ -22,10 +23,8 @@ from eddies.scene.scene import BOX_LENGTH, Scene
 from eddies.scene.terms import Forcing
 from eddies.workflows.ground_truth.frame_counts import rollout_start
 from eddies.workflows.ground_truth.truth import GroundTruth
-from eddies.workflows.learned.model import load_kernel
-from eddies.workflows.rollout.course import Course
+from eddies.workflows.rollout.course import Course, frame_layout
 from eddies.workflows.rollout.eulerian_run import EulerianRun
-from eddies.workflows.rollout.frames import RolloutFrames
 from eddies.workflows.rollout.method import Method
 from eddies.workflows.rollout.particle_run import BallisticRun, LearnedRun, injection
 
@@ -47,16 +46,16 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         truth = GroundTruth(truth_file, slab)
         start = start_frame(scene, truth, directory)
         method = method_class(settings.method)(scene, truth, start, directory, device)
-        kernel = load_kernel(comm, directory / "kernel.h5") if scene.kernel else None
         saved = guard.checkpoints.newest()
-        frames = RolloutFrames(guard.checkpoints.path, truth, kernel, truth.times[start], method.has_density,
-                               () if saved is None else saved.files)
+        layout = frame_layout(truth.total, slab.length, method.has_density)
+        segments = FrameSegments(comm, guard.checkpoints.path, layout, () if saved is None else saved.files)
         turnover = truth.reference["eddy_turnover_time"]
         count = int(np.ceil(settings.turnovers * turnover / settings.frame_interval - 1e-9))
-        with frames.segments:
-            outcome = Course(method, frames, count, settings.frame_interval, guard, saved).run()
+        with segments:
+            course = Course(method, segments, count, settings.frame_interval, guard, saved)
+            outcome = course.run()
             with create_product(comm, directory / "rollout.h5", "rollout", scene.provenance("simulate")) as file:
-                frames.write(file)
+                segments.assemble(file)
                 write_attributes(file.create_group("rollout"), {
                     **outcome, **method.description(), "method": settings.method,
                     "turnovers": outcome["time"] / turnover, "injection_rate": forcing_rate(injection(scene, truth)),
@@ -64,7 +63,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                     "eddy_turnover_time": turnover, "start_time": float(truth.times[start]),
                     "particles": truth.total, "ranks": comm.size})
                 for name, columns in method.series().items():
-                    write_table(file, name, {"time": frames.times, **columns})
+                    write_table(file, name, {"time": course.times, **columns})
     guard.checkpoints.remove()
     pace = (pace_in_words(outcome["seconds_per_step"], outcome["storing_share"]) if "seconds_per_step" in outcome
             else "too few steps to time one")

@@ -10,16 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from eddies.analysis.accuracy import StoredRollout, accuracy
-from eddies.io.hdf5 import open_product, read_attributes, read_table
-from eddies.io.provenance import environment, read_provenance
-from eddies.io.trajectories import Trajectory
+from eddies.analysis.accuracy import accuracy
+from eddies.io.hdf5 import open_product, read_table
+from eddies.io.provenance import environment
 from eddies.kernels.library import threads
 from eddies.measures import MEASURES
 from eddies.parallel.communicator import Comm
 from eddies.pipeline import STAGES
 from eddies.scene.scene import Eulerian, Scene
-from eddies.workflows.rollout.stored_spectra import read_spectra
 from eddies.workflows.run_directory.work import FAILURE
 from eddies.workflows.variants import Place
 
@@ -116,21 +114,16 @@ def notes(scene: Scene) -> list[str]:
 
 def measured(directory: Path, alone: Comm) -> dict[str, Any]:
     """What the rollout of a run directory shows, and how long its steps took."""
-    with (open_product(alone, directory / "ground_truth.h5", "ground_truth") as truth_file,
-          open_product(alone, directory / ROLLOUT, "rollout") as file):
-        reference, rollout = read_attributes(truth_file, "reference"), read_attributes(file, "rollout")
-        model, truth = (Trajectory(file, name) for name in ("model", "truth"))
-        stored = StoredRollout(
-            model, truth, read_spectra(file, read_table(truth_file, "spectra")), model.length,
-            turnover=rollout["eddy_turnover_time"], kolmogorov_time=reference["kolmogorov_time"],
-            filter_wavenumber=np.pi / reference["filter_width"])
-        complete = rollout["status"] == "complete"
-        found = {"status": rollout["status"], "stopped_at": None if complete else rollout["turnovers"],
-                 **accuracy(stored, complete)}
-        found["ranks"] = ranks = read_provenance(file)["ranks"]
-    found["time_step"] = rollout.get("time_step")  # missing where the first step went wrong
-    if "seconds_per_step" in rollout:
-        found |= step_costs(rollout, stored.turnover, ranks)
+    from eddies.workflows.rollout.measured import open_rollout  # torch, which the report on other products does without
+    with open_rollout(directory, alone) as stored:
+        stored.measure(alone, whole=False)
+        rollout = stored.rollout
+        attributes, ranks = rollout.attributes, stored.provenance["ranks"]
+        found = {"status": rollout.status, "ranks": ranks, **accuracy(rollout),
+                 "stopped_at": None if rollout.status == "complete" else attributes["turnovers"]}
+    found["time_step"] = attributes.get("time_step")  # missing where the first step went wrong
+    if "seconds_per_step" in attributes:
+        found |= step_costs(attributes, rollout.turnover, ranks)
     return found
 
 

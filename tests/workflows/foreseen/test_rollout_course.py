@@ -7,7 +7,7 @@ import pytest
 from eddies.clock import ProgressLine
 from eddies.scene.scene import load_scene
 from eddies.workflows.foreseen.rollout_course import RolloutCourse, rollout_course
-from eddies.workflows.foreseen.stored import rollout_bytes, stored_spectra, trajectory_bytes
+from eddies.workflows.foreseen.stored import rollout_bytes, trajectory_bytes
 
 SCENE = """
 [flow]
@@ -64,14 +64,13 @@ def test_a_rollout_takes_the_steps_that_are_foreseen(comm, folder, overrides, mo
     with h5py.File(folder / "rollout.h5") as file:
         found, times = dict(file["rollout"].attrs), file["particles/model/time"][()]
         steps, size = file["particles/model/step"][()], stored(file)
-        spectra = tuple(len(file[f"spectra_of_{name}/time"]) for name in ("model", "truth"))
     course = rollout_course(scene, found["eddy_turnover_time"])
     assert (course.steps, course.intervals) == (found["steps"], len(times) - 1)
     assert np.array_equal(course.steps_to_frames, steps)
     assert course.time_step == pytest.approx(found["time_step"])
     if course.stages:
         assert course.evaluations == found["evaluations"]
-    assert rollout_bytes(scene, course) == size and stored_spectra(scene, course) == spectra
+    assert rollout_bytes(scene, course) == size
     # Progress is shown by time, so it is told after every step, and not only at frames.
     assert [step for _, step in shown] == list(range(1, course.steps + 1))
     assert all(0 < done <= 1 for done, _ in shown)

@@ -2,12 +2,17 @@
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 
+from eddies.io.frame_segments import FrameSegments
 from eddies.io.guard import Guard
+from eddies.io.hdf5 import create_product, open_product
+from eddies.io.trajectories import Trajectory
+from eddies.particles.particle_set import ParticleSet
 from eddies.parallel.stop import Stopped
-from eddies.workflows.rollout.course import Course
+from eddies.workflows.rollout.course import Course, frame_layout
 from tests.workflows.stopping import StopAtStep
 
 
@@ -21,7 +26,7 @@ class Standing:
         self.time += 0.1
 
     def frame(self, time):
-        return SimpleNamespace(velocity=torch.zeros(1, 3)), torch.zeros(1, 3)
+        return SimpleNamespace(velocity=torch.zeros(1, 3), to_numpy=dict), torch.zeros(1, 3)
 
     def status(self):
         return ""
@@ -33,28 +38,18 @@ class Standing:
         self.time = saved["time"]
 
 
-class Frames:
+class Still(Course):
     """Takes down times and steps of the frames."""
 
-    segments = None
-
-    def __init__(self, comm):
-        self.truth, self.times, self.steps = SimpleNamespace(decomposition=SimpleNamespace(comm=comm), total=1), [], []
-
-    def store(self, step, time, particles, acceleration, near):
-        self.times.append(time)
-        self.steps.append(step)
-
-    def state_dict(self):
-        return {"times": self.times}
-
-    def load_state_dict(self, state):
-        self.times = state["times"]
+    def _store(self, at):
+        self.times.append(at)
+        self.stored = [*getattr(self, "stored", []), self.steps]
 
 
 def course_of(comm, directory, looks=10**9, method=Standing, count=4, interval=0.25):
     guard = Guard(comm, directory, "settings", StopAtStep(comm, looks))
-    return Course(method(), Frames(comm), count, interval, guard, guard.checkpoints.newest())
+    segments = SimpleNamespace(comm=comm, names=[], close=lambda: None)
+    return Still(method(), segments, count, interval, guard, guard.checkpoints.newest())
 
 
 @pytest.mark.mpi(1)
@@ -62,14 +57,14 @@ def test_parts_of_a_run_leave_out_a_warm_up_each(comm, tmp_path):
     whole = course_of(comm, tmp_path / "whole")
     outcome = whole.run()
     assert outcome["status"] == "complete" and outcome["steps"] == 10 and len(whole.seconds) == 8
-    assert whole.frames.times == [0, 0.25, 0.5, 0.75, 1] and whole.frames.steps == [0, 3, 5, 8, 10]
+    assert whole.times == [0, 0.25, 0.5, 0.75, 1] and whole.stored == [0, 3, 5, 8, 10]
     first = course_of(comm, tmp_path / "parts", 5)
     with pytest.raises(Stopped, match="from step 5"):
         first.run()
     second = course_of(comm, tmp_path / "parts")
     assert second.progress.done == pytest.approx(0.5) and second.seconds == first.seconds and len(first.seconds) == 3
     assert second.run()["steps"] == 10 and len(second.seconds) == 3 + 3
-    assert second.frames.times == whole.frames.times and second.frames.steps == [8, 10]
+    assert second.times == whole.times and second.stored == [8, 10]
 
 
 class Falling(Standing):
@@ -99,3 +94,40 @@ def test_seconds_on_another_number_of_ranks_are_those_since_then(comm, tmp_path)
         course = course_of(alone, tmp_path / "run")
         assert course.steps == 5 and course.seconds == []
     comm.Barrier()
+
+
+class Carried(Standing):
+    """Particles that a rank other than theirs holds, in any order, some beyond the box."""
+
+    def __init__(self, comm, total, density):
+        super().__init__()
+        ids = np.arange(total)[::-1]
+        own = ids[ids % comm.size == comm.rank]
+        self.columns = {"id": own, "position": own[:, None] + np.array([0.5, 7.0, -1.0]),
+                        "velocity": own[:, None] * np.ones(3)} | ({"density": 2.0 + own} if density else {})
+
+    def frame(self, time):
+        return ParticleSet.from_numpy(self.columns), torch.full((len(self.columns["id"]), 3), time)
+
+
+@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.parametrize("density", [True, False])
+def test_a_frame_holds_what_the_method_produces_in_order_of_id(comm, tmp_path, density):
+    total, length = 7, 2 * np.pi
+    guard = Guard(comm, tmp_path / "checkpoints", "settings", StopAtStep(comm, 10**9))
+    with FrameSegments(comm, tmp_path / "checkpoints", frame_layout(total, length, density)) as segments:
+        course = Course(Carried(comm, total, density), segments, 2, 0.1, guard, None)
+        course.run()
+        with create_product(comm, tmp_path / "rollout.h5", "rollout", {}) as file:
+            segments.assemble(file)
+    assert course.energy == pytest.approx(1.5 * np.mean(np.arange(total) ** 2))
+    with open_product(comm, tmp_path / "rollout.h5", "rollout") as file:
+        assert list(file["particles"]) == ["model"] and "fields" not in file
+        stored, ids = Trajectory(file, "model"), np.arange(total)
+        assert set(stored.columns) == {"position", "image", "velocity", "acceleration"} | (
+            {"density"} if density else set())
+        assert stored.times == pytest.approx([0, 0.1, 0.2])
+        assert stored.read(0, "position") == pytest.approx((ids[:, None] + [0.5, 7.0, -1.0]) % length, abs=1e-6)
+        assert np.array_equal(stored.read(2, "velocity"), ids[:, None] * np.ones(3))
+        assert stored.read(2, "acceleration") == pytest.approx(np.full((total, 3), 0.2))
+        assert not density or stored.read(1, "density").tolist() == (2.0 + ids).tolist()

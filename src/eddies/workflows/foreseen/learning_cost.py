@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 from eddies.kernels.library import threads
@@ -10,14 +9,12 @@ from eddies.particles.smoothing_kernels import KNOTS
 from eddies.scene.scene import BOX_LENGTH, Scene
 from eddies.workflows.foreseen.coarse_probe import coarse_scene
 from eddies.workflows.foreseen.cost_model import busiest_cells, cost, flow_bytes
-from eddies.workflows.foreseen.particle_cost import (NEIGHBOR_BYTES, POINT_BYTES, PROCESS_BYTES, particle_bytes,
-                                                     particle_cost)
+from eddies.workflows.foreseen.particle_cost import NEIGHBOR_BYTES, PROCESS_BYTES, particle_bytes, particle_cost
 from eddies.workflows.foreseen.particle_work import ParticleWork, particle_work
 from eddies.workflows.foreseen.rollout_course import rollout_course
 from eddies.workflows.foreseen.stage_cost import FILE_BYTES_PER_SECOND, START_SECONDS, Speeds, StageCost
-from eddies.workflows.foreseen.stored import (kernel_bytes, model_bytes, rollout_bytes, stored_spectra,
-                                              true_frames)
-from eddies.workflows.foreseen.training_probe import cube_rows, evaluated_scene, spectral_scene, trained_scene
+from eddies.workflows.foreseen.stored import kernel_bytes, model_bytes, rollout_bytes
+from eddies.workflows.foreseen.training_probe import cube_rows, evaluated_scene, trained_scene
 from eddies.workflows.learned.a_priori import EVALUATIONS as TESTED_FRAMES
 from eddies.workflows.learned.training_data import COMBINED_DRAWS, VALIDATION_PARTICLES
 from eddies.workflows.learned.training_phases import HORIZON_VALIDATIONS, VALIDATIONS
@@ -26,9 +23,8 @@ SAMPLES = 4                  # fields that a kernel is trained on, one more is c
 # Seconds in which torch is loaded, what draws the curves, and torch's checkpointing; of tiny on one idle rank.
 TORCH_SECONDS, CURVES_SECONDS, CHECKPOINTING_SECONDS = 1.3, 2.0, 4.0
 # Iterations of a solve for the resolved velocity: that starts from nothing; that starts from what is foreseen and goes
-# to the same tolerance, as in a training through horizons; that starts from a field that is near and goes farther, for
-# a spectrum; of its gradient. Of tiny to hit, 20 to 40, 1 to 7, 0 to 10, 18 to 22.
-COLD, FORESEEN, NEAR, ADJOINT = 25.0, 4.0, 7.0, 20.0
+# to the same tolerance, as in a training through horizons; of its gradient. Of tiny to hit, 20 to 40, 1 to 7, 18 to 22.
+COLD, FORESEEN, ADJOINT = 25.0, 4.0, 20.0
 # Of a loss without its gradient over that of an optimiser step; of the sums of an evaluation with theirs, made once
 # forth, once more on the way back, and differentiated (docs/performance.md: 2.3 to 2.6 times).
 LOSS_ALONE, WITH_GRADIENT = 0.6, 4.5
@@ -109,7 +105,7 @@ def horizon_seconds(scene: Scene, work: ParticleWork, ranks: int, speeds: Speeds
 
 
 def rollout_cost(scene: Scene, ranks: int, speeds: Speeds) -> StageCost:
-    """Of a rollout: its steps, its frames with those of the truth, and the files."""
+    """Of a rollout: its steps, its frames, and the files."""
     course, settings = rollout_course(scene), scene.simulation
     own, disk, memory = scene.tracers.particles / ranks, rollout_bytes(scene, course), PROCESS_BYTES
     evaluation, first = 0.0, 0.0
@@ -125,15 +121,7 @@ def rollout_cost(scene: Scene, ranks: int, speeds: Speeds) -> StageCost:
         moved = speeds.coarse.tracers * busiest_cells(coarse, ranks)
         parts["steps"] = course.steps * (cost(coarse, ranks, speeds.coarse).seconds + moved)
         memory += flow_bytes(coarse, ranks)
-    frames = course.intervals + 1 + true_frames(scene, course)
     parts["frames"] = course.evaluations_of_frames * evaluation
-    of_model, of_truth = stored_spectra(scene, course)
-    known = settings.on_grid or "model" in settings.needs and "resolved" in scene.model.reads
-    parts["spectra"] = (of_model * spectrum_seconds(scene, ranks, speeds, NEAR if known else COLD)
-                        + of_truth * spectrum_seconds(scene, ranks, speeds, NEAR))
-    memory += POINT_BYTES * scene.tracers.planes**2 * math.ceil(scene.tracers.planes / ranks)
-    if scene.kernel:
-        parts["frames"] += frames * speeds.training.averages.at(own)
     parts["files"] = disk / FILE_BYTES_PER_SECOND
     return StageCost("simulate", parts, memory + STORED_BYTES * own, disk)
 
@@ -142,14 +130,6 @@ def evaluation_seconds(scene: Scene, work: ParticleWork, ranks: int, speeds: Spe
     """Seconds of an evaluation of the model with so many iterations of its solve, if it has one."""
     work = replace(work, iterations=iterations if work.wavenumber else 0.0)
     return particle_cost(work, speeds.particles, ranks, threads(), speeds.flow.bandwidth).seconds
-
-
-def spectrum_seconds(scene: Scene, ranks: int, speeds: Speeds, iterations: float) -> float:
-    """Seconds of a solve in so many iterations for the resolved velocity, of whose modes a spectrum is."""
-    work, bandwidth = particle_work(spectral_scene(scene)), speeds.flow.bandwidth
-    whole, rest = (particle_cost(replace(work, iterations=number), speeds.spectra, ranks, threads(), bandwidth)
-                   for number in (iterations, 0.0))
-    return whole.seconds - rest.seconds
 
 
 def frame_bytes(scene: Scene, work: ParticleWork, ranks: int, speeds: Speeds) -> float:

@@ -49,14 +49,13 @@ class StageCost:
 
 @dataclass(frozen=True)
 class Speeds:
-    """What the probes found: of the flow, and where a scene has them of particles with the model, of training, of
-    particles whose spectrum is found, and of a coarse grid. `missing` says by stage why it is not foreseen."""
+    """What the probes found: of the flow, and where a scene has them of particles with the model, of training, and of a
+    coarse grid. `missing` says by stage why it is not foreseen."""
 
     flow: Speed
     particles: ParticleSpeed | None
     training: TrainingSpeed | None
     missing: dict[str, str]
-    spectra: ParticleSpeed | None = None
     coarse: Speed | None = None
 
 

@@ -19,7 +19,7 @@ def probe_scene(scene: Scene, comm: Comm) -> Speeds:
     if scene.device != "cpu":
         missing |= dict.fromkeys(learned, "particles on a GPU are not probed")
         learned = set()
-    particles, training, spectra, coarse = None, None, None, None
+    particles, training, coarse = None, None, None
     if learned or scene.kernel:
         from eddies.workflows.foreseen import particle_probe, training_probe  # torch, where something is learned
         try:
@@ -29,11 +29,9 @@ def probe_scene(scene: Scene, comm: Comm) -> Speeds:
         except particle_probe.ProbeError as error:  # on all ranks
             missing |= dict.fromkeys(set(scene.stages) - {"dns", "report"}, str(error))
     if scene.simulation and "simulate" not in missing:
-        from eddies.workflows.foreseen import coarse_probe, particle_probe, training_probe  # torch, which is used then
-        resolved = particles is not None and training_probe.evaluated_scene(scene).resolves
-        spectra = particles if resolved else particle_probe.probe_particles(training_probe.spectral_scene(scene), comm)
+        from eddies.workflows.foreseen import coarse_probe
         coarse = coarse_probe.probe_coarse(scene, comm) if scene.simulation.on_grid else None
-    return Speeds(flow, particles, training, missing, spectra, coarse)
+    return Speeds(flow, particles, training, missing, coarse)
 
 
 def evaluated(scene: Scene) -> set[str]:

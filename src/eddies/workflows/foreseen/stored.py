@@ -80,15 +80,12 @@ def model_bytes(scene: Scene) -> int:
 
 
 def rollout_bytes(scene: Scene, course: RolloutCourse) -> int:
-    """Of rollout.h5: frames of the model, and of the truth as long as it lasts."""
-    particles, points = scene.tracers.particles, [scene.tracers.cells] * 3
-    frame, field = 3 * stored_bytes((particles, 3), "f4") + stored_bytes((particles, 3), "i2"), 0
+    """Of rollout.h5: frames of the model."""
+    particles = scene.tracers.particles
+    frame = 3 * stored_bytes((particles, 3), "f4") + stored_bytes((particles, 3), "i2")
     if stores_density(scene):
         frame += stored_bytes((particles,), "f4")
-    if scene.kernel:
-        frame, field = frame + stored_bytes((particles, 3, 3), "f4"), stored_bytes((3, *points), "f4")
-    own, true = course.intervals + 1, true_frames(scene, course)
-    return 16 * particles + (own + true) * (frame + field) + true * field
+    return 8 * particles + (course.intervals + 1) * frame
 
 
 def stores_density(scene: Scene) -> bool:
@@ -97,15 +94,6 @@ def stores_density(scene: Scene) -> bool:
         return scene.eulerian is not None and scene.eulerian.compressible
     return scene.flow.compressible and ("density" in scene.simulation.needs or "model" in scene.simulation.needs
                                         and "density" in scene.model.reads)
-
-
-def stored_spectra(scene: Scene, course: RolloutCourse) -> tuple[int, int]:
-    """Spectra of a rollout of model and truth: of both at the times of filtered fields, of the model also after the
-    truth."""
-    tracers, true = scene.tracers, true_frames(scene, course)
-    every = round(course.interval / tracers.frame_interval)
-    with_field = sum(frame * every % tracers.field_every == 0 for frame in range(true))
-    return with_field + course.intervals + 1 - true, with_field
 
 
 def true_frames(scene: Scene, course: RolloutCourse) -> int:

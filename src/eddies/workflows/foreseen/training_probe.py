@@ -26,7 +26,7 @@ from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.particle_field import ParticleField
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.smoothing_kernels import KernelNetwork
-from eddies.scene.scene import BOX_LENGTH, Model, Scene, Simulation
+from eddies.scene.scene import BOX_LENGTH, Scene, Simulation
 from eddies.workflows.foreseen.particle_probe import ITERATIONS, LEAST_SIDE, ProbeError, probed_model
 
 REPEATS = 2
@@ -113,14 +113,6 @@ def trained_scene(scene: Scene) -> Scene:
         step=interval, frame_interval=interval, turnovers=1.0, start=0.0, skin=0.0,
         precision=training.precision if training else "float32",
         integrator=training.horizons.integrator if training and training.horizons else "rk3"))
-
-
-def spectral_scene(scene: Scene) -> Scene:
-    """The scene with a rollout that does no more than find the resolved velocity of its particles."""
-    interval = scene.tracers.frame_interval
-    return replace(scene.without_variants, training=None, eulerian=None,
-                   model=Model(terms=("relaxation",), path="nowhere"),
-                   simulation=Simulation(step=interval, frame_interval=interval, turnovers=1.0, start=0.0, skin=0.0))
 
 
 def cube_rows(scene: Scene, side: int) -> float:

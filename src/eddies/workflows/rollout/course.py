@@ -11,24 +11,33 @@ import numpy as np
 
 from eddies.clock import WARM_UP_STEPS, Clock, ProgressLine
 from eddies.io.checkpoint import Checkpoint
+from eddies.io.frame_segments import FrameLayout, FrameSegments
 from eddies.io.guard import Guard
+from eddies.parallel.migration import IdOrder, wrap
 from eddies.parallel.reduction import global_sum
-from eddies.workflows.rollout.frames import RolloutFrames
+from eddies.particles.particle_set import as_numpy
 from eddies.workflows.rollout.method import Method
 
 log = logging.getLogger("eddies")
 
 
+def frame_layout(total: int, length: float, density: bool) -> FrameLayout:
+    """What a rollout stores of so many particles in a box: with their `density`, where they have one."""
+    columns = {"position": (3,), "velocity": (3,), "acceleration": (3,)} | ({"density": ()} if density else {})
+    return FrameLayout(total, length, {"model": columns}, np.float32, {})
+
+
 class Course:
     """A method on its way through `count` frame intervals of a length, from the start or from a checkpoint.
 
-    `guard` looks on before each step. A method that cannot tell its state makes no checkpoints.
+    `segments` take the frames. `guard` looks on before each step. A method that cannot tell its state makes no
+    checkpoints.
     """
 
-    def __init__(self, method: Method, frames: RolloutFrames, count: int, interval: float, guard: Guard,
+    def __init__(self, method: Method, segments: FrameSegments, count: int, interval: float, guard: Guard,
                  saved: Checkpoint | None) -> None:
-        self.method, self.frames, self.count, self.interval, self.guard = method, frames, count, interval, guard
-        self.comm = frames.truth.decomposition.comm
+        self.method, self.segments, self.count, self.interval, self.guard = method, segments, count, interval, guard
+        self.comm, self.times = segments.comm, []
         self.clock, self.seconds, self.energy = Clock(end=count * interval), [], 0.0
         self._warm_up = WARM_UP_STEPS
         if saved is not None:
@@ -49,9 +58,9 @@ class Course:
         start or the last restart that storing frames took, and the seconds of those steps that were timed.
         """
         complaint: str | None = None
-        if not self.frames.times:
+        if not self.times:
             self._store(0.0)
-        while complaint is None and (number := len(self.frames.times)) <= self.count:
+        while complaint is None and (number := len(self.times)) <= self.count:
             until = number * self.interval
             while complaint is None and self.method.time < until - 1e-9 * self.interval:
                 self._look()
@@ -63,28 +72,27 @@ class Course:
             log.warning("rollout stopped at time %.4g: %s", self.clock.time, complaint)
         step = {"time_step": self.clock.time / self.steps,
                 "storing_share": self.progress.storing_share} if self.steps else {}
-        return {"status": "complete" if complaint is None else f"stopped: {complaint}", "time": self.frames.times[-1],
+        return {"status": "complete" if complaint is None else f"stopped: {complaint}", "time": self.times[-1],
                 "steps": self.steps, **step, **quartiles(self.seconds)}
 
     def state_dict(self) -> dict[str, Any]:
         """All that goes on, for a checkpoint, beside the files of the frames."""
         return {"rollout": {"clock": self.clock.state_dict(), "energy": self.energy, "ranks": self.comm.size,
-                            "seconds": self.seconds, "frames": self.frames.state_dict()},
+                            "seconds": self.seconds, "times": self.times},
                 **self.method.state_dict()}
 
     def _load(self, saved: Checkpoint) -> None:
         """Take what is no part of the method from a checkpoint."""
         known = saved["rollout"]
         self.clock.load_state_dict(known["clock"])
-        self.frames.load_state_dict(known["frames"])
-        self.energy = known["energy"]
+        self.times, self.energy = known["times"], known["energy"]
         if known["ranks"] == self.comm.size:  # else they are no measure of the steps of this run
             self.seconds = known["seconds"]
 
     def _look(self) -> None:
         """Let the guard look on; without a state to keep, only whether the run is to stop."""
         if hasattr(self.method, "state_dict"):
-            self.guard(self, self.frames.segments)
+            self.guard(self, self.segments)
         else:
             self.guard.stop.check()
 
@@ -100,12 +108,18 @@ class Course:
 
     def _store(self, at: float) -> None:
         """Store the frame of a time, and take down the mean kinetic energy <v.v>/2 of its particles."""
+        layout = self.segments.layout
         with self.progress.storing():
             particles, acceleration = self.method.frame(at)
-            near = self.method.velocity_modes() if hasattr(self.method, "velocity_modes") else None
-            self.frames.store(self.steps, at, particles, acceleration, near)
+            columns = {**particles.to_numpy(), "acceleration": as_numpy(acceleration)}
+            columns["position"] = wrap(columns["position"], layout.length)
+            order = IdOrder(self.comm, columns["id"], layout.total)
+            self.segments.open(self.steps)
+            self.segments.trajectories["model"].append(self.steps, at, order.start, {
+                name: order.apply(columns[name]) for name in layout.trajectories["model"]})
+            self.times.append(at)
         energy = 0.5 * float(particles.velocity.double().square().sum())
-        self.energy = float(global_sum(self.comm, energy)) / self.frames.truth.total
+        self.energy = float(global_sum(self.comm, energy)) / layout.total
 
     def _describe(self) -> str:
         return f"t {self.clock.time:.3f}  energy {self.energy:.4f}{self.method.status()}"

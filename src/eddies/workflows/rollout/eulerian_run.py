@@ -30,7 +30,6 @@ from eddies.spectral.mode_operators import gaussian_transfer
 from eddies.spectral.spectral_grid import SpectralGrid, regrid
 from eddies.time_stepping import ETDRK4
 from eddies.workflows.ground_truth.truth import GroundTruth
-from eddies.workflows.rollout.method import GridModes
 from eddies.workflows.rollout.particle_run import injection
 from eddies.workflows.rollout.saved_rows import restored_rows, saved_rows
 
@@ -99,10 +98,6 @@ class EulerianRun:
         """The particles, with the density of a compressible fluid, and their acceleration."""
         density = {"density": self.tracers.density(self.state)} if self.has_density else {}
         return ParticleSet.from_numpy(self.tracers.columns | density), torch.from_numpy(self._acceleration())
-
-    def velocity_modes(self) -> GridModes:
-        """The grid, and the modes of the velocity that the particles follow."""
-        return self.fluid.grid, self.tracers.field.transfer * self.state[:3]
 
     def _acceleration(self) -> np.ndarray:
         """du/dt + v.grad u (n, 3) of the filtered velocity u at the particles: the rate of change of their velocity,

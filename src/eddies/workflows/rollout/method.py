@@ -4,23 +4,17 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
-import numpy as np
 import torch
 
 from eddies.io.checkpoint import Checkpoint
 from eddies.particles.particle_set import ParticleSet
-from eddies.spectral.spectral_grid import SpectralGrid
-
-
-GridModes = tuple[SpectralGrid, np.ndarray]  # a grid, and modes (3, kz, ky_local, kx) of a velocity on it
 
 
 class Method(Protocol):
     """What moves the particles of a rollout, made as Class(scene, truth, start, directory, device) where `start` is the
     frame of the ground truth that it starts from. All methods are collective.
 
-    `state_dict` and `load_state_dict` may be missing: a rollout that is stopped then begins anew. So may
-    `velocity_modes`: the spectra of the particles then take longer to find.
+    `state_dict` and `load_state_dict` may be missing: a rollout that is stopped then begins anew.
     """
 
     has_density: bool  # of the particles of its frames
@@ -33,9 +27,6 @@ class Method(Protocol):
 
     def frame(self, time: float) -> tuple[ParticleSet, torch.Tensor]:
         """The particles at a time that the last step reached, in any order, and their acceleration (n, 3)."""
-
-    def velocity_modes(self) -> GridModes | None:
-        """A velocity near that of the particles of the last `frame`, if one is known."""
 
     def status(self) -> str:
         """What the progress line shows of it beside time and energy."""

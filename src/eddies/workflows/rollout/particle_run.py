@@ -25,7 +25,6 @@ from eddies.scene.scene import Scene
 from eddies.scene.terms import Forcing
 from eddies.workflows.ground_truth.truth import GroundTruth, particles_for
 from eddies.workflows.learned.model import load_feature_range, load_model
-from eddies.workflows.rollout.method import GridModes
 from eddies.workflows.rollout.particle_state import particle_state, restored_particles
 
 log = logging.getLogger("eddies")
@@ -125,14 +124,6 @@ class ParticleRun:
             self._shares_outside.append(self.seen.share_outside(self.comm, pair_features(self.dynamics, particles)))
         self._count_solves()
         return particles, rates.acceleration
-
-    def velocity_modes(self) -> GridModes | None:
-        """The grid of the resolved velocity, if there is one, and its modes in the last evaluation of the forces, which
-        is that of the last frame."""
-        resolution = self.dynamics.resolution
-        if resolution is None or resolution.found is None:
-            return None
-        return resolution.grid.spectral, resolution.found.numpy()
 
     def _now(self) -> Moment:
         """The particles with their acceleration, which the next step does not evaluate again; collective."""

@@ -1,0 +1,259 @@
+"""A rollout beside the true particles: frames of both, and what is measured of them alike."""
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+
+from eddies.analysis.spectra import band_ratios, energy_spectrum, spectrum_error, vorticity
+from eddies.analysis.velocity_gradients import Invariants
+
+SHOWN = 3  # spectra of a rollout
+Table = Mapping[str, np.ndarray]  # columns wavenumber (shells,), time (m,), energy or others (m, shells)
+
+
+class Frames(Protocol):
+    """Particles at several times."""
+
+    times: np.ndarray
+    columns: Collection[str]
+
+    def read(self, frame: int, column: str, start: int = 0, stop: int | None = None) -> np.ndarray:
+        """Rows start to stop of one column of one frame, in order of id."""
+
+
+@dataclass(frozen=True)
+class CommonFrames:
+    """Frames of model and truth at the same times: indices and times, all (m,)."""
+
+    model: np.ndarray
+    truth: np.ndarray
+    times: np.ndarray
+
+    @classmethod
+    def of(cls, model: Frames, truth: Frames, until: float = np.inf) -> "CommonFrames":
+        """Pair the frames before `until` whose times agree to 1e-6; raises ValueError if there is none."""
+        gap = np.abs(model.times[:, None] - truth.times[None, :])
+        same = gap <= 1e-6 * max(1.0, np.ptp(model.times))
+        rows, columns = np.nonzero(same & (model.times < until)[:, None])
+        if rows.size == 0:
+            raise ValueError("model and truth have no finite frame at a common time")
+        return cls(rows, columns, model.times[rows])
+
+    def spread(self, count: int) -> np.ndarray:
+        """At most `count` positions in this list, evenly spread from the first to the last."""
+        return spread(np.arange(self.times.size), count)
+
+
+def spread(values: np.ndarray, count: int) -> np.ndarray:
+    """At most `count` of values (m,), evenly spread from the first to the last."""
+    return values[np.unique(np.rint(np.linspace(0, len(values) - 1, count)).astype(int))]
+
+
+@dataclass(frozen=True)
+class Pair:
+    """One quantity of model and truth at one time."""
+
+    time: float
+    model: np.ndarray
+    truth: np.ndarray
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """What averages with a kernel make of particles at one moment.
+
+    Parameters
+    ----------
+    invariants : of the velocity gradient at the particles.
+    velocity : (3, n, n) and vorticity : its magnitude (n, n), [y, x] in the plane z = pi.
+    energy : of each shell of the whole field, k = 0, 1, ...; (shells,).
+    """
+
+    invariants: Invariants
+    velocity: np.ndarray
+    vorticity: np.ndarray
+    energy: np.ndarray
+
+    @classmethod
+    def of(cls, gradient: np.ndarray, field: np.ndarray) -> "Reconstruction":
+        """Of gradients (particles, 3, 3) at the particles and the velocity (3, n, n, n) on a grid."""
+        middle = field.shape[1] // 2
+        rotation = np.linalg.norm(vorticity(field)[:, middle], axis=0)
+        return cls(Invariants.of(gradient), field[:, middle].copy(), rotation.astype(np.float32),
+                   energy_spectrum(field)[1])
+
+    def energy_above(self, wavenumber: float) -> float:
+        """Energy of the shells k > wavenumber."""
+        return float(self.energy[np.arange(len(self.energy)) > wavenumber].sum())
+
+
+@dataclass(frozen=True)
+class SpectraAt:
+    """Spectra at one time, (shells,) each from k = 0 on: of the model's particles and of the true ones, found alike in
+    their velocities; and of the filtered flow itself."""
+
+    time: float
+    model: np.ndarray
+    truth: np.ndarray
+    filtered: np.ndarray
+
+    @property
+    def wavenumber(self) -> np.ndarray:
+        """k = 0, 1, ..."""
+        return np.arange(len(self.model))
+
+    def error(self, of: str, filter_wavenumber: float) -> float:
+        """`spectrum_error` of "model" or "truth" against the filtered flow, up to k_d or the last shell there is."""
+        return spectrum_error(getattr(self, of), self.filtered, self._largest(filter_wavenumber))
+
+    def bands(self, of: str, filter_wavenumber: float) -> dict[str, float]:
+        """`band_ratios` of "model" or "truth" to the filtered flow, as far."""
+        return band_ratios(getattr(self, of), self.filtered, self._largest(filter_wavenumber))
+
+    def _largest(self, filter_wavenumber: float) -> float:
+        return min(filter_wavenumber, float(self.wavenumber[-1]))
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """A rollout, the true particles beside it, and what is measured of both alike; read frame by frame.
+
+    Parameters
+    ----------
+    attributes : of the group `rollout` of the product.
+    model, truth : particles, at times since the start of the rollout. The truth may end earlier, and has no frame where
+        there is no ground truth to compare with; `without_truth` says why.
+    length : edge of the box.
+    flow : table `spectra` of the ground truth, with `energy` and `filtered`; its times count from the release of the
+        tracers, as `start_time` does.
+    reference : scales of the ground truth.
+    spectra : of "model" and "truth", by frame: the energy (shells,) of the modes that least squares find in the
+        particles' velocities.
+    reconstructions : of both likewise, by frame; None without a kernel.
+    outside_training : share of the pairs outside the training range, (frames,), where it was counted.
+    closure : columns over the frames on the solves for the resolved velocity, where there were any.
+    """
+
+    attributes: Mapping[str, float | str]
+    model: Frames
+    truth: Frames
+    length: float
+    flow: Table
+    reference: Mapping[str, float]
+    spectra: Mapping[str, Mapping[int, np.ndarray]]
+    reconstructions: Mapping[str, Mapping[int, Reconstruction]] | None
+    outside_training: np.ndarray | None = None
+    closure: Table | None = None
+    without_truth: str = ""
+
+    @property
+    def turnover(self) -> float:
+        """Eddy turnover time T, the unit of time in the figures."""
+        return float(self.attributes["eddy_turnover_time"])
+
+    @property
+    def start_time(self) -> float:
+        """When it starts, since the release of the tracers."""
+        return float(self.attributes["start_time"])
+
+    @property
+    def filter_width(self) -> float:
+        """d of the filter."""
+        return float(self.reference["filter_width"])
+
+    @property
+    def filter_wavenumber(self) -> float:
+        """k_d = pi / d."""
+        return np.pi / self.filter_width
+
+    @property
+    def forced(self) -> bool:
+        """Whether its large scales were forced."""
+        return self.powers[0] > 0
+
+    @property
+    def powers(self) -> tuple[float, float]:
+        """With which its large scales were forced and those of the true tracers, a mass."""
+        model, truth = (float(self.attributes.get(name, 0.0)) for name in ("injection_rate", "truth_injection_rate"))
+        return model, truth
+
+    @property
+    def status(self) -> str:
+        """How it ended: "complete", or "stopped: reason"."""
+        return str(self.attributes["status"])
+
+    @cached_property
+    def broken(self) -> float:
+        """Time of the first frame with a velocity or acceleration that is not finite; infinity without one."""
+        for frame, time in enumerate(self.model.times):
+            if not all(np.isfinite(self.model.read(frame, column)).all() for column in ("velocity", "acceleration")):
+                return float(time)
+        return np.inf
+
+    @cached_property
+    def common(self) -> CommonFrames:
+        """The frames of both at the same times, before the model broke, if it did. Raises ValueError, with the reason,
+        if there is none."""
+        if not len(self.truth.times) and self.without_truth:
+            raise ValueError(self.without_truth)
+        return CommonFrames.of(self.model, self.truth, self.broken)
+
+    def before_broken(self, of: str) -> np.ndarray:
+        """The frames of "model" or "truth" before the model broke."""
+        return np.flatnonzero(getattr(self, of).times < self.broken)
+
+    def pair(self, index: int, column: str) -> Pair:
+        """A column of both at a common frame, rows in order of id."""
+        common = self.common
+        return Pair(float(common.times[index]), self.model.read(int(common.model[index]), column),
+                    self.truth.read(int(common.truth[index]), column))
+
+    def reconstructed(self, index: int) -> tuple[Reconstruction, Reconstruction]:
+        """What the kernel makes of model and truth at a common frame."""
+        assert self.reconstructions is not None
+        return (self.reconstructions["model"][int(self.common.model[index])],
+                self.reconstructions["truth"][int(self.common.truth[index])])
+
+    def has_flow(self, times: np.ndarray) -> np.ndarray:
+        """At which times the spectrum of the flow itself is known, (m,) booleans."""
+        return _contained(self.start_time + times, self.flow["time"])
+
+    def spectral(self) -> np.ndarray:
+        """The common frames at which the spectrum of the flow itself is known."""
+        return np.flatnonzero(self.has_flow(self.common.times))
+
+    def shown_spectra(self) -> np.ndarray:
+        """A few of these frames, from the first to the last."""
+        return spread(self.spectral(), SHOWN)
+
+    def late_spectra(self) -> np.ndarray:
+        """Frames of the model over which its spectrum is averaged: in the second half of the rollout until it broke,
+        those at which the flow's is known, or where the truth has ended; the last such frame where there are none."""
+        times = self.model.times
+        frames = np.flatnonzero((self.has_flow(times) | ~_contained(times, self.truth.times)) & (times < self.broken))
+        late = second_half(times[frames], float(times[self.before_broken("model")[-1]]))
+        return frames[late]
+
+    def spectra_at(self, index: int) -> SpectraAt:
+        """The spectra at a common frame, of as many shells as all have; of the flow at the nearest time."""
+        common = self.common
+        model, truth = (self.spectra[of][int(frames[index])]
+                        for of, frames in (("model", common.model), ("truth", common.truth)))
+        nearest = int(np.argmin(np.abs(self.flow["time"] - (self.start_time + common.times[index]))))
+        shells = min(len(model), self.flow["wavenumber"].size)
+        return SpectraAt(float(common.times[index]), model[:shells], truth[:shells],
+                         self.flow["filtered"][nearest][:shells])
+
+
+def _contained(times: np.ndarray, among: np.ndarray) -> np.ndarray:
+    """Which of times (m,) are among others (l,), to 1e-6."""
+    return (np.abs(times[:, None] - among[None, :]) < 1e-6).any(axis=1)
+
+
+def second_half(times: np.ndarray, end: float) -> np.ndarray:
+    """Rows of the second half of what ends at a time; the last row before it, where there is none."""
+    rows = np.flatnonzero((times >= end / 2) & (times <= end * (1 + 1e-9)))
+    return rows if rows.size else np.array([max(int(np.searchsorted(times, end, "right")) - 1, 0)])

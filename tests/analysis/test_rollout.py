@@ -1,0 +1,81 @@
+"""What a rollout is compared with, and at which times."""
+
+import numpy as np
+import pytest
+
+from eddies.analysis.rollout import CommonFrames, Reconstruction, Rollout
+
+SHELLS, CELLS = np.arange(6), 12
+
+
+class Still:
+    """Particles at rest at some times; the velocities of one frame may not be finite."""
+
+    columns = ("velocity", "acceleration")
+
+    def __init__(self, times, broken=None):
+        self.times, self.broken = np.array(times), broken
+
+    def read(self, frame, column, start=0, stop=None):
+        return np.full((4, 3), np.nan if frame == self.broken else 0.0)
+
+
+def rollout(model=(0.0, 0.5, 1.0, 1.5), truth=(0.0, 0.5, 1.0), flow=(0.0, 1.0, 1.5, 2.0, 2.5), broken=None, shells=9):
+    """Spectra 2^-k at a time t times e^t and a factor: of the flow, 1.2 of the model and 0.9 of the truth."""
+    def energies(times, size, factor=1.0):
+        return factor * np.exp(np.asarray(times))[:, None] * 0.5 ** np.arange(size)
+
+    spectra = {name: dict(enumerate(energies(times, 6, factor)))
+               for name, times, factor in (("model", model, 1.2), ("truth", truth, 0.9))}
+    table = {"time": np.array(flow), "wavenumber": np.arange(shells), "filtered": energies(flow, shells)}
+    return Rollout({"start_time": 1.0}, Still(model, broken), Still(truth), 2 * np.pi, table, {}, spectra, None)
+
+
+def test_spectra_are_those_of_a_common_frame_and_of_the_flow_then():
+    run = rollout()
+    assert run.spectral().tolist() == [0, 1, 2] and run.shown_spectra().tolist() == [0, 1, 2]
+    at = run.spectra_at(2)
+    assert at.time == 1.0 and at.wavenumber.tolist() == SHELLS.tolist()
+    assert at.truth == pytest.approx(0.9 * np.e * 0.5**SHELLS) and at.model == pytest.approx(1.2 * np.e * 0.5**SHELLS)
+    assert at.filtered == pytest.approx(np.e**2 * 0.5**SHELLS)
+    assert at.error("truth", 4.0) == pytest.approx(1 - np.log(0.9))
+    assert at.bands("model", 4.0) == pytest.approx(dict.fromkeys(("1-2", "3-4"), 1.2 / np.e))
+
+
+def test_no_shell_counts_that_one_of_them_has_not():
+    at = rollout(shells=5).spectra_at(0)
+    assert list(at.bands("model", 20.0)) == ["1-2", "3-4"] and at.error("truth", 20.0) == pytest.approx(1 - np.log(0.9))
+
+
+def test_frames_between_the_flows_have_no_spectrum_until_the_truth_has_ended():
+    """The flow is known at 0 and 1 of the rollout, and there is no truth at 1.5."""
+    run = rollout(flow=(1.0, 2.0))
+    assert run.spectral().tolist() == [0, 2] and run.late_spectra().tolist() == [2, 3]
+    assert rollout(flow=(1.0,), truth=(0.0, 0.5, 1.0, 1.5)).late_spectra().tolist() == [0]
+    assert rollout(broken=3).late_spectra().tolist() == [1, 2]
+
+
+def test_common_frames_are_those_of_the_same_time_before_the_model_broke():
+    run = rollout(model=(0.0, 0.25, 0.5, 1.0), broken=3)
+    assert run.broken == 1.0 and run.common.model.tolist() == [0, 2] and run.common.truth.tolist() == [0, 1]
+    assert run.before_broken("model").tolist() == [0, 1, 2] and run.before_broken("truth").tolist() == [0, 1]
+    for alone in (rollout(broken=0), rollout(truth=(7.0,))):
+        with pytest.raises(ValueError, match="no finite frame at a common time"):
+            alone.common
+    spread = CommonFrames.of(Still(range(9)), Still(range(9))).spread(3)
+    assert spread.tolist() == [0, 4, 8]
+
+
+def test_a_reconstruction_has_what_is_in_the_plane_and_in_the_shells():
+    """A velocity u_x = sin 2z + cos 5y / 2: |w| = |2 cos 2z, 2.5 sin 5y|, and energies 1/4 and 1/16."""
+    z, y = (2 * np.pi * np.arange(CELLS) / CELLS for _ in range(2))
+    field = np.zeros((3, CELLS, CELLS, CELLS))
+    field[0] = np.sin(2 * z)[:, None, None] + np.cos(5 * y)[None, :, None] / 2
+    gradient = np.random.default_rng(2).standard_normal((50, 3, 3))
+    found = Reconstruction.of(gradient, field)
+    assert found.velocity.shape == (3, CELLS, CELLS) and np.array_equal(found.velocity, field[:, CELLS // 2])
+    expected = np.hypot(2 * np.cos(2 * np.pi), 2.5 * np.sin(5 * y))
+    assert found.vorticity == pytest.approx(np.tile(expected[:, None], CELLS), abs=1e-6)
+    assert found.energy[[2, 5]] == pytest.approx([1 / 4, 1 / 16])
+    assert found.energy_above(2.0) == pytest.approx(1 / 16) and found.energy_above(1.9) == pytest.approx(5 / 16)
+    assert found.invariants.second.dtype == np.float32
