@@ -1,17 +1,15 @@
-"""Measure the step of the direct simulation on several numbers of ranks, and say what larger runs would take.
+"""Measure the step of the direct simulation on several numbers of ranks.
 
-    .venv/bin/python mpi_tools/scaling.py [--cells 64 128] [--ranks 1 2] [--scene hit-paper] [--larger 256 512 ...]
+    .venv/bin/python mpi_tools/scaling.py [--cells 64 128] [--ranks 1 2]
 
 The times are those of tests/benchmarks/step.py, which shows each part against its bound; speed-up and efficiency are
-against the first of RANKS. What follows is `eddies check` of the scene on other grids, on the last of RANKS: the same
-flow at the same k_max eta and Courant number. It measures anew and knows the model of larger runs.
+against the first of RANKS. `tests/benchmarks/projection.py flow` says what larger runs take.
 """
 
 import argparse
 import json
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 
 CHECKOUT = Path(__file__).parents[1]
@@ -44,22 +42,6 @@ def row(result: dict, first: dict) -> str:
             + f" {result['memory_bytes'] / 1e6:9.0f} MB")
 
 
-def other_grid(scene: str, cells: int) -> list[str]:
-    """Options of `eddies check` for a built-in scene on another grid: nu ~ n^(-4/3) keeps k_max eta."""
-    settings = tomllib.loads(output_of(["-m", "eddies", "scenes", scene]))
-    ratio = settings["flow"]["cells"] / cells
-    changes = {"flow.cells": cells, "flow.viscosity": settings["flow"]["viscosity"] * ratio ** (4 / 3)}
-    changes |= {f"time.{key}": settings["time"][key] * ratio for key in ("max_step", "step") if key in settings["time"]}
-    return [word for key, value in changes.items() for word in ("--set", f"{key}={value:g}")]
-
-
-def larger_run(scene: str, cells: int, ranks: int) -> str:
-    """What `eddies check` says of more ranks."""
-    report = output_of(["-m", "eddies", "check", scene, *other_grid(scene, cells)], ranks).splitlines()
-    start = next(number for number, line in enumerate(report) if line.startswith("more ranks"))
-    return "\n".join([f"{cells}^3, {scene}", *(line for line in report[start:] if line[:1] == " ")])
-
-
 def positive(text: str) -> int:
     """An integer of the command line that is larger than zero."""
     if not text.isdigit() or int(text) < 1:
@@ -73,9 +55,6 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--ranks", nargs="+", type=positive, default=[1, 2], help="numbers of ranks, measured")
     parser.add_argument("--precision", nargs="+", choices=["float64", "float32"], default=["float64", "float32"])
     parser.add_argument("--steps", type=positive, default=7, help="steps of which the median is taken")
-    parser.add_argument("--scene", default="hit-paper", help="built-in scene of the larger runs (default: hit-paper)")
-    parser.add_argument("--larger", nargs="*", type=positive, default=[256, 512, 1024, 2048, 4096],
-                        help="cells along a side of the larger runs")
     options = parser.parse_args(arguments)
     names = " ".join(f"{name:>10}" for name in GROUPS)
     print(f"cells precision  ranks  s a step speed-up efficiency {names}    memory", flush=True)
@@ -85,8 +64,6 @@ def main(arguments: list[str] | None = None) -> None:
             for ranks in options.ranks:
                 results.append(measured(cells, ranks, precision, options.steps))
                 print(row(results[-1], results[0]), flush=True)
-    for cells in options.larger:
-        print(f"\n{larger_run(options.scene, cells, options.ranks[-1])}", flush=True)
 
 
 if __name__ == "__main__":

@@ -57,16 +57,6 @@ def quick_spectra(monkeypatch):
 
 
 @pytest.fixture
-def quick_probes(monkeypatch):
-    """Probes of smaller grids among fewer particles, once each: where it does not matter how fast anything is."""
-    from eddies.workflows.foreseen import cost_model, particle_probe, training_probe
-    monkeypatch.setattr(cost_model, "PROBE_CELLS", 16)
-    for probe in (particle_probe, training_probe):
-        monkeypatch.setattr(probe, "LEAST_SIDE", 4)
-        monkeypatch.setattr(probe, "REPEATS", 1)
-
-
-@pytest.fixture
 def own(tmp_path, monkeypatch):
     """A function that writes a module of a user's, NAME and text, into tmp_path, where modules are found as long as the
     test lasts."""

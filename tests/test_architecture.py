@@ -153,7 +153,7 @@ def test_tools_import_nothing_from_the_package():
     ("flow/forcing", "from ..particles import pairs", "not below it"),
     ("parallel/slab", "import eddies.flow.forcing", "not below it"),
     ("clock", "from eddies import scene", "not below it"),
-    ("workflows/foreseen/cost_model", "from eddies.workflows.dns import run", "not below it"),
+    ("workflows/foreseen/seconds", "from eddies.workflows.dns import run", "not below it"),
     ("workflows/learned/model", "from eddies.workflows import train", "not below it"),
     ("learning/losses", "def late():\n    from eddies.scene.scene import Scene", "imports eddies.scene.scene"),
     ("flow/forcing", "from eddies.scene.values import number", "imports eddies.scene.values"),

@@ -98,7 +98,6 @@ def test_command_exists(command, folder):
         assert (CHECKOUT / path).exists(), path
 
 
-@pytest.mark.usefixtures("quick_probes")
 @pytest.mark.mpi(1)
 @pytest.mark.parametrize("command", dict.fromkeys(
     shlex.join(shlex.split(line, comments=True)) for line in COMMANDS if re.match(r"eddies (scenes|check)", line)))

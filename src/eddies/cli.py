@@ -14,6 +14,7 @@ import signal
 import sys
 import time
 import traceback
+from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,7 +24,7 @@ from eddies.clock import duration
 from eddies.errors import UserError
 from eddies.logs import OUTCOME, Output, configure_logging, show_warnings
 from eddies.pipeline import STAGES
-from eddies.scene.scene import SceneError, builtin_scenes, load_scene
+from eddies.scene.scene import Scene, SceneError, builtin_scenes, load_scene
 
 if TYPE_CHECKING:
     from eddies.parallel.communicator import Comm
@@ -89,7 +90,9 @@ def run(arguments: list[str] | None) -> int:
         options = parse_arguments(arguments, comm.rank)
         configure_logging(comm.rank, getattr(options, "log", None))
         library()  # and with it the threads that torch shares
-        if options.command in SHORT_COMMANDS:
+        if options.command == "check" and options.time:
+            time_command(options, comm, signals)
+        elif options.command in SHORT_COMMANDS:
             release_signals(signals)
             SHORT_COMMANDS[options.command](options, comm)
         else:
@@ -209,13 +212,25 @@ def export_command(options: argparse.Namespace, comm: Comm) -> None:
 
 def check_command(options: argparse.Namespace, comm: Comm) -> None:
     """Derived numbers and estimates of a scene."""
+    for scene in checked_scenes(options, comm):
+        import_module("eddies.workflows.check").run(scene, comm, options.json)
+
+
+def time_command(options: argparse.Namespace, comm: Comm, signals: list[int]) -> None:
+    """Seconds of a step of each stage of a scene, measured."""
+    for scene in checked_scenes(options, comm):
+        import_module("eddies.workflows.timing").run(scene, comm, signals)
+
+
+def checked_scenes(options: argparse.Namespace, comm: Comm) -> Iterator[Scene]:
+    """The scene of the command line, or the variants named, each once it is known to be feasible."""
     from eddies.workflows.feasibility import check_feasible
     whole = load_scene(options.scene, options.overrides, options.removals)
     whole.check_variants(options.variants)
     for scene in [whole.variant[name] for name in options.variants] or [whole]:
         for each in (scene, *scene.variant.values()):
             check_feasible(each.stages, each, comm)
-        import_module("eddies.workflows.check").run(scene, comm, options.json)
+        yield scene
 
 
 def scenes_command(options: argparse.Namespace, comm: Comm) -> None:

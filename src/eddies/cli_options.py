@@ -21,7 +21,8 @@ EXAMPLES = {
     "simulate": ("eddies simulate hit-small --overwrite --set simulation.method=none",),
     "report": ("eddies report runs/hit-small --open",),
     "export": ("eddies export runs/tiny --format vtkhdf", "eddies export runs/hit --format lagrangebench"),
-    "check": ("eddies check hit", "eddies check mine.toml --set flow.cells=256 --unset forcing --json"),
+    "check": ("eddies check hit", "eddies check mine.toml --set flow.cells=256 --unset forcing --json",
+              "mpirun -n 2 eddies check hit-small --time"),
     "scenes": ("eddies scenes", "eddies scenes tiny"),
     "status": ("eddies status", "eddies status runs/hit-small"),
     "diff": ("eddies diff runs/hit-small runs/second", "eddies diff runs/cost --variant learned --variant paper"),
@@ -64,10 +65,12 @@ def build_parser() -> argparse.ArgumentParser:
                         help="for ParaView, or particles as learned simulators read them (default: vtkhdf)")
     export.add_argument("--output", type=directory, metavar="DIR", help="where the files go (default: RUN/FORMAT)")
     add_log_options(export)
-    check = add_command(commands, "check", "derived numbers, memory, ranks and time; writes nothing")
+    check = add_command(commands, "check", "derived numbers, memory, ranks and time; leaves nothing")
     add_scene_options(check)
     add_variants(check, "check this variant in place of the scene; repeatable")
-    check.add_argument("--json", action="store_true", help="the numbers as JSON, for programs")
+    how = check.add_mutually_exclusive_group()
+    how.add_argument("--json", action="store_true", help="the numbers as JSON, for programs")
+    how.add_argument("--time", action="store_true", help="run a few steps of each stage, and say how long it will take")
     scenes = add_command(commands, "scenes", "the built-in scenes, a line each; or one with all settings")
     scenes.add_argument("scene", nargs="?", metavar="SCENE", help="print this scene, defaults included")
     status = add_command(commands, "status", "what stands in run directories: stages, checkpoints, jobs, sizes")

@@ -29,10 +29,9 @@ from eddies.parallel.stop import Stopped, StopRequest
 from eddies.pipeline import STAGES, Stage
 from eddies.scene.scene import Scene, SceneError
 from eddies.workflows.feasibility import check_feasible, check_ground_truth, check_places
-from eddies.workflows.foreseen.estimates import ground_truth_alone, most_ranks
-from eddies.workflows.foreseen.refusals import single_writer
-from eddies.workflows.foreseen.stage_cost import in_units
-from eddies.workflows.foreseen.warnings import stage_warnings
+from eddies.workflows.foreseen.problems import single_writer, stage_warnings
+from eddies.workflows.foreseen.ranks import ground_truth_alone, most_ranks
+from eddies.workflows.foreseen.storage import in_units
 from eddies.workflows.learned.source import read_source
 from eddies.workflows.run_directory.work import FAILURE, SECONDS, Work, find_work, is_done, stage_seconds
 from eddies.workflows.variants import Step, check_unseen, link, steps

@@ -77,6 +77,8 @@ class ETDRK4:
     The operators f(step L) are kept for every step size met, so steps should come from a ladder.
     """
 
+    evaluations = 4
+
     def __init__(self, equation: Equation) -> None:
         self.equation = equation
         self._operators: dict[float, list[Any]] = {}
@@ -110,6 +112,8 @@ class ETDRK4:
 
 class RungeKutta4:
     """The classical explicit fourth-order method, for L and N alike: the reference for error against run time."""
+
+    evaluations = 4
 
     def __init__(self, equation: Equation) -> None:
         self.equation = equation

@@ -1,6 +1,7 @@
-"""What an evaluation of a particle model costs, over particles, ranks and threads: measured, bounded, foreseen.
+"""What an evaluation of a particle model costs, over particles, ranks and threads: measured and bounded.
 
     OMP_NUM_THREADS=1 .venv/bin/python tests/benchmarks/performance.py measure docs/performance.json  # 10 min
+    .venv/bin/python tests/benchmarks/projection.py particles docs/performance.json  # what follows for more cores
     .venv/bin/python tests/benchmarks/performance.py draw docs/performance.json docs/performance.png
 
 Measures by the programs beside it, each a job of its own: `particle_step.py` on one rank, on one rank of two threads
@@ -14,7 +15,6 @@ import math
 import os
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,21 +26,18 @@ from eddies.parallel.slab import SlabDecomposition
 from eddies.report.figures import MODEL, SECOND, THIRD, TRUTH, letter, panels, png, styled
 from eddies.scene.scene import Scene, load_scene
 from eddies.spectral.spectral_grid import SpectralGrid
-from eddies.workflows.foreseen.cost_model import RANK_BANDWIDTH
-from eddies.workflows.foreseen.estimates import most_ranks
-from eddies.workflows.foreseen.particle_cost import components, particle_cost, particle_costs
-from eddies.workflows.foreseen.particle_probe import probe_particles
-from eddies.workflows.foreseen.particle_work import particle_work
+from eddies.workflows.foreseen.numbers import resolved_shells
 from eddies.workflows.variant_rows import processor
 
 HERE = Path(__file__).parent
 LAYOUTS, MODELS, SIDES = ((1, 1), (1, 2), (2, 1)), ("resolved", "resolved + pairs"), (16, 24, 32, 48, 64, 96)
 ALL_LAYOUTS = 64             # particles a side; on two ranks alone beyond
-FORESEEN = (64, 128, 256, 512)
 CELLS_A_PARTICLE = 1.5
 # Of the network 16-16, once a pair: multiplications with additions, and tanh as eleven of them.
 PAIR_FLOPS = 2 * (3 * 16 + 16 * 16 + 16 * 2 + 32 * 11)
 SPLINE_FLOPS = 2 * 4**3      # of a component at a particle
+# Components of transforms and splines in an evaluation, beside six in each iteration.
+TRANSFORMED, INTERPOLATED = 31, 13
 # 64^3 particles: notebooks published with the method, force and neighbours, on two cores; the paper, on one A100.
 NOTEBOOKS, PAPER = 46.0, 0.5
 
@@ -55,7 +52,7 @@ def measure() -> dict:
                                              "--threads", threads))
         found["grid"].append(of_job(2, 1, "step.py", round(CELLS_A_PARTICLE * side), "--precision", "float32"))
     taken = next(row["iterations"] for row in found["steps"] if (row["particles"], row["model"]) == (64, MODELS[1]))
-    return found | {"bounds": bounds(taken), "foreseen": foreseen(), "held": held(found["steps"])}
+    return found | {"bounds": bounds(taken)}
 
 
 def of_job(ranks: int, threads: int, program: str, *arguments: object) -> dict:
@@ -81,39 +78,12 @@ def bounds(iterations: float) -> dict[str, float]:
     a, b = np.ones((2, 1024, 1024), np.float32)
     flops = 2 * 1024**3 / best(lambda: a @ b)
     scene = scene_of(64, MODELS[1])
-    work, speed = replace(particle_work(scene), iterations=iterations), probe_particles(scene, MPI.COMM_SELF)
-    grid = SpectralGrid(SlabDecomposition(MPI.COMM_SELF, 2 * math.pi, work.cells), "float32", work.wavenumber)
+    particles, slab = scene.tracers.particles, SlabDecomposition(MPI.COMM_SELF, 2 * math.pi, scene.tracers.planes)
+    grid = SpectralGrid(slab, "float32", resolved_shells(scene))
     return {"flops": flops,
-            "pairs": work.pairs(1) * PAIR_FLOPS / flops,
-            "transforms": sum(transform_bounds(grid, 1, 1, 1).values()) * components(work, speed, "transforms") / 2,
-            "splines": components(work, speed, "splines") * work.particles * SPLINE_FLOPS / flops}
-
-
-def foreseen() -> list[dict]:
-    """Seconds on 1 to 4096 cores, by the model that `eddies check` has."""
-    rows = []
-    for side in FORESEEN:
-        scene = scene_of(side, MODELS[1])
-        speed, most = probe_particles(scene, MPI.COMM_SELF), min(most_ranks(scene).values())
-        rows += [{"particles": side, "cores": row.cores, "ranks": row.ranks, "threads": row.threads,
-                  "seconds": row.seconds, "memory": row.memory, "binds": row.binds}
-                 for row in particle_costs(particle_work(scene), speed, most, RANK_BANDWIDTH)]
-    return rows
-
-
-def held(steps: list[dict]) -> list[dict]:
-    """What the same model has for the evaluations that were measured, of as many iterations, over what they took."""
-    rows = []
-    for side, model in dict.fromkeys((row["particles"], row["model"]) for row in steps):
-        scene = scene_of(side, model)
-        work, speed = particle_work(scene), probe_particles(scene, MPI.COMM_SELF)
-        for row in steps:
-            if (row["particles"], row["model"]) == (side, model):
-                cost = particle_cost(replace(work, iterations=row["iterations"]), speed, row["ranks"], row["threads"],
-                                     RANK_BANDWIDTH)
-                rows.append({name: row[name] for name in ("particles", "model", "ranks", "threads")}
-                            | {"foreseen_over_measured": cost.seconds / row["seconds_per_evaluation"]})
-    return rows
+            "pairs": particles * scene.neighbors / 2 * PAIR_FLOPS / flops,
+            "transforms": sum(transform_bounds(grid, 1, 1, 1).values()) * (6 * iterations + TRANSFORMED) / 2,
+            "splines": (6 * iterations + INTERPOLATED) * particles * SPLINE_FLOPS / flops}
 
 
 @styled
@@ -174,9 +144,10 @@ def parts(axis: Axes, found: dict) -> None:
 
 
 def over_cores(axis: Axes, found: dict) -> None:
-    """What is foreseen for more cores, and what was measured on one and two."""
-    for side, colour in zip(FORESEEN, (TRUTH, MODEL, SECOND, THIRD)):
-        rows = [row for row in found["foreseen"] if row["particles"] == side]
+    """What is projected for more cores, and what was measured on one and two."""
+    sides = dict.fromkeys(row["particles"] for row in found["projected"])
+    for side, colour in zip(sides, (TRUTH, MODEL, SECOND, THIRD)):
+        rows = [row for row in found["projected"] if row["particles"] == side]
         axis.loglog([row["cores"] for row in rows], [row["seconds"] for row in rows], "--", color=colour,
                     label=f"{side}³")
         threaded = [row for row in rows if row["threads"] > 1]
@@ -184,7 +155,7 @@ def over_cores(axis: Axes, found: dict) -> None:
     for ranks, threads in LAYOUTS:
         side, seconds = seconds_of(found, MODELS[1], ranks, threads)
         axis.loglog(ranks * threads, seconds[side == 64], "s" if threads > 1 else "o", color=TRUTH)
-    axis.set(title="foreseen, with pairs", xlabel="cores", ylabel="seconds an evaluation")
+    axis.set(title="projected, with pairs", xlabel="cores", ylabel="seconds an evaluation")
     axis.legend(title="particles", loc="upper right")
 
 

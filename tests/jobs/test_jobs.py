@@ -108,14 +108,14 @@ def test_large_job_fits_the_scene():
     # Ranks that all work on planes of their own, ghost planes included, in the memory of a node; those of the stages
     # that follow, of which the comment speaks, are no more than they can use.
     from eddies.scene.scene import load_scene
-    from eddies.workflows.foreseen.cost_model import flow_bytes
-    from eddies.workflows.foreseen.estimates import ground_truth_alone, most_ranks
+    from eddies.workflows.foreseen.ranks import ground_truth_alone, most_ranks
+    from eddies.workflows.foreseen.storage import flow_memory
     scene, asked = load_scene("hit-paper"), asked_of_slurm("hit-paper.slurm.sh")
     on_node = int(asked["ntasks-per-node"])
     ranks = int(asked["nodes"]) * on_node
     assert scene.flow.cells % ranks == 0
     assert ranks <= min(most_ranks(ground_truth_alone(scene)).values())
-    assert 1.1 * on_node * flow_bytes(scene, ranks) < 1e9 * int(asked["mem"].removesuffix("G"))
+    assert 1.1 * on_node * flow_memory(scene, ranks) < 1e9 * int(asked["mem"].removesuffix("G"))
     text = (CHECKOUT / "jobs/hit-paper.slurm.sh").read_text()
     most = min(most_ranks(scene).values())
     assert f"at most {most} ranks" in text

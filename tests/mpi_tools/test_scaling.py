@@ -4,7 +4,6 @@ import re
 
 import pytest
 
-from eddies.scene.scene import load_scene
 from mpi_tools import scaling
 
 
@@ -21,20 +20,6 @@ def test_row_is_against_the_first_number_of_ranks():
     assert row == ["64", "float64", "8", "0.2000", "2.00", "50%", "50%", "30%", "10%", "200", "MB"]
 
 
-def test_other_grid_resolves_the_same_flow():
-    from eddies.workflows.foreseen.estimates import expected_turbulence, largest_wavenumber
-
-    def resolution(overrides):
-        scene = load_scene("hit-small", overrides)
-        return largest_wavenumber(scene) * expected_turbulence(scene).kolmogorov_length
-
-    words = scaling.other_grid("hit-small", 1024)
-    assert words[::2] == ["--set"] * 3
-    # k_max is an integer below a third of the cells: the two differ by its rounding.
-    assert resolution(words[1::2]) == pytest.approx(resolution([]), rel=0.02)
-    assert load_scene("hit-small", words[1::2]).time.max_step == pytest.approx(0.02 / 16)
-
-
 @pytest.mark.parametrize("wrong", [["--ranks", "0"], ["--cells", "many"], ["--precision", "float16"]])
 def test_wrong_options_are_refused(wrong, capsys):
     with pytest.raises(SystemExit) as ended:
@@ -44,14 +29,10 @@ def test_wrong_options_are_refused(wrong, capsys):
 
 
 def test_small_grids_on_one_and_two_ranks(capsys):
-    scaling.main(["--cells", "12", "--precision", "float32", "--steps", "1", "--scene", "taylor-green",
-                  "--larger", "16"])
+    scaling.main(["--cells", "12", "--precision", "float32", "--steps", "1"])
     printed = capsys.readouterr().out
     rows = re.findall(r"^ +12 +float32 +(\d) +([\d.]+) +([\d.]+) +(\d+)%(.*)%", printed, re.MULTILINE)
     assert [row[0] for row in rows] == ["1", "2"]
     for ranks, seconds, speed_up, _, shares in rows:
         assert float(seconds) > 0 and float(speed_up) > 0
         assert len(shares.split("%")) == 3 and float(shares.split("%")[0]) > 0
-    # 16 planes: a table up to as many ranks
-    assert [line.split()[0] for line in printed.split("16^3, taylor-green")[1].splitlines()[-5:]] == [
-        "1", "2", "4", "8", "16"]

@@ -252,7 +252,7 @@ def test_seconds_of_a_step_are_a_median_with_quartiles():
     (["simulation.method=eulerian"], "ghost planes of the coarse grid"),
 ])
 def test_ranks_are_limited_by_what_the_method_needs_alone(overrides, limit):
-    from eddies.workflows.foreseen.estimates import most_ranks
+    from eddies.workflows.foreseen.ranks import most_ranks
     alone = ("particles' reach", "filtered fields", "resolved velocity", "coarse grid")
     found = [reason for reason in most_ranks(load_scene("tiny", overrides)) if any(part in reason for part in alone)]
     assert len(found) == (limit is not None) and all(reason.startswith(limit) for reason in found)

@@ -77,19 +77,18 @@ def check_words(path, dataset):
 
 
 def test_what_check_foresees_is_what_was_run(run_directory):
-    from eddies.workflows.foreseen.numbers import mach
-    from eddies.workflows.foreseen.rollout_course import rollout_course
-    from eddies.workflows.foreseen.stored import kernel_bytes, model_bytes, rollout_bytes, trajectory_bytes
+    from eddies.workflows.foreseen.numbers import mach, rollout_of
+    from eddies.workflows.foreseen.storage import disk, rollout_bytes, trajectory_bytes
     scene = load_scene("tiny")
     with h5py.File(run_directory / "rollout.h5") as file:
         rollout = dict(file["rollout"].attrs)
     with h5py.File(run_directory / "ground_truth.h5") as file:
         frames, measured = len(file["particles/tracers/time"]), file["reference"].attrs["mach_turbulent"]
-    course = rollout_course(scene, rollout["eddy_turnover_time"])
+    course = rollout_of(scene, rollout["eddy_turnover_time"])
     assert (course.steps, course.evaluations) == (rollout["steps"], rollout["evaluations"]) == (9, 28)
     assert mach(scene) == pytest.approx(measured, rel=0.5)
     sizes = {"ground_truth": trajectory_bytes(scene, frames), "rollout": rollout_bytes(scene, course),
-             "kernel": kernel_bytes(scene), "model": model_bytes(scene)}
+             "kernel": disk(scene, "train-kernel"), "model": disk(scene, "train")}
     for name, size in sizes.items():
         assert (run_directory / f"{name}.h5").stat().st_size == pytest.approx(size, rel=0.2), name
 

@@ -17,6 +17,9 @@ from eddies.flow.statistics import (
 )
 
 
+EVERY = 4  # steps between two samples
+
+
 class FlowHistory:
     """An observer that measures a flow every few steps: for each sample a row in `rows` and E(k) in `spectra`.
 
@@ -25,7 +28,7 @@ class FlowHistory:
     the dissipated energy (over E(0) where nothing is dissipated).
     """
 
-    def __init__(self, fluid: Fluid, every: int = 4) -> None:
+    def __init__(self, fluid: Fluid, every: int = EVERY) -> None:
         self.fluid, self.every = fluid, every
         self.rows: list[dict[str, float]] = []
         self.spectra: list[np.ndarray] = []

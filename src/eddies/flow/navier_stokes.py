@@ -51,7 +51,7 @@ class IncompressibleFluid:
     (3, kz, ky, kx). Nine transforms an evaluation, of which eight are sent.
     """
 
-    compressible = False
+    compressible, transforms = False, 9
 
     def __init__(self, grid: SpectralGrid, viscosity: float, sound_speed: float = math.inf,
                  forcing: LinearForcing | None = None, closure: Closure | None = None) -> None:
@@ -100,7 +100,7 @@ class CompressibleFluid:
     x and y are taken after the transform along z.
     """
 
-    compressible = True
+    compressible, transforms = True, 19
 
     def __init__(self, grid: SpectralGrid, viscosity: float, sound_speed: float,
                  forcing: LinearForcing | None = None, closure: Closure | None = None) -> None:

@@ -16,7 +16,7 @@ from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.flow_units import ScaleError
 from eddies.pipeline import STAGES
 from eddies.scene.scene import BOX_LENGTH, Scene, SceneError
-from eddies.workflows.foreseen.estimates import expected_step, expected_turbulence, run_time
+from eddies.workflows.foreseen.numbers import expected_step, expected_turbulence, run_time
 from eddies.workflows.ground_truth.frame_counts import check_frames
 
 # Of the direct simulation, of the rollout, and frames of the tracers: at a microsecond each a quarter of an hour, and

@@ -15,7 +15,7 @@ from eddies.io.run_lock import find_lock
 from eddies.parallel.communicator import Comm
 from eddies.pipeline import STAGES, Stage
 from eddies.scene.scene import Scene, SceneError, load_scene
-from eddies.workflows.foreseen.stage_cost import in_units
+from eddies.workflows.foreseen.storage import in_units
 from eddies.workflows.run_directory.work import changed_settings, is_done, of_other_settings, stage_seconds
 from eddies.workflows.variants import steps
 

@@ -25,12 +25,12 @@ from eddies.particles.smoothing_kernels import CubicSpline, KernelNetwork, Smoot
 from eddies.pipeline import STAGES
 from eddies.scene.scene import BOX_LENGTH, Scene
 from eddies.spectral.spectral_grid import SpectralGrid
+from eddies.workflows.ground_truth.frame_counts import KERNEL_FIELDS
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.learned.steps import take_all_steps
 
 log = logging.getLogger("eddies")
 
-TRAINING_SAMPLES = 4
 FINAL_RATE_FRACTION = 0.05
 # Of those that a step has.
 LOSSES = "loss", "velocity", "gradient", "normalization"
@@ -49,7 +49,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     with open_product(comm, directory / "ground_truth.h5", "ground_truth") as file:
         truth = GroundTruth(file, slab)
         seen = np.flatnonzero(truth.fields.times <= scene.window * truth.times[-1])
-        chosen = np.unique(np.linspace(0, len(seen) - 1, TRAINING_SAMPLES).astype(int))
+        chosen = np.unique(np.linspace(0, len(seen) - 1, KERNEL_FIELDS).astype(int))
         samples = [load_sample(truth, index, support) for index in chosen]
         unseen = load_sample(truth, len(truth.fields.times) - 1, support)
     guard = Guard(comm, directory / STAGES["train-kernel"].checkpoints, scene.fingerprint("train-kernel"), stop,

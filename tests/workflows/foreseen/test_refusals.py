@@ -1,7 +1,5 @@
 """What a stage would refuse later is told before, in the words of the stage."""
 
-import os
-
 import numpy as np
 import pytest
 
@@ -9,15 +7,13 @@ from eddies.errors import UserError
 from eddies.flow.forcing import ForcingError
 from eddies.parallel.slab import SlabDecomposition
 from eddies.scene.scene import load_scene
-from eddies.workflows.foreseen.refusals import refusals
-from eddies.workflows.foreseen.stage_cost import StageCost
-from eddies.workflows.foreseen.stage_costs import totals
+from eddies.workflows.foreseen.problems import refusals
 
 FORCED = ["forcing.injection_rate=0.5"]
 
 
-def told(comm, name, *overrides, costs=()):
-    return refusals(load_scene(name, list(overrides)), comm, costs)
+def told(comm, name, *overrides):
+    return refusals(load_scene(name, list(overrides)), comm)
 
 
 @pytest.mark.mpi(1, 2)
@@ -32,7 +28,7 @@ def test_a_start_that_forcing_cannot_amplify_is_told_where_it_is_refused(comm):
             refused = False
         except ForcingError:
             refused = True
-        lines = refusals(scene, comm, [])
+        lines = refusals(scene, comm)
         assert bool(lines) == refused and all("which linear forcing could amplify" in line for line in lines)
 
 
@@ -51,7 +47,7 @@ def test_files_that_do_not_fit_are_told_in_the_words_of_the_stage(comm, tmp_path
         FieldWriter(file, "unfiltered", 12, {"velocity": 3}).append(0.0, slab.start, at_rest)
     assert told(comm, "taylor-green", *changes) == []
     scene = load_scene("taylor-green", [*changes, "initial.state=1"])
-    line, = refusals(scene, comm, [])
+    line, = refusals(scene, comm)
     with pytest.raises(UserError) as error:
         initial_state(scene, build_fluid(scene, comm))
     assert line == str(error.value) and "holds 1 states of the whole flow" in line
@@ -68,19 +64,10 @@ def test_weights_that_are_no_model_are_told(comm, tmp_path):
     assert f"{path}/model.h5" in line
 
 
-@pytest.mark.mpi(1)
+@pytest.mark.mpi(1, 2)
 def test_a_machine_that_is_too_small_is_told(comm):
-    there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    fits = StageCost("dns", {}, 0.1 * there, 1e3)
-    assert told(comm, "tiny", costs=[fits]) == []
-    large, = told(comm, "tiny", costs=[fits, StageCost("train", {}, 1.1 * there, 1e3)])
-    assert large.startswith("train: 1 ranks with about")
-    full, = told(comm, "tiny", costs=[StageCost("dns", {}, 0.0, 1e3, 1e18)])
-    assert full.startswith("the stages need about 1e+09 GB of disk")
-
-
-def test_totals_are_sums_and_the_worst_moments():
-    flow = StageCost("dns", {"steps": 3.0, "files": 1.0}, 5.0, 10.0, 20.0)
-    costs = [flow, StageCost("train", {"steps": 2.0}, 7.0, 4.0)]
-    assert totals(costs) == {"seconds": 6.0, "memory": 7.0, "disk": 14.0, "most_disk": 30.0}
-    assert totals([]) == {"seconds": 0, "memory": 0, "disk": 0, "most_disk": 0}
+    large = [line for line in told(comm, "taylor-green", "flow.cells=8192") if "of memory here" in line]
+    assert len(large) == 1 and large[0].startswith(f"dns: {comm.size} ranks with about")
+    full, = told(comm, "tiny", "tracers.frame_interval=1e-9", "simulation.frame_interval=0.1")
+    assert full.startswith("the stages need about") and "GB of disk" in full
+    assert told(comm, "tiny") == []

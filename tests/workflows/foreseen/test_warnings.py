@@ -1,6 +1,7 @@
 """Warnings: each where it is due, with its key, its value and the remedy, after which it is gone; none of built-in
 scenes."""
 
+import logging
 import re
 from dataclasses import replace
 
@@ -8,9 +9,8 @@ import numpy as np
 import pytest
 
 from eddies.scene.scene import builtin_scenes, load_scene
-from eddies.workflows.foreseen.estimates import expected_turbulence, rms_speed
-from eddies.workflows.foreseen.numbers import mach
-from eddies.workflows.foreseen.warnings import stage_warnings, warnings
+from eddies.workflows.foreseen.numbers import expected_turbulence, mach, rms_speed
+from eddies.workflows.foreseen.problems import stage_warnings, warnings
 
 
 def told(*overrides, scene="tiny"):
@@ -139,3 +139,52 @@ class Spring(eddies.Term):
     longest = float(line.rpartition(" ")[2])
     assert line == f'[simulation] step = 0.1: the term "Spring" wants at most {longest:g}' and longest < 0.1
     assert told(terms, f"simulation.step={longest}", scene=own) == []
+
+
+def test_steps_that_sound_outruns_are_told():
+    """Of terms of SPH."""
+    found = {changes: [line for line in told(*changes) if "resolve sound" in line]
+             for changes in (("model.preset=wcsph",), ("model.preset=wcsph", "simulation.step=0.001"), ())}
+    (line,) = found.pop(("model.preset=wcsph",))
+    assert line.startswith('[simulation] step = 0.08: the term "wcsph" has to resolve sound, with a step of at most')
+    scene = load_scene("tiny", ["model.preset=wcsph"])
+    # Of Monaghan (1992), with an alpha of 0.05.
+    longest = 0.4 * scene.interaction_radius / 2 / (scene.flow.sound_speed * 1.03)
+    assert float(line.partition("at most ")[2].split()[0]) == pytest.approx(longest, rel=0.1)
+    assert list(found.values()) == [[], []]
+
+
+def test_terms_that_nothing_trains_are_told():
+    fast = ["training.horizons.steps=5", "training.horizons.frames=[12]"]
+    for preset in ("resolved + pairs", "resolved", "transport-velocity"):
+        lines = [line for line in told(f"model.preset={preset}") if "horizons" in line]
+        assert lines == ([] if "resolved" in preset else [
+            '[model] terms: "transport-velocity" is trained through horizons alone, and stays as it starts without '
+            "them: add [training.horizons]"])
+        assert not any("horizons" in line for line in told(f"model.preset={preset}", *fast))
+
+
+def test_weights_that_are_not_there_yet_are_told(tmp_path):
+    (line,) = told(f"model.path={tmp_path}")
+    assert f"there is no {tmp_path / 'model.h5'} yet" in line
+    (tmp_path / "model.h5").touch()
+    assert told(f"model.path={tmp_path}") == []
+
+
+def test_job_with_too_many_ranks_is_told():
+    assert any("this job has 100 ranks" in line for line in warnings(load_scene("tiny"), 100))
+    assert list(warnings(load_scene("hit-small"), 2)) == []
+
+
+@pytest.mark.mpi(1)
+def test_a_run_tells_the_warnings_of_its_stages_when_it_starts(comm, tmp_path, monkeypatch, caplog):
+    from eddies.parallel.stop import StopRequest
+    from eddies.stages import run_stages
+    from eddies.workflows import dns
+    monkeypatch.setattr(logging.getLogger("eddies"), "propagate", True)
+    monkeypatch.setattr(dns, "run", lambda *given: None)
+    scene = load_scene("tiny", ["flow.sound_speed=4", "model.preset=paper"])
+    with caplog.at_level(logging.WARNING, logger="eddies"):
+        run_stages(["dns"], scene, comm, tmp_path, StopRequest(comm))
+    shown = [record.getMessage() for record in caplog.records]
+    assert shown == list(stage_warnings(scene, ["dns"])) and len(shown) == 1

@@ -20,8 +20,8 @@ from eddies.particles.model import FORCING
 from eddies.scene.scene import SceneError, load_scene
 from eddies.stages import check_inputs, check_ranks
 from eddies.workflows import dns, train
-from eddies.workflows.foreseen.estimates import most_ranks
-from eddies.workflows.foreseen.warnings import warnings
+from eddies.workflows.foreseen.problems import warnings
+from eddies.workflows.foreseen.ranks import most_ranks
 from eddies.workflows.ground_truth.truth import load_frame
 from eddies.workflows.learned import transfer
 from eddies.workflows.learned.training_data import model_of

@@ -12,6 +12,8 @@ from eddies.scene.scene import Scene, SceneError, Training
 
 # The share of the training window, at its end, that is held out for validation; no less than the longest horizon.
 HELD_OUT = 0.1
+# Filtered fields that the kernel is trained on; frames of the a-priori test, and particles of which it keeps the rates.
+KERNEL_FIELDS, TESTED_FRAMES, TESTED_PARTICLES = 4, 9, 20_000
 
 
 def check_frames(stages: Sequence[str], scene: Scene, seen: float, frames: int) -> None:

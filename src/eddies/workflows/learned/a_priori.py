@@ -17,10 +17,8 @@ from eddies.particles.model import FORCING, LagrangianModel
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.spectral.interpolation import SplineInterpolation
 from eddies.spectral.spectral_grid import SpectralGrid
-from eddies.workflows.ground_truth.frame_counts import between_frames
+from eddies.workflows.ground_truth.frame_counts import TESTED_FRAMES, TESTED_PARTICLES, between_frames
 from eddies.workflows.ground_truth.truth import GroundTruth, load_frame, particles_for
-
-EVALUATIONS, SAMPLE = 9, 20000
 
 
 def evaluation_frames(truth: GroundTruth) -> np.ndarray:
@@ -30,7 +28,7 @@ def evaluation_frames(truth: GroundTruth) -> np.ndarray:
     """
     at_fields = [truth.frame_of_field(index) for index in range(len(truth.fields.times))]
     usable = np.array(between_frames(len(truth.times), at_fields))
-    return usable[np.unique(np.linspace(0, len(usable) - 1, EVALUATIONS).astype(int))]
+    return usable[np.unique(np.linspace(0, len(usable) - 1, TESTED_FRAMES).astype(int))]
 
 
 @torch.no_grad()
@@ -114,7 +112,7 @@ def _sample(truth: GroundTruth, frame: TrainingFrame, exact: torch.Tensor,
             error: torch.Tensor) -> dict[str, np.ndarray]:
     """True and predicted rates of the particles with the lowest ids, on every rank."""
     columns = {"truth": as_numpy(exact), "predicted": as_numpy(exact + error)}
-    ids, sampled = as_numpy(frame.particles.id), min(SAMPLE, truth.total)
+    ids, sampled = as_numpy(frame.particles.id), min(TESTED_PARTICLES, truth.total)
     chosen = ids < sampled
     whole = {name: np.zeros((sampled, *values.shape[1:])) for name, values in columns.items()}
     for name, values in columns.items():

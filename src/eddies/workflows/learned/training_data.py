@@ -19,7 +19,7 @@ from eddies.particles.periodic_box import PeriodicBox
 from eddies.particles.resolved_velocity import ResolvedVelocity
 from eddies.particles.smoothing_kernels import SmoothingKernel
 from eddies.scene.scene import BOX_LENGTH, Scene
-from eddies.workflows.foreseen.estimates import ALLOWED_VELOCITY
+from eddies.workflows.foreseen.ranks import ALLOWED_VELOCITY
 from eddies.workflows.ground_truth.frame_counts import last_trained_on
 from eddies.workflows.ground_truth.truth import GroundTruth, load_frame
 from eddies.workflows.learned.model import scene_model

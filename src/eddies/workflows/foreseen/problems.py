@@ -1,20 +1,34 @@
-"""What is likely to go wrong with a scene, in words: key, value, why, and what to do. `check` tells all of it, a stage
-that starts what concerns it."""
+"""What may go wrong with a scene, a line each: warnings, of key, value, reason and remedy, which a stage logs when it
+starts; and refusals, which end a stage on these ranks of this machine."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+import os
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
 
+from eddies.errors import UserError
 from eddies.flow.stability import REMEDIES, limits_of_step
+from eddies.io.single_writer import LARGEST_BYTES, REMEDY, has_single_writer
+from eddies.parallel.broadcast import on_first_rank
+from eddies.parallel.communicator import Comm, node_ranks
+from eddies.pipeline import STAGES
 from eddies.scene.scene import BOX_LENGTH, Scene
 from eddies.scene.terms import StepUnits
-from eddies.workflows.foreseen.estimates import (courant_bound, expected_turbulence, foreseen_allowed_step,
-                                                 largest_wavenumber, most_ranks, peak_speed, rms_speed)
+from eddies.workflows.foreseen.numbers import (courant_bound, expected_allowed_step, expected_turbulence,
+                                               largest_wavenumber, peak_speed, rms_speed)
+from eddies.workflows.foreseen.ranks import most_ranks
+from eddies.workflows.foreseen.storage import disk, in_units, memory, most_disk
+from eddies.workflows.ground_truth.scene_flow import stored_states
 
 LARGEST_MACH = 0.3           # turbulent Mach number up to which density fluctuations, of about its square, are small
 LEAST_REYNOLDS = 5.0         # Re_lambda from which on there is an inertial transfer from scale to scale
 KMAX_ETA = 1.0, 4.0          # that resolves the dissipation, and more than anybody needs
+
+
+# ---- warnings
 
 
 def stage_warnings(scene: Scene, stages: Iterable[str]) -> Iterator[str]:
@@ -124,7 +138,7 @@ def rollout_steps(scene: Scene) -> Iterator[str]:
     settings = scene.simulation
     if "model" not in settings.needs or not scene.injects:
         return
-    allowed = foreseen_allowed_step(scene)
+    allowed = expected_allowed_step(scene)
     if allowed and settings.step > allowed * (1 + 1e-9):
         yield (f"[simulation] step = {settings.step:g}: the particles will take shorter steps, of about "
                f"{at_most(allowed)}, in which their resolved velocity can follow the flow; lower it to that")
@@ -147,18 +161,81 @@ def term_steps(scene: Scene) -> Iterator[str]:
 
 def at_least(value: float) -> str:
     """Two digits, rounded up."""
-    return f"{math.ceil(value / _second_digit(value) - 1e-9) * _second_digit(value):.2g}"
+    digit = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return f"{math.ceil(value / digit - 1e-9) * digit:.2g}"
 
 
 def at_most(value: float) -> str:
     """Two digits, rounded down."""
-    return f"{math.floor(value / _second_digit(value) + 1e-9) * _second_digit(value):.2g}"
-
-
-def _second_digit(value: float) -> float:
-    return 10.0 ** (math.floor(math.log10(value)) - 1)
+    digit = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return f"{math.floor(value / digit + 1e-9) * digit:.2g}"
 
 
 SUBJECTS: dict[str, tuple[Callable[[Scene], Iterator[str]], ...]] = {
     "dns": (resolution, compressibility, turbulence_at_all, stability, filter_width),
     "train": (learning,), "simulate": (rollout_steps, term_steps)}
+
+
+# ---- refusals
+
+
+def refusals(scene: Scene, comm: Comm) -> list[str]:
+    """What ends a stage of the scene on these ranks; all ranks call it and get the same."""
+    return [*files(scene, comm), *forced_modes(scene), *single_writer(scene.stages, scene, comm),
+            *small_machine(scene, comm)]
+
+
+def files(scene: Scene, comm: Comm) -> Iterator[str]:
+    """A file to start from, trained weights that are there, and ground truths to train on, that do not fit."""
+    model, training = scene.model, scene.training
+    try:
+        if scene.initial.flow.from_file:
+            with stored_states(scene.initial, comm):
+                pass
+    except UserError as error:
+        yield str(error)
+    try:
+        if model is not None and model.path is not None and on_first_rank(comm, model.weights_file.is_file):
+            from eddies.workflows.learned.source import read_source  # torch, where there is a model
+            read_source(scene, comm)
+    except UserError as error:
+        yield str(error)
+    if training is not None and training.truths is not None:
+        from eddies.workflows.learned.truths import truth_problems  # torch, where there is a model
+        yield from truth_problems(scene, comm, scene.directory)
+
+
+def forced_modes(scene: Scene) -> Iterator[str]:
+    """A start without energy at the modes that linear forcing amplifies."""
+    initial, forcing = scene.initial, scene.forcing
+    if forcing is None or forcing.injection_rate == 0:
+        return
+    wave = initial.flow.wave and initial.flow.wave * initial.wavenumber
+    if initial.flow.sound or wave and wave >= forcing.wavenumber:
+        yield (f'[forcing] wavenumber = {forcing.wavenumber:g}: [initial] kind = "{initial.kind}" has no energy at '
+               "0 < |k| < wavenumber, which linear forcing could amplify; start from another flow, raise wavenumber, "
+               "or remove [forcing]")
+
+
+def single_writer(stages: Sequence[str], scene: Scene, comm: Comm) -> Iterator[str]:
+    """Products that are too large for rank 0 to write for all."""
+    for stage in stages if has_single_writer(comm) else ():
+        size = disk(scene, stage) or 0.0
+        if size > LARGEST_BYTES and STAGES[stage].product is not None:
+            yield (f"{STAGES[stage].file}: this h5py is built without MPI, so that rank 0 writes for {comm.size} "
+                   f"ranks, up to {in_units(LARGEST_BYTES)} a file, and this will take {in_units(size)}; {REMEDY}")
+
+
+def small_machine(scene: Scene, comm: Comm) -> Iterator[str]:
+    """More memory than the ranks of this node have together, or more disk than is free where run directories are,
+    unless --output says otherwise."""
+    ranks, there = node_ranks(comm), os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    for stage in scene.stages:
+        if ranks * (size := memory(scene, stage, comm.size)) > there:
+            yield (f"{stage}: {ranks} ranks with about {in_units(size)} each need more than the {in_units(there)} of "
+                   "memory here; take more nodes, or fewer cells or particles")
+    place = Path("runs") if Path("runs").is_dir() else Path()
+    needed, free = most_disk(scene), on_first_rank(comm, lambda: shutil.disk_usage(place).free)
+    if needed > free:
+        yield (f"the stages need about {in_units(needed)} of disk, and {in_units(free)} are free here; choose another "
+               "--output, or raise [tracers] frame_interval or field_every")

@@ -1,0 +1,64 @@
+"""The wall time of a stage, for batch requests: right within a factor of three; `eddies check --time` measures instead.
+
+    seconds = START + (transforms x TRANSFORM + pairs x PAIR) / ranks + calls x (CALL + ROUNDS x (ranks - 1) x MESSAGE)
+"""
+
+from eddies.flow.navier_stokes import FLUIDS, CompressibleFluid
+from eddies.scene.scene import BOX_LENGTH, Eulerian, Scene
+from eddies.time_stepping import ETDRK4, STEPPERS
+from eddies.workflows.foreseen.numbers import flow_steps, rollout_of
+from eddies.workflows.foreseen.storage import training_steps
+from eddies.workflows.ground_truth.frame_counts import KERNEL_FIELDS, TESTED_FRAMES
+
+# Seconds, measured on one and two cores of an AMD EPYC with AVX-512, with `tiny`, `hit-small` and `hit-coarse`: of a
+# transform of a grid point (1 + cells / CACHED times that where planes outgrow the caches), a pair of particles in a
+# sum, an evaluation or iteration without its work, a message; of an idle stage.
+TRANSFORM, CACHED, PAIR, CALL, MESSAGE, ROUNDS = 4e-9, 550, 2.5e-8, 2.5e-4, 2e-6, 4
+START = {"dns": 0.4, "train-kernel": 0.7, "train": 1.0, "simulate": 0.3, "report": 2.3}
+COLD, ITERATION = 25, 12     # iterations of a solve from nothing; transforms of a point in one, with its splines
+GRADIENT = 4                 # an evaluation with its gradient, and a step of the optimiser, over an evaluation
+
+
+def seconds(scene: Scene, stage: str, ranks: int) -> float | None:
+    """Wall time of a stage on so many ranks; None where the number of its steps is not known."""
+    tracers, kernel, model, rollout = scene.tracers, scene.kernel, scene.model, rollout_of(scene)
+    transforms = pairs = calls = solves = 0.0
+    neighbors = scene.neighbors if model and "pairs" in model.reads else 0.0
+    if stage == "dns":
+        if (steps := flow_steps(scene)) is None:
+            return None
+        calls = steps * STEPPERS[scene.time.stepper].evaluations
+        cells, fluid = scene.flow.cells, FLUIDS.get(scene.flow.fluid, CompressibleFluid)
+        transforms = calls * fluid.transforms * cells**3 * (1 + cells / CACHED)
+    elif stage == "train-kernel":  # twice
+        calls = 2 * kernel.steps * GRADIENT
+        pairs = kernel.neighbors * (kernel.steps * tracers.particles + 2 * KERNEL_FIELDS * tracers.cells**3)
+    elif stage == "train":
+        training, solves = scene.training if model.path is None else None, TESTED_FRAMES
+        if training:
+            solves, pairs = solves + training.frames + 1, GRADIENT * training.steps * training.batch * neighbors
+            if training.field_weight > 0:  # of the particles in and around a cube of a quarter of the box
+                width = min(1 / 4 + 2 * scene.kernel_support / BOX_LENGTH, 1)
+                pairs += GRADIENT * training.combined_steps * tracers.particles * width**3 * kernel.neighbors
+            if horizons := training.horizons:
+                substeps = round(tracers.frame_interval / (horizons.time_step or tracers.frame_interval))
+                evaluations = horizons.steps * sum(horizons.frames) * substeps * horizons.scheme.evaluations
+                solves += 2 * evaluations
+                pairs += GRADIENT * evaluations * tracers.particles * neighbors / 2
+        calls = GRADIENT * training_steps(scene)
+    elif stage == "simulate":
+        if rollout is None:
+            return None
+        calls, pairs = rollout.evaluations, rollout.evaluations * tracers.particles * neighbors / 2
+        if scene.simulation.on_grid:
+            eulerian, calls = scene.eulerian or Eulerian(), rollout.steps * ETDRK4.evaluations
+            transforms = calls * CompressibleFluid.transforms * eulerian.cells_for(tracers.filter_width) ** 3
+        elif "model" in scene.simulation.needs:
+            solves = rollout.evaluations * scene.simulation.scheme.iterations / COLD
+    elif rollout and kernel:       # a report averages model and truth at particles and grid points
+        pairs = 2 * (rollout.intervals + 1) * (tracers.particles + tracers.cells**3) * kernel.neighbors
+    if solves and scene.resolves:
+        calls += solves * COLD
+        transforms += solves * COLD * ITERATION * tracers.planes**3
+    work = (transforms * TRANSFORM + pairs * PAIR) / ranks
+    return START[stage] + work + calls * (CALL + ROUNDS * (ranks - 1) * MESSAGE)

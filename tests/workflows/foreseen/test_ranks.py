@@ -1,0 +1,94 @@
+"""The ranks that a scene can use are those that its parts accept."""
+
+import pytest
+
+from eddies.scene.scene import load_scene
+from eddies.workflows.foreseen.numbers import expected_turbulence
+from eddies.workflows.foreseen.ranks import (ALLOWED_VELOCITY, PEAK_VELOCITY, most_ranks, most_training_ranks,
+                                             particle_reach)
+
+
+@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.parametrize("neighbors, most", [(100, 3), (200, 2)])
+def test_most_ranks_is_what_the_parts_accept(comm, neighbors, most):
+    from eddies.parallel.halo import HaloError, require_thick_slabs
+    from eddies.parallel.slab import SlabDecomposition
+    from eddies.scene.scene import BOX_LENGTH
+    from eddies.spectral.interpolation import SplineInterpolation
+    from eddies.spectral.spectral_grid import SpectralGrid
+    scene = load_scene("tiny", [f"kernel.neighbors={neighbors}"])
+    fields, particles = (SlabDecomposition(comm, BOX_LENGTH, planes)
+                         for planes in (scene.tracers.cells, scene.tracers.planes))
+    assert min(most_ranks(scene).values()) == most
+    SplineInterpolation(SpectralGrid(fields), "quintic")
+    SplineInterpolation(SpectralGrid(particles), "cubic")
+    if comm.size <= most:
+        require_thick_slabs(fields, scene.kernel_support)
+        require_thick_slabs(particles, particle_reach(scene))
+    else:
+        with pytest.raises(HaloError):
+            require_thick_slabs(fields, scene.kernel_support)
+            require_thick_slabs(particles, particle_reach(scene))
+
+
+@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.parametrize("frames, thick, planes", [(2, 3, 6), (4, 2, 5), (8, 2, 3), (12, 1, 2)])
+def test_ranks_for_horizons_are_those_that_the_grid_and_the_particles_accept(comm, frames, thick, planes):
+    """With particles as fast as in stationary turbulence: what training builds, and a particle at its farthest."""
+    import torch
+
+    from eddies.parallel.halo import HaloError
+    from eddies.parallel.slab import SlabDecomposition
+    from eddies.particles.neighborhood import Neighborhood
+    from eddies.particles.particle_set import ParticleSet
+    from eddies.particles.resolved_velocity import ResolvedVelocity
+    from eddies.scene.scene import BOX_LENGTH
+    from tests.particles.configurations import FLOW
+
+    def accepted(build):
+        try:
+            build()
+        except HaloError:
+            return False
+        return True
+
+    scene = load_scene("tiny", ["training.horizons.steps=5", f"training.horizons.frames=[1, {frames}]"])
+    limits = most_training_ranks(scene)
+    by_reach, = (ranks for reason, ranks in limits.items() if reason.startswith("slabs no thinner"))
+    by_grid = limits["ghost planes of the grid in the training through horizons"]
+    assert (by_reach, by_grid) == (thick, planes)
+    speed, tracers = expected_turbulence(scene).velocity_rms, scene.tracers
+    slab, support = SlabDecomposition(comm, BOX_LENGTH, tracers.planes), scene.kernel_support
+    time = frames * tracers.frame_interval
+    drift = ALLOWED_VELOCITY * speed * time
+    assert accepted(lambda: ResolvedVelocity.on_slabs(slab, FLOW, drift)) == (comm.size <= by_grid)
+    far = torch.tensor([[1.0, 1.0, slab.upper + PEAK_VELOCITY * speed * time]], dtype=torch.float64)
+    particles = ParticleSet(torch.tensor([comm.rank]), far, torch.zeros_like(far), torch.ones(1))
+    around = Neighborhood(slab, BOX_LENGTH, support, 0.0)
+    assert accepted(lambda: around.update(particles)) == (comm.size <= by_reach)
+
+
+def test_ranks_are_not_limited_by_horizons_that_are_not_trained():
+    for changes in ([], ["training.horizons.steps=5", "model.path=runs/other"]):
+        scene = load_scene("hit-small", changes)
+        assert min(most_ranks(scene).values()) == 12 and not any("horizons" in reason for reason in most_ranks(scene))
+
+
+def test_ghost_planes_limit_the_ranks():
+    fields = {planes: most_ranks(load_scene("tiny", [f"tracers.field_cells={planes}"])) for planes in (11, 12)}
+    assert [limits["ghost planes of the filtered fields"] for limits in fields.values()] == [2, 3]
+    # Of 20 planes: two for the splines, and what half the skin reaches; particles come home at every stage of a step.
+    assert fields[12]["ghost planes of the resolved velocity"] == 20 // 3
+    for overrides, ghosts in ((["simulation.step=0.2"], 3), (["simulation.skin=1"], 4)):
+        assert most_ranks(load_scene("tiny", overrides))["ghost planes of the resolved velocity"] == 20 // ghosts
+    assert "ghost planes of the resolved velocity" not in most_ranks(load_scene("tiny", ["model.preset=paper"]))
+
+
+def test_what_no_term_reads_limits_no_ranks():
+    fast = ["training.horizons.steps=5", "training.horizons.frames=[12]"]
+    limits = {preset: most_ranks(load_scene("tiny", [*fast, f"model.preset={preset}"]))
+              for preset in ("resolved + pairs", "resolved", "transport-velocity")}
+    found = {preset: {word for word in ("reach", "resolved") if any(word in reason for reason in reasons)}
+             for preset, reasons in limits.items()}
+    assert found == {"resolved": {"resolved"}, "transport-velocity": {"reach"},
+                     "resolved + pairs": {"reach", "resolved"}}
