@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Sequence
+from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
@@ -109,8 +110,10 @@ class Course:
     def _store(self, at: float) -> None:
         """Store the frame of a time, and take down the mean kinetic energy <v.v>/2 of its particles."""
         layout = self.segments.layout
-        with self.progress.storing():
+        # The first step begins with the forces of the first frame; what others take is taken for the frame alone.
+        with self.progress.storing() if self.times else nullcontext():
             particles, acceleration = self.method.frame(at)
+        with self.progress.storing():
             columns = {**particles.to_numpy(), "acceleration": as_numpy(acceleration)}
             columns["position"] = wrap(columns["position"], layout.length)
             order = IdOrder(self.comm, columns["id"], layout.total)
