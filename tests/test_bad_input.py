@@ -224,7 +224,7 @@ def test_files_that_may_not_be_read_or_written(open_to_all):
     folder = str(open_to_all)
     cases = [
         (["report", folder], f"{folder}: cannot be written; change its permissions, or choose another directory"),
-        (["export", folder], "ground_truth.h5: cannot be read: Permission denied; change its permissions"),
+        (["export", folder], "ground_truth.h5: cannot be read: Permission denied; check its permissions"),
         (["check", f"{folder}/case.toml"], "case.toml: cannot be read: Permission denied; give the path"),
         (["dns", "abc", "--output", folder], f"{folder}: cannot be written; change its permissions"),
         (["dns", "abc", "--output", f"{folder}/new"], "new: cannot be written (Permission denied); choose another")]
