@@ -13,13 +13,12 @@ pytest_plugins = ["mpi_tools.pytest_mpi"]
 
 
 @pytest.fixture(autouse=True)
-def logger_as_before():
-    """What a test makes of the package's logger does not outlast it: tests of all modules share a process."""
+def fresh_logger():
+    """Each test begins with the package's logger as imported: a command configures it, and module-scoped fixtures run
+    commands before any function-scoped fixture is set up."""
     logger = logging.getLogger("eddies")
-    handlers, propagate, level = list(logger.handlers), logger.propagate, logger.level
-    yield
-    logger.handlers, logger.propagate = handlers, propagate
-    logger.setLevel(level)
+    logger.handlers, logger.propagate = [], True
+    logger.setLevel(logging.NOTSET)
 
 
 @pytest.fixture

@@ -51,7 +51,6 @@ def test_classes_of_the_users_are_told_once(comm, tmp_path, own, caplog, monkeyp
     own("own_start", "from eddies.flow.initial_fields import abc\n"
         "def twice(grid, initial, seed):\n    return abc(grid, 2 * initial.amplitude, 1)\n")
     scene = eddies.load_scene("abc", ["time.duration=0.1", "initial.kind=own_start:twice"])
-    monkeypatch.setattr(logging.getLogger("eddies"), "propagate", True)
     with caplog.at_level(logging.INFO, logger="eddies"):
         eddies.run(scene, output=tmp_path, comm=comm)
     told = [record.getMessage() for record in caplog.records if "own_start" in record.getMessage()]

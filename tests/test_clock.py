@@ -18,9 +18,8 @@ def wall(monkeypatch):
 
 
 @pytest.fixture
-def lines(caplog, monkeypatch):
+def lines(caplog):
     """The lines so far: seconds a step, percent, and what is left."""
-    monkeypatch.setattr(logging.getLogger("eddies"), "propagate", True)
     caplog.set_level(logging.INFO, logger="eddies")
     pattern = re.compile(r"(\S+) s/step(?: \(storing: \d+ % of the time\))?  (\d+) %  (.+) left")
     return lambda: [pattern.search(record.getMessage()).groups() for record in caplog.records]

@@ -55,7 +55,6 @@ def example(comm, smaller, examples):
 def test_ten_lines_set_a_rollout_going(smaller, caplog, monkeypatch):
     page = (CHECKOUT / "docs/python.md").read_text(encoding="utf-8")
     program = re.search(r"^```python\n(import dataclasses\n.*?)^```", page, re.MULTILINE | re.DOTALL)[1]
-    monkeypatch.setattr(logging.getLogger("eddies"), "propagate", True)
     with caplog.at_level(logging.INFO, "eddies"):
         exec(compile(program, "python.md", "exec"), {})
     assert caplog.text.count("rollout: complete") == 2

@@ -17,14 +17,9 @@ def lines_of(scene, comm, caplog):
     return "\n".join(record.getMessage() for record in caplog.records)
 
 
-@pytest.fixture
-def recorded(monkeypatch):
-    monkeypatch.setattr(logging.getLogger("eddies"), "propagate", True)
-
-
 @pytest.mark.mpi(1)
 @pytest.mark.parametrize("name", [name for name, _ in builtin_scenes()])
-def test_check_of_any_scene_writes_nothing(comm, tmp_path, monkeypatch, caplog, recorded, name):
+def test_check_of_any_scene_writes_nothing(comm, tmp_path, monkeypatch, caplog, name):
     monkeypatch.chdir(tmp_path)
     text = lines_of(load_scene(name), comm, caplog)
     for subject in ("grid", "turbulence", "steps", "ranks", "stages"):
@@ -33,7 +28,7 @@ def test_check_of_any_scene_writes_nothing(comm, tmp_path, monkeypatch, caplog, 
 
 
 @pytest.mark.mpi(2, 3)
-def test_check_on_more_ranks(comm, caplog, recorded):
+def test_check_on_more_ranks(comm, caplog):
     text = lines_of(load_scene("hit-small"), comm, caplog)
     assert text == "" if comm.rank > 0 else "at most 12" in text and f"on {comm.size} ranks" in text
 
@@ -77,7 +72,7 @@ def test_every_key_is_described(comm, capfd):
 
 
 @pytest.mark.mpi(1)
-def test_what_is_not_known_is_null(comm, capfd, own, caplog, recorded):
+def test_what_is_not_known_is_null(comm, capfd, own, caplog):
     check.run(load_scene("abc"), comm, as_json=True)
     told = json.loads(capfd.readouterr().out)
     assert told["turbulence"] is told["particles"] is told["kernel_support"] is None
@@ -90,7 +85,7 @@ def test_what_is_not_known_is_null(comm, capfd, own, caplog, recorded):
 
 
 @pytest.mark.mpi(1)
-def test_numbers_of_the_small_case(comm, caplog, recorded):
+def test_numbers_of_the_small_case(comm, caplog):
     text = lines_of(load_scene("hit-small"), comm, caplog)
     for part in ("spacing 0.09817, k_max 21", "32^3 = 32768, mean spacing 0.1963 = 2 cells", "Re_lambda 50.3",
                  "filter width 0.3927", "kernel support 0.4769, 60 neighbours", "at most 12"):
@@ -98,7 +93,7 @@ def test_numbers_of_the_small_case(comm, caplog, recorded):
 
 
 @pytest.mark.mpi(1)
-def test_warnings_and_refusals_are_told(comm, caplog, recorded):
+def test_warnings_and_refusals_are_told(comm, caplog):
     assert "k_max eta is about 0.047, below 1" in lines_of(load_scene("tiny", ["flow.viscosity=0.001"]), comm, caplog)
     text = lines_of(load_scene("taylor-green", ["initial.kind=file", "initial.path=nowhere.h5"]), comm, caplog)
     assert "fails here  nowhere.h5" in text

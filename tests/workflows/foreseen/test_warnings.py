@@ -181,7 +181,6 @@ def test_a_run_tells_the_warnings_of_its_stages_when_it_starts(comm, tmp_path, m
     from eddies.parallel.stop import StopRequest
     from eddies.stages import run_stages
     from eddies.workflows import dns
-    monkeypatch.setattr(logging.getLogger("eddies"), "propagate", True)
     monkeypatch.setattr(dns, "run", lambda *given: None)
     scene = load_scene("tiny", ["flow.sound_speed=4", "model.preset=paper"])
     with caplog.at_level(logging.WARNING, logger="eddies"):

@@ -218,7 +218,6 @@ def test_a_frame_that_one_rank_cannot_read_is_told_by_all(comm, directory):
 
 @pytest.mark.mpi(2)
 def test_solves_that_do_not_converge_are_told_once(comm, directory, monkeypatch, caplog):
-    monkeypatch.setattr(logging.getLogger("eddies"), "propagate", True)
     from eddies.workflows.rollout import particle_measures
     monkeypatch.setattr(particle_measures, "MOST_ITERATIONS", 2)
     with caplog.at_level(logging.INFO, logger="eddies"), open_rollout(directory, comm.Split(comm.rank)) as measured:

@@ -371,7 +371,6 @@ def test_a_method_of_the_users(comm, tmp_path, own, fluid):
 
 @pytest.mark.mpi(1)
 def test_solves_that_do_not_converge_are_told_once_and_all_counted(comm, monkeypatch, caplog):
-    monkeypatch.setattr(logging.getLogger("eddies"), "propagate", True)
     run = LearnedRun.__new__(LearnedRun)
     run.comm, run._solves = comm, {name: [] for name in SOLVES}
     with caplog.at_level(logging.INFO, logger="eddies"):
