@@ -77,7 +77,7 @@ def _run(scene: Scene | str | Path, stages: Sequence[str] | None, output: str | 
         directory = Path(output) if output is not None else scene.directory
         from eddies.stages import run_stages
         in_order = [name for name in STAGES if name in (stages or ())]
-        run_stages(in_order or scene.stages, scene, comm, directory, _stop(comm, directory), overwrite,
+        run_stages(in_order or scene.stages_of_all, scene, comm, directory, _stop(comm, directory), overwrite,
                    variants=variants)
     return directory
 

@@ -75,7 +75,8 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
     check_unseen(scene, directory)
     planned, reported = steps(scene, stages, directory, variants), "report" in stages
     if not planned and not reported:
-        check_sections(stages, scene)
+        for each in [scene.variant[name] for name in variants] or [scene]:
+            check_sections(stages, each)
     for step in planned:
         check_feasible(step.stages, step.scene, comm, step.directory)
         check_ranks(step.stages, step.scene, comm)
@@ -97,7 +98,7 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
         prepare_directory(scene, comm, directory)
         failures = run_steps(planned, comm, directory, stop, overwrite, take_over)
         if reported:
-            run_stage(STAGES["report"], scene, comm, directory, stop, False)
+            run_stage(STAGES["report"], scene, comm, directory, stop, False, variants=variants)
     if failures:
         raise VariantsFailed(f"{scene.name}: variants failed: " + "; ".join(
             f"{name} ({failure})" for name, failure in failures.items()))
@@ -193,15 +194,17 @@ def tell(stages: Sequence[str], scene: Scene, comm: Comm) -> None:
             log.warning(problem)
 
 
-def run_stage(stage: Stage, scene: Scene, comm: Comm, directory: Path, stop: StopRequest, begun: bool) -> None:
-    """Run one stage, and record its wall time, also when it is stopped: if it was `begun` before, that is added."""
+def run_stage(stage: Stage, scene: Scene, comm: Comm, directory: Path, stop: StopRequest, begun: bool,
+              **more: Sequence[str]) -> None:
+    """Run one stage, and record its wall time, also when it is stopped: if it was `begun` before, that is added.
+    `more` are further arguments of the stage."""
     log.info("%s: starts on %d %s", stage.name, comm.size, "rank" if comm.size == 1 else "ranks")
     start = time.perf_counter()
     module, _, function = RUN[stage.name].partition(":")
     run = getattr(import_module(module), function)
     stop.check()
     try:
-        run(scene, comm, directory, stop)
+        run(scene, comm, directory, stop, **more)
         comm.Barrier()
     except Stopped:
         record_seconds(stage.name, time.perf_counter() - start, comm, directory, begun)

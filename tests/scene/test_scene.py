@@ -173,6 +173,9 @@ def test_fingerprint_of_training_changes_with_the_weights_that_it_starts_from(tm
         prints.append(scene.fingerprint("train"))
     assert len(set(prints)) == 3
     assert scene.fingerprint("train-kernel") == load_scene("tiny").fingerprint("train-kernel")
+    moved = tmp_path / "moved.h5"
+    (tmp_path / "model.h5").rename(moved)
+    assert load_scene("tiny", [f"model.path={moved}"]).fingerprint("train") == prints[-1]
 
 
 def test_trained_weights_need_no_training_and_have_seen_nothing():
@@ -258,7 +261,7 @@ def test_keys_and_sections_are_left_out_before_others_are_set():
 
 
 @pytest.mark.parametrize("removal, message", [
-    ("spinup", "--unset spinup: there is no such key or section to remove; there are: title, seed, flow"),
+    ("spinup", "--unset: spinup: there is no such key or section to remove; there are: title, seed, flow"),
     ("flow.forcing", "there are: fluid, cells, viscosity, sound_speed"), ("seed.x", "there are: title"),
     ("flow.cells", r"tiny.toml, --unset: \[flow\] cells: this key is missing"),
     ("flow", r"tiny.toml, --unset: \[flow\]: this section is missing")])

@@ -6,7 +6,8 @@ from eddies.scene.layers import BUILT_IN
 from eddies.scene.scene import SceneError, load_scene
 
 HEAD = 'title = "a test"\nbase = "tiny"\nsimulation.turnovers = 0.25\n'
-TWO = HEAD + """
+TWO = HEAD + """training.horizons.steps = 2
+
 [variant.plain]
 
 [variant.wide]
@@ -36,7 +37,8 @@ def test_variants_are_the_scene_with_changes(tmp_path):
 @pytest.mark.parametrize("extra", [
     "", '[variant.paper]\nmodel.preset = "paper"\nsimulation.integrator = "verlet"\nsimulation.step = 0.02\n',
     '[variant.grid]\nunset = ["model.pairs"]\nsimulation.method = "eulerian"\neulerian.cells = 12\n',
-    "[variant.free]\nunset = [\"kernel\", \"training.field_weight\"]\nsimulation.method = \"none\"\n"])
+    "[variant.free]\nunset = [\"kernel\", \"training.field_weight\"]\nsimulation.method = \"none\"\n",
+    '[variant.one-step]\nunset = ["training.horizons"]\n'])
 def test_a_written_scene_is_read_back_equal(tmp_path, extra):
     scene = load_scene(written(tmp_path, TWO + extra))
     assert load_scene(written(tmp_path, scene.to_toml(), "again.toml")) == scene
@@ -68,7 +70,11 @@ BAD_OPTIONS = [
     ([], ["training"], 'the variant "wide" changes this key itself; reach it by --unset variant.wide.training'),
     (["variant.wid.training.steps=3"], [], 'there is no variant "wid"; did you mean wide? there are: plain, wide'),
     (["a.b.c.d=1"], [], "--set a.b.c.d=1: must be section.key=value"),
-    ([], ["variant.plain.seed"], "--unset variant.plain.seed: there is no such key or section to remove"),
+    ([], ["variant.plain.seed"], "--unset: variant.plain.seed: there is no such key or section to remove"),
+    (["variant=3"], [], "--set: variant: must be sections; write [variant.NAME]"),
+    (["variant.plain=3"], [], "--set: variant: must be sections; write [variant.NAME]"),
+    (["base=hit"], [], "--set base=hit: base is a key of a file alone; write a scene with this base"),
+    (['unset=["training"]'], [], "unset is a key of a file alone; use --unset"),
     (["variant.plain.name=x"], [], 'variant "plain": name: a variant cannot change this key'),
 ]
 
@@ -91,6 +97,7 @@ BAD = [
     (HEAD + "[variant]\na = 3\n", "variant: must be sections; write [variant.NAME]"),
     (HEAD + '[variant."a/b"]\n', 'variant "a/b": name = "a/b": must be the name of a directory'),
     (HEAD + "[variant.report]\n", 'variant "report": a run directory uses this name for something else'),
+    (HEAD + "[variant.LOCK]\n", "a run directory uses this name for something else"),
     (HEAD + "[variant.checkpoints-train]\n", "a run directory uses this name for something else"),
     (HEAD + "[variant.realisation-2]\n", "a run directory uses this name for something else"),
     (HEAD + "[variant.a]\nmodel.hiden = [8]\n", 'variant "a": '),

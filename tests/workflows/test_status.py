@@ -1,4 +1,5 @@
 import json
+import os
 
 import numpy as np
 import pytest
@@ -79,3 +80,8 @@ def test_variants_of_one_run_are_told_apart(comm, tmp_path, capfd):
     assert main(["status", str(tmp_path)]) == 0
     lines = [line.split() for line in capfd.readouterr().out.splitlines()]
     assert ["b:", "simulate", "to", "do"] in lines and ["dns", "to", "do"] in lines and len(lines) == 7
+    (tmp_path / "report").mkdir()
+    for name, made in (("report/index.html", 1000), ("b/rollout.h5", 2000)):
+        (tmp_path / name).touch()
+        os.utime(tmp_path / name, (made, made))
+    assert "older than the products" in list(status_lines(tmp_path))[-1]

@@ -31,6 +31,8 @@ simulation.injection = 1e5
 """
 UNSEEN = """
 [variant.learned]
+[variant.longer-steps]
+simulation.step = 0.1
 [variant.grid]
 simulation.method = "eulerian"
 eulerian.cells = 12
@@ -82,10 +84,40 @@ def test_steps_of_a_scene(folder):
     assert where == [
         ("runs/unseen", ("dns", "train-kernel")), ("runs/unseen/realisation-5", ("dns", "train-kernel")),
         ("runs/unseen/realisation-6", ("dns", "train-kernel")), ("runs/unseen/learned", ("train",)),
+        ("runs/unseen/longer-steps", ("train",)),  # finds the link to the model
         ("runs/unseen/learned/realisation-5", ("train", "simulate")),
+        ("runs/unseen/longer-steps/realisation-5", ("train", "simulate")),
         ("runs/unseen/grid/realisation-5", ("simulate",)),
         ("runs/unseen/learned/realisation-6", ("train", "simulate")),
+        ("runs/unseen/longer-steps/realisation-6", ("train", "simulate")),
         ("runs/unseen/grid/realisation-6", ("simulate",))]
+    links = {directory: links for directory, _, links in planned(unseen, every)}
+    assert links["runs/unseen/longer-steps"]["train"] == "runs/unseen/learned"
+
+
+@pytest.mark.mpi(1)
+def test_what_is_made_with_weights_of_a_file_is_not_shared(folder):
+    """The file may be made anew, and be another one, before it is read: equal settings then say nothing."""
+    (folder / "weights.toml").write_text('base = "base.toml"\nmodel.path = "."\n[variant.a]\n[variant.b]\n')
+    (folder / "model.h5").write_text("weights of before")
+    made = {directory: (stages, links) for directory, stages, links in planned(
+        load_scene("weights.toml"), ("train", "simulate")) if "simulate" in stages}
+    assert [sorted(links) for _, links in made.values()] == [["dns", "train-kernel"]] * 2
+
+
+@pytest.mark.mpi(1)
+def test_stages_that_a_variant_alone_asks_for_are_run(folder):
+    (folder / "mixed.toml").write_text('base = "base.toml"\nsimulation.method = "none"\n[variant.free]\n'
+                                       '[variant.learned]\nsimulation.method = "learned"\n')
+    scene = load_scene("mixed.toml")
+    assert "train" not in scene.stages
+    assert ("runs/mixed/learned", ("train",)) in [step[:2] for step in planned(scene, scene.stages_of_all)]
+
+
+@pytest.mark.mpi(1)
+def test_a_stage_that_the_variant_named_lacks_is_refused(comm, folder, capfd):
+    assert run_cli("train", "small.toml", "--variant", "no-force", "--output", "out") == 2
+    assert 'no-force: [simulation] method = "none" needs no trained model' in capfd.readouterr().err
 
 
 @pytest.mark.mpi(1)
@@ -127,6 +159,7 @@ def test_variants_are_run_measured_and_kept(comm, folder, capfd):
     told = "longer-steps: holds work of other settings (simulation.step = 0.1, now 0.12) that would be replaced"
     assert comm.rank > 0 or told in capfd.readouterr().err
     assert run_cli("run", "small.toml", "--variant", "no-force", "--output", "out") == 0
+    assert comm.rank > 0 or "no-force is worth its cost in" in (out / "report/index.html").read_text()
     comm.Barrier()
     assert [str(path.relative_to(out)) for path, time in before.items() if path.stat().st_mtime_ns != time] == [
         "no-force/rollout.h5"]
@@ -185,7 +218,9 @@ def test_realisations_that_no_training_has_seen(comm, folder):
     assert run_cli("run", "unseen.toml", "--output", "out") == 0
     out = folder / "out"
     assert sorted(str(path.relative_to(out)) for path in out.glob("**/model.h5")) == [
-        "learned/model.h5", "learned/realisation-5/model.h5", "learned/realisation-6/model.h5"]
+        f"{name}/{where}model.h5" for name in ("learned", "longer-steps")
+        for where in ("", "realisation-5/", "realisation-6/")]
+    assert (out / "longer-steps/model.h5").resolve() == out / "learned/model.h5"
     assert not (out / "learned/rollout.h5").exists()
     weights = [load_weights(comm, path, "model")[1] for path in out.glob("**/model.h5")]
     assert all(np.array_equal(one[name], values) for one in weights for name, values in weights[0].items())
@@ -206,6 +241,8 @@ def test_realisations_that_no_training_has_seen(comm, folder):
         assert row["energy_ratio"] == pytest.approx(np.mean(both), rel=1e-6)
         assert row["energy_ratio_spread"] == pytest.approx(abs(both[0] - both[1]) / 2**0.5, rel=1e-4)
         assert both[0] != both[1]
+    out.rename(folder / "moved")
+    assert run_cli("simulate", "unseen.toml", "--output", "moved") == 0  # no work of other settings
 
 
 @pytest.mark.mpi(1, 2)

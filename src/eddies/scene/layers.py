@@ -10,6 +10,7 @@ import copy
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from eddies.scene.values import SceneError
 
 BUILT_IN = Path(__file__).parents[1] / "scenes"
 VARIANT = "variant"
+OF_FILES = ("base", "unset")  # keys that a file alone has
 # [section.sub.key], and the same in [variant.NAME].
 DEEPEST = 3
 
@@ -34,7 +36,7 @@ class Layer:
     ----------
     values : new values by dotted key, such as "flow.cells"; an empty table makes an absent section.
     unset : dotted keys and sections that are removed before.
-    source : what begins a message about one of them, such as "--unset ".
+    source : what begins a message about one of them.
     """
 
     values: Mapping[str, Any]
@@ -53,8 +55,7 @@ class Layer:
     @property
     def keys(self) -> frozenset[str]:
         """The keys that are set, with the sections that hold them."""
-        parts = [key.split(".") for key in self.values]
-        return frozenset(".".join(names[:depth]) for names in parts for depth in range(1, len(names) + 1))
+        return frozenset(part for key in self.values for part in with_sections(key))
 
     def apply(self, document: Document) -> None:
         """Change the document in place.
@@ -96,6 +97,11 @@ def dotted(table: Mapping[str, Any], within: str = "") -> Iterator[tuple[str, An
             yield from dotted(value, key)
         else:
             yield key, value
+
+
+def with_sections(key: str) -> Iterator[str]:
+    """A dotted key after the sections that hold it, the outermost first."""
+    return accumulate(key.split("."), "{}.{}".format)
 
 
 def read_document(name_or_path: str, above: Sequence[Path] = ()) -> tuple[Path, Document]:
@@ -144,8 +150,11 @@ def command_line(overrides: Sequence[str], removals: Sequence[str]) -> Layer:
             raise SceneError(f"--set {shortened(override)}: must be section.key=value, or key=value outside sections, "
                              "or section.name.key=value in a section of a section; for one variant, "
                              "variant.NAME.section.key=value")
+        if key in OF_FILES:
+            raise SceneError(f"--set {shortened(override)}: {key} is a key of a file alone; "
+                             + ("use --unset" if key == "unset" else "write a scene with this base"))
         values[key] = _parsed(value)
-    return Layer(values, removals, "--unset ")
+    return Layer(values, removals)
 
 
 def refuse_keys_of_variants(given: Layer, variants: Mapping[str, Layer]) -> None:

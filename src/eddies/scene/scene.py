@@ -18,7 +18,8 @@ from typing import Any
 from eddies.import_path import origins, search_in
 from eddies.pipeline import STAGES
 from eddies.scene.checks import first_inconsistency
-from eddies.scene.layers import BUILT_IN, VARIANT, Layer, command_line, dotted, read_document, refuse_keys_of_variants
+from eddies.scene.layers import (BUILT_IN, OF_FILES, VARIANT, Layer, command_line, dotted, read_document,
+                                 refuse_keys_of_variants, with_sections)
 from eddies.scene.model import Model
 from eddies.scene.parts import Parts
 from eddies.scene.reader import read_section, write_section
@@ -35,7 +36,7 @@ FOREIGN_IN = ("flow", "initial", "model", "simulation")
 # Keys of a scene that a variant cannot change.
 OF_THE_WHOLE = ("name", "base", "realisations", VARIANT)
 # In a run directory: what is no name of a variant, beside the products and directories of the stages.
-RESERVED = ("report", "vtkhdf", "lagrangebench", "STOP")
+RESERVED = ("report", "vtkhdf", "lagrangebench", "STOP", "LOCK")
 REALISATION = "realisation-"
 
 
@@ -47,7 +48,7 @@ class Scene(Parts):
     """
 
     variant: "Mapping[str, Scene]" = scenes()
-    of_the_file = ("base", "unset", VARIANT)
+    of_the_file = (*OF_FILES, VARIANT)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -62,6 +63,12 @@ class Scene(Parts):
                 hint = f"{nearest(name, self.variant)} ".lstrip()
                 raise SceneError(f'{self.name}: there is no variant "{name}"; {hint}there are: '
                                  f"{', '.join(self.variant) or 'none'}")
+
+    @property
+    def stages_of_all(self) -> tuple[str, ...]:
+        """The stages that the scene or one of its variants asks for, in the order in which they run."""
+        asked = {stage for scene in (self, *self.variant.values()) for stage in scene.stages}
+        return tuple(stage for stage in STAGES if stage in asked)
 
     @property
     def without_variants(self) -> "Scene":
@@ -89,11 +96,11 @@ class Scene(Parts):
                       for scene in (self.without_variants, variant))
         for name in set(OF_THE_WHOLE) & {*own, *other}:
             own.pop(name, None), other.pop(name, None)
-        absent = {section for key in own if (section := key.partition(".")[0]) not in {
-            held.partition(".")[0] for held in other}}
-        removed = [*sorted(absent), *(key for key in own if key not in other and key.partition(".")[0] not in absent)]
+        held = Layer(other).keys
+        removed = dict.fromkeys(next(part for part in with_sections(key) if part not in held)
+                                for key in own if key not in held)
         if removed:
-            yield f"unset = {quoted(removed)}"
+            yield f"unset = {quoted([*removed])}"
         yield from (f"{key} = {quoted(value)}" for key, value in other.items() if own.get(key) != value)
 
     def fingerprint(self, stage: str) -> str:
@@ -103,6 +110,8 @@ class Scene(Parts):
         settings = asdict(self) | {"window": self.window, "start": _digest(self.initial.path),
                                    "weights": _digest(self.model.weights_file if self.model else None),
                                    "truths": _fingerprints(self.training.truth_files if self.training else ())}
+        if settings["weights"] is not None:
+            del settings["model"]["path"]  # weights are known by what they are, wherever they lie
         settings |= {f"own_{name}": origins(self._foreign_in(name)) for name in FOREIGN_IN}
         of_these = {*STAGES[stage].depends_on, stage} & {*self.stages}
         keys = [key for each in STAGES.values() if each.name in of_these for key in each.reads]
@@ -139,10 +148,11 @@ def load_scene(name_or_path: str | Path, overrides: Sequence[str] = (), removals
     given = Layer({})
     try:
         given = command_line(overrides, removals)
-        _check_names_of_variants(given, document.get(VARIANT, {}))
+        _check_names_of_variants(given, _tables_of_variants(document))
         given.apply(document)
         document.setdefault("name", path.stem)
-        tables = document.pop(VARIANT, {})
+        tables = _tables_of_variants(document)
+        document.pop(VARIANT, None)
         variants = {name: Layer.of_table(table) for name, table in tables.items()}
         refuse_keys_of_variants(given, variants)
         scene = read_section(Scene, document)
@@ -152,10 +162,16 @@ def load_scene(name_or_path: str | Path, overrides: Sequence[str] = (), removals
         raise SceneError(f"{path}{option}: {error}", error.key) from None
 
 
-def _check_names_of_variants(given: Layer, tables: Any) -> None:
-    """Refuse what is no table of tables of keys, and changes of a variant that the scene has not."""
+def _tables_of_variants(document: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """The changed keys of each variant of a document; SceneError for what is no section of sections."""
+    tables = document.get(VARIANT, {})
     if not isinstance(tables, dict) or not all(isinstance(table, dict) for table in tables.values()):
         raise SceneError(f"{VARIANT}: must be sections; write [{VARIANT}.NAME] and the changed keys below", VARIANT)
+    return tables
+
+
+def _check_names_of_variants(given: Layer, tables: Mapping[str, Any]) -> None:
+    """Refuse changes of a variant that the scene has not."""
     for key in (*given.values, *given.unset):
         whole, _, rest = key.partition(".")
         name = rest.partition(".")[0]

@@ -74,16 +74,17 @@ class Run:
     forced: bool = False
 
 
-def run_stage(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | None = None) -> None:
+def run_stage(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | None = None,
+              variants: Sequence[str] = ()) -> None:
     """The report as a stage of a scene."""
-    run(directory, comm)
+    run(directory, comm, variants)
 
 
 def run(directory: str | Path, comm: Comm, variants: Sequence[str] = ()) -> None:
     """Write report/index.html, report/figures/*.png and report/metrics.json of a run directory; all ranks call it.
 
-    Of a scene with variants the page begins with their table and goes on with the first of `variants` or, where none is
-    named, of all that were run; every other one has a page of its own, one click away.
+    Of a scene with variants the page begins with their table and goes on with the first of `variants` that was run or,
+    without one, of all that were run; every other one has a page of its own, one click away.
 
     Raises ProductError if the directory holds no product, or a damaged one, or the report cannot be written; SceneError
     if a variant is named that the scene has not.
@@ -94,8 +95,8 @@ def run(directory: str | Path, comm: Comm, variants: Sequence[str] = ()) -> None
     if scene is not None:
         scene.check_variants(variants)
     ran = {name: where[0].directory for name, where in places.items() if (where[0].directory / ROLLOUT).exists()}
-    chosen = next(iter([*variants, *ran]), None)
-    main = places[chosen][0].directory if chosen in ran else directory
+    chosen = next((name for name in (*variants, *ran) if name in ran), None)
+    main = directory if chosen is None else ran[chosen]
     pages = {name: where for name, where in ran.items() if where != directory}
     alone = comm.Split(comm.rank)
     try:
@@ -104,7 +105,7 @@ def run(directory: str | Path, comm: Comm, variants: Sequence[str] = ()) -> None
                 record, sections = _made(where, comm, alone, scanned, own=True)
                 _write_report(comm, where / "report", record, sections, _links(scene, directory, where, pages))
                 log.info("report: variant %s: %s", name, where / "report" / "index.html")
-        table = _table(scene, places, chosen, comm, alone) if chosen in ran else None
+        table = None if chosen is None else _table(scene, places, chosen, comm, alone)
         first = [section_on_variants(table, notes(scene))] if table else []
         record, sections = _made(main, comm, alone, scanned, first=first)
     finally:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from eddies.clock import duration
@@ -17,7 +17,7 @@ from eddies.pipeline import STAGES, Stage
 from eddies.scene.scene import Scene, SceneError, load_scene
 from eddies.workflows.foreseen.storage import in_units
 from eddies.workflows.run_directory.work import changed_settings, is_done, of_other_settings, stage_seconds
-from eddies.workflows.variants import steps
+from eddies.workflows.variants import Step, steps
 
 SCENE, PAGE = "scene.toml", Path("report") / "index.html"
 
@@ -67,7 +67,7 @@ def run_lines(directory: Path, inner: set[Path]) -> Iterator[str]:
         took = duration(seconds[name]) if name in seconds else ""
         yield f"  {title:{width}}  {took:>12}  {state}".rstrip()
     took = duration(seconds["report"]) if "report" in (seconds := stage_seconds(directory)) else ""
-    yield f"  {'report':{width}}  {took:>12}  {page_state(directory)}"
+    yield f"  {'report':{width}}  {took:>12}  {page_state(directory, planned)}"
 
 
 def stage_state(stage: Stage, scene: Scene, directory: Path) -> str:
@@ -85,11 +85,11 @@ def stage_state(stage: Stage, scene: Scene, directory: Path) -> str:
     return "to do"
 
 
-def page_state(directory: Path) -> str:
-    """Whether the report is there, and newer than what it is about."""
+def page_state(directory: Path, planned: Sequence[Step]) -> str:
+    """Whether the report is there, and newer than what it is about: the products of these steps."""
     page = directory / PAGE
     if not page.is_file():
         return "to do"
-    products = [path for stage in STAGES.values() if (path := directory / stage.file).is_file()]
-    old = any(path.stat().st_mtime > page.stat().st_mtime for path in products)
+    products = [step.directory / STAGES[stage].file for step in planned for stage in step.stages]
+    old = any(path.stat().st_mtime > page.stat().st_mtime for path in products if path.is_file())
     return f"older than the products: `eddies report {directory}`" if old else f"complete, {page}"

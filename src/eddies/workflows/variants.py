@@ -62,6 +62,7 @@ def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[
     """What is to be done for some stages of a scene, of all variants or of those named, in order.
 
     Rollouts go round by round over the variants, so that a machine that is slow for a while is slow for all of them.
+    What is made with weights that are taken over is never shared: their file may be made in an earlier step.
     """
     if not scene.variant and not scene.realisations:
         making = tuple(stage for stage in stages if STAGES[stage].product is not None)
@@ -84,9 +85,12 @@ def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[
         working, links = [], {}
         for stage in [stage for stage in STAGES if stage in own.stages and stage in (*SHARED, "train", "simulate")]:
             key = stage, own.fingerprint(stage)
-            holder = made.get(key)
+            taken_over = stage not in SHARED and own.model is not None and own.model.path is not None
+            holder = None if taken_over else made.get(key)
             if holder is not None and holder != where:
                 links[stage] = holder
+                if seeds and stage == "train" and stage in possible and stage in stages:
+                    working.append(stage)  # finds the link; rollouts on realisations take the model over from here
             elif stage in possible and holder is None:
                 made[key] = where
                 working += [stage] if stage in stages else []
