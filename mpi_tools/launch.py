@@ -10,7 +10,6 @@ stay as they are.
 
 import argparse
 import contextlib
-import math
 import os
 import shutil
 import signal
@@ -19,46 +18,37 @@ import sys
 import threading
 from pathlib import Path
 
+sys.path.append(str(Path(__file__).parents[1] / "src"))  # of this checkout, where no eddies is installed yet
+from eddies.cores import check_threads, default_to_one_thread, is_positive, local_cores, threads  # noqa: E402
+
 # How mpirun frames its notices, how those begin that tell of a rank that has not ended with 0, and the exit codes of
 # which the ranks have said why: bad input, stopped, interrupted.
 RULE = b"-" * 74
 NOTICES = (b"Primary job  terminated normally", b"mpirun detected that one or more processes exited with non-zero",
            b"prterun detected that one or more processes exited with non-zero")
 EXPLAINED = (2, 75, 130)
-CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")
-
-
-def local_cores() -> int:
-    """Physical cores that this process may use: affinity and container quota count, hyper-threads do not."""
-    cores = set()
-    for cpu in os.sched_getaffinity(0):
-        siblings = Path(f"/sys/devices/system/cpu/cpu{cpu}/topology/thread_siblings_list")
-        cores.add(siblings.read_text() if siblings.exists() else str(cpu))
-    limit, period = (CPU_QUOTA.read_text().split() if CPU_QUOTA.exists() else ("max", "1"))
-    return len(cores) if limit == "max" else max(1, min(len(cores), math.ceil(int(limit) / int(period))))
 
 
 def default_ranks() -> int:
     """As many as there are cores for OMP_NUM_THREADS threads each, or EDDIES_RANKS where that asks for fewer.
 
-    Raises ValueError if one of these is no positive integer.
+    Raises ValueError if one of these is no number of at least 1.
     """
-    most = max(local_cores() // _number("OMP_NUM_THREADS", 1), 1)
-    return min(most, _number("EDDIES_RANKS", most))
+    check_threads()
+    most, asked = max(local_cores() // threads(), 1), os.environ.get("EDDIES_RANKS", "").strip()
+    return min(most, positive("EDDIES_RANKS", asked)) if asked else most
 
 
-def _number(name: str, otherwise: int) -> int:
-    asked = os.environ.get(name) or str(otherwise)
-    if not asked.isdigit() or int(asked) < 1:
-        raise ValueError(f"{name} = {asked!r}: a positive number is expected")
-    return int(asked)
+def positive(name: str, text: str) -> int:
+    """The number of at least 1 that a text is, given by this name; ValueError where it is none."""
+    if not is_positive(text):
+        raise ValueError(f'{name} = "{text}": must be a whole number of at least 1')
+    return int(text)
 
 
 def mpi_environment(ranks: int) -> dict[str, str]:
     """The caller's environment and what `ranks` ranks on this machine need beyond it."""
     needed = {
-        # One thread a rank: torch, OpenBLAS and MKL would start a thread on every core, in every rank.
-        "OMP_NUM_THREADS": "1",
         # Two jobs on one machine would both be bound to its first cores.
         "OMPI_MCA_hwloc_base_binding_policy": "none",
     }
@@ -70,7 +60,9 @@ def mpi_environment(ranks: int) -> dict[str, str]:
         needed |= {"OMPI_MCA_rmaps_base_oversubscribe": "1",
                    "PRTE_MCA_rmaps_default_mapping_policy": ":oversubscribe",
                    "OMPI_MCA_mpi_yield_when_idle": "1"}
-    return needed | dict(os.environ)
+    environment = needed | dict(os.environ)
+    default_to_one_thread(environment)
+    return environment
 
 
 def mpirun_command(ranks: int, command: list[str]) -> list[str]:
@@ -164,11 +156,11 @@ def run_job(line: list[str], environment: dict[str, str]) -> int:
 def main() -> None:
     """Run the command and end with its exit code."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("-n", dest="ranks", type=int, help="number of ranks (default: one for each core)")
+    parser.add_argument("-n", dest="ranks", help="number of ranks (default: one for each core)")
     parser.add_argument("command", nargs="+")
     given = parser.parse_args()
     try:
-        ranks = given.ranks or default_ranks()
+        ranks = default_ranks() if given.ranks is None else positive("-n", given.ranks)
         line = mpirun_command(ranks, given.command)
     except (ValueError, FileNotFoundError) as error:
         parser.error(str(error))

@@ -274,9 +274,10 @@ def test_exit_code_of_the_program():
 
 @pytest.mark.mpi(1)
 def test_threads_per_rank(comm, monkeypatch):
-    for given, used in ((None, "1"), ("3", "3")):
+    monkeypatch.setattr(os, "cpu_count", lambda: 3)
+    for given, used in ((None, "1"), ("", "1"), ("3", "3")):
         monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
-        if given:
+        if given is not None:
             monkeypatch.setenv("OMP_NUM_THREADS", given)
         assert run_cli("scenes") == 0 and os.environ["OMP_NUM_THREADS"] == used
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import math
-import os
 import sys
 import traceback
 from collections.abc import Iterator, Sequence
@@ -17,6 +16,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from eddies.cores import check_threads, default_to_one_thread
 from eddies.errors import UserError
 from eddies.logs import configure_logging
 from eddies.pipeline import STAGES
@@ -92,7 +92,7 @@ def _stop(comm: Comm, directory: Path) -> StopRequest:
 def _job(comm: Comm | None) -> Iterator[Comm]:
     """The communicator of a job, all ranks if None; log lines go to standard output unless the program sends them
     elsewhere, and an error that not all ranks meet ends the job, as the others may wait for ever."""
-    os.environ.setdefault("OMP_NUM_THREADS", "1")  # else torch takes a thread for every core, in every rank
+    default_to_one_thread()
     from mpi4py import MPI
 
     from eddies.kernels.library import library
@@ -102,6 +102,7 @@ def _job(comm: Comm | None) -> Iterator[Comm]:
         configure_logging(comm.rank)
     errors = comm.Dup()
     try:
+        check_threads()
         library()  # and with it the threads that torch shares
         yield comm
     except BaseException:

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 
 from eddies.cli_options import OptionError, parse_arguments
 from eddies.clock import duration
+from eddies.cores import check_threads, default_to_one_thread
 from eddies.errors import UserError
 from eddies.logs import OUTCOME, Output, configure_logging, show_warnings
 from eddies.pipeline import STAGES
@@ -70,7 +71,7 @@ def main(arguments: list[str] | None = None) -> int:
 def run(arguments: list[str] | None) -> int:
     """Run one command, all ranks together; returns the exit code."""
     # Before numpy and torch are imported: they would start a thread for every core, in every rank.
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    default_to_one_thread()
     from eddies.kernels.memory import keep_freed_memory
     keep_freed_memory()
     signals = catch_signals()  # first of all: MPI takes a second to start
@@ -89,6 +90,7 @@ def run(arguments: list[str] | None) -> int:
         require_same(comm, shlex.join(sys.argv[1:] if arguments is None else arguments), "the arguments {}")
         options = parse_arguments(arguments, comm.rank)
         configure_logging(comm.rank, getattr(options, "log", None))
+        check_threads()
         library()  # and with it the threads that torch shares
         if options.command == "check" and options.time:
             time_command(options, comm, signals)

@@ -26,6 +26,7 @@ from eddies.logs import OUTCOME
 from eddies.parallel.communicator import Comm
 from eddies.parallel.rendezvous import all_arrive
 from eddies.parallel.stop import Stopped, StopRequest
+from eddies.parallel.threads import warn_of_few_processors
 from eddies.pipeline import STAGES, Stage
 from eddies.scene.scene import Scene, SceneError
 from eddies.workflows.feasibility import check_feasible, check_ground_truth, check_places
@@ -71,6 +72,7 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
     settings = [scene.to_toml(), *map(scene.fingerprint, scene.stages), str(directory), *stages, *variants]
     require_same(comm, hashlib.sha256(json.dumps(settings).encode()).hexdigest()[:16],
                  "a scene, stages and a directory of which the SHA-256 is {}")
+    warn_of_few_processors(comm)
     scene.check_variants(variants)
     check_unseen(scene, directory)
     planned, reported = steps(scene, stages, directory, variants), "report" in stages

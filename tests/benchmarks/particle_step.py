@@ -25,7 +25,8 @@ from step import Stopwatch
 from eddies.flow.initial_fields import random_velocity
 from eddies.flow.statistics import energy_spectrum, turbulence_scales
 from eddies.flow.tracers import release
-from eddies.kernels.library import library, threads
+from eddies.cores import threads
+from eddies.kernels.library import library
 from eddies.kernels.modes import ModePasses
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.context import Context

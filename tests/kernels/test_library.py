@@ -58,21 +58,6 @@ def test_the_best_that_the_processor_runs_is_taken():
     assert found[0] == "plain" and module.library() is module.load(found[-1])
 
 
-@pytest.mark.parametrize("given, threads", [(None, 1), ("3", 3), (" 4 ,2", 4)])
-def test_threads_are_those_of_openmp(monkeypatch, given, threads):
-    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
-    if given:
-        monkeypatch.setenv("OMP_NUM_THREADS", given)
-    assert module.threads() == threads
-
-
-@pytest.mark.parametrize("given", ["", "auto", "0", "-1", "2.5"])
-def test_what_is_no_number_of_threads_is_told(monkeypatch, given):
-    monkeypatch.setenv("OMP_NUM_THREADS", given)
-    with pytest.raises(module.ThreadsError, match="must be the number of threads that each rank takes"):
-        module.threads()
-
-
 RUNTIME = """
 import ctypes
 from eddies.kernels.library import library

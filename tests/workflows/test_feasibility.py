@@ -35,6 +35,46 @@ def test_it_is_said_once(comm, tmp_path, capfd):
     assert errors.count("\n") == (comm.rank == 0) and not (tmp_path / "run").exists()
 
 
+@pytest.mark.mpi(1, 2)
+@pytest.mark.parametrize("overrides, message", [
+    (["initial.amplitude=1e-15"], "of 0.05, limited by [time] max_step, for a time of"),
+    (["initial.kind=tests.workflows.test_feasibility:at_rest"],
+     "at rest, so that it never turns over; start from another"),
+    (["tracers.turnovers=1e13"], "limited by the flow, for a time of"),
+    (["tracers.frame_interval=1e-11"], "[tracers] frame_interval = 1e-11: "),
+    (["spin_up.turnovers=1e10"], "of 0.05, limited by [time] max_step"),
+], ids=lambda value: value[0] if isinstance(value, list) else "")
+def test_a_flow_that_is_not_known_before_is_refused_once_it_is_there(comm, tmp_path, capfd, overrides, message):
+    """As one from a file; without viscosity nothing is foreseen of a random one either."""
+    options = [word for each in ("flow.viscosity=0", "flow.cells=16", "tracers.particles_per_side=4", *overrides)
+               for word in ("--set", each)]
+    assert eddies("dns", "tracers-only", *options, "--output", tmp_path) == 2
+    errors = capfd.readouterr().err
+    assert comm.rank > 0 or errors.startswith("eddies: error: tracers-only: ") and errors.count("\n") == 1
+    assert comm.rank > 0 or message in errors
+    comm.Barrier()
+    assert not (tmp_path / "ground_truth.h5").exists()
+
+
+@pytest.mark.mpi(1)
+def test_a_run_of_given_time_has_a_limit_of_steps(comm, tmp_path, capfd):
+    fast = ["--set", "initial.kind=tests.workflows.test_feasibility:fast", "--set", "time.duration=1e9", "--unset",
+            "time.step"]
+    assert eddies("dns", "abc", *fast, "--output", tmp_path) == 2
+    assert "limited by the flow, for a time of 1e+09, and 1e+09 are the most" in capfd.readouterr().err
+
+
+def fast(grid, initial, seed):
+    """A flow of the user's, of which no speed is known."""
+    from eddies.flow.initial_fields import INITIAL_FLOWS
+    return 1e4 * INITIAL_FLOWS["random"](grid, initial, seed)
+
+
+def at_rest(grid, initial, seed):
+    """A flow of the user's that does not move."""
+    return 0 * fast(grid, initial, seed)
+
+
 @pytest.mark.mpi(1)
 @pytest.mark.parametrize("name", [name for name, _ in builtin_scenes()])
 def test_built_in_scenes_are_feasible(comm, name):
@@ -76,6 +116,15 @@ def test_a_ground_truth_with_too_few_frames_or_without_motion(comm, tmp_path):
     with pytest.raises(SceneError, match="after frame 14 of 30 no filtered field is followed .*, 0.5 later; lower"):
         coarse = dataclasses.replace(scene.simulation, frame_interval=0.5)
         check_ground_truth(["simulate"], dataclasses.replace(scene, simulation=coarse), comm, tmp_path)
+    comm.Barrier()
+    if comm.rank == 0:
+        import h5py
+        with h5py.File(tmp_path / "ground_truth.h5", "a") as file:
+            file["reference"].attrs["eddy_turnover_time"] = 1e12
+    comm.Barrier()
+    check_ground_truth(["train"], scene, comm, tmp_path)
+    with pytest.raises(SceneError, match="tiny: .simulation. step = 0.08: 3.8e.12 steps for a time of 3e.11,"):
+        check_ground_truth(["train", "simulate"], scene, comm, tmp_path)
     short = dataclasses.replace(scene, training=dataclasses.replace(scene.training, window=0.1))
     with pytest.raises(SceneError, match="window = 0.1: holds 2 frames of the ground truth, too few"):
         check_ground_truth(["train"], short, comm, tmp_path)

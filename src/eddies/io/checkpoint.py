@@ -24,7 +24,8 @@ from eddies.io.errors import WriteError, wanted_and_free
 from eddies.io.hdf5 import in_files
 from eddies.io.manifest import find_damage, hash_file, manifest_text, parse_manifest
 from eddies.io.reading import open_to_read
-from eddies.kernels.library import in_use, threads
+from eddies.cores import threads
+from eddies.kernels.library import in_use
 from eddies.parallel.broadcast import first_complaint, on_all_ranks, on_first_rank
 
 log = logging.getLogger("eddies")

@@ -5,9 +5,9 @@ from __future__ import annotations
 import ctypes
 import functools
 import hashlib
-import os
 from pathlib import Path
 
+from eddies.cores import threads
 from eddies.errors import UserError
 
 # As setup.py has them; a processor that runs one runs those before it.
@@ -18,10 +18,6 @@ REMEDY = ("install a C++ compiler (g++), then eddies anew: `pip install --force-
 
 class MissingLibraryError(UserError):
     """The compiled library is not there, does not load, or is not of the sources beside it."""
-
-
-class ThreadsError(UserError, ValueError):
-    """OMP_NUM_THREADS is no number of threads."""
 
 
 @functools.cache
@@ -66,16 +62,6 @@ def load(instruction_set: str) -> ctypes.CDLL:
         raise MissingLibraryError(f"the compiled kernels in {sources[0].parent} are of other sources than lie there: "
                                   "build them anew with `python setup.py build_ext --inplace`")
     return found
-
-
-def threads() -> int:
-    """Threads of each rank, which kernels, transforms and torch take: OMP_NUM_THREADS, its first number if there are
-    several, 1 unless set. Raises ThreadsError where that is no number of threads."""
-    given = os.environ.get("OMP_NUM_THREADS", "1").split(",")[0].strip()
-    if not given.isdecimal() or int(given) == 0:
-        raise ThreadsError(f'OMP_NUM_THREADS = "{given}": must be the number of threads that each rank takes, 1 or '
-                           "more; set it to 1, or unset it")
-    return int(given)
 
 
 @functools.cache

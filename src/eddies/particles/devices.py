@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from eddies.errors import UserError
-from eddies.kernels.library import threads
+from eddies.cores import threads
 from eddies.parallel.communicator import Comm, node_rank
 
 

@@ -17,7 +17,8 @@ import numpy as np
 import pyfftw
 
 from eddies.kernels.copies import ColumnCopies, PlaneCopies
-from eddies.kernels.library import library, threads
+from eddies.cores import threads
+from eddies.kernels.library import library
 
 BLOCK_BYTES = 2**18  # of one component and thread in a pass: a few of them fit the second-level cache of a core
 CACHE_LINE = 64

@@ -21,6 +21,7 @@ from eddies.pipeline import STAGES
 from eddies.scene.scene import Scene
 from eddies.scene.sections import SpinUp
 from eddies.time_stepping import STEPPERS
+from eddies.workflows.feasibility import check_span
 from eddies.workflows.ground_truth.flow_run import FlowRun, TracerRun
 from eddies.workflows.ground_truth.scene_flow import build_fluid, build_step_limit, initial_state
 from eddies.workflows.ground_truth.tracer_frames import frame_layout
@@ -45,11 +46,11 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         if saved is None:
             flow.history.sample(flow.state, flow.clock)
         if flow.phase == "spin-up":
-            spin_up(scene.spin_up.turnovers, flow)
+            spin_up(scene, flow)
         if scene.tracers is not None:
             follow_tracers(scene, file, flow, saved if flow.phase == "tracers" else None)
         else:
-            run_for(scene.time.duration, flow)
+            run_for(scene, flow)
             write_final_fields(file, flow)
             write_attributes(file.create_group("reference"), {
                 **scales_of(flow.history.sample(flow.state, flow.clock)), "viscosity": flow.fluid.viscosity,
@@ -74,19 +75,24 @@ def build_run(scene: Scene, comm: Comm, guard: Guard, saved: Checkpoint | None) 
     return flow
 
 
-def run_for(duration: float, flow: FlowRun) -> None:
-    """Run the flow for a time after its start or spin-up."""
-    clock = flow.clock
+def run_for(scene: Scene, flow: FlowRun) -> None:
+    """Run the flow for [time] duration after its start or spin-up.
+
+    Raises SceneError where that takes too many steps.
+    """
+    clock, duration = flow.clock, scene.time.duration
     if flow.phase == "start":
+        check_span(scene, duration, flow.step_limit.bound(flow.state, clock))
         clock.end, flow.phase = clock.time + duration, "run"
     start = clock.end - duration
     progress = ProgressLine("dns", flow.history.describe, done=(clock.time - start) / duration)
     flow.advance([flow.history, lambda _, clock: progress((clock.time - start) / duration, clock.steps)])
 
 
-def spin_up(turnovers: float, flow: FlowRun) -> None:
-    """Run until the flow has turned over the given number of times."""
-    history = flow.history
+def spin_up(scene: Scene, flow: FlowRun) -> None:
+    """Run until the flow has turned over as often as [spin_up] asks. Raises SceneError where that takes too many steps,
+    as in a flow that nothing forces and that comes to rest meanwhile."""
+    history, turnovers = flow.history, scene.spin_up.turnovers
     progress = ProgressLine("spin-up", history.describe, done=history.rows[-1]["turnovers"] / turnovers)
 
     def until_turned_over(_: np.ndarray, clock: Clock) -> None:
@@ -94,6 +100,9 @@ def spin_up(turnovers: float, flow: FlowRun) -> None:
         progress(done, clock.steps)
         if done >= 1:
             clock.stop()
+        elif flow.fluid.forcing is None:
+            last = history.rows[-1]
+            check_span(scene, (1 - done) * turnovers * last["eddy_turnover_time"], last["time_step"] or np.inf)
 
     flow.advance([history, until_turned_over])
     flow.clock.end, flow.phase = np.inf, "start"  # the end is known in the phases that follow
@@ -113,6 +122,9 @@ def follow_tracers(scene: Scene, file: File, flow: FlowRun, saved: Checkpoint | 
     """Release tracers into the flow, and store their frames, the filtered fields, the scales, and the forcing that
     stays on."""
     comm, names = flow.fluid.grid.decomposition.comm, saved.files if saved is not None else ()
+    if saved is None:
+        span = scene.tracers.turnovers * flow.history.sample(flow.state, flow.clock)["eddy_turnover_time"]
+        check_span(scene, span, flow.step_limit.bound(flow.state, flow.clock), frames=True)
     layout = frame_layout(scene.tracers, flow.fluid.compressible, flow.fluid.grid.cutoff)
     with FrameSegments(comm, flow.guard.checkpoints.path, layout, names) as segments:
         run = TracerRun(scene, flow, segments, saved)

@@ -15,7 +15,7 @@ from eddies.parallel.communicator import Comm
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.flow_units import ScaleError
 from eddies.pipeline import STAGES
-from eddies.scene.scene import BOX_LENGTH, Scene, SceneError
+from eddies.scene.scene import BOX_LENGTH, Scene, SceneError, Tracers
 from eddies.workflows.foreseen.numbers import expected_step, expected_turbulence, run_time
 from eddies.workflows.ground_truth.frame_counts import check_frames
 
@@ -53,10 +53,14 @@ def check_ground_truth(stages: Sequence[str], scene: Scene, comm: Comm, director
         check_frames(stages, scene, scene.seen_in(directory), len(Trajectory(file, "tracers").times))
         if {"train", "simulate"} & set(stages):
             from eddies.workflows.ground_truth.truth import GroundTruth  # torch, only here
+            truth = GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes))
             try:
-                GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes)).scales
+                truth.scales
             except ScaleError as error:
                 raise SceneError(f"{path}: {error}") from None
+            turnover = truth.reference["eddy_turnover_time"]
+            for problem in rollout_problems(scene, turnover) if "simulate" in stages else ():
+                raise SceneError(f"{scene.name}: {problem}")
 
 
 def check_places(stages: Sequence[str], comm: Comm, directory: Path) -> None:
@@ -122,17 +126,43 @@ def decay_problems(scene: Scene) -> Iterator[str]:
 def step_problems(scene: Scene) -> Iterator[str]:
     """More steps of the direct simulation, or frames, than any run can take."""
     expected, span = expected_step(scene), run_time(scene)
-    if expected is not None and span is not None and span > MOST_STEPS * expected[0]:
-        step, limit = expected
+    if expected is not None and span is not None:
+        yield from too_many_steps(scene, span, *expected)
+    turbulence, tracers = expected_turbulence(scene), scene.tracers
+    if tracers is not None and turbulence is not None:
+        yield from too_many_frames(tracers, tracers.turnovers * turbulence.turnover_time)
+
+
+def too_many_steps(scene: Scene, span: float, step: float, limit: str) -> Iterator[str]:
+    """More steps of the direct simulation than MOST_STEPS in a time; `limit` is what limits the step, in words."""
+    if not span <= MOST_STEPS * step:  # so that what is no number is refused
         yield (f"the direct simulation would take {span / step:.1e} steps of {step:.3g}, {limit}, for a time of "
                f"{span:.3g}, and {MOST_STEPS:.0e} are the most; raise {_step_key(scene, limit)} or shorten "
                f"{'[time] duration' if scene.tracers is None else '[tracers] or [spin_up] turnovers'}")
-    turbulence, tracers = expected_turbulence(scene), scene.tracers
-    if tracers is not None and turbulence is not None:
-        span = tracers.turnovers * turbulence.turnover_time
-        if span > MOST_STEPS * tracers.frame_interval:
-            yield (f"[tracers] frame_interval = {tracers.frame_interval:g}: {span / tracers.frame_interval:.1e} frames "
-                   f"in {tracers.turnovers:g} turnovers, and {MOST_STEPS:.0e} are the most; raise frame_interval")
+
+
+def too_many_frames(tracers: Tracers, span: float) -> Iterator[str]:
+    """More frames of tracers than MOST_STEPS in a time."""
+    if not span <= MOST_STEPS * tracers.frame_interval:
+        yield (f"[tracers] frame_interval = {tracers.frame_interval:g}: {span / tracers.frame_interval:.1e} frames "
+               f"in {tracers.turnovers:g} turnovers, and {MOST_STEPS:.0e} are the most; raise frame_interval")
+
+
+def check_span(scene: Scene, span: float, bound: float, frames: bool = False) -> None:
+    """Raise SceneError where the flow as it is takes too many steps for a time, or with `frames` stores too many in it,
+    or where the time is without end, as in a flow at rest.
+
+    For flows that are not known before they are there; `bound` is the longest step that this one allows.
+    """
+    if span == math.inf:
+        raise SceneError(f"{scene.name}: the flow is at rest, so that it never turns over; start from another one")
+    settings = scene.time
+    step = settings.step or min(bound, settings.max_step)
+    limit = ("fixed by [time] step" if settings.step else
+             "limited by [time] max_step" if bound >= settings.max_step else "limited by the flow")
+    problems = [*too_many_steps(scene, span, step, limit), *(too_many_frames(scene.tracers, span) if frames else ())]
+    if problems:
+        raise SceneError(f"{scene.name}: {problems[0]}")
 
 
 def _step_key(scene: Scene, limit: str) -> str:
@@ -141,12 +171,14 @@ def _step_key(scene: Scene, limit: str) -> str:
     return "[time] max_step" if "max_step" in limit else "[time] courant, lower [flow] cells or the speed of the flow,"
 
 
-def rollout_problems(scene: Scene) -> Iterator[str]:
-    """More steps of a rollout than it can take."""
+def rollout_problems(scene: Scene, turnover_time: float | None = None) -> Iterator[str]:
+    """More steps of a rollout than it can take, in a flow of the expected turnover time or of a given one."""
     settings, turbulence = scene.simulation, expected_turbulence(scene)
     span = settings.frame_interval  # at the least
-    if turbulence is not None:
-        span = max(span, settings.turnovers * turbulence.turnover_time)
+    if turnover_time is None and turbulence is not None:
+        turnover_time = turbulence.turnover_time
+    if turnover_time is not None:
+        span = max(span, settings.turnovers * turnover_time)
     if span > MOST_STEPS * settings.step:
         yield (f"[simulation] step = {settings.step:g}: {span / settings.step:.1e} steps for a time of {span:.3g}, and "
                f"{MOST_STEPS:.0e} are the most; raise step or lower turnovers")

@@ -13,7 +13,7 @@ import numpy as np
 from eddies.analysis.accuracy import accuracy
 from eddies.io.hdf5 import open_product, read_table
 from eddies.io.provenance import environment
-from eddies.kernels.library import threads
+from eddies.cores import threads
 from eddies.measures import MEASURES
 from eddies.parallel.communicator import Comm
 from eddies.pipeline import STAGES

@@ -36,6 +36,10 @@ def test_built_in_scenes_give_no_reason(name):
     ("time.courant=2.5", "[time] courant = 2.5: is unstable by advection", None),
     ("tracers.filter_width=2", "[tracers] filter_width = 2: passes wavenumbers up to 1.6, less than the 2 of the "
      "scales that are forced", "tracers.filter_width={lower it to}"),
+    ("simulation.turnovers=5", "[simulation] turnovers = 5: the ground truth ends 0.3 turnovers after its start",
+     "simulation.turnovers={lower it to}"),
+    ("simulation.turnovers=5", "compared with nothing", "tracers.turnovers={raise .tracers. turnovers to}"),
+    ("simulation.start=0.9", "[simulation] turnovers = 0.3: the ground truth ends 0.06 turnovers after its", None),
     ("tracers.filter_width=0.1", "narrower than a cell", "tracers.filter_width=0.3"),
 ])
 def test_a_warning_names_key_and_value_and_its_remedy_helps(given, words, remedy):

@@ -159,6 +159,19 @@ def term_steps(scene: Scene) -> Iterator[str]:
                 name=name, longest=at_most(longest), integrator=settings.integrator)
 
 
+def beyond_truth(scene: Scene) -> Iterator[str]:
+    """A rollout that goes on after the end of its ground truth. Not of a flow that is forced throughout, with whose
+    average later frames are compared."""
+    settings, tracers, start = scene.simulation, scene.tracers, scene.simulation.start
+    if start is None:
+        start = scene.seen_in(scene.directory)
+    left = (1 - (0.0 if scene.realisations else start)) * tracers.turnovers  # realisations start at the beginning
+    if settings.turnovers > left * (1 + 1e-9) and not tracers.forced:
+        yield (f"[simulation] turnovers = {settings.turnovers:g}: the ground truth ends {left:.3g} turnovers after its "
+               f"start, and what comes later is compared with nothing; lower it to {at_most(left)}, or raise [tracers] "
+               f"turnovers to {at_least(tracers.turnovers * settings.turnovers / left)}")
+
+
 def at_least(value: float) -> str:
     """Two digits, rounded up."""
     digit = 10.0 ** (math.floor(math.log10(value)) - 1)
@@ -173,7 +186,7 @@ def at_most(value: float) -> str:
 
 SUBJECTS: dict[str, tuple[Callable[[Scene], Iterator[str]], ...]] = {
     "dns": (resolution, compressibility, turbulence_at_all, stability, filter_width),
-    "train": (learning,), "simulate": (rollout_steps, term_steps)}
+    "train": (learning,), "simulate": (rollout_steps, term_steps, beyond_truth)}
 
 
 # ---- refusals

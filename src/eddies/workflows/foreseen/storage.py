@@ -7,7 +7,7 @@ import math
 
 from eddies.flow.history import EVERY
 from eddies.io.checkpoint import KEPT
-from eddies.kernels.library import threads
+from eddies.cores import threads
 from eddies.scene.scene import Scene
 from eddies.spectral.fourier_passes import BLOCK_BYTES
 from eddies.workflows.foreseen.numbers import Rollout, flow_steps, largest_wavenumber, rollout_of, tracer_intervals
