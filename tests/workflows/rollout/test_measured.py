@@ -11,6 +11,7 @@ import pytest
 from eddies.analysis.accuracy import accuracy
 from eddies.io.hdf5 import ProductError, open_product
 from eddies.io.trajectories import Trajectory
+from eddies.workflows.rollout import truth_cache
 from eddies.workflows.rollout.measured import TrueParticles, open_rollout
 from eddies.workflows.rollout.particle_measures import KernelAverages, ParticleSpectra
 from tests.workflows.synthetic_run import START, write_kernel, write_rollout, write_run
@@ -172,6 +173,15 @@ def test_another_kernel_measures_anew(comm, directory):
     write_kernel(comm, directory, seed=2)
     second = numbers(directory, comm)
     assert all((first[key] == second[key]) == (key[0] == "spectra") for key in first)
+
+
+@pytest.mark.mpi(1)
+def test_other_code_measures_anew(comm, directory, work, monkeypatch):
+    numbers(directory, comm)
+    monkeypatch.setattr(truth_cache, "_code", lambda: "of other sources")
+    work.clear()
+    numbers(directory, comm)
+    assert {of for of, _ in work} == {"model", "truth"}
 
 
 @pytest.mark.mpi(1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import logging
@@ -13,11 +14,13 @@ from typing import Any
 
 import numpy as np
 
+import eddies
 from eddies.analysis.rollout import Reconstruction
 from eddies.analysis.velocity_gradients import Invariants
 from eddies.errors import UserError
 from eddies.io.hdf5 import create_product, open_product, read_attributes, read_table, write_attributes, write_table
-from eddies.io.provenance import environment, product_provenance
+from eddies.io.provenance import product_provenance
+from eddies.kernels.library import in_use
 from eddies.parallel.communicator import Comm
 
 log = logging.getLogger("eddies")
@@ -45,10 +48,9 @@ class TruthCache:
 
     def __init__(self, truth: Path, kernel: Path | None, alone: Comm) -> None:
         self.path, self.alone = truth.resolve().with_name(f"{KIND}.h5"), alone
-        code = {name: environment(1)[name] for name in ("eddies", "commit", "kernels")}
-        self._keys = {"spectra": json.dumps([code, _identity(truth)])}
+        self._keys = {"spectra": json.dumps([_code(), in_use(), _identity(truth)])}
         if kernel is not None:
-            self._keys["reconstructions"] = json.dumps([code, _identity(truth), _identity(kernel)])
+            self._keys["reconstructions"] = json.dumps([_code(), in_use(), _identity(truth), _identity(kernel)])
 
     def read(self) -> Measures:
         """All that is known; empty where nothing is, or where it is of no use."""
@@ -115,6 +117,15 @@ def _mark(key: str, table: Table) -> str:
     found = hashlib.blake2b(key.encode())
     for column in sorted(table):
         found.update(column.encode() + np.ascontiguousarray(table[column]).tobytes())
+    return found.hexdigest()
+
+
+@functools.cache
+def _code() -> str:
+    """A hash of the sources of the package, committed or not."""
+    found, package = hashlib.blake2b(digest_size=16), Path(eddies.__file__).parent
+    for path in sorted([*package.rglob("*.py"), *package.rglob("*.?pp")]):
+        found.update(path.read_bytes())
     return found.hexdigest()
 
 
