@@ -33,7 +33,8 @@ def check(scene: Scene | str | Path, *, comm: Comm | None = None) -> None:
     """Log what a scene amounts to: resolution, memory, ranks and time. Writes nothing."""
     with _job(comm) as comm:
         scene = _scene(scene)
-        import_module("eddies.workflows.feasibility").check_feasible(scene.stages, scene, comm)
+        for each in (scene, *scene.variant.values()):
+            import_module("eddies.workflows.feasibility").check_feasible(each.stages, each, comm)
         import_module("eddies.workflows.check").run(scene, comm)
 
 
@@ -51,16 +52,17 @@ def run(scene: Scene | str | Path, *, stages: Sequence[str] | None = None, outpu
 
 
 def train(scene: Scene | str | Path, *, output: str | Path | None = None, overwrite: bool = False,
-          comm: Comm | None = None) -> Path:
-    """Train the model of a scene, on the ground truth and with the kernel of the run directory, which it returns."""
-    return _run(scene, ("train",), output, overwrite, comm)
+          variants: Sequence[str] = (), comm: Comm | None = None) -> Path:
+    """Train the model of a scene, on the ground truth and with the kernel of the run directory, which it returns; of a
+    scene with variants those of all, or of those named."""
+    return _run(scene, ("train",), output, overwrite, comm, variants)
 
 
 def simulate(scene: Scene | str | Path, *, output: str | Path | None = None, overwrite: bool = False,
-             comm: Comm | None = None) -> Path:
+             variants: Sequence[str] = (), comm: Comm | None = None) -> Path:
     """Let the particles of a scene go, from its ground truth, with its trained model if its method needs one; returns
-    the run directory, with the new rollout.h5."""
-    return _run(scene, ("simulate",), output, overwrite, comm)
+    the run directory, with the new rollout.h5, of a scene with variants one in the directory of each."""
+    return _run(scene, ("simulate",), output, overwrite, comm, variants)
 
 
 def _scene(scene: Scene | str | Path) -> Scene:
@@ -68,7 +70,7 @@ def _scene(scene: Scene | str | Path) -> Scene:
 
 
 def _run(scene: Scene | str | Path, stages: Sequence[str] | None, output: str | Path | None, overwrite: bool,
-         comm: Comm | None, variants: Sequence[str] = ()) -> Path:
+         comm: Comm | None, variants: Sequence[str]) -> Path:
     unknown = [name for name in stages or () if name not in STAGES]
     if unknown:
         raise UserError(f'stages: there is no "{unknown[0]}"; there are: {", ".join(STAGES)}')

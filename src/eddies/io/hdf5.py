@@ -156,12 +156,6 @@ def growing_dataset(group: h5py.Group, name: str, frame_shape: tuple[int, ...], 
     return dataset
 
 
-def stored_bytes(frame_shape: tuple[int, ...], dtype: Any) -> int:
-    """Bytes that a frame of such a dataset takes in a file: whole chunks."""
-    return np.dtype(dtype).itemsize * math.prod(
-        math.ceil(extent / chunk) * chunk for extent, chunk in zip(frame_shape, _chunk(frame_shape, dtype)[1:]))
-
-
 def _chunk(frame_shape: tuple[int, ...], dtype: Any) -> tuple[int, ...]:
     chunk, largest = [1], CHUNK_BYTES // np.dtype(dtype).itemsize
     for axis, extent in enumerate(frame_shape):
