@@ -184,11 +184,11 @@ def test_report_of_no_directory(comm, tmp_path, capfd):
 def test_input_of_other_settings_is_refused(comm, tmp_path, capfd):
     from eddies.io.hdf5 import create_product
     from eddies.scene.scene import load_scene
-    from eddies.stages import check_inputs
+    from eddies.stages import Step, check_inputs
     scene = load_scene("tiny")
     with create_product(comm, tmp_path / "ground_truth.h5", "ground_truth", {"fingerprint": scene.fingerprint("dns")}):
         pass
-    check_inputs(["train-kernel"], scene, comm, tmp_path)
+    check_inputs(Step(scene, ("train-kernel",), tmp_path), comm)
     assert run_cli("train-kernel", "tiny", "--set", "seed=2", "--output", tmp_path) == 2
     errors = capfd.readouterr().err
     assert comm.rank > 0 or "ground_truth.h5: was made with other settings" in errors

@@ -7,7 +7,7 @@ import json
 import logging
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
 from importlib import import_module
@@ -80,7 +80,7 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
         for each in [scene.variant[name] for name in variants] or [scene]:
             check_sections(stages, each)
     for step in planned:
-        check_feasible(step.stages, step.scene, comm, step.directory)
+        check_feasible(step.stages, step.scene, comm, step.holder("dns"))
         check_ranks(step.stages, step.scene, comm)
         for problem in single_writer(step.stages, step.scene, comm):
             raise SceneError(f"{step.scene.name}: {problem}")
@@ -142,7 +142,7 @@ def run_steps(planned: Sequence[Step], comm: Comm, directory: Path, stop: StopRe
 def run_step(step: Step, comm: Comm, stop: StopRequest, overwrite: bool) -> None:
     """Run the stages of a step that are not done, in its directory, which is held."""
     if step.links:  # else checked before any step
-        check_inputs(step.stages, step.scene, comm, step.directory)
+        check_inputs(step, comm)
     work = look_at_work(step, comm, overwrite)
     tell(step.stages, step.scene, comm)
     known = False  # that the ground truth is what the other stages need
@@ -170,12 +170,7 @@ def check_made(planned: Sequence[Step], comm: Comm) -> None:
     """Refuse steps that start from a product which neither they make nor an earlier job has made."""
     making = {(stage, step.directory) for step in planned for stage in step.stages}
     for step in planned:
-        if not step.links:
-            check_inputs(step.stages, step.scene, comm, step.directory)
-        for name, holder in step.links.items():
-            if (name, holder) not in making:
-                with open_product(comm, holder / STAGES[name].file, STAGES[name].product):
-                    pass
+        check_inputs(step, comm, making)
 
 
 @contextmanager
@@ -240,21 +235,26 @@ def check_sections(stages: Sequence[str], scene: Scene) -> None:
             raise SceneError(f"{scene.name}: has no [{STAGES[stage].section}], which `eddies {stage}` is about; add it")
 
 
-def check_inputs(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path) -> None:
-    """Refuse stages that the scene lacks, and inputs that are missing or of other settings or another form than the
-    scene's."""
+def check_inputs(step: Step, comm: Comm, making: Collection[tuple[str, Path]] = ()) -> None:
+    """Refuse stages that the scene of a step lacks, and inputs that are missing or of other settings or another form
+    than the scene's; but for those that are still to be made, each by its stage and directory."""
+    stages, scene = step.stages, step.scene
     check_sections(stages, scene)
-    if "train" in stages and scene.model is not None and scene.model.path is not None:
+    weights = scene.model.weights_file if "train" in stages and scene.model is not None else None
+    if weights is not None and ("train", weights.parent) not in making:
         read_source(scene, comm)
     if "train" in stages and scene.training is not None and scene.training.truths is not None:
         from eddies.workflows.learned.truths import truth_problems  # torch, only here
-        for problem in truth_problems(scene, comm, directory):
+        for problem in truth_problems(scene, comm, step.holder("dns")):
             raise SceneError(f"{scene.name}: {problem}")
     for needed in scene.inputs(stages[0]):
-        with open_product(comm, directory / needed.file, needed.product):
+        holder = step.holder(needed.name)
+        if (needed.name, holder) in making:
+            continue
+        with open_product(comm, holder / needed.file, needed.product):
             pass
-        if not on_first_rank(comm, partial(is_done, needed.name, scene, directory)):
-            raise SceneError(f"{directory / needed.file}: was made with other settings than this scene's; run "
+        if not on_first_rank(comm, partial(is_done, needed.name, scene, holder)):
+            raise SceneError(f"{holder / needed.file}: was made with other settings than this scene's; run "
                              f"`eddies {needed.name} --overwrite` with these, or give `eddies {stages[0]}` the --set "
                              "of then")
 

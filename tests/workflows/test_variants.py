@@ -120,12 +120,28 @@ def test_a_stage_that_the_variant_named_lacks_is_refused(comm, folder, capfd):
     assert 'no-force: [simulation] method = "none" needs no trained model' in capfd.readouterr().err
 
 
-@pytest.mark.mpi(1)
+@pytest.mark.mpi(1, timeout=300)
 def test_a_variant_in_another_flow_makes_its_own_ground_truth(folder):
-    (folder / "own.toml").write_text('base = "base.toml"\n[variant.a]\n[variant.b]\nflow.viscosity = 0.2\n')
+    """In place of the link to the one of all, where that was its own before."""
+    text = 'base = "base.toml"\nunset = ["kernel"]\nsimulation.method = "none"\ntraining.combined_steps = 0\n'
+    text += "training.field_weight = 0\ntraining.velocity_kl_weight = 0\ntraining.acceleration_kl_weight = 0\n"
+    (folder / "own.toml").write_text(text + "[variant.a]\n[variant.b]\n")
+    assert run_cli("simulate", "own.toml") == 2
+    for stage in ("dns", "simulate"):
+        assert run_cli(stage, "own.toml") == 0
+    truths = [folder / "runs/own" / where / "ground_truth.h5" for where in ("", "a", "b")]
+    shared = truths[0].read_bytes()
+    (folder / "own.toml").write_text(text + "[variant.a]\n[variant.b]\nflow.viscosity = 0.2\n")
     scene = load_scene("own.toml")
-    assert ("runs/own/b", ("dns", "train-kernel", "train"), {}) in planned(scene, ("dns", "train-kernel", "train"))
     assert [place.scene.flow.viscosity for (place,) in rollouts(scene, folder).values()] == [0.1, 0.2]
+    assert planned(scene, ("dns", "simulate"))[1] == ("runs/own/b", ("dns",), {})
+    assert run_cli("dns", "own.toml") == 0
+    assert run_cli("simulate", "own.toml", "--overwrite") == 0
+    assert [path.is_symlink() for path in truths] == [False, True, False]
+    assert truths[0].read_bytes() == shared != truths[2].read_bytes()
+    (folder / "fresh.toml").write_text((folder / "own.toml").read_text())
+    eddies.run(load_scene("fresh.toml"), stages=["dns", "simulate"])
+    assert (folder / "runs/fresh/b/rollout.h5").exists()
 
 
 @pytest.mark.mpi(2, timeout=300)

@@ -43,6 +43,10 @@ class Step:
     variant: str | None = None
     links: Mapping[str, Path] = field(default_factory=dict)
 
+    def holder(self, stage: str) -> Path:
+        """The directory that holds the product of a stage, or will hold it."""
+        return self.links.get(stage, self.directory)
+
 
 @dataclass(frozen=True)
 class Place:

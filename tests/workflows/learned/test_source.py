@@ -12,7 +12,7 @@ from eddies.io.weights import save_weights
 from eddies.particles.flow_units import ReferenceScales
 from eddies.scene.rules import quoted
 from eddies.scene.scene import Model, SceneError, load_scene
-from eddies.stages import check_inputs
+from eddies.stages import Step, check_inputs
 from eddies.workflows.learned.model import with_weights
 from eddies.workflows.learned.source import describe, differences, read_source
 
@@ -107,8 +107,8 @@ def test_other_terms_are_refused_with_both_lists(comm, tmp_path, terms):
 def test_missing_weights_are_refused_before_any_work_on_all_ranks(comm, tmp_path):
     wanted = scene(f"model.path={tmp_path}")
     with pytest.raises(ProductError, match=r"tiny: \[model\] path = .*model.h5: no such file; run `eddies train"):
-        check_inputs(wanted.stages, wanted, comm, tmp_path)
-    check_inputs(["dns"], wanted, comm, tmp_path)
+        check_inputs(Step(wanted, wanted.stages, tmp_path), comm)
+    check_inputs(Step(wanted, ("dns",), tmp_path), comm)
 
 
 @pytest.mark.mpi(1, 2)

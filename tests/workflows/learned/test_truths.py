@@ -18,7 +18,7 @@ from eddies.learning.losses import relative_error
 from eddies.parallel.reduction import global_sum
 from eddies.particles.model import FORCING
 from eddies.scene.scene import SceneError, load_scene
-from eddies.stages import check_inputs, check_ranks
+from eddies.stages import Step, check_inputs, check_ranks
 from eddies.workflows import dns, train
 from eddies.workflows.foreseen.problems import warnings
 from eddies.workflows.foreseen.ranks import most_ranks
@@ -257,7 +257,7 @@ def test_truths_that_do_not_fit_are_refused_before_any_work(comm, tmp_path, over
     assert problems[0].startswith(f'[training] truths: "{tmp_path / name}": ')
     # The own ground truth, which is named too, is made by the run itself.
     with pytest.raises(SceneError, match=r"own: \[training\] truths: "):
-        check_inputs(("train",), scene, comm, tmp_path / "own")
+        check_inputs(Step(scene, ("train",), tmp_path / "own"), comm)
 
 
 def on_ranks(size):
