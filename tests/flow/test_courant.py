@@ -25,6 +25,17 @@ def test_memory_of_the_step_goes_on_between_two_measurements(comm):
 
 
 @pytest.mark.mpi(1)
+def test_the_last_step_ends_at_the_end(comm):
+    grid = SpectralGrid(SlabDecomposition(comm, 6.283185307179586, 8))
+    velocity, limit = taylor_green(grid, 1.0), CourantLimit(grid, 0.5, 1.0)
+    step = limit(velocity, Clock())
+    clock = Clock(end=2.5 * step)
+    while clock.running:
+        clock.tick(limit(velocity, clock))
+    assert clock.time == pytest.approx(2.5 * step, rel=1e-15) and clock.steps == 3
+
+
+@pytest.mark.mpi(1)
 @pytest.mark.parametrize("sound_speed", [0.1, 100.0])
 def test_up_to_a_courant_number_of_1_3_no_limit_of_the_explicit_stepper_is_broken(comm, sound_speed):
     # k_max dx is at most 2 pi / 3, and 1.35 times that is 2.83.

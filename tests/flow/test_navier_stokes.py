@@ -179,3 +179,14 @@ def test_dissipation_against_all_nine_gradients(comm):
     expected = np.mean(third / second**1.5), np.mean(fourth / second**2)
     assert (budget["skewness"], budget["flatness"]) == pytest.approx(expected, rel=1e-10)
     assert gradient_moments(grid, state[:3]) == pytest.approx(expected, rel=1e-10)
+
+
+@pytest.mark.mpi(1, 2)
+def test_the_energy_of_a_weak_sound_wave_is_that_of_its_compression(comm):
+    """c^2 <s^2> / 2 of s = a cos(kx) at rest, but for powers of a; nothing where nothing is compressed."""
+    grid, sound_speed, amplitude = SpectralGrid(SlabDecomposition(comm, 2 * np.pi, 16)), 8.0, 1e-3
+    state = np.zeros((4, *grid.spectral_shape), grid.complex)
+    assert compressible_budget(grid, state, 0.0, sound_speed)["total_energy"] == 0
+    state[3] = initial_fields.sound_wave_density(grid, amplitude, 2)
+    energy = compressible_budget(grid, state, 0.0, sound_speed)["total_energy"]
+    assert energy == pytest.approx(sound_speed**2 * amplitude**2 / 4, rel=1e-5)

@@ -1,7 +1,10 @@
+from collections import Counter
+
 import h5py
 import pytest
 
 from eddies.io.hdf5 import create_product, growing_dataset, write_table
+from eddies.io.quantities import words_on
 
 
 @pytest.mark.mpi(1, 2)
@@ -24,3 +27,31 @@ def test_a_flow_says_its_units_its_box_and_what_t_0_is(comm, tmp_path):
             assert origin is None or origin in file.attrs["time_origin"] and "wrapped" in file.attrs["box"]
             assert {"units", "box", "time_origin"} & set(file.attrs) == ({"units", "box", "time_origin"} if origin
                                                                          else set())
+
+
+def dimensions(*paths):
+    """The powers of L, T and M in the unit of a product of datasets of a ground truth; each may have a power of its
+    own, path^2."""
+    powers = Counter()
+    for path in paths:
+        path, _, power = path.partition("^")
+        for place, part in enumerate(words_on("ground_truth", path)["units"].split("/")):
+            name, _, own = part.partition("^")
+            powers[name] += (-1 if place else 1) * int(own or 1) * int(power or 1)
+    return {name: power for name, power in powers.items() if name != "1" and power}
+
+
+@pytest.mark.parametrize("one, other", [
+    (["particles/tracers/position/value"], ["particles/tracers/velocity/value", "statistics/time"]),
+    (["particles/tracers/velocity/value"], ["particles/tracers/acceleration/value", "statistics/time"]),
+    (["fields/filtered/velocity^2"], ["statistics/energy"]), (["spectra/energy"], ["statistics/energy"]),
+    (["statistics/energy"], ["statistics/dissipation_rate", "statistics/time"]),
+    (["statistics/dissipation_rate"], ["statistics/injection_rate"]),
+    (["statistics/integral_scale"], ["statistics/velocity_rms", "statistics/eddy_turnover_time"]),
+    (["statistics/kolmogorov_length^2"], ["statistics/dissipation_rate", "statistics/kolmogorov_time^3"]),
+    (["statistics/taylor_scale"], ["statistics/kolmogorov_length"]),
+    (["statistics/density_rms"], ["fields/filtered/density"]),
+    (["reconstructions/second^3"], ["reconstructions/third^2"]),
+    (["gradients/model/velocity_gradient^2"], ["reconstructions/second"])], ids=str)
+def test_units_are_those_of_the_equations(one, other):
+    assert dimensions(*one) == dimensions(*other) != {}

@@ -48,6 +48,13 @@ def test_training_is_the_same_on_any_number_of_ranks(comm):
         assert torch.allclose(parameter, other, rtol=1e-8, atol=1e-12)
 
 
+@pytest.mark.mpi(1, 2, 3)
+def test_a_field_of_nothing_has_an_error_of_one(comm):
+    """Over the whole grid, whatever the rank has of it."""
+    sample = sample_of(comm, 2.4 * SPACING)
+    assert sample.errors_of(0 * sample.field, 0 * sample.gradient) == pytest.approx((1, 1), rel=1e-12)
+
+
 @pytest.mark.mpi(1)
 @pytest.mark.parametrize("spacings", [1.8, 3.0])
 def test_the_learned_kernel_beats_a_cubic_spline_of_the_wrong_width_on_the_field_it_was_fitted_to(comm, spacings):

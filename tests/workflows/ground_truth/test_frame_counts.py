@@ -1,7 +1,9 @@
+from dataclasses import replace
+
 import pytest
 
-from eddies.scene.scene import load_scene
-from eddies.workflows.ground_truth.frame_counts import rollout_start, whole_frames
+from eddies.scene.scene import Horizons, load_scene
+from eddies.workflows.ground_truth.frame_counts import last_trained_on, rollout_start, whole_frames
 
 FRAMES = 101
 
@@ -16,3 +18,11 @@ def test_the_whole_flow_is_stored_where_rollouts_start(changes):
 
 def test_nowhere_without_a_rollout():
     assert whole_frames(load_scene("tracers-only"), FRAMES) == set()
+
+
+@pytest.mark.parametrize("window, horizons, held_out", [
+    (0.8, None, 8), (0.8, Horizons(steps=100, frames=(1, 20)), 20), (0.15, None, 2)],
+    ids=["a tenth", "the longest horizon", "at least two"])
+def test_what_validates_is_not_trained_on(window, horizons, held_out):
+    training = replace(load_scene("hit-small").training, window=window, horizons=horizons)
+    assert last_trained_on(training, FRAMES) == window * (FRAMES - 1) - held_out
