@@ -230,6 +230,16 @@ def test_every_term_is_in_the_table():
     assert set(named) == {*TERMS, '"module:name"'}
 
 
+def test_every_guarantee_names_tests_that_exist():
+    table = TEXT.split("| guarantee | tests |")[1].split("\n\n")[0]
+    guarantees = [row.strip("|").split("|") for row in table.splitlines()[2:] if not row.startswith("| **")]
+    for guarantee, tests in guarantees:
+        named = re.findall(r"`([\w/]+\.py)::(\w+)`", tests)
+        assert named and len(named) == tests.count("`") / 2, guarantee
+        for path, name in named:
+            assert f"\ndef {name}(" in (CHECKOUT / "tests" / path).read_text(), f"{path}::{name}"
+
+
 def test_formulas_shown_are_those_of_the_library():
     source = (CHECKOUT / "src/eddies/kernels/summands.hpp").read_text()
     shown = blocks("cpp")
