@@ -15,8 +15,8 @@ from eddies.particles.pairs import compiled_sums
 from eddies.particles.smoothing_kernels import CubicSpline, WendlandC2
 from eddies.particles.terms.term import PairTerm
 from tests.particles.configurations import (
-    CONFIGURATIONS, CUTOFF, FLOW, LENGTH, NEIGHBORS, PAIR_MODELS, SCALES, alone, by_torch, dynamics_of, given, model,
-    state,
+    CONFIGURATIONS, CUTOFF, FLOW, LENGTH, NEIGHBORS, OPEN, PAIR_MODELS, SCALES, alone, by_torch, dynamics_of, given,
+    model, state,
 )
 
 # Every term over pairs as it is without settings, and others.
@@ -25,6 +25,9 @@ TERMS = {word: {word: {}} for word, kind in BUILT_IN.items() if issubclass(kind,
     "flux and friction": {"pairs": {}, "density-flux": {}, "eddy-viscosity": dict(form="monaghan")},
     "antisymmetric alone": {"pairs": dict(basis="paper", symmetry="antisymmetric")},
     "two-sided": {"eddy-viscosity": dict(form="two-sided", basis="paper")},
+    "unit vectors in a window": {"pairs": dict(basis="unit"), "eddy-viscosity": dict(basis="unit", form="monaghan"),
+                                 "density-flux": dict(sign=True, inputs=("distance",))},
+    "vectors without": {"pairs": dict(basis="paper", **OPEN), "eddy-viscosity": dict(basis="paper", **OPEN)},
     "continuity": {"continuity": dict(diffusion=0.1), "wcsph": {}},
     "transport velocity": {"continuity": {}, "wcsph": {}, "transport-velocity": {}},
     "transport velocity alone": {"transport-velocity": {}},
@@ -101,7 +104,7 @@ def test_with_any_number_of_rows_of_cells(comm, served, monkeypatch, kind, cutof
 
 
 @pytest.mark.mpi(1)
-@pytest.mark.parametrize("name", ["corrected", "antisymmetric", "continuity"])
+@pytest.mark.parametrize("name", ["corrected", "published", "antisymmetric", "continuity"])
 def test_single_precision_differs_by_its_rounding(comm, served, monkeypatch, name):
     """Sums of up to a hundred pairs of either sign, of which each is rounded several times."""
     compare(monkeypatch, *set_up(TERMS[name], "even", dtype=torch.float32), 3e-5)

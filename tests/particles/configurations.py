@@ -36,10 +36,13 @@ CONFIGURATIONS = {
 }
 #: A model with a density of its own that a term reads and changes.
 OWN_DENSITY = {"pairs": {}, "density-flux": {}, "continuity": dict(diffusion=0.1)}
+OPEN = dict(window="none", scaling="root")
 #: Models of pairs.
 PAIR_MODELS = {
     "paper": {"pairs": dict(basis="paper"), "density-flux": {},
               "eddy-viscosity": dict(form="two-sided", basis="paper")},
+    "published": {"pairs": dict(basis="unit", **OPEN), "eddy-viscosity": dict(basis="unit", **OPEN),
+                  "density-flux": dict(sign=True, **OPEN), "density-diffusion": OPEN},
     "corrected": {**OWN_DENSITY, "eddy-viscosity": dict(form="monaghan")},
     "pairs": {"pairs": {}},
     "antisymmetric": {"pairs": dict(basis="paper", symmetry="antisymmetric"), "continuity": {},

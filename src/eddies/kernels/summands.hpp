@@ -218,47 +218,51 @@ inline Real dot(const Real (*a)[BLOCK], const Real (*b)[BLOCK], int p) {
     return a[0][p] * b[0][p] + a[1][p] * b[1][p] + a[2][p] * b[2][p];
 }
 
-// w NN_1 x and w NN_2 v, or with one output w NN, of a network of the pairs' invariants.
+// Added to lengths by which vectors are divided (particles/terms/pair_basis.py).
+constexpr double SMALL = 1e-6;
+
+// w NN_1 x and w NN_2 v, or with one output w NN, of a network of the pairs' invariants; with unit vectors x/|x| and
+// v/|v|; with w = 1 where pairs are not weighted; with one output times the sign of the difference of densities.
 template <typename Real>
 class PairNetwork : public Summand<Real> {
    public:
     // Numbers: outputs, whether densities enter as sum and square of the difference, whether the network is told
-    // density (the scalar), distance, speed, approach; widths of hidden layers.
+    // density (the scalar), distance, speed, approach; whether directions are unit vectors, pairs weighted, the output
+    // times the sign; widths of hidden layers.
     explicit PairNetwork(const Given& given)
         : Summand<Real>(given.numbers[0] == 2 ? 6 : 1), symmetric_(given.numbers[1]),
-          density_(given.numbers[2] ? static_cast<int>(given.scalar) : -1), distance_(given.numbers[3]),
-          speed_(given.numbers[4]), approach_(given.numbers[5]),
-          network_(widths(given), given.parameters, given.parameters_count) {
-        this->scalars = density_ >= 0;
+          scalar_(static_cast<int>(given.scalar)), density_(given.numbers[2]), distance_(given.numbers[3]),
+          speed_(given.numbers[4]), approach_(given.numbers[5]), unit_(given.numbers[6]), weighted_(given.numbers[7]),
+          sign_(given.numbers[8]), network_(widths(given), given.parameters, given.parameters_count) {
+        this->scalars = density_ || sign_;
         this->parameters = static_cast<int>(given.parameters_count);
     }
 
     void values(const Block<Real>& pairs, Components<Real> found) override {
         evaluate(pairs);
         const Rows<Real>& outputs = network_.outputs();
-        const Real *along_x = outputs[0], *w = pairs.weight;
+        const Real* along_x = outputs[0];
         if (this->components == 1) {
-            EDDIES_PAIRS found[0][p] = w[p] * along_x[p];
+            EDDIES_PAIRS found[0][p] = by_x_[p] * along_x[p];
             return;
         }
         const Real* along_v = outputs[1];
         for (int c = 0; c < 3; ++c) {
-            EDDIES_PAIRS found[c][p] = w[p] * along_x[p] * pairs.x[c][p];
-            EDDIES_PAIRS found[3 + c][p] = w[p] * along_v[p] * pairs.v[c][p];
+            EDDIES_PAIRS found[c][p] = by_x_[p] * along_x[p] * pairs.x[c][p];
+            EDDIES_PAIRS found[3 + c][p] = by_v_[p] * along_v[p] * pairs.v[c][p];
         }
     }
 
     void gradients(const Block<Real>& pairs, GivenComponents<Real> given, ByPairs<Real>* by_pairs,
                    Real* by_parameters) override {
         evaluate(pairs);
-        const Real* w = pairs.weight;
         Rows<Real>& by_outputs = network_.by_outputs();
         if (this->components == 1) {
-            EDDIES_PAIRS by_outputs[0][p] = w[p] * given[0][p];
+            EDDIES_PAIRS by_outputs[0][p] = by_x_[p] * given[0][p];
         } else {
             Real *by_x = by_outputs[0], *by_v = by_outputs[1];
-            EDDIES_PAIRS by_x[p] = w[p] * dot(given, pairs.x, p);
-            EDDIES_PAIRS by_v[p] = w[p] * dot(given + 3, pairs.v, p);
+            EDDIES_PAIRS by_x[p] = by_x_[p] * dot(given, pairs.x, p);
+            EDDIES_PAIRS by_v[p] = by_v_[p] * dot(given + 3, pairs.v, p);
         }
         network_.backward(by_parameters, by_pairs != nullptr);
         if (by_pairs) add_by_pairs(pairs, given, *by_pairs);
@@ -266,15 +270,16 @@ class PairNetwork : public Summand<Real> {
 
    private:
     bool symmetric_;
-    int density_;
-    bool distance_, speed_, approach_;
+    int scalar_;
+    bool density_, distance_, speed_, approach_, unit_, weighted_, sign_;
     Network<Real> network_;
-    alignas(64) Real speed_of_[BLOCK];
+    // |v|; and what the outputs are multiplied by beside x and v: the weight, and the sign or the inverse lengths.
+    alignas(64) Real speed_of_[BLOCK], by_x_[BLOCK], by_v_[BLOCK];
 
     static std::vector<int> widths(const Given& given) {
         const double* told = given.numbers;
         std::vector<int> found(1, static_cast<int>(2 * told[2] + told[3] + told[4] + told[5]));
-        found.insert(found.end(), told + 6, told + given.numbers_count);
+        found.insert(found.end(), told + 9, told + given.numbers_count);
         found.push_back(static_cast<int>(told[0]));
         return found;
     }
@@ -283,8 +288,9 @@ class PairNetwork : public Summand<Real> {
     __attribute__((noinline)) void evaluate(const Block<Real>& pairs) {
         Rows<Real>& features = network_.features();
         int row = 0;
-        if (density_ >= 0) {
-            const Real *own = pairs.scalar[0][density_], *other = pairs.scalar[1][density_];
+        if (speed_ || unit_) EDDIES_PAIRS speed_of_[p] = std::sqrt(dot(pairs.v, pairs.v, p));
+        if (density_) {
+            const Real *own = pairs.scalar[0][scalar_], *other = pairs.scalar[1][scalar_];
             Real *first = features[row++], *second = features[row++];
             if (symmetric_) {
                 EDDIES_PAIRS {
@@ -297,36 +303,45 @@ class PairNetwork : public Summand<Real> {
             }
         }
         if (distance_) std::copy(pairs.distance, pairs.distance + BLOCK, features[row++]);
-        if (speed_) {
-            EDDIES_PAIRS speed_of_[p] = std::sqrt(dot(pairs.v, pairs.v, p));
-            std::copy(speed_of_, speed_of_ + BLOCK, features[row++]);
-        }
+        if (speed_) std::copy(speed_of_, speed_of_ + BLOCK, features[row++]);
         if (approach_) {
             Real* feature = features[row];
             EDDIES_PAIRS feature[p] = dot(pairs.x, pairs.v, p);
         }
+        find_factors(pairs);
         network_.forward();
+    }
+
+    void find_factors(const Block<Real>& pairs) {
+        const Real* w = pairs.weight;
+        EDDIES_PAIRS by_x_[p] = weighted_ ? w[p] : Real(w[p] > 0);
+        std::copy(by_x_, by_x_ + BLOCK, by_v_);
+        if (unit_) EDDIES_PAIRS {
+                by_x_[p] /= pairs.distance[p] + Real(SMALL);
+                by_v_[p] /= speed_of_[p] + Real(SMALL);
+            }
+        if (sign_) {
+            const Real *own = pairs.scalar[0][scalar_], *other = pairs.scalar[1][scalar_];
+            EDDIES_PAIRS by_x_[p] *= Real(own[p] > other[p]) - Real(own[p] < other[p]);
+        }
     }
 
     void add_by_pairs(const Block<Real>& pairs, GivenComponents<Real> given, ByPairs<Real>& by) {
         const Rows<Real>&by_features = network_.by_features(), &outputs = network_.outputs();
-        const Real *w = pairs.weight, *along_x = outputs[0];
+        const Real* along_x = outputs[0];
         if (this->components == 1) {
-            EDDIES_PAIRS by.weight[p] += given[0][p] * along_x[p];
+            if (weighted_) {
+                EDDIES_PAIRS by.weight[p] += pairs.weight[p] > 0 ? given[0][p] * along_x[p] * by_x_[p] / pairs.weight[p]
+                                                                 : Real(0);
+            }
         } else {
-            const Real* along_v = outputs[1];
-            for (int c = 0; c < 3; ++c) EDDIES_PAIRS {
-                    by.weight[p] += given[c][p] * along_x[p] * pairs.x[c][p];
-                    by.weight[p] += given[3 + c][p] * along_v[p] * pairs.v[c][p];
-                    by.x[c][p] += given[c][p] * w[p] * along_x[p];
-                    by.v[c][p] += given[3 + c][p] * w[p] * along_v[p];
-                }
+            add_by_directions(pairs, given, along_x, outputs[1], by);
         }
         int row = 0;
-        if (density_ >= 0) {
-            const Real *own = pairs.scalar[0][density_], *other = pairs.scalar[1][density_];
+        if (density_) {
+            const Real *own = pairs.scalar[0][scalar_], *other = pairs.scalar[1][scalar_];
             const Real *first = by_features[row++], *second = by_features[row++];
-            Real *by_own = by.scalar[0][density_], *by_other = by.scalar[1][density_];
+            Real *by_own = by.scalar[0][scalar_], *by_other = by.scalar[1][scalar_];
             const Real symmetric = symmetric_ ? 1 : 0;
             EDDIES_PAIRS {
                 const Real turned = symmetric * 2 * (own[p] - other[p]) * second[p];
@@ -350,6 +365,31 @@ class PairNetwork : public Summand<Real> {
                     by.v[c][p] += feature[p] * pairs.x[c][p];
                 }
         }
+    }
+
+    // The gradient of w NN_1 b_1 and w NN_2 b_2 by w and the directions, the networks being held.
+    void add_by_directions(const Block<Real>& pairs, GivenComponents<Real> given, const Real* along_x,
+                           const Real* along_v, ByPairs<Real>& by) {
+        for (int c = 0; c < 3; ++c) EDDIES_PAIRS {
+                by.x[c][p] += given[c][p] * by_x_[p] * along_x[p];
+                by.v[c][p] += given[3 + c][p] * by_v_[p] * along_v[p];
+            }
+        if (!weighted_ && !unit_) return;
+        alignas(64) Real of_x[BLOCK], of_v[BLOCK];  // along_x and along_v times what they are given, but for w
+        EDDIES_PAIRS of_x[p] = along_x[p] * dot(given, pairs.x, p);
+        EDDIES_PAIRS of_v[p] = along_v[p] * dot(given + 3, pairs.v, p);
+        if (unit_) EDDIES_PAIRS {
+                of_x[p] /= pairs.distance[p] + Real(SMALL);
+                of_v[p] /= speed_of_[p] + Real(SMALL);
+            }
+        if (weighted_) EDDIES_PAIRS by.weight[p] += of_x[p] + of_v[p];
+        if (!unit_) return;
+        EDDIES_PAIRS {
+            const Real w = weighted_ ? pairs.weight[p] : Real(pairs.weight[p] > 0);
+            by.distance[p] -= w * of_x[p] / (pairs.distance[p] + Real(SMALL));
+            of_v[p] *= speed_of_[p] > 0 ? w / (speed_of_[p] * (speed_of_[p] + Real(SMALL))) : Real(0);
+        }
+        for (int c = 0; c < 3; ++c) EDDIES_PAIRS by.v[c][p] -= of_v[p] * pairs.v[c][p];
     }
 };
 
@@ -376,27 +416,62 @@ struct Moments {
 
 static const bool moments = declare_formula<Moments>("moments");
 
-// w Pi x with Pi = mu (|a_2| mu - |a_1|), mu = x.v / (|x|^2 + softening), or of approaching pairs alone. Numbers: whether
-// so, and the softening. Parameters: |a_1| and |a_2|.
+// w, or 1 of pairs within the radius.
+template <typename W>
+inline auto window(const W& w, bool weighted) {
+    using Real = std::decay_t<decltype(value_of(w)[0])>;
+    const Real kept = weighted ? 1 : 0;
+    const auto within = value_of(w) > Real(0);
+    return kept * w + where(within, Vector<Real>{} + (Real(1) - kept), Vector<Real>{});
+}
+
+// w Pi x/(unit |x| + length) with Pi = mu (|a_2| mu - |a_1|), mu = x.v / (|x|^2 + softening), or of approaching pairs
+// alone. Numbers: whether so, the softening, whether pairs are weighted, unit and length. Parameters: |a_1| and |a_2|.
 template <typename Real>
 struct EddyViscosity {
     static constexpr int components = 3, scalars = 0, parameters = 2;
     Real limit, softening;
+    bool weighted;
+    Real unit, length;
 
     explicit EddyViscosity(const Given& given)
-        : limit(given.numbers[0] ? Real(0) : std::numeric_limits<Real>::infinity()), softening(given.numbers[1]) {}
+        : limit(given.numbers[0] ? Real(0) : std::numeric_limits<Real>::infinity()), softening(given.numbers[1]),
+          weighted(given.numbers[2]), unit(given.numbers[3]), length(given.numbers[4]) {}
 
     template <typename Pairs, typename Give>
     void operator()(const Pairs& pairs, const Give& give) const {
         const auto &x = pairs.x, &r = pairs.distance, &linear = pairs.parameter[0], &quadratic = pairs.parameter[1];
         const auto rate = let(product(x, pairs.v) / (r * r + softening));
         const auto mu = let(at_most(rate, limit));
-        const auto strength = let(pairs.weight * mu * (quadratic * mu - linear));
+        const auto w = let(window(pairs.weight, weighted));
+        const auto strength = let(w * mu * (quadratic * mu - linear) / (unit * r + length));
         for (int c = 0; c < 3; ++c) give(c, strength * x[c]);
     }
 };
 
 static const bool eddy_viscosity = declare_formula<EddyViscosity>("eddy-viscosity");
+
+// -w (|b_1| + |b_2| |q|) q, q = (rho'_i - rho'_j) / (|x|^2 + softening). Numbers: the softening, and whether pairs are
+// weighted. Parameters: |b_1| and |b_2|. The scalar: rho'.
+template <typename Real>
+struct DensityDiffusion {
+    static constexpr int components = 1, scalars = 1, parameters = 2;
+    Real softening;
+    bool weighted;
+
+    explicit DensityDiffusion(const Given& given) : softening(given.numbers[0]), weighted(given.numbers[1]) {}
+
+    template <typename Pairs, typename Give>
+    void operator()(const Pairs& pairs, const Give& give) const {
+        const auto &r = pairs.distance, &linear = pairs.parameter[0], &quadratic = pairs.parameter[1];
+        const auto w = let(window(pairs.weight, weighted));
+        const auto q = let((pairs.own[0] - pairs.other[0]) / (r * r + softening));
+        const auto size = where(value_of(q) < Real(0), Real(-1) * q, q);
+        give(0, Real(-1) * w * (linear + quadratic * size) * q);
+    }
+};
+
+static const bool density_diffusion = declare_formula<DensityDiffusion>("density-diffusion");
 
 // -W'/q h^4 of the cubic spline W as a function of q = r/h <= 1.
 template <typename Q>

@@ -13,13 +13,13 @@ from typing import Any, ClassVar
 
 from eddies.errors import UserError
 from eddies.scene.integrators import Scheme
-from eddies.scene.values import KeyProblem, Section, choice, integer, integers, named, number, texts
+from eddies.scene.values import KeyProblem, Section, boolean, choice, integer, integers, named, number, texts
 
 READS = ("pairs", "resolved", "density")
 GIVES = ("acceleration", "density", "density_rate", "shift_velocity")
 #: What a network can be told of a pair, in units of the flow: the densities of both, |x|, |v| and x.v.
 INPUTS = ("density", "distance", "speed", "approach")
-BASES = ("corrected", "paper")
+BASES = ("corrected", "paper", "unit")
 # How much faster than its own rate what relaxes may be, as neighbours tell the noise of a particle with the wrong sign:
 # 3.6 to 4.0 among particles at random, and in turbulence. Two fifths more for what else makes noise grow: at 4.2 a flow
 # at M_t = 0.16 ran away after a turnover, at 5.5 one of 256^3 cells within steps.
@@ -86,6 +86,33 @@ class TermSettings(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
+class PairSum(TermSettings):
+    """How the values of pairs are weighted, and how their sum is scaled."""
+
+    window: str = choice("factor of a pair at the distance q, over the radius of interaction; smooth: (1 - q^2)^2; none: "
+                         "1, so that a rate jumps where a neighbour enters or leaves", "smooth", "none",
+                         default="smooth")
+    scaling: str = choice("of the sum, by the expected number n of neighbours; number: 1/n; root: n^(-1/2)", "number",
+                          "root", default="number")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ForceSum(PairSum):
+    """A sum of forces between pairs along two directions."""
+
+    basis: str = choice("directions of a pair's forces; paper: x and v of Eq. 4; unit: x/|x| and v/|v|; corrected: x "
+                        "and v, and the sum times the inverse moment matrix in place of its scaling", *BASES,
+                        default="corrected")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.basis == "corrected" and (self.window, self.scaling) != ("smooth", "number"):
+            key = "window" if self.window != "smooth" else "scaling"
+            raise KeyProblem(self.section_name(), key, f' = "{getattr(self, key)}": the moment matrix of basis = '
+                             '"corrected" takes the place of both window and scaling; set basis = "paper" or "unit"')
+
+
+@dataclass(frozen=True, kw_only=True)
 class NetworkSettings(TermSettings):
     """A network of the invariants of a pair."""
 
@@ -105,44 +132,58 @@ class NetworkSettings(TermSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PairNetwork(NetworkSettings):
+class PairNetwork(NetworkSettings, ForceSum):
     """The learned pair force, Eqs. 3 and 4."""
 
     word = "pairs"
 
-    basis: str = choice("of the sum over pairs; corrected: times the inverse moment matrix", *BASES,
-                        default="corrected")
-    symmetry: str = choice("antisymmetric: pairs get opposite forces, which keep the momentum; with basis paper only",
-                           "none", "antisymmetric", default="none")
+    symmetry: str = choice("antisymmetric: pairs get opposite forces, which keep the momentum; not with basis "
+                           "corrected", "none", "antisymmetric", default="none")
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.symmetry == "antisymmetric" and self.basis != "paper":
+        if self.symmetry == "antisymmetric" and self.basis == "corrected":
             raise KeyProblem(self.section_name(), "symmetry", f' = "{self.symmetry}": with basis = "{self.basis}" the '
                              "forces of a pair are not opposite, as each particle has a moment matrix of its own; set "
                              'basis = "paper", or symmetry = "none"')
 
 
 @dataclass(frozen=True, kw_only=True)
-class EddyViscosity(TermSettings):
+class EddyViscosity(ForceSum):
     """Explicit eddy viscosity between pairs, the term Pi of Eq. 3."""
 
     word = "eddy-viscosity"
 
     form: str = choice("two-sided: of all pairs; monaghan: of approaching ones", "two-sided", "monaghan",
                        default="two-sided")
-    basis: str = choice("of the sum over pairs, as of the pair network", *BASES, default="corrected")
-
     numbers_per_pair = 8
     reads = ("pairs",)
 
 
 @dataclass(frozen=True, kw_only=True)
-class DensityFlux(NetworkSettings):
-    """The paper's rate of density: a learned flux between pairs."""
+class DensityFlux(NetworkSettings, PairSum):
+    """The network of the density in Eq. 3."""
 
     word = "density-flux"
+
+    sign: bool = boolean("multiply by the sign of the density difference of the pair", default=False)
+
     gives = ("density_rate",)
+
+    @property
+    def reads(self) -> tuple[str, ...]:  # type: ignore[override]
+        """Pairs, and the density where the network or the sign needs it."""
+        return ("pairs", "density") if self.sign or "density" in self.inputs else ("pairs",)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DensityDiffusion(PairSum):
+    """Nonlinear diffusion of the density between pairs: the part of Pi in the density equation."""
+
+    word = "density-diffusion"
+    reads = ("pairs", "density")
+    gives = ("density_rate",)
+    numbers_per_pair = 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -291,13 +332,22 @@ LITTLE_FRICTION = {"alpha": 0.05, "beta": 1.5}
 
 RESOLVED = ("pressure", "stress", "viscosity", "damping", "relaxation")
 
+
+def _published(basis: str) -> dict[str, Mapping[str, Any]]:
+    """Eq. 3: networks of force and density, and Pi of both. What the text leaves open is as in the public code."""
+    plain, network = {"window": "none", "scaling": "root"}, {"hidden": (20, 100, 20)}
+    return {"pairs": {"basis": basis, **plain, **network}, "eddy-viscosity": {"basis": basis, **plain},
+            "density-flux": {"sign": True, **plain, **network}, "density-diffusion": plain}
+
+
 #: Of each preset the settings that differ from the terms' own, by term, in the order of the terms.
 PRESETS: dict[str, dict[str, Mapping[str, Any]]] = {
     "resolved": dict.fromkeys(RESOLVED, {}),
     # The density there is that of the pressure, whose force is given: a network that is told of it learns no more, and
     # costs twice as much, as pairs then are not opposite.
     "resolved + pairs": {**dict.fromkeys(RESOLVED, {}), "pairs": {"inputs": ("distance", "speed", "approach")}},
-    "paper": {"pairs": {"basis": "paper", "hidden": (20, 100, 20)}, "density-flux": {"hidden": (20, 100, 20)}},
+    "paper": _published("paper"),
+    "paper-code": _published("unit"),
     "local": {"filtered-equations": {}, "eddy-viscosity": {}},
     "wcsph": {"continuity": {}, "wcsph": LITTLE_FRICTION},
     "transport-velocity": {"continuity": {}, "wcsph": LITTLE_FRICTION, "transport-velocity": {}},

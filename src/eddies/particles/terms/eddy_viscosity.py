@@ -9,7 +9,9 @@ from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.pairs import CompiledSum, ScaledPairs
 from eddies.particles.rates import Rates
-from eddies.particles.terms.pair_basis import acceleration, along_separation
+from eddies.particles.terms.pair_basis import (
+    SMALL, acceleration, along_separation, separation_direction, told, window,
+)
 from eddies.particles.terms.term import PairTerm
 from eddies.scene import terms as declared
 
@@ -18,7 +20,7 @@ SOFTENING = 0.1
 
 
 class EddyViscosity(PairTerm):
-    """a_rms times the sum of w Pi x, as that of the pair network, with
+    """a_rms times the sum of w Pi b_1, weighted and scaled as that of the pair network, with
 
         Pi = -|a_1| mu + |a_2| mu^2,   mu = x.v / (|x|^2 + 0.1),
 
@@ -44,13 +46,18 @@ class EddyViscosity(PairTerm):
         return mu * (quadratic * mu - linear)
 
     def pair_values(self, pairs: ScaledPairs) -> Tensor:
-        """w Pi x, (3, m)."""
-        return (pairs.weight * self.strength(pairs.distance, pairs.approach)) * pairs.x
+        """w Pi b_1, (3, m)."""
+        return (window(pairs, self.settings) * self.strength(pairs.distance, pairs.approach)
+                ) * separation_direction(pairs, self.settings)
 
     def compiled(self, context: Context) -> CompiledSum:
         """The same for the compiled library."""
-        return CompiledSum("eddy-viscosity", (self.settings.form == "monaghan", SOFTENING), self.coefficients.abs())
+        unit, weighted = told(self.settings)
+        # b_1 = x / (unit |x| + length)
+        length = SMALL if unit else 1.0
+        return CompiledSum("eddy-viscosity", (self.settings.form == "monaghan", SOFTENING, weighted, unit, length),
+                           self.coefficients.abs())
 
     def rates_of(self, sums: Tensor, context: Context) -> Rates:
         """The acceleration."""
-        return Rates(acceleration(along_separation(sums, self.settings.basis, context), context))
+        return Rates(acceleration(along_separation(sums, self.settings, context), context))

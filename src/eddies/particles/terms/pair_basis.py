@@ -1,8 +1,8 @@
-"""How sums over neighbours along x and along v become an acceleration, and how networks of pairs are made."""
+"""Weights, directions and scaling of sums over neighbours, and how networks of pairs are made."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
 
 import torch
 from torch import Tensor, nn
@@ -11,21 +11,58 @@ from eddies.import_path import is_path, load
 from eddies.particles import moments
 from eddies.particles.context import Context
 from eddies.particles.dense_network import DenseNetwork
-from eddies.particles.pairs import CompiledSum
-from eddies.scene.terms import NetworkSettings, TermError
+from eddies.particles.pairs import CompiledSum, ScaledPairs
+from eddies.particles.periodic_box import safe_norm
+from eddies.particles.rates import Rates
+from eddies.scene.terms import ForceSum, NetworkSettings, PairSum, TermError
+
+# Added to |x| and |v| where vectors are divided by their length, so that coincident particles have no direction.
+SMALL = 1e-6
 
 
-def along_separation(sums: Tensor, basis: str, context: Context) -> Tensor:
-    """sum_j w f x (3, k): times the inverse moment matrix M_i^-1, M_i = sum_j w x x^T, in the basis "corrected", which
-    makes derivatives of differences between irregular particles; over n in the basis "paper"."""
-    if basis == "corrected":
+def window(pairs: ScaledPairs, settings: PairSum) -> Tensor:
+    """w (m,), the factor of each pair: (1 - q^2)^2, or 1 within the radius of interaction."""
+    return pairs.weight if settings.window == "smooth" else (pairs.weight > 0).to(pairs.weight)
+
+
+def separation_direction(pairs: ScaledPairs, settings: ForceSum) -> Tensor:
+    """b_1 (3, m): x, or x/|x| in the basis "unit"."""
+    return pairs.x / (pairs.distance + SMALL) if settings.basis == "unit" else pairs.x
+
+
+def velocity_direction(pairs: ScaledPairs, settings: ForceSum) -> Tensor:
+    """b_2 (3, m): v, or v/|v| in the basis "unit"."""
+    return pairs.v / (safe_norm(pairs.v, dim=0) + SMALL) if settings.basis == "unit" else pairs.v
+
+
+def scaled(sums: Tensor, settings: PairSum, context: Context) -> Tensor:
+    """Sums over neighbours divided by their expected number n, or by its square root."""
+    neighbors = context.flow.neighbors
+    return sums / (neighbors if settings.scaling == "number" else math.sqrt(neighbors))
+
+
+def along_separation(sums: Tensor, settings: ForceSum, context: Context) -> Tensor:
+    """sum_j w f b_1 (3, k), scaled; in the basis "corrected" times the inverse of M_i = sum_j w x x^T, which makes a
+    derivative of the differences between irregular particles."""
+    if settings.basis == "corrected":
         return moments.apply_symmetric(context.moments.inverse, sums)
-    return sums / context.flow.neighbors
+    return scaled(sums, settings, context)
 
 
-def along_velocity(sums: Tensor, basis: str, context: Context) -> Tensor:
-    """sum_j w f v (3, k): over sum_j w in the basis "corrected", over n in the basis "paper"."""
-    return sums / (context.moments.weight if basis == "corrected" else context.flow.neighbors)
+def along_velocity(sums: Tensor, settings: ForceSum, context: Context) -> Tensor:
+    """sum_j w f b_2 (3, k), scaled; in the basis "corrected" over sum_j w."""
+    return sums / context.moments.weight if settings.basis == "corrected" else scaled(sums, settings, context)
+
+
+def density_rate(sums: Tensor, settings: PairSum, context: Context) -> Rates:
+    """A dimensionless rate of density (1, k), scaled, in the units of the flow."""
+    rate = context.flow.scales.required("density_rate") * scaled(sums[0], settings, context)
+    return Rates(density_rate=rate.to(context.particles.velocity.dtype))
+
+
+def told(settings: PairSum) -> tuple[float, float]:
+    """Whether directions are unit vectors, and whether pairs are weighted, as the compiled library is told."""
+    return getattr(settings, "basis", "") == "unit", settings.window == "smooth"
 
 
 def acceleration(scaled: Tensor, context: Context) -> Tensor:
@@ -33,17 +70,18 @@ def acceleration(scaled: Tensor, context: Context) -> Tensor:
     return (context.flow.scales.acceleration * scaled.T).to(context.particles.velocity.dtype)
 
 
-def compiled_network(network: nn.Module, inputs: Sequence[str], outputs: int, symmetric: bool,
-                     context: Context) -> CompiledSum | None:
-    """What the compiled library is told of a term whose network has one or two `outputs`; None of a network that it
-    does not know."""
+def compiled_network(network: nn.Module, settings: NetworkSettings, outputs: int, symmetric: bool,
+                     context: Context, sign: bool = False) -> CompiledSum | None:
+    """What the compiled library is told of a term whose network has one or two `outputs`, times the sign of the density
+    difference or not; None of a network that it does not know."""
     if type(network) is not DenseNetwork:
         return None
     layers = list(zip(network.weights, network.biases))
-    told = [name in inputs for name in ("density", "distance", "speed", "approach")]
-    return CompiledSum("pair-network", (outputs, symmetric, *told, *(len(bias) for _, bias in layers[:-1])),
+    inputs = [name in settings.inputs for name in ("density", "distance", "speed", "approach")]
+    return CompiledSum("pair-network", (outputs, symmetric, *inputs, *told(settings), sign,
+                                        *(len(bias) for _, bias in layers[:-1])),
                        torch.cat([parameter.flatten() for layer in layers for parameter in layer]),
-                       (context.density_fluctuation,) if "density" in inputs else ())
+                       (context.density_fluctuation,) if inputs[0] or sign else ())
 
 
 def build_network(settings: NetworkSettings, outputs: int, seed: int) -> nn.Module:

@@ -10,7 +10,8 @@ from eddies.particles.flow_units import FlowUnits
 from eddies.particles.pairs import CompiledSum, ScaledPairs
 from eddies.particles.rates import Rates
 from eddies.particles.terms.pair_basis import (
-    acceleration, along_separation, along_velocity, build_network, compiled_network,
+    acceleration, along_separation, along_velocity, build_network, compiled_network, separation_direction,
+    velocity_direction, window,
 )
 from eddies.particles.terms.term import PairTerm
 from eddies.scene import terms as declared
@@ -19,11 +20,12 @@ from eddies.scene import terms as declared
 class PairNetwork(PairTerm):
     """dv_i/dt = a_rms A_i with
 
-        A_i = 1/n (sum_j w NN_1 x + sum_j w NN_2 v)                          basis "paper"
+        A_i = s (sum_j w NN_1 x + sum_j w NN_2 v)                            basis "paper"
+        A_i = s (sum_j w NN_1 x/|x| + sum_j w NN_2 v/|v|)                    basis "unit"
         A_i = M_i^-1 sum_j w NN_1 x + sum_j w NN_2 v / sum_j w               basis "corrected"
 
-    NN_1 and NN_2 of the invariants of a pair (rho'_i, rho'_j, |x|, |v|, x.v) in the units of `ScaledPairs`, n the
-    expected number of neighbours, M_i = sum_j w x x^T. With symmetry "antisymmetric" the first two invariants are
+    NN_1 and NN_2 of the invariants of a pair (rho'_i, rho'_j, |x|, |v|, x.v) in the units of `ScaledPairs`, w the
+    window, s the scaling, M_i = sum_j w x x^T. With symmetry "antisymmetric" the first two invariants are
     rho'_i + rho'_j and (rho'_i - rho'_j)^2: i and j get opposite forces, which keep the total momentum. Without the
     densities all invariants are those of i and j alike: what is summed is opposite, and evaluated once.
     """
@@ -44,16 +46,16 @@ class PairNetwork(PairTerm):
         return pairs.invariants(self.settings.inputs, self.mutual)
 
     def pair_values(self, pairs: ScaledPairs) -> Tensor:
-        """w NN_1 x and w NN_2 v, (6, m)."""
-        along_x, along_v = self.network(self.features(pairs))
-        return torch.cat([(pairs.weight * along_x) * pairs.x, (pairs.weight * along_v) * pairs.v])
+        """w NN_1 b_1 and w NN_2 b_2, (6, m)."""
+        along_x, along_v = window(pairs, self.settings) * self.network(self.features(pairs))
+        return torch.cat([along_x * separation_direction(pairs, self.settings),
+                          along_v * velocity_direction(pairs, self.settings)])
 
     def compiled(self, context: Context) -> CompiledSum | None:
         """The same for the compiled library."""
-        return compiled_network(self.network, self.settings.inputs, 2, self.mutual, context)
+        return compiled_network(self.network, self.settings, 2, self.mutual, context)
 
     def rates_of(self, sums: Tensor, context: Context) -> Rates:
         """The acceleration."""
-        basis = self.settings.basis
-        return Rates(acceleration(along_separation(sums[:3], basis, context)
-                                  + along_velocity(sums[3:], basis, context), context))
+        return Rates(acceleration(along_separation(sums[:3], self.settings, context)
+                                  + along_velocity(sums[3:], self.settings, context), context))
