@@ -132,7 +132,7 @@ class NetworkSettings(TermSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PairNetwork(NetworkSettings, ForceSum):
+class PairNetwork(ForceSum, NetworkSettings):
     """The learned pair force, Eqs. 3 and 4."""
 
     word = "pairs"
@@ -161,7 +161,7 @@ class EddyViscosity(ForceSum):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DensityFlux(NetworkSettings, PairSum):
+class DensityFlux(PairSum, NetworkSettings):
     """The network of the density in Eq. 3."""
 
     word = "density-flux"
