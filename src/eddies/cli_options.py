@@ -18,6 +18,7 @@ EXAMPLES = {
     "dns": ("eddies dns hit-small --set seed=2 --output runs/hit-small-seed-2",),
     "train-kernel": ("eddies train-kernel hit-small --set kernel.steps=500",),
     "train": ("eddies train hit-small", "eddies train hit-mt016 --set model.path=runs/hit"),
+    "find-step": ("eddies find-step hit-small --set simulation.integrator=verlet",),
     "simulate": ("eddies simulate hit-small --overwrite --set simulation.method=none",),
     "report": ("eddies report runs/hit-small --open",),
     "export": ("eddies export runs/tiny --format vtkhdf", "eddies export runs/hit --format lagrangebench"),
@@ -50,7 +51,7 @@ def build_parser() -> argparse.ArgumentParser:
                         **{stage.name: stage.about for stage in STAGES.values() if stage.product is not None}}.items():
         command = add_command(commands, name, about)
         add_scene_options(command)
-        if name in ("run", "train", "simulate"):
+        if name in ("run", "train", "find-step", "simulate"):
             add_variants(command, "work on this variant of the scene alone; repeatable")
         add_job_options(command, "run directory (default: runs/NAME)")
     report = add_command(commands, "report", STAGES["report"].about)

@@ -43,11 +43,14 @@ STAGES = {stage.name: stage for stage in (
     Stage("train", "the model of the particles", "model", "model",
           ("device", "model", "weights", "training", "truths", "own_model"),
           ("dns", "train-kernel"), "checkpoints-train"),
-    Stage("simulate", "the trained model, without the direct simulation", "simulation", "rollout",
+    Stage("find-step", "the cheapest step of the rollout that has converged", "simulation", "step",
           ("device", "simulation", "window", "truths", "eulerian", "own_simulation"),
-          ("dns", "train-kernel", "train"), "checkpoints-rollout"),
+          ("dns", "train-kernel", "train"), None),
+    Stage("simulate", "the trained model, without the direct simulation", "simulation", "rollout",
+          ("device", "simulation", "found_step", "window", "truths", "eulerian", "own_simulation"),
+          ("dns", "train-kernel", "train", "find-step"), "checkpoints-rollout"),
     Stage("report", "figures, one page and metrics.json of a run directory", None, None,
-          (), ("dns", "train-kernel", "train", "simulate"), None),
+          (), ("dns", "train-kernel", "train", "find-step", "simulate"), None),
 )}
 #: The stage that makes a kind of product.
 MAKER_OF = {stage.product: stage for stage in STAGES.values() if stage.product is not None}

@@ -41,7 +41,8 @@ log = logging.getLogger("eddies")
 
 # Where the functions are that do the stages, each as run(scene, comm, directory, stop); imported once it is their turn.
 RUN = {"dns": "eddies.workflows.dns:run", "train-kernel": "eddies.workflows.train_kernel:run",
-       "train": "eddies.workflows.train:run", "simulate": "eddies.workflows.simulate:run",
+       "train": "eddies.workflows.train:run", "find-step": "eddies.workflows.find_step:run",
+       "simulate": "eddies.workflows.simulate:run",
        "report": "eddies.workflows.report:run_stage"}
 
 

@@ -103,6 +103,9 @@ QUANTITIES = {
     "acceleration_sample/*": Quantity("L/T^2", "particle xyz", "{name} acceleration of some particles"),
     "density_rate_sample/*": Quantity("M/L^3/T", "particle", "{name} rate of the density of some particles"),
     "*feature_range/*": Quantity("1", "input", "{name} of each input of the network in training"),
+    "trials/*/seconds_per_turnover": Quantity("s", ROW, "wall time of an eddy turnover"),
+    "trials/*/size": Quantity("T", ROW, "time step; on a grid the Courant number"),
+    "trials/*": Quantity("1", ROW, "rms over that of the true velocity: {name}"),
     "weights/*": Quantity("1", "", "trained parameters"),
 }
 

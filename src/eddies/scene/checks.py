@@ -241,9 +241,10 @@ def simulation_problems(scene: Parts) -> Iterator[str]:
     if simulation is None or scene.tracers is None:
         return
     frame = simulation.frame_interval
-    if not simulation.scheme.dense and not _is_multiple(frame, simulation.step):
+    step = simulation.longest_step
+    if not simulation.scheme.dense and math.isfinite(step) and not _is_multiple(frame, step):
         yield (f"[simulation] frame_interval = {frame:g}: must be a whole multiple of step = "
-               f'{simulation.step:g} with integrator = "{simulation.integrator}", which does not tell what is between '
+               f'{step:g} with integrator = "{simulation.integrator}", which does not tell what is between '
                "steps; change any")
     if not _is_multiple(frame, scene.tracers.frame_interval):
         yield (f"[simulation] frame_interval = {frame:g}: must be a whole multiple of [tracers] "

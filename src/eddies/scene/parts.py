@@ -43,8 +43,16 @@ class Parts(Section):
     def stages(self) -> tuple[str, ...]:
         """The stages that this scene asks for, in the order in which they run."""
         learned = self.simulation is None or self.needs_model
-        return tuple(stage.name for stage in STAGES.values() if (learned or stage.name != "train")
+        finds = self.simulation is not None and self.simulation.finds_step
+        return tuple(stage.name for stage in STAGES.values()
+                     if (learned or stage.name != "train") and (finds or stage.name != "find-step")
                      and (stage.section is None or getattr(self, stage.section) is not None))
+
+    @property
+    def step_file(self) -> Path | None:
+        """The file of the step that another run has found; None where none is named."""
+        named = self.simulation and self.simulation.step_from
+        return Path(named) / STAGES["find-step"].file if named else None
 
     @property
     def needs_model(self) -> bool:

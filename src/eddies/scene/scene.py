@@ -109,9 +109,12 @@ class Scene(Parts):
         hold the source of foreign classes; of the ground truths that a model is trained on their own fingerprints."""
         settings = asdict(self) | {"window": self.window, "start": _digest(self.initial.path),
                                    "weights": _digest(self.model.weights_file if self.model else None),
-                                   "truths": _fingerprints(self.training.truth_files if self.training else ())}
+                                   "truths": _fingerprints(self.training.truth_files if self.training else ()),
+                                   "found_step": _digest(self.step_file)}
         if settings["weights"] is not None:
             del settings["model"]["path"]  # weights are known by what they are, wherever they lie
+        if settings["found_step"] is not None:
+            del settings["simulation"]["step_from"]
         settings |= {f"own_{name}": origins(self._foreign_in(name)) for name in FOREIGN_IN}
         of_these = {*STAGES[stage].depends_on, stage} & {*self.stages}
         keys = [key for each in STAGES.values() if each.name in of_these for key in each.reads]

@@ -249,13 +249,21 @@ class Training(Section):
         return tuple(product_file(path, "ground_truth.h5") for path in self.truths or ())
 
 
+#: The step of a rollout that short rollouts find.
+CONVERGED = "converged"
+
+
 @dataclass(frozen=True, kw_only=True)
 class Simulation(Section):
     """The run of the particles, without the direct simulation."""
 
     method: str = named("what moves the particles; see Baselines", *METHODS, default="learned")
-    integrator: str = choice("time stepping of the particles", *SCHEMES, default="rk3")
-    step: float = number("longest time step; see docs/closure.md", above=0)
+    integrator: str | None = choice("time stepping of the particles; absent: rk3, or with step = \"converged\" the "
+                                    "cheapest", *SCHEMES, default=None)
+    step: float | str = number("longest time step; converged: the cheapest that has converged, found by short rollouts",
+                               default=CONVERGED, words=(CONVERGED,), above=0)
+    step_from: str | None = text("run directory whose converged step is used; absent: it is found for this rollout",
+                                 default=None)
     turnovers: float = number("large-eddy turnovers to simulate", above=0)
     start: float | None = number("as a fraction of the ground truth; absent: where the training window ends, or at the "
                                  "first field of a ground truth that is not trained on", default=None, at_least=0,
@@ -267,10 +275,31 @@ class Simulation(Section):
                                     "its tracers were followed; dissipation: as the flow loses", default="truth",
                                     words=("truth", "none", "dissipation"), above=0)
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.step_from is not None and self.step != CONVERGED:
+            raise KeyProblem("simulation", "step_from", f' = "{self.step_from}": step = {self.step:g} needs no other '
+                             f'run; set step = "{CONVERGED}", or remove step_from')
+
     @property
     def scheme(self) -> Scheme:
         """What the integrator does in a step."""
-        return SCHEMES[self.integrator]
+        return SCHEMES[self.integrator or "rk3"]
+
+    @property
+    def schemes(self) -> tuple[str, ...]:
+        """The integrators among which a converged step is sought."""
+        return (self.integrator,) if self.integrator else tuple(SCHEMES)
+
+    @property
+    def longest_step(self) -> float:
+        """The longest time step as given, infinite where it is to be found."""
+        return math.inf if isinstance(self.step, str) else self.step
+
+    @property
+    def finds_step(self) -> bool:
+        """Whether the step is to be found for this rollout."""
+        return self.step == CONVERGED and self.step_from is None
 
     @property
     def needs(self) -> tuple[str, ...]:

@@ -179,8 +179,8 @@ def rollout_problems(scene: Scene, turnover_time: float | None = None) -> Iterat
         turnover_time = turbulence.turnover_time
     if turnover_time is not None:
         span = max(span, settings.turnovers * turnover_time)
-    if span > MOST_STEPS * settings.step:
-        yield (f"[simulation] step = {settings.step:g}: {span / settings.step:.1e} steps for a time of {span:.3g}, and "
+    if span > MOST_STEPS * settings.longest_step:
+        yield (f"[simulation] step = {settings.step:g}: {span / settings.longest_step:.1e} steps for a time of {span:.3g}, and "
                f"{MOST_STEPS:.0e} are the most; raise step or lower turnovers")
 
 

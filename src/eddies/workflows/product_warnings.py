@@ -77,7 +77,7 @@ def _wrong(kind: str, place: str, values: np.ndarray) -> np.ndarray:
     if kind == "ground_truth":
         return np.isnan(values)  # scales without viscosity and the sound speed of an incompressible fluid are infinite
     table, _, column = place.partition("/")
-    gaps = kind == "model" and table == "history" and column not in OF_EVERY_STEP
+    gaps = kind == "step" or kind == "model" and table == "history" and column not in OF_EVERY_STEP
     return ~np.isfinite(values) & (not gaps)
 
 

@@ -34,7 +34,7 @@ from eddies.parallel.broadcast import on_all_ranks
 from eddies.parallel.communicator import Comm
 from eddies.parallel.stop import StopRequest
 from eddies.pipeline import MAKER_OF
-from eddies.report import forced, ground_truth, kernel, mach, stationary, tracers
+from eddies.report import forced, ground_truth, kernel, mach, stationary, steps, tracers
 from eddies.report.figures import draw
 from eddies.report.model import section as model_section
 from eddies.report.page import Metric, RunRecord, Section, metrics_json, shown, write_page
@@ -53,7 +53,7 @@ from eddies.workflows.variants import Place, rollouts
 
 log = logging.getLogger("eddies")
 
-KINDS = "ground_truth", "kernel", "model", "rollout"  # products, in the order of the page
+KINDS = "ground_truth", "kernel", "model", "step", "rollout"  # products, in the order of the page
 ROLLOUT_COST = {"seconds_per_step": "rollout: seconds of a step (median, without storing)",
                 "particles": "particles of the rollout",
                 "ranks": "ranks of the rollout"}
@@ -246,7 +246,7 @@ def _read_share(directory: Path, comm: Comm, alone: Comm, record: Run, kinds: Se
     """The sections of this rank on products of these kinds, neighbours on the page, without that on the cost; all ranks
     measure the rollout."""
     readers = {"ground_truth": (_read_flow, _read_tracers), "kernel": (_read_kernel,), "model": (_read_model,),
-               "rollout": (None,)}
+               "step": (_read_step,), "rollout": (None,)}
     parts = [(kind, read) for kind in kinds for read in readers[kind]]
 
     def sections() -> list[Section]:
@@ -350,6 +350,11 @@ def _read_tracers(file: File, record: Run) -> list[Section]:
 def _read_kernel(file: File, record: Run) -> list[Section]:
     tables = {name: read_table(file, name) for name in ("kernels", "slices", "errors", "history")}
     return [kernel.section(read_json(file, "description")["support"], **tables)]
+
+
+def _read_step(file: File, record: Run) -> list[Section]:
+    return [steps.section(read_attributes(file, "found"),
+                          {name: read_table(file, f"trials/{name}") for name in file["trials"]})]
 
 
 def _read_model(file: File, record: Run) -> list[Section]:

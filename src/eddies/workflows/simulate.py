@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from eddies.clock import pace_in_words
-from eddies.import_path import is_path, load
 from eddies.io.frame_segments import FrameSegments
 from eddies.io.guard import Guard
 from eddies.io.hdf5 import create_product, open_product, write_attributes, write_table
@@ -24,15 +22,10 @@ from eddies.scene.terms import Forcing
 from eddies.workflows.ground_truth.frame_counts import rollout_start
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.rollout.course import Course, frame_layout
-from eddies.workflows.rollout.eulerian_run import EulerianRun
-from eddies.workflows.rollout.method import Method
-from eddies.workflows.rollout.particle_run import BallisticRun, LearnedRun, injection
+from eddies.workflows.rollout.method_of_step import method_of_step, stored_step
+from eddies.workflows.rollout.particle_run import injection
 
 log = logging.getLogger("eddies")
-
-#: The classes behind the words of [simulation] method, each built as Class(scene, truth, start, directory, device).
-METHODS: dict[str, Callable[..., Method]] = {"learned": LearnedRun, "none": BallisticRun, "eulerian": EulerianRun}
-
 
 def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | None = None) -> None:
     """Simulate what a scene asks for and write rollout.h5. A run that goes wrong ends there, keeps its frames, and
@@ -44,8 +37,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                   " of the rollout")
     with open_product(comm, directory / "ground_truth.h5", "ground_truth") as truth_file, torch.no_grad():
         truth = GroundTruth(truth_file, slab)
-        start = start_frame(scene, truth, directory)
-        method = method_class(settings.method)(scene, truth, start, directory, device)
+        start, found = start_frame(scene, truth, directory), stored_step(scene, comm, directory)
+        method = method_of_step(scene, found, truth, start, directory, device)
         saved = guard.checkpoints.newest()
         layout = frame_layout(truth.total, slab.length, method.has_density)
         segments = FrameSegments(comm, guard.checkpoints.path, layout, () if saved is None else saved.files)
@@ -68,11 +61,6 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     pace = (pace_in_words(outcome["seconds_per_step"], outcome["storing_share"]) if "seconds_per_step" in outcome
             else "too few steps to time one")
     log.info("rollout: %s after %.2f turnovers, %s", outcome["status"], outcome["time"] / turnover, pace)
-
-
-def method_class(name: str) -> Callable[..., Method]:
-    """The class of a word or an import path."""
-    return load(name) if is_path(name) else METHODS[name]
 
 
 def forcing_rate(forcing: Forcing | None) -> float:

@@ -24,7 +24,7 @@ from eddies.parallel.stop import Stopped, StopRequest
 from eddies.particles.devices import prepare_torch
 from eddies.pipeline import STAGES
 from eddies.scene.scene import Scene
-from eddies.workflows import dns, report, simulate, train, train_kernel
+from eddies.workflows import dns, find_step, report, simulate, train, train_kernel
 from eddies.workflows.foreseen.numbers import expected_step, flow_steps, rollout_of
 from eddies.workflows.foreseen.storage import training_steps
 from eddies.workflows.ground_truth.frame_counts import TESTED_FRAMES
@@ -34,8 +34,8 @@ from eddies.workflows.learned.truths import open_truths, training_data
 
 log = logging.getLogger("eddies")
 
-RUN = {"dns": dns.run, "train-kernel": train_kernel.run, "train": train.run, "simulate": simulate.run,
-       "report": report.run_stage}
+RUN = {"dns": dns.run, "train-kernel": train_kernel.run, "train": train.run, "find-step": find_step.run,
+       "simulate": simulate.run,        "report": report.run_stage}
 FEW = 4                      # steps of a training, and intervals of a rollout
 A_MOMENT = 1e-9              # turnovers of a spin-up of as few steps as there can be
 
@@ -57,7 +57,8 @@ def run(scene: Scene, comm: Comm, signals: Sequence[int] = ()) -> None:
     signal."""
     rollout, stop = rollout_of(scene), StepTimes(comm, signals)
     whole = {"dns": flow_steps(scene), "train-kernel": scene.kernel and 2 * scene.kernel.steps,
-             "train": training_steps(scene) if scene.model else 0, "simulate": rollout and rollout.steps, "report": 0}
+             "train": training_steps(scene) if scene.model else 0, "find-step": 0,
+             "simulate": rollout and rollout.steps, "report": 0}
     log.info("%s: measured on %d %s", scene.name, comm.size, "rank" if comm.size == 1 else "ranks")
     log.info("stage         s a step   steps  wall time")
     with temporary_directory(comm) as directory:

@@ -24,6 +24,8 @@ from eddies.workflows.run_directory.work import is_done
 
 # The stages whose products all variants share where their settings agree.
 SHARED = ("dns", "train-kernel")
+# The stages that make a product.
+MAKING = tuple(stage.name for stage in STAGES.values() if stage.product is not None)
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,7 @@ def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[
     What is made with weights that are taken over is never shared: their file may be made in an earlier step.
     """
     if not scene.variant and not scene.realisations:
-        making = tuple(stage for stage in stages if STAGES[stage].product is not None)
+        making = tuple(stage for stage in stages if stage in MAKING)
         return [Step(scene, making, directory)] if making else []
     seeds = scene.realisations or ()
     planned = [(None, scene.without_variants, directory, SHARED)]
@@ -78,7 +80,7 @@ def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[
     for name in chosen:
         own = scene.variant[name] if name else scene.without_variants
         trained = ("train",) if not seeds or own.model is not None and own.model.path is None else ()
-        planned.append((name, own, _directory_of(name, directory), (*SHARED, *trained)))
+        planned.append((name, own, _directory_of(name, directory), (*SHARED, *trained, "find-step")))
     by_variant = [_rollouts_of(scene, name, directory) for name in chosen]
     for together in zip(*by_variant):
         planned += [(name, own, where, (*SHARED, *(("train",) if seeds else ()), "simulate"))
@@ -87,7 +89,7 @@ def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[
     made: dict[tuple[str, str], Path] = {}
     for name, own, where, possible in planned:
         working, links = [], {}
-        for stage in [stage for stage in STAGES if stage in own.stages and stage in (*SHARED, "train", "simulate")]:
+        for stage in [stage for stage in STAGES if stage in own.stages and stage in MAKING]:
             key = stage, own.fingerprint(stage)
             taken_over = stage not in SHARED and own.model is not None and own.model.path is not None
             holder = None if taken_over else made.get(key)
@@ -140,7 +142,9 @@ def _rollouts_of(scene: Scene, name: str | None, directory: Path) -> list[tuple[
     model = own.model if "train" in own.stages else None
     if model is not None and model.path is None:
         model = replace(model, path=str(where))
-    return [(replace(own, seed=seed, model=model, training=None, simulation=replace(own.simulation, start=0.0)),
+    found = str(where) if own.simulation.finds_step else own.simulation.step_from
+    simulation = replace(own.simulation, start=0.0, step_from=found)
+    return [(replace(own, seed=seed, model=model, training=None, simulation=simulation),
              where / f"{REALISATION}{seed}") for seed in scene.realisations]
 
 

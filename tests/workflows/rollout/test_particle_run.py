@@ -27,7 +27,7 @@ from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.learned.model import scene_model
 from eddies.workflows.learned.source import describe
 from eddies.workflows.rollout.particle_run import SOLVES, LearnedRun
-from eddies.workflows.simulate import METHODS, method_class
+from eddies.workflows.rollout.method_of_step import METHODS, method_of_step
 
 pytestmark = pytest.mark.usefixtures("quick_spectra")
 
@@ -138,7 +138,7 @@ def write_model(comm, directory, scene, scales, bound=1e3, features=5):
 def method_of(comm, directory, scene, start):
     with open_product(comm, directory / "ground_truth.h5", "ground_truth") as file:
         truth = GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes))
-        method = method_class(scene.simulation.method)(scene, truth, start, directory, torch.device("cpu"))
+        method = method_of_step(scene, None, truth, start, directory, torch.device("cpu"))
         with torch.no_grad():
             return truth.scales_at(start), truth.scales, method, *method.frame(0.0)
 

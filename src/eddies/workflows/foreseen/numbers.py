@@ -194,14 +194,15 @@ def rollout_of(scene: Scene, turnover_time: float | None = None) -> Rollout | No
 
 def rollout_step(scene: Scene) -> float:
     """The time step of the particles: the scene's, or where that is less what their resolved velocity can follow, or
-    the Courant number on a coarse grid allows."""
+    the Courant number on a coarse grid allows. Where it is still to be found, at most a frame interval is expected."""
     settings, allowed = scene.simulation, None
     if settings.on_grid:
         cells, speed = (scene.eulerian or Eulerian()).cells_for(scene.tracers.filter_width), peak_speed(scene)
         allowed = speed and scene.time.courant * BOX_LENGTH / cells / speed
     elif "model" in settings.needs and scene.resolves:
         allowed = expected_allowed_step(scene)
-    return min(settings.step, allowed or math.inf)
+    return min(settings.longest_step if math.isfinite(settings.longest_step) else settings.frame_interval,
+               allowed or math.inf)
 
 
 def resolved_shells(scene: Scene) -> int:

@@ -139,7 +139,7 @@ def rollout_steps(scene: Scene) -> Iterator[str]:
     if "model" not in settings.needs or not scene.injects:
         return
     allowed = expected_allowed_step(scene)
-    if allowed and settings.step > allowed * (1 + 1e-9):
+    if allowed and math.isfinite(settings.longest_step) and settings.longest_step > allowed * (1 + 1e-9):
         yield (f"[simulation] step = {settings.step:g}: the particles will take shorter steps, of about "
                f"{at_most(allowed)}, in which their resolved velocity can follow the flow; lower it to that")
 
@@ -147,16 +147,16 @@ def rollout_steps(scene: Scene) -> Iterator[str]:
 def term_steps(scene: Scene) -> Iterator[str]:
     """Steps that are too long for terms: in which sound outruns particles, or they relax too far."""
     settings, speed = scene.simulation, rms_speed(scene)
-    if "model" not in settings.needs:
+    if "model" not in settings.needs or math.isinf(settings.longest_step):
         return
     units = StepUnits(radius=scene.interaction_radius, filter_width=scene.tracers.filter_width,
                       sound_speed=scene.flow.sound_speed, scheme=settings.scheme,
                       velocity=None if speed is None else speed / math.sqrt(3))
     for name, term in scene.model.settings.items():
         longest = term.longest_step(units)
-        if settings.step > longest:
+        if settings.longest_step > longest:
             yield f"[simulation] step = {settings.step:g}: " + term.too_long.format(
-                name=name, longest=at_most(longest), integrator=settings.integrator)
+                name=name, longest=at_most(longest), integrator=settings.scheme.name)
 
 
 def beyond_truth(scene: Scene) -> Iterator[str]:

@@ -14,7 +14,8 @@ from eddies.workflows.ground_truth.frame_counts import KERNEL_FIELDS, TESTED_FRA
 # transform of a grid point (1 + cells / CACHED times that where planes outgrow the caches), a pair of particles in a
 # sum, an evaluation or iteration without its work, a message; of an idle stage.
 TRANSFORM, CACHED, PAIR, CALL, MESSAGE, ROUNDS = 4e-9, 550, 2.5e-8, 2.5e-4, 2e-6, 4
-START = {"dns": 0.4, "train-kernel": 0.7, "train": 1.0, "simulate": 0.3, "report": 2.3}
+START = {"dns": 0.4, "train-kernel": 0.7, "train": 1.0, "find-step": 0.5, "simulate": 0.3, "report": 2.3}
+SEARCH = 2                   # turnovers of the short rollouts that find a step, of the longest step
 COLD, ITERATION = 25, 12     # iterations of a solve from nothing; transforms of a point in one, with its splines
 GRADIENT = 4                 # an evaluation with its gradient, and a step of the optimiser, over an evaluation
 
@@ -46,6 +47,9 @@ def seconds(scene: Scene, stage: str, ranks: int) -> float | None:
                 solves += 2 * evaluations
                 pairs += GRADIENT * evaluations * tracers.particles * neighbors / 2
         calls = GRADIENT * training_steps(scene)
+    elif stage == "find-step":
+        whole = seconds(scene, "simulate", ranks)
+        return whole and START[stage] + SEARCH / scene.simulation.turnovers * (whole - START["simulate"])
     elif stage == "simulate":
         if rollout is None:
             return None

@@ -75,6 +75,8 @@ def disk(scene: Scene, stage: str) -> float | None:
         return PRODUCT_BYTES + 80 * scene.tracers.cells**2 + 64 * scene.kernel.steps
     if stage == "train":         # mostly samples of rates and the history
         return PRODUCT_BYTES + 48 * min(scene.tracers.particles, TESTED_PARTICLES) + 100 * training_steps(scene)
+    if stage == "find-step":
+        return PRODUCT_BYTES
     if stage == "simulate":
         return rollout and rollout_bytes(scene, rollout)
     return FIGURE_BYTES * sum(FIGURES.get(name, 0) for name in scene.stages)

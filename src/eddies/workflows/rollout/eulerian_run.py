@@ -45,7 +45,7 @@ class EulerianRun:
     """
 
     def __init__(self, scene: Scene, truth: GroundTruth, start: int, directory: Path, device: torch.device) -> None:
-        self.settings, self.longest_step = scene.eulerian or Eulerian(), scene.simulation.step
+        self.settings, self.longest_step = scene.eulerian or Eulerian(), scene.simulation.longest_step
         comm, length, width = truth.decomposition.comm, truth.decomposition.length, truth.scales.filter_width
         cells = self.settings.cells_for(width)
         grid = SpectralGrid(SlabDecomposition(comm, length, cells), scene.simulation.precision)

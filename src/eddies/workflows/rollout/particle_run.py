@@ -45,6 +45,8 @@ class ParticleRun:
 
     largest_deviation = np.inf
     seen: FeatureRange | None = None
+    #: whether steps are limited to what the resolved velocity can follow; not where the step was found by rollouts
+    limited = True
 
     def __init__(self, scene: Scene, truth: GroundTruth, start: int, directory: Path, device: torch.device) -> None:
         self.settings, self.comm, self.scales = scene.simulation, truth.decomposition.comm, truth.scales_at(start)
@@ -52,7 +54,7 @@ class ParticleRun:
         dtype = getattr(torch, self.settings.precision)
         self.model = self.build(scene, directory).forced(injection(scene, truth)).to(dtype=dtype, device=device)
         self.dynamics = ParticleDynamics(truth.decomposition, self.model, self.settings.skin * self.flow.cutoff, dtype)
-        self.integrator = INTEGRATORS[self.settings.integrator](self.dynamics)
+        self.integrator = INTEGRATORS[self.settings.scheme.name](self.dynamics)
         self.particles, self.total = particles_for(self.model, truth.particles(start), device), truth.total
         self._before: Moment | None = None
         self.limits = Limits(RUNAWAY_SPEED * self.scales.velocity, self.scales.density_mean, self.largest_deviation)
@@ -79,7 +81,7 @@ class ParticleRun:
         Steps are as long as the scene has them, or as the flow allows where that is less. Those of a scheme that can
         tell what was between them may go beyond that time; those of others end there.
         """
-        step, left = min(self.settings.step, self._allowed_step()), until - self.time
+        step, left = min(self.settings.longest_step, self._allowed_step()), until - self.time
         if not self.integrator.scheme.dense:
             step = left / np.ceil(left / step - 1e-9)
         try:
@@ -96,7 +98,7 @@ class ParticleRun:
     def _allowed_step(self) -> float:
         """The longest step in which the resolved velocity, if there is one, can follow the flow as it is now."""
         resolution = self.dynamics.resolution
-        if resolution is None:
+        if resolution is None or not self.limited:
             return np.inf
         highest = resolution.grid.resolved * 2 * np.pi / self.dynamics.box.length
         return allowed_step(self.integrator.scheme.angle, highest, resolution.speed)
@@ -171,7 +173,7 @@ class ParticleRun:
 
     def description(self) -> dict[str, float | str]:
         """Integrator, terms, and how often the rates were evaluated for the steps."""
-        return {"integrator": self.settings.integrator, "terms": ", ".join(self.model.terms) or "none",
+        return {"integrator": self.settings.scheme.name, "terms": ", ".join(self.model.terms) or "none",
                 "evaluations": self.dynamics.evaluations}
 
 

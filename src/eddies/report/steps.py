@@ -1,0 +1,54 @@
+"""The report's part on the step of a rollout: what short rollouts say of each, and which is taken."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
+
+from eddies.report.figures import GUIDE, letter, panels, styled
+from eddies.report.page import Metric, Section
+
+
+@styled
+def convergence(found: Mapping[str, float | str], trials: Mapping[str, Mapping[str, np.ndarray]], size: str) -> Figure:
+    """Change by halving the step, and seconds of a turnover, over the step, for each integrator.
+
+    trials: columns (trials,) by integrator, each with half the step of the one before.
+    """
+    figure, ((change, cost),) = panels(1, 2, (4.6, 3.2))
+    for name, columns in trials.items():
+        change.loglog(columns["size"][:-1], columns["difference"][1:], marker="o", markersize=3, label=name)
+        cost.loglog(columns["size"], columns["seconds_per_turnover"], marker="o", markersize=3)
+    change.axhline(0.02 * found["error_with_half"], color=GUIDE, linestyle="--", linewidth=1.1)
+    change.plot(found["size"], found["difference"], marker="o", markersize=9, fillstyle="none", color="black")
+    cost.plot(found["size"], found["seconds_per_turnover"], marker="o", markersize=9, fillstyle="none", color="black")
+    change.set(title="Change by halving the step", xlabel=size, ylabel="rms change / rms velocity")
+    cost.set(title="Cost", xlabel=size, ylabel="seconds a turnover")
+    for axis in (change, cost):
+        axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axis.xaxis.set_minor_locator(NullLocator())
+    figure.legend(*change.get_legend_handles_labels(), loc="outside lower center", ncols=5)
+    letter((change, cost))
+    return figure
+
+
+def section(found: Mapping[str, float | str], trials: Mapping[str, Mapping[str, np.ndarray]]) -> Section:
+    """The step that was found, the rows of all trials, and what finding it cost."""
+    size = "Courant number" if found["integrator"] == "etdrk4" else "time step"
+    metrics = [Metric(f"{name}_{step:.4g}", f"{name}, {size} {step:.4g}", {
+        "error": error, "change from twice the step": change, "seconds a turnover": seconds})
+        for name, columns in trials.items()
+        for step, error, change, seconds in zip(*(columns[key] for key in (
+            "size", "error", "difference", "seconds_per_turnover")))]
+    shown = Section(
+        "step", f"Step: {found['integrator']}, {size} {found['size']:.4g}",
+        f"Rollouts of {found['turnovers']:.2g} turnovers on the ground truth, without limits of stability. A step has "
+        "converged if halving it changes the velocities at the end by less than 2 % of their error, or 1e-4 of "
+        f"themselves. Of those the cheapest is taken: {found['seconds_per_turnover']:.3g} s a turnover. Its error is "
+        f"{found['error']:.4f}, that of half the step {found['error_with_half']:.4f}. To find it took "
+        f"{found['seconds']:.3g} s.", metrics=metrics, folded=True)
+    shown.add_figure("step", "Convergence in the step", convergence(found, trials, size),
+                     "Circle: the step that is taken. Dashed: 2 % of its error. Both axes are logarithmic.")
+    return shown

@@ -1,0 +1,105 @@
+"""The step that is found for a rollout against errors that are known, and what a rollout makes of it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from eddies.io.hdf5 import open_product, read_attributes, read_table
+from eddies.scene.scene import SceneError
+from eddies.workflows import find_step, simulate
+from tests.workflows.rollout.test_particle_run import prepared, with_method
+
+# Velocities are wrong by a constant and by what is of first order in the step.
+OWN_METHOD = """
+import torch
+
+from eddies.particles.particle_set import ParticleSet
+
+
+class FirstOrder:
+    needs = ()
+    has_density = False
+    slope = {slope}
+
+    def __init__(self, scene, truth, start, directory, device):
+        self.time, self.longest = 0.0, scene.simulation.step
+        columns = truth.particles(start)
+        columns.pop("density", None)
+        self.particles = ParticleSet.from_numpy(columns)
+
+    def advance(self, until, number):
+        self.time += min(until - self.time, self.longest)
+
+    def frame(self, time):
+        velocity = self.particles.velocity + self.slope * self.longest
+        return ParticleSet(self.particles.id, self.particles.position, velocity), torch.zeros_like(velocity)
+
+    def status(self):
+        return ""
+
+    def series(self):
+        return {{}}
+
+    def description(self):
+        return {{"integrator": "first order", "terms": ""}}
+"""
+
+
+def searched(scene, method="none"):
+    """The scene with a step that is to be found."""
+    scene = with_method(scene, method)
+    return replace(scene, simulation=replace(scene.simulation, step="converged", integrator="rk2"))
+
+
+def velocities(comm, directory, *frames):
+    """Of all true particles at some frames, in double precision."""
+    with open_product(comm, directory / "ground_truth.h5", "ground_truth") as file:
+        value = file["particles/tracers/velocity/value"]
+        return [value[frame].astype(np.float64) for frame in frames]
+
+
+@pytest.mark.mpi(1, 2)
+def test_the_step_is_the_longest_whose_half_changes_little_of_the_error(comm, tmp_path, own):
+    """Of a method whose error is a + b h: halving the step changes b h / 2."""
+    own("first_order", OWN_METHOD.format(slope=3.0))
+    scene = searched(prepared(comm, tmp_path), "first_order:FirstOrder")
+    find_step.run(scene, comm, tmp_path)
+    with open_product(comm, tmp_path / "step.h5", "step") as file:
+        found, trials = read_attributes(file, "found"), read_table(file, "trials/rk2")
+        turnover = found["turnovers"]
+    with open_product(comm, tmp_path / "ground_truth.h5", "ground_truth") as file:
+        span = turnover * read_attributes(file, "reference")["eddy_turnover_time"]
+    frames = round(span / scene.tracers.frame_interval)
+    first, last = velocities(comm, tmp_path, scene.tracers.field_every, scene.tracers.field_every + frames)
+    rms = np.sqrt(np.mean(last**2))
+    sizes = span / 2.0 ** np.arange(20)
+    errors = [np.sqrt(np.mean((first + 3.0 * size - last) ** 2)) / rms for size in sizes]
+    wanted = next(size for size, error in zip(sizes, errors[1:]) if 3.0 * size / 2 / rms < 0.02 * error)
+    assert found["size"] == pytest.approx(wanted) and found["integrator"] == "rk2"
+    assert trials["size"] == pytest.approx(sizes[:len(trials["size"])])
+    assert trials["error"] == pytest.approx(errors[:len(trials["size"])], rel=1e-6)
+    assert trials["difference"][1:] == pytest.approx(3.0 * trials["size"][1:] / rms, rel=1e-5)
+
+
+@pytest.mark.mpi(1, 2)
+def test_a_rollout_takes_the_step_that_was_found(comm, tmp_path):
+    """Without a force any step is exact, so the first is taken: the whole of the short rollout."""
+    scene = searched(prepared(comm, tmp_path))
+    find_step.run(scene, comm, tmp_path)
+    simulate.run(scene, comm, tmp_path)
+    with open_product(comm, tmp_path / "step.h5", "step") as file:
+        found = read_attributes(file, "found")
+    with open_product(comm, tmp_path / "rollout.h5", "rollout") as file:
+        rollout = read_attributes(file, "rollout")
+    assert found["difference"] < 1e-12 and found["size"] >= scene.simulation.frame_interval
+    assert rollout["time_step"] == pytest.approx(found["size"])
+
+
+@pytest.mark.mpi(1)
+def test_where_none_converges_a_number_is_asked_for(comm, tmp_path, own):
+    own("never_converges", OWN_METHOD.format(slope=1e9))
+    scene = searched(prepared(comm, tmp_path), "never_converges:FirstOrder")
+    with pytest.raises(SceneError, match=r"step = \"converged\": none has converged down to .*; give a number"):
+        find_step.run(scene, comm, tmp_path)
+    assert not (tmp_path / "step.h5").exists()
