@@ -77,13 +77,13 @@ BAD_OVERRIDES = [
     ("model.closure=poisson", "[model] closure: no such key; valid here: preset, terms, neighbors, path"),
     ("model.neighbors=5", "[model] neighbors = 5: must be a number at least 8"),
     ("model.neighbors=2000", "[model] neighbors = 2000: 1728 particles reach 4.5 with the skin, and half the cube"),
-    ("model.preset=wide", '[model] preset = "wide": must be one of "resolved", "resolved + pairs", "paper", "paper-code", '
-     '"local", "wcsph", "transport-velocity" ('),
+    ("model.preset=wide", '[model] preset = "wide": must be one of "resolved", "resolved + pairs", "paper", '
+     '"paper-code", "local", "wcsph", "transport-velocity" ('),
     ("model.preset=resolve", "did you mean resolved?"),
     ("model.pairs=3", "[model] pairs: no such key"),
     ("model.pair.hidden=[8]", "[model.pair]: no such term; did you mean pairs? the terms are pressure, stress, "
      "viscosity, damping, relaxation, pairs; remove the section, or add the term to the list"),
-    ("model.pairs.hiden=[8]", "[model.pairs] hiden: no such key; did you mean hidden? valid here: hidden, inputs, "),
+    ("model.pairs.hiden=[8]", "[model.pairs] hiden: no such key; did you mean hidden? valid here: window, "),
     ("model.pairs.hidden=[16, 0]", "[model.pairs] hidden = [16, 0]: must be a list such as [16, 16] of whole numbers, "
      "each at least 1"),
     ('model.pairs.inputs=["densty"]', '[model.pairs] inputs = ["densty"]: must be a list of any of "density", '
@@ -206,7 +206,7 @@ BAD_OVERRIDES = [
     ("training.learning_rate=nan", "[training] learning_rate = nan: must be a number above 0"),
     ("training.window=0", "[training] window = 0: must be a number above 0 and at most 1"),
     ("training.patience=none", "[training] patience: no such key; valid here: truths, window, frames"),
-    ("simulation.step=1e-300", "[simulation] step = 1e-300: must be a number above 0 (longest time step; see docs/cl"),
+    ("simulation.step=1e-300", "[simulation] step = 1e-300: must be a number above 0 or \"converged\" ("),
     ("simulation.step=0", "[simulation] step = 0: must be a number above 0"),
     ("simulation.turnovers=1e300", "[simulation] turnovers = 1e+300: must be a number above 0"),
     ("simulation.integrator=euler", '[simulation] integrator = "euler": must be one of "verlet", "corrected-verlet"'),

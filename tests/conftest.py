@@ -2,6 +2,7 @@
 
 import importlib
 import logging
+import os
 import pkgutil
 import sys
 
@@ -63,8 +64,9 @@ def own(tmp_path, monkeypatch):
     written = []
 
     def write(name, text):
-        path = tmp_path / f"{name}.py"
-        path.write_text(text)
+        path, new = tmp_path / f"{name}.py", tmp_path / f"{name}-{os.getpid()}"
+        new.write_text(text)
+        new.replace(path)  # other ranks, which write the same, never read a part of it
         importlib.invalidate_caches()
         written.append(name)
         return path

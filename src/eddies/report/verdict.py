@@ -13,7 +13,8 @@ from eddies.report.page import Metric, Section
 GOOD, FAIR, POOR = "good", "fair", "poor"
 KEY = "verdict"
 #: In this order the sections stand on the page; open are those that say how good the run is.
-ORDER = ("variants", KEY, "rollout", "forced", "step", "model", "kernel", "cost", "ground_truth", "stationary", "tracers")
+ORDER = ("variants", KEY, "rollout", "forced", "step", "model", "kernel", "cost", "ground_truth", "stationary",
+         "tracers")
 OPEN = ("variants", KEY, "rollout", "forced")
 
 #: Up to which part of the baseline's error an error is good, and fair; beyond them it is poor.

@@ -89,8 +89,8 @@ class TermSettings(Section):
 class PairSum(TermSettings):
     """How the values of pairs are weighted, and how their sum is scaled."""
 
-    window: str = choice("factor of a pair at the distance q, over the radius of interaction; smooth: (1 - q^2)^2; none: "
-                         "1, so that a rate jumps where a neighbour enters or leaves", "smooth", "none",
+    window: str = choice("factor of a pair at the distance q, over the radius of interaction; smooth: (1 - q^2)^2; "
+                         "none: 1, so that a rate jumps where a neighbour enters or leaves", "smooth", "none",
                          default="smooth")
     scaling: str = choice("of the sum, by the expected number n of neighbours; number: 1/n; root: n^(-1/2)", "number",
                           "root", default="number")
@@ -113,7 +113,7 @@ class ForceSum(PairSum):
 
 
 @dataclass(frozen=True, kw_only=True)
-class NetworkSettings(TermSettings):
+class NetworkSettings(PairSum):
     """A network of the invariants of a pair."""
 
     hidden: tuple[int, ...] = integers("widths of the network's layers", default=(16, 16), at_least=1)
@@ -161,7 +161,7 @@ class EddyViscosity(ForceSum):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DensityFlux(PairSum, NetworkSettings):
+class DensityFlux(NetworkSettings):
     """The network of the density in Eq. 3."""
 
     word = "density-flux"

@@ -180,8 +180,8 @@ def rollout_problems(scene: Scene, turnover_time: float | None = None) -> Iterat
     if turnover_time is not None:
         span = max(span, settings.turnovers * turnover_time)
     if span > MOST_STEPS * settings.longest_step:
-        yield (f"[simulation] step = {settings.step:g}: {span / settings.longest_step:.1e} steps for a time of {span:.3g}, and "
-               f"{MOST_STEPS:.0e} are the most; raise step or lower turnovers")
+        yield (f"[simulation] step = {settings.step:g}: {span / settings.longest_step:.1e} steps for a time of "
+               f"{span:.3g}, and {MOST_STEPS:.0e} are the most; raise step or lower turnovers")
 
 
 def frame_problems(stages: Sequence[str], scene: Scene, seen: float) -> Iterator[str]:

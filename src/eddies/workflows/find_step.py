@@ -45,8 +45,8 @@ class Trial:
     Parameters
     ----------
     step : its step. seconds : of a turnover, without storing.
-    error, difference : rms of the velocity at the end less the true one, and less that with twice the step, over that of
-        a component of the true one; nan where there is no such end.
+    error, difference : rms of the velocity at the end less the true one, and less that with twice the step, over that
+        of the true one; nan where there is no such end.
     """
 
     step: Step

@@ -27,6 +27,7 @@ from eddies.workflows.rollout.particle_run import injection
 
 log = logging.getLogger("eddies")
 
+
 def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | None = None) -> None:
     """Simulate what a scene asks for and write rollout.h5. A run that goes wrong ends there, keeps its frames, and
     says so in its status; one that is stopped goes on from a checkpoint."""

@@ -90,12 +90,14 @@ def test_a_description_is_json_and_differs_from_its_own_scene_in_nothing(preset)
 
 
 def test_no_key_of_a_term_s_settings_goes_unnoticed():
-    """A key that has come since, or that has gone, is a difference with its value."""
-    scene = load_scene("tiny", [SMALL])
+    """A key that has gone is a difference with its value; one that has come since has its default."""
+    scene = load_scene("tiny", [SMALL, "model.pairs.basis=paper"])
+    other = load_scene("tiny", [SMALL, "model.pairs.basis=paper", "model.pairs.symmetry=antisymmetric"])
     stored = json.loads(json.dumps(describe(scene, SCALES)))
     stored["terms"]["pairs"]["depth"] = 3
     del stored["terms"]["pairs"]["symmetry"]
-    assert {key for key, *_ in differences(scene, stored)} == {"[model.pairs] depth", "[model.pairs] symmetry"}
+    assert {key for key, *_ in differences(scene, stored)} == {"[model.pairs] depth"}
+    assert {key for key, *_ in differences(other, stored)} == {"[model.pairs] depth", "[model.pairs] symmetry"}
 
 
 @pytest.mark.mpi(1)

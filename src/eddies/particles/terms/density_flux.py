@@ -17,8 +17,8 @@ from eddies.scene import terms as declared
 class DensityFlux(PairTerm):
     """d rho_i/dt = r_rms s sum_j w NN_rho, or w NN_rho sign(rho_i - rho_j), of the invariants of a pair.
 
-    r_rms is the rms of the density rate, NN_rho a network of its own; w, s and the invariants as in PairNetwork. The text
-    does not say which direction the density has in place of b_k; the sign is that of the public code.
+    r_rms is the rms of the density rate, NN_rho a network of its own; w, s and the invariants as in PairNetwork. The
+    paper's text does not say what the density has in place of b_k; the sign is that of the public code.
     """
 
     Settings = declared.DensityFlux

@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import MISSING, asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -43,11 +43,14 @@ def differences(scene: Scene, description: Mapping[str, Any]) -> Iterator[tuple[
         yield "[model] terms", quoted(scene.model.terms), quoted(list(trained_terms))
         return
     for term, trained in trained_terms.items():
-        name = short_name(term)
-        wanted = json.loads(json.dumps(asdict(scene.model.settings[name])))
-        for key in wanted.keys() | trained.keys():
-            if (value := wanted.get(key, FORMER.get(key))) != trained.get(key):
-                yield f"[model.{name}] {key}", quoted(value), quoted(trained.get(key))
+        name, settings = short_name(term), scene.model.settings[short_name(term)]
+        wanted = json.loads(json.dumps(asdict(settings)))
+        # A model that was trained before there was a key has its default.
+        then = {field.name: field.default for field in fields(settings) if field.default is not MISSING}
+        then = json.loads(json.dumps(then)) | trained
+        for key in wanted.keys() | then.keys():
+            if (value := wanted.get(key, FORMER.get(key))) != then.get(key):
+                yield f"[model.{name}] {key}", quoted(value), quoted(then.get(key))
     if "pairs" in scene.model.reads and scene.neighbors != description["neighbors"]:
         yield "[model] neighbors", quoted(scene.neighbors), quoted(description["neighbors"])
     scales, tracers = description["scales"], scene.tracers
