@@ -9,7 +9,7 @@ from eddies.parallel.halo import HaloError
 TARGET = torch.tensor([[1.0, -2.0, 0.5]], dtype=torch.float64)
 
 
-def training_of(comm, validate=None, steps=(6, 5)):
+def training_of(comm, validate=None, steps=(6, 5), patience=None):
     """A linear map learned from random vectors, drawn for each step, in two phases; ranks share the loss evenly."""
     torch.manual_seed(3)
     model = nn.Linear(3, 1, bias=False).double()
@@ -22,7 +22,7 @@ def training_of(comm, validate=None, steps=(6, 5)):
     def error():
         return float((model.weight - TARGET).norm())
 
-    phases = [Phase(f"phase {number}", np.ones(count), (0.1, 0.01), take, validate or error, 2)
+    phases = [Phase(f"phase {number}", np.ones(count), (0.1, 0.01), take, validate or error, 2, patience)
               for number, count in enumerate(steps)]
     return Training(comm, model, phases)
 
@@ -40,14 +40,15 @@ def numbers(training):
 
 
 @pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("best", [None, 2], ids=["best at the end", "best after two steps"])
-def test_a_training_restored_at_any_step_is_bitwise_the_one_never_stopped(comm, best):
+@pytest.mark.parametrize("best, patience", [(None, None), (2, None), (2, 2)],
+                         ids=["best at the end", "best after two steps", "of little patience"])
+def test_a_training_restored_at_any_step_is_bitwise_the_one_never_stopped(comm, best, patience):
     def begun():
-        training = training_of(comm, best and (lambda: abs(training.optimizer.taken - best)))
+        training = training_of(comm, best and (lambda: abs(training.optimizer.taken - best)), patience=patience)
         return training
 
     whole = numbers(finished(begun()))
-    for split in range(11):
+    for split in range(len(whole["step"])):
         first, second = begun(), begun()
         for _ in range(split):
             first.step()
@@ -73,6 +74,16 @@ def test_the_state_of_least_validation_error_is_kept(comm):
     assert np.array_equal(seen[4], seen[2])  # the second phase begins with the best of the first
     starts = np.flatnonzero(training.columns()["phase"] == 1)
     assert starts[0] == 6
+
+
+@pytest.mark.mpi(1)
+def test_a_phase_ends_with_its_patience(comm):
+    """Of the first phase the error is least after two steps, looked at every other one; the second is at its best at
+    its end."""
+    training = training_of(comm, lambda: abs(training.optimizer.taken - 2) if training.number == 0 else
+                           10.0 - training.optimizer.taken, steps=(12, 8), patience=4)
+    columns = finished(training).columns()
+    assert np.bincount(columns["phase"].astype(int)).tolist() == [6, 8]
 
 
 @pytest.mark.mpi(1)

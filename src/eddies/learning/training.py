@@ -28,6 +28,7 @@ class Phase:
     take : one step of the optimiser, given the number of the step within the phase; returns losses by name.
     validate : error on what is not trained on; the state where it was least is kept. None: the last state is.
     validate_every : steps between two validations. The last step is always followed by one.
+    patience : steps without a smaller error on what is held out after which the phase ends; None: it takes all steps.
     """
 
     name: str
@@ -36,6 +37,7 @@ class Phase:
     take: Callable[[Adam, int], dict[str, float]]
     validate: Callable[[], float] | None = None
     validate_every: int = 1
+    patience: int | None = None
 
     @property
     def steps(self) -> int:
@@ -68,7 +70,7 @@ class Training:
 
     def _begin(self, number: int) -> None:
         """Be at the start of a phase."""
-        self.number, self.best_error, self.best = number, np.inf, self._weights()
+        self.number, self.best_error, self.best, self.best_at = number, np.inf, self._weights(), 0
         if self.running:
             self.optimizer = Adam(self.comm, self.model.parameters(), self.phase.steps, *self.phase.rates)
 
@@ -112,6 +114,7 @@ class Training:
         last = self.optimizer.taken == phase.steps
         if phase.validate and (last or self.optimizer.taken % phase.validate_every == 0):
             row["validation_error"] = self._error_of(phase.validate)
+            last = last or phase.patience is not None and self.optimizer.taken - self.best_at >= phase.patience
         if phase.validate and last:
             if self.best_error == np.inf:
                 raise TrainingDiverged(f"{place}: at no time of this phase was the error on what is held out finite")
@@ -130,7 +133,7 @@ class Training:
         """All that goes on, for a checkpoint: numbers and arrays by name."""
         parts = {"model": self._weights(), "best": self.best, "history": self.columns(),
                  "optimizer": self.optimizer.state_dict()}
-        return {"number": self.number, "best_error": self.best_error,
+        return {"number": self.number, "best_error": self.best_error, "best_at": self.best_at,
                 "names": {part: list(values) for part, values in parts.items()},
                 **{f"{part} {name}": value if isinstance(value, int) else np.atleast_1d(value)
                    for part, values in parts.items() for name, value in values.items()}}
@@ -140,7 +143,7 @@ class Training:
         parts = {part: {name: state[f"{part} {name}"] for name in names} for part, names in state["names"].items()}
         self._load(parts["model"])
         self._begin(state["number"])
-        self.best, self.best_error = parts["best"], state["best_error"]
+        self.best, self.best_error, self.best_at = parts["best"], state["best_error"], state["best_at"]
         self.optimizer.load_state_dict(parts["optimizer"])
         rows = zip(*parts["history"].values())
         self.history = [{name: float(value) for name, value in zip(parts["history"], row) if value == value}
@@ -155,7 +158,7 @@ class Training:
             error = np.inf
         error = error if np.isfinite(error) else np.inf
         if error < self.best_error:
-            self.best_error, self.best = error, self._weights()
+            self.best_error, self.best, self.best_at = error, self._weights(), self.optimizer.taken
         return error
 
     def _weights(self) -> dict[str, np.ndarray]:

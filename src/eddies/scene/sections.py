@@ -232,6 +232,9 @@ class Training(Section):
     frames: int = integer("frames to draw from, in all, evenly shared by the ground truths", at_least=2)
     batch: int = integer("particles per step", at_least=1)
     steps: int = integer("optimiser steps; 0: parameters stay as they start", at_least=0)
+    patience: int | None = integer("steps without a smaller error on what is held out after which the steps on "
+                                   "trajectories end, and those on all losses; absent: all steps are taken",
+                                   default=None, at_least=1)
     learning_rate: float = number("of the optimiser, at the start", default=5e-3, above=0)
     final_learning_rate: float = number("of the optimiser, at the end", default=1e-4, above=0)
     precision: str = choice("of the training", "float32", "float64", default="float32")

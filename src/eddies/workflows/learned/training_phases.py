@@ -18,6 +18,8 @@ from eddies.workflows.learned.training_data import COMBINED_DRAWS, VALIDATION_PA
 
 # How many validations a phase has.
 VALIDATIONS, HORIZON_VALIDATIONS = 25, 4
+# How many validations at least before the patience of a phase is at its end.
+LOOKS = 4
 
 Trainer = TypeVar("Trainer")
 
@@ -38,7 +40,10 @@ def one_step_phases(scene: Scene, data: Sequence[TrainingData], kernel: Smoothin
         # Work in evaluations of the force of a particle.
         work = np.array([float(_at_turn(trainers, step).batch) for step in range(steps)])
         return Phase(name, work, rates, lambda optimizer, step: take(_at_turn(trainers, step), optimizer, step),
-                     _mean(error, trainers, held_out), max(steps // VALIDATIONS, 1))
+                     _mean(error, trainers, held_out), every(steps), settings.patience)
+
+    def every(steps: int) -> int:
+        return max(min(steps // VALIDATIONS, (settings.patience or steps) // LOOKS), 1)
 
     phases = [phase("one step", alone, (settings.learning_rate, between),
                     lambda trainer, optimizer, step: trainer.trajectory_step(optimizer, step),
