@@ -205,7 +205,7 @@ BAD_OVERRIDES = [
     ("training.steps=100000000000000000000", "whole numbers of a scene are at most 1,000,000,000"),
     ("training.learning_rate=nan", "[training] learning_rate = nan: must be a number above 0"),
     ("training.window=0", "[training] window = 0: must be a number above 0 and at most 1"),
-    ("training.haste=none", "[training] haste: no such key; valid here: truths, window, frames"),
+    ("training.zeal=none", "[training] zeal: no such key; valid here: truths, window, frames"),
     ("simulation.step=1e-300", "[simulation] step = 1e-300: must be a number above 0 or \"converged\" ("),
     ("simulation.step=0", "[simulation] step = 0: must be a number above 0"),
     ("simulation.turnovers=1e300", "[simulation] turnovers = 1e+300: must be a number above 0"),
