@@ -15,12 +15,18 @@
 #SBATCH --signal=USR1@300
 #SBATCH --requeue
 #SBATCH --open-mode=append
+#SBATCH --export=ALL
+##SBATCH --account=NAME
+##SBATCH --partition=NAME
 EDDIES_SCENE=hit-paper
-ground_truth() { srun --cpus-per-task="${SLURM_CPUS_PER_TASK:-1}" "$1" dns "${@:3}"; }  # this stage instead of `run`, which is all of them
+ranks=(srun --mpi="${SLURM_MPI_TYPE:-pmix}" --export=ALL --cpus-per-task="${SLURM_CPUS_PER_TASK:-1}")
+ground_truth() { "${ranks[@]}" "$1" dns "${@:3}"; }  # this stage instead of `run`, which is all of them
 launcher=(ground_truth)
 resubmit=(scontrol requeue "${SLURM_JOB_ID:-}")
 
 # ---- the same for every scheduler
 set -euo pipefail
 cd "${PBS_O_WORKDIR:-$PWD}"
-source "${EDDIES_CHECKOUT:-$PWD}/jobs/run.sh"
+body=${EDDIES_CHECKOUT:-$PWD}/jobs/run.sh
+if [ ! -e "$body" ]; then echo "no $body: submit from the checkout, or set EDDIES_CHECKOUT to it" >&2; exit 2; fi
+source "$body"

@@ -13,4 +13,6 @@ resubmit=(qsub -V jobs/pbs.sh)
 # ---- the same for every scheduler
 set -euo pipefail
 cd "${PBS_O_WORKDIR:-$PWD}"
-source "${EDDIES_CHECKOUT:-$PWD}/jobs/run.sh"
+body=${EDDIES_CHECKOUT:-$PWD}/jobs/run.sh
+if [ ! -e "$body" ]; then echo "no $body: submit from the checkout, or set EDDIES_CHECKOUT to it" >&2; exit 2; fi
+source "$body"

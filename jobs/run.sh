@@ -16,8 +16,9 @@ if [ -n "${EDDIES_OUTPUT:-}" ]; then arguments+=(--output "$EDDIES_OUTPUT"); fi
 trap : USR1  # some schedulers signal this shell too; the ranks end with 75, it waits for them
 status=0
 "${launcher[@]}" "$checkout/.venv/bin/eddies" "${arguments[@]}" "$@" || status=$?
+if [ "$status" -eq 138 ]; then status=75; fi  # by SIGUSR1, before they could catch it: nothing was begun
 if [ "$status" -eq 75 ]; then
-    echo "stopped before the time limit: the same command goes on from the last checkpoint"
+    echo "stopped before the time limit: the same command goes on"
     "${resubmit[@]}" || echo "not queued again, do it by hand: ${resubmit[*]}" >&2
 fi
 exit "$status"

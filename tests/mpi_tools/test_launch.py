@@ -101,8 +101,10 @@ def test_doctor_finds_nothing(tmp_path):
 def test_doctor_names_what_is_missing(tmp_path):
     for name in ("pyfftw", "torch", "matplotlib"):  # the last two take long to import
         (tmp_path / f"{name}.py").write_text("raise ImportError('made up')")
-    code = (f"import sys, runpy; sys.path.insert(0, {str(tmp_path)!r}); "
+    # A third rank that MPI does not connect.
+    code = (f"import os, sys, runpy; sys.path.insert(0, {str(tmp_path)!r}); os.environ['OMPI_COMM_WORLD_SIZE'] = '3'; "
             f"runpy.run_path({str(CHECKOUT / 'mpi_tools/doctor.py')!r}, run_name='__main__')")
     result = launched(2, "-c", code, cwd=tmp_path)
-    assert result.returncode == 6  # three on each of two ranks
+    assert result.returncode == 8  # four on each of two ranks
+    assert "rank 0: 3 ranks were started, MPI connects 2 of them" in result.stdout
     assert "rank 1: pyfftw cannot be imported (made up)" in result.stdout
