@@ -87,7 +87,7 @@ def test_local_passes_scene_and_options_on(checkout):
 def test_local_refuses_a_wrong_number_of_ranks(checkout, asked):
     result = run(checkout, "local.sh", EDDIES_RANKS=asked)
     assert result.returncode == 2
-    assert f"EDDIES_RANKS = '{asked}'" in result.stderr
+    assert f'EDDIES_RANKS = "{asked}"' in result.stderr
 
 
 def asked_of_slurm(script):
