@@ -257,6 +257,7 @@ def test_realisations_that_no_training_has_seen(comm, folder):
         assert row["energy_ratio"] == pytest.approx(np.mean(both), rel=1e-6)
         assert row["energy_ratio_spread"] == pytest.approx(abs(both[0] - both[1]) / 2**0.5, rel=1e-4)
         assert both[0] != both[1]
+    assert {"error-against-run-time", "figure-9-errors"} <= {*eddies.open_run(out).figures}
     out.rename(folder / "moved")
     assert run_cli("simulate", "unseen.toml", "--output", "moved") == 0  # no work of other settings
 

@@ -122,7 +122,8 @@ def _read_value(field: dataclasses.Field, value: Any, name: str) -> Any:
 def _unknown(key: str, value: Any, section: str, valid: Sequence[str]) -> SceneError:
     hint = f"{nearest(key, valid, cutoff=0.5)} ".lstrip()
     is_section = isinstance(value, dict) and not section
-    problem = f": no such {'section' if is_section else 'key'}; {hint}valid here: {', '.join(valid) or 'no key'}"
+    known = ", ".join(valid) or "no key; remove it"
+    problem = f": no such {'section' if is_section else 'key'}; {hint}valid here: {known}"
     return SceneError(f"[{key}]{problem}", key) if is_section else KeyProblem(section, key, problem)
 
 

@@ -94,7 +94,7 @@ def run(directory: str | Path, comm: Comm, variants: Sequence[str] = ()) -> None
     scene, places = in_files(comm, directory, lambda: stored_rollouts(directory))
     if scene is not None:
         scene.check_variants(variants)
-    ran = {name: where[0].directory for name, where in places.items() if (where[0].directory / ROLLOUT).exists()}
+    ran = rolled_out(places)
     chosen = next((name for name in (*variants, *ran) if name in ran), None)
     main = directory if chosen is None else ran[chosen]
     pages = {name: where for name, where in ran.items() if where != directory}
@@ -129,6 +129,11 @@ def stored_rollouts(directory: Path) -> tuple[Scene | None, dict[str, list[Place
     except SceneError:
         return None, {}
     return scene, rollouts(scene, directory) if scene.simulation is not None else {}
+
+
+def rolled_out(places: Mapping[str, Sequence[Place]]) -> dict[str, Path]:
+    """The directory of the first rollout of each variant that was run."""
+    return {name: where[0].directory for name, where in places.items() if (where[0].directory / ROLLOUT).exists()}
 
 
 def _made(directory: Path, comm: Comm, alone: Comm, scanned: dict[Path, str], own: bool = False,
@@ -189,9 +194,13 @@ def _links(scene: Scene | None, directory: Path, page: Path, pages: Mapping[str,
 
 
 def sections_of(directory: Path, alone: Comm) -> list[Section]:
-    """All sections that one rank reads, their figures not yet drawn."""
-    record = _survey(directory, alone, {})
-    return [*_read_share(directory, alone, alone, record, list(record.provenance)), _cost_section(record)]
+    """All sections of the page of a run directory, read by one rank, their figures not yet drawn."""
+    scene, places = stored_rollouts(directory)
+    chosen, main = next(iter(rolled_out(places).items()), ("", directory))
+    first, record = [], _survey(main, alone, {})
+    if scene and scene.variant and chosen:
+        first = [section_on_variants(_table(scene, places, chosen, alone, alone), notes(scene))]
+    return [*first, *_read_share(main, alone, alone, record, list(record.provenance)), _cost_section(record)]
 
 
 def _survey(directory: Path, alone: Comm, scanned: dict[Path, str]) -> Run:
