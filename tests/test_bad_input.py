@@ -10,9 +10,9 @@ import sys
 import tempfile
 from pathlib import Path
 
-import h5py
 import pytest
 
+from tests.changed_product import changed
 from tests.test_cli import LAUNCHER, run_cli
 from tests.workflows.synthetic_run import write_ground_truth, write_kernel
 
@@ -43,7 +43,7 @@ def test_provenance_that_is_none(comm, tmp_path, capfd, value):
     write_ground_truth(comm, tmp_path, frames=2)
     comm.Barrier()
     if comm.rank == 0:
-        with h5py.File(tmp_path / "ground_truth.h5", "a") as file:
+        with changed(tmp_path / "ground_truth.h5") as file:
             file.attrs["provenance"] = value
     comm.Barrier()
     told = (f"{tmp_path / 'ground_truth.h5'}: its attribute provenance is not what was written, the file is damaged; "
@@ -61,7 +61,7 @@ def test_provenance_that_is_none(comm, tmp_path, capfd, value):
     ("format", "three", "whose ground truth this version does not read; remove it and run `eddies dns`")], ids=repr)
 def test_attributes_of_another_type(comm, tmp_path, capfd, name, value, told):
     write_ground_truth(comm, tmp_path)
-    with h5py.File(tmp_path / "ground_truth.h5", "a") as file:
+    with changed(tmp_path / "ground_truth.h5") as file:
         file.attrs[name] = value
     assert told in refused(capfd, comm, "report", tmp_path)
 
@@ -73,7 +73,7 @@ def test_weights_without_a_description(comm, tmp_path, name, value):
     from eddies.io.hdf5 import ProductError
     from eddies.io.weights import load_weights
     write_kernel(comm, tmp_path)
-    with h5py.File(tmp_path / "kernel.h5", "a") as file:
+    with changed(tmp_path / "kernel.h5") as file:
         del file.attrs[name]
         if value is not None:
             file.attrs[name] = value

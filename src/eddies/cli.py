@@ -261,7 +261,7 @@ def scenes_command(options: argparse.Namespace, comm: Comm) -> None:
 
 def status_command(options: argparse.Namespace, comm: Comm) -> None:
     """What stands in run directories."""
-    import_module("eddies.workflows.status").run(options.directory, comm)
+    import_module("eddies.workflows.status").run(options.directory, comm, options.verify)
 
 
 def diff_command(options: argparse.Namespace, comm: Comm) -> None:

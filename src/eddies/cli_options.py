@@ -25,7 +25,7 @@ EXAMPLES = {
     "check": ("eddies check hit", "eddies check mine.toml --set flow.cells=256 --unset forcing --json",
               "mpirun -n 2 eddies check hit-small --time"),
     "scenes": ("eddies scenes", "eddies scenes tiny"),
-    "status": ("eddies status", "eddies status runs/hit-small"),
+    "status": ("eddies status", "eddies status runs/hit-small --verify"),
     "diff": ("eddies diff runs/hit-small runs/second", "eddies diff runs/cost --variant learned --variant paper"),
 }
 
@@ -77,6 +77,7 @@ def build_parser() -> argparse.ArgumentParser:
     status = add_command(commands, "status", "what stands in run directories: stages, checkpoints, jobs, sizes")
     status.add_argument("directory", nargs="?", type=directory, default=Path("runs"), metavar="DIR",
                         help="a run directory, or one of several (default: runs)")
+    status.add_argument("--verify", action="store_true", help="compare all bytes of the products with their checksums")
     diff = add_command(commands, "diff", "what differs between two runs: settings and numbers")
     add_run(diff, "one")
     add_run(diff, "other", nargs="?")

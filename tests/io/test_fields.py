@@ -5,6 +5,7 @@ import pytest
 
 from eddies.io.fields import FieldSeries, FieldWriter
 from eddies.io.hdf5 import ProductError, create_product, open_product
+from tests.changed_product import changed
 
 CELLS = 6
 VARIABLES = {"velocity": 3, "density": 1}
@@ -38,3 +39,19 @@ def test_fields_survive(comm, tmp_path, planes):
         assert np.array_equal(planes, field(1, "velocity")[:, 2:4].astype(np.float32))
         with pytest.raises(ProductError, match="holds no fields/truth"):
             FieldSeries(file, "truth")
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("change, told", [
+    (lambda group: group["time"].write_direct(np.array([0.1, 0.1])), "time, holds times that do not increase"),
+    (lambda group: group["time"].resize(1, 0), r"has the shape \(2, ., 6, 6, 6\), with 1 times, 6 cells a side"),
+    (lambda group: group.attrs.modify("cells", 8), r"has the shape \(2, ., 6, 6, 6\), with 2 times, 8 cells a side")])
+def test_series_that_no_stage_writes_are_told(comm, tmp_path, change, told):
+    with create_product(comm, tmp_path / "f.h5", "ground_truth", {}) as file:
+        writer = FieldWriter(file, "filtered", CELLS, VARIABLES)
+        for index in range(2):
+            writer.append(0.1 * index, 0, {name: field(index, name) for name in VARIABLES})
+    with changed(tmp_path / "f.h5") as file:
+        change(file["fields/filtered"])
+    with open_product(comm, tmp_path / "f.h5", "ground_truth") as file, pytest.raises(ProductError, match=told):
+        FieldSeries(file, "filtered").times

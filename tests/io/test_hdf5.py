@@ -12,6 +12,7 @@ from eddies.io.hdf5 import (CHUNK_BYTES, ProductError, append_frame, create_prod
 from eddies.io.provenance import product_fingerprint, product_provenance, read_provenance
 from eddies.parallel.stop import Stopped
 from eddies.pipeline import MAKER_OF
+from tests.changed_product import changed
 
 
 def write(comm, path, kind="kernel"):
@@ -78,7 +79,7 @@ def test_missing_and_wrong_kind(comm, tmp_path):
 def change_format(comm, path, number):
     """As another version writes it: with another number, or None, as eddies 0.1.0 wrote none."""
     if comm.rank == 0:
-        with h5py.File(path, "a") as file:
+        with changed(path) as file:
             del file.attrs["format"]
             if number is not None:
                 file.attrs["format"] = number

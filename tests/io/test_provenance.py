@@ -2,11 +2,11 @@
 
 import json
 
-import h5py
 import pytest
 
 from eddies.io.hdf5 import create_product, open_product
 from eddies.io.provenance import others_trained_on, product_provenance, read_provenance
+from tests.changed_product import changed
 
 
 def write(comm, directory, kind, *made_from):
@@ -31,7 +31,7 @@ def test_a_product_has_an_id_of_its_own_and_those_of_what_it_was_made_from(comm,
 def test_a_product_without_an_id_stays_readable(comm, tmp_path):
     """As one made before there were ids; what is made from it knows that it was one of those."""
     write(comm, tmp_path, "ground_truth")
-    with h5py.File(tmp_path / "ground_truth.h5", "r+") as file:
+    with changed(tmp_path / "ground_truth.h5") as file:
         origin = json.loads(file.attrs["provenance"])
         del origin["id"], origin["made_from"]
         file.attrs["provenance"] = json.dumps(origin)

@@ -5,6 +5,7 @@ import pytest
 
 from eddies.io.hdf5 import ProductError, create_product, open_product
 from eddies.io.trajectories import Trajectory, TrajectoryWriter
+from tests.changed_product import changed
 
 COLUMNS = {"position": (3,), "density": (), "velocity_gradient": (3, 3)}
 TOTAL, FRAMES = 11, 3
@@ -72,3 +73,33 @@ def test_unknown_names_list_the_others(comm, tmp_path):
             Trajectory(file, "tracers")
         with pytest.raises(ProductError, match="holds no velocity; .*position"):
             Trajectory(file, "model").read(0, "velocity")
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("place, index, value, told", [
+    ("time", 1, 1.0, "time, holds times that do not increase"),
+    ("time", 2, np.nan, "time, holds times that do not increase"),
+    ("id", 3, 4, "id, holds ids that are not in order"),
+    ("position/value", (1, 5, 0), -0.1, "position/value, frame 1: holds values that are outside of 0 to 6.28319"),
+    ("position/value", (1, 5, 0), 6.3, "position/value, frame 1: holds values that are outside of 0 to 6.28319"),
+    ("density/value", (1, 5), np.inf, "density/value, frame 1: holds values that are not finite")])
+def test_values_that_no_stage_writes_are_told(comm, tmp_path, place, index, value, told):
+    write(comm, tmp_path / "t.h5", np.float32, BLOCKS["even"](comm))
+    with changed(tmp_path / "t.h5") as file:
+        file[f"particles/model/{place}"][index] = value
+    with open_product(comm, tmp_path / "t.h5", "ground_truth") as file, pytest.raises(ProductError) as error:
+        trajectory = Trajectory(file, "model")
+        assert len(trajectory.times) == FRAMES
+        for column in COLUMNS:
+            trajectory.read(1, column, 2, 8)
+    assert str(error.value) == (f"{tmp_path / 't.h5'}: /particles/model/{told}; remove it and run `eddies dns` again")
+
+
+@pytest.mark.mpi(1)
+def test_fewer_times_than_frames_are_told(comm, tmp_path):
+    write(comm, tmp_path / "t.h5", np.float32, BLOCKS["even"](comm))
+    with changed(tmp_path / "t.h5") as file:
+        file["particles/model/time"].resize(FRAMES - 1, 0)
+    told = r"value, holds \(3, 11\) frames and particles where there are \(2, 11\) times and ids"
+    with open_product(comm, tmp_path / "t.h5", "ground_truth") as file, pytest.raises(ProductError, match=told):
+        Trajectory(file, "model").times

@@ -1,11 +1,11 @@
 """Weights: read back as written, and refused when they are not."""
 
-import h5py
 import numpy as np
 import pytest
 
 from eddies.io.hdf5 import ProductError
 from eddies.io.weights import load_tables, load_weights, save_weights
+from tests.changed_product import changed
 
 DESCRIPTION = {"basis": "corrected", "hidden": [16, 16], "scales": {"filter_width": 0.39}}
 
@@ -58,7 +58,7 @@ DAMAGES = {
 def test_damage_is_named(comm, tmp_path, damage):
     save(comm, tmp_path / "m.h5")
     if comm.rank == 0:
-        with h5py.File(tmp_path / "m.h5", "a") as file:
+        with changed(tmp_path / "m.h5") as file:
             DAMAGES[damage](file)
     comm.Barrier()
     with pytest.raises(ProductError, match="m.h5: tensor (scale|layers.*bias) is not what was written"):

@@ -7,6 +7,7 @@ import pytest
 
 from eddies.scene.scene import SceneError, builtin_scenes, load_scene
 from tests.bad_scenes import INFEASIBLE
+from tests.changed_product import changed
 from tests.workflows.synthetic_run import write_ground_truth
 
 
@@ -130,8 +131,7 @@ def test_a_ground_truth_with_too_few_frames_or_without_motion(comm, tmp_path):
         check_ground_truth(["train"], short, comm, tmp_path)
     comm.Barrier()
     if comm.rank == 0:
-        import h5py
-        with h5py.File(tmp_path / "ground_truth.h5", "a") as file:
+        with changed(tmp_path / "ground_truth.h5") as file:
             file["reference"].attrs["acceleration_rms"] = 0.0
     comm.Barrier()
     with pytest.raises(SceneError, match="ground_truth.h5: reference scale acceleration = 0.0: must be .*start from"):

@@ -1,12 +1,12 @@
 """What is said of products that do not belong together, and of numbers that are not finite."""
 
-import h5py
 import numpy as np
 import pytest
 
 from eddies.io.hdf5 import open_product
 from eddies.io.provenance import product_provenance
 from eddies.workflows.product_warnings import changed_truths, mixed_products, not_finite
+from tests.changed_product import changed
 from tests.workflows.synthetic_run import write_ground_truth, write_kernel, write_model, write_rollout
 
 TRUTH = {"id": "t1", "made_from": {}, "date": "2030-01-01", "scene": "seed = 1\n[flow]\ncells = 48"}
@@ -68,7 +68,7 @@ def test_a_product_of_before_there_were_ids_says_so_beside_one_that_has_one():
 def said_of(comm, directory, kind, **holes):
     """What is said of a product in which numbers are replaced: column by place with "__" for "/", an index, a value."""
     path = directory / f"{kind}.h5"
-    with h5py.File(path, "r+") as file:
+    with changed(path) as file:
         for place, (index, value) in holes.items():
             file[place.replace("__", "/")][index] = value
     with open_product(comm, path, kind) as file:

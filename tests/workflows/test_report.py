@@ -12,6 +12,7 @@ from eddies.io.hdf5 import ProductError
 from eddies.report.rollout_figures import errors_over_time
 from eddies.workflows import report
 from eddies.workflows.rollout.measured import open_rollout
+from tests.changed_product import changed
 from tests.workflows.synthetic_run import write_ground_truth, write_kernel, write_model, write_rollout, write_run
 
 FIGURES = {
@@ -111,7 +112,7 @@ def test_the_series_of_a_rollout_have_the_density_that_is_stored(comm, tmp_path,
 @pytest.mark.mpi(1)
 def test_a_product_of_another_version_is_said_in_one_line(comm, tmp_path):
     write_run(comm, tmp_path)
-    with h5py.File(tmp_path / "kernel.h5", "r+") as file:
+    with changed(tmp_path / "kernel.h5") as file:
         del file.attrs["format"]
     with pytest.raises(ProductError, match="kernel.h5: written by eddies .* remove it and run `eddies train-kernel` "):
         report.run(tmp_path, comm)
@@ -153,7 +154,7 @@ def check_stationary(shown, page):
 @pytest.mark.mpi(1)
 def test_a_span_too_short_to_average_is_said_and_the_rest_is_shown(comm, tmp_path):
     write_ground_truth(comm, tmp_path, stationary=True)
-    with h5py.File(tmp_path / "ground_truth.h5", "r+") as file:
+    with changed(tmp_path / "ground_truth.h5") as file:
         file["stationary"].attrs["end"] = file["stationary"].attrs["start"]
     report.run(tmp_path, comm)
     metrics, page = written(tmp_path)
@@ -319,7 +320,7 @@ def test_a_rollout_of_an_earlier_version_shows_the_same(comm, tmp_path):
     write_run(comm, tmp_path)
     report.run(tmp_path, comm)
     expected = written(tmp_path)[0]["rollout"]
-    with h5py.File(tmp_path / "rollout.h5", "r+") as file:
+    with changed(tmp_path / "rollout.h5") as file:
         file.copy("particles/model", "particles/truth")
         file["fields/model/velocity"], file["spectra_of_truth/energy"] = [0.0], [0.0]
     report.run(tmp_path, comm)
@@ -388,7 +389,7 @@ def test_a_ground_truth_that_others_were_not_made_from_is_said_at_the_top(comm, 
     ("rollout", "closure/not_converged", 2), ("rollout", "particles/model/velocity/value", (8, 0, 0))])
 def test_numbers_that_are_not_finite_are_said_at_the_top(comm, tmp_path, capfd, kind, place, index):
     write_run(comm, tmp_path)
-    with h5py.File(tmp_path / f"{kind}.h5", "r+") as file:
+    with changed(tmp_path / f"{kind}.h5") as file:
         file[place][index] = math.nan
     said, = told_at_the_top(tmp_path, capfd)
     assert said.startswith(f"{kind}.h5 holds numbers that are not finite ({place}")
@@ -401,7 +402,7 @@ def test_a_section_that_cannot_be_made_of_such_numbers_says_so(comm, tmp_path, c
     write_ground_truth(comm, tmp_path)
     write_kernel(comm, tmp_path)
     write_model(comm, tmp_path)
-    with h5py.File(tmp_path / "model.h5", "r+") as file:
+    with changed(tmp_path / "model.h5") as file:
         file["acceleration_sample/truth"][5, 1] = math.nan
     said, = told_at_the_top(tmp_path, capfd)
     metrics, page = written(tmp_path)
@@ -413,7 +414,7 @@ def test_a_section_that_cannot_be_made_of_such_numbers_says_so(comm, tmp_path, c
 @pytest.mark.mpi(1)
 def test_a_ground_truth_that_is_not_finite_is_refused(comm, tmp_path):
     write_ground_truth(comm, tmp_path)
-    with h5py.File(tmp_path / "ground_truth.h5", "r+") as file:
+    with changed(tmp_path / "ground_truth.h5") as file:
         file["fields/filtered/velocity"][0, 0, 0, 0, 0] = math.nan
     with pytest.raises(ProductError, match="ground_truth.h5: /fields/filtered/velocity, frame 0: holds values that are "
                                            "not finite; remove it and run `eddies dns` again"):
@@ -424,7 +425,7 @@ def test_a_ground_truth_that_is_not_finite_is_refused(comm, tmp_path):
 @pytest.mark.mpi(1)
 def test_a_rollout_of_too_few_steps_says_why_it_has_no_time_of_a_step(comm, tmp_path):
     write_rollout(comm, tmp_path)
-    with h5py.File(tmp_path / "rollout.h5", "r+") as file:
+    with changed(tmp_path / "rollout.h5") as file:
         del file["rollout"].attrs["seconds_per_step"], file["rollout"].attrs["time_step"]
     report.run(tmp_path, comm)
     metrics, page = written(tmp_path)

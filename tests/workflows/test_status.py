@@ -1,6 +1,7 @@
 import json
 import os
 
+import h5py
 import numpy as np
 import pytest
 
@@ -11,6 +12,8 @@ from eddies.io.hdf5 import create_product
 from eddies.scene.scene import load_scene
 from eddies.workflows.diff import diff_lines
 from eddies.workflows.status import status_lines
+from tests.test_cli import run_cli
+from tests.workflows.synthetic_run import write_ground_truth, write_kernel, write_rollout
 
 
 def write_scene(directory, *changes):
@@ -85,3 +88,46 @@ def test_variants_of_one_run_are_told_apart(comm, tmp_path, capfd):
         (tmp_path / name).touch()
         os.utime(tmp_path / name, (made, made))
     assert "older than the products" in list(status_lines(tmp_path))[-1]
+
+
+@pytest.mark.mpi(1, 2)
+def test_products_that_are_not_as_written_are_told(comm, tmp_path, capfd):
+    """Those of a variant too; a link to a product is no other one, and one of before there were checksums is none."""
+    if comm.rank == 0:
+        alone = comm.Create_group(comm.group.Incl([0]))
+        write_scene(tmp_path)
+        (tmp_path / "a").mkdir()
+        write_ground_truth(alone, tmp_path, frames=3)
+        (tmp_path / "a/ground_truth.h5").symlink_to("../ground_truth.h5")
+        write_kernel(alone, tmp_path)
+        with h5py.File(tmp_path / "kernel.h5", "r+") as file:
+            del file.attrs["checksums"]
+        write_rollout(alone, tmp_path / "a")
+    comm.Barrier()
+
+    def told(code):
+        assert run_cli("status", tmp_path, "--verify") == code
+        output, errors = capfd.readouterr()
+        return [line for line in output.splitlines() if line.startswith(f"{tmp_path}/")], errors
+
+    rest = [f"{tmp_path / 'ground_truth.h5'}: as written",
+            f"{tmp_path / 'kernel.h5'}: holds no checksums, made by an earlier version"]
+    lines, _ = told(0)
+    assert lines == ([f"{tmp_path / 'a/rollout.h5'}: as written", *rest] if comm.rank == 0 else [])
+    comm.Barrier()
+    if comm.rank == 0:
+        with h5py.File(tmp_path / "a/rollout.h5") as file:
+            place = file["particles/model/velocity/value"].id.get_chunk_info_by_coord((4, 0, 0)).byte_offset
+        with open(tmp_path / "a/rollout.h5", "r+b") as file:
+            file.seek(place + 5000)
+            file.write(b"other bytes")
+    comm.Barrier()
+    lines, errors = told(2)
+    if comm.rank == 0:
+        assert lines[0].startswith(f"{tmp_path / 'a/rollout.h5'}: particles/model/velocity/value, frame 4")
+        assert lines[0].endswith("not what was written, the file is damaged; remove it and run `eddies simulate` again")
+        assert lines[1:] == rest and errors == f"eddies: error: {tmp_path}: 1 of 3 products are damaged\n"
+    for command in ("report", "export"):
+        assert run_cli(command, tmp_path / "a") == 2
+        errors = capfd.readouterr().err
+        assert comm.rank > 0 or "a/rollout.h5: particles/model/velocity/value, frame 4" in errors.splitlines()[-1]

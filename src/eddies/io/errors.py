@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 
 from eddies.errors import UserError
+from eddies.pipeline import MAKER_OF
 
 # A full disk, a used up quota, a file that is longer than it may be.
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -47,3 +48,8 @@ def wanted_and_free(path: Path | str, wanted: int) -> str:
     """Bytes wanted for a file, and those free where it is."""
     disk = os.statvfs(next(place for place in Path(path).absolute().parents if place.is_dir()))
     return f"{wanted} bytes wanted, {disk.f_bavail * disk.f_frsize} free"
+
+
+def make_again(kind: str) -> str:
+    """What to do with a product that is of no use; as it is there, its stage would keep it."""
+    return f"remove it and run `eddies {MAKER_OF[kind].name}` again" if kind in MAKER_OF else "make it again"

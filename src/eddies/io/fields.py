@@ -6,7 +6,7 @@ from functools import cached_property
 import h5py
 import numpy as np
 
-from eddies.io.hdf5 import append_frame, find_group, growing_dataset, read_frame, write_attributes
+from eddies.io.hdf5 import append_frame, find_group, growing_dataset, read_frame, read_times, unfit, write_attributes
 
 
 class FieldWriter:
@@ -34,7 +34,7 @@ class FieldWriter:
 
 
 class FieldSeries:
-    """Reads /fields/NAME of an open product; ProductError if there is none."""
+    """Reads /fields/NAME of an open product; ProductError if there is none, or it is not what a stage writes."""
 
     def __init__(self, file: h5py.File, name: str) -> None:
         self.file, self._group = file, find_group(file, f"fields/{name}")
@@ -46,7 +46,11 @@ class FieldSeries:
     @cached_property
     def times(self) -> np.ndarray:
         """Time of each field, (frames,)."""
-        return self._group["time"][()]
+        times = read_times(self._group["time"])
+        for found in (self._group[name] for name in self.variables):
+            if (found.shape[0], *found.shape[2:]) != (len(times), *[self.cells] * 3):
+                raise unfit(found, f"has the shape {found.shape}, with {len(times)} times, {self.cells} cells a side")
+        return times
 
     @property
     def cells(self) -> int:

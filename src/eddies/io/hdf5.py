@@ -16,7 +16,8 @@ import h5py
 import numpy as np
 from mpi4py import MPI
 
-from eddies.io.errors import ProductError, WriteError, write_error
+from eddies.io.checksums import ATTRIBUTE, WORDS
+from eddies.io.errors import ProductError, WriteError, make_again, write_error
 from eddies.io.provenance import FORMAT, environment, has_this_format, identity, read_json, read_provenance
 from eddies.io.quantities import conventions, describe
 from eddies.io.reading import open_to_read, why_unreadable
@@ -65,11 +66,12 @@ def create_product(comm: MPI.Comm, path: str | Path, kind: str,
         with writing(unfinished.file, len(origin) + HEADER_BYTES):
             write_attributes(unfinished.file,
                              {"kind": kind, "format": FORMAT, "complete": False, "provenance": origin,
-                              **conventions(kind)})
+                              ATTRIBUTE: WORDS, **conventions(kind)})
         yield unfinished.file
         with writing(unfinished.file, HEADER_BYTES):
             unfinished.file.attrs["complete"] = True
             unfinished.close()
+        unfinished.add_checksums()
     except BaseException as error:
         # Several ranks close a file together: only where all of them are here.
         if comm.size > 1 and not isinstance(error, Stopped | WriteError | RunTakenOver):
@@ -182,16 +184,31 @@ def append_frame(dataset: h5py.Dataset, block: np.ndarray, offset: tuple[int, ..
         dataset.id.write(in_memory, in_file, block, dxpl=transfer)
 
 
-def read_frame(dataset: h5py.Dataset, frame: int, selection: tuple[slice, ...]) -> np.ndarray:
-    """A part of a frame of floating-point numbers.
+def read_frame(dataset: h5py.Dataset, frame: int, selection: tuple[slice, ...], limit: float = np.inf) -> np.ndarray:
+    """A part of a frame of floating-point numbers, or with a `limit` of such between 0 and this.
 
-    ProductError, on this rank, where one of them is not finite; but a rollout may end with such a state.
+    ProductError, on this rank, where one of them is not finite, but a rollout may end with such a state, or beyond.
     """
     values, kind = dataset[frame, *selection], dataset.file.attrs["kind"]
+    place = f"frame {frame % len(dataset)}: holds values that are"
     if kind != "rollout" and not np.isfinite(values).all():
-        raise ProductError(f"{dataset.file.filename}: {dataset.name}, frame {frame % len(dataset)}: holds values that "
-                           f"are not finite; {make_again(kind)}")
+        raise unfit(dataset, f"{place} not finite")
+    if limit < np.inf and np.any((values < 0) | (values > limit)):
+        raise unfit(dataset, f"{place} outside of 0 to {limit:.6g}")
     return values
+
+
+def read_times(dataset: h5py.Dataset) -> np.ndarray:
+    """The times of a series; ProductError where they do not increase."""
+    times = dataset[()]
+    if not (np.isfinite(times).all() and (np.diff(times) > 0).all()):
+        raise unfit(dataset, "holds times that do not increase")
+    return times
+
+
+def unfit(dataset: h5py.Dataset, words: str) -> ProductError:
+    """That a dataset is not what a stage writes, and what to do."""
+    return ProductError(f"{dataset.file.filename}: {dataset.name}, {words}; {make_again(dataset.file.attrs['kind'])}")
 
 
 def _collective(file: h5py.File) -> h5py.h5p.PropDXID:
@@ -241,8 +258,3 @@ def _problem(file: h5py.File, kind: str | None, remedy: str) -> str | None:
         what = found.replace("_", " ")
         return f"written by eddies {version}, whose {what} this version does not read; {make_again(found)}"
     return None
-
-
-def make_again(kind: str) -> str:
-    """What to do with a product that is of no use; as it is there, its stage would keep it."""
-    return f"remove it and run `eddies {MAKER_OF[kind].name}` again" if kind in MAKER_OF else "make it again"

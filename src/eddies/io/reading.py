@@ -1,4 +1,5 @@
-"""HDF5 files that are read: opened without HDF5's own lock, and what it means where one cannot be opened.
+"""HDF5 files that are read: compared with their checksums, where they have some, without HDF5's own lock; and what it
+means where one cannot be opened.
 
 A run directory has a lock of its own (io/run_lock.py), and products get their names once they are complete. HDF5's lock
 fails on network file systems that take none, and where another program holds the file.
@@ -11,10 +12,22 @@ from pathlib import Path
 
 import h5py
 
+from eddies.io.checksums import ATTRIBUTE, MISSING, CheckedFile, has_checksums
+
 
 def open_to_read(path: str | Path) -> h5py.File:
-    """An HDF5 file, by whoever it is made; OSError where it cannot be opened."""
-    return h5py.File(path, "r", locking=False)
+    """An HDF5 file, by whoever it is made.
+
+    Raises OSError where it cannot be opened, and, here and at whatever is read of it, ProductError where bytes are not
+    those that its checksums tell of.
+    """
+    if has_checksums(path):
+        return h5py.File(CheckedFile(path), "r")
+    file = h5py.File(path, "r", locking=False)
+    if ATTRIBUTE in file.attrs:
+        file.close()
+        raise OSError(MISSING)
+    return file
 
 
 def why_unreadable(error: OSError) -> str | None:

@@ -11,10 +11,12 @@ import h5py
 import numpy as np
 
 import eddies
-from eddies.io.hdf5 import append_frame, find_group, growing_dataset, read_frame, write_array, write_attributes
+from eddies.io.hdf5 import (append_frame, find_group, growing_dataset, read_frame, read_times, unfit, write_array,
+                            write_attributes)
 
 
 IMAGE = "image"
+ROUNDING = 1e-6  # of positions in single precision
 
 
 class TrajectoryWriter:
@@ -82,15 +84,22 @@ class _Images:
 
 
 class Trajectory:
-    """Reads /particles/NAME of an open product; ProductError if there is none."""
+    """Reads /particles/NAME of an open product; ProductError if there is none, or it is not what a stage writes."""
 
     def __init__(self, file: h5py.File, name: str) -> None:
         self._group = find_group(file, f"particles/{name}")
+        self._in_order: set[tuple[int, int | None]] = set()  # rows whose ids have been looked at
 
     @cached_property
     def times(self) -> np.ndarray:
         """Time of each frame, (frames,)."""
-        return self._group["time"][()]
+        times = read_times(self._group["time"])
+        for column in self.columns:
+            found = self._group[column]["value"]
+            if found.shape[:2] != (len(times), self.total):
+                raise unfit(found, f"holds {found.shape[:2]} frames and particles where there are "
+                                   f"{(len(times), self.total)} times and ids")
+        return times
 
     @cached_property
     def steps(self) -> np.ndarray:
@@ -114,8 +123,14 @@ class Trajectory:
 
     def read(self, frame: int, column: str, start: int = 0, stop: int | None = None) -> np.ndarray:
         """Rows start to stop of a column at a frame, (stop - start, ...), in order of id. ProductError where one is not
-        finite."""
-        return read_frame(find_group(self._group, column)["value"], frame, (slice(start, stop),))
+        finite, or a position outside of the cube."""
+        rows, ids = slice(start, stop), self._group["id"]
+        if (start, stop) not in self._in_order:
+            if not np.array_equal(ids[rows], np.arange(self.total)[rows]):
+                raise unfit(ids, "holds ids that are not in order")
+            self._in_order.add((start, stop))
+        limit = self.length * (1 + ROUNDING) if column == "position" else np.inf
+        return read_frame(find_group(self._group, column)["value"], frame, (rows,), limit)
 
 
 def _write_header(file: h5py.File) -> None:

@@ -17,6 +17,7 @@ from eddies.io.errors import NoRoom, ProductError, WriteError, wanted_and_free, 
 from eddies.io.run_lock import RunTakenOver
 from eddies.io.single_writer import gather_frame, has_single_writer
 from eddies.io.sink import MARGIN_BYTES, Sink, check_limit, reserve
+from eddies.io.verification import add_checksums
 from eddies.parallel.broadcast import first_complaint
 
 # Of the index of a chunked dataset, for each chunk, and of a dataset beside its values: more than HDF5 takes.
@@ -85,6 +86,10 @@ class Unfinished:
         self.file.close()
         if self._sink is not None:
             self._sink.close()
+
+    def add_checksums(self) -> None:
+        """Add checksums to the closed file. WriteError on all ranks."""
+        self._alike(lambda: add_checksums(self.comm, self.path))
 
     def remove(self) -> None:
         """Remove the closed file, unless it is that of another job. Rank 0 alone calls it."""

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from eddies.io.hdf5 import File, make_again, read_attributes
+from eddies.io.errors import make_again
+from eddies.io.hdf5 import File, read_attributes
 from eddies.io.provenance import product_provenance
 from eddies.io.stored_numbers import stored_numbers
 from eddies.pipeline import MAKER_OF, STAGES

@@ -9,24 +9,64 @@ from pathlib import Path
 from eddies.clock import duration
 from eddies.errors import UserError
 from eddies.io.checkpoint import checkpoints_in
+from eddies.io.checksums import ATTRIBUTE
+from eddies.io.errors import ProductError
 from eddies.io.hdf5 import in_files
 from eddies.io.provenance import product_provenance
+from eddies.io.reading import open_to_read
 from eddies.io.run_lock import find_lock
+from eddies.io.verification import find_damage
+from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm
 from eddies.pipeline import STAGES, Stage
 from eddies.scene.scene import Scene, SceneError, load_scene
 from eddies.workflows.foreseen.storage import in_units
+from eddies.workflows.rollout.truth_cache import KIND as TRUTH_MEASURES
 from eddies.workflows.run_directory.work import changed_settings, is_done, of_other_settings, stage_seconds
 from eddies.workflows.variants import Step, steps
 
 SCENE, PAGE = "scene.toml", Path("report") / "index.html"
 
 
-def run(directory: Path, comm: Comm) -> None:
-    """Print a line for every stage of the runs in a directory, or of the run that it is; all ranks call it."""
-    lines = in_files(comm, directory, lambda: list(status_lines(directory)))
+def run(directory: Path, comm: Comm, verify: bool = False) -> None:
+    """Print a line for every stage of the runs in a directory, or of the run that it is; all ranks call it. `verify`:
+    also one for every product, all of whose bytes the ranks compare with its checksums; UserError where some differ."""
+    for line in in_files(comm, directory, lambda: list(status_lines(directory))):
+        _print(comm, line)
+    if not verify:
+        return
+    products, damaged = in_files(comm, directory, lambda: products_in(directory)), 0
+    for path in products:
+        old = on_first_rank(comm, lambda: before_checksums(path))
+        complaint = None if old else find_damage(comm, path)
+        damaged += complaint is not None
+        sound = "holds no checksums, made by an earlier version" if old else "as written"
+        _print(comm, complaint or f"{path}: {sound}")
+    if damaged:
+        raise UserError(f"{directory}: {damaged} of {len(products)} products are damaged")
+
+
+def products_in(directory: Path) -> list[Path]:
+    """The products of all runs in a directory and what is kept beside them, in order of their names; of links those
+    alone that lead to others."""
+    names = [stage.file for stage in STAGES.values() if stage.product] + [f"{TRUTH_MEASURES}.h5"]
+    found = sorted((path for name in names for path in directory.rglob(name)), key=Path.is_symlink, reverse=True)
+    return sorted({path.resolve(): path for path in found}.values())
+
+
+def before_checksums(path: Path) -> bool:
+    """Whether a product is of a version that made no checksums."""
+    try:
+        with open_to_read(path) as file:
+            return ATTRIBUTE not in file.attrs
+    except (OSError, ProductError):
+        return False
+
+
+def _print(comm: Comm, line: str) -> None:
     if comm.rank == 0:
-        sys.stdout.write("".join(f"{line}\n" for line in lines))
+        sys.stdout.write(f"{line}\n")
+        sys.stdout.flush()
 
 
 def status_lines(directory: Path) -> Iterator[str]:

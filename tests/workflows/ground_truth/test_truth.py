@@ -10,6 +10,7 @@ from eddies.io.hdf5 import ProductError, open_product
 from eddies.io.trajectories import Trajectory
 from eddies.parallel.slab import SlabDecomposition
 from eddies.workflows.ground_truth.truth import GroundTruth
+from tests.changed_product import changed
 from tests.workflows.synthetic_run import LENGTH, write_ground_truth
 
 FRAMES = 5
@@ -117,10 +118,26 @@ def test_columns_are_those_that_are_stored(comm, path, density):
 def test_a_value_that_is_not_finite_is_refused_by_all_ranks(comm, path, density, dataset, where, ask):
     """One rank alone reads it, the first or the last."""
     if comm.rank == 0:
-        with h5py.File(path, "r+") as file:
+        with changed(path) as file:
             file[dataset][where] = np.nan
     comm.Barrier()
     told = (f"ground_truth.h5: /{dataset}, frame {where[0]}: holds values that are not finite; remove it and run "
             "`eddies dns` again")
     with pytest.raises(ProductError, match=told):
         read(comm, path, ask)
+
+
+@pytest.mark.parametrize("density", [True])
+@pytest.mark.mpi(1, 2, timeout=30)
+def test_bytes_that_are_not_as_written_are_told_by_all_ranks(comm, path, density):
+    """Those of the last particle, which the last rank alone reads."""
+    if comm.rank == 0:
+        with h5py.File(path) as file:
+            frame = file["particles/tracers/velocity/value"].id.get_chunk_info_by_coord((2, 0, 0))
+        with open(path, "r+b") as file:
+            file.seek(frame.byte_offset + frame.size - 8)
+            file.write(np.float64(0.5).tobytes())
+    comm.Barrier()
+    told = "ground_truth.h5: particles/tracers/velocity/value, frame 2 .* is not what was written.* `eddies dns` again"
+    with pytest.raises(ProductError, match=told):
+        read(comm, path, lambda truth: truth.particles(2))

@@ -5,7 +5,6 @@ import shutil
 from dataclasses import replace
 from types import SimpleNamespace
 
-import h5py
 import numpy as np
 import pytest
 import torch
@@ -29,6 +28,7 @@ from eddies.workflows.learned.truths import open_truths, training_data, truth_pr
 from eddies.workflows.rollout.eulerian_run import EulerianRun
 from eddies.workflows.rollout.particle_run import injection
 from eddies.workflows.simulate import start_frame
+from tests.changed_product import changed
 
 CPU = torch.device("cpu")
 SCENE = """
@@ -134,7 +134,7 @@ def test_the_own_ground_truth_named_is_that_of_a_scene_that_names_none(comm, tmp
 def twice_as_fast(source, target):
     """The same flow in another unit of time, half as long."""
     powers = {"velocity_rms": 1, "acceleration_rms": 2, "sound_speed": 1, "viscosity": 1, "density_rate_rms": 1}
-    with h5py.File(copied(source, target), "r+") as file:
+    with changed(copied(source, target)) as file:
         file.attrs["provenance"] = json.dumps(json.loads(file.attrs["provenance"]) | {"id": "another"})
         reference, tracers = file["reference"].attrs, file["particles/tracers"]
         for name, power in powers.items():
@@ -289,7 +289,7 @@ def test_more_ranks_than_another_truth_can_be_cut_for_are_refused_before_any_wor
         check_ranks(("dns",), scene, on_ranks(3))
         check_ranks(("train",), replace(scene, model=replace(scene.model, path="runs/other")), on_ranks(3))
 
-    with h5py.File(tmp_path / "other/ground_truth.h5", "r+") as file:
+    with changed(tmp_path / "other/ground_truth.h5") as file:
         file["reference"].attrs["velocity_rms"] = 30.0
     scene = trained_on(scene_of(tmp_path, "tracers.particles_per_side=8"), tmp_path / "other")
     assert most_ranks(scene)[f"{place}: ghost planes of the grid in the training through horizons"] == 1

@@ -14,6 +14,7 @@ from eddies.io.trajectories import Trajectory
 from eddies.workflows.rollout import truth_cache
 from eddies.workflows.rollout.measured import TrueParticles, open_rollout
 from eddies.workflows.rollout.particle_measures import KernelAverages, ParticleSpectra
+from tests.changed_product import changed
 from tests.workflows.synthetic_run import START, write_kernel, write_rollout, write_run
 
 CACHE = "truth_measures.h5"
@@ -218,7 +219,7 @@ def test_without_ground_truth_or_kernel_there_is_what_is_left(comm, directory):
 @pytest.mark.mpi(2, timeout=60)
 def test_a_frame_that_one_rank_cannot_read_is_told_by_all(comm, directory):
     if comm.rank == 0:
-        with h5py.File(directory / "ground_truth.h5", "r+") as file:
+        with changed(directory / "ground_truth.h5") as file:
             file["particles/tracers/position/value"][7] = np.nan
     comm.Barrier()
     with open_rollout(directory, comm.Split(comm.rank)) as measured, pytest.raises(
