@@ -2,6 +2,7 @@
 
 import os
 import random
+import re
 import resource
 import shutil
 import signal
@@ -15,6 +16,7 @@ import pytest
 from eddies.io.checkpoint import CheckpointDirectory
 from eddies.io.contiguous import Block
 from eddies.io.hdf5 import ProductError
+from eddies.io.verification import add_checksums
 from eddies.parallel.slab import block_starts
 
 SHAPE = (3, 5, 7, 4)  # seven rows along the axis that is cut
@@ -127,26 +129,33 @@ def test_damage_is_found_and_the_checkpoint_before_is_used(comm, tmp_path, caplo
         assert directory.newest().content["step"] == 1, trial
         if comm.rank == 0:
             assert f"step-00000002/{name}: " in caplog.text and "not used" in caplog.text, harmed
-            named = "cut datasets: " if kind == "truncation" else ": dataset "
-            assert name != "state.h5" or named in caplog.text
+            named = "was cut off" if kind == "truncation" else "is not what was written|checksums are missing"
+            assert name != "state.h5" or re.search(f"state.h5: .*({named})", caplog.text), harmed
 
 
 @pytest.mark.mpi(1, 2)
-def test_damage_of_frames_is_found(comm, tmp_path, caplog):
+@pytest.mark.parametrize("kind, told", [("flip", "is not what was written"), ("truncation", "was cut off"),
+                                        ("others", "is another file than was written")])
+def test_damage_of_frames_is_found(comm, tmp_path, caplog, kind, told):
     directory = CheckpointDirectory(comm, tmp_path / "checkpoints", "settings")
     directory.write(1, arrays(comm, 1)[0])
     frames = directory.path / "frames-00000001.h5"
     if comm.rank == 0:
         frames.write_bytes(b"frames" * 1000)
-    comm.Barrier()
+    add_checksums(comm, frames)
     directory.write(2, arrays(comm, 2)[0], [frames.name])
     assert directory.newest().files == [frames.name]
     comm.Barrier()
     if comm.rank == 0:
-        harm(frames, "flip", random.Random(1))
+        if kind == "others":
+            frames.write_bytes(b"others" * 1000)
+        else:
+            harm(frames, kind, random.Random(1))
+    if kind == "others":
+        add_checksums(comm, frames)
     comm.Barrier()
     assert directory.newest().content["step"] == 1
-    assert comm.rank > 0 or "frames-00000001.h5: dataset frames is not what was written" in caplog.text
+    assert comm.rank > 0 or re.search(f"frames-00000001.h5: .*{told}.*; this checkpoint is not used", caplog.text)
 
 
 @pytest.mark.mpi(1, 2)

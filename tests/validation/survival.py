@@ -151,7 +151,6 @@ def harms(kind, count, directory, chooser):
         seen["harms"] += 1
         seen["of state.h5"] += name == "state.h5"
         seen["found, file named"] += f"step-00000002/{name}: " in told.text
-        seen["dataset named (state.h5)"] += name == "state.h5" and "dataset" in told.text
         seen["checkpoint before it used"] += saved is not None and saved.content["step"] == 1
     return seen
 

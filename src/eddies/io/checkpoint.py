@@ -19,12 +19,13 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
+from eddies.cores import threads
 from eddies.io.contiguous import Block, lay_out, total_bytes, write_arrays
 from eddies.io.errors import WriteError, wanted_and_free
 from eddies.io.hdf5 import in_files
-from eddies.io.manifest import find_damage, hash_file, manifest_text, parse_manifest
+from eddies.io.manifest import manifest_text, parse_manifest
 from eddies.io.reading import open_to_read
-from eddies.cores import threads
+from eddies.io.verification import add_checksums, find_damage, known_sums
 from eddies.kernels.library import in_use
 from eddies.parallel.broadcast import first_complaint, on_all_ranks, on_first_rank
 
@@ -35,7 +36,7 @@ STATE, MANIFEST = "state.h5", "manifest.json"
 # The dataset of what is no array.
 PLAIN = "plain"
 # Of the layout of a checkpoint: others are not used. To be raised with that of the products too: frames are such.
-FORMAT = 8
+FORMAT = 9
 
 
 @dataclass(frozen=True)
@@ -101,11 +102,9 @@ class CheckpointDirectory:
             on_first_rank(self.comm, lambda: _make_empty(partial))
             regions = on_first_rank(self.comm, lambda: lay_out(partial / STATE, arrays))
             on_all_ranks(self.comm, lambda: write_arrays(self.comm.rank, partial / STATE, regions, arrays))
-            size = on_first_rank(self.comm, lambda: (partial / STATE).stat().st_size)
-            content = {"step": step, "format": FORMAT, "fingerprint": self.fingerprint,
-                       "state": hash_file(self.comm, partial / STATE, regions, size),
-                       "files": {name: self._hash_whole(name) for name in files}, "computed_by": _computed_by()}
-            on_first_rank(self.comm, lambda: _finish(partial, final, manifest_text(content)))
+            add_checksums(self.comm, partial / STATE)
+            content = {"step": step, "format": FORMAT, "fingerprint": self.fingerprint, "computed_by": _computed_by()}
+            on_first_rank(self.comm, lambda: _finish(partial, final, content, files))
         except OSError as error:
             if self.comm.rank == 0:
                 shutil.rmtree(partial, ignore_errors=True)
@@ -148,8 +147,8 @@ class CheckpointDirectory:
             complaint = f"{path}: was made with other settings"
         if complaint is None:
             complaint = find_damage(self.comm, path / STATE, content["state"])
-        for name, entry in content["files"].items() if complaint is None else ():
-            complaint = complaint or find_damage(self.comm, self.path / name, entry)
+        for name, known in content["files"].items() if complaint is None else ():
+            complaint = complaint or find_damage(self.comm, self.path / name, known)
         return content, complaint
 
     def _compare(self, then: str) -> None:
@@ -164,11 +163,6 @@ class CheckpointDirectory:
 
     def _exists(self, path: Path) -> bool:
         return on_first_rank(self.comm, path.exists)
-
-    def _hash_whole(self, name: str) -> dict[str, Any]:
-        size = on_first_rank(self.comm, lambda: (self.path / name).stat().st_size)
-        on_first_rank(self.comm, lambda: _sync(self.path / name))
-        return hash_file(self.comm, self.path / name, {"frames": (0, size)}, size)
 
     def _clean(self, kept: set[str]) -> None:
         def clean() -> None:
@@ -207,13 +201,13 @@ def _delete(path: Path) -> None:
         path.unlink()
 
 
-def _finish(partial: Path, final: Path, manifest: str) -> None:
+def _finish(partial: Path, final: Path, content: Mapping[str, Any], files: Sequence[str]) -> None:
     """Write the manifest, wait for the disk, and give the checkpoint its name."""
-    with open(partial / MANIFEST, "w", encoding="utf-8") as file:
-        file.write(manifest)
-        file.flush()
-        os.fsync(file.fileno())
-    _sync(partial)
+    known = {name: known_sums(final.parent / name) for name in files}
+    manifest = manifest_text({**content, "state": known_sums(partial / STATE), "files": known})
+    (partial / MANIFEST).write_text(manifest, encoding="utf-8")
+    for path in (*(final.parent / name for name in files), partial / STATE, partial / MANIFEST, partial):
+        _sync(path)
     partial.rename(final)
     _sync(final.parent)
 

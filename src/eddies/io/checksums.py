@@ -66,7 +66,8 @@ class CheckedFile:
         content = read_blocks(self._descriptor, first, last, self._size)
         wrong = np.flatnonzero(sums_of(content) != read_table(self._descriptor, first, last, self._size))
         if wrong.size:
-            raise ProductError(damage_words(self.path, first + int(wrong[0]), self._naming))
+            words = damage_words(self.path, first + int(wrong[0]), self._naming)
+            raise ProductError(f"{words}; {make_again(self.path.stem)}")
         part = content[self._at - first * BLOCK_BYTES:][:len(buffer)]
         buffer[:len(part)] = part
         return len(part)
@@ -81,11 +82,11 @@ def has_checksums(path: str | Path) -> bool:
 
 
 def damage_words(path: Path, block: int, naming: bool = True) -> str:
-    """That a block is not what was written, in a line that names file, dataset and frame, and what to do."""
+    """That a block is not what was written, in a line that names file, dataset and frame."""
     start, stop = block * BLOCK_BYTES, (block + 1) * BLOCK_BYTES
     place = f"bytes {start} to {stop}"
     place = f"{_place(path, start, stop)} ({place})" if naming else place
-    return f"{path}: {place} is not what was written, the file is damaged; {make_again(path.stem)}"
+    return f"{path}: {place} is not what was written, the file is damaged"
 
 
 def count_blocks(size: int) -> int:
@@ -141,8 +142,8 @@ def _place(path: Path, start: int, stop: int) -> str:
     try:
         with h5py.File(CheckedFile(path, naming=False), "r") as file:
             file.visititems(look)
-    except ProductError:
-        pass  # the very bytes tell where the datasets are
+    except ProductError:  # the very bytes tell where datasets are
+        found.append("the structure of the file, or what lies beside it,")
     return " or ".join(found[:NAMED]) or "the structure of the file"
 
 

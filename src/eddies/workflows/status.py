@@ -10,7 +10,7 @@ from eddies.clock import duration
 from eddies.errors import UserError
 from eddies.io.checkpoint import checkpoints_in
 from eddies.io.checksums import ATTRIBUTE
-from eddies.io.errors import ProductError
+from eddies.io.errors import ProductError, make_again
 from eddies.io.hdf5 import in_files
 from eddies.io.provenance import product_provenance
 from eddies.io.reading import open_to_read
@@ -40,8 +40,8 @@ def run(directory: Path, comm: Comm, verify: bool = False) -> None:
         old = on_first_rank(comm, lambda: before_checksums(path))
         complaint = None if old else find_damage(comm, path)
         damaged += complaint is not None
-        sound = "holds no checksums, made by an earlier version" if old else "as written"
-        _print(comm, complaint or f"{path}: {sound}")
+        _print(comm, f"{complaint}; {make_again(path.stem)}" if complaint else
+               f"{path}: {'holds no checksums, made by an earlier version' if old else 'as written'}")
     if damaged:
         raise UserError(f"{directory}: {damaged} of {len(products)} products are damaged")
 

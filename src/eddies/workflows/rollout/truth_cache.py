@@ -38,8 +38,8 @@ class TruthCache:
     """The file truth_measures.h5 beside the ground truth that `truth` is or is linked to, with a table a quantity.
 
     A table holds for one ground truth and, of reconstructions, one kernel, each known by its id, size and time of
-    writing, and for one state of the code. Its mark is a hash of these and of all its numbers: a table of others, or a
-    damaged one, counts for nothing. That the file cannot be written costs no more than to measure again.
+    writing, and for one state of the code: its mark. A table of others, or a damaged one, counts for nothing. That the
+    file cannot be written costs no more than to measure again.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ class TruthCache:
         tables, marks = self._stored(self.path)
         found: Measures = {}
         for quantity, key in self._keys.items():
-            if quantity in tables and marks.get(quantity) == _mark(key, tables[quantity]):
+            if quantity in tables and marks.get(quantity) == key:
                 for frame, *values in zip(*(tables[quantity][column] for column in COLUMNS[quantity])):
                     found[quantity, int(frame)] = values[0] if quantity == "spectra" else Reconstruction(
                         Invariants(*values[:2], float(values[2])), *values[3:])
@@ -70,7 +70,7 @@ class TruthCache:
             rows = [(frame, *_values(found)) for (kind, frame), found in sorted(measures.items(), key=_place)
                     if kind == quantity]
             tables[quantity] = dict(zip(COLUMNS[quantity], map(np.array, zip(*rows))))
-            marks[quantity] = _mark(self._keys[quantity], tables[quantity])
+            marks[quantity] = self._keys[quantity]
         scratch = self.path.with_name(f"{KIND}-{uuid.uuid4().hex}.h5")  # others may write at the same time
         try:
             try:
@@ -78,9 +78,7 @@ class TruthCache:
                     for quantity, table in tables.items():
                         write_table(file, TABLE.format(quantity), table)
                     write_attributes(file.create_group("marks"), marks)
-                again, _ = self._stored(scratch)
-                if all(_mark(self._keys[quantity], again[quantity]) == marks[quantity] for quantity, _ in measures):
-                    os.replace(scratch, self.path)
+                os.replace(scratch, self.path)
             finally:
                 scratch.unlink(missing_ok=True)
         except (UserError, OSError, KeyError) as error:
@@ -110,14 +108,6 @@ def _values(found: np.ndarray | Reconstruction) -> tuple:
         return (found,)
     invariants = found.invariants
     return (invariants.second, invariants.third, invariants.scale, found.velocity, found.vorticity, found.energy)
-
-
-def _mark(key: str, table: Table) -> str:
-    """A hash of what a table holds for and of all its numbers."""
-    found = hashlib.blake2b(key.encode())
-    for column in sorted(table):
-        found.update(column.encode() + np.ascontiguousarray(table[column]).tobytes())
-    return found.hexdigest()
 
 
 @functools.cache
