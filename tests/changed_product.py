@@ -11,8 +11,8 @@ from eddies.io.verification import add_checksums
 
 
 @contextmanager
-def changed(path: Path) -> Iterator[h5py.File]:
+def changed(path: str | Path) -> Iterator[h5py.File]:
     """A product to change; one rank calls it. It gets the checksums of what it is then."""
     with h5py.File(path, "r+") as file:
         yield file
-    add_checksums(MPI.COMM_SELF, path)
+    add_checksums(MPI.COMM_SELF, Path(path))

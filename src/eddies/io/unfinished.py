@@ -18,7 +18,7 @@ from eddies.io.run_lock import RunTakenOver
 from eddies.io.single_writer import gather_frame, has_single_writer
 from eddies.io.sink import MARGIN_BYTES, Sink, check_limit, reserve
 from eddies.io.verification import add_checksums
-from eddies.parallel.broadcast import first_complaint
+from eddies.parallel.broadcast import first_complaint, on_first_rank
 
 # Of the index of a chunked dataset, for each chunk, and of a dataset beside its values: more than HDF5 takes.
 INDEX_BYTES, HEADER_BYTES = 2**8, 2**14
@@ -88,8 +88,9 @@ class Unfinished:
             self._sink.close()
 
     def add_checksums(self) -> None:
-        """Add checksums to the closed file. WriteError on all ranks."""
-        self._alike(lambda: add_checksums(self.comm, self.path))
+        """Add checksums to the closed file, unless it is that of another job. WriteError on all ranks."""
+        if on_first_rank(self.comm, self._is_own):
+            self._alike(lambda: add_checksums(self.comm, self.path))
 
     def remove(self) -> None:
         """Remove the closed file, unless it is that of another job. Rank 0 alone calls it."""
