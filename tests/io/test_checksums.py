@@ -4,7 +4,7 @@ import h5py
 import numpy as np
 import pytest
 
-from eddies.io.checksums import ATTRIBUTE, BLOCK_BYTES, has_checksums
+from eddies.io.checksums import ATTRIBUTE, BLOCK_BYTES, PIECE, has_checksums
 from eddies.io.errors import ProductError
 from eddies.io.hdf5 import (append_frame, create_product, growing_dataset, open_product, read_frame, read_table,
                             write_table)
@@ -128,3 +128,17 @@ def test_what_is_changed_with_new_checksums_is_read(comm, path):
         file["table/b"][1] = 2.0
     with open_product(comm, path, "rollout") as file:
         assert np.array_equal(read_table(file, "table")["b"], [1, 2, 1])
+
+
+@pytest.mark.mpi(1)
+def test_an_array_that_is_read_in_pieces(comm, tmp_path):
+    many = np.random.default_rng(1).random(3 * PIECE * BLOCK_BYTES // 16)
+    with create_product(comm, tmp_path / "a.h5", "kernel", {}) as file:
+        write_table(file, "table", {"many": many})
+    with open_product(comm, tmp_path / "a.h5", "kernel") as file:
+        assert np.array_equal(read_table(file, "table")["many"], many)
+        place = file["table/many"].id.get_offset()
+    harm(comm, tmp_path / "a.h5", place + many.nbytes - 1)
+    with open_product(comm, tmp_path / "a.h5", "kernel") as file:
+        with pytest.raises(ProductError, match="table/many .*not what was written"):
+            read_table(file, "table")

@@ -26,6 +26,7 @@ FOOTER, MARK = struct.Struct("<Q16s"), b"eddies CRC-32 4K"
 ATTRIBUTE = "checksums"
 WORDS = f"behind the end of the HDF5 file: CRC-32 of every {BLOCK_BYTES} bytes, as little-endian integers of 4 bytes"
 MISSING = "its checksums are missing: it was cut off, or another program has changed it"
+PIECE = 2**10  # blocks that are read at once
 NAMED = 3  # places that a block may touch
 
 
@@ -62,15 +63,17 @@ class CheckedFile:
 
     def readinto(self, buffer: memoryview) -> int:
         """Fill a buffer from there on. ProductError, which names dataset and frame, where bytes are not as written."""
-        first, last = self._at // BLOCK_BYTES, count_blocks(self._at + len(buffer))
-        content = read_blocks(self._descriptor, first, last, self._size)
-        wrong = np.flatnonzero(sums_of(content) != read_table(self._descriptor, first, last, self._size))
-        if wrong.size:
-            words = damage_words(self.path, first + int(wrong[0]), self._naming)
-            raise ProductError(f"{words}; {make_again(self.path.stem)}")
-        part = content[self._at - first * BLOCK_BYTES:][:len(buffer)]
-        buffer[:len(part)] = part
-        return len(part)
+        done, size = 0, min(len(buffer), self._size - self._at)
+        while done < size:
+            first, last = (self._at + done) // BLOCK_BYTES, count_blocks(self._at + size)
+            content, wrong = compared_blocks(self._descriptor, first, min(last, first + PIECE), self._size)
+            if wrong is not None:
+                words = damage_words(self.path, wrong, self._naming)
+                raise ProductError(f"{words}; {make_again(self.path.stem)}")
+            part = content[self._at + done - first * BLOCK_BYTES:][:size - done]
+            buffer[done:done + len(part)] = part
+            done += len(part)
+        return done
 
     read = readinto  # h5py wants to see one, and takes the other
 
@@ -99,6 +102,13 @@ def covered_bytes(descriptor: int) -> int | None:
     end = os.fstat(descriptor).st_size - FOOTER.size
     size, mark = FOOTER.unpack(os.pread(descriptor, FOOTER.size, end)) if end > 0 else (0, b"")
     return size if mark == MARK and size + 4 * count_blocks(size) == end else None
+
+
+def compared_blocks(descriptor: int, first: int, last: int, size: int) -> tuple[memoryview, int | None]:
+    """Blocks first to last of a file, of whose bytes `size` are covered, and the first one that is not as written."""
+    content = read_blocks(descriptor, first, last, size)
+    wrong = np.flatnonzero(sums_of(content) != read_table(descriptor, first, last, size))
+    return content, first + int(wrong[0]) if wrong.size else None
 
 
 def read_table(descriptor: int, first: int, last: int, size: int) -> np.ndarray:

@@ -3,26 +3,33 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from mpi4py import MPI
 
-from eddies.io.checksums import (FOOTER, MARK, MISSING, count_blocks, covered_bytes, damage_words, opened, read_blocks,
-                                 read_table, sums_of)
+from eddies.io.checksums import (FOOTER, MARK, MISSING, PIECE, compared_blocks, count_blocks, covered_bytes,
+                                 damage_words, opened, read_blocks, read_table, sums_of)
 from eddies.io.errors import NoRoom
 from eddies.parallel.broadcast import on_all_ranks, on_first_rank
-from eddies.parallel.reduction import global_sum
+from eddies.parallel.reduction import global_min, global_sum
 from eddies.parallel.slab import block_starts
-
-PIECE = 2**10  # blocks that are read at once
 
 
 def add_checksums(comm: MPI.Comm, path: Path) -> None:
     """Add checksums to a closed file of all ranks; collective. OSError on all ranks."""
     comm.Barrier()  # all have closed it
     size = on_first_rank(comm, lambda: path.stat().st_size)
-    table = _sums(comm, path, size).astype("<u4").tobytes() + FOOTER.pack(size, MARK)
+    sums = np.zeros(count_blocks(size), np.uint32)
+
+    def read() -> None:
+        with opened(path) as descriptor:
+            for first, last in _share(comm, size):
+                sums[first:last] = sums_of(read_blocks(descriptor, first, last, size))
+
+    on_all_ranks(comm, read)
+    table = global_sum(comm, sums).astype("<u4").tobytes() + FOOTER.pack(size, MARK)
 
     def append() -> None:
         try:
@@ -47,37 +54,31 @@ def known_sums(path: Path) -> int | None:
 def find_damage(comm: MPI.Comm, path: Path, known: int | None = None) -> str | None:
     """What is wrong with a file, in words that name file, dataset and frame; None if every byte is as written.
     Collective. `known`: its `known_sums` when it was written."""
-    def look() -> tuple[int, np.ndarray] | str:
+    def look() -> int | str:
         if not path.is_file():
             return f"{path}: missing"
         with opened(path) as descriptor:
             size = covered_bytes(descriptor)
-            if size is None:
-                return f"{path}: {MISSING}"
-            if known not in (None, known_sums(path)):
-                return f"{path}: is another file than was written"
-            return size, read_table(descriptor, 0, count_blocks(size), size)
+        if size is not None and known not in (None, known_sums(path)):
+            return f"{path}: is another file than was written"
+        return f"{path}: {MISSING}" if size is None else size
+
+    def compare() -> int:
+        with opened(path) as descriptor:
+            found = (compared_blocks(descriptor, *piece, size)[1] for piece in _share(comm, size))
+            return next((block for block in found if block is not None), count_blocks(size))
 
     try:
-        found = on_first_rank(comm, look)
-        if isinstance(found, str):
-            return found
-        wrong = np.flatnonzero(_sums(comm, path, found[0]) != found[1])
+        size = on_first_rank(comm, look)
+        if isinstance(size, str):
+            return size
+        block = int(global_min(comm, on_all_ranks(comm, compare)))
     except OSError as error:
         return f"{path}: cannot be read ({error})"
-    return on_first_rank(comm, lambda: damage_words(path, int(wrong[0]))) if wrong.size else None
+    return on_first_rank(comm, lambda: damage_words(path, block)) if block < count_blocks(size) else None
 
 
-def _sums(comm: MPI.Comm, path: Path, size: int) -> np.ndarray:
-    """Checksums of the first bytes of a file, of which each rank reads a share; collective. OSError on all ranks."""
-    sums = np.zeros(count_blocks(size), np.uint32)
-    start, stop = map(int, block_starts(len(sums), comm.size)[comm.rank:comm.rank + 2])
-
-    def read() -> None:
-        with opened(path) as descriptor:
-            for first in range(start, stop, PIECE):
-                last = min(first + PIECE, stop)
-                sums[first:last] = sums_of(read_blocks(descriptor, first, last, size))
-
-    on_all_ranks(comm, read)
-    return global_sum(comm, sums)
+def _share(comm: MPI.Comm, size: int) -> Iterator[tuple[int, int]]:
+    """First and last of the blocks of so many bytes that this rank takes, a few at a time."""
+    start, stop = map(int, block_starts(count_blocks(size), comm.size)[comm.rank:comm.rank + 2])
+    return ((first, min(first + PIECE, stop)) for first in range(start, stop, PIECE))
