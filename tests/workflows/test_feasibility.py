@@ -119,8 +119,7 @@ def test_a_ground_truth_with_too_few_frames_or_without_motion(comm, tmp_path):
         check_ground_truth(["simulate"], dataclasses.replace(scene, simulation=coarse), comm, tmp_path)
     comm.Barrier()
     if comm.rank == 0:
-        import h5py
-        with h5py.File(tmp_path / "ground_truth.h5", "a") as file:
+        with changed(tmp_path / "ground_truth.h5") as file:
             file["reference"].attrs["eddy_turnover_time"] = 1e12
     comm.Barrier()
     check_ground_truth(["train"], scene, comm, tmp_path)
