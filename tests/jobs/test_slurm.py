@@ -14,7 +14,7 @@ from tests.jobs.slurm import Slurm, missing
 
 CHECKOUT = Path(__file__).parents[2]
 EDDIES = Path(sys.executable).with_name("eddies")
-STEPS, STEP = 100, 0.001
+STEPS, STEP = 60, 0.001
 pytestmark = pytest.mark.skipif(bool(missing()), reason=missing())
 
 
