@@ -62,7 +62,7 @@ def test_some_stages(comm, tmp_path):
     scene = eddies.load_scene("abc", ["time.duration=0.1"])
     eddies.run(scene, stages=["dns"], output=tmp_path, comm=comm)
     assert (tmp_path / "ground_truth.h5").exists() and not (tmp_path / "report").exists()
-    with pytest.raises(eddies.UserError, match='stages: there is no "dsn"; there are: dns, train-kernel, train, sim'):
+    with pytest.raises(eddies.UserError, match='stages: there is no "dsn"; there are: dns, train-kernel, train, find'):
         eddies.run(scene, stages=["dsn"], output=tmp_path, comm=comm)
 
 
