@@ -126,7 +126,7 @@ class Trajectory:
         finite, or a position outside of the cube."""
         rows, ids = slice(start, stop), self._group["id"]
         if (start, stop) not in self._in_order:
-            if not np.array_equal(ids[rows], np.arange(self.total)[rows]):
+            if not np.array_equal(ids[rows], np.arange(*rows.indices(self.total))):
                 raise unfit(ids, "holds ids that are not in order")
             self._in_order.add((start, stop))
         limit = self.length * (1 + ROUNDING) if column == "position" else np.inf
