@@ -96,15 +96,16 @@ def test_ranks_that_slurm_does_not_connect_are_refused_and_no_others(slurm, tmp_
     script = tmp_path / "script"
     script.write_text(f"""#!/bin/bash
 eddies='{EDDIES}'
+srun() {{ command srun --ntasks=2 --exact "$@"; }}
 alone=(srun --mpi=none env -u SLURM_STEPID -u SLURM_STEP_ID "$eddies")
 {{ "${{alone[@]}}" run abc --output '{tmp_path}/run'; echo "none $?"; }} &
 "$eddies" scenes abc > /dev/null; echo "in the script $?"
 mpirun -n 2 "$eddies" scenes abc > /dev/null; echo "mpirun in the script $?"
-wait
 srun --mpi=none mpirun -n 1 "$eddies" scenes abc > /dev/null; echo "mpirun in a step $?"
 srun --mpi=pmix "$eddies" scenes abc > /dev/null; echo "pmix $?"
+wait
 """)
-    _, output = end(slurm, slurm.submit("--ntasks=2", script, **mpi_environment(2)))
+    _, output = end(slurm, slurm.submit("--ntasks=4", script, **mpi_environment(2)))
     said = sorted(line for line in output.splitlines() if not line.startswith("srun: "))
     assert [line for line in said if not line.startswith("eddies: ")] == [
         "in the script 0", "mpirun in a step 0", "mpirun in the script 0", "none 2", "pmix 0"], output
