@@ -294,6 +294,31 @@ def test_a_second_interrupt_ends_at_once():
     assert (ended.returncode, ended.stdout) == (-signal.SIGINT, "goes on\n")
 
 
+@pytest.mark.parametrize("number", [signal.SIGUSR1, signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+def test_a_signal_at_the_very_end_changes_nothing(number):
+    """As one that another rank was given a moment before; this one comes once Python has taken its handlers back."""
+    code = ("import ctypes, sys\nfrom eddies import cli\ncli.catch_signals()\n"
+            "send = getattr(ctypes.CDLL(None), 'raise')\nclass Last:\n"
+            f"    def __del__(self, send=send): send({int(number)})\nsys.last = Last()\nsys.exit(75)\n")
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=20)
+    assert (ended.returncode, ended.stderr) == (75, "")
+
+
+@pytest.mark.parametrize("where", ["a pipe without a reader", "closed"])
+def test_an_interrupt_that_cannot_be_answered_is_noted(tmp_path, where):
+    """Where standard error is closed, another file has its number."""
+    code = ("import os, signal\nfrom eddies import cli\nreceived = cli.catch_signals()\n"
+            "other = os.open('other', os.O_WRONLY | os.O_CREAT)\nsignal.raise_signal(signal.SIGINT)\n"
+            "print(received, other)\n")
+    line = ["sh", "-c", '"$@" 2>&-' if where == "closed" else '"$@"', "sh", sys.executable, "-c", code]
+    reader, writer = os.pipe()
+    os.close(reader)
+    ended = subprocess.run(line, stdout=subprocess.PIPE, stderr=writer, text=True, cwd=tmp_path, timeout=20)
+    os.close(writer)
+    assert ended.returncode == 0 and ended.stdout == f"[2] {2 if where == 'closed' else 3}\n"
+    assert (tmp_path / "other").read_bytes() == b""
+
+
 def test_a_signal_that_is_ignored_stays_ignored():
     """As by nohup, and by a shell that starts a job in the background."""
     code = ("import signal\nfrom eddies import cli\nsignal.signal(signal.SIGHUP, signal.SIG_IGN)\n"

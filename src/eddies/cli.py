@@ -6,6 +6,7 @@ This is where the communicator of the job enters; everything below gets it as an
 from __future__ import annotations
 
 import argparse
+import atexit
 import contextlib
 import logging
 import os
@@ -129,6 +130,7 @@ def catch_signals() -> list[int]:
 
     Schedulers send SIGUSR1 or SIGTERM before the time limit, the keyboard SIGINT, a terminal that closes SIGHUP. One
     that is ignored, as by nohup, stays so. A second one of the same kind, but for SIGUSR1, ends the process at once.
+    Those that come as the process ends change nothing any more: another rank may have got its own a moment before.
     """
     received: list[int] = []
 
@@ -136,12 +138,19 @@ def catch_signals() -> list[int]:
         received.append(number)
         if number != signal.SIGUSR1:
             signal.signal(number, signal.SIG_DFL)
-        if number == signal.SIGINT:
-            os.write(sys.__stderr__.fileno() if sys.__stderr__ else 2, STOPPING)
+        if number == signal.SIGINT and sys.__stderr__ is not None:  # else another file may have its number
+            with contextlib.suppress(OSError):  # a pipe without a reader, or a full disk, must not end the run here
+                os.write(sys.__stderr__.fileno(), STOPPING)
+
+    def ignore() -> None:
+        for number in STOP_SIGNALS:
+            if signal.getsignal(number) is note:
+                signal.signal(number, signal.SIG_IGN)  # Python would let the first one end it with a code of its own
 
     for number in STOP_SIGNALS:
         if signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, note)
+    atexit.register(ignore)
     return received
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from eddies.io import hdf5
 from eddies.io.hdf5 import ProductError, create_product, open_product
+from eddies.io.reading import open_to_read
 
 NO_LOCKS = """
 #include <errno.h>
@@ -59,6 +60,13 @@ def test_what_the_system_refuses_is_told_as_it_is(comm, product, monkeypatch, nu
         pass
     assert f"cannot be read: {os.strerror(number)}; check its permissions" in str(error.value)
     assert "damaged" not in str(error.value) and "delete" not in str(error.value)
+
+
+@pytest.mark.mpi(1, timeout=30)
+def test_a_pipe_in_place_of_a_file_is_not_waited_for(comm, tmp_path):
+    os.mkfifo(tmp_path / "kernel.h5")
+    with pytest.raises(OSError, match="not a regular file"):
+        open_to_read(tmp_path / "kernel.h5")
 
 
 @pytest.mark.mpi(1)

@@ -105,6 +105,25 @@ def test_a_lock_that_may_not_be_read_holds(comm, tmp_path):
         refuse_if_held(comm, tmp_path)
 
 
+@pytest.mark.mpi(1, timeout=30)
+@pytest.mark.parametrize("change", [{"pid": "abc"}, {"pid": 0}, {"pid": -1}, {"pid": 10**30}, {"pid": None},
+                                    {"restarts": "x"}, {"start": 3}, None], ids=repr)
+def test_a_lock_of_other_types_is_none_of_a_job(comm, tmp_path, monkeypatch, change):
+    """Of this machine and batch job, so that its process and restarts are looked at; or a pipe."""
+    monkeypatch.setenv("SLURM_JOB_ID", "7")
+    put(tmp_path, Holder.this_job())
+    if change is None:
+        (tmp_path / "LOCK").unlink()
+        os.mkfifo(tmp_path / "LOCK")
+    else:
+        (tmp_path / "LOCK").write_text(json.dumps(vars(Holder.this_job()) | change))
+    with pytest.raises(RunInUse, match="an unknown machine"):
+        refuse_if_held(comm, tmp_path)
+    with lock_directory(comm, tmp_path, take_over=True):
+        pass
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.mpi(1)
 @pytest.mark.parametrize("content", ["", "[]", '{"job": 3}', "\xff"])
 def test_a_lock_that_cannot_be_read_holds_as_long_as_it_is_new(comm, tmp_path, content):

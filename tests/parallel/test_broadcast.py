@@ -3,7 +3,7 @@
 import pytest
 
 from eddies.errors import UserError
-from eddies.parallel.broadcast import first_complaint, on_all_ranks, on_first_rank
+from eddies.parallel.broadcast import first_complaint, on_all_ranks, on_first_rank, share_text
 from eddies.scene.values import KeyProblem, SceneError
 
 pytestmark = pytest.mark.mpi(1, 2, 3)
@@ -40,3 +40,9 @@ def test_the_complaint_of_the_lowest_rank_counts(comm):
     assert first_complaint(comm, f"rank {comm.rank}" if comm.rank >= comm.size // 2 else None) == (
         f"rank {comm.size // 2}")
     assert first_complaint(comm, None) is None
+
+
+@pytest.mark.parametrize("text", ["", "λ ≤ η", "\udcff.toml"])
+def test_text_of_any_bytes_is_shared(comm, text):
+    """Arguments hold what is no UTF-8 as surrogates."""
+    assert share_text(comm, text if comm.rank == 0 else "other") == text

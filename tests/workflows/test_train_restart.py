@@ -112,13 +112,16 @@ def test_a_kernel_that_diverges_is_told_with_the_remedy(comm, tmp_path):
 
 
 @pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("fault", ["a directory is in its place", "nonsense as backend", "no matplotlib"])
+@pytest.mark.parametrize("fault", ["a directory is in its place", "nonsense as backend", "no matplotlib",
+                                   "matplotlib that ends the program"])
 def test_a_training_is_not_lost_to_a_picture(comm, tmp_path, monkeypatch, caplog, fault):
     scene = prepared(comm, tmp_path)
     if fault.startswith("a directory") and comm.rank == 0:
         (tmp_path / "learning.png").mkdir()
     elif fault.startswith("nonsense"):
         monkeypatch.setattr("eddies.report.figures.png", lambda figure: matplotlib.use("nonsense"))
+    elif fault.startswith("matplotlib"):
+        monkeypatch.setattr("eddies.report.figures.png", sys.exit)
     elif fault.startswith("no"):
         monkeypatch.setitem(sys.modules, "eddies.report.learning", None)
     monkeypatch.setattr(train, "DRAWING_SECONDS", -1.0)  # draw after each step, too

@@ -20,7 +20,7 @@ from eddies.io.checksums import ATTRIBUTE, WORDS
 from eddies.io.errors import ProductError, WriteError, make_again, write_error
 from eddies.io.provenance import FORMAT, environment, has_this_format, identity, read_json, read_provenance
 from eddies.io.quantities import conventions, describe
-from eddies.io.reading import open_to_read, why_unreadable
+from eddies.io.reading import cannot_be_read, open_to_read, why_unreadable
 from eddies.io.run_lock import RunTakenOver
 from eddies.io.unfinished import HEADER_BYTES, Unfinished, frame_bytes, writing, written_here
 from eddies.parallel.broadcast import on_first_rank, share_text
@@ -228,8 +228,7 @@ def _open_checked(path: Path, kind: str | None) -> h5py.File:
         file = open_to_read(path)
     except OSError as error:
         if reason := why_unreadable(error):
-            raise ProductError(f"{path}: cannot be read: {reason}; check its permissions, its directory and the file "
-                               "system, or give another path") from None
+            raise ProductError(cannot_be_read(path, reason)) from None
         message = f"{path}: damaged or not an HDF5 file ({error}); delete it and make it again"
         raise ProductError(message) from None
     try:

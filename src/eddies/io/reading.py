@@ -7,7 +7,9 @@ fails on network file systems that take none, and where another program holds th
 
 from __future__ import annotations
 
+import errno
 import os
+import stat
 from pathlib import Path
 
 import h5py
@@ -21,6 +23,8 @@ def open_to_read(path: str | Path) -> h5py.File:
     Raises OSError where it cannot be opened, and, here and at whatever is read of it, ProductError where bytes are not
     those that its checksums tell of.
     """
+    if not stat.S_ISREG(os.stat(path).st_mode):  # opening a pipe would wait for its writer
+        raise OSError(errno.EINVAL, "not a regular file", str(path))
     if has_checksums(path):
         return h5py.File(CheckedFile(path), "r")
     file = h5py.File(path, "r", locking=False)
@@ -28,6 +32,12 @@ def open_to_read(path: str | Path) -> h5py.File:
         file.close()
         raise OSError(MISSING)
     return file
+
+
+def cannot_be_read(path: str | Path, reason: str) -> str:
+    """That the system does not let a file be read, with what to look at."""
+    return (f"{path}: cannot be read: {reason}; check its permissions, its directory and the file system, or give "
+            "another path")
 
 
 def why_unreadable(error: OSError) -> str | None:

@@ -285,8 +285,14 @@ def _is_held_by(path: Path, holder: Holder) -> bool:
 
 def _read(path: Path) -> Holder:
     try:
+        if path.exists() and not path.is_file():  # reading a pipe would wait for its writer
+            raise OSError
         known = json.loads(path.read_text(errors="replace"))
-        return Holder(**{field.name: known[field.name] for field in fields(Holder)})
+        values = {field.name: known[field.name] for field in fields(Holder)}
+        whole = all(type(values[field.name]).__name__ == field.type for field in fields(Holder))
+        if not whole or not 0 < values["pid"] < 2**31:
+            raise ValueError
+        return Holder(**values)
     except (FileNotFoundError, NotADirectoryError):
         raise
     except (OSError, ValueError, KeyError, TypeError):  # another user's, being written, or no lock of a job

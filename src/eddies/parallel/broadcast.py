@@ -15,15 +15,15 @@ Result = TypeVar("Result")
 
 
 def share_text(comm: MPI.Comm, text: str, root: int = 0) -> str:
-    """The text of rank `root` on every rank. One rank sends nothing."""
+    """The text of rank `root` on every rank, such as an argument of any bytes. One rank sends nothing."""
     if comm.size == 1:
         return text
-    encoded = np.frombuffer(text.encode(), np.uint8)
+    encoded = np.frombuffer(text.encode(errors="surrogateescape"), np.uint8)
     length = np.array([len(encoded)], np.int64)
     comm.Bcast(length, root)
     content = encoded.copy() if comm.rank == root else np.empty(length[0], np.uint8)
     comm.Bcast(content, root)
-    return content.tobytes().decode()
+    return content.tobytes().decode(errors="surrogateescape")
 
 
 def first_complaint(comm: MPI.Comm, complaint: str | None) -> str | None:

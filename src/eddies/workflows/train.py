@@ -107,7 +107,7 @@ class LearningCurves:
             from eddies.report import figures  # matplotlib takes a while to start
             from eddies.report.learning import curves
             write_files({self.path: figures.png(curves(training.columns()))})
-        except Exception as error:  # of matplotlib, its settings, the disk: no reason to lose a training
+        except (Exception, SystemExit) as error:  # of matplotlib, its settings, the disk: no reason to lose a training
             self._failed = True
             log.warning("train: %s cannot be drawn (%s: %s); the training goes on without it", self.path,
                         type(error).__name__, error)

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch import nn
 
 from eddies.io.hdf5 import ProductError
 from eddies.io.weights import load_weights, save_weights
@@ -12,7 +13,7 @@ from eddies.particles.flow_units import ReferenceScales
 from eddies.particles.smoothing_kernels import KernelNetwork
 from eddies.scene.scene import Model, SceneError, load_scene
 from eddies.scene.terms import PRESETS
-from eddies.workflows.learned.model import load_kernel, load_model, scene_model
+from eddies.workflows.learned.model import load_kernel, load_model, scene_model, take_from_first_rank
 from eddies.workflows.learned.source import describe, differences
 
 # Of the scene tiny: the filter is two spacings wide.
@@ -157,6 +158,32 @@ def test_parameters_of_another_shape_on_a_rank_are_refused(comm, own):
     with pytest.raises(SceneError, match=r"terms.Mine.drawn is torch.float64 \[5, 3\] on rank 1 and torch.float64 "
                                          r"\[2, 3\] on rank 0; make it the same on all ranks"):
         scene_model(with_terms("pressure", "own_terms:Mine"), SCALES, comm)
+
+
+@pytest.mark.mpi(2)
+def test_parameters_are_known_by_name_in_any_type(comm):
+    """Registered in another order on each rank; numbers, and types that numpy or MPI do not know."""
+    model = nn.Module()
+    for name in ("first", "second") if comm.rank == 0 else ("second", "first"):
+        model.register_parameter(name, nn.Parameter(torch.tensor([1.0 if name == "first" else 2.0])))
+    for name in ("bfloat16", "float16", "complex64"):
+        model.register_buffer(f"in_{name}", torch.full((), comm.rank + 0.5, dtype=getattr(torch, name)))
+    take_from_first_rank(model, comm)
+    assert model.first.item() == 1 and model.second.item() == 2
+    assert all(buffer.item() == 0.5 and buffer.ndim == 0 for buffer in model.buffers())
+
+
+@pytest.mark.mpi(2)
+@pytest.mark.parametrize("parameter, told", [
+    (lambda rank: nn.Parameter(torch.ones(3, dtype=torch.float64), requires_grad=rank == 0),
+     r"drawn is torch.float64 \[3\] that is not trained on rank 1 and torch.float64 \[3\] on rank 0; make it the same"),
+    (lambda rank: nn.UninitializedParameter(), "drawn has no shape before it is used, as that of a lazy module; give")],
+    ids=["fixed", "lazy"])
+def test_parameters_that_cannot_be_taken_are_refused(comm, parameter, told):
+    model = nn.Module()
+    model.drawn = parameter(comm.rank)
+    with pytest.raises(SceneError, match=told):
+        take_from_first_rank(model, comm)
 
 
 NETWORK = KernelNetwork(0.7, [4], seed=3).float()

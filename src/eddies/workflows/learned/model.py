@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import nn
+from torch.nn.parameter import is_lazy
 
 from eddies.io.hdf5 import ProductError, open_product, read_table
 from eddies.io.weights import load_weights
@@ -21,7 +22,6 @@ from eddies.parallel.reduction import any_rank
 from eddies.particles.feature_range import FeatureRange
 from eddies.particles.flow_units import FlowUnits, ReferenceScales
 from eddies.particles.model import LagrangianModel, build_model
-from eddies.particles.particle_set import as_numpy
 from eddies.particles.smoothing_kernels import HermiteKernel, KernelNetwork
 from eddies.scene.scene import Scene, SceneError
 from eddies.scene.terms import TermError
@@ -49,10 +49,11 @@ def scene_model(scene: Scene, scales: ReferenceScales, comm: Comm) -> Lagrangian
 def take_from_first_rank(model: nn.Module, comm: Comm) -> None:
     """Give parameters and buffers the values of rank 0 on all ranks, with a warning where they differed; collective.
 
-    Raises SceneError, on all ranks, where a rank has others than rank 0, or of another shape or type.
+    Raises SceneError, on all ranks, where a rank has others than rank 0, or of another shape or type, or fixed ones
+    where rank 0 trains them, and where one has no shape before it is used.
     """
     own = {**dict(model.named_parameters()), **dict(model.named_buffers())}
-    forms = {name: f"{tensor.dtype} {list(tensor.shape)}" for name, tensor in own.items()}
+    forms = {name: _form(tensor) for name, tensor in own.items()}
     first = json.loads(share_text(comm, json.dumps(forms)))
     wrong = next((name for name in {**first, **forms} if first.get(name) != forms.get(name)), None)
     complaint = first_complaint(comm, wrong and (
@@ -60,18 +61,34 @@ def take_from_first_rank(model: nn.Module, comm: Comm) -> None:
         f"{first.get(wrong, 'missing')} on rank 0; make it the same on all ranks"))
     if complaint is not None:
         raise SceneError(complaint)
+    shapeless = next((name for name in first if is_lazy(own[name])), None)
+    if shapeless is not None:
+        raise SceneError(f"[model] terms: {shapeless} has no shape before it is used, as that of a lazy module; give "
+                         "the module its sizes")
     differing = []
-    for name, tensor in own.items():
-        values = np.ascontiguousarray(as_numpy(tensor.detach()))
-        given = values.copy()
-        comm.Bcast(given)
-        if any_rank(comm, given.tobytes() != values.tobytes()):
+    for name in first:  # a rank may have registered them in another order
+        values = own[name].detach().cpu().contiguous()
+        given = values.clone()
+        comm.Bcast(_bytes(given))
+        if any_rank(comm, not np.array_equal(_bytes(given), _bytes(values))):
             differing.append(name)
             with torch.no_grad():
-                tensor.copy_(torch.from_numpy(given))
+                own[name].copy_(given)
     if differing and comm.rank == 0:
         log.warning("model: %s: other values on other ranks; all take those of rank 0. Draw random numbers from a "
                     "generator with the seed of the flow (flow.seed)", ", ".join(differing))
+
+
+def _form(tensor: torch.Tensor) -> str:
+    if is_lazy(tensor):
+        return "without a shape"
+    fixed = isinstance(tensor, nn.Parameter) and not tensor.requires_grad
+    return f"{tensor.dtype} {list(tensor.shape)}" + (" that is not trained" if fixed else "")
+
+
+def _bytes(tensor: torch.Tensor) -> np.ndarray:
+    """Those of a tensor, also of types that numpy or MPI do not know; no copy."""
+    return tensor.reshape(-1).view(torch.uint8).numpy()
 
 
 def load_model(scene: Scene, comm: Comm, path: str | Path, scales: ReferenceScales) -> LagrangianModel:

@@ -15,6 +15,7 @@ from eddies.errors import UserError
 from eddies.io.checkpoint import checkpoints_in
 from eddies.io.errors import ProductError
 from eddies.io.provenance import product_provenance
+from eddies.io.reading import cannot_be_read, open_to_read, why_unreadable
 from eddies.pipeline import STAGES, Stage
 from eddies.scene.rules import quoted
 from eddies.scene.scene import Scene
@@ -59,7 +60,10 @@ class Work:
 
 
 def find_work(stages: Sequence[str], scene: Scene, directory: Path) -> Work:
-    """What stages of a scene find in a run directory. One rank calls it, the directory being locked."""
+    """What stages of a scene find in a run directory. One rank calls it, the directory being locked.
+
+    Raises ProductError where the system does not let a product be read: it may be sound.
+    """
     done, begun, useless, lost, changes = set(), set(), set(), [], {}
     seconds = stage_seconds(directory)
     for stage in [STAGES[name] for name in stages if STAGES[name].product is not None]:
@@ -73,6 +77,8 @@ def find_work(stages: Sequence[str], scene: Scene, directory: Path) -> Work:
                 useless.add(stage.name)
             continue
         if product.is_file() and not product.is_symlink():
+            if not origin:
+                _refuse_unreadable(product)
             lost.append(stage.file + _cost(origin, seconds.get(stage.name)))
             changes |= dict.fromkeys(changed_settings(stage, origin.get("scene"), scene.to_toml()))
         if checkpoints and not of_others:
@@ -127,6 +133,17 @@ def of_other_settings(changes: Sequence[str]) -> str:
     """That settings have changed, and the first of those that did, in words."""
     listed = [*changes[:MOST_CHANGES], *(["..."] if changes[MOST_CHANGES:] else [])]
     return "other settings" + (f" ({', '.join(listed)})" if listed else "")
+
+
+def _refuse_unreadable(product: Path) -> None:
+    """Raise ProductError where the system does not let a product be read, which may be sound."""
+    try:
+        open_to_read(product).close()
+    except OSError as error:
+        if reason := why_unreadable(error):
+            raise ProductError(cannot_be_read(product, reason)) from None
+    except ProductError:  # of its content
+        return
 
 
 def _fits(origin: Mapping[str, Any], stage: str, scene: Scene) -> bool:
