@@ -9,10 +9,13 @@ import pytest
 from eddies import cli
 from eddies.analysis.against_truth import error_series, particle_series
 from eddies.io.hdf5 import ProductError
+from eddies.parallel.stop import Stopped
 from eddies.report.rollout_figures import errors_over_time
+from eddies.scene.scene import load_scene
 from eddies.workflows import report
 from eddies.workflows.rollout.measured import open_rollout
 from tests.changed_product import changed
+from tests.workflows.stopping import StopAtStep
 from tests.workflows.synthetic_run import write_ground_truth, write_kernel, write_model, write_rollout, write_run
 
 FIGURES = {
@@ -453,3 +456,17 @@ def test_ranks_share_the_drawing(comm, tmp_path):
         images = {path.read_bytes() for path in (tmp_path / "report" / "figures").glob("*.png")}
         assert len(images) == 4, "each has its own"
     alone.Free()
+
+
+@pytest.mark.usefixtures("no_figures")
+@pytest.mark.mpi(1, 2)
+@pytest.mark.parametrize("looks", [0, 1])
+def test_a_report_is_stopped_before_and_after_its_figures_are_drawn(comm, tmp_path, looks):
+    write_ground_truth(comm, tmp_path, tracers=False)
+    with pytest.raises(Stopped):
+        report.run_stage(load_scene("tiny"), comm, tmp_path, StopAtStep(comm, looks))
+    comm.Barrier()
+    assert not (tmp_path / "report").exists()
+    report.run_stage(load_scene("tiny"), comm, tmp_path, StopAtStep(comm, 2))
+    comm.Barrier()
+    assert (tmp_path / "report/index.html").exists()

@@ -77,19 +77,19 @@ class Run:
 def run_stage(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | None = None,
               variants: Sequence[str] = ()) -> None:
     """The report as a stage of a scene."""
-    run(directory, comm, variants)
+    run(directory, comm, variants, stop)
 
 
-def run(directory: str | Path, comm: Comm, variants: Sequence[str] = ()) -> None:
+def run(directory: str | Path, comm: Comm, variants: Sequence[str] = (), stop: StopRequest | None = None) -> None:
     """Write report/index.html, report/figures/*.png and report/metrics.json of a run directory; all ranks call it.
 
     Of a scene with variants the page begins with their table and goes on with the first of `variants` that was run or,
     without one, of all that were run; every other one has a page of its own, one click away.
 
     Raises ProductError if the directory holds no product, or a damaged one, or the report cannot be written; SceneError
-    if a variant is named that the scene has not.
+    if a variant is named that the scene has not; Stopped, before a page is written, when `stop` asks for it.
     """
-    directory, scanned = Path(directory), {}
+    directory, scanned, stop = Path(directory), {}, stop or StopRequest(comm)
     check_places(("report",), comm, directory)
     scene, places = in_files(comm, directory, lambda: stored_rollouts(directory))
     if scene is not None:
@@ -102,12 +102,12 @@ def run(directory: str | Path, comm: Comm, variants: Sequence[str] = ()) -> None
     try:
         for name, where in pages.items():
             if where != main:
-                record, sections = _made(where, comm, alone, scanned, own=True)
+                record, sections = _made(where, comm, alone, scanned, stop, own=True)
                 _write_report(comm, where / "report", record, sections, _links(scene, directory, where, pages))
                 log.info("report: variant %s: %s", name, where / "report" / "index.html")
         table = None if chosen is None else _table(scene, places, chosen, comm, alone)
         first = [section_on_variants(table, notes(scene))] if table else []
-        record, sections = _made(main, comm, alone, scanned, first=first)
+        record, sections = _made(main, comm, alone, scanned, stop, first=first)
     finally:
         alone.Free()
     if main != directory:  # the variant that is shown has a page of its own too
@@ -136,10 +136,10 @@ def rolled_out(places: Mapping[str, Sequence[Place]]) -> dict[str, Path]:
     return {name: where[0].directory for name, where in places.items() if (where[0].directory / ROLLOUT).exists()}
 
 
-def _made(directory: Path, comm: Comm, alone: Comm, scanned: dict[Path, str], own: bool = False,
+def _made(directory: Path, comm: Comm, alone: Comm, scanned: dict[Path, str], stop: StopRequest, own: bool = False,
           first: Sequence[Section] = ()) -> tuple[Run, list[Section]]:
     """All sections on a run directory, with those that come `first`, their figures drawn, on rank 0; with `own` only
-    those on products that were made there."""
+    those on products that were made there. Raises Stopped, before and after drawing, when `stop` asks for it."""
     began = time.perf_counter()
     record = in_files(comm, directory, lambda: _survey(directory, alone, scanned))
     kinds = [kind for kind in record.provenance if not (own and (directory / f"{kind}.h5").is_symlink())]
@@ -147,7 +147,9 @@ def _made(directory: Path, comm: Comm, alone: Comm, scanned: dict[Path, str], ow
     if comm.rank == 0:
         found = [*first, *found]
     read = time.perf_counter()
+    stop.check()
     draw(comm, found)
+    stop.check()
     log.debug("report: read and measured in %.1f s, drawn in %.1f s", read - began, time.perf_counter() - read)
     gathered = comm.gather(found) or []
     sections = [section for part in gathered for section in part] + [_cost_section(record)]

@@ -1,15 +1,18 @@
 """What is kept of a run directory, what would be lost, and how that is told."""
 
+import errno
 import json
 from importlib import import_module
 
 import pytest
 
 from eddies.io.checkpoint import CheckpointDirectory
-from eddies.io.hdf5 import create_product
+from eddies.io import provenance
+from eddies.io.hdf5 import ProductError, create_product
 from eddies.pipeline import STAGES
 from eddies.scene.scene import load_scene
 from eddies.stages import RUN
+from eddies.workflows.run_directory import work as work_module
 from eddies.workflows.run_directory.work import WorkAtStake, find_work
 
 MAKING = ("dns", "train-kernel", "train", "simulate")
@@ -130,3 +133,20 @@ def test_every_maker_has_checkpoints_of_its_own():
     folders = [STAGES[stage].checkpoints for stage in MAKING]
     assert len({*folders}) == len(MAKING) and None not in folders
     assert all(import_module(RUN[stage].partition(":")[0]) for stage in MAKING)
+
+
+@pytest.mark.mpi(1)
+def test_a_product_that_the_system_does_not_let_be_read_is_no_work_to_be_replaced(comm, tmp_path, scene, monkeypatch):
+    """As by an error of the disk, which the content need not have; what HDF5 finds damaged may be replaced."""
+    leave(comm, tmp_path, scene, ["dns"])
+    for module in (provenance, work_module):
+        monkeypatch.setattr(module, "open_to_read", refuse)
+    with pytest.raises(ProductError, match="ground_truth.h5: cannot be read: Input/output error; check its"):
+        find_work(scene.stages, scene, tmp_path)
+    monkeypatch.undo()
+    (tmp_path / "ground_truth.h5").write_bytes(b"damaged")
+    assert "ground_truth.h5 (damaged" in find_work(scene.stages, scene, tmp_path).lost[0]
+
+
+def refuse(path):
+    raise OSError(errno.EIO, "unable to read")
