@@ -1,7 +1,10 @@
 import html
 import json
 import math
+import os
 import re
+import subprocess
+import sys
 
 import h5py
 import pytest
@@ -470,3 +473,27 @@ def test_a_report_is_stopped_before_and_after_its_figures_are_drawn(comm, tmp_pa
     report.run_stage(load_scene("tiny"), comm, tmp_path, StopAtStep(comm, 2))
     comm.Barrier()
     assert (tmp_path / "report/index.html").exists()
+
+
+@pytest.mark.mpi(1, 2)
+def test_numbers_and_other_figures_do_not_depend_on_a_figure(comm, tmp_path, monkeypatch, caplog):
+    from eddies.report import figures as module
+    write_ground_truth(comm, tmp_path, tracers=False)
+    draw, left = module.png, [1 if comm.rank == 0 else 0]
+
+    def png(figure):
+        left[0] -= 1
+        return draw(figure) if left[0] != 0 else 1 / 0
+
+    monkeypatch.setattr(module, "png", png)
+    report.run(tmp_path, comm)
+    told = [record.getMessage() for record in caplog.records if "a figure is left out" in record.getMessage()]
+    assert told == ["report: a figure is left out, it cannot be drawn (ZeroDivisionError: division by zero)"] * (
+        comm.rank == 0)
+    comm.Barrier()
+    assert len(figures(tmp_path)) == 2 and "ground_truth" in written(tmp_path)[0]
+
+
+def test_a_backend_that_there_is_not_is_none_of_the_report_s():
+    code = "import eddies.report.figures, matplotlib; matplotlib.figure.Figure().savefig('/dev/null', format='png')"
+    assert subprocess.run([sys.executable, "-c", code], env={**os.environ, "MPLBACKEND": "nonsense"}).returncode == 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import io
+import logging
 import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
@@ -23,6 +24,8 @@ from eddies.report.page import Section
 
 if TYPE_CHECKING:
     from eddies.parallel.communicator import Comm
+
+log = logging.getLogger("eddies")
 
 # Colour-blind safe (Okabe and Ito), the same quantity in the same colour in every figure.
 DNS, FILTERED, TRUTH, MODEL = "#000000", "#7f7f7f", "#0072B2", "#D55E00"
@@ -212,7 +215,10 @@ def png(figure: Figure) -> bytes:
 
 
 def draw(comm: Comm, sections: Sequence[Section]) -> None:
-    """Turn the figures of this rank's sections into PNG images; all ranks call it, and each draws as many as any."""
+    """Turn the figures of this rank's sections into PNG images; all ranks call it, and each draws as many as any.
+
+    One that cannot be drawn is a warning, and its section goes without it.
+    """
     illustrations = [illustration for section in sections for illustration in section.illustrations]
     counts = comm.allgather(len(illustrations))
     share = -(-sum(counts) // comm.size)
@@ -224,10 +230,20 @@ def draw(comm: Comm, sections: Sequence[Section]) -> None:
     given = comm.alltoall([[illustration.image for illustration, place in zip(rest, places) if place == rank]
                            for rank in range(comm.size)])
     for illustration in own:
-        illustration.image = png(illustration.image)
-    drawn = comm.alltoall([[png(figure) for figure in figures] for figures in given])
+        illustration.image = _png_or_none(illustration.image)
+    drawn = comm.alltoall([[_png_or_none(figure) for figure in figures] for figures in given])
     for illustration, place in zip(rest, places):
         illustration.image = drawn[place].pop(0)
+    for section in sections:
+        section.illustrations = [each for each in section.illustrations if each.image is not None]
+
+
+def _png_or_none(figure: Figure) -> bytes | None:
+    try:
+        return png(figure)
+    except Exception as error:  # of matplotlib or its settings: no reason to lose numbers and other figures
+        log.warning("report: a figure is left out, it cannot be drawn (%s: %s)", type(error).__name__, error)
+        return None
 
 
 def largest(*arrays: np.ndarray, quantile: float = 0.998) -> float:
