@@ -1,6 +1,7 @@
 """Start a command on this machine's cores under `mpirun`, with the environment that it needs there.
 
-SIGTERM and SIGUSR1 reach the ranks as SIGUSR1, so that they can end in order; a second SIGTERM ends the job at once.
+SIGTERM, SIGUSR1 and, unless it is ignored, SIGHUP reach the ranks as SIGUSR1, so that they can end in order; a second
+SIGTERM or SIGHUP ends the job at once.
 
     python mpi_tools/launch.py [-n RANKS] -- COMMAND...
 
@@ -130,10 +131,11 @@ def run_job(line: list[str], environment: dict[str, str]) -> int:
     terminations, interrupts = [], []
 
     def hand_on(number: int, frame: object) -> None:
-        terminations.extend([number] if number == signal.SIGTERM else [])
+        terminations.extend([number] if number != signal.SIGUSR1 else [])
         job.send_signal(signal.SIGTERM if len(terminations) > 1 else signal.SIGUSR1)
 
-    signals = {signal.SIGTERM, signal.SIGUSR1}
+    signals = {number for number in (signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP)
+               if signal.getsignal(number) != signal.SIG_IGN}
     # Held back until there is a job to hand them on to.
     signal.pthread_sigmask(signal.SIG_BLOCK, signals)
     job = subprocess.Popen(line, env=environment, stderr=subprocess.PIPE,
