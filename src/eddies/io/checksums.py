@@ -65,13 +65,12 @@ class CheckedFile:
         """Fill a buffer from there on. ProductError, which names dataset and frame, where bytes are not as written."""
         done, size = 0, min(len(buffer), self._size - self._at)
         while done < size:
-            first, last = (self._at + done) // BLOCK_BYTES, count_blocks(self._at + size)
-            content, wrong = compared_blocks(self._descriptor, first, min(last, first + PIECE), self._size)
+            first, skipped = divmod(self._at + done, BLOCK_BYTES)
+            part = memoryview(buffer)[done:min(size, done + PIECE * BLOCK_BYTES - skipped)]
+            wrong = compare(self._descriptor, first, part, self._size, skipped)
             if wrong is not None:
                 words = damage_words(self.path, wrong, self._naming)
                 raise ProductError(f"{words}; {make_again(self.path.stem)}")
-            part = content[self._at + done - first * BLOCK_BYTES:][:size - done]
-            buffer[done:done + len(part)] = part
             done += len(part)
         return done
 
@@ -104,11 +103,12 @@ def covered_bytes(descriptor: int) -> int | None:
     return size if mark == MARK and size + 4 * count_blocks(size) == end else None
 
 
-def compared_blocks(descriptor: int, first: int, last: int, size: int) -> tuple[memoryview, int | None]:
-    """Blocks first to last of a file, of whose bytes `size` are covered, and the first one that is not as written."""
-    content = read_blocks(descriptor, first, last, size)
-    wrong = np.flatnonzero(sums_of(content) != read_table(descriptor, first, last, size))
-    return content, first + int(wrong[0]) if wrong.size else None
+def compare(descriptor: int, first: int, part: memoryview, size: int, skipped: int = 0) -> int | None:
+    """Read a part of a file, of whose bytes `size` are covered, `skipped` bytes after the beginning of block `first`;
+    the first block of it that is not as written, None if all are."""
+    sums = read_sums(descriptor, first, part, size, skipped)
+    wrong = np.flatnonzero(sums != read_table(descriptor, first, first + len(sums), size))
+    return first + int(wrong[0]) if wrong.size else None
 
 
 def read_table(descriptor: int, first: int, last: int, size: int) -> np.ndarray:
@@ -116,16 +116,15 @@ def read_table(descriptor: int, first: int, last: int, size: int) -> np.ndarray:
     return np.frombuffer(os.pread(descriptor, 4 * (min(last, count_blocks(size)) - first), size + 4 * first), "<u4")
 
 
-def read_blocks(descriptor: int, first: int, last: int, size: int) -> memoryview:
-    """Blocks first to last of a file, of whose bytes `size` are covered."""
-    start = first * BLOCK_BYTES
-    return memoryview(os.pread(descriptor, min(last * BLOCK_BYTES, size) - start, start))
-
-
-def sums_of(content: memoryview) -> np.ndarray:
-    """Checksums of blocks."""
-    return np.array([zlib.crc32(content[start:start + BLOCK_BYTES]) for start in range(0, len(content), BLOCK_BYTES)],
-                    np.uint32)
+def read_sums(descriptor: int, first: int, part: memoryview, size: int, skipped: int = 0) -> np.ndarray:
+    """Read a part of a file as `compare` does; the checksums of its blocks, those that it has in part as a whole."""
+    start, end = first * BLOCK_BYTES, first * BLOCK_BYTES + skipped + len(part)
+    head, tail = bytearray(skipped), bytearray(min(count_blocks(end) * BLOCK_BYTES, size) - end)
+    os.preadv(descriptor, [head, part, tail], start)
+    sums = [zlib.crc32(part[:BLOCK_BYTES - skipped], zlib.crc32(head))]
+    sums += [zlib.crc32(part[at:at + BLOCK_BYTES]) for at in range(BLOCK_BYTES - skipped, len(part), BLOCK_BYTES)]
+    sums[-1] = zlib.crc32(tail, sums[-1])
+    return np.array(sums, np.uint32)
 
 
 @contextmanager

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from mpi4py import MPI
 
-from eddies.io.checksums import (FOOTER, MARK, MISSING, PIECE, compared_blocks, count_blocks, covered_bytes,
-                                 damage_words, opened, read_blocks, read_table, sums_of)
+from eddies.io.checksums import (BLOCK_BYTES, FOOTER, MARK, MISSING, PIECE, compare, count_blocks, covered_bytes,
+                                 damage_words, opened, read_sums, read_table)
 from eddies.io.errors import NoRoom
 from eddies.parallel.broadcast import on_all_ranks, on_first_rank
 from eddies.parallel.reduction import global_min, global_sum
@@ -25,8 +25,9 @@ def add_checksums(comm: MPI.Comm, path: Path) -> None:
 
     def read() -> None:
         with opened(path) as descriptor:
-            for first, last in _share(comm, size):
-                sums[first:last] = sums_of(read_blocks(descriptor, first, last, size))
+            for first, part in _share(comm, size):
+                found = read_sums(descriptor, first, part, size)
+                sums[first:first + len(found)] = found
 
     on_all_ranks(comm, read)
     table = global_sum(comm, sums).astype("<u4").tobytes() + FOOTER.pack(size, MARK)
@@ -63,22 +64,24 @@ def find_damage(comm: MPI.Comm, path: Path, known: int | None = None) -> str | N
             return f"{path}: is another file than was written"
         return f"{path}: {MISSING}" if size is None else size
 
-    def compare() -> int:
+    def first_wrong() -> int:
         with opened(path) as descriptor:
-            found = (compared_blocks(descriptor, *piece, size)[1] for piece in _share(comm, size))
+            found = (compare(descriptor, *piece, size) for piece in _share(comm, size))
             return next((block for block in found if block is not None), count_blocks(size))
 
     try:
         size = on_first_rank(comm, look)
         if isinstance(size, str):
             return size
-        block = int(global_min(comm, on_all_ranks(comm, compare)))
+        block = int(global_min(comm, on_all_ranks(comm, first_wrong)))
     except OSError as error:
         return f"{path}: cannot be read ({error})"
     return on_first_rank(comm, lambda: damage_words(path, block)) if block < count_blocks(size) else None
 
 
-def _share(comm: MPI.Comm, size: int) -> Iterator[tuple[int, int]]:
-    """First and last of the blocks of so many bytes that this rank takes, a few at a time."""
+def _share(comm: MPI.Comm, size: int) -> Iterator[tuple[int, memoryview]]:
+    """The share of this rank of the blocks of so many bytes, a few at a time: the first one, and room for them."""
     start, stop = map(int, block_starts(count_blocks(size), comm.size)[comm.rank:comm.rank + 2])
-    return ((first, min(first + PIECE, stop)) for first in range(start, stop, PIECE))
+    room = memoryview(bytearray(PIECE * BLOCK_BYTES))
+    for first in range(start, stop, PIECE):
+        yield first, room[:min(size, stop * BLOCK_BYTES) - first * BLOCK_BYTES]
