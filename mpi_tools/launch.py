@@ -1,7 +1,7 @@
 """Start a command on this machine's cores under `mpirun`, with the environment that it needs there.
 
-SIGTERM, SIGUSR1 and, unless it is ignored, SIGHUP reach the ranks as SIGUSR1, so that they can end in order; a second
-SIGTERM or SIGHUP ends the job at once.
+SIGTERM, SIGUSR1, SIGINT and, unless it is ignored, SIGHUP reach the ranks as SIGUSR1, so that they can end in order; a
+second one, but for SIGUSR1, ends the job at once.
 
     python mpi_tools/launch.py [-n RANKS] -- COMMAND...
 
@@ -128,13 +128,13 @@ def run_job(line: list[str], environment: dict[str, str]) -> int:
 
     mpirun kills its ranks soon after a SIGTERM and returns a code of its own; SIGUSR1 it hands on, and no more.
     """
-    terminations, interrupts = [], []
+    terminations: list[int] = []
 
     def hand_on(number: int, frame: object) -> None:
         terminations.extend([number] if number != signal.SIGUSR1 else [])
         job.send_signal(signal.SIGTERM if len(terminations) > 1 else signal.SIGUSR1)
 
-    signals = {number for number in (signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP)
+    signals = {number for number in (signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP, signal.SIGINT)
                if signal.getsignal(number) != signal.SIG_IGN}
     # Held back until there is a job to hand them on to.
     signal.pthread_sigmask(signal.SIG_BLOCK, signals)
@@ -142,14 +142,13 @@ def run_job(line: list[str], environment: dict[str, str]) -> int:
                            preexec_fn=lambda: signal.pthread_sigmask(signal.SIG_UNBLOCK, signals))
     for number in signals:
         signal.signal(number, hand_on)
-    # The keyboard interrupts mpirun as well, which ends the ranks by SIGTERM, and the launcher waits for it.
-    signal.signal(signal.SIGINT, lambda number, frame: interrupts.append(number))
     signal.pthread_sigmask(signal.SIG_UNBLOCK, signals)
     errors = threading.Thread(target=pass_errors_on, args=(job,), daemon=True)
     errors.start()
     code = job.wait()
     errors.join()
-    if interrupts and code != 0:
+    # The keyboard interrupts mpirun as well, which ends the ranks by SIGTERM.
+    if signal.SIGINT in terminations and code not in (0, *EXPLAINED):
         print("interrupted", file=sys.stderr)
         return 128 + signal.SIGINT
     return code if code >= 0 else 128 - code

@@ -335,7 +335,8 @@ def launch(ranks, *command):
 
 
 # In set-up, and some steps later.
-@pytest.mark.parametrize("number, after", [(signal.SIGTERM, 0), (signal.SIGUSR1, 1), (signal.SIGHUP, 1)])
+@pytest.mark.parametrize("number, after", [(signal.SIGTERM, 0), (signal.SIGUSR1, 1), (signal.SIGHUP, 1),
+                                           (signal.SIGINT, 1)])
 def test_a_signal_ends_the_job_to_be_resumed(tmp_path, number, after):
     job, output = launch(2, "-m", "eddies", "dns", "hit-small", "--output", tmp_path), ""
     while "dns: starts" not in output:
