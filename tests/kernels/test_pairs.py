@@ -143,7 +143,7 @@ def test_every_summand_with_a_gradient_is_one_of_a_term(comm, library):
 
 @pytest.mark.parametrize("kind, numbers, parity, parameters, scalar", [
     ("unheard-of", (), 1, 0, 0), ("moments", (), 6, 0, 0), ("moments", (), 7, 1, 0),
-    ("wcsph", (1.0, 1.0, 0.1), 3, 2, 1), ("pair-network", (2, 0, 0, 1, 0, 0, 3), 6, 13, 0)])
+    ("wcsph", (1.0, 1.0, 0.1), 3, 2, 1), ("pair-network", (2, 0, 0, 1, 0, 0, 0, 1, 0, 3), 6, 13, 0)])
 def test_what_a_summand_does_not_take_is_told(library, kind, numbers, parity, parameters, scalar):
     """A name, components, parameters and columns of numbers."""
     space = PairSpace(LENGTH, True, 1.0, 1.0, 1.0, mutual=False)

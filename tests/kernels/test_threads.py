@@ -69,7 +69,8 @@ def mode_passes(library):
 def pair_sums(library):
     random = np.random.default_rng(1)
     position, velocity = random.uniform(0, 1, (5000, 3)), random.standard_normal((5000, 3))
-    summands = [Summand("pair-network", (2, 1, 1, 1, 1, 1, 9, 6), (-1.0,) * 6), Summand("moments", (), (1.0,) * 7)]
+    network = (2, 1, 1, 1, 1, 1, 0, 1, 0, 9, 6)
+    summands = [Summand("pair-network", network, (-1.0,) * 6), Summand("moments", (), (1.0,) * 7)]
     parameters = [random.standard_normal(9 * 6 + 6 * 10 + 2 * 7), np.zeros(0)]
     for kind in (np.float32, np.float64):
         for mutual in (True, False):
