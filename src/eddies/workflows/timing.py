@@ -65,7 +65,7 @@ def run(scene: Scene, comm: Comm, signals: Sequence[int] = ()) -> None:
         for stage in scene.stages:
             try:
                 with quiet():
-                    seconds, step = measured(stage, whole[stage] or 0, scene, comm, directory, stop)
+                    seconds, step = measured(stage, whole[stage], scene, comm, directory, stop)
             except Stopped:
                 raise Stopped(stop.reason, "from the beginning") from None
             except UserError as error:
@@ -76,9 +76,10 @@ def run(scene: Scene, comm: Comm, signals: Sequence[int] = ()) -> None:
                      duration(seconds) if known else "not known, as the number of steps is not")
 
 
-def measured(stage: str, steps: int, scene: Scene, comm: Comm, directory: Path,
+def measured(stage: str, steps: int | None, scene: Scene, comm: Comm, directory: Path,
              stop: StepTimes) -> tuple[float, float]:
-    """Wall time of a stage of so many steps, and of one of them with what is stored between steps, from a short run."""
+    """Wall time of a stage of so many steps, or of an unknown number (None), and of one of them with what is stored
+    between steps, from a short run."""
     turnover = None
     if scene.tracers:
         if stage == "dns":  # once through a single interval of frames, to know how fast the flow turns over
@@ -96,10 +97,12 @@ def measured(stage: str, steps: int, scene: Scene, comm: Comm, directory: Path,
     if stage == "train":
         rest, step = rest_of_training(few, scene, comm, directory, stop)
         return seconds + rest, step
+    if steps == 0:  # it asks now and then, and not before each step
+        return seconds, 0.0
     paces = [after - before for before, after in zip(stop.times[first:], stop.times[first + 1:])]
     usual = paces[WARM_UP_STEPS:] or paces
     step = sum(usual) / max(len(usual), 1)
-    return seconds + max(steps - len(paces) - 1, 0) * step, step
+    return seconds + max((steps or 0) - len(paces) - 1, 0) * step, step
 
 
 def rest_of_training(few: Scene, scene: Scene, comm: Comm, directory: Path, stop: StopRequest) -> tuple[float, float]:

@@ -305,7 +305,7 @@ def test_a_rollout_that_goes_wrong_ends_there_and_keeps_its_frames(comm, tmp_pat
 @pytest.mark.usefixtures("no_figures", "quick_solves")
 @pytest.mark.mpi(2)
 @pytest.mark.parametrize("model, weights, rate", [
-    ('preset = "paper"\n[model.pairs]\nhidden = [4]\n[model.density-flux]\nhidden = [4]', 4 + 4, True),
+    ('preset = "paper"\n[model.pairs]\nhidden = [4]\n[model.density-flux]\nhidden = [4]', 4 + 4 + 2, True),
     ('terms = ["pressure", "viscosity"]', 0, False),
 ])
 def test_other_models_run(comm, tmp_path, model, weights, rate):
