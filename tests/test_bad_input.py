@@ -192,12 +192,15 @@ def test_a_rank_may_have_a_particle_or_none(comm, tmp_path):
 
 def as_nobody(commands, built_in):
     """Exit codes and the error output of commands that are run by a user without rights of root, who need not be
-    allowed to read this checkout: all modules are loaded before, and the folder of the built-in scenes is another."""
+    allowed to read this checkout: all modules and the compiled library are loaded before, and the folder of the
+    built-in scenes is another."""
     code = ("import encodings.utf_8_sig, importlib, json, os, pathlib, pkgutil, sys, numpy.random, eddies.cli\n"
             "names = [found.name for found in pkgutil.walk_packages(eddies.__path__, 'eddies.')]\n"
             "others = '__main__', 'avx2', 'avx512', 'plain'  # a command, and libraries that are no modules\n"
             "[importlib.import_module(name) for name in names if name.split('.')[-1] not in others]\n"
-            "eddies.scene.scene.BUILT_IN = pathlib.Path(sys.argv[2])\n"
+            "eddies.kernels.library.library()\n"
+            "for module in eddies.scene.scene, eddies.scene.layers:\n"
+            "    module.BUILT_IN = pathlib.Path(sys.argv[2])\n"
             f"os.getuid() or (os.setgroups([]), os.setgid({NOBODY}), os.setuid({NOBODY}))\n"
             "print([eddies.cli.main(command) for command in json.loads(sys.argv[1])])")
     ended = subprocess.run([sys.executable, "-c", code, json.dumps(commands), built_in], stdin=subprocess.DEVNULL,
