@@ -237,8 +237,10 @@ def check_sections(stages: Sequence[str], scene: Scene) -> None:
 
 
 def check_inputs(step: Step, comm: Comm, making: Collection[tuple[str, Path]] = ()) -> None:
-    """Refuse stages that the scene of a step lacks, and inputs that are missing or of other settings or another form
-    than the scene's; but for those that are still to be made, each by its stage and directory."""
+    """Refuse stages that the scene of a step lacks, and inputs that are missing, of other settings or of another form.
+
+    `making` names the inputs that the same job makes first, by stage and directory. They are not checked.
+    """
     stages, scene = step.stages, step.scene
     check_sections(stages, scene)
     weights = scene.model.weights_file if "train" in stages and scene.model is not None else None

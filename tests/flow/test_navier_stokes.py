@@ -183,7 +183,7 @@ def test_dissipation_against_all_nine_gradients(comm):
 
 @pytest.mark.mpi(1, 2)
 def test_the_energy_of_a_weak_sound_wave_is_that_of_its_compression(comm):
-    """c^2 <s^2> / 2 of s = a cos(kx) at rest, but for powers of a; nothing where nothing is compressed."""
+    """The energy of s = a cos(kx) at rest is c^2 <s^2> / 2 to leading order in a. Without compression it is zero."""
     grid, sound_speed, amplitude = SpectralGrid(SlabDecomposition(comm, 2 * np.pi, 16)), 8.0, 1e-3
     state = np.zeros((4, *grid.spectral_shape), grid.complex)
     assert compressible_budget(grid, state, 0.0, sound_speed)["total_energy"] == 0

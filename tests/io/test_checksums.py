@@ -1,4 +1,4 @@
-"""Bytes that are not as written are told when they are read, with dataset and frame, and no others are looked at."""
+"""A reader reports damaged bytes that it reads, with dataset and frame. It does not check other bytes."""
 
 import h5py
 import numpy as np

@@ -109,7 +109,7 @@ def test_a_lock_that_may_not_be_read_holds(comm, tmp_path):
 @pytest.mark.parametrize("change", [{"pid": "abc"}, {"pid": 0}, {"pid": -1}, {"pid": 10**30}, {"pid": None},
                                     {"restarts": "x"}, {"start": 3}, None], ids=repr)
 def test_a_lock_of_other_types_is_none_of_a_job(comm, tmp_path, monkeypatch, change):
-    """Of this machine and batch job, so that its process and restarts are looked at; or a pipe."""
+    """A lock of this machine and batch job, whose process and restarts the reader checks; or a pipe."""
     monkeypatch.setenv("SLURM_JOB_ID", "7")
     put(tmp_path, Holder.this_job())
     if change is None:

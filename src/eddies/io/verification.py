@@ -53,8 +53,11 @@ def known_sums(path: Path) -> int | None:
 
 
 def find_damage(comm: MPI.Comm, path: Path, known: int | None = None) -> str | None:
-    """What is wrong with a file, in words that name file, dataset and frame; None if every byte is as written.
-    Collective. `known`: its `known_sums` when it was written."""
+    """Compare a file with its checksums; collective.
+
+    Returns a line that names file, dataset and frame of the first damage, or None. `known`: `known_sums` of the file
+    that is expected.
+    """
     def look() -> int | str:
         if not path.is_file():
             return f"{path}: missing"

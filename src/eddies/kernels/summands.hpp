@@ -243,13 +243,13 @@ class PairNetwork : public Summand<Real> {
         const Rows<Real>& outputs = network_.outputs();
         const Real* along_x = outputs[0];
         if (this->components == 1) {
-            EDDIES_PAIRS found[0][p] = by_x_[p] * along_x[p];
+            EDDIES_PAIRS found[0][p] = window_[p] * by_x_[p] * along_x[p];
             return;
         }
         const Real* along_v = outputs[1];
         for (int c = 0; c < 3; ++c) {
-            EDDIES_PAIRS found[c][p] = by_x_[p] * along_x[p] * pairs.x[c][p];
-            EDDIES_PAIRS found[3 + c][p] = by_v_[p] * along_v[p] * pairs.v[c][p];
+            EDDIES_PAIRS found[c][p] = window_[p] * by_x_[p] * along_x[p] * pairs.x[c][p];
+            EDDIES_PAIRS found[3 + c][p] = window_[p] * by_v_[p] * along_v[p] * pairs.v[c][p];
         }
     }
 
@@ -258,11 +258,11 @@ class PairNetwork : public Summand<Real> {
         evaluate(pairs);
         Rows<Real>& by_outputs = network_.by_outputs();
         if (this->components == 1) {
-            EDDIES_PAIRS by_outputs[0][p] = by_x_[p] * given[0][p];
+            EDDIES_PAIRS by_outputs[0][p] = window_[p] * by_x_[p] * given[0][p];
         } else {
             Real *by_x = by_outputs[0], *by_v = by_outputs[1];
-            EDDIES_PAIRS by_x[p] = by_x_[p] * dot(given, pairs.x, p);
-            EDDIES_PAIRS by_v[p] = by_v_[p] * dot(given + 3, pairs.v, p);
+            EDDIES_PAIRS by_x[p] = window_[p] * by_x_[p] * dot(given, pairs.x, p);
+            EDDIES_PAIRS by_v[p] = window_[p] * by_v_[p] * dot(given + 3, pairs.v, p);
         }
         network_.backward(by_parameters, by_pairs != nullptr);
         if (by_pairs) add_by_pairs(pairs, given, *by_pairs);
@@ -273,8 +273,8 @@ class PairNetwork : public Summand<Real> {
     int scalar_;
     bool density_, distance_, speed_, approach_, unit_, weighted_, sign_;
     Network<Real> network_;
-    // |v|; and what the outputs are multiplied by beside x and v: the weight, and the sign or the inverse lengths.
-    alignas(64) Real speed_of_[BLOCK], by_x_[BLOCK], by_v_[BLOCK];
+    // |v|; w; and the factors of x and v: 1, or 1/|x| and 1/|v|. The sign is a factor of x.
+    alignas(64) Real speed_of_[BLOCK], window_[BLOCK], by_x_[BLOCK], by_v_[BLOCK];
 
     static std::vector<int> widths(const Given& given) {
         const double* told = given.numbers;
@@ -314,12 +314,9 @@ class PairNetwork : public Summand<Real> {
 
     void find_factors(const Block<Real>& pairs) {
         const Real* w = pairs.weight;
-        EDDIES_PAIRS by_x_[p] = weighted_ ? w[p] : Real(w[p] > 0);
-        std::copy(by_x_, by_x_ + BLOCK, by_v_);
-        if (unit_) EDDIES_PAIRS {
-                by_x_[p] /= pairs.distance[p] + Real(SMALL);
-                by_v_[p] /= speed_of_[p] + Real(SMALL);
-            }
+        EDDIES_PAIRS window_[p] = weighted_ ? w[p] : Real(w[p] > 0);
+        EDDIES_PAIRS by_x_[p] = unit_ ? 1 / (pairs.distance[p] + Real(SMALL)) : Real(1);
+        EDDIES_PAIRS by_v_[p] = unit_ ? 1 / (speed_of_[p] + Real(SMALL)) : Real(1);
         if (sign_) {
             const Real *own = pairs.scalar[0][scalar_], *other = pairs.scalar[1][scalar_];
             EDDIES_PAIRS by_x_[p] *= Real(own[p] > other[p]) - Real(own[p] < other[p]);
@@ -330,10 +327,7 @@ class PairNetwork : public Summand<Real> {
         const Rows<Real>&by_features = network_.by_features(), &outputs = network_.outputs();
         const Real* along_x = outputs[0];
         if (this->components == 1) {
-            if (weighted_) {
-                EDDIES_PAIRS by.weight[p] += pairs.weight[p] > 0 ? given[0][p] * along_x[p] * by_x_[p] / pairs.weight[p]
-                                                                 : Real(0);
-            }
+            if (weighted_) EDDIES_PAIRS by.weight[p] += given[0][p] * along_x[p] * by_x_[p];
         } else {
             add_by_directions(pairs, given, along_x, outputs[1], by);
         }
@@ -371,25 +365,20 @@ class PairNetwork : public Summand<Real> {
     void add_by_directions(const Block<Real>& pairs, GivenComponents<Real> given, const Real* along_x,
                            const Real* along_v, ByPairs<Real>& by) {
         for (int c = 0; c < 3; ++c) EDDIES_PAIRS {
-                by.x[c][p] += given[c][p] * by_x_[p] * along_x[p];
-                by.v[c][p] += given[3 + c][p] * by_v_[p] * along_v[p];
+                by.x[c][p] += given[c][p] * window_[p] * by_x_[p] * along_x[p];
+                by.v[c][p] += given[3 + c][p] * window_[p] * by_v_[p] * along_v[p];
             }
         if (!weighted_ && !unit_) return;
-        alignas(64) Real of_x[BLOCK], of_v[BLOCK];  // along_x and along_v times what they are given, but for w
-        EDDIES_PAIRS of_x[p] = along_x[p] * dot(given, pairs.x, p);
-        EDDIES_PAIRS of_v[p] = along_v[p] * dot(given + 3, pairs.v, p);
-        if (unit_) EDDIES_PAIRS {
-                of_x[p] /= pairs.distance[p] + Real(SMALL);
-                of_v[p] /= speed_of_[p] + Real(SMALL);
-            }
-        if (weighted_) EDDIES_PAIRS by.weight[p] += of_x[p] + of_v[p];
-        if (!unit_) return;
+        alignas(64) Real by_speed[BLOCK];
         EDDIES_PAIRS {
-            const Real w = weighted_ ? pairs.weight[p] : Real(pairs.weight[p] > 0);
-            by.distance[p] -= w * of_x[p] / (pairs.distance[p] + Real(SMALL));
-            of_v[p] *= speed_of_[p] > 0 ? w / (speed_of_[p] * (speed_of_[p] + Real(SMALL))) : Real(0);
+            const Real of_x = along_x[p] * by_x_[p] * dot(given, pairs.x, p);
+            const Real of_v = along_v[p] * by_v_[p] * dot(given + 3, pairs.v, p);
+            by.weight[p] += weighted_ ? of_x + of_v : Real(0);
+            by.distance[p] -= unit_ ? window_[p] * of_x * by_x_[p] : Real(0);
+            by_speed[p] = unit_ && speed_of_[p] > 0 ? window_[p] * of_v * by_v_[p] / speed_of_[p] : Real(0);
         }
-        for (int c = 0; c < 3; ++c) EDDIES_PAIRS by.v[c][p] -= of_v[p] * pairs.v[c][p];
+        if (unit_)
+            for (int c = 0; c < 3; ++c) EDDIES_PAIRS by.v[c][p] -= by_speed[p] * pairs.v[c][p];
     }
 };
 

@@ -20,7 +20,7 @@ def convergence(found: Mapping[str, float | str], trials: Mapping[str, Mapping[s
     for name, columns in trials.items():
         change.loglog(columns["size"][:-1], columns["difference"][1:], marker="o", markersize=3, label=name)
         cost.loglog(columns["size"], columns["seconds_per_turnover"], marker="o", markersize=3)
-    change.axhline(0.02 * found["error_with_half"], color=GUIDE, linestyle="--", linewidth=1.1)
+    change.axhline(found["tolerance"], color=GUIDE, linestyle="--", linewidth=1.1)
     change.plot(found["size"], found["difference"], marker="o", markersize=9, fillstyle="none", color="black")
     cost.plot(found["size"], found["seconds_per_turnover"], marker="o", markersize=9, fillstyle="none", color="black")
     change.set(title="Change by halving the step", xlabel=size, ylabel="rms change / rms velocity")
@@ -45,10 +45,11 @@ def section(found: Mapping[str, float | str], trials: Mapping[str, Mapping[str, 
     shown = Section(
         "step", f"Step: {found['integrator']}, {size} {found['size']:.4g}",
         f"Rollouts of {found['turnovers']:.2g} turnovers on the ground truth, without limits of stability. A step has "
-        "converged if halving it changes the velocities at the end by less than 2 % of their error, or 1e-4 of "
-        f"themselves. Of those the cheapest is taken: {found['seconds_per_turnover']:.3g} s a turnover. Its error is "
+        "converged if halving it changes the velocities at the end by less than a small share of their error: here "
+        f"{found['tolerance']:.2g}. The cheapest of these is taken: {found['seconds_per_turnover']:.3g} s a turnover. "
+        "Its error is "
         f"{found['error']:.4f}, that of half the step {found['error_with_half']:.4f}. To find it took "
         f"{found['seconds']:.3g} s.", metrics=metrics, folded=True)
     shown.add_figure("step", "Convergence in the step", convergence(found, trials, size),
-                     "Circle: the step that is taken. Dashed: 2 % of its error. Both axes are logarithmic.")
+                     "Circle: the step that is taken. Dashed: the change below which a step has converged.")
     return shown

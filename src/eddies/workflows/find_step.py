@@ -27,7 +27,7 @@ from eddies.particles.devices import prepare_torch
 from eddies.scene.integrators import SCHEMES
 from eddies.scene.scene import BOX_LENGTH, Scene, SceneError
 from eddies.workflows.ground_truth.truth import GroundTruth
-from eddies.workflows.rollout.method_of_step import Step, method_of_step
+from eddies.workflows.rollout.method_of_step import METHODS, Step, method_of_step
 
 log = logging.getLogger("eddies")
 
@@ -55,9 +55,9 @@ class Trial:
     difference: float = np.nan
 
     @property
-    def confirms(self) -> bool:
-        """Whether the end differs so little from that with twice the step that twice the step has converged."""
-        return self.difference < max(OF_ERROR * self.error, OF_VELOCITY)
+    def tolerance(self) -> float:
+        """The difference below which twice the step has converged."""
+        return max(OF_ERROR * self.error, OF_VELOCITY)
 
 
 def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | None = None) -> None:
@@ -74,7 +74,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     with create_product(comm, directory / "step.h5", "step", scene.provenance("find-step")) as file:
         write_attributes(file.create_group("found"), {
             "integrator": found.step.integrator, "size": found.step.size, "seconds_per_turnover": found.seconds,
-            "error": found.error, "error_with_half": half.error, "difference": half.difference, "seconds": seconds,
+            "error": found.error, "error_with_half": half.error, "difference": half.difference,
+            "tolerance": half.tolerance, "seconds": seconds,
             "turnovers": search.span / search.turnover})
         for name in dict.fromkeys(trial.step.integrator for trial in search.trials):
             own = [trial for trial in search.trials if trial.step.integrator == name]
@@ -95,7 +96,7 @@ class _Search:
         self.scene, self.truth, self.directory, self.device, self.stop = scene, truth, directory, device, stop
         self.comm, self.turnover = truth.decomposition.comm, float(truth.reference["eddy_turnover_time"])
         self.interval = scene.simulation.frame_interval
-        whole = [round(at / truth.times[1]) for at in truth.states.times]
+        whole = [int(np.argmin(np.abs(truth.times - at))) for at in truth.states.times]
         self.start = min((frame for frame in whole if frame > 0), default=1)
         # Whole frame intervals, as rollouts take them.
         frames = round(self.interval / scene.tracers.frame_interval)
@@ -113,7 +114,7 @@ class _Search:
             for halved in range(HALVINGS):
                 trial, ended = self._try(Step(name, first / 2**halved), velocity)
                 self.trials.append(trial)
-                if before is not None and trial.confirms:
+                if before is not None and trial.difference < trial.tolerance:
                     if best is None or before.seconds < best[0].seconds:
                         best = before, trial
                     break
@@ -133,7 +134,8 @@ class _Search:
         if settings.on_grid:
             yield "etdrk4", COURANT
             return
-        for name in settings.schemes:
+        # A method of the user's steps in its own way, whatever the integrator.
+        for name in settings.schemes if settings.method in METHODS else settings.schemes[:1]:
             yield name, self.span if SCHEMES[name].dense else self.interval
 
     def _try(self, step: Step, coarser: np.ndarray | None) -> tuple[Trial, np.ndarray | None]:

@@ -126,7 +126,7 @@ def stage_state(stage: Stage, scene: Scene, directory: Path) -> str:
 
 
 def page_state(directory: Path, planned: Sequence[Step]) -> str:
-    """Whether the report is there, and newer than what it is about: the products of these steps."""
+    """The state of the report: to do, older than a product of these steps, or complete."""
     page = directory / PAGE
     if not page.is_file():
         return "to do"

@@ -61,7 +61,7 @@ def density_rate(sums: Tensor, settings: PairSum, context: Context) -> Rates:
 
 
 def told(settings: PairSum) -> tuple[float, float]:
-    """Whether directions are unit vectors, and whether pairs are weighted, as the compiled library is told."""
+    """Two numbers for the compiled library: 1 for unit vectors, and 1 for weighted pairs; else 0."""
     return getattr(settings, "basis", "") == "unit", settings.window == "smooth"
 
 
@@ -72,8 +72,10 @@ def acceleration(scaled: Tensor, context: Context) -> Tensor:
 
 def compiled_network(network: nn.Module, settings: NetworkSettings, outputs: int, symmetric: bool,
                      context: Context, sign: bool = False) -> CompiledSum | None:
-    """What the compiled library is told of a term whose network has one or two `outputs`, times the sign of the density
-    difference or not; None of a network that it does not know."""
+    """The sum of a term with a network for the compiled library; None for a network of a user's class.
+
+    The network has one or two `outputs`. `sign`: its output is multiplied by the sign of the density difference.
+    """
     if type(network) is not DenseNetwork:
         return None
     layers = list(zip(network.weights, network.biases))

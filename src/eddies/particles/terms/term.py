@@ -70,7 +70,8 @@ class PairTerm(Term):
     parity: Tensor = torch.ones(1)
 
     def pair_values(self, pairs: ScaledPairs) -> Tensor:
-        """What is summed over neighbours, (components, m); zero at the radius of interaction."""
+        """What is summed over neighbours, (components, m); zero beyond the radius of interaction: listed pairs may be
+        farther apart."""
         raise NotImplementedError(f"{type(self).__name__} has no pair_values(pairs)")
 
     def rates_of(self, sums: Tensor, context: Context) -> Rates:

@@ -17,7 +17,7 @@ from eddies.scene.sections import CONVERGED
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.rollout.eulerian_run import EulerianRun
 from eddies.workflows.rollout.method import Method
-from eddies.workflows.rollout.particle_run import BallisticRun, LearnedRun
+from eddies.workflows.rollout.particle_run import BallisticRun, LearnedRun, ParticleRun
 
 #: The classes behind the words of [simulation] method, each built as Class(scene, truth, start, directory, device).
 METHODS: dict[str, Callable[..., Method]] = {"learned": LearnedRun, "none": BallisticRun, "eulerian": EulerianRun}
@@ -44,7 +44,7 @@ def method_of_step(scene: Scene, step: Step | None, truth: GroundTruth, start: i
         scene = replace(scene, simulation=replace(settings, integrator=step.integrator, step=step.size, step_from=None))
     kind = load(settings.method) if is_path(settings.method) else METHODS[settings.method]
     method = kind(scene, truth, start, directory, device)
-    if step is not None and isinstance(method, (LearnedRun, BallisticRun)):
+    if step is not None and isinstance(method, ParticleRun):
         method.limited = False
     return method
 
