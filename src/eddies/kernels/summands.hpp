@@ -236,6 +236,8 @@ class PairNetwork : public Summand<Real> {
           sign_(given.numbers[8]), network_(widths(given), given.parameters, given.parameters_count) {
         this->scalars = density_ || sign_;
         this->parameters = static_cast<int>(given.parameters_count);
+        std::fill_n(by_x_, BLOCK, Real(1));
+        std::fill_n(by_v_, BLOCK, Real(1));
     }
 
     void values(const Block<Real>& pairs, Components<Real> found) override {
@@ -273,8 +275,9 @@ class PairNetwork : public Summand<Real> {
     int scalar_;
     bool density_, distance_, speed_, approach_, unit_, weighted_, sign_;
     Network<Real> network_;
-    // |v|; w; and the factors of x and v: 1, or 1/|x| and 1/|v|. The sign is a factor of x.
-    alignas(64) Real speed_of_[BLOCK], window_[BLOCK], by_x_[BLOCK], by_v_[BLOCK];
+    // |v|; the factors of x and v: 1, or 1/|x| and 1/|v|, the sign being one of x; w, where it is not that of the pairs.
+    alignas(64) Real speed_of_[BLOCK], by_x_[BLOCK], by_v_[BLOCK], open_[BLOCK];
+    const Real* window_;  // w
 
     static std::vector<int> widths(const Given& given) {
         const double* told = given.numbers;
@@ -314,12 +317,15 @@ class PairNetwork : public Summand<Real> {
 
     void find_factors(const Block<Real>& pairs) {
         const Real* w = pairs.weight;
-        EDDIES_PAIRS window_[p] = weighted_ ? w[p] : Real(w[p] > 0);
-        EDDIES_PAIRS by_x_[p] = unit_ ? 1 / (pairs.distance[p] + Real(SMALL)) : Real(1);
-        EDDIES_PAIRS by_v_[p] = unit_ ? 1 / (speed_of_[p] + Real(SMALL)) : Real(1);
+        window_ = weighted_ ? w : open_;
+        if (!weighted_) EDDIES_PAIRS open_[p] = Real(w[p] > 0);
+        if (unit_) EDDIES_PAIRS {
+                by_x_[p] = 1 / (pairs.distance[p] + Real(SMALL));
+                by_v_[p] = 1 / (speed_of_[p] + Real(SMALL));
+            }
         if (sign_) {
             const Real *own = pairs.scalar[0][scalar_], *other = pairs.scalar[1][scalar_];
-            EDDIES_PAIRS by_x_[p] *= Real(own[p] > other[p]) - Real(own[p] < other[p]);
+            EDDIES_PAIRS by_x_[p] = Real(own[p] > other[p]) - Real(own[p] < other[p]);
         }
     }
 

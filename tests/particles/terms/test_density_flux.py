@@ -26,6 +26,16 @@ def test_the_flux_between_two_particles():
     assert found.tolist() == pytest.approx([unit * (second - 2 * first), unit * (first - 2 * second)], rel=1e-10)
 
 
+def test_the_sign_of_the_density_difference():
+    """What the denser particle of a pair gets has the sign of the network's output, the other one the opposite."""
+    force = model(density_flux=dict(inputs=("distance",), network=f"{__name__}:Network", sign=True))
+    position = torch.tensor([[1.0, 1, 1], [1.5, 1, 1]], dtype=torch.float64)
+    density = torch.tensor([1.01, 0.98], dtype=torch.float64)
+    found = rates(force, position, torch.zeros_like(position), density).density_rate
+    unit = SCALES.density_rate / NEIGHBORS * (1 - (0.5 / CUTOFF) ** 2) ** 2 * 0.5 / SCALES.filter_width
+    assert found.tolist() == pytest.approx([unit, -unit], rel=1e-10)
+
+
 def test_the_flux_has_weights_of_its_own():
     force = model(pairs={}, density_flux={})
     networks = [force.terms[name].network for name in ("pairs", "density-flux")]
