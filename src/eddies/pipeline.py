@@ -44,7 +44,7 @@ STAGES = {stage.name: stage for stage in (
           ("device", "model", "weights", "training", "truths", "own_model"),
           ("dns", "train-kernel"), "checkpoints-train"),
     Stage("find-step", "the cheapest step of the rollout that has converged", "simulation", "step",
-          ("device", "simulation", "window", "truths", "eulerian", "own_simulation"),
+          ("device", "simulation", "confirming", "window", "truths", "eulerian", "own_simulation"),
           ("dns", "train-kernel", "train"), None),
     Stage("simulate", "the trained model, without the direct simulation", "simulation", "rollout",
           ("device", "simulation", "found_step", "window", "truths", "eulerian", "own_simulation"),

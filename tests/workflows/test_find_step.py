@@ -8,6 +8,7 @@ import pytest
 from eddies.io.hdf5 import open_product, read_attributes, read_table
 from eddies.scene.scene import SceneError
 from eddies.workflows import find_step, simulate
+from eddies.workflows.rollout.method_of_step import Step
 from tests.workflows.rollout.test_particle_run import prepared, with_method
 
 # Velocities are wrong by a constant and by what is of first order in the step.
@@ -52,6 +53,21 @@ def searched(scene, method="none"):
     return replace(scene, simulation=replace(scene.simulation, step="converged", integrator="rk2"))
 
 
+def sizes_and_errors(comm, scene, directory, turnovers, slope):
+    """Steps of the ladder, and the relative error of each that FirstOrder has, with the rms of the velocity."""
+    with open_product(comm, directory / "ground_truth.h5", "ground_truth") as file:
+        span = turnovers * read_attributes(file, "reference")["eddy_turnover_time"]
+    frames = round(span / scene.tracers.frame_interval)
+    first, last = velocities(comm, directory, scene.tracers.field_every, scene.tracers.field_every + frames)
+    rms = np.sqrt(np.mean(last**2))
+    sizes = span / 2.0 ** np.arange(20)
+    return sizes, [np.sqrt(np.mean((first + slope * size - last) ** 2)) / rms for size in sizes], rms
+
+
+def first_converged(sizes, errors, rms, slope):
+    return next(size for size, error in zip(sizes, errors[1:]) if slope * size / 2 / rms < 0.02 * error)
+
+
 def velocities(comm, directory, *frames):
     """Of all true particles at some frames, in double precision."""
     with open_product(comm, directory / "ground_truth.h5", "ground_truth") as file:
@@ -67,19 +83,51 @@ def test_the_step_is_the_longest_whose_half_changes_little_of_the_error(comm, tm
     find_step.run(scene, comm, tmp_path)
     with open_product(comm, tmp_path / "step.h5", "step") as file:
         found, trials = read_attributes(file, "found"), read_table(file, "trials/rk2")
-        turnover = found["turnovers"]
-    with open_product(comm, tmp_path / "ground_truth.h5", "ground_truth") as file:
-        span = turnover * read_attributes(file, "reference")["eddy_turnover_time"]
-    frames = round(span / scene.tracers.frame_interval)
-    first, last = velocities(comm, tmp_path, scene.tracers.field_every, scene.tracers.field_every + frames)
-    rms = np.sqrt(np.mean(last**2))
-    sizes = span / 2.0 ** np.arange(20)
-    errors = [np.sqrt(np.mean((first + 3.0 * size - last) ** 2)) / rms for size in sizes]
-    wanted = next(size for size, error in zip(sizes, errors[1:]) if 3.0 * size / 2 / rms < 0.02 * error)
+    sizes, errors, rms = sizes_and_errors(comm, scene, tmp_path, found["turnovers"], 3.0)
+    wanted = first_converged(sizes, errors, rms, 3.0)
     assert found["size"] == pytest.approx(wanted) and found["integrator"] == "rk2"
     assert trials["size"] == pytest.approx(sizes[:len(trials["size"])])
     assert trials["error"] == pytest.approx(errors[:len(trials["size"])], rel=1e-6)
     assert trials["difference"][1:] == pytest.approx(3.0 * trials["size"][1:] / rms, rel=1e-5)
+
+
+@pytest.mark.mpi(1, 2)
+def test_a_step_has_to_converge_on_the_other_ground_truths_too(comm, tmp_path, own):
+    """In a weaker flow the same error of the method is a larger share."""
+    own("of_first_order", OWN_METHOD.format(slope=3.0))
+    scene = searched(prepared(comm, tmp_path), "of_first_order:FirstOrder")
+    weaker = tmp_path / "weaker"
+    prepared(comm, weaker, overrides=["initial.amplitude=0.2"])
+    with_it = replace(scene, simulation=replace(scene.simulation, confirmed_on=(str(weaker),)))
+    assert with_it.fingerprint("find-step") != scene.fingerprint("find-step")
+    found = {}
+    for name, each in (("alone", scene), ("confirmed", with_it)):
+        find_step.run(each, comm, tmp_path)
+        with open_product(comm, tmp_path / "step.h5", "step") as file:
+            found[name] = read_attributes(file, "found")
+    span = found["alone"]["turnovers"]
+    both = [first_converged(*sizes_and_errors(comm, scene, where, span, 3.0), 3.0) for where in (tmp_path, weaker)]
+    assert found["alone"]["size"] == pytest.approx(both[0]) and found["alone"]["confirmed_on"] == 0
+    assert both[1] < both[0]
+    assert found["confirmed"]["size"] < found["alone"]["size"] and found["confirmed"]["confirmed_on"] == 1
+
+
+@pytest.mark.mpi(1)
+def test_a_ground_truth_of_other_particles_confirms_nothing(comm, tmp_path):
+    scene = searched(prepared(comm, tmp_path))
+    prepared(comm, tmp_path / "more", side=7)
+    other = replace(scene, simulation=replace(scene.simulation, confirmed_on=(str(tmp_path / "more"),)))
+    with pytest.raises(SceneError, match=r"confirmed_on: .*ground_truth.h5 holds 343 particles, not 216"):
+        find_step.run(other, comm, tmp_path)
+
+
+def test_what_an_integrator_could_still_cost():
+    """Differences of 0.16 have to fall to 0.01: four halvings at first order, two at second."""
+    before = find_step.Trial(Step("rk2", 0.2), 1.0, 0.5, np.nan)
+    trial = find_step.Trial(Step("rk2", 0.1), 2.0, 0.5, 0.159)
+    assert find_step._foreseen(before, trial, 1) == pytest.approx(2.0**4)
+    assert find_step._foreseen(before, trial, 2) == pytest.approx(2.0**2)
+    assert find_step._foreseen(None, trial, 2) == 2.0
 
 
 @pytest.mark.mpi(1, 2)

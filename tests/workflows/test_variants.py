@@ -96,6 +96,18 @@ def test_steps_of_a_scene(folder):
 
 
 @pytest.mark.mpi(1)
+def test_a_step_is_confirmed_on_all_realisations(folder):
+    """But on none of another flow than the variant's."""
+    (folder / "steps.toml").write_text('base = "base.toml"\nrealisations = [5, 6]\nsimulation.step = "converged"\n'
+                                       "[variant.own]\n[variant.other]\nflow.viscosity = 0.2\n")
+    scene = load_scene("steps.toml")
+    named = {str(step.directory): step.scene.simulation.confirmed_on for step in steps(scene, scene.stages_of_all,
+                                                                                      scene.directory)}
+    assert named["runs/steps/own"] == ("runs/steps/realisation-5", "runs/steps/realisation-6")
+    assert named["runs/steps/other"] is None and named["runs/steps/own/realisation-5"] is None
+
+
+@pytest.mark.mpi(1)
 def test_what_is_made_with_weights_of_a_file_is_not_shared(folder):
     """The file may be made anew, and be another one, before it is read: equal settings then say nothing."""
     (folder / "weights.toml").write_text('base = "base.toml"\nmodel.path = "."\n[variant.a]\n[variant.b]\n')

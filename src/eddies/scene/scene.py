@@ -110,11 +110,14 @@ class Scene(Parts):
         settings = asdict(self) | {"window": self.window, "start": _digest(self.initial.path),
                                    "weights": _digest(self.model.weights_file if self.model else None),
                                    "truths": _fingerprints(self.training.truth_files if self.training else ()),
-                                   "found_step": _digest(self.step_file)}
+                                   "found_step": _digest(self.step_file), "confirming": _fingerprints(
+                                       self.simulation.confirming_files if self.simulation else ())}
         if settings["weights"] is not None:
             del settings["model"]["path"]  # weights are known by what they are, wherever they lie
         if settings["found_step"] is not None:
             del settings["simulation"]["step_from"]
+        if self.simulation is not None:
+            del settings["simulation"]["confirmed_on"]  # known by what they are, as are weights
         settings |= {f"own_{name}": origins(self._foreign_in(name)) for name in FOREIGN_IN}
         of_these = {*STAGES[stage].depends_on, stage} & {*self.stages}
         keys = [key for each in STAGES.values() if each.name in of_these for key in each.reads]

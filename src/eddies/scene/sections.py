@@ -11,6 +11,7 @@ from pathlib import Path
 from eddies.import_path import is_path, load
 from eddies.scene.integrators import SCHEMES, Scheme
 from eddies.scene.methods import METHODS, method_of
+from eddies.scene.rules import quoted
 from eddies.scene.values import (KeyProblem, Section, boolean, choice, integer, integers, named, number,
                                  product_file, section, text, texts)
 
@@ -267,6 +268,9 @@ class Simulation(Section):
                                default=CONVERGED, words=(CONVERGED,), above=0)
     step_from: str | None = text("run directory whose converged step is used; absent: it is found for this rollout",
                                  default=None)
+    confirmed_on: tuple[str, ...] | None = texts(
+        "run directories or files of further ground truths, on each of which a step must have converged as well; "
+        "absent: the realisations of the scene", default=None)
     turnovers: float = number("large-eddy turnovers to simulate", above=0)
     start: float | None = number("as a fraction of the ground truth; absent: where the training window ends, or at the "
                                  "first field of a ground truth that is not trained on", default=None, at_least=0,
@@ -283,6 +287,9 @@ class Simulation(Section):
         if self.step_from is not None and self.step != CONVERGED:
             raise KeyProblem("simulation", "step_from", f' = "{self.step_from}": step = {self.step:g} needs no other '
                              f'run; set step = "{CONVERGED}", or remove step_from')
+        if self.confirmed_on and not self.finds_step:
+            raise KeyProblem("simulation", "confirmed_on", f" = {quoted(self.confirmed_on)}: no step is sought for this "
+                             f'rollout; set step = "{CONVERGED}" without step_from, or remove confirmed_on')
 
     @property
     def scheme(self) -> Scheme:
@@ -303,6 +310,11 @@ class Simulation(Section):
     def finds_step(self) -> bool:
         """Whether the step is to be found for this rollout."""
         return self.step == CONVERGED and self.step_from is None
+
+    @property
+    def confirming_files(self) -> tuple[Path, ...]:
+        """The files of `confirmed_on`; none without the key."""
+        return tuple(product_file(path, "ground_truth.h5") for path in self.confirmed_on or ())
 
     @property
     def needs(self) -> tuple[str, ...]:

@@ -78,7 +78,7 @@ def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[
     planned += [(None, _truth_of(scene, seed), directory / f"{REALISATION}{seed}", SHARED) for seed in seeds]
     chosen: Sequence[str | None] = [*names] or [*scene.variant] or [None]
     for name in chosen:
-        own = scene.variant[name] if name else scene.without_variants
+        own = _confirmed(scene, scene.variant[name] if name else scene.without_variants, directory)
         trained = ("train",) if not seeds or own.model is not None and own.model.path is None else ()
         planned.append((name, own, _directory_of(name, directory), (*SHARED, *trained, "find-step")))
     by_variant = [_rollouts_of(scene, name, directory) for name in chosen]
@@ -143,12 +143,22 @@ def _rollouts_of(scene: Scene, name: str | None, directory: Path) -> list[tuple[
     if model is not None and model.path is None:
         model = replace(model, path=str(where))
     found = str(where) if own.simulation.finds_step else own.simulation.step_from
-    simulation = replace(own.simulation, start=0.0, step_from=found)
+    simulation = replace(own.simulation, start=0.0, step_from=found, confirmed_on=None)
     return [(replace(own, seed=seed, model=model, training=None, simulation=simulation),
              where / f"{REALISATION}{seed}") for seed in scene.realisations]
 
 
+def _confirmed(scene: Scene, own: Scene, directory: Path) -> Scene:
+    """The scene of a variant, the step of which is to converge on all realisations of the whole scene; as it is where
+    these are of another flow."""
+    asked = scene.realisations and own.simulation.finds_step and own.simulation.confirmed_on is None
+    if not asked or own.fingerprint("dns") != scene.without_variants.fingerprint("dns"):
+        return own
+    named = tuple(str(directory / f"{REALISATION}{seed}") for seed in scene.realisations)
+    return replace(own, simulation=replace(own.simulation, confirmed_on=named))
+
+
 def _truth_of(scene: Scene, seed: int) -> Scene:
     """The scene of a further ground truth: with a rollout that needs no model, from its beginning."""
-    simulation = scene.simulation and replace(scene.simulation, method="none", start=0.0)
+    simulation = scene.simulation and replace(scene.simulation, method="none", start=0.0, confirmed_on=None)
     return replace(scene.without_variants, seed=seed, model=None, training=None, eulerian=None, simulation=simulation)
