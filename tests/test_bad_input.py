@@ -13,10 +13,11 @@ from pathlib import Path
 import pytest
 
 from tests.changed_product import changed
+from tests.small_scene import TINY
 from tests.test_cli import LAUNCHER, run_cli
 from tests.workflows.synthetic_run import write_ground_truth, write_kernel
 
-TINY = (Path(__file__).parents[1] / "src/eddies/scenes/tiny.toml").read_text()
+TEXT = (Path(__file__).parents[1] / "src/eddies/scenes/tiny.toml").read_text()
 NOBODY = 65534
 
 
@@ -48,7 +49,7 @@ def test_provenance_that_is_none(comm, tmp_path, capfd, value):
     comm.Barrier()
     told = (f"{tmp_path / 'ground_truth.h5'}: its attribute provenance is not what was written, the file is damaged; "
             "delete it and make it again\n")
-    for command in (["report", tmp_path], ["export", tmp_path], ["simulate", "tiny", "--output", tmp_path]):
+    for command in (["report", tmp_path], ["export", tmp_path], ["simulate", TINY, "--output", tmp_path]):
         assert refused(capfd, comm, *command).endswith(told) or comm.rank > 0
 
 
@@ -88,7 +89,7 @@ def test_a_directory_in_place_of_a_product(comm, tmp_path, capfd, name, stage):
         (tmp_path / name).mkdir()
     comm.Barrier()
     for command in ("run", stage):
-        told = refused(capfd, comm, command, "tiny", "--output", tmp_path)
+        told = refused(capfd, comm, command, TINY, "--output", tmp_path)
         assert comm.rank > 0 or f"{tmp_path / name}: is a directory, and `eddies {stage}` writes a file" in told
     told = refused(capfd, comm, "report", tmp_path)
     again = f"{tmp_path / name}: is a directory, not a file; move it away, then run `eddies {stage} SCENE` first"
@@ -102,7 +103,7 @@ def test_a_file_in_place_of_a_directory(comm, tmp_path, capfd, name, stage):
     if comm.rank == 0:
         (tmp_path / name).write_text("")
     comm.Barrier()
-    told = refused(capfd, comm, "run", "tiny", "--output", tmp_path)
+    told = refused(capfd, comm, "run", TINY, "--output", tmp_path)
     assert comm.rank > 0 or f"{tmp_path / name}: is a file, and `eddies {stage}` makes a directory of this name" in told
     if stage == "report":
         told = refused(capfd, comm, "report", tmp_path)
@@ -126,9 +127,9 @@ LONG = 300 * "o"
 
 @pytest.mark.mpi(1, 2)
 @pytest.mark.parametrize("command, told", [
-    (["run", "tiny", "--output", ""], "an empty text is no directory"),
+    (["run", TINY, "--output", ""], "an empty text is no directory"),
     (["report", ""], "an empty text is no directory"),
-    (["dns", "tiny", "--output", LONG], "cannot be used as a directory: File name too long; choose another"),
+    (["dns", TINY, "--output", LONG], "cannot be used as a directory: File name too long; choose another"),
     (["export", "", "--output", "x"], "an empty text is no directory"),
     (["export", "runs", "--output", LONG], "cannot be used as a directory: File name too long"),
     (["run", "compare-small", "--output", LONG], "cannot be used as a directory: File name too long"),
@@ -164,8 +165,8 @@ def test_files_that_are_no_scenes(comm, tmp_path, capfd, content, told):
 
 def test_a_mark_of_the_encoding_is_no_part_of_a_scene(tmp_path):
     from eddies.scene.scene import load_scene
-    (tmp_path / "tiny.toml").write_text("\ufeff" + TINY, encoding="utf-8")
-    assert load_scene(tmp_path / "tiny.toml") == load_scene("tiny")
+    (tmp_path / "tiny.toml").write_text("\ufeff" + TEXT, encoding="utf-8")
+    assert load_scene(tmp_path / "tiny.toml") == load_scene(TINY)
 
 
 @pytest.mark.parametrize("key", ["tracers.filter_width", "tracers.field_cells", "time.step", "model.path",
@@ -173,7 +174,7 @@ def test_a_mark_of_the_encoding_is_no_part_of_a_scene(tmp_path):
 def test_none_is_a_key_that_is_left_out(key):
     """As the reference of the keys in the docs calls it."""
     from eddies.scene.scene import load_scene
-    assert load_scene("tiny", [f"{key}=none"]) == load_scene("tiny")
+    assert load_scene(TINY, [f"{key}=none"]) == load_scene(TINY)
 
 
 def test_the_filter_of_few_particles_is_read_back(tmp_path):
@@ -221,7 +222,7 @@ def test_files_that_may_not_be_read_or_written(open_to_all):
     from eddies.scene.scene import load_scene
     assert program("dns", "abc", "--set", "time.duration=0.1", "--output", open_to_all).returncode == 0
     (open_to_all / "abc.toml").write_text(load_scene("abc").to_toml())  # in place of the built-in one
-    (open_to_all / "case.toml").write_text(TINY)
+    (open_to_all / "case.toml").write_text(TEXT)
     for name in ("ground_truth.h5", "case.toml"):
         (open_to_all / name).chmod(0o600)
     folder = str(open_to_all)
@@ -256,7 +257,7 @@ def test_a_run_goes_on_where_its_lines_cannot_be_written(tmp_path):
 
 @pytest.mark.parametrize("encoding", ["ascii", "latin-1"])
 def test_an_encoding_without_the_letters(encoding, tmp_path):
-    (tmp_path / "case.toml").write_text(TINY.replace('title = "', 'title = "λ ≤ η '), encoding="utf-8")
+    (tmp_path / "case.toml").write_text(TEXT.replace('title = "', 'title = "λ ≤ η '), encoding="utf-8")
     environment = {**os.environ, "PYTHONIOENCODING": encoding}
     ended = program("scenes", tmp_path / "case.toml", stdout=subprocess.PIPE, env=environment)
     assert (ended.returncode, ended.stderr) == (0, "") and 'title = "\\u03bb \\u2264 \\u03b7 ' in ended.stdout
@@ -349,13 +350,13 @@ def test_an_interrupted_job_of_two_ranks_ends(tmp_path):
 @pytest.mark.mpi(1)
 def test_a_flow_that_overflows_is_told_without_the_warnings_of_numpy(comm, tmp_path, capfd):
     assert "the flow is not finite. Correct what it starts from: amplitude or path" in refused(
-        capfd, comm, "dns", "tiny", "--set", "initial.amplitude=1e6", "--set", "forcing.injection_rate=0",
+        capfd, comm, "dns", TINY, "--set", "initial.amplitude=1e6", "--set", "forcing.injection_rate=0",
         "--set", "spin_up.turnovers=1e-4", "--output", tmp_path)
 
 
 @pytest.mark.mpi(1)
 def test_a_supersonic_flow_is_told_as_such(comm, tmp_path, capfd):
-    told = refused(capfd, comm, "dns", "tiny", "--set", "flow.sound_speed=0.5", "--output", tmp_path)
+    told = refused(capfd, comm, "dns", TINY, "--set", "flow.sound_speed=0.5", "--output", tmp_path)
     assert "The flow is supersonic, its turbulent Mach number was 4.3, and shocks are not resolved: raise" in told
     assert not list(tmp_path.rglob("*.partial"))
 

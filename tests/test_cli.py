@@ -14,6 +14,7 @@ import pytest
 
 from mpi_tools.launch import mpi_environment, mpirun_command
 from tests.bad_scenes import BAD_OVERRIDES, BAD_TEXTS
+from tests.small_scene import TINY
 
 ABC = ["abc", "--set", "time.duration=0.1"]
 FAILING = Path(__file__).with_name("failing_stage.py")
@@ -42,7 +43,7 @@ def told_once(comm, capfd, message):
 @pytest.mark.mpi(1, 2)
 @pytest.mark.parametrize("override, message", BAD_OVERRIDES, ids=[override[:50] for override, _ in BAD_OVERRIDES])
 def test_bad_override_ends_with_2_and_writes_nothing(comm, tmp_path, capfd, override, message):
-    assert run_cli("run", "tiny", "--set", override, "--output", tmp_path / "run") == 2
+    assert run_cli("run", TINY, "--set", override, "--output", tmp_path / "run") == 2
     output, errors = capfd.readouterr()
     assert not (tmp_path / "run").exists()
     if comm.rank > 0:
@@ -61,7 +62,7 @@ def test_a_machine_without_mpi_is_told_what_to_install():
 
 @pytest.mark.mpi(3)
 def test_a_skin_that_reaches_beyond_the_slabs_is_refused(comm, tmp_path, capfd):
-    assert run_cli("simulate", "tiny", "--set", "simulation.skin=1", "--output", tmp_path / "run") == 2
+    assert run_cli("simulate", TINY, "--set", "simulation.skin=1", "--output", tmp_path / "run") == 2
     assert comm.rank > 0 or "slabs no thinner than the particles' reach" in capfd.readouterr().err
     assert not (tmp_path / "run").exists()
 
@@ -78,7 +79,7 @@ def test_bad_scene_file_ends_with_2(comm, tmp_path, capfd, text, message):
 @pytest.mark.mpi(1, 2)
 @pytest.mark.parametrize("stage", ["train-kernel", "train", "simulate"])
 def test_stage_without_its_input_writes_nothing(comm, tmp_path, capfd, stage):
-    assert run_cli(stage, "tiny", "--output", tmp_path / "run") == 2
+    assert run_cli(stage, TINY, "--output", tmp_path / "run") == 2
     assert not (tmp_path / "run").exists()
     if comm.rank == 0:
         assert "ground_truth.h5: no such file; run `eddies dns SCENE` first" in capfd.readouterr().err
@@ -90,9 +91,9 @@ def test_input_of_another_version_is_one_line(comm, tmp_path, capfd):
     from eddies.scene.scene import load_scene
 
     with create_product(comm, tmp_path / "ground_truth.h5", "ground_truth",
-                        {"fingerprint": load_scene("tiny").fingerprint("dns"), "eddies": "0.1.0"}) as file:
+                        {"fingerprint": load_scene(TINY).fingerprint("dns"), "eddies": "0.1.0"}) as file:
         del file.attrs["format"]
-    assert run_cli("train-kernel", "tiny", "--output", tmp_path) == 2
+    assert run_cli("train-kernel", TINY, "--output", tmp_path) == 2
     if comm.rank == 0:
         assert capfd.readouterr().err == (
             f"eddies: error: {tmp_path / 'ground_truth.h5'}: written by eddies 0.1.0, whose ground truth this version "
@@ -115,7 +116,7 @@ def test_directory_that_cannot_be_made(comm, tmp_path, capfd):
 
 
 @pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("arguments", [[], ["fly"], ["run"], ["run", "tiny", "--colour"]])
+@pytest.mark.parametrize("arguments", [[], ["fly"], ["run"], ["run", TINY, "--colour"]])
 def test_wrong_usage_is_said_once(comm, capfd, arguments):
     with pytest.raises(SystemExit) as ended:
         run_cli(*arguments)
@@ -185,11 +186,11 @@ def test_input_of_other_settings_is_refused(comm, tmp_path, capfd):
     from eddies.io.hdf5 import create_product
     from eddies.scene.scene import load_scene
     from eddies.stages import Step, check_inputs
-    scene = load_scene("tiny")
+    scene = load_scene(TINY)
     with create_product(comm, tmp_path / "ground_truth.h5", "ground_truth", {"fingerprint": scene.fingerprint("dns")}):
         pass
     check_inputs(Step(scene, ("train-kernel",), tmp_path), comm)
-    assert run_cli("train-kernel", "tiny", "--set", "seed=2", "--output", tmp_path) == 2
+    assert run_cli("train-kernel", TINY, "--set", "seed=2", "--output", tmp_path) == 2
     errors = capfd.readouterr().err
     assert comm.rank > 0 or "ground_truth.h5: was made with other settings" in errors
     assert comm.rank > 0 or "run `eddies dns --overwrite` with these" in errors
@@ -199,7 +200,7 @@ def test_input_of_other_settings_is_refused(comm, tmp_path, capfd):
 @pytest.mark.mpi(2)
 def test_more_ranks_than_slabs_are_refused_before_any_work(comm, tmp_path, capfd):
     coarse = ["--set", "tracers.field_cells=6", "--output", tmp_path / "run"]
-    assert run_cli("run", "tiny", *coarse) == 2
+    assert run_cli("run", TINY, *coarse) == 2
     told = "tiny: 2 ranks are more than the 1 that it can use (ghost planes of the filtered fields)"
     assert comm.rank > 0 or told in capfd.readouterr().err
     assert not (tmp_path / "run").exists()
@@ -211,10 +212,10 @@ def test_limit_of_ranks_is_that_of_the_stages(comm):
 
     from eddies.scene.scene import SceneError, load_scene
     from eddies.stages import check_ranks
-    check_ranks(["dns"], load_scene("tiny"), SimpleNamespace(size=8))
+    check_ranks(["dns"], load_scene(TINY), SimpleNamespace(size=8))
     check_ranks(load_scene("hit-small").stages, load_scene("hit-small"), SimpleNamespace(size=8))
     with pytest.raises(SceneError, match="start at most 4"):
-        check_ranks(load_scene("tiny").stages, load_scene("tiny"), SimpleNamespace(size=5))
+        check_ranks(load_scene(TINY).stages, load_scene(TINY), SimpleNamespace(size=5))
 
 
 @pytest.mark.mpi(1)
@@ -267,7 +268,7 @@ def test_unknown_log_level_is_bad_input(comm, capfd, monkeypatch):
 
 
 def test_exit_code_of_the_program():
-    code, _, errors = start(2, "-m", "eddies", "check", "tiny", "--set", "flow.cels=3")
+    code, _, errors = start(2, "-m", "eddies", "check", TINY, "--set", "flow.cels=3")
     assert code == 2
     assert errors.count("did you mean cells?") == 1 and "Traceback" not in errors
 
@@ -291,7 +292,7 @@ def test_what_ends_one_rank_ends_the_job(tmp_path, kind, code, told):
 
 
 @pytest.mark.mpi(2, 3, timeout=30)
-@pytest.mark.parametrize("other", [["check", "tiny"], ["dns", "abc", "--set", "seed=2"], ["dns"],
+@pytest.mark.parametrize("other", [["check", TINY], ["dns", "abc", "--set", "seed=2"], ["dns"],
                                    ["dns", "abc", "--output", "b"], ["--version"]])
 def test_ranks_of_different_commands_are_refused(comm, tmp_path, monkeypatch, capfd, other):
     monkeypatch.chdir(tmp_path)

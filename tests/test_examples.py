@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import eddies
+from tests.small_scene import TINY
 
 CHECKOUT = Path(__file__).parents[1]
 EXAMPLES = CHECKOUT / "docs" / "examples"
@@ -35,7 +36,8 @@ def results(directory):
 def smaller(tmp_path, monkeypatch, no_figures, quick_solves):
     """A folder to work in, where scenes are smaller."""
     load = eddies.load_scene
-    monkeypatch.setattr(eddies, "load_scene", lambda name, overrides: load(name, [*overrides, *SMALL]))
+    monkeypatch.setattr(eddies, "load_scene", lambda name, overrides, removals=(): load(
+        name, [*overrides, *SMALL], removals))
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -157,6 +159,6 @@ def test_a_wrong_initial_flow_has_one_error(comm, tmp_path, own):
     if comm.rank == 0:
         own("wrong", "import numpy\n\ndef flow(grid, initial, seed):\n    return numpy.zeros((3, 4, 4, 4))\n")
     comm.Barrier()
-    scene = eddies.load_scene("tiny", [*SMALL, "initial.kind=wrong:flow", "initial.peak_wavenumber=3"])
+    scene = eddies.load_scene(TINY, [*SMALL, "initial.kind=wrong:flow", "initial.peak_wavenumber=3"])
     with pytest.raises(eddies.SceneError, match=r'\[initial\] kind = "wrong:flow": returned .*must be the modes'):
         eddies.run(scene, output=tmp_path / "run", comm=comm)

@@ -30,4 +30,4 @@ def kida(grid, initial, seed: int) -> np.ndarray:
 
 if __name__ == "__main__":
     eddies.run(eddies.load_scene("tiny", ['name="own-initial-flow"', "initial.kind=own_initial_flow:kida",
-                                          "forcing.injection_rate=0.0"]))
+                                          "forcing.injection_rate=0.0"], removals=["variant"]))

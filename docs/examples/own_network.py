@@ -35,4 +35,5 @@ class Waves(torch.nn.Module):
 
 
 if __name__ == "__main__":
-    eddies.run(eddies.load_scene("tiny", ['name="own-network"', "model.pairs.network=own_network:Waves"]))
+    eddies.run(eddies.load_scene("tiny", ['name="own-network"', "model.pairs.network=own_network:Waves"],
+                                 removals=["variant"]))

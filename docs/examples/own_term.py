@@ -52,4 +52,4 @@ class SmagorinskyStress(eddies.Term):
 
 if __name__ == "__main__":
     terms = '["pressure", "own_term:SmagorinskyStress", "viscosity", "relaxation", "pairs"]'
-    eddies.run(eddies.load_scene("tiny", ['name="own-term"', f"model.terms={terms}"]))
+    eddies.run(eddies.load_scene("tiny", ['name="own-term"', f"model.terms={terms}"], removals=["variant"]))

@@ -14,6 +14,7 @@ from eddies.stages import run_stages
 from eddies.workflows import dns
 from eddies.workflows.foreseen.problems import refusals
 from tests.io.test_unfinished import largest_file, write
+from tests.small_scene import TINY
 from tests.workflows.stopping import StopAtStep
 from tests.workflows.test_dns_restart import SPLIT, product
 
@@ -91,7 +92,7 @@ def test_an_error_that_the_other_ranks_may_not_know_of_leaves_no_file_open(comm,
 
 @pytest.mark.mpi(2)
 def test_a_stopped_simulation_goes_on_as_with_parallel_files(comm, tmp_path, serial):
-    scene = load_scene("tiny", SPLIT)
+    scene = load_scene(TINY, SPLIT)
     for name in ("parallel", "serial"):
         if comm.rank == 0:
             (tmp_path / name).mkdir()
@@ -112,7 +113,7 @@ def test_what_is_too_large_for_one_rank_is_refused_before_any_work(comm, tmp_pat
     serial()
     line, *_ = refusals(scene, comm)
     assert line.startswith("ground_truth.h5: this h5py is built without MPI") and "up to 4 GB" in line
-    assert refusals(load_scene("tiny"), comm) == []
+    assert refusals(load_scene(TINY), comm) == []
     with pytest.raises(UserError, match="hit-paper: ground_truth.h5: .* HDF5_MPI=ON"):
         run_stages(["dns"], scene, comm, tmp_path / "run", StopRequest(comm))
     assert not (tmp_path / "run").exists()

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from mpi_tools import launch
+from tests.small_scene import TINY
 
 CHECKOUT = Path(__file__).parents[2]
 
@@ -84,7 +85,7 @@ def test_a_line_that_is_not_ended_is_passed_on_at_once():
 
 
 def test_a_refusal_stands_alone():
-    ended = launched(2, "-m", "eddies", "check", "tiny", "--set", "flow.cels=3")
+    ended = launched(2, "-m", "eddies", "check", TINY, "--set", "flow.cels=3")
     assert ended.returncode == 2 and ended.stderr.count("\n") == 1 and "did you mean cells?" in ended.stderr
     silent = launched(2, "-c", "raise SystemExit(2)")
     assert silent.returncode == 2 and "non-zero" in silent.stderr

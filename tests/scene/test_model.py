@@ -10,6 +10,7 @@ from eddies.pipeline import STAGES as TABLE
 from eddies.scene.model import settings_class
 from eddies.scene.scene import Flow, Initial, Model, Scene, SceneError, Simulation, Time, load_scene
 from eddies.scene.terms import DEFAULT_PRESET, PRESETS, TERMS, Continuity, PairNetwork, Pressure, Stress
+from tests.small_scene import TINY
 
 STAGES = tuple(TABLE)
 LEARNING = """
@@ -129,7 +130,7 @@ def test_bad_model(changes, message):
     (lambda: Model(terms=("pairs",), settings={"pairs": {"hidden": 3}}), "[model.pairs] hidden = 3: must be a list"),
     (lambda: Scene(flow=3, time=Time(duration=1)), "flow = 3: must be a Flow"),
     (lambda: Scene(seed=-1, flow=Flow(fluid="incompressible", cells=8, viscosity=1)), "seed = -1: must be a whole"),
-    (lambda: replace(load_scene("tiny").flow, viscosity="thin"), '[flow] viscosity = "thin": must be a number'),
+    (lambda: replace(load_scene(TINY).flow, viscosity="thin"), '[flow] viscosity = "thin": must be a number'),
 ])
 def test_what_a_program_makes_is_checked_as_what_a_file_holds(make, message):
     refused(message, make)
@@ -205,7 +206,7 @@ class Run:
     def advance(self, until, number): pass
     frame = status = series = description = has_density = advance
 """)
-    text = load_scene("tiny").to_toml().partition("[model]")
+    text = load_scene(TINY).to_toml().partition("[model]")
     bare = text[0] + "[model]\n[training]" + text[2].partition("[training]")[2]
     scene = read(tmp_path, bare, *overrides)
     before = [scene.fingerprint(stage) for stage in STAGES]
@@ -217,7 +218,7 @@ class Run:
 
 
 def test_provenance_names_no_classes_where_there_are_none():
-    scene = load_scene("tiny")
+    scene = load_scene(TINY)
     assert scene.provenance("train") == {"scene": scene.to_toml(), "fingerprint": scene.fingerprint("train"),
                                          "made_from": ["ground_truth", "kernel"]}
 
@@ -258,7 +259,7 @@ def test_a_density_is_given_once(tmp_path):
      "it has no forward"),
 ])
 def test_a_wrong_class_is_told_before_any_work(key, path, message):
-    refused(message, lambda: load_scene("tiny", [f"{key}={path}"]))
+    refused(message, lambda: load_scene(TINY, [f"{key}={path}"]))
 
 
 def test_keys_of_an_own_initial_flow():
@@ -282,8 +283,9 @@ def test_a_scene_with_a_model_loads_no_torch():
 
 def test_another_list_on_the_command_line_takes_the_place_of_the_file_s(tmp_path):
     """Of a preset, of terms, and of a written scene, which has settings of all its terms."""
-    written = load_scene("hit-small", ["model.preset=resolved + pairs", "model.pairs.hidden=[8, 8]"]).to_toml()
-    assert load_scene("hit-small", ['model.terms=["pressure", "pairs"]']).model.terms == ("pressure", "pairs")
+    written = load_scene("hit-small", ["model.preset=resolved + pairs", "model.pairs.hidden=[8, 8]"],
+                         ["variant"]).to_toml()
+    assert load_scene("hit-small", ['model.terms=["pressure", "pairs"]'], ["variant"]).model.terms == ("pressure", "pairs")
     found = read(tmp_path, written, "model.preset=resolved").model
     assert found.terms == tuple(PRESETS["resolved"]) == tuple(found.settings)
     kept = read(tmp_path, written, 'model.terms=["pressure", "pairs"]').model

@@ -10,6 +10,7 @@ from eddies.scene.scene import Eulerian, Flow, Horizons, Scene, SceneError, Time
 from eddies.scene.sections import CLOSURES
 from eddies.scene.values import rule_of
 from tests.bad_scenes import BAD_OVERRIDES, BAD_TEXTS
+from tests.small_scene import TINY
 
 STAGES = tuple(TABLE)
 
@@ -30,7 +31,7 @@ def test_written_scene_reads_back_equal(name, tmp_path):
 
 
 def test_all_values_survive_writing(tmp_path):
-    scene = load_scene("tiny", ['title="a \\"quoted\\" # title"', "tracers.filter_width=0.1234567890123456",
+    scene = load_scene(TINY, ['title="a \\"quoted\\" # title"', "tracers.filter_width=0.1234567890123456",
                                 "simulation.injection=1e-7", "model.pairs.hidden=[1, 2, 3]", "simulation.start=0"])
     assert load_scene(scene_file(tmp_path, scene.to_toml())) == scene
     assert scene.simulation.start == 0.0
@@ -59,29 +60,29 @@ def test_override(override, read, tmp_path):
 
 
 def test_all_stages_of_a_whole_scene():
-    assert load_scene("tiny").stages == tuple(stage for stage in STAGES if stage != "find-step")
-    assert load_scene("tiny", ["simulation.step=converged"]).stages == STAGES
-    assert "find-step" not in load_scene("tiny", ["simulation.step=converged", "simulation.step_from=runs/a"]).stages
+    assert load_scene(TINY).stages == tuple(stage for stage in STAGES if stage != "find-step")
+    assert load_scene(TINY, ["simulation.step=converged"]).stages == STAGES
+    assert "find-step" not in load_scene(TINY, ["simulation.step=converged", "simulation.step_from=runs/a"]).stages
 
 
 def test_without_a_learned_force_nothing_is_trained():
-    scene = load_scene("tiny", ["simulation.method=none"])
+    scene = load_scene(TINY, ["simulation.method=none"])
     assert scene.stages == ("dns", "train-kernel", "simulate", "report")
-    other = load_scene("tiny", ["simulation.method=none", "model.pairs.hidden=[4]", "training.steps=50"])
+    other = load_scene(TINY, ["simulation.method=none", "model.pairs.hidden=[4]", "training.steps=50"])
     assert other.fingerprint("simulate") == scene.fingerprint("simulate")
     bare = dataclasses.replace(scene, model=None, training=None)
     assert bare.stages == scene.stages
 
 
 def test_the_form_of_a_baseline_counts_for_its_rollout_alone():
-    scene, changed = (load_scene("tiny", ["simulation.method=eulerian", f"eulerian.closure={closure}"])
+    scene, changed = (load_scene(TINY, ["simulation.method=eulerian", f"eulerian.closure={closure}"])
                       for closure in ("none", "spectral"))
     affected = [stage for stage in STAGES if scene.fingerprint(stage) != changed.fingerprint(stage)]
     assert affected == ["simulate", "report"]
 
 
 def test_where_a_rollout_starts_counts_for_it_without_a_model_too():
-    plain, others = (load_scene("tiny", ["simulation.method=none", *more])
+    plain, others = (load_scene(TINY, ["simulation.method=none", *more])
                      for more in ([], ['training.truths=["runs/second", "runs/third"]']))
     assert plain.seen_in(plain.directory) > 0 == others.seen_in(others.directory)
     assert plain.fingerprint("simulate") != others.fingerprint("simulate")
@@ -94,40 +95,40 @@ def test_coarse_grid_of_the_filter():
     assert Eulerian().cells_for(widths["tiny"]) == 8
     assert Eulerian(cells=24).cells_for(widths["hit"]) == 24
     with pytest.raises(SceneError, match=r"\[eulerian\] cells = 50: must be at most the 24 of the flow that it"):
-        load_scene("tiny", ["simulation.method=eulerian", "eulerian.cells=50"])
+        load_scene(TINY, ["simulation.method=eulerian", "eulerian.cells=50"])
 
 
 def test_a_coarse_grid_that_takes_what_is_learned_needs_the_training():
     learned = ["simulation.method=eulerian", "eulerian.closure=learned"]
-    assert "train" in load_scene("tiny", learned).stages
-    assert "train" not in load_scene("tiny", learned[:1]).stages
+    assert "train" in load_scene(TINY, learned).stages
+    assert "train" not in load_scene(TINY, learned[:1]).stages
     with pytest.raises(SceneError, match='closure = "learned": takes the rates of the term "damping", which'):
-        load_scene("tiny", [*learned, 'model.terms=["pressure", "stress"]'])
+        load_scene(TINY, [*learned, 'model.terms=["pressure", "stress"]'])
 
 
 def test_rates_of_the_horizons_fall():
     with pytest.raises(SceneError, match=r"\[training\] final_learning_rate = 0.0001: must be at most "
                                          r"\[training.horizons\] learning_rate = 1e-05"):
-        load_scene("tiny", ["training.horizons.learning_rate=1e-5", "training.horizons.steps=1"])
+        load_scene(TINY, ["training.horizons.learning_rate=1e-5", "training.horizons.steps=1"])
 
 
 def test_the_radius_of_interaction_is_the_models_own():
-    tiny = load_scene("tiny")
+    tiny = load_scene(TINY)
     assert tiny.neighbors == tiny.kernel.neighbors == 56 and tiny.interaction_radius == tiny.kernel_support
-    own = load_scene("tiny", ["model.neighbors=28"])
+    own = load_scene(TINY, ["model.neighbors=28"])
     assert own.interaction_radius == pytest.approx(own.kernel_support / 2 ** (1 / 3), rel=1e-12)
     alone = dataclasses.replace(load_scene("tracers-only"), kernel=None)
     assert alone.neighbors == 60 and alone.kernel_support is None and "train-kernel" not in alone.stages
     with pytest.raises(SceneError, match=r"\[model\] neighbors = 50: none of the terms .*reads pairs"):
-        load_scene("tiny", ["model.preset=resolved", "model.neighbors=50"])
+        load_scene(TINY, ["model.preset=resolved", "model.neighbors=50"])
     with pytest.raises(SceneError, match=r"\[training\] field_weight = 0.1: this loss is .*; add \[kernel\], or"):
-        dataclasses.replace(load_scene("tiny", ["training.field_weight=0.1", "training.combined_steps=2"]), kernel=None)
+        dataclasses.replace(load_scene(TINY, ["training.field_weight=0.1", "training.combined_steps=2"]), kernel=None)
 
 
 def test_a_section_within_a_section_is_read_and_written():
-    scene = load_scene("tiny", ["training.horizons.steps=3", "training.horizons.frames=[2]"])
+    scene = load_scene(TINY, ["training.horizons.steps=3", "training.horizons.frames=[2]"])
     assert scene.training.horizons == Horizons(steps=3, frames=(2,)) and "[training.horizons]" in scene.to_toml()
-    assert load_scene("tiny").training.horizons is None and "horizons" not in load_scene("tiny").to_toml()
+    assert load_scene(TINY).training.horizons is None and "horizons" not in load_scene(TINY).to_toml()
     with pytest.raises(SceneError, match=r"\[training.horizons\] steps = 0: must be a whole number at least 1"):
         Horizons(steps=0)
 
@@ -136,7 +137,7 @@ def test_derived_lengths():
     tracers = load_scene("hit-small").tracers
     assert tracers.filter_width == 2 * tracers.spacing == pytest.approx(0.3926990817)
     assert (tracers.particles, tracers.cells) == (32768, 48)
-    assert load_scene("tiny").tracers.cells == 18
+    assert load_scene(TINY).tracers.cells == 18
     assert load_scene("hit-small").kernel_support / tracers.spacing == pytest.approx(2.4287, rel=1e-4)
 
 
@@ -147,13 +148,13 @@ FINGERPRINTS = {"flow.viscosity=0.061": "dns", "seed=2": "dns", "kernel.steps=99
 
 @pytest.mark.parametrize("override, first_changed", FINGERPRINTS.items())
 def test_fingerprint_changes_from_the_stage_that_reads_the_key(override, first_changed):
-    scene, changed = load_scene("tiny"), load_scene("tiny", [override])
+    scene, changed = load_scene(TINY), load_scene(TINY, [override])
     affected = [stage for stage in STAGES if scene.fingerprint(stage) != changed.fingerprint(stage)]
     assert affected == list(STAGES[STAGES.index(first_changed):])
 
 
 def test_fingerprint_ignores_names():
-    scene, renamed = load_scene("tiny"), load_scene("tiny", ["name=x", "title=y"])
+    scene, renamed = load_scene(TINY), load_scene(TINY, ["name=x", "title=y"])
     assert scene.fingerprint("report") == renamed.fingerprint("report")
 
 
@@ -168,25 +169,25 @@ def test_fingerprint_changes_with_the_file_that_the_flow_starts_from(tmp_path):
 
 
 def test_fingerprint_of_training_changes_with_the_weights_that_it_starts_from(tmp_path):
-    scene = load_scene("tiny", [f"model.path={tmp_path}"])
+    scene = load_scene(TINY, [f"model.path={tmp_path}"])
     prints = [scene.fingerprint("train")]
     for content in ("some weights", "others"):
         (tmp_path / "model.h5").write_text(content)
         prints.append(scene.fingerprint("train"))
     assert len(set(prints)) == 3
-    assert scene.fingerprint("train-kernel") == load_scene("tiny").fingerprint("train-kernel")
+    assert scene.fingerprint("train-kernel") == load_scene(TINY).fingerprint("train-kernel")
     moved = tmp_path / "moved.h5"
     (tmp_path / "model.h5").rename(moved)
-    assert load_scene("tiny", [f"model.path={moved}"]).fingerprint("train") == prints[-1]
+    assert load_scene(TINY, [f"model.path={moved}"]).fingerprint("train") == prints[-1]
 
 
 def test_trained_weights_need_no_training_and_have_seen_nothing():
-    scene = load_scene("tiny", ["model.path=runs/other"])
+    scene = load_scene(TINY, ["model.path=runs/other"])
     alone = dataclasses.replace(scene, training=None)
     assert (scene.seen_in(scene.directory), alone.seen_in(alone.directory), alone.window) == (0.5, 0.0, 0.5)
     assert alone.stages == scene.stages
     assert str(alone.model.weights_file) == "runs/other/model.h5"
-    assert str(load_scene("tiny", ["model.path=a/b.h5"]).model.weights_file) == "a/b.h5"
+    assert str(load_scene(TINY, ["model.path=a/b.h5"]).model.weights_file) == "a/b.h5"
 
 
 def test_of_a_ground_truth_that_is_not_trained_on_nothing_is_seen(tmp_path):
@@ -194,41 +195,41 @@ def test_of_a_ground_truth_that_is_not_trained_on_nothing_is_seen(tmp_path):
     for directory in (own, other, linked):
         directory.mkdir()
     (linked / "ground_truth.h5").symlink_to(own / "ground_truth.h5")  # as variants of a comparison have it
-    alone, both, others = (load_scene("tiny", [f"training.truths={[str(path) for path in paths]}"])
+    alone, both, others = (load_scene(TINY, [f"training.truths={[str(path) for path in paths]}"])
                            for paths in ([own / "ground_truth.h5"], [other, own], [other]))
-    assert [scene.seen_in(own) for scene in (load_scene("tiny"), alone, both, others)] == [0.5, 0.5, 0.5, 0.0]
+    assert [scene.seen_in(own) for scene in (load_scene(TINY), alone, both, others)] == [0.5, 0.5, 0.5, 0.0]
     assert [scene.seen_in(linked) for scene in (alone, others)] == [0.5, 0.0]
     # Then a rollout may start even though the window is the whole of what is trained on.
-    assert load_scene("tiny", [f'training.truths=["{other}"]', "training.window=1"]).seen_in(own) == 0
+    assert load_scene(TINY, [f'training.truths=["{other}"]', "training.window=1"]).seen_in(own) == 0
 
 
 @pytest.mark.mpi(1)
 def test_fingerprint_of_training_is_that_of_the_ground_truths_too(comm, tmp_path):
-    scene = load_scene("tiny", [f'training.truths=["{tmp_path}"]'])
+    scene = load_scene(TINY, [f'training.truths=["{tmp_path}"]'])
     prints = [scene.fingerprint("train")]
     for seed in (2, 3):
-        other = load_scene("tiny", [f"seed={seed}"])
+        other = load_scene(TINY, [f"seed={seed}"])
         with create_product(comm, tmp_path / "ground_truth.h5", "ground_truth", other.provenance("dns")):
             pass
         prints.append(scene.fingerprint("train"))
     assert len(set(prints)) == 3
-    assert scene.fingerprint("train-kernel") == load_scene("tiny").fingerprint("train-kernel")
+    assert scene.fingerprint("train-kernel") == load_scene(TINY).fingerprint("train-kernel")
 
 
 def test_the_forcing_that_stays_on_needs_one_and_no_other(tmp_path):
-    scene = load_scene("tiny", ["tracers.forced=true"])
-    assert scene.injects and not load_scene("tiny").injects
-    assert not load_scene("tiny", ["tracers.forced=true", "simulation.injection=none"]).injects
+    scene = load_scene(TINY, ["tracers.forced=true"])
+    assert scene.injects and not load_scene(TINY).injects
+    assert not load_scene(TINY, ["tracers.forced=true", "simulation.injection=none"]).injects
     dataclasses.replace(scene, spin_up=None)  # the forcing acts while tracers are followed
     with pytest.raises(SceneError, match=r"\[tracers\] forced = true: there is no \[forcing\] that could stay on"):
         dataclasses.replace(scene, forcing=None)
 
 
 def test_window_without_training_is_the_default_of_training():
-    scene = load_scene("tiny")
+    scene = load_scene(TINY)
     alone = dataclasses.replace(scene, model=None, training=None, simulation=None)
     assert alone.window == scene.window == 0.5
-    assert load_scene("tiny", ["training.window=0.4"]).window == 0.4
+    assert load_scene(TINY, ["training.window=0.4"]).window == 0.4
     assert alone.fingerprint("train-kernel") == scene.fingerprint("train-kernel")
 
 
@@ -244,20 +245,20 @@ def test_bad_text(text, message, tmp_path):
 @pytest.mark.parametrize("override, message", BAD_OVERRIDES, ids=[override[:50] for override, _ in BAD_OVERRIDES])
 def test_bad_override(override, message):
     with pytest.raises(SceneError) as error:
-        load_scene("tiny", [override])
+        load_scene(TINY, [override])
     assert message in str(error.value)
 
 
 @pytest.mark.parametrize("integrator", ["rk2", "rk3", "rk4"])
 def test_steps_of_a_scheme_that_tells_what_is_between_need_not_fall_on_frames(integrator):
-    scene = load_scene("tiny", [f"simulation.integrator={integrator}", "simulation.step=0.07"])
+    scene = load_scene(TINY, [f"simulation.integrator={integrator}", "simulation.step=0.07"])
     assert (scene.simulation.step, scene.simulation.frame_interval) == (0.07, 0.1)
-    assert load_scene("tiny", ["simulation.integrator=verlet", "simulation.step=0.05"]).simulation.step == 0.05
+    assert load_scene(TINY, ["simulation.integrator=verlet", "simulation.step=0.05"]).simulation.step == 0.05
 
 
 def test_keys_and_sections_are_left_out_before_others_are_set():
     pairs = ["model.preset=resolved + pairs", "model.pairs.hidden=[4]"]
-    scene = load_scene("tiny", pairs, ["seed", "forcing", "model", "training.window"])
+    scene = load_scene(TINY, pairs, ["seed", "forcing", "model", "training.window"])
     assert scene.forcing is None and scene.seed == 1 and "hidden = [4]" in scene.to_toml()
     assert scene.training.frames == 8
 
@@ -269,12 +270,12 @@ def test_keys_and_sections_are_left_out_before_others_are_set():
     ("flow", r"tiny.toml, --unset: \[flow\]: this section is missing")])
 def test_what_cannot_be_left_out_is_said(removal, message):
     with pytest.raises(SceneError, match=message):
-        load_scene("tiny", (), [removal])
+        load_scene(TINY, (), [removal])
 
 
 def test_override_is_named_as_the_origin():
     with pytest.raises(SceneError, match=r"tiny.toml, --set: \[flow\] cells = 3: "):
-        load_scene("tiny", ["flow.cells=3"])
+        load_scene(TINY, ["flow.cells=3"])
 
 
 def test_unknown_scene_lists_those_there_are():
@@ -288,7 +289,7 @@ def test_sections_are_checked_against_each_other_without_a_file():
 
 
 def test_every_key_is_explained():
-    scene = load_scene("tiny")
+    scene = load_scene(TINY)
     for section in (scene, scene.flow, scene.initial, scene.forcing, scene.time, scene.spin_up, scene.tracers,
                     scene.kernel, scene.model, scene.training, scene.simulation, *scene.model.settings.values()):
         for field in dataclasses.fields(section):
@@ -300,7 +301,7 @@ def test_every_key_is_explained():
     ([], ["ground_truth", "kernel", "model"]), (["simulation.method=none"], ["ground_truth", "kernel"])])
 def test_a_rollout_is_made_from_what_its_scene_asks_for(overrides, kinds):
     """A model that lies beside a rollout without one is none of its business."""
-    assert load_scene("tiny", overrides).provenance("simulate")["made_from"] == kinds
+    assert load_scene(TINY, overrides).provenance("simulate")["made_from"] == kinds
 
 
 @pytest.mark.parametrize("equations, closures", [

@@ -4,8 +4,9 @@ import pytest
 
 from eddies.scene.layers import BUILT_IN
 from eddies.scene.scene import SceneError, load_scene
+from tests.small_scene import TINY
 
-HEAD = 'title = "a test"\nbase = "tiny"\nsimulation.turnovers = 0.25\n'
+HEAD = f'title = "a test"\nbase = "{TINY}"\nsimulation.turnovers = 0.25\n'
 TWO = HEAD + """training.horizons.steps = 2
 
 [variant.plain]
@@ -30,7 +31,7 @@ def test_variants_are_the_scene_with_changes(tmp_path):
     assert (plain.training.steps, plain.simulation.turnovers, plain.training.frames) == (60, 0.25, 6)
     assert (wide.model.settings["pairs"].hidden, wide.training.steps, wide.training.frames) == ((32, 32), 70, 6)
     assert (plain.label, wide.label) == (None, "a wider network") and wide.simulation == plain.simulation
-    assert plain.fingerprint("dns") == wide.fingerprint("dns") == load_scene("tiny").fingerprint("dns")
+    assert plain.fingerprint("dns") == wide.fingerprint("dns") == load_scene(TINY).fingerprint("dns")
     assert plain.fingerprint("train") != wide.fingerprint("train")
 
 

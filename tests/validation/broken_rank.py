@@ -19,6 +19,7 @@ import eddies.io.contiguous
 import eddies.io.hdf5
 import eddies.parallel.plane_halo
 import eddies.parallel.reduction
+from tests.small_scene import TINY
 
 # What of eddies breaks, and in which call of it. In each of these the other ranks wait for this one, or soon will.
 PLACES = {
@@ -63,7 +64,7 @@ def main():
     overrides = [word for override in SCENE for word in ("--set", override)]
     # A checkpoint before every step, so that steps and their writing alternate.
     often = ["--checkpoint-minutes", "1e-9"] if place == "checkpoint" else []
-    return eddies.cli.main(["dns", "tiny", "--output", str(directory / "run"), *overrides, *often])
+    return eddies.cli.main(["dns", TINY, "--output", str(directory / "run"), *overrides, *often])
 
 
 sys.exit(main())

@@ -24,6 +24,7 @@ sys.path[:0] = [str(HERE.parents[1])]
 
 from eddies.scene.scene import load_scene  # noqa: E402
 from mpi_tools.launch import mpi_environment, mpirun_command  # noqa: E402
+from tests.small_scene import TINY  # noqa: E402
 
 SMALL = ["flow.cells=16", "flow.viscosity=0.1", "spin_up.turnovers=0.3", "tracers.particles_per_side=8",
          "tracers.field_cells=12", "tracers.frame_interval=0.1", "tracers.field_every=1", "kernel.neighbors=30",
@@ -96,7 +97,7 @@ def run_all(commands, rank_counts, levels, plenty, disk):
 
 def write_inputs(place):
     """The scene, and the same with variants."""
-    (place / "small.toml").write_text(load_scene("tiny", SMALL).to_toml())
+    (place / "small.toml").write_text(load_scene(TINY, SMALL).to_toml())
     (place / "variants.toml").write_text(VARIANTS)
 
 

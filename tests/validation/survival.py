@@ -36,6 +36,7 @@ from eddies.io.checkpoint import CheckpointDirectory  # noqa: E402
 from eddies.pipeline import STAGES  # noqa: E402
 from eddies.scene.scene import load_scene  # noqa: E402
 from mpi_tools.launch import mpi_environment, mpirun_command  # noqa: E402
+from tests.small_scene import TINY  # noqa: E402
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class Killed:
     def process(self, directory, *options, stage=None):
         """A process of the stage, or of another, or the mpirun of several; not a part of this script's MPI job."""
         overrides = [word for override in self.overrides for word in ("--set", override)]
-        line = [sys.executable, "-m", "eddies", stage or self.stage, "tiny", "--output", str(directory), *overrides,
+        line = [sys.executable, "-m", "eddies", stage or self.stage, TINY, "--output", str(directory), *overrides,
                 *options]
         environment = {name: value for name, value in mpi_environment(self.ranks).items()
                        if not name.startswith(("OMPI_COMM", "PMIX_"))}
@@ -73,7 +74,7 @@ class Killed:
 
     def checkpoints(self, directory):
         """Those of the stage in a run directory."""
-        fingerprint = load_scene("tiny", self.overrides).fingerprint(self.stage)
+        fingerprint = load_scene(TINY, self.overrides).fingerprint(self.stage)
         return CheckpointDirectory(MPI.COMM_SELF, directory / STAGES[self.stage].checkpoints, fingerprint)
 
 

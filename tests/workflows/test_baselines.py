@@ -15,6 +15,7 @@ from eddies.particles.smoothing_kernels import KernelNetwork
 from eddies.report.rollout import moved_by
 from eddies.scene.scene import BOX_LENGTH, SceneError, load_scene
 from eddies.workflows.rollout.measured import open_rollout
+from tests.small_scene import TINY
 
 pytestmark = pytest.mark.usefixtures("quick_spectra")
 
@@ -254,5 +255,5 @@ def test_seconds_of_a_step_are_a_median_with_quartiles():
 def test_ranks_are_limited_by_what_the_method_needs_alone(overrides, limit):
     from eddies.workflows.foreseen.ranks import most_ranks
     alone = ("particles' reach", "filtered fields", "resolved velocity", "coarse grid")
-    found = [reason for reason in most_ranks(load_scene("tiny", overrides)) if any(part in reason for part in alone)]
+    found = [reason for reason in most_ranks(load_scene(TINY, overrides)) if any(part in reason for part in alone)]
     assert len(found) == (limit is not None) and all(reason.startswith(limit) for reason in found)

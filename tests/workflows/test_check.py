@@ -9,6 +9,7 @@ import pytest
 
 from eddies.scene.scene import Time, builtin_scenes, load_scene
 from eddies.workflows import check
+from tests.small_scene import TINY, one_model
 
 
 def lines_of(scene, comm, caplog):
@@ -29,13 +30,13 @@ def test_check_of_any_scene_writes_nothing(comm, tmp_path, monkeypatch, caplog, 
 
 @pytest.mark.mpi(2, 3)
 def test_check_on_more_ranks(comm, caplog):
-    text = lines_of(load_scene("hit-small"), comm, caplog)
+    text = lines_of(one_model("hit-small"), comm, caplog)
     assert text == "" if comm.rank > 0 else "at most 12" in text and f"on {comm.size} ranks" in text
 
 
 @pytest.mark.mpi(1, 2)
 def test_numbers_for_programs(comm, capfd):
-    check.run(load_scene("hit-small"), comm, as_json=True)
+    check.run(one_model("hit-small"), comm, as_json=True)
     shown = capfd.readouterr().out
     if comm.rank > 0:
         assert shown == ""
@@ -60,7 +61,7 @@ def test_numbers_for_programs(comm, capfd):
 @pytest.mark.mpi(1)
 def test_every_key_is_described(comm, capfd):
     described = (Path(__file__).parents[2] / "docs/check.md").read_text(encoding="utf-8")
-    check.run(load_scene("tiny"), comm, as_json=True)
+    check.run(load_scene(TINY), comm, as_json=True)
 
     def keys(value):
         for part in value if isinstance(value, list) else [value] if isinstance(value, dict) else []:
@@ -86,7 +87,7 @@ def test_what_is_not_known_is_null(comm, capfd, own, caplog):
 
 @pytest.mark.mpi(1)
 def test_numbers_of_the_small_case(comm, caplog):
-    text = lines_of(load_scene("hit-small"), comm, caplog)
+    text = lines_of(one_model("hit-small"), comm, caplog)
     for part in ("spacing 0.09817, k_max 21", "32^3 = 32768, mean spacing 0.1963 = 2 cells", "Re_lambda 50.3",
                  "filter width 0.3927", "kernel support 0.4769, 60 neighbours", "at most 12"):
         assert part in text
@@ -94,6 +95,6 @@ def test_numbers_of_the_small_case(comm, caplog):
 
 @pytest.mark.mpi(1)
 def test_warnings_and_refusals_are_told(comm, caplog):
-    assert "k_max eta is about 0.047, below 1" in lines_of(load_scene("tiny", ["flow.viscosity=0.001"]), comm, caplog)
+    assert "k_max eta is about 0.047, below 1" in lines_of(load_scene(TINY, ["flow.viscosity=0.001"]), comm, caplog)
     text = lines_of(load_scene("taylor-green", ["initial.kind=file", "initial.path=nowhere.h5"]), comm, caplog)
     assert "fails here  nowhere.h5" in text

@@ -14,6 +14,7 @@ from eddies.scene.scene import BOX_LENGTH, SceneError, load_scene
 from eddies.scene.sections import SpinUp
 from eddies.workflows import dns
 from eddies.workflows.ground_truth.scene_flow import build_fluid, initial_state
+from tests.small_scene import TINY
 
 SMALL = ["flow.cells=16", "tracers.particles_per_side=6", "tracers.turnovers=0.05", "tracers.field_cells=8"]
 
@@ -108,7 +109,7 @@ def test_a_flow_with_tracers_is_a_start_on_any_grid(comm, tmp_path):
         return comm.bcast(str(directory / "ground_truth.h5"))
 
     flow = ["time.step=0.01", "flow.fluid=compressible", "flow.sound_speed=22.5", "flow.viscosity=0.06"]
-    path = followed("first", load_scene("tiny", [
+    path = followed("first", load_scene(TINY, [
         *flow, "flow.cells=16", "tracers.particles_per_side=6", "tracers.field_cells=8", "spin_up.turnovers=0.1",
         "kernel.neighbors=20", "training.batch=9"]))
     with open_product(comm, path, "ground_truth") as file:
@@ -147,7 +148,7 @@ def test_statistics_are_sampled_every_few_steps_at_the_release_and_at_the_end(co
     overrides = ["flow.cells=16", "tracers.particles_per_side=6", "tracers.field_cells=8", "spin_up.turnovers=0.1",
                  "spin_up.stationary=0.04", "tracers.turnovers=0.3", "time.step=0.01", "kernel.neighbors=20",
                  "training.batch=9"]
-    dns.run(load_scene("tiny", overrides), comm, tmp_path)
+    dns.run(load_scene(TINY, overrides), comm, tmp_path)
     with open_product(comm, tmp_path / "ground_truth.h5", "ground_truth") as file:
         statistics, reference = read_table(file, "statistics"), read_attributes(file, "reference")
         spectra, stationary = read_table(file, "spectra_of_statistics"), read_attributes(file, "stationary")
@@ -177,12 +178,12 @@ def test_the_stationary_span_is_the_last_turnovers_of_the_spin_up():
 
 
 @pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("name", ["tiny", "tracers-only"])
+@pytest.mark.parametrize("name", [TINY, "tracers-only"])
 def test_scales_are_those_of_the_release_however_long_the_flow_is_followed(comm, tmp_path, name):
     from eddies.workflows.ground_truth.truth import GroundTruth
 
     overrides = ["flow.cells=16", "tracers.particles_per_side=6", "tracers.field_cells=8"]
-    if name == "tiny":
+    if name == TINY:
         overrides += ["spin_up.turnovers=0.05", "spin_up.stationary=0.03", "kernel.neighbors=20", "training.batch=9"]
     scales = {}
     for turnovers in (0.02, 0.2):
@@ -201,7 +202,7 @@ def test_scales_are_those_of_the_release_however_long_the_flow_is_followed(comm,
             truth = GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, 16))
             release, later = truth.scales, truth.scales_at(1)
     assert (later.acceleration, later.density_rate) == (release.acceleration, release.density_rate)
-    assert truth.has_density == (name == "tiny") == (release.sound_speed is not None)
+    assert truth.has_density == (name == TINY) == (release.sound_speed is not None)
     assert len(trajectory.times) > 2 and scales[0.02] == scales[0.2]
     rates = {"velocity": ("acceleration", 0.0), "density": ("density_rate", 1.0)}
     for column, values in columns.items():
@@ -307,7 +308,7 @@ class SilentComm:
 
 
 def test_one_rank_sends_nothing(tmp_path):
-    scene = load_scene("tiny", ["flow.cells=16", "spin_up.turnovers=0.05", "tracers.turnovers=0.05",
+    scene = load_scene(TINY, ["flow.cells=16", "spin_up.turnovers=0.05", "tracers.turnovers=0.05",
                                 "tracers.field_cells=8"])
     # Any reduction, exchange or transpose would be an AttributeError.
     dns.run(scene, SilentComm(), tmp_path)

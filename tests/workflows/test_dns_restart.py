@@ -13,6 +13,7 @@ from eddies.io.trajectories import Trajectory
 from eddies.parallel.stop import Stopped
 from eddies.scene.scene import load_scene
 from eddies.workflows import dns
+from tests.small_scene import TINY
 from tests.workflows.stopping import StopAtStep
 
 # Eight steps of spin-up, twelve with tracers in four frame intervals.
@@ -67,7 +68,7 @@ def product(comm, path):
 @pytest.mark.mpi(2)
 def test_a_split_of_a_run_is_the_whole_run(comm, tmp_path, last, monkeypatch):
     monkeypatch.setattr("eddies.io.checkpoint.KEPT", 100)
-    scene, whole = load_scene("tiny", SPLIT), tmp_path / "whole"
+    scene, whole = load_scene(TINY, SPLIT), tmp_path / "whole"
     if comm.rank == 0:
         whole.mkdir()
     comm.Barrier()
@@ -95,7 +96,7 @@ def test_a_split_of_a_run_is_the_whole_run(comm, tmp_path, last, monkeypatch):
 
 @pytest.mark.mpi(1)
 def test_forcing_that_stays_on_stays_on_over_a_restart(comm, tmp_path, last):
-    scene, found = load_scene("tiny", [*SPLIT, "tracers.forced=true"]), {}
+    scene, found = load_scene(TINY, [*SPLIT, "tracers.forced=true"]), {}
     for name, steps in (("whole", []), ("split", [14])):  # within the time of the tracers
         directory = tmp_path / name
         directory.mkdir()
@@ -110,7 +111,7 @@ def test_forcing_that_stays_on_stays_on_over_a_restart(comm, tmp_path, last):
 
 @pytest.mark.mpi(1, 2)
 def test_a_stopped_run_goes_on_and_leaves_nothing_else(comm, tmp_path, last):
-    scene = load_scene("tiny", SPLIT)
+    scene = load_scene(TINY, SPLIT)
     for _ in range(2):  # in spin-up, then with tracers: the second stop is the resumed run's
         with pytest.raises(Stopped, match="command goes on from step"):
             dns.run(scene, comm, tmp_path, StopAtStep(comm, 7))
@@ -125,9 +126,9 @@ def test_a_stopped_run_goes_on_and_leaves_nothing_else(comm, tmp_path, last):
 @pytest.mark.mpi(1)
 def test_a_checkpoint_of_other_settings_is_not_used(comm, tmp_path, last, caplog):
     with pytest.raises(Stopped):
-        dns.run(load_scene("tiny", SPLIT), comm, tmp_path, StopAtStep(comm, 5))
+        dns.run(load_scene(TINY, SPLIT), comm, tmp_path, StopAtStep(comm, 5))
     with caplog.at_level("WARNING", "eddies"), pytest.raises(Stopped, match="from step 2"):
-        dns.run(load_scene("tiny", [*SPLIT, "seed=5"]), comm, tmp_path, StopAtStep(comm, 2))
+        dns.run(load_scene(TINY, [*SPLIT, "seed=5"]), comm, tmp_path, StopAtStep(comm, 2))
     assert "step-00000005: was made with other settings; this checkpoint is not used" in caplog.text
 
 
@@ -145,7 +146,7 @@ def test_a_run_without_tracers_goes_on(comm, tmp_path, last):
 @pytest.mark.parametrize("before, after", [(1, 2), (2, 3), (3, 1)])
 def test_another_number_of_ranks(comm, tmp_path, last, before, after):
     # Stopped at step 10, within a frame interval; 20 more follow.
-    scene, run = load_scene("tiny", [*SPLIT, "tracers.turnovers=0.36"]), tmp_path / "run"
+    scene, run = load_scene(TINY, [*SPLIT, "tracers.turnovers=0.36"]), tmp_path / "run"
     groups = {size: comm.Split(int(comm.rank < size)) for size in (before, after)}
     if comm.rank == 0:
         run.mkdir()

@@ -8,6 +8,7 @@ import pytest
 from eddies.scene.scene import SceneError, builtin_scenes, load_scene
 from tests.bad_scenes import INFEASIBLE
 from tests.changed_product import changed
+from tests.small_scene import TINY
 from tests.workflows.synthetic_run import write_ground_truth
 
 
@@ -22,7 +23,7 @@ def eddies(*arguments):
 @pytest.mark.parametrize("override, message", INFEASIBLE, ids=[override for override, _ in INFEASIBLE])
 def test_what_cannot_end_is_refused_before_it_begins(comm, tmp_path, monkeypatch, capfd, command, override, message):
     monkeypatch.chdir(tmp_path)
-    assert eddies(command, "tiny", "--set", override) == 2
+    assert eddies(command, TINY, "--set", override) == 2
     output, errors = capfd.readouterr()
     assert output == "" and errors.startswith("eddies: error: tiny: ") and errors.count("\n") == 1
     assert message in errors
@@ -31,7 +32,7 @@ def test_what_cannot_end_is_refused_before_it_begins(comm, tmp_path, monkeypatch
 
 @pytest.mark.mpi(2)
 def test_it_is_said_once(comm, tmp_path, capfd):
-    assert eddies("run", "tiny", "--set", "time.step=1e-12", "--output", tmp_path / "run") == 2
+    assert eddies("run", TINY, "--set", "time.step=1e-12", "--output", tmp_path / "run") == 2
     errors = capfd.readouterr().err
     assert errors.count("\n") == (comm.rank == 0) and not (tmp_path / "run").exists()
 
@@ -87,7 +88,7 @@ def test_built_in_scenes_are_feasible(comm, name):
 @pytest.mark.mpi(1)
 def test_only_the_stages_that_are_asked_for_count(comm):
     from eddies.workflows.feasibility import check_feasible
-    scene = load_scene("tiny", ["simulation.step=1e-12"])
+    scene = load_scene(TINY, ["simulation.step=1e-12"])
     check_feasible(["dns", "train-kernel", "train"], scene, comm)
     with pytest.raises(SceneError, match="simulation. step = 1e-12"):
         check_feasible(["simulate"], scene, comm)
@@ -99,7 +100,7 @@ def test_a_gpu_that_is_not_there(comm, tmp_path, monkeypatch, capfd, command):
     import torch
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.chdir(tmp_path)
-    assert eddies(command, "tiny", "--set", "device=cuda") == 2
+    assert eddies(command, TINY, "--set", "device=cuda") == 2
     assert capfd.readouterr().err == (
         'eddies: error: device = "cuda": torch finds no GPU here; set device = "cpu"\n')
     assert list(tmp_path.iterdir()) == []
@@ -109,7 +110,7 @@ def test_a_gpu_that_is_not_there(comm, tmp_path, monkeypatch, capfd, command):
 def test_a_ground_truth_with_too_few_frames_or_without_motion(comm, tmp_path):
     from eddies.io.hdf5 import ProductError
     from eddies.workflows.feasibility import check_ground_truth
-    scene = load_scene("tiny", ["tracers.field_every=5"])
+    scene = load_scene(TINY, ["tracers.field_every=5"])
     with pytest.raises(ProductError, match="ground_truth.h5: no such file; run"):
         check_ground_truth(["train"], scene, comm, tmp_path)
     write_ground_truth(comm, tmp_path, frames=30)
@@ -141,7 +142,7 @@ def test_a_ground_truth_with_too_few_frames_or_without_motion(comm, tmp_path):
 def test_frames_that_are_enough_are_found(frames, every):
     """The first usable frame has the field and the truth that it needs, and there is one if any has."""
     from eddies.workflows.ground_truth.frame_counts import rollout_start
-    tiny = load_scene("tiny")
+    tiny = load_scene(TINY)
     at_fields = range(0, frames, every)
     usable = [frame for frame in at_fields if frame >= max(int(0.5 * (frames - 1)), 1) and frame + 5 <= frames - 2]
     if usable:

@@ -16,6 +16,7 @@ import pytest
 from eddies.scene.model import COME_ALONG, WEIGHTS, weights_that_come_along
 from eddies.scene.scene import load_scene
 from eddies.stored_run import open_run
+from tests.small_scene import TINY
 
 pytestmark = pytest.mark.mpi(2, timeout=240)
 
@@ -38,8 +39,8 @@ def numbers(metrics):
 def run_directory(comm):
     """One run for all tests here, the same folder on both ranks."""
     folder = comm.bcast(tempfile.mkdtemp() if comm.rank == 0 else None)
-    directory = Path(folder) / "tiny"
-    assert eddies("run", "tiny", "--output", directory) == 0
+    directory = Path(folder) / TINY
+    assert eddies("run", TINY, "--output", directory) == 0
     comm.Barrier()
     yield directory
     comm.Barrier()
@@ -79,7 +80,7 @@ def check_words(path, dataset):
 def test_what_check_foresees_is_what_was_run(run_directory):
     from eddies.workflows.foreseen.numbers import mach, rollout_of
     from eddies.workflows.foreseen.storage import disk, rollout_bytes, trajectory_bytes
-    scene = load_scene("tiny")
+    scene = load_scene(TINY)
     with h5py.File(run_directory / "rollout.h5") as file:
         rollout = dict(file["rollout"].attrs)
     with h5py.File(run_directory / "ground_truth.h5") as file:
@@ -109,7 +110,7 @@ def test_pairs_outside_the_training_data_are_counted(run_directory):
     with h5py.File(run_directory / "model.h5") as file:
         low, high = (file[f"feature_range/{bound}"][()] for bound in ("low", "high"))
         description = json.loads(file.attrs["description"])
-    scene, length = load_scene("tiny"), description["scales"]["filter_width"]
+    scene, length = load_scene(TINY), description["scales"]["filter_width"]
     support = scene.kernel_support / length
     # |x|, |v|, x.v
     assert low.shape == high.shape == (3,) and np.all(low < high)
@@ -137,7 +138,7 @@ def test_weights_that_come_along_are_as_good_as_their_card_says(comm, run_direct
         for name in ("ground_truth.h5", "kernel.h5"):
             (tmp_path / name).symlink_to(run_directory / name)
     comm.Barrier()
-    assert eddies("train", "tiny", "--set", "model.path=eddies:tiny", "--output", tmp_path) == 0
+    assert eddies("train", TINY, "--set", "model.path=eddies:tiny", "--output", tmp_path) == 0
     with h5py.File(tmp_path / "model.h5") as file:
         assert file["a_priori/acceleration_error"][-1] == pytest.approx(card["eddies:tiny"], rel=0.02)
         assert file["source_a_priori/acceleration_error"][-1] == pytest.approx(card["eddies:tiny"], rel=0.01)
@@ -162,7 +163,7 @@ def test_products_say_what_they_were_made_from(run_directory):
 
 @pytest.mark.usefixtures("no_figures")
 def test_a_new_ground_truth_beside_an_old_model_is_said(comm, run_directory, tmp_path, capfd):
-    assert eddies("dns", "tiny", "--set", "seed=2", "--output", tmp_path) == 0
+    assert eddies("dns", TINY, "--set", "seed=2", "--output", tmp_path) == 0
     if comm.rank == 0:
         for name in ("kernel", "model", "rollout"):
             shutil.copy(run_directory / f"{name}.h5", tmp_path)
@@ -185,7 +186,7 @@ def test_a_new_ground_truth_beside_an_old_model_is_said(comm, run_directory, tmp
 def test_what_fits_is_kept_and_what_changed_is_redone(comm, run_directory, capfd):
     before = {path: path.stat().st_mtime_ns for path in run_directory.glob("*.h5") if path.name != "truth_measures.h5"}
     comm.Barrier()
-    changed = ("run", "tiny", "--output", run_directory, "--set", "simulation.turnovers=0.2")
+    changed = ("run", TINY, "--output", run_directory, "--set", "simulation.turnovers=0.2")
     assert eddies(*changed) == 2
     told = "that would be replaced: rollout.h5 (took "
     assert (told in capfd.readouterr().err) == (comm.rank == 0)
@@ -199,7 +200,7 @@ def test_what_fits_is_kept_and_what_changed_is_redone(comm, run_directory, capfd
 @pytest.mark.usefixtures("no_figures")
 def test_a_trained_model_runs_on_another_flow(comm, run_directory, tmp_path):
     """At twice the Mach number, with nothing of that flow but its scales; all of it is unseen."""
-    slower = load_scene("tiny", ["flow.sound_speed=11", "seed=2", "tracers.turnovers=0.25", "kernel.steps=4",
+    slower = load_scene(TINY, ["flow.sound_speed=11", "seed=2", "tracers.turnovers=0.25", "kernel.steps=4",
                                  "simulation.turnovers=0.1", f"model.path={run_directory}"])
     if comm.rank == 0:
         (tmp_path / "slower.toml").write_text(dataclasses.replace(slower, training=None).to_toml())

@@ -12,13 +12,14 @@ from eddies.io.hdf5 import create_product
 from eddies.scene.scene import load_scene
 from eddies.workflows.diff import diff_lines
 from eddies.workflows.status import status_lines
+from tests.small_scene import TINY
 from tests.test_cli import run_cli
 from tests.workflows.synthetic_run import write_ground_truth, write_kernel, write_rollout
 
 
 def write_scene(directory, *changes):
     directory.mkdir(parents=True, exist_ok=True)
-    scene = load_scene("tiny", changes)
+    scene = load_scene(TINY, changes)
     (directory / "scene.toml").write_text(scene.to_toml())
     return scene
 
@@ -30,7 +31,7 @@ def test_what_there_is_of_every_stage_is_told(comm, tmp_path, capfd):
     checkpoints.write(40, {"weights": np.ones(3)})
     with create_product(comm, tmp_path / "one/ground_truth.h5", "ground_truth", scene.provenance("dns")):
         pass
-    before = load_scene("tiny", ["kernel.steps=7"])
+    before = load_scene(TINY, ["kernel.steps=7"])
     with create_product(comm, tmp_path / "one/kernel.h5", "kernel", before.provenance("train-kernel")):
         pass
     (tmp_path / "one/stage_seconds.json").write_text('{"dns": 75.0}')
@@ -71,7 +72,7 @@ def test_settings_and_numbers_that_differ(tmp_path):
 
 @pytest.mark.mpi(1)
 def test_variants_of_one_run_are_told_apart(comm, tmp_path, capfd):
-    (tmp_path / "scene.toml").write_text('base = "tiny"\n[variant.a]\n[variant.b]\nsimulation.step = 0.05\n')
+    (tmp_path / "scene.toml").write_text(f'base = "{TINY}"\n[variant.a]\n[variant.b]\nsimulation.step = 0.05\n')
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
         scene = load_scene(tmp_path / "scene.toml").variant[name]

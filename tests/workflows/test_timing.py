@@ -13,6 +13,7 @@ import pytest
 from eddies.parallel.stop import Stopped
 from eddies.scene.scene import load_scene
 from eddies.workflows import timing
+from tests.small_scene import TINY
 
 LAUNCH = Path(__file__).parents[2] / "mpi_tools/launch.py"
 
@@ -41,7 +42,7 @@ def told(comm, tmp_path, monkeypatch):
 @pytest.mark.mpi(1, 2, 3)
 def test_every_stage_of_the_pipeline_is_measured(comm, told, no_figures, quick_solves):
     horizons = ["training.horizons.steps=5", "training.horizons.frames=[1, 2]"] if comm.size == 1 else []
-    found = told("tiny", *horizons)
+    found = told(TINY, *horizons)
     trained = 60 + 5 * len(horizons)
     for stage, steps in {"dns": 82, "train-kernel": 200, "train": trained, "simulate": 5, "report": 0}.items():
         pace, count = re.match(rf"{stage} +(\S+) +(\d+)  ", found[stage]).groups()
@@ -50,7 +51,7 @@ def test_every_stage_of_the_pipeline_is_measured(comm, told, no_figures, quick_s
 
 @pytest.mark.mpi(1)
 @pytest.mark.parametrize("name, overrides", [
-    ("abc", []), ("tracers-only", []), ("tiny", ["simulation.method=eulerian"]), ("tiny", ["simulation.method=none"])])
+    ("abc", []), ("tracers-only", []), (TINY, ["simulation.method=eulerian"]), (TINY, ["simulation.method=none"])])
 def test_scenes_without_a_model_are_measured(told, no_figures, name, overrides):
     found = told(name, *overrides)
     for stage in load_scene(name, overrides).stages:
@@ -67,7 +68,7 @@ def test_what_cannot_be_measured_is_said_and_the_rest_is_measured(told, no_figur
 @pytest.mark.mpi(1, 2)
 def test_a_signal_ends_it_with_nothing_left(comm, told):
     with pytest.raises(Stopped, match="SIGTERM; the same command goes on from the beginning"):
-        told("tiny", signals=[signal.SIGTERM])
+        told(TINY, signals=[signal.SIGTERM])
     comm.Barrier()
     assert list(Path().iterdir()) == []
 

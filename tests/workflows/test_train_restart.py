@@ -16,6 +16,7 @@ from eddies.parallel.stop import Stopped, StopRequest
 from eddies.scene.scene import SceneError, load_scene
 from eddies.workflows import dns, train, train_kernel
 from eddies.workflows.run_directory.work import stage_seconds
+from tests.small_scene import TINY
 from tests.workflows.stopping import StopAtStep
 
 # Ten frame intervals, all of them for training: six steps on single frames, two of them with every loss; and then, or
@@ -33,7 +34,7 @@ pytestmark = pytest.mark.usefixtures("quick_solves", "no_figures")
 
 def prepared(comm, directory, settings=THROUGH_HORIZONS):
     """A directory with the ground truth and the kernel of the short scene."""
-    scene = load_scene("tiny", settings)
+    scene = load_scene(TINY, settings)
     if comm.rank == 0:
         directory.mkdir(parents=True, exist_ok=True)
     comm.Barrier()
@@ -162,7 +163,7 @@ def test_a_training_goes_on_from_products_of_the_settings_that_it_began_with(com
 @pytest.mark.mpi(1, 2)
 def test_a_window_too_short_for_its_horizons_is_refused(comm, tmp_path):
     prepared(comm, tmp_path)
-    scene = load_scene("tiny", [*SHORT, "training.horizons.steps=1", "training.horizons.frames=[1,5]"])
+    scene = load_scene(TINY, [*SHORT, "training.horizons.steps=1", "training.horizons.frames=[1,5]"])
     with pytest.raises(SceneError, match=r"\[training\] window = 1: holds 10 frames of the ground truth, too few with "
                                          "5 held out for validation and horizons of 5; raise it or .* frame_interval "
                                          r"or \[training.horizons\] frames"):

@@ -7,8 +7,9 @@ from eddies.scene.scene import load_scene
 from eddies.workflows import variant_rows as module
 from eddies.workflows.variant_rows import THROUGH_KERNEL, notes, row, step_costs, together, why_not
 from eddies.workflows.variants import Place
+from tests.small_scene import TINY
 
-HEAD = 'base = "tiny"\nsimulation.turnovers = 0.25\nkernel.steps = 50\n'
+HEAD = f'base = "{TINY}"\nsimulation.turnovers = 0.25\nkernel.steps = 50\n'
 
 
 def scene_of(tmp_path, *variants, head=""):

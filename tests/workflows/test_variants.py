@@ -14,6 +14,7 @@ from eddies.workflows import product_warnings
 from eddies.workflows.rollout.measured import TrueParticles, open_rollout
 from eddies.workflows.rollout.particle_measures import KernelAverages, ParticleSpectra
 from eddies.workflows.variants import rollouts, steps
+from tests.small_scene import TINY
 
 SMALLER = ["flow.cells=16", "flow.viscosity=0.1", "spin_up.turnovers=0.3", "tracers.particles_per_side=8",
            "tracers.field_cells=12", "tracers.frame_interval=0.1", "tracers.field_every=1", "kernel.neighbors=30",
@@ -48,7 +49,7 @@ def run_cli(*arguments):
 def folder(comm, tmp_path, monkeypatch):
     """A folder with a scene to be the base, to work in."""
     if comm.rank == 0:
-        (tmp_path / "base.toml").write_text(load_scene("tiny", [*SMALLER, "name=base"]).to_toml())
+        (tmp_path / "base.toml").write_text(load_scene(TINY, [*SMALLER, "name=base"]).to_toml())
         (tmp_path / "small.toml").write_text('base = "base.toml"\ntitle = "small"\n' + VARIANTS)
         (tmp_path / "unseen.toml").write_text('base = "base.toml"\nrealisations = [5, 6]\n' + UNSEEN)
     comm.Barrier()

@@ -288,8 +288,8 @@ class Simulation(Section):
             raise KeyProblem("simulation", "step_from", f' = "{self.step_from}": step = {self.step:g} needs no other '
                              f'run; set step = "{CONVERGED}", or remove step_from')
         if self.confirmed_on and not self.finds_step:
-            raise KeyProblem("simulation", "confirmed_on", f" = {quoted(self.confirmed_on)}: no step is sought for this "
-                             f'rollout; set step = "{CONVERGED}" without step_from, or remove confirmed_on')
+            raise KeyProblem("simulation", "confirmed_on", f" = {quoted(self.confirmed_on)}: no step is sought for "
+                             f'this rollout; set step = "{CONVERGED}" without step_from, or remove confirmed_on')
 
     @property
     def scheme(self) -> Scheme:

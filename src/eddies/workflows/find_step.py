@@ -3,8 +3,8 @@
 Every method goes by the same rule. For each integrator steps are halved from a generous one on. A step has converged if
 a rollout with it and one with half of it end with velocities that differ, in the root mean square, by less than 2 % of
 the error of the latter or 1e-4 of the velocity, whichever is larger. It must have converged on every further ground
-truth that the scene names as well. Coarse grids have Courant numbers in place of steps. Of the steps that have converged
-the cheapest is taken.
+truth that the scene names as well. Coarse grids have Courant numbers in place of steps. Of the steps that have
+converged the cheapest is taken.
 
 An integrator is given up once a step that could converge would cost more than the best one so far. That step is
 foreseen from the last difference, as if it fell with the full order of the integrator, and the cost from its last rise.
@@ -100,8 +100,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
 
 
 class _Start:
-    """The part of a ground truth that short rollouts go through: from the first frame at which the whole flow is stored,
-    or from the second frame, in whole frame intervals of the rollout."""
+    """The part of a ground truth that short rollouts go through: from the first frame at which the whole flow is
+    stored, or from the second frame, in whole frame intervals of the rollout."""
 
     def __init__(self, truth: GroundTruth, scene: Scene) -> None:
         self.truth, self.turnover = truth, float(truth.reference["eddy_turnover_time"])
@@ -116,8 +116,7 @@ class _Start:
 
 
 class _Search:
-    """Short rollouts of a scene on ground truths, the first of which is searched; `trials` are all that were made there.
-    """
+    """Short rollouts of a scene on ground truths. The first is searched, and `trials` are all that were made there."""
 
     def __init__(self, scene: Scene, truths: Sequence[GroundTruth], directory: Path, device: torch.device,
                  stop: StopRequest) -> None:

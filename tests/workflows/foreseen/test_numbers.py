@@ -10,6 +10,7 @@ from eddies.clock import ProgressLine
 from eddies.scene.scene import Time, load_scene
 from eddies.workflows.foreseen.numbers import expected_allowed_step, expected_step, expected_turbulence, rollout_of
 from eddies.workflows.foreseen.storage import rollout_bytes, trajectory_bytes
+from tests.small_scene import one_model
 
 SCENE = """
 [flow]
@@ -115,12 +116,12 @@ def test_rollouts_of_methods_of_the_users_are_not_known(own):
     own("own_method", "class Own:\n    has_density = needs = ()\n"
                       "    advance = frame = status = series = description = 0\n")
     for changes in (["simulation.method=own_method:Own"], ["flow.viscosity=0"]):
-        assert rollout_of(load_scene("hit-small", changes)) is None
+        assert rollout_of(one_model("hit-small", changes)) is None
     assert rollout_of(load_scene("taylor-green")) is None
 
 
 def test_particles_of_a_decaying_flow_may_take_longer_steps():
-    free, forced = (expected_allowed_step(load_scene("hit-small", [f"simulation.injection={name}"]))
+    free, forced = (expected_allowed_step(one_model("hit-small", [f"simulation.injection={name}"]))
                     for name in ("none", "dissipation"))
     assert 1.1 * forced < free < 1.5 * forced
     turbulence, interval = expected_turbulence(load_scene("hit-small")), 1e-4

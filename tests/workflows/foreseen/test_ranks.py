@@ -6,6 +6,7 @@ from eddies.scene.scene import load_scene
 from eddies.workflows.foreseen.numbers import expected_turbulence
 from eddies.workflows.foreseen.ranks import (ALLOWED_VELOCITY, PEAK_VELOCITY, most_ranks, most_training_ranks,
                                              particle_reach)
+from tests.small_scene import TINY, one_model
 
 
 @pytest.mark.mpi(1, 2, 3)
@@ -16,7 +17,7 @@ def test_most_ranks_is_what_the_parts_accept(comm, neighbors, most):
     from eddies.scene.scene import BOX_LENGTH
     from eddies.spectral.interpolation import SplineInterpolation
     from eddies.spectral.spectral_grid import SpectralGrid
-    scene = load_scene("tiny", [f"kernel.neighbors={neighbors}"])
+    scene = load_scene(TINY, [f"kernel.neighbors={neighbors}"])
     fields, particles = (SlabDecomposition(comm, BOX_LENGTH, planes)
                          for planes in (scene.tracers.cells, scene.tracers.planes))
     assert min(most_ranks(scene).values()) == most
@@ -52,7 +53,7 @@ def test_ranks_for_horizons_are_those_that_the_grid_and_the_particles_accept(com
             return False
         return True
 
-    scene = load_scene("tiny", ["training.horizons.steps=5", f"training.horizons.frames=[1, {frames}]"])
+    scene = load_scene(TINY, ["training.horizons.steps=5", f"training.horizons.frames=[1, {frames}]"])
     limits = most_training_ranks(scene)
     by_reach, = (ranks for reason, ranks in limits.items() if reason.startswith("slabs no thinner"))
     by_grid = limits["ghost planes of the grid in the training through horizons"]
@@ -70,23 +71,23 @@ def test_ranks_for_horizons_are_those_that_the_grid_and_the_particles_accept(com
 
 def test_ranks_are_not_limited_by_horizons_that_are_not_trained():
     for changes in ([], ["training.horizons.steps=5", "model.path=runs/other"]):
-        scene = load_scene("hit-small", changes)
+        scene = one_model("hit-small", changes)
         assert min(most_ranks(scene).values()) == 12 and not any("horizons" in reason for reason in most_ranks(scene))
 
 
 def test_ghost_planes_limit_the_ranks():
-    fields = {planes: most_ranks(load_scene("tiny", [f"tracers.field_cells={planes}"])) for planes in (11, 12)}
+    fields = {planes: most_ranks(load_scene(TINY, [f"tracers.field_cells={planes}"])) for planes in (11, 12)}
     assert [limits["ghost planes of the filtered fields"] for limits in fields.values()] == [2, 3]
     # Of 20 planes: two for the splines, and what half the skin reaches; particles come home at every stage of a step.
     assert fields[12]["ghost planes of the resolved velocity"] == 20 // 3
     for overrides, ghosts in ((["simulation.step=0.2"], 3), (["simulation.skin=1"], 4)):
-        assert most_ranks(load_scene("tiny", overrides))["ghost planes of the resolved velocity"] == 20 // ghosts
-    assert "ghost planes of the resolved velocity" not in most_ranks(load_scene("tiny", ["model.preset=paper"]))
+        assert most_ranks(load_scene(TINY, overrides))["ghost planes of the resolved velocity"] == 20 // ghosts
+    assert "ghost planes of the resolved velocity" not in most_ranks(load_scene(TINY, ["model.preset=paper"]))
 
 
 def test_what_no_term_reads_limits_no_ranks():
     fast = ["training.horizons.steps=5", "training.horizons.frames=[12]"]
-    limits = {preset: most_ranks(load_scene("tiny", [*fast, f"model.preset={preset}"]))
+    limits = {preset: most_ranks(load_scene(TINY, [*fast, f"model.preset={preset}"]))
               for preset in ("resolved + pairs", "resolved", "transport-velocity")}
     found = {preset: {word for word in ("reach", "resolved") if any(word in reason for reason in reasons)}
              for preset, reasons in limits.items()}

@@ -8,6 +8,7 @@ from eddies.flow.forcing import ForcingError
 from eddies.parallel.slab import SlabDecomposition
 from eddies.scene.scene import load_scene
 from eddies.workflows.foreseen.problems import refusals
+from tests.small_scene import TINY
 
 FORCED = ["forcing.injection_rate=0.5"]
 
@@ -53,14 +54,19 @@ def test_files_that_do_not_fit_are_told_in_the_words_of_the_stage(comm, tmp_path
     assert line == str(error.value) and "holds 1 states of the whole flow" in line
 
 
+def taken(comm, path):
+    """Of a scene that takes weights over."""
+    return refusals(load_scene("hit-mt008", [f"model.path={path}"], ["variant"]), comm)
+
+
 @pytest.mark.mpi(1, 2)
 def test_weights_that_are_no_model_are_told(comm, tmp_path):
     path = comm.bcast(str(tmp_path))
-    assert told(comm, "hit-mt008", f"model.path={path}") == []  # yet to be trained: a warning
+    assert taken(comm, path) == []  # yet to be trained: a warning
     if comm.rank == 0:
         (tmp_path / "model.h5").write_text("nothing")
     comm.Barrier()
-    line, = told(comm, "hit-mt008", f"model.path={path}")
+    line, = taken(comm, path)
     assert f"{path}/model.h5" in line
 
 
@@ -68,6 +74,6 @@ def test_weights_that_are_no_model_are_told(comm, tmp_path):
 def test_a_machine_that_is_too_small_is_told(comm):
     large = [line for line in told(comm, "taylor-green", "flow.cells=8192") if "of memory here" in line]
     assert len(large) == 1 and large[0].startswith(f"dns: {comm.size} ranks with about")
-    full, = told(comm, "tiny", "tracers.frame_interval=1e-9", "simulation.frame_interval=0.1")
+    full, = told(comm, TINY, "tracers.frame_interval=1e-9", "simulation.frame_interval=0.1")
     assert full.startswith("the stages need about") and "GB of disk" in full
-    assert told(comm, "tiny") == []
+    assert told(comm, TINY) == []

@@ -11,9 +11,10 @@ import pytest
 from eddies.scene.scene import builtin_scenes, load_scene
 from eddies.workflows.foreseen.numbers import expected_turbulence, mach, rms_speed
 from eddies.workflows.foreseen.problems import stage_warnings, warnings
+from tests.small_scene import TINY, one_model
 
 
-def told(*overrides, scene="tiny"):
+def told(*overrides, scene=TINY):
     return list(warnings(load_scene(scene, list(overrides)), 1))
 
 
@@ -65,6 +66,9 @@ def test_a_flow_that_is_not_turbulent_is_told():
 def test_steps_that_relax_too_far_are_told():
     """Runs of `hit` with C_r = 2 end in noise with velocity Verlet and steps of 0.05, those of `hit-256` with 100
     neighbours in steps of 0.1; none is told within limits."""
+    def told(*overrides, scene):
+        return list(warnings(one_model(scene, list(overrides)), 1))
+
     changes = ["model.preset=local", "model.filtered-equations.relaxation=2"]
     for integrator, step, expected in (("verlet", 0.05, True), ("verlet", 0.01, False), ("rk3", 0.04, False)):
         lines = told(*changes, f"simulation.integrator={integrator}", f"simulation.step={step}", scene="hit")
@@ -73,7 +77,8 @@ def test_steps_that_relax_too_far_are_told():
         lines = told("model.preset=local", "simulation.integrator=corrected-verlet", f"simulation.step={step}",
                      scene="hit-256")
         assert any("relaxes so fast" in line for line in lines) is expected
-    line, = (line for line in told(*changes, scene="hit") if "relaxes so fast" in line)
+    given = [*changes, "simulation.step=0.1"]
+    line, = (line for line in told(*given, scene="hit") if "relaxes so fast" in line)
     remedy = re.search(r"more than about ([\d.]+);", line).group(1)
     assert not any("relaxes so fast" in line for line in told(*changes, f"simulation.step={remedy}", scene="hit"))
 
@@ -95,7 +100,7 @@ def test_particles_of_a_forced_rollout_are_told_of_shorter_steps():
 
 
 def test_stages_tell_what_concerns_them():
-    scene = load_scene("tiny", ["flow.sound_speed=4", 'model.terms=["pairs", "density-flux", "continuity"]',
+    scene = load_scene(TINY, ["flow.sound_speed=4", 'model.terms=["pairs", "density-flux", "continuity"]',
                                 "model.continuity.diffusion=0.1"])
     by_stage = {stage: list(stage_warnings(scene, [stage])) for stage in scene.stages}
     assert [stage for stage, lines in by_stage.items() if lines] == ["dns", "train"]
@@ -114,8 +119,8 @@ def test_speeds_and_mach_numbers_are_those_of_the_flow(comm):
         energy = sum(component_energies(fluid.grid, initial_state(scene, fluid)[:3]).values())
         assert rms_speed(scene) == pytest.approx(np.sqrt(2 * energy), rel=1e-6)
         assert mach(scene) == pytest.approx(np.sqrt(2 * energy) / 10, rel=1e-6)
-    turbulence = expected_turbulence(load_scene("tiny"))
-    assert mach(load_scene("tiny")) == pytest.approx(np.sqrt(3) * turbulence.velocity_rms / 22.5)
+    turbulence = expected_turbulence(load_scene(TINY))
+    assert mach(load_scene(TINY)) == pytest.approx(np.sqrt(3) * turbulence.velocity_rms / 22.5)
 
 
 def test_a_term_of_the_users_says_which_steps_are_too_long(tmp_path):
@@ -137,7 +142,7 @@ class Spring(eddies.Term):
     Settings = Stiff
 """)
     own = tmp_path / "own.toml"
-    own.write_text(load_scene("tiny").to_toml())
+    own.write_text(load_scene(TINY).to_toml())
     terms = 'model={terms=["viscosity", "own_stiff:Spring"]}'
     line, = told(terms, "simulation.step=0.1", scene=own)
     longest = float(line.rpartition(" ")[2])
@@ -151,7 +156,7 @@ def test_steps_that_sound_outruns_are_told():
              for changes in (("model.preset=wcsph",), ("model.preset=wcsph", "simulation.step=0.001"), ())}
     (line,) = found.pop(("model.preset=wcsph",))
     assert line.startswith('[simulation] step = 0.08: the term "wcsph" has to resolve sound, with a step of at most')
-    scene = load_scene("tiny", ["model.preset=wcsph"])
+    scene = load_scene(TINY, ["model.preset=wcsph"])
     # Of Monaghan (1992), with an alpha of 0.05.
     longest = 0.4 * scene.interaction_radius / 2 / (scene.flow.sound_speed * 1.03)
     assert float(line.partition("at most ")[2].split()[0]) == pytest.approx(longest, rel=0.1)
@@ -176,7 +181,7 @@ def test_weights_that_are_not_there_yet_are_told(tmp_path):
 
 
 def test_job_with_too_many_ranks_is_told():
-    assert any("this job has 100 ranks" in line for line in warnings(load_scene("tiny"), 100))
+    assert any("this job has 100 ranks" in line for line in warnings(load_scene(TINY), 100))
     assert list(warnings(load_scene("hit-small"), 2)) == []
 
 
@@ -186,7 +191,7 @@ def test_a_run_tells_the_warnings_of_its_stages_when_it_starts(comm, tmp_path, m
     from eddies.stages import run_stages
     from eddies.workflows import dns
     monkeypatch.setattr(dns, "run", lambda *given: None)
-    scene = load_scene("tiny", ["flow.sound_speed=4", "model.preset=paper"])
+    scene = load_scene(TINY, ["flow.sound_speed=4", "model.preset=paper"])
     with caplog.at_level(logging.WARNING, logger="eddies"):
         run_stages(["dns"], scene, comm, tmp_path, StopRequest(comm))
     shown = [record.getMessage() for record in caplog.records]

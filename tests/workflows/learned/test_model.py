@@ -15,6 +15,7 @@ from eddies.scene.scene import Model, SceneError, load_scene
 from eddies.scene.terms import PRESETS
 from eddies.workflows.learned.model import load_kernel, load_model, scene_model, take_from_first_rank
 from eddies.workflows.learned.source import describe, differences
+from tests.small_scene import TINY
 
 # Of the scene tiny: the filter is two spacings wide.
 SCALES = ReferenceScales(filter_width=1.0471975511965976, spacing=0.5235987755982988, velocity=0.9, density_mean=1.0,
@@ -23,12 +24,12 @@ SMALL = "model.pairs.hidden=[4]"
 
 
 def with_terms(*terms):
-    return replace(load_scene("tiny"), model=Model(terms=terms))
+    return replace(load_scene(TINY), model=Model(terms=terms))
 
 
 def saved(comm, directory, scene=None, change=lambda weights: weights):
     """A model and the file of its weights, changed."""
-    scene = scene or load_scene("tiny", [SMALL])
+    scene = scene or load_scene(TINY, [SMALL])
     model = scene_model(scene, SCALES, comm).float()
     with torch.no_grad():
         for parameter in model.parameters():
@@ -79,12 +80,12 @@ def test_weights_of_another_scene_are_refused_with_the_key(comm, tmp_path):
     _, _, path = saved(comm, tmp_path)
     with pytest.raises(ProductError, match=r"model.h5: was trained with \[model.pairs\] hidden = \[4\], and the scene "
                                            r"has \[5\]; run `eddies train` again, or set the key to that"):
-        load_model(load_scene("tiny", ["model.pairs.hidden=[5]"]), comm, path, SCALES)
+        load_model(load_scene(TINY, ["model.pairs.hidden=[5]"]), comm, path, SCALES)
 
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_a_description_is_json_and_differs_from_its_own_scene_in_nothing(preset):
-    scene = load_scene("tiny", [f"model.preset={preset}"])
+    scene = load_scene(TINY, [f"model.preset={preset}"])
     stored = json.loads(json.dumps(describe(scene, SCALES)))
     assert list(differences(scene, stored)) == []
     assert list(stored["terms"]) == list(scene.model.terms)
@@ -92,8 +93,8 @@ def test_a_description_is_json_and_differs_from_its_own_scene_in_nothing(preset)
 
 def test_no_key_of_a_term_s_settings_goes_unnoticed():
     """A key that has gone is a difference with its value; one that has come since has its default."""
-    scene = load_scene("tiny", [SMALL, "model.pairs.basis=paper"])
-    other = load_scene("tiny", [SMALL, "model.pairs.basis=paper", "model.pairs.symmetry=antisymmetric"])
+    scene = load_scene(TINY, [SMALL, "model.pairs.basis=paper"])
+    other = load_scene(TINY, [SMALL, "model.pairs.basis=paper", "model.pairs.symmetry=antisymmetric"])
     stored = json.loads(json.dumps(describe(scene, SCALES)))
     stored["terms"]["pairs"]["depth"] = 3
     del stored["terms"]["pairs"]["symmetry"]
@@ -120,7 +121,7 @@ def test_a_network_that_cannot_be_made_has_one_error(comm, own):
     own("own_networks", "from torch import nn\nclass mine(nn.Module):\n    def __init__(self, inputs): pass\n"
                         "    def forward(self, features): pass\n")
     message = "cannot be made with (inputs, hidden, outputs, seed): "
-    scene = load_scene("tiny", ["model.pairs.network=own_networks:mine"])
+    scene = load_scene(TINY, ["model.pairs.network=own_networks:mine"])
     with pytest.raises(SceneError) as error:
         scene_model(scene, SCALES, comm)
     assert str(error.value).startswith('[model] terms: term "pairs": network = "own_networks:mine": ' + message)

@@ -15,6 +15,7 @@ from eddies.scene.scene import Model, SceneError, load_scene
 from eddies.stages import Step, check_inputs
 from eddies.workflows.learned.model import with_weights
 from eddies.workflows.learned.source import describe, differences, read_source
+from tests.small_scene import TINY, one_model
 
 # Of the scene tiny: filter width two spacings, whatever their number.
 SCALES = ReferenceScales(filter_width=0.5, spacing=0.25, velocity=1.0, acceleration=2.0, density_mean=1.0,
@@ -32,11 +33,11 @@ class Drag(eddies.Term):
 
 
 def scene_with(path, *terms):
-    return replace(load_scene("tiny"), model=Model(terms=terms, path=str(path)))
+    return replace(load_scene(TINY), model=Model(terms=terms, path=str(path)))
 
 
 def scene(*overrides):
-    return load_scene("tiny", ["model.pairs.hidden=[8, 8]", *overrides])
+    return load_scene(TINY, ["model.pairs.hidden=[8, 8]", *overrides])
 
 
 def described(*overrides):
@@ -135,8 +136,8 @@ def test_a_file_never_has_a_class_imported(comm, tmp_path, own):
                                         ("hit-small", "hit-small"), ("tiny", "tiny")])
 def test_weights_of_the_first_version_are_read(comm, name, base):
     """Of a term's keys that there are no more, with the values at which they are fixed now."""
-    changes = ["model.preset=local"] if name == "hit-local" else []
-    found = load_scene(base, [*changes, f"model.path=eddies:{name}"])
+    changes = {"hit-local": ["model.preset=local"], "tiny": ["model.preset=resolved + pairs", "model.pairs.hidden=[8, 8]"]}
+    found = one_model(base, [*changes.get(name, ()), f"model.path=eddies:{name}"])
     source = read_source(found, comm)
     scales = ReferenceScales(**source.description["scales"])
     model = with_weights(found, comm, source.description, source.weights, source.path, scales)
@@ -145,7 +146,7 @@ def test_weights_of_the_first_version_are_read(comm, name, base):
 
 
 def test_a_former_key_with_another_value_is_another_model():
-    resolved = load_scene("tiny", ["model.preset=resolved"])
+    resolved = load_scene(TINY, ["model.preset=resolved"])
     scales = replace(SCALES, filter_width=resolved.tracers.filter_width, spacing=resolved.tracers.spacing)
     description = json.loads(json.dumps(describe(resolved, scales)))
     assert list(differences(resolved, description)) == []

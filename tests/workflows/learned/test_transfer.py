@@ -15,6 +15,7 @@ from eddies.scene.scene import BOX_LENGTH, load_scene
 from eddies.workflows.learned.model import scene_model, with_weights
 from eddies.workflows.learned.source import ModelSource, describe
 from eddies.workflows.learned.transfer import trained_on
+from tests.small_scene import TINY
 
 # Of the scene tiny: filter width two spacings, whatever their number.
 SCALES = ReferenceScales(filter_width=BOX_LENGTH / 6, spacing=BOX_LENGTH / 12, velocity=0.9, density_mean=1.0,
@@ -25,7 +26,7 @@ SCALES = ReferenceScales(filter_width=BOX_LENGTH / 6, spacing=BOX_LENGTH / 12, v
 @pytest.mark.parametrize("preset, weight", [("paper", 1e-5), ("resolved + pairs", 1e-4), ("resolved", 1e-6)])
 def test_the_same_flow_in_other_units_gets_the_same_force_in_those_units(comm, preset, weight):
     """Twice as fast, and with four times the fluctuations of density at the same speed of sound."""
-    scene = load_scene("tiny", [f"model.preset={preset}"])
+    scene = load_scene(TINY, [f"model.preset={preset}"])
     model = scene_model(scene, SCALES, comm).float()
     weights = {name: tensor.numpy() for name, tensor in model.state_dict().items()}
     other = replace(SCALES, velocity=1.8, density=0.08, acceleration=6.8, density_rate=0.4,
@@ -52,7 +53,7 @@ def test_the_same_flow_in_other_units_gets_the_same_force_in_those_units(comm, p
 
 
 def test_weights_that_go_from_run_to_run_keep_where_they_were_trained():
-    scene, errors = load_scene("tiny", ["model.path=runs/first"]), {"a_priori": {"acceleration_error": 0.3}}
+    scene, errors = load_scene(TINY, ["model.path=runs/first"]), {"a_priori": {"acceleration_error": 0.3}}
     first = ModelSource(Path("first"), {}, {}, errors, {"mach_turbulent": 0.08})
     origin, own = trained_on(scene, first)
     assert origin == {"path": "runs/first", "mach_turbulent": 0.08} and own == errors["a_priori"]
@@ -63,8 +64,8 @@ def test_weights_that_go_from_run_to_run_keep_where_they_were_trained():
     found = trained_on(scene, ModelSource(Path("first"), {}, {}, errors, elsewhere))
     assert found == ({"path": "runs/first", "truths": {"runs/a/ground_truth.h5": 0.04}}, None)
     second = ModelSource(Path("second"), {}, {}, errors, {"mach_turbulent": 0.16, "source": found[0]})
-    assert trained_on(load_scene("tiny", ["model.path=runs/second"]), second) == found
+    assert trained_on(load_scene(TINY, ["model.path=runs/second"]), second) == found
 
     tables = {"a_priori": {"acceleration_error": 0.5}, "source_a_priori": own}
     second = ModelSource(Path("second"), {}, {}, tables, {"mach_turbulent": 0.16, "source": origin})
-    assert trained_on(load_scene("tiny", ["model.path=runs/second"]), second) == (origin, own)
+    assert trained_on(load_scene(TINY, ["model.path=runs/second"]), second) == (origin, own)

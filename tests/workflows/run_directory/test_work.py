@@ -14,13 +14,14 @@ from eddies.scene.scene import load_scene
 from eddies.stages import RUN
 from eddies.workflows.run_directory import work as work_module
 from eddies.workflows.run_directory.work import WorkAtStake, find_work
+from tests.small_scene import TINY
 
 MAKING = ("dns", "train-kernel", "train", "simulate")
 
 
 @pytest.fixture
 def scene():
-    return load_scene("tiny")
+    return load_scene(TINY)
 
 
 def leave(comm, directory, scene, stages=MAKING):
@@ -64,7 +65,7 @@ def test_what_fits_is_done_whatever_is_to_be_made_before_it(comm, tmp_path, scen
 def test_what_would_be_replaced_is_named_with_cost_and_reason(comm, tmp_path, scene, change, stages, lost, changes):
     leave(comm, tmp_path, scene)
     (tmp_path / "stage_seconds.json").write_text(json.dumps({"dns": 125, "simulate": 3.2}))
-    work = find_work(stages, load_scene("tiny", [change]), tmp_path)
+    work = find_work(stages, load_scene(TINY, [change]), tmp_path)
     assert [each.split()[0] for each in work.lost] == lost and work.done == set(stages) - {
         stage for stage in stages if STAGES[stage].file in lost}
     if not lost:
@@ -87,7 +88,7 @@ def test_a_file_that_cannot_be_read_is_not_replaced_silently_either(comm, tmp_pa
 
 @pytest.mark.mpi(1)
 def test_checkpoints_of_other_settings_are_work_too(comm, tmp_path, scene):
-    other = load_scene("tiny", ["training.steps=70"])
+    other = load_scene(TINY, ["training.steps=70"])
     save(comm, tmp_path, other, "train", 5)
     work = find_work(scene.stages, scene, tmp_path)
     assert work.useless == {"train"}
@@ -104,7 +105,7 @@ def test_checkpoints_of_other_settings_are_work_too(comm, tmp_path, scene):
 @pytest.mark.mpi(1)
 def test_checkpoints_beside_a_product_that_fits_are_for_whoever_replaces_it(comm, tmp_path, scene):
     leave(comm, tmp_path, scene, ["train"])
-    other = load_scene("tiny", ["training.steps=70"])
+    other = load_scene(TINY, ["training.steps=70"])
     save(comm, tmp_path, other, "train", 5)
     work = find_work(["train"], scene, tmp_path)
     assert work.done == {"train"} and not work.useless and not work.lost
@@ -123,7 +124,7 @@ def test_checkpoints_of_another_format_are_work_that_nobody_goes_on_with(comm, t
 
 @pytest.mark.mpi(1)
 def test_a_link_is_no_work(comm, tmp_path, scene):
-    leave(comm, tmp_path, load_scene("tiny", ["kernel.steps=5"]), ["train-kernel"])
+    leave(comm, tmp_path, load_scene(TINY, ["kernel.steps=5"]), ["train-kernel"])
     (tmp_path / "here").mkdir()
     (tmp_path / "here/kernel.h5").symlink_to("../kernel.h5")
     assert not find_work(["train-kernel"], scene, tmp_path / "here").lost

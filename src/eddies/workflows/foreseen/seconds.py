@@ -1,10 +1,14 @@
 """The wall time of a stage, for batch requests: right within a factor of three; `eddies check --time` measures instead.
 
-    seconds = START + (transforms x TRANSFORM + pairs x PAIR) / ranks + calls x (CALL + ROUNDS x (ranks - 1) x MESSAGE)
+    seconds = START + (transforms x TRANSFORM + pairs x (PAIR + weights x WEIGHT)) / ranks
+            + calls x (CALL + ROUNDS x (ranks - 1) x MESSAGE)
 """
 
+from itertools import pairwise
+
 from eddies.flow.navier_stokes import FLUIDS, CompressibleFluid
-from eddies.scene.scene import BOX_LENGTH, Eulerian, Scene
+from eddies.scene.scene import BOX_LENGTH, Eulerian, Model, Scene
+from eddies.scene.terms import NetworkSettings
 from eddies.time_stepping import ETDRK4, STEPPERS
 from eddies.workflows.foreseen.numbers import flow_steps, rollout_of
 from eddies.workflows.foreseen.storage import training_steps
@@ -12,8 +16,8 @@ from eddies.workflows.ground_truth.frame_counts import KERNEL_FIELDS, TESTED_FRA
 
 # Seconds, measured on one and two cores of an AMD EPYC with AVX-512, with `tiny`, `hit-small` and `hit-coarse`: of a
 # transform of a grid point (1 + cells / CACHED times that where planes outgrow the caches), a pair of particles in a
-# sum, an evaluation or iteration without its work, a message; of an idle stage.
-TRANSFORM, CACHED, PAIR, CALL, MESSAGE, ROUNDS = 4e-9, 550, 2.5e-8, 2.5e-4, 2e-6, 4
+# sum, a weight of a network for a pair, an evaluation or iteration without its work, a message; of an idle stage.
+TRANSFORM, CACHED, PAIR, WEIGHT, CALL, MESSAGE, ROUNDS = 4e-9, 550, 2.5e-8, 6e-11, 2.5e-4, 2e-6, 4
 START = {"dns": 0.4, "train-kernel": 0.7, "train": 1.0, "find-step": 0.5, "simulate": 0.3, "report": 2.3}
 SEARCH = 2                   # turnovers of the short rollouts that find a step, of the longest step
 COLD, ITERATION = 25, 12     # iterations of a solve from nothing; transforms of a point in one, with its splines
@@ -64,5 +68,13 @@ def seconds(scene: Scene, stage: str, ranks: int) -> float | None:
     if solves and scene.resolves:
         calls += solves * COLD
         transforms += solves * COLD * ITERATION * tracers.planes**3
-    work = (transforms * TRANSFORM + pairs * PAIR) / ranks
+    learned = _weights(model) if stage in ("train", "simulate") and model else 0
+    work = (transforms * TRANSFORM + pairs * (PAIR + learned * WEIGHT)) / ranks
     return START[stage] + work + calls * (CALL + ROUNDS * (ranks - 1) * MESSAGE)
+
+
+def _weights(model: Model) -> int:
+    """How many weights the networks of pairs have, about: those between their inputs and hidden layers."""
+    layers = [(len(settings.inputs), *settings.hidden) for settings in model.settings.values()
+              if isinstance(settings, NetworkSettings)]
+    return sum(first * second for widths in layers for first, second in pairwise(widths))
