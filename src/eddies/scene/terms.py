@@ -352,4 +352,4 @@ PRESETS: dict[str, dict[str, Mapping[str, Any]]] = {
     "wcsph": {"continuity": {}, "wcsph": LITTLE_FRICTION},
     "transport-velocity": {"continuity": {}, "wcsph": LITTLE_FRICTION, "transport-velocity": {}},
 }
-DEFAULT_PRESET = "resolved"
+DEFAULT_PRESET = "paper"
