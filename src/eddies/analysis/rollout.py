@@ -63,7 +63,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """What averages with a kernel make of particles at one moment.
+    """What is reconstructed from particles at one moment, of model and truth alike.
 
     Parameters
     ----------

@@ -1,4 +1,5 @@
-"""Particles at one moment as samples of a field: kernel averages on a grid and at the particles themselves."""
+"""Particles at one moment as samples of a field: averages, moving least squares and kriging, on a grid and at the
+particles themselves."""
 
 from __future__ import annotations
 
@@ -9,21 +10,27 @@ import torch
 from torch import Tensor
 
 from eddies.kernels.library import library
+from eddies.kernels.moving_least_squares import fitted
+from eddies.kernels.neighbors import Box
 from eddies.kernels.pairs import PairSpace
 from eddies.kernels.reconstruction import GridPlanes, sums_on_grid, told_kernel
 from eddies.parallel.halo import HaloExchange
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.devices import kernels_serve
 from eddies.particles.exchanges import exchange_ghost_positions, exchange_ghosts
+from eddies.particles.kriging import Covariance, interpolated
 from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.pairs import CompiledSum, Pairs, compiled_sums
 from eddies.particles.particle_set import as_numpy
 from eddies.particles.periodic_box import PeriodicBox
-from eddies.particles.reconstruction import reciprocal, reconstruct_on_grid, reconstruct_with_gradient
+from eddies.particles.reconstruction import (RIDGE, moving_least_squares, reciprocal, reconstruct_on_grid,
+                                             reconstruct_with_gradient)
 from eddies.particles.smoothing_kernels import HermiteKernel, SmoothingKernel
 
 # Pairs taken together where no gradient is recorded: about a core's cache.
 PAIRS_TOGETHER = 1 << 16
+# Of kriging, which has ten weights of each: enough receivers for as many threads as there are.
+KRIGED_TOGETHER = 1 << 20
 
 
 class ParticleField:
@@ -40,11 +47,11 @@ class ParticleField:
 
     def __init__(self, decomposition: SlabDecomposition, support: float, position: Tensor, velocity: Tensor,
                  dtype: torch.dtype = torch.float32) -> None:
-        self.decomposition, self.dtype, self.owned = decomposition, dtype, position
+        self.decomposition, self.dtype, self.owned, self.support = decomposition, dtype, position, support
         self.halo = HaloExchange(decomposition, as_numpy(position), support)
         self._position = torch.cat([position, exchange_ghost_positions(self.halo, position)])
         self._velocity = torch.cat([velocity, exchange_ghosts(self.halo, velocity)]).to(dtype)
-        self._points, self._support = grid_points(decomposition, decomposition.planes).to(position.device), support
+        self.points = grid_points(decomposition, decomposition.planes).to(position.device)
         self._entries: Tensor | None = None
 
     def volumes(self, kernel: SmoothingKernel) -> Tensor:
@@ -74,29 +81,30 @@ class ParticleField:
 
     def on_grid(self, kernel: SmoothingKernel, volume: Tensor, rows: Tensor | slice) -> tuple[Tensor, Tensor]:
         """Velocity (k, 3) and its gradient (k, 3, 3) at some of this rank's grid points; differentiable."""
-        pairs = self._around.pairs(self._points, self._position, rows, self.dtype)
+        pairs = self._around.pairs(self.points, self._position, rows, self.dtype)
         return reconstruct_with_gradient(kernel, pairs, volume, self._velocity)
 
     @torch.no_grad()
     def on_whole_grid(self, kernel: SmoothingKernel, volume: Tensor) -> tuple[Tensor, Tensor]:
         """Velocity (m, 3) and gradient (m, 3, 3) at all of this rank's grid points, by the kernel's `volumes`."""
         if kernels_serve(self.owned.device):
-            none = self._velocity.new_zeros(len(self._points), 4)
-            return self._averages(kernel, torch.cat([self._points, self._position]),
+            none = self._velocity.new_zeros(len(self.points), 4)
+            return self._averages(kernel, torch.cat([self.points, self._position]),
                                   torch.cat([none, self._columns(volume)]), none)
         return _joined(self.on_grid(kernel, volume, block) for block in self._around.blocks(PAIRS_TOGETHER))
 
     @torch.no_grad()
     def velocity_on_whole_grid(self, kernel: SmoothingKernel, volume: Tensor) -> Tensor:
         """Velocity (m, 3) at all of this rank's grid points, cheaper than with its gradient; not differentiable."""
-        slab = self.decomposition
         if kernels_serve(self.owned.device):
-            weighted = volume.unsqueeze(1) * torch.cat([torch.ones_like(volume).unsqueeze(1), self._velocity], dim=1)
-            planes = GridPlanes(slab.planes, slab.spacing, slab.start, slab.count, slab.size == 1)
-            sums = torch.from_numpy(sums_on_grid(library(), planes, kernel.support, kernel.pieces.numpy(),
-                                                 self._position.numpy(), weighted.numpy()))
+            sums = self._sums_on_grid(kernel, volume)
             return sums[:, 1:] * reciprocal(sums[:, :1])
-        return reconstruct_on_grid(kernel, slab, self._position, volume, self._velocity)
+        return reconstruct_on_grid(kernel, self.decomposition, self._position, volume, self._velocity)
+
+    @torch.no_grad()
+    def denominators_on_grid(self, kernel: SmoothingKernel, volume: Tensor) -> Tensor:
+        """sum_j V_j W (m,), one on average, by which averages at this rank's grid points are divided."""
+        return self._sums_on_grid(kernel, volume)[:, 0]
 
     @torch.no_grad()
     def at_particles(self, kernel: SmoothingKernel, volume: Tensor) -> tuple[Tensor, Tensor]:
@@ -107,6 +115,30 @@ class ParticleField:
             itself[:, :1] *= kernel.value(itself.new_zeros(()))
             return self._averages(kernel, self._position, columns, itself)
         return _joined(reconstruct_with_gradient(kernel, pairs, volume, self._velocity) for pairs in self._own_pairs)
+
+    # ---- by other forms, at any points of this rank (k, 3)
+
+    @torch.no_grad()
+    def fitted(self, kernel: SmoothingKernel, degree: int, mean_volume: float,
+               receivers: Tensor) -> tuple[Tensor, Tensor]:
+        """Velocity (k, 3) and gradient (k, 3, 3) by `moving_least_squares`."""
+        neighbors = self._neighbors_of(receivers)
+        if not kernels_serve(self.owned.device):
+            return _joined(moving_least_squares(
+                kernel, neighbors.pairs(receivers, self._position, block, torch.float64), degree, mean_volume,
+                self._velocity) for block in neighbors.blocks(PAIRS_TOGETHER))
+        box = Box(self.decomposition.length, self.decomposition.size == 1)
+        found = torch.from_numpy(fitted(library(), box, degree, _told(kernel), mean_volume, RIDGE,
+                                        neighbors.offsets.numpy(), neighbors.senders.numpy(), receivers.numpy(),
+                                        self._position.numpy(), self._velocity.numpy())).to(self.dtype)
+        return found[:, 0], found[:, 1:].transpose(1, 2)
+
+    @torch.no_grad()
+    def kriged(self, covariance: Covariance, receivers: Tensor) -> tuple[Tensor, Tensor]:
+        """Velocity (k, 3) and gradient (k, 3, 3) by kriging with all neighbours within the support: `interpolated`."""
+        neighbors = self._neighbors_of(receivers)
+        return _joined(interpolated(neighbors.pairs(receivers, self._position, block, self.dtype), self.support,
+                                    covariance, self._velocity) for block in neighbors.blocks(KRIGED_TOGETHER))
 
     # ---- by the compiled library
 
@@ -125,13 +157,20 @@ class ParticleField:
         gradient = (sums[7:].reshape(3, 3, -1) - relative.unsqueeze(1) * sums[4:7]) * factor
         return (relative + itself.T[1:]).T, gradient.permute(2, 0, 1)
 
+    def _sums_on_grid(self, kernel: SmoothingKernel, volume: Tensor) -> Tensor:
+        """sum_j V_j W and sum_j V_j v_j W at this rank's grid points, (m, 4)."""
+        slab = self.decomposition
+        weighted = volume.unsqueeze(1) * torch.cat([torch.ones_like(volume).unsqueeze(1), self._velocity], dim=1)
+        planes = GridPlanes(slab.planes, slab.spacing, slab.start, slab.count, slab.size == 1)
+        return torch.from_numpy(sums_on_grid(library(), planes, _told(kernel), self._position.numpy(),
+                                             weighted.numpy()))
+
     def _sums(self, kernel: SmoothingKernel, kind: str, components: int, position: Tensor, count: int,
               scalars: tuple[Tensor, ...] = ()) -> tuple[Tensor, ...]:
         """Sums over the particles within the support, (components, count), of the first `count` positions."""
         space = PairSpace(self.decomposition.length, self.decomposition.size == 1, kernel.support, 1.0, 1.0, False)
         wanted = np.arange(len(position)) < count
-        told = CompiledSum(kind, told_kernel(kernel.support, kernel.pieces.numpy()), scalars=scalars,
-                           reads_velocity=False)
+        told = CompiledSum(kind, _told(kernel), scalars=scalars, reads_velocity=False)
         found = compiled_sums(space, [told], [torch.ones(components)], position, None, wanted, self.dtype)
         return tuple(sums[:, :count] for sums in found)
 
@@ -145,11 +184,11 @@ class ParticleField:
     @cached_property
     def _around(self) -> NeighborList:
         """The particles around grid points."""
-        return self._neighbors_of(self._points)
+        return self._neighbors_of(self.points)
 
     def _neighbors_of(self, receivers: Tensor) -> NeighborList:
         box = PeriodicBox(self.decomposition.length, periodic_z=self.decomposition.size == 1)
-        found = NeighborList(box, self._support, 0.0)
+        found = NeighborList(box, self.support, 0.0)
         found.build(receivers, self._position, exclude_self=False)
         return found
 
@@ -162,6 +201,10 @@ def grid_points(slab: SlabDecomposition, cells: int) -> Tensor:
     own = axis[first:end]
     z, y, x = torch.meshgrid(own, axis, axis, indexing="ij")
     return torch.stack([x.flatten(), y.flatten(), z.flatten()], dim=1)
+
+
+def _told(kernel: SmoothingKernel) -> tuple[float, ...]:
+    return told_kernel(kernel.support, kernel.pieces.numpy(), kernel.signed)
 
 
 def _joined(blocks) -> tuple[Tensor, Tensor]:

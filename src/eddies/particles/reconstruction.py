@@ -1,4 +1,4 @@
-"""Fields and their gradients from particles: kernel averages (Eqs. 5 and 6), normalised."""
+"""Fields and their gradients from particles: kernel averages (Eqs. 5 and 6), normalised, and moving least squares."""
 
 from __future__ import annotations
 
@@ -11,6 +11,9 @@ from eddies.particles.smoothing_kernels import SmoothingKernel
 
 # Points of the grid, near particles, that are looked at together: about a core's cache.
 POINTS_TOGETHER = 1 << 18
+# Of moving least squares, what is added to the squares of all coefficients but the constant, see there: below 1e-4 it
+# changes no error of a filtered field, and of particles without a force, which gather, it bounds the gradients.
+RIDGE = 1e-4
 
 
 def volumes(kernel: SmoothingKernel, pairs: Pairs) -> Tensor:
@@ -89,6 +92,47 @@ def reconstruct_with_gradient(
     products = deviation.unsqueeze(1) * gradient.unsqueeze(0)
     sums = pairs.sum(products.flatten(0, 1).T).reshape(pairs.count, *products.shape[:2])
     return average, sums * factor[:, :, None]
+
+
+@torch.no_grad()
+def moving_least_squares(kernel: SmoothingKernel, pairs: Pairs, degree: int, mean_volume: float, sender_values: Tensor,
+                         ridge: float = RIDGE) -> tuple[Tensor, Tensor]:
+    """A field (n, c) and its gradient (n, c, 3) at the receivers: value and gradient there of the polynomial p of a
+    degree, 1 or 2, with the least
+
+        V sum_j W(x - x_j) |p(x_j) - A_j|^2 + ridge (sum of the squares of all coefficients of p but the constant),
+
+    p in (x_j - x)/h, V the mean volume of a particle, so that V sum_j W is one on average. Without a ridge polynomials
+    of this degree are exact. A constant is so always: where neighbours are few, far or badly placed, the ridge outweighs
+    them and leaves the average with W. Zero where no particle lies within the support.
+
+    Parameters
+    ----------
+    kernel : smoothing kernel that is nowhere negative, with a support that does not exceed the cutoff of the pairs.
+    pairs : receivers are the points x; particles that receive are among their own neighbours.
+    sender_values : (s, c), the field A at all local particles.
+    """
+    monomials = _monomials(-pairs.displacement.double() / kernel.support, degree)
+    weighted = (mean_volume * kernel.value(pairs.distance.double()))[:, None] * monomials
+    matrix = pairs.sum(weighted[:, :, None] * monomials[:, None, :])
+    right = pairs.sum(weighted[:, :, None] * pairs.at_senders(sender_values).double()[:, None, :])
+    size = matrix.shape[1]
+    penalty = ridge * torch.eye(size, dtype=matrix.dtype, device=matrix.device)
+    penalty[0, 0] = 0
+    factor, failed = torch.linalg.cholesky_ex(matrix + penalty)
+    failed = failed[:, None, None] > 0
+    identity = torch.eye(size, dtype=matrix.dtype, device=matrix.device)
+    found = torch.cholesky_solve(torch.where(failed, 0, right), torch.where(failed, identity, factor))
+    found = found.to(sender_values.dtype)
+    return found[:, 0], found[:, 1:4].transpose(1, 2) / kernel.support
+
+
+def _monomials(x: Tensor, degree: int) -> Tensor:
+    """1, x, y, z and, of degree 2, xx, xy, xz, yy, yz, zz of (m, 3): (m, 4 or 10)."""
+    columns = [torch.ones_like(x[:, 0]), *x.unbind(1)]
+    if degree == 2:
+        columns += [x[:, i] * x[:, j] for i in range(3) for j in range(i, 3)]
+    return torch.stack(columns, dim=1)
 
 
 def _average(kernel: SmoothingKernel, pairs: Pairs, volume: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
