@@ -16,8 +16,6 @@ from eddies.particles.smoothing_kernels import SmoothingKernel
 log = logging.getLogger("eddies")
 
 DEGREES = {"linear": 1, "quadratic": 2}
-# Of the sum of V W over neighbours, one on average: what a signed kernel leaves below this is near no particles.
-LEAST_DENOMINATOR = 0.05
 
 
 class Reconstructed(Protocol):
@@ -44,7 +42,8 @@ class Form(Protocol):
 
 @dataclass(frozen=True)
 class Average:
-    """Normalised averages with a kernel, Eqs. 5 and 6; the gradient is exactly that of the reconstructed field."""
+    """Averages with a kernel, Eqs. 5 and 6, as `reconstruct` has them; the gradient of normalised ones is exactly that of
+    the reconstructed field."""
 
     kernel: SmoothingKernel
 
@@ -65,24 +64,13 @@ class _Averaged:
     volume: Tensor
 
     def on_grid(self) -> tuple[Tensor, Tensor]:
-        self._warn()
         return self.field.on_whole_grid(self.kernel, self.volume)
 
     def velocity_on_grid(self) -> Tensor:
-        self._warn()
         return self.field.velocity_on_whole_grid(self.kernel, self.volume)
 
     def at_particles(self) -> tuple[Tensor, Tensor]:
         return self.field.at_particles(self.kernel, self.volume)
-
-    def _warn(self) -> None:
-        """Tell where a signed kernel leaves hardly anything to divide by."""
-        if self.kernel.signed:
-            weak = int((self.field.denominators_on_grid(self.kernel, self.volume) < LEAST_DENOMINATOR).sum())
-            if weak:
-                log.warning("kernel: of %d grid points %d have a sum of weights below %g, or of the other sign; what is "
-                            "reconstructed there has no bound. Set [kernel] positive = true", len(self.field.points),
-                            weak, LEAST_DENOMINATOR)
 
 
 @dataclass(frozen=True)
@@ -155,8 +143,8 @@ def form_of(name: str, kernel: SmoothingKernel, filter_width: float, mean_volume
 
     Parameters
     ----------
-    kernel : the learned W, whose support holds the neighbours of all forms. filter_width : d of the filter that the
-    velocities have passed. mean_volume : of a particle.
+    kernel : the learned W, whose support holds the neighbours of all forms; nowhere negative but for averages.
+    filter_width : d of the filter that the velocities have passed. mean_volume : of a particle.
     """
     if name == "average":
         return Average(kernel)

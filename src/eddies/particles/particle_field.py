@@ -23,7 +23,7 @@ from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.pairs import CompiledSum, Pairs, compiled_sums
 from eddies.particles.particle_set import as_numpy
 from eddies.particles.periodic_box import PeriodicBox
-from eddies.particles.reconstruction import (RIDGE, moving_least_squares, reciprocal, reconstruct_on_grid,
+from eddies.particles.reconstruction import (RIDGE, moving_least_squares, normalisation, reconstruct_on_grid,
                                              reconstruct_with_gradient)
 from eddies.particles.smoothing_kernels import HermiteKernel, SmoothingKernel
 
@@ -55,7 +55,10 @@ class ParticleField:
         self._entries: Tensor | None = None
 
     def volumes(self, kernel: SmoothingKernel) -> Tensor:
-        """Volumes 1 / sum_j W(x_i - x_j), i itself counted, of all local particles (s,); collective, differentiable."""
+        """Volumes 1 / sum_j W(x_i - x_j), i itself counted, or the kernel's mean volume, of all local particles (s,);
+        collective, differentiable."""
+        if kernel.mean_volume is not None:
+            return self._velocity.new_full((len(self._position),), kernel.mean_volume)
         if kernels_serve(self.owned.device) and not torch.is_grad_enabled():
             sums, = self._sums(kernel, "kernel-sum", 1, self._position, len(self.owned))
             return self._with_ghosts(1 / (sums[0] + kernel.value(sums.new_zeros(()))))
@@ -64,6 +67,8 @@ class ParticleField:
     def volumes_by_table(self, kernel: HermiteKernel) -> Tensor:
         """The same of a tabulated kernel, fast for one table after the other: what an entry adds to the sum of each
         particle is found once, 8 bytes for each knot and particle. Collective, differentiable."""
+        if kernel.mean_volume is not None:
+            return self.volumes(kernel)
         if self._entries is None or self._entries.shape[1] != len(kernel.table):
             with torch.no_grad():
                 self._entries = torch.cat([self._by_entry(kernel, pairs) for pairs in self._own_pairs])
@@ -97,14 +102,13 @@ class ParticleField:
     def velocity_on_whole_grid(self, kernel: SmoothingKernel, volume: Tensor) -> Tensor:
         """Velocity (m, 3) at all of this rank's grid points, cheaper than with its gradient; not differentiable."""
         if kernels_serve(self.owned.device):
-            sums = self._sums_on_grid(kernel, volume)
-            return sums[:, 1:] * reciprocal(sums[:, :1])
+            slab = self.decomposition
+            weighted = volume.unsqueeze(1) * torch.cat([torch.ones_like(volume).unsqueeze(1), self._velocity], dim=1)
+            planes = GridPlanes(slab.planes, slab.spacing, slab.start, slab.count, slab.size == 1)
+            sums = torch.from_numpy(sums_on_grid(library(), planes, _told(kernel), self._position.numpy(),
+                                                 weighted.numpy()))
+            return sums[:, 1:] * normalisation(kernel, sums[:, :1])
         return reconstruct_on_grid(kernel, self.decomposition, self._position, volume, self._velocity)
-
-    @torch.no_grad()
-    def denominators_on_grid(self, kernel: SmoothingKernel, volume: Tensor) -> Tensor:
-        """sum_j V_j W (m,), one on average, by which averages at this rank's grid points are divided."""
-        return self._sums_on_grid(kernel, volume)[:, 0]
 
     @torch.no_grad()
     def at_particles(self, kernel: SmoothingKernel, volume: Tensor) -> tuple[Tensor, Tensor]:
@@ -152,18 +156,13 @@ class ParticleField:
         others, which have `columns` (s, 4) of volume and velocity. `itself` (m, 4): V W(0) of each as one of its own
         neighbours, and the velocity that others are taken relative to."""
         sums = self._sums(kernel, "kernel-average", 16, position, len(itself), tuple(columns.T))[0]
-        factor = reciprocal(sums[:1] + itself.T[:1])
+        weight, own = sums[:1] + itself.T[:1], itself.T[1:]
+        factor = normalisation(kernel, weight)
         relative = sums[1:4] * factor
+        if kernel.mean_volume is not None:
+            relative = relative + (weight - 1) * own
         gradient = (sums[7:].reshape(3, 3, -1) - relative.unsqueeze(1) * sums[4:7]) * factor
-        return (relative + itself.T[1:]).T, gradient.permute(2, 0, 1)
-
-    def _sums_on_grid(self, kernel: SmoothingKernel, volume: Tensor) -> Tensor:
-        """sum_j V_j W and sum_j V_j v_j W at this rank's grid points, (m, 4)."""
-        slab = self.decomposition
-        weighted = volume.unsqueeze(1) * torch.cat([torch.ones_like(volume).unsqueeze(1), self._velocity], dim=1)
-        planes = GridPlanes(slab.planes, slab.spacing, slab.start, slab.count, slab.size == 1)
-        return torch.from_numpy(sums_on_grid(library(), planes, _told(kernel), self._position.numpy(),
-                                             weighted.numpy()))
+        return (relative + own).T, gradient.permute(2, 0, 1)
 
     def _sums(self, kernel: SmoothingKernel, kind: str, components: int, position: Tensor, count: int,
               scalars: tuple[Tensor, ...] = ()) -> tuple[Tensor, ...]:
@@ -204,7 +203,7 @@ def grid_points(slab: SlabDecomposition, cells: int) -> Tensor:
 
 
 def _told(kernel: SmoothingKernel) -> tuple[float, ...]:
-    return told_kernel(kernel.support, kernel.pieces.numpy(), kernel.signed)
+    return told_kernel(kernel.support, kernel.pieces.numpy(), kernel.mean_volume is not None)
 
 
 def _joined(blocks) -> tuple[Tensor, Tensor]:

@@ -1,4 +1,5 @@
-"""Fields and their gradients from particles: kernel averages (Eqs. 5 and 6), normalised, and moving least squares."""
+"""Fields and their gradients from particles: kernel averages (Eqs. 5 and 6), normalised but for kernels that may be
+negative, and moving least squares."""
 
 from __future__ import annotations
 
@@ -17,10 +18,13 @@ RIDGE = 1e-4
 
 
 def volumes(kernel: SmoothingKernel, pairs: Pairs) -> Tensor:
-    """Volume of each particle, 1 / (W(0) + sum_j W(x_i - x_j)), shape (count,), in length^3.
+    """Volume of each particle, 1 / (W(0) + sum_j W(x_i - x_j)), shape (count,), in length^3; the mean volume of a kernel
+    that has one.
 
     `pairs` leaves out the particle itself, which the first term counts once.
     """
+    if kernel.mean_volume is not None:
+        return pairs.distance.new_full((pairs.count,), kernel.mean_volume)
     at_centre = kernel.value(pairs.distance.new_zeros(1))
     return 1 / (at_centre + pairs.sum(kernel.value(pairs.distance)))
 
@@ -28,7 +32,8 @@ def volumes(kernel: SmoothingKernel, pairs: Pairs) -> Tensor:
 def reconstruct(
     kernel: SmoothingKernel, pairs: Pairs, sender_volumes: Tensor, sender_values: Tensor
 ) -> Tensor:
-    """<A>(x) = sum_j V_j A_j W(x - x_j) / sum_j V_j W(x - x_j) at the receivers: (count, components).
+    """<A>(x) = sum_j V_j A_j W(x - x_j) / sum_j V_j W(x - x_j) at the receivers: (count, components); of a kernel with
+    a mean volume the numerator alone, Eq. 6.
 
     Parameters
     ----------
@@ -38,7 +43,7 @@ def reconstruct(
     sender_volumes : (s,), volumes of all local particles, as `volumes` gives them.
     sender_values : (s, components), the quantity A at all local particles.
 
-    A constant is reproduced to rounding. Zero where no particle lies within the support.
+    A constant is reproduced to rounding where sums are normalised. Zero where no particle lies within the support.
     """
     return _average(kernel, pairs, pairs.at_senders(sender_volumes), pairs.at_senders(sender_values).T)[0]
 
@@ -72,7 +77,7 @@ def reconstruct_on_grid(
         point, particle = point.index_select(0, near), some.index_select(0, near // side**3)
         for column, total in zip(columns, sums):
             total.index_add_(0, point, weight * column.index_select(0, particle))
-    return (sums[1:] * reciprocal(sums[0])).T
+    return (sums[1:] * normalisation(kernel, sums[0])).T
 
 
 def reconstruct_with_gradient(
@@ -81,7 +86,8 @@ def reconstruct_with_gradient(
     """`reconstruct`, and its gradient (count, components, 3), the last axis the direction of the derivative.
 
     The gradient is sum_j V_j (A_j - <A>) grad W(x - x_j) / sum_j V_j W, the asymmetric finite-particle form, and
-    exactly the derivative of the reconstructed field. Arguments as there.
+    exactly the derivative of the reconstructed field; of a kernel with a mean volume the numerator alone. Arguments as
+    there.
     """
     volume, value, distance = pairs.at_senders(sender_volumes), pairs.at_senders(sender_values).T, pairs.distance
     average, factor = _average(kernel, pairs, volume, value)
@@ -136,10 +142,10 @@ def _monomials(x: Tensor, degree: int) -> Tensor:
 
 
 def _average(kernel: SmoothingKernel, pairs: Pairs, volume: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
-    """<A> (count, components) of volumes (m,) and values (components, m) of pairs, and 1 / sum_j V_j W (count, 1)."""
+    """<A> (count, components) of volumes (m,) and values (components, m) of pairs, and by what sums are multiplied (count, 1)."""
     weight = volume * kernel.value(pairs.distance)
     sums = pairs.sum(torch.cat([weight.unsqueeze(0), weight * value]).T)
-    factor = reciprocal(sums[:, :1])
+    factor = normalisation(kernel, sums[:, :1])
     return sums[:, 1:] * factor, factor
 
 
@@ -149,7 +155,9 @@ def _outer_sum(z: Tensor, y: Tensor, x: Tensor) -> Tensor:
     return (z[:, :, None, None] + plane.unsqueeze(1)).flatten()
 
 
-def reciprocal(denominator: Tensor) -> Tensor:
-    """1 / denominator, and zero where no particle contributes."""
+def normalisation(kernel: SmoothingKernel, denominator: Tensor) -> Tensor:
+    """1 / denominator, and zero where no particle contributes; one of a kernel with a mean volume."""
+    if kernel.mean_volume is not None:
+        return torch.ones_like(denominator)
     empty = denominator == 0
     return torch.where(empty, torch.zeros_like(denominator), 1 / torch.where(empty, 1, denominator))

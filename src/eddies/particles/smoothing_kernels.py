@@ -1,8 +1,8 @@
 """Smoothing kernels W(r) of compact support: SPH's own, tabulated ones, and the learned kernel after Eq. 7.
 
 Every kernel has unit integral over space, W in units of 1/length^3, is nowhere negative, and exactly zero for
-r >= support. The learned kernel in the published form alone is `signed`: it may be negative, and its integral is one
-as nearly as the loss L_n makes it.
+r >= support. The learned kernel in the published form alone may be negative, and its integral is one as nearly as the
+loss L_n makes it; it has the `mean_volume` L^3/N of a particle, V_j of Eq. 6, and its sums are not divided by anything.
 """
 
 from __future__ import annotations
@@ -24,10 +24,14 @@ KNOTS = 129                  # of a table of the learned kernel
 
 
 class SmoothingKernel(Protocol):
-    """W(r) and dW/dr for distances of any shape, zero for r >= `support`; negative somewhere only if it is `signed`."""
+    """W(r) and dW/dr for distances of any shape, zero for r >= `support`.
+
+    With a `mean_volume` W may be negative, and <A> = V sum_j A_j W with V = L^3/N, Eq. 6 as published. Without one W is
+    nowhere negative, volumes are V_j = 1/sum_k W, and averages are normalised.
+    """
 
     support: float
-    signed: bool
+    mean_volume: float | None
 
     @property
     def pieces(self) -> Tensor:
@@ -43,7 +47,7 @@ class SmoothingKernel(Protocol):
 class _Polynomial:
     """Kernel from a shape W h^3 and its slope, functions of q = r/h on [0, 1)."""
 
-    signed = False
+    mean_volume = None
     shape_pieces: tuple[tuple[float, ...], ...]
 
     def __init__(self, support: float) -> None:
@@ -102,16 +106,16 @@ class HermiteKernel:
     ----------
     support : h.
     values, slopes : (knots,), the dimensionless W h^3 and d(W h^3)/dq; what is computed is differentiable in both.
-    signed : whether values may be negative. If not, slopes of more than three times the value within a cell are lowered
-        to that: a cubic between them would be negative somewhere.
+    mean_volume : see SmoothingKernel. Without one values are not negative, and slopes of more than three times the value
+        within a cell are lowered to that: a cubic between them would be negative somewhere.
     """
 
-    def __init__(self, support: float, values: Tensor, slopes: Tensor, signed: bool = False) -> None:
+    def __init__(self, support: float, values: Tensor, slopes: Tensor, mean_volume: float | None = None) -> None:
         if values.dim() != 1 or values.shape != slopes.shape or len(values) < 2:
             raise ValueError(f"kernel table {(*values.shape,)}, {(*slopes.shape,)}: not two equal columns")
-        self.support, self.values, self.cells, self.signed = support, values, len(values) - 1, signed
+        self.support, self.values, self.cells, self.mean_volume = support, values, len(values) - 1, mean_volume
         steepest = 3 * self.cells * values
-        self.slopes = slopes if signed else torch.clamp(slopes, -steepest, steepest)
+        self.slopes = torch.clamp(slopes, -steepest, steepest) if mean_volume is None else slopes
         start, rise = values[:-1], values[1:] - values[:-1]
         first, last = self.slopes[:-1] / self.cells, self.slopes[1:] / self.cells
         self._coefficients = (start, first, 3 * rise - 2 * first - last, first + last - 2 * rise)
@@ -121,7 +125,7 @@ class HermiteKernel:
         inside, cell, t = self._locate(distance)
         a, b, c, d = self._cubic(cell)
         value = a + t * (b + t * (c + t * d))
-        if not self.signed:
+        if self.mean_volume is None:
             value = torch.clamp(value, min=0)  # below zero by rounding alone
         return torch.where(inside, value, torch.zeros_like(value)) / self.support**3
 
@@ -167,8 +171,8 @@ class HermiteKernel:
 
 
 class KernelNetwork(nn.Module):
-    """The learned kernel: W(r) = alpha exp(NN(2 q^2 - 1)) g(q) with q = r/h, alpha from the unit integral, or, if it is
-    not `positive`, W(r) = NN(q) g(q) / h^3, Eq. 7 as published.
+    """The learned kernel: W(r) = alpha exp(NN(2 q^2 - 1)) g(q) with q = r/h, alpha from the unit integral, or, with a
+    `mean_volume`, W(r) = NN(q) g(q) / h^3, Eq. 7 as published.
 
     Parameters
     ----------
@@ -177,24 +181,25 @@ class KernelNetwork(nn.Module):
     cutoff : "smooth": g = (1 - q^2)^2, exactly zero with zero slope at q = r/h = 1; or "sigmoid", the paper's
         g = 1/(1 + exp(C (q - 1))), which is 1/2 at q = 1, so that the kernel ends there with a jump.
     seed : of the initial weights.
-    positive : whether W is so everywhere.
+    mean_volume : L^3/N of the published form, which may be negative; None: the positive form.
 
-    The published form may be negative, and where all neighbours of a point lie at distances of either sign the
-    denominator of an average passes zero. Its alpha is part of the output layer, which the loss L_n of Eq. 11 brings to
-    the unit integral. With positive weights an average lies between the values that it is taken of.
+    The alpha of the published form is part of the output layer, which the loss L_n of Eq. 11 brings to the unit
+    integral. Neither volumes 1/sum W nor normalised averages would do with it: they do not change with alpha, and their
+    denominators pass zero where weights of either sign cancel. With positive weights an average lies between the values
+    that it is taken of.
 
     The positive form sees 2 q^2 - 1, so it is an even function of q: smooth at r = 0, with no slope there, as the
     gradient of a reconstructed field needs. Its output layer starts small, so that W starts near g, a bell shape.
     """
 
     def __init__(self, support: float, hidden: Sequence[int] = (20, 20, 20, 20), cutoff: str = "smooth", seed: int = 1,
-                 positive: bool = True) -> None:
+                 mean_volume: float | None = None) -> None:
         super().__init__()
         if cutoff not in ("smooth", "sigmoid"):
             raise ValueError(f'kernel cutoff "{cutoff}": "smooth" or "sigmoid"')
-        self.support, self.cutoff, self.positive = support, cutoff, positive
+        self.support, self.cutoff, self.mean_volume, self.positive = support, cutoff, mean_volume, mean_volume is None
         self.network = DenseNetwork(1, hidden, 1, seed)
-        if positive:
+        if self.positive:
             with torch.no_grad():
                 self.network.weights[-1].mul_(0.1)
 
@@ -219,7 +224,7 @@ class KernelNetwork(nn.Module):
             bell = torch.sigmoid(SIGMOID_SHARPNESS * (1 - q))
             bell_slope = -SIGMOID_SHARPNESS * bell * (1 - bell)
         return HermiteKernel(self.support, (shape * bell)[0], (slope * bell + shape * bell_slope)[0],
-                             signed=not self.positive)
+                             self.mean_volume)
 
     def integral(self, knots: int = KNOTS) -> Tensor:
         """The integral over space before W is normalised, 1/alpha: what the loss of Eq. 11 brings near one."""

@@ -201,12 +201,12 @@ class Kernel(Section):
 
     preset: str | None = choice("values of other keys that have a name, under those that are given; paper: Eqs. 6 to 11 "
                                 "as published", *KERNEL_PRESETS, default=None)
-    form: str | None = choice("how fields and gradients are reconstructed from particles: average: sums with W over their "
-                              "weights; linear, quadratic: polynomials fitted with W as weight; kriging: the best "
+    form: str | None = choice("how fields and gradients are reconstructed from particles: average: with weights W; "
+                              "linear, quadratic: polynomials fitted with W as weight; kriging: the best "
                               "estimate for filtered turbulence; absent: kriging", "average", "linear", "quadratic",
                               "kriging", default=None)
-    positive: bool | None = boolean("W = alpha exp(NN) g, of unit integral; false: NN g of Eq. 7, which may be negative; "
-                                    "absent: true", default=None)
+    positive: bool | None = boolean("W = alpha exp(NN) g, of unit integral; false: NN g of Eq. 7, which may be negative, "
+                                    "and sums of Eq. 6, which nothing divides; absent: true", default=None)
 
     neighbors: float = number("mean number of particles within the support", default=NEIGHBORS, at_least=8)
     hidden: tuple[int, ...] = integers("widths of the network's tanh layers", default=(20, 20, 20, 20),

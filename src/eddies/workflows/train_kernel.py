@@ -67,8 +67,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         tables = {"kernels": shapes(kernels, support), "history": history, **compare(kernels, unseen)}
         tables["errors"] |= errors_of_forms(kernels["learned"], unseen, scales)
     description = {"form": networks["learned"].formula, "support": support, "neighbors": settings.neighbors,
-                   "hidden": list(settings.hidden), "cutoff": settings.cutoff, "positive": settings.positive,
-                   "reconstruction": settings.form}
+                   "hidden": list(settings.hidden), "cutoff": settings.cutoff,
+                   "mean_volume": networks["learned"].mean_volume, "reconstruction": settings.form}
     weights = {name: tensor.numpy() for name, tensor in networks["learned"].state_dict().items()}
     save_weights(comm, directory / "kernel.h5", "kernel", description, weights, scene.provenance("train-kernel"),
                  tables)
@@ -114,7 +114,7 @@ def training_of(scene: Scene, samples: list[KernelSample]) -> Training:
     networks, phases = nn.ModuleDict(), []
     for name, gradient_weight in (("learned", settings.gradient_weight), ("learned_no_gradient", 0.0)):
         networks[name] = KernelNetwork(support, settings.hidden, settings.cutoff, scene.seed,
-                                       settings.positive).to(dtype)
+                                       None if settings.positive else scene.tracers.spacing**3).to(dtype)
         weights = KernelLossWeights(gradient_weight, settings.normalization_weight)
         trainer = KernelTrainer(networks[name], samples, weights, settings.points, scene.seed)
         phases.append(Phase(name, np.ones(settings.steps), rates, trainer.step))
@@ -159,7 +159,7 @@ def compare(kernels: dict[str, SmoothingKernel], sample: KernelSample) -> dict[s
 def errors_of_forms(kernel: SmoothingKernel, sample: KernelSample, scales: ReferenceScales) -> dict[str, float]:
     """Errors on a field of the forms other than averages, with a kernel that may be their weight; collective."""
     errors = {}
-    for name in () if kernel.signed else OTHER_FORMS:
+    for name in OTHER_FORMS if kernel.mean_volume is None else ():
         made = form_of(name, kernel, scales.filter_width, scales.spacing**3).of(sample.particles)
         errors[f"velocity_error_{name}"], errors[f"gradient_error_{name}"] = sample.errors_of(*made.on_grid())
     return errors

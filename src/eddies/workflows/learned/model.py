@@ -142,7 +142,7 @@ def load_form(comm: Comm, path: str | Path, scales: ReferenceScales) -> Form:
 def _table_of(description: Mapping[str, Any], tensors: Mapping[str, np.ndarray], path: str | Path,
               device: torch.device | str = "cpu") -> HermiteKernel:
     network = KernelNetwork(description["support"], description["hidden"], description["cutoff"],
-                            positive=description.get("positive", True))
+                            mean_volume=description.get("mean_volume"))
     formula = description.get("form", "NN g")
     if formula != network.formula:
         raise ProductError(f'{path}: form = "{formula}", and the kernel of these settings is now "{network.formula}": '
