@@ -47,8 +47,8 @@ def test_a_constant_is_exact_and_has_no_gradient(comm, name):
 @pytest.mark.mpi(1)
 @pytest.mark.parametrize("name, power", [("linear", 1), ("quadratic", 1), ("quadratic", 2)])
 def test_polynomials_are_exact_but_for_the_ridge(comm, monkeypatch, name, power):
-    """Away from the faces of the box, where they jump. With the ridge to what it is beside the moments of the weight, of
-    some 1e-2; without it to rounding."""
+    """Away from the faces of the box, where they jump. With the ridge to what it is beside the moments of the weight,
+    of some 1e-2; without it to rounding."""
     def polynomial(x):
         y = x - LENGTH / 2
         return y if power == 1 else torch.stack([y[:, 0] * y[:, 1], y[:, 2] ** 2, y[:, 1] + y[:, 0] ** 2], dim=1)
@@ -73,7 +73,8 @@ def test_polynomials_are_exact_but_for_the_ridge(comm, monkeypatch, name, power)
 
 @pytest.mark.mpi(1, 2, 3)
 @pytest.mark.parametrize("name, velocity_error, gradient_error",
-                         [("average", 0.3, 0.9), ("linear", 0.16, 0.24), ("quadratic", 0.04, 0.18), ("kriging", 0.04, 0.18)])
+                         [("average", 0.3, 0.9), ("linear", 0.16, 0.24), ("quadratic", 0.04, 0.18),
+                          ("kriging", 0.04, 0.18)])
 def test_a_smooth_field_and_its_gradient_on_any_number_of_ranks(comm, name, velocity_error, gradient_error):
     """Waves of k = 1, six supports long: an average flattens them by k^2 <x^2>/2 of 4 %, with noise of placement."""
     field = field_of(comm, waves)
@@ -90,8 +91,9 @@ def test_a_smooth_field_and_its_gradient_on_any_number_of_ranks(comm, name, velo
 @pytest.mark.mpi(1)
 @forms
 def test_the_gradient_is_that_of_the_field(comm, name):
-    """Exactly of an average, but for what a difference over 5e-3 misses; of polynomials and kriging, whose weights move with the point, to a part of it. Where a
-    neighbour enters or leaves, kriging's field has a small jump, and no gradient: a twentieth of the points is left out.
+    """Exactly of an average, but for what a difference over 5e-3 misses; of polynomials and kriging, whose weights move
+    with the point, to a part of it. Where a neighbour enters or leaves, kriging's field has a small jump, and no
+    gradient: a twentieth of the points is left out.
     """
     field, step = field_of(comm, waves, "lattice"), 5e-3
     made = form(name).of(field)

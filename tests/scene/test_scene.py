@@ -317,8 +317,9 @@ def test_each_closure_is_for_its_equations_alone(equations, closures):
 
 def test_a_preset_of_the_kernel_fills_what_is_not_given(tmp_path):
     preset = load_scene("hit-small", ["kernel.preset=paper"], ["kernel.learning_rate"]).kernel
-    assert (preset.form, preset.positive, preset.cutoff, preset.normalization_weight) == ("average", False, "sigmoid", 1.0)
-    assert (preset.learning_rate, preset.final_learning_rate, preset.preset) == (1e-3, 1e-6, None)
+    assert (preset.form, preset.positive, preset.cutoff) == ("average", False, "sigmoid")
+    assert (preset.normalization_weight, preset.learning_rate, preset.final_learning_rate) == (1.0, 1e-3, 1e-6)
+    assert preset.preset is None
     given = load_scene("hit-small", ["kernel.preset=paper", "kernel.cutoff=smooth"]).kernel
     assert (given.cutoff, given.learning_rate, given.final_learning_rate) == ("smooth", 5e-3, 1e-6)
     plain = load_scene("hit-small").kernel
@@ -329,7 +330,7 @@ def test_a_preset_of_the_kernel_fills_what_is_not_given(tmp_path):
 
 
 def test_polynomials_are_refused_a_weight_that_may_be_negative():
-    with pytest.raises(SceneError, match=r'\[kernel\] form = "quadratic": its weights must be positive.*form = "average"'):
+    with pytest.raises(SceneError, match=r'\[kernel\] form = "quadratic": its weights must be .*form = "average"'):
         load_scene("hit-small", ["kernel.positive=false", "kernel.form=quadratic"])
 
 

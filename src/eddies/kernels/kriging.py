@@ -14,7 +14,8 @@ MOST_NEIGHBORS = 1024
 
 class _Kriging(ctypes.Structure):
     _fields_ = ([("receivers", ctypes.c_int64), ("pairs", ctypes.c_int64), ("sited", ctypes.c_int64),
-                 ("offsets", ctypes.c_void_p), ("displacement", ctypes.c_void_p), ("support", ctypes.c_double), ("noise", ctypes.c_double),
+                 ("offsets", ctypes.c_void_p), ("displacement", ctypes.c_void_p), ("support", ctypes.c_double),
+                 ("noise", ctypes.c_double),
                  ("most", ctypes.c_int64), ("scales", ctypes.c_int64), ("slowest", ctypes.c_double)]
                 + [(name, ctypes.c_void_p) for name in ("amplitudes", "own", "weights")])
 
@@ -73,7 +74,8 @@ def told(library: ctypes.CDLL, offsets: np.ndarray, senders: np.ndarray, own: Se
     """
     receivers, rows, dtype, sited = len(offsets) - 1, len(weights), field.dtype, own is not None
     own = own if sited else []
-    if (rows not in (1, 3, 4, 10) or len(own) != rows * sited or dtype not in (np.float32, np.float64) or field.ndim != 2
+    if (rows not in (1, 3, 4, 10) or len(own) != rows * sited or dtype not in (np.float32, np.float64)
+            or field.ndim != 2
             or len(field) < receivers * sited or offsets[-1] != len(senders)
             or any(array.dtype != np.int64 or not array.flags.c_contiguous for array in (offsets, senders))
             or any(array.dtype != dtype or not array.flags.c_contiguous for array in (field, *own, *weights))

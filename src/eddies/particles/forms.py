@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -32,9 +33,10 @@ class Reconstructed(Protocol):
 
 
 class Form(Protocol):
-    """A way to reconstruct a velocity from the particles within `support`."""
+    """A way to reconstruct a velocity from the particles within `support`; `words` name it."""
 
     support: float
+    words: str
 
     def of(self, field: ParticleField) -> Reconstructed:
         """What it makes of particles; collective."""
@@ -42,10 +44,11 @@ class Form(Protocol):
 
 @dataclass(frozen=True)
 class Average:
-    """Averages with a kernel, Eqs. 5 and 6, as `reconstruct` has them; the gradient of normalised ones is exactly that of
-    the reconstructed field."""
+    """Averages with a kernel, Eqs. 5 and 6, as `reconstruct` has them; the gradient of normalised ones is exactly that
+    of the reconstructed field."""
 
     kernel: SmoothingKernel
+    words = "averages with the learned kernel"
 
     @property
     def support(self) -> float:
@@ -83,13 +86,19 @@ class LeastSquares:
     mean_volume: float
 
     @property
+    def words(self) -> str:
+        """That it is of this degree."""
+        return f"polynomials of degree {self.degree} fitted to neighbours"
+
+    @property
     def support(self) -> float:
         """h."""
         return self.kernel.support
 
     def of(self, field: ParticleField) -> _AtAnyPoints:
         """See Form."""
-        return _AtAnyPoints(field, lambda receivers: field.fitted(self.kernel, self.degree, self.mean_volume, receivers))
+        return _AtAnyPoints(
+            field, lambda receivers: field.fitted(self.kernel, self.degree, self.mean_volume, receivers))
 
 
 @dataclass(frozen=True)
@@ -101,6 +110,7 @@ class Kriging:
 
     covariance: Covariance
     instead: LeastSquares
+    words = "kriging among neighbours"
 
     @property
     def support(self) -> float:
@@ -125,7 +135,7 @@ class Kriging:
 class _AtAnyPoints:
     """What needs no more than the particles around a point, wherever that lies on this rank."""
 
-    def __init__(self, field: ParticleField, at) -> None:
+    def __init__(self, field: ParticleField, at: Callable[[Tensor], tuple[Tensor, Tensor]]) -> None:
         self._field, self.at = field, at
 
     def on_grid(self) -> tuple[Tensor, Tensor]:

@@ -17,8 +17,8 @@ from eddies.particles.devices import kernels_serve
 from eddies.particles.moments import ENTRIES
 from eddies.particles.pairs import Pairs
 
-# Rows of weights: of the field itself, then of its first and of its second derivatives, xx, xy, xz, yy, yz, zz; those of
-# the field and its gradient.
+# Rows of weights: of the field itself, then of its first and of its second derivatives, xx, xy, xz, yy, yz, zz; those
+# of the field and its gradient.
 OWN, FIRST, SECOND, UP_TO_FIRST = 0, slice(1, 4), slice(4, 10), slice(0, 4)
 # Rows of the entries (j, k) of a symmetric matrix.
 PLACES = ((0, 1, 2), (1, 3, 4), (2, 4, 5))

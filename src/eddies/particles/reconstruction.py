@@ -18,8 +18,8 @@ RIDGE = 1e-4
 
 
 def volumes(kernel: SmoothingKernel, pairs: Pairs) -> Tensor:
-    """Volume of each particle, 1 / (W(0) + sum_j W(x_i - x_j)), shape (count,), in length^3; the mean volume of a kernel
-    that has one.
+    """Volume of each particle, 1 / (W(0) + sum_j W(x_i - x_j)), shape (count,), in length^3; of a kernel that has
+    a mean volume this one.
 
     `pairs` leaves out the particle itself, which the first term counts once.
     """
@@ -109,8 +109,8 @@ def moving_least_squares(kernel: SmoothingKernel, pairs: Pairs, degree: int, mea
         V sum_j W(x - x_j) |p(x_j) - A_j|^2 + ridge (sum of the squares of all coefficients of p but the constant),
 
     p in (x_j - x)/h, V the mean volume of a particle, so that V sum_j W is one on average. Without a ridge polynomials
-    of this degree are exact. A constant is so always: where neighbours are few, far or badly placed, the ridge outweighs
-    them and leaves the average with W. Zero where no particle lies within the support.
+    of this degree are exact. A constant is so always: where neighbours are few, far or badly placed, the ridge
+    outweighs them and leaves the average with W. Zero where no particle lies within the support.
 
     Parameters
     ----------
@@ -142,7 +142,8 @@ def _monomials(x: Tensor, degree: int) -> Tensor:
 
 
 def _average(kernel: SmoothingKernel, pairs: Pairs, volume: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
-    """<A> (count, components) of volumes (m,) and values (components, m) of pairs, and by what sums are multiplied (count, 1)."""
+    """<A> (count, components) of volumes (m,) and values (components, m) of pairs, and by what sums are multiplied
+    (count, 1)."""
     weight = volume * kernel.value(pairs.distance)
     sums = pairs.sum(torch.cat([weight.unsqueeze(0), weight * value]).T)
     factor = normalisation(kernel, sums[:, :1])

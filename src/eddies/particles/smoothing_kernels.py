@@ -106,8 +106,8 @@ class HermiteKernel:
     ----------
     support : h.
     values, slopes : (knots,), the dimensionless W h^3 and d(W h^3)/dq; what is computed is differentiable in both.
-    mean_volume : see SmoothingKernel. Without one values are not negative, and slopes of more than three times the value
-        within a cell are lowered to that: a cubic between them would be negative somewhere.
+    mean_volume : see SmoothingKernel. Without one values are not negative, and slopes of more than three times the
+        value within a cell are lowered to that: a cubic between them would be negative somewhere.
     """
 
     def __init__(self, support: float, values: Tensor, slopes: Tensor, mean_volume: float | None = None) -> None:

@@ -237,8 +237,8 @@ def _differing_start(scene: Scene, variant: Scene) -> Iterator[str]:
                    "and are compared at the same times; change it for the whole scene")
     ours, theirs = (other.kernel and other.kernel.form for other in (variant, scene))
     if None not in (ours, theirs) and ours != theirs:
-        yield (f'[kernel] form = "{ours}" where the scene has "{theirs}": all variants are measured alike; change it for '
-               "the whole scene")
+        yield (f'[kernel] form = "{ours}" where the scene has "{theirs}": all variants are measured alike; change it '
+               "for the whole scene")
     if scene.realisations is None and variant.simulation.start is None:
         ours, theirs = (other.training and other.training.window for other in (variant, scene))
         if ours != theirs:

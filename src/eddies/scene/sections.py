@@ -199,20 +199,20 @@ class Kernel(Section):
     Once made it holds the values of all keys, and no preset.
     """
 
-    preset: str | None = choice("values of other keys that have a name, under those that are given; paper: Eqs. 6 to 11 "
-                                "as published", *KERNEL_PRESETS, default=None)
+    preset: str | None = choice("values of other keys that have a name, under those that are given; paper: Eqs. 6 to "
+                                "11 as published", *KERNEL_PRESETS, default=None)
     form: str | None = choice("how fields and gradients are reconstructed from particles: average: with weights W; "
                               "linear, quadratic: polynomials fitted with W as weight; kriging: the best "
                               "estimate for filtered turbulence; absent: kriging", "average", "linear", "quadratic",
                               "kriging", default=None)
-    positive: bool | None = boolean("W = alpha exp(NN) g, of unit integral; false: NN g of Eq. 7, which may be negative, "
-                                    "and sums of Eq. 6, which nothing divides; absent: true", default=None)
+    positive: bool | None = boolean("W = alpha exp(NN) g, of unit integral; false: NN g of Eq. 7, which may be "
+                                    "negative, and sums of Eq. 6, which nothing divides; absent: true", default=None)
 
     neighbors: float = number("mean number of particles within the support", default=NEIGHBORS, at_least=8)
     hidden: tuple[int, ...] = integers("widths of the network's tanh layers", default=(20, 20, 20, 20),
                                        at_least=1)
-    cutoff: str | None = choice("factor g that ends the kernel at its support, where the sigmoid is 1/2; absent: smooth",
-                                "smooth", "sigmoid", default=None)
+    cutoff: str | None = choice("factor g that ends the kernel at its support, where the sigmoid is 1/2; absent: "
+                                "smooth", "smooth", "sigmoid", default=None)
     gradient_weight: float = number("weight of the velocity gradient in the loss", default=1.0, at_least=0)
     normalization_weight: float | None = number("weight of (integral - 1)^2 of the kernel before it is normalised; "
                                                 "absent: 0", default=None, at_least=0)

@@ -21,8 +21,8 @@ from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.devices import prepare_torch
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.learned.model import load_form
-from eddies.workflows.rollout.particle_measures import (GRADIENT, FieldsOfParticles, ParticleSpectra, ReconstructedFields,
-                                                        WithGradients)
+from eddies.workflows.rollout.particle_measures import (GRADIENT, FieldsOfParticles, ParticleSpectra,
+                                                        ReconstructedFields, WithGradients)
 from eddies.workflows.rollout.truth_cache import TruthCache
 
 log = logging.getLogger("eddies")
@@ -247,6 +247,6 @@ def open_rollout(directory: Path, alone: Comm) -> Iterator[MeasuredRollout]:
             name: OnDemand(lambda frame, run=run: Reconstruction.of(*fields.of(run, frame)))
             for name, run in both.items()}
         rollout = Rollout(attributes, model, truth, model.length, read_table(truth_file, "spectra"), ground.reference,
-                          spectra, reconstructions, **tables)
+                          spectra, reconstructions, **tables, reconstructed_by=fields.form.words if fields else "")
         cache = TruthCache(directory / "ground_truth.h5", kernel if fields else None, alone)
         yield MeasuredRollout(rollout, provenance, fields, solver, cache)
