@@ -105,7 +105,7 @@ def test_the_gradient_is_that_of_the_field(comm, name):
             del field._around
         moved[sign] = form(name).of(field).on_grid()[0]
     slope = (moved[1] - moved[-1]) / (2 * step)
-    bound = {"average": 5e-3, "linear": 0.2, "quadratic": 0.1, "kriging": 0.03}[name]
+    bound = {"average": 5e-3, "linear": 0.2, "quadratic": 0.1, "kriging": 0.2}[name]
     assert torch.quantile((slope - gradient[..., 0]).abs().amax(1), 0.95) < bound
 
 
