@@ -53,8 +53,8 @@ def create_product(comm: MPI.Comm, path: str | Path, kind: str,
     `provenance` (JSON-able: the scene's text, its fingerprint, ...) is stored with the versions of all
     libraries, the number of ranks, the date and an id; of the kinds in its `made_from` those that lie beside the file,
     with their ids. An `id` in it is kept: the file takes the place of one that others were made from, and would be made
-    alike from this one. An exception inside the block leaves whatever stood under `path` untouched, and nothing beside it
-    where all ranks know of it.
+    alike from this one. An exception inside the block leaves whatever stood under `path` untouched, and nothing beside
+    it where all ranks know of it.
 
     Raises:
         WriteError: the file cannot be made or get its name, or there is no room for it.

@@ -1,5 +1,6 @@
 // Kriging: by which weights of what neighbours have a random field with a given covariance and an unknown mean, and its
-// derivatives, are told best at a point, where a particle sits or none, and what they tell then. Equations of receivers are solved together, one in
+// derivatives, are told best at a point, where a particle sits or none, and what they tell then. Equations of receivers
+// are solved together, one in
 // each lane of a vector, and no lane's result depends on the others.
 
 #include <algorithm>
@@ -184,7 +185,7 @@ class Equations {
     void fill(const Covariance<Real>& covariance, bool sited) {
         for (Int i = 0; i < size_; ++i) {
             V* entries = row(i);
-            for (Int j = 0; j < i; ++j) entries[j] = covariance(square(i, j)) * known(i);  // then j > 0 is known as well
+            for (Int j = 0; j < i; ++j) entries[j] = covariance(square(i, j)) * known(i);  // then j > 0 is known too
             if (i > 0) entries[0] *= known(0);
             entries[i] = (covariance(V{}) + noise(i)) * known(i) + (1 - known(i));
             V first, second;

@@ -14,8 +14,8 @@ class Smoothing {
     using V = Vector<Real>;
 
    public:
-    // h, the least W there is, number of pieces, coefficients of each; then these, of u = 1 ... 0 from begin to end of a
-    // piece.
+    // h, the least W there is, number of pieces, coefficients of each; then these, of u = 1 ... 0 from begin to end of
+    // a piece.
     explicit Smoothing(const double* given)
         : pieces_(static_cast<int>(given[2])), width_(static_cast<int>(given[3])), stride_(padded<Real>(width_)),
           least_(static_cast<Real>(given[1])), per_length_(static_cast<Real>(given[2] / given[0])),
