@@ -152,6 +152,9 @@ def run_step(step: Step, comm: Comm, stop: StopRequest, overwrite: bool) -> None
             remove_checkpoints(stage, comm, step.directory)
         if stage.name in work.done:
             log.info("%s: skipped, %s is complete and made with the same settings", stage.name, stage.file)
+            if stage.name == "train-kernel":
+                from eddies.workflows.train_kernel import keep_form  # torch, only here
+                keep_form(step.scene, comm, step.directory)
             continue
         if "dns" in stage.depends_on and not known:
             rest, known = step.stages[step.stages.index(stage.name):], True

@@ -113,3 +113,15 @@ def test_single_precision_follows_the_weights():
 def test_unknown_cutoff_is_refused():
     with pytest.raises(ValueError, match="smooth"):
         KernelNetwork(SUPPORT, cutoff="sharp")
+
+
+def test_the_published_form_may_be_negative_and_is_not_normalised():
+    """W h^3 = NN(q) / (1 + exp(10 (q - 1))), Eq. 7."""
+    kernel = KernelNetwork(SUPPORT, cutoff="sigmoid", seed=5, mean_volume=0.1)
+    q = torch.linspace(0, 0.999, 1001, dtype=torch.float64)
+    exact = kernel.network(q[None])[0] / (1 + torch.exp(10 * (q - 1)))
+    with torch.no_grad():
+        table = kernel.table()
+    assert table.mean_volume == 0.1 and exact.min() < 0
+    assert torch.allclose(table.value(q * SUPPORT) * SUPPORT**3, exact, atol=1e-6)
+    assert integral(table).item() == pytest.approx(kernel.integral().item()) != pytest.approx(1, abs=0.1)

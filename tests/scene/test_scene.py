@@ -314,3 +314,30 @@ def test_each_closure_is_for_its_equations_alone(equations, closures):
         else:
             with pytest.raises(SceneError, match=f"it must be one of {', '.join(closures)}; change one of the two"):
                 Eulerian(equations=equations, closure=closure)
+
+
+def test_a_preset_of_the_kernel_fills_what_is_not_given(tmp_path):
+    preset = load_scene("hit-small", ["kernel.preset=paper"], ["kernel.learning_rate"]).kernel
+    assert (preset.form, preset.positive, preset.cutoff) == ("average", False, "sigmoid")
+    assert (preset.normalization_weight, preset.learning_rate, preset.final_learning_rate) == (1.0, 1e-3, 1e-6)
+    assert preset.preset is None
+    given = load_scene("hit-small", ["kernel.preset=paper", "kernel.cutoff=smooth"]).kernel
+    assert (given.cutoff, given.learning_rate, given.final_learning_rate) == ("smooth", 5e-3, 1e-6)
+    plain = load_scene("hit-small").kernel
+    assert (plain.form, plain.positive, plain.final_learning_rate) == ("kriging", True, pytest.approx(2.5e-4))
+    path = tmp_path / "again.toml"
+    path.write_text(load_scene("hit-small", ["kernel.preset=paper"]).to_toml())
+    assert load_scene(path).kernel == load_scene("hit-small", ["kernel.preset=paper"]).kernel
+
+
+def test_polynomials_are_refused_a_weight_that_may_be_negative():
+    with pytest.raises(SceneError, match=r'\[kernel\] form = "quadratic": its weights must be .*form = "average"'):
+        load_scene("hit-small", ["kernel.positive=false", "kernel.form=quadratic"])
+
+
+def test_the_form_of_reconstruction_asks_for_no_training():
+    scenes = [load_scene("hit-small", [f"kernel.form={form}"]) for form in ("average", "kriging")]
+    for stage in ("train-kernel", "train", "simulate"):
+        assert len({scene.fingerprint(stage) for scene in scenes}) == 1
+    assert len({load_scene("hit-small", [f"kernel.cutoff={word}"]).fingerprint("train-kernel")
+                for word in ("smooth", "sigmoid")}) == 2

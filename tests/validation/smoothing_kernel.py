@@ -20,6 +20,7 @@ from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.particle_field import grid_points
 from eddies.particles.periodic_box import PeriodicBox
+from eddies.particles.reconstruction import moving_least_squares
 from eddies.particles.smoothing_kernels import CubicSpline, HermiteKernel, WendlandC2
 from eddies.scene.scene import BOX_LENGTH
 from eddies.scene.sections import Tracers
@@ -30,7 +31,7 @@ KNOTS, POINTS, TOGETHER = 17, 8192, 1024
 # Weights of velocity and gradient in what the best table minimises.
 AIMS = {"velocity": (1.0, 0.0), "gradient": (0.0, 1.0), "both": (1.0, 1.0)}
 DEGREES = {"linear": 1, "quadratic": 2}
-LEAST_WEIGHT = 1e-8  # added to the normal equations, of the largest entry: points with too few neighbours stay solvable
+LEAST_WEIGHT = 1e-8  # the ridge: points with too few neighbours stay solvable
 
 
 class Field:
@@ -96,35 +97,20 @@ class Field:
             with torch.no_grad():
                 found[f"best for {name}"] = self.average(kernel)
         for name, degree in DEGREES.items():
-            found[f"moving least squares, {name}"] = moving_least_squares(
+            found[f"moving least squares, {name}"] = fitted(
                 points, self.position, self.velocity, self.support, degree)
         return {name: [float(share) ** 0.5 for share in self.shares(*fields)] for name, fields in found.items()}
 
 
-def moving_least_squares(points, position, velocity, support, degree):
+def fitted(points, position, velocity, support, degree):
     """Values (k, 3) and gradients (k, 3, 3) [component, direction] at points of the polynomials of a degree, 1 or 2,
     that fit the velocities (n, 3) of the particles within the support best, with Wendland's weights."""
     neighbors, weights = NeighborList(PeriodicBox(BOX_LENGTH), support, 0.0), WendlandC2(support)
     neighbors.build(points, position, exclude_self=False)
-    parts = []
-    for rows in torch.arange(len(points)).split(TOGETHER):
-        pairs = neighbors.pairs(points, position, rows, torch.float64)
-        monomials = _monomials(-pairs.displacement / support, degree)
-        weighted = weights.value(pairs.distance)[:, None] * monomials
-        matrix = pairs.sum(weighted[:, :, None] * monomials[:, None, :])
-        right = pairs.sum(weighted[:, :, None] * pairs.at_senders(velocity).double()[:, None, :])
-        ridge = LEAST_WEIGHT * matrix.amax((1, 2))[:, None, None] * torch.eye(matrix.shape[1])
-        found = torch.linalg.solve(matrix + ridge, right)
-        parts.append((found[:, 0], found[:, 1:4].transpose(1, 2) / support))
+    parts = [moving_least_squares(weights, neighbors.pairs(points, position, rows, torch.float64), degree,
+                                  BOX_LENGTH**3 / len(position), velocity.double(), LEAST_WEIGHT)
+             for rows in torch.arange(len(points)).split(TOGETHER)]
     return [torch.cat(part) for part in zip(*parts)]
-
-
-def _monomials(x, degree):
-    """1, x, y, z and, of degree 2, their products: (pairs, 4 or 10)."""
-    columns = [torch.ones_like(x[:, 0]), *x.unbind(1)]
-    if degree == 2:
-        columns += [x[:, i] * x[:, j] for i in range(3) for j in range(i, 3)]
-    return torch.stack(columns, dim=1)
 
 
 def main():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from flows import WITH_TRACERS
-from smoothing_kernel import AIMS, Field, moving_least_squares
+from smoothing_kernel import AIMS, Field, fitted
 
 from eddies.scene.scene import load_scene
 from eddies.workflows import dns
@@ -20,7 +20,7 @@ def test_moving_least_squares_reproduce_polynomials(degree):
     def field(x):
         return x @ slopes.T + curvature * (x * x.roll(1, 1))
 
-    velocity, gradient = moving_least_squares(points, position, field(position), 1.2, degree)
+    velocity, gradient = fitted(points, position, field(position), 1.2, degree)
     expected = slopes.repeat(50, 1, 1)
     for component in range(3):  # of x_i x_(i-1)
         expected[:, component, component] += curvature * points.roll(1, 1)[:, component]

@@ -133,7 +133,7 @@ def write_kernel(comm, directory, cells=32, seed=1):
                "loss_learned_no_gradient": np.exp(-step / 40)}
     tables = {"kernels": kernels, "slices": slices, "errors": errors, "history": history}
     network = KernelNetwork(1.4, [4], "smooth", seed)
-    description = {"form": network.FORM, "support": 1.4, "hidden": [4], "cutoff": "smooth"}
+    description = {"form": network.formula, "support": 1.4, "hidden": [4], "cutoff": "smooth"}
     weights = {name: tensor.numpy() for name, tensor in network.float().state_dict().items()}
     save_weights(comm, directory / "kernel.h5", "kernel", description, weights, provenance("ground_truth"), tables)
 

@@ -58,7 +58,7 @@ def made(comm):
     scene = load_scene(folder / "baseline.toml")
     dns.run(scene, comm, folder)
     network = KernelNetwork(scene.kernel_support, [4])
-    description = {"form": network.FORM, "support": network.support, "hidden": [4], "cutoff": "smooth"}
+    description = {"form": network.formula, "support": network.support, "hidden": [4], "cutoff": "smooth"}
     weights = {name: tensor.numpy() for name, tensor in network.state_dict().items()}
     provenance = {"scene": SCENE, "fingerprint": scene.fingerprint("train-kernel")}
     save_weights(comm, folder / "kernel.h5", "kernel", description, weights, provenance)

@@ -12,7 +12,7 @@ from eddies.io.weights import load_weights
 from eddies.scene.scene import load_scene
 from eddies.workflows import product_warnings
 from eddies.workflows.rollout.measured import TrueParticles, open_rollout
-from eddies.workflows.rollout.particle_measures import KernelAverages, ParticleSpectra
+from eddies.workflows.rollout.particle_measures import FieldsOfParticles, ParticleSpectra
 from eddies.workflows.variants import rollouts, steps
 from tests.small_scene import TINY
 
@@ -229,13 +229,13 @@ def test_each_truth_is_measured_and_read_through_once(comm, folder, monkeypatch,
             return method(self, particles, frame, *more)
         return measure
 
-    for cls in (KernelAverages, ParticleSpectra):
+    for cls in (FieldsOfParticles, ParticleSpectra):
         monkeypatch.setattr(cls, "of", counted(cls.of))
     monkeypatch.setattr(product_warnings, "stored_numbers", lambda file: scanned.append(file.filename) or ())
     assert run_cli("run", f"{scene}.toml", "--output", "out") == 0
     together = [each for some in comm.allgather(measured) for each in some]
     assert len(set(together)) == len(together) and len({path for _, path, _ in together}) == truths
-    assert {name for name, *_ in together} == {"KernelAverages", "ParticleSpectra"}
+    assert {name for name, *_ in together} == {"FieldsOfParticles", "ParticleSpectra"}
     read = [os.path.realpath(path) for path in scanned]
     assert len(set(read)) == len(read) and (len(read) > truths) == (comm.rank == 0)
 

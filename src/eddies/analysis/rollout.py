@@ -63,7 +63,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """What averages with a kernel make of particles at one moment.
+    """What is reconstructed from particles at one moment, of model and truth alike.
 
     Parameters
     ----------
@@ -134,6 +134,7 @@ class Rollout:
         particles' velocities.
     reconstructions : of both likewise, by frame; None without a kernel.
     outside_training : share of the pairs outside the training range, (frames,), where it was counted.
+    reconstructed_by : the form of the reconstructions, in words.
     closure : columns over the frames on the solves for the resolved velocity, where there were any.
     """
 
@@ -148,6 +149,7 @@ class Rollout:
     outside_training: np.ndarray | None = None
     closure: Table | None = None
     without_truth: str = ""
+    reconstructed_by: str = ""
 
     @property
     def turnover(self) -> float:

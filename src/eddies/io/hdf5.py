@@ -52,8 +52,9 @@ def create_product(comm: MPI.Comm, path: str | Path, kind: str,
 
     `provenance` (JSON-able: the scene's text, its fingerprint, ...) is stored with the versions of all
     libraries, the number of ranks, the date and an id; of the kinds in its `made_from` those that lie beside the file,
-    with their ids. An exception inside the block leaves whatever stood under `path` untouched, and nothing beside it
-    where all ranks know of it.
+    with their ids. An `id` in it is kept: the file takes the place of one that others were made from, and would be made
+    alike from this one. An exception inside the block leaves whatever stood under `path` untouched, and nothing beside
+    it where all ranks know of it.
 
     Raises:
         WriteError: the file cannot be made or get its name, or there is no room for it.
@@ -61,7 +62,8 @@ def create_product(comm: MPI.Comm, path: str | Path, kind: str,
     path = Path(path)
     unfinished = Unfinished(comm, path.with_name(path.name + ".partial"))
     origin = share_text(comm, "" if comm.rank else json.dumps({
-        **environment(comm.size), **provenance, **identity(path.parent, provenance.get("made_from", ()))}))
+        **environment(comm.size), **provenance, **identity(path.parent, provenance.get("made_from", ())),
+        **{key: value for key, value in provenance.items() if key == "id"}}))
     try:
         with writing(unfinished.file, len(origin) + HEADER_BYTES):
             write_attributes(unfinished.file,

@@ -1,5 +1,6 @@
 // Kriging: by which weights of what neighbours have a random field with a given covariance and an unknown mean, and its
-// derivatives, are told best at a point, and what they tell then. Equations of receivers are solved together, one in
+// derivatives, are told best at a point, where a particle sits or none, and what they tell then. Equations of receivers
+// are solved together, one in
 // each lane of a vector, and no lane's result depends on the others.
 
 #include <algorithm>
@@ -14,7 +15,7 @@ extern "C" {
 
 // Receivers and their neighbours in compressed rows; kernels/kriging.py has the same structure.
 struct Kriging {
-    std::int64_t receivers, pairs;
+    std::int64_t receivers, pairs, sited;  // the last: whether a receiver is a particle, whose own value counts
     const std::int64_t* offsets;    // (receivers + 1,)
     const void* displacement;       // (3, pairs), from a neighbour to its receiver
     double support, noise;          // the latter is that of a neighbour at the receiver's own place
@@ -30,9 +31,9 @@ struct Kriging {
 struct Told {
     std::int64_t receivers, rows, columns;
     const std::int64_t *offsets, *senders;
-    const void* const* own;         // rows of (receivers,)
+    const void* const* own;         // rows of (receivers,), or null: receivers are no particles
     const void* const* weights;     // rows of (pairs,)
-    const void* field;              // (seen, columns), receivers first
+    const void* field;              // (seen, columns), receivers first if they are particles
     void* result;                   // (receivers, columns, rows)
 };
 
@@ -129,10 +130,10 @@ class Equations {
 
     void solve(const Kriging& k, const Covariance<Real>& covariance, const Int* receiver, int count) {
         read(k, receiver, count);
-        fill(covariance);
+        fill(covariance, k.sited);
         factorise();
         substitute_back();
-        leave_means();
+        leave_means(k.sited);
         write(k, receiver, count);
     }
 
@@ -159,7 +160,7 @@ class Equations {
             known(j) = noise(j) = V{};
             for (int axis = 0; axis < 3; ++axis) place(j, axis) = V{};
         }
-        known(0) = all<Real>(1);
+        known(0) = all<Real>(k.sited ? 1 : 0);
         for (int lane = 0; lane < count; ++lane) {
             const Int begin = k.offsets[receiver[lane]], neighbors = k.offsets[receiver[lane] + 1] - begin;
             for (Int j = 0; j < neighbors; ++j) {
@@ -181,14 +182,15 @@ class Equations {
         return x * x + y * y + z * z;
     }
 
-    void fill(const Covariance<Real>& covariance) {
+    void fill(const Covariance<Real>& covariance, bool sited) {
         for (Int i = 0; i < size_; ++i) {
             V* entries = row(i);
-            for (Int j = 0; j < i; ++j) entries[j] = covariance(square(i, j)) * known(i);  // then j is known as well
+            for (Int j = 0; j < i; ++j) entries[j] = covariance(square(i, j)) * known(i);  // then j > 0 is known too
+            if (i > 0) entries[0] *= known(0);
             entries[i] = (covariance(V{}) + noise(i)) * known(i) + (1 - known(i));
             V first, second;
             covariance.derivatives(square(i, 0), first, second);
-            row(size_)[i] = all<Real>(i == 0);
+            row(size_)[i] = sited ? all<Real>(i == 0) : covariance(square(i, 0)) * known(i);
             row(size_ + FUNCTIONALS)[i] = known(i);
             // By the receiver's place x of C(|x - x_j|^2): -2 C' (x_j - x), and 4 C'' (x_j - x) (x_j - x) + 2 C' I.
             for (int axis = 0; axis < 3; ++axis) row(size_ + 1 + axis)[i] = -2 * first * place(i, axis) * known(i);
@@ -292,14 +294,15 @@ class Equations {
             }
     }
 
-    // The mean is not known: less of K^-1 1 what lets the weights of each add up to nothing.
-    void leave_means() {
+    // The mean is not known: less of K^-1 1 what lets the weights of each add up to nothing; those of the field itself,
+    // where it is not known of the receiver, to one.
+    void leave_means(bool sited) {
         const V* ones = row(size_ + FUNCTIONALS);
         V whole{};
         for (Int j = 0; j < size_; ++j) whole += ones[j];
         for (int f = 0; f < FUNCTIONALS; ++f) {
             V* found = row(size_ + f);
-            V part{};
+            V part = all<Real>(f == 0 && !sited ? -1 : 0);
             for (Int j = 0; j < size_; ++j) part += found[j];
             part /= whole;
             for (Int j = 0; j < size_; ++j) found[j] -= part * ones[j];
@@ -375,7 +378,7 @@ void tell(const Told& t) {
     const auto* field = static_cast<const Real*>(t.field);
     const Real *own[ROWS], *weights[ROWS];
     for (int r = 0; r < ROWS; ++r) {
-        own[r] = static_cast<const Real*>(t.own[r]);
+        own[r] = t.own ? static_cast<const Real*>(t.own[r]) : nullptr;
         weights[r] = static_cast<const Real*>(t.weights[r]);
     }
 #pragma omp parallel for schedule(static)
@@ -383,7 +386,7 @@ void tell(const Told& t) {
         for (Int c = 0; c < t.columns; ++c) {
             Vector<Real> sums[ROWS] = {};
             Real rest[ROWS];
-            for (int r = 0; r < ROWS; ++r) rest[r] = own[r][i] * field[i * t.columns + c];
+            for (int r = 0; r < ROWS; ++r) rest[r] = t.own ? own[r][i] * field[i * t.columns + c] : Real(0);
             Int pair = t.offsets[i];
             const Int end = t.offsets[i + 1];
             for (; pair + lanes <= end; pair += lanes) {
@@ -400,10 +403,11 @@ void tell(const Told& t) {
         }
 }
 
-// All weights, those of a gradient, or those of one functional.
+// All weights, those of a field and its gradient, of the gradient, or of one functional.
 template <typename Real>
 void tell(const Told& t) {
     if (t.rows == FUNCTIONALS) tell<Real, FUNCTIONALS>(t);
+    else if (t.rows == 4) tell<Real, 4>(t);
     else if (t.rows == 3) tell<Real, 3>(t);
     else tell<Real, 1>(t);
 }

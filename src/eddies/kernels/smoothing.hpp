@@ -14,12 +14,14 @@ class Smoothing {
     using V = Vector<Real>;
 
    public:
-    // h, number of pieces, coefficients of each; then these, of u = 1 ... 0 from begin to end of a piece.
+    // h, the least W there is, number of pieces, coefficients of each; then these, of u = 1 ... 0 from begin to end of
+    // a piece.
     explicit Smoothing(const double* given)
-        : pieces_(static_cast<int>(given[1])), width_(static_cast<int>(given[2])), stride_(padded<Real>(width_)),
-          per_length_(static_cast<Real>(given[1] / given[0])), coefficients_(std::size_t(pieces_) * stride_) {
+        : pieces_(static_cast<int>(given[2])), width_(static_cast<int>(given[3])), stride_(padded<Real>(width_)),
+          least_(static_cast<Real>(given[1])), per_length_(static_cast<Real>(given[2] / given[0])),
+          coefficients_(std::size_t(pieces_) * stride_) {
         for (int piece = 0; piece < pieces_; ++piece)
-            std::copy_n(given + 3 + piece * width_, width_, coefficients_.data() + piece * stride_);
+            std::copy_n(given + 4 + piece * width_, width_, coefficients_.data() + piece * stride_);
     }
 
     // W of some distances below h; of others anything that is finite.
@@ -33,7 +35,7 @@ class Smoothing {
 
    private:
     int pieces_, width_, stride_;
-    Real per_length_;
+    Real least_, per_length_;
     Aligned<Real> coefficients_;  // of each piece, and zeros up to a whole number of groups
 
     template <bool sloping>
@@ -59,7 +61,7 @@ class Smoothing {
             }
         }
         if (sloping) slope = -rate * per_length_;
-        return sum > 0 ? sum : V{};  // below zero by rounding alone
+        return sum > least_ ? sum : V{} + least_;  // below zero, where that is the least, by rounding alone
     }
 };
 

@@ -1,4 +1,4 @@
-"""Derivatives of a smooth field at particles, from its values at their neighbours, by kriging."""
+"""A smooth field and its derivatives at particles, or where none sits, from its values at neighbours, by kriging."""
 
 from __future__ import annotations
 
@@ -17,8 +17,9 @@ from eddies.particles.devices import kernels_serve
 from eddies.particles.moments import ENTRIES
 from eddies.particles.pairs import Pairs
 
-# Rows of weights: of the field itself, then of its first and of its second derivatives, xx, xy, xz, yy, yz, zz.
-OWN, FIRST, SECOND = 0, slice(1, 4), slice(4, 10)
+# Rows of weights: of the field itself, then of its first and of its second derivatives, xx, xy, xz, yy, yz, zz; those
+# of the field and its gradient.
+OWN, FIRST, SECOND, UP_TO_FIRST = 0, slice(1, 4), slice(4, 10), slice(0, 4)
 # Rows of the entries (j, k) of a symmetric matrix.
 PLACES = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
 
@@ -78,15 +79,41 @@ def weights(pairs: Pairs, support: float, covariance: Covariance) -> tuple[Tenso
     its second derivatives xx, xy, xz, yy, yz, zz. They are NaN where equations cannot be solved, or there are more than
     MOST_NEIGHBORS: what is wrong with one particle is for all ranks to say.
     """
+    return _weights(pairs, support, covariance, sited=True)
+
+
+@torch.no_grad()
+def interpolated(pairs: Pairs, support: float, covariance: Covariance, sender_values: Tensor) -> tuple[Tensor, Tensor]:
+    """A field (n, c) and its gradient (n, c, 3) at receivers that are no particles, from what it is at all local
+    particles (s, c): sum_j w_j f_j, w = K^-1 b with K as in `weights` and b_j = C(|x - x_j|), or its derivatives by x.
+
+    The mean is not known: weights of the field add up to one, those of its gradient to nothing, so that a constant is
+    exact. NaN where `weights` are; a particle at the receiver's own place is a neighbour like others. Zero where no
+    particle lies within the support.
+    """
+    _, found = _weights(pairs, support, covariance, sited=False)
+    rows, values = found[UP_TO_FIRST], sender_values.to(pairs.displacement.dtype)
+    if kernels_serve(pairs.displacement.device):
+        told_there = torch.from_numpy(told(library(), pairs.offsets.numpy(), pairs.sender.numpy(), None,
+                                           [row.numpy() for row in rows], values.contiguous().numpy()))
+    else:
+        sent = pairs.at_senders(values)
+        told_there = torch.stack([pairs.sum(row[:, None] * sent) for row in rows], -1)
+    return told_there[..., OWN], told_there[..., FIRST]
+
+
+def _weights(pairs: Pairs, support: float, covariance: Covariance, sited: bool) -> tuple[Tensor, Sequence[Tensor]]:
     if kernels_serve(pairs.displacement.device):
         found = kriging_weights(library(), pairs.offsets.numpy(), np.ascontiguousarray(pairs.displacement.T.numpy()),
-                                support, NOISE, covariance.slowest, np.array(covariance.amplitudes))
+                                support, NOISE, covariance.slowest, np.array(covariance.amplitudes), sited)
         return torch.from_numpy(found[0]), [torch.from_numpy(row) for row in found[1]]
-    return solved(pairs.offsets, pairs.displacement, support, covariance)
+    return solved(pairs.offsets, pairs.displacement, support, covariance, sited)
 
 
-def solved(offsets: Tensor, displacement: Tensor, support: float, covariance: Covariance) -> tuple[Tensor, Tensor]:
-    """The same by torch, of displacements (m, 3) x_i - x_j of each particle's pairs."""
+def solved(offsets: Tensor, displacement: Tensor, support: float, covariance: Covariance,
+           sited: bool = True) -> tuple[Tensor, Tensor]:
+    """Weights by torch, of displacements (m, 3) x_i - x_j of each receiver's pairs; receivers are particles, or, if not
+    `sited`, points without a value of their own."""
     count = len(offsets) - 1
     own, found = displacement.new_empty((10, count)), displacement.new_full((10, len(displacement)), torch.nan)
     for start in range(0, count, TOGETHER):
@@ -99,30 +126,34 @@ def solved(offsets: Tensor, displacement: Tensor, support: float, covariance: Co
         pair = (edges[:-1, None] + place)[known]
         away = displacement.new_zeros((len(listed), len(place) + 1, 3))  # the particle itself the first
         away[:, 1:][known] = -displacement[pair]
-        known = torch.cat([known.new_ones(len(listed), 1), known], 1)
+        known = torch.cat([known.new_full((len(listed), 1), sited), known], 1)
         right, matrix = _equations(away, known, support, covariance)
         factor, failed = torch.linalg.cholesky_ex(matrix)
         factor[failed > 0] = torch.nan  # as the library has it: an error here would be that of one rank alone
         solution = torch.cholesky_solve(right, factor)
         solution, ones = solution[..., :10], solution[..., 10:]
-        solution = solution - ones * (solution.sum(1, keepdim=True) / ones.sum(1, keepdim=True))
+        wanted = solution.new_zeros(10)
+        wanted[OWN] = not sited
+        solution = solution - ones * ((solution.sum(1, keepdim=True) - wanted) / ones.sum(1, keepdim=True))
         own[:, start : start + len(listed)] = solution[:, 0].T.masked_fill(crowded, torch.nan)
         found[:, pair] = solution[:, 1:][known[:, 1:]].T
     return own, found
 
 
 def _equations(away: Tensor, known: Tensor, support: float, covariance: Covariance) -> tuple[Tensor, Tensor]:
-    """Right-hand sides (k, p, 11), the last all 1, and matrices (k, p, p) of places x_j - x_i that are `known`."""
+    """Right-hand sides (k, p, 11), the last all 1, and matrices (k, p, p) of places x_j - x_i that are `known`; the
+    first place is the receiver's own, which is known of a particle."""
     value, _, _ = covariance.derivatives((away[:, :, None] - away[:, None]).square().sum(-1))
     both = known[:, :, None] & known[:, None]
     distance = away.norm(dim=-1)
     diagonal = torch.where(known, noise_at(distance, support), 1.0)
     matrix = torch.where(both, value, 0.0) + torch.diag_embed(diagonal)
-    _, first, second = covariance.derivatives(distance.square())
-    right = [torch.zeros_like(first), *(-2 * first * away[..., axis] for axis in range(3)),
+    towards, first, second = covariance.derivatives(distance.square())
+    itself = torch.zeros_like(first)
+    itself[:, 0] = 1
+    right = [torch.where(known[:, :1], itself, towards), *(-2 * first * away[..., axis] for axis in range(3)),
              *(4 * second * away[..., j] * away[..., k] + (2 * first if j == k else 0) for j, k in ENTRIES),
              torch.ones_like(first)]
-    right[0][:, 0] = 1
     return torch.stack(right, -1) * known[..., None], matrix
 
 

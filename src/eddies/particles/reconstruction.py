@@ -1,4 +1,5 @@
-"""Fields and their gradients from particles: kernel averages (Eqs. 5 and 6), normalised."""
+"""Fields and their gradients from particles: kernel averages (Eqs. 5 and 6), normalised but for kernels that may be
+negative, and moving least squares."""
 
 from __future__ import annotations
 
@@ -11,13 +12,19 @@ from eddies.particles.smoothing_kernels import SmoothingKernel
 
 # Points of the grid, near particles, that are looked at together: about a core's cache.
 POINTS_TOGETHER = 1 << 18
+# Of moving least squares, what is added to the squares of all coefficients but the constant, see there: below 1e-4 it
+# changes no error of a filtered field, and of particles without a force, which gather, it bounds the gradients.
+RIDGE = 1e-4
 
 
 def volumes(kernel: SmoothingKernel, pairs: Pairs) -> Tensor:
-    """Volume of each particle, 1 / (W(0) + sum_j W(x_i - x_j)), shape (count,), in length^3.
+    """Volume of each particle, 1 / (W(0) + sum_j W(x_i - x_j)), shape (count,), in length^3; of a kernel that has
+    a mean volume this one.
 
     `pairs` leaves out the particle itself, which the first term counts once.
     """
+    if kernel.mean_volume is not None:
+        return pairs.distance.new_full((pairs.count,), kernel.mean_volume)
     at_centre = kernel.value(pairs.distance.new_zeros(1))
     return 1 / (at_centre + pairs.sum(kernel.value(pairs.distance)))
 
@@ -25,7 +32,8 @@ def volumes(kernel: SmoothingKernel, pairs: Pairs) -> Tensor:
 def reconstruct(
     kernel: SmoothingKernel, pairs: Pairs, sender_volumes: Tensor, sender_values: Tensor
 ) -> Tensor:
-    """<A>(x) = sum_j V_j A_j W(x - x_j) / sum_j V_j W(x - x_j) at the receivers: (count, components).
+    """<A>(x) = sum_j V_j A_j W(x - x_j) / sum_j V_j W(x - x_j) at the receivers: (count, components); of a kernel with
+    a mean volume the numerator alone, Eq. 6.
 
     Parameters
     ----------
@@ -35,7 +43,7 @@ def reconstruct(
     sender_volumes : (s,), volumes of all local particles, as `volumes` gives them.
     sender_values : (s, components), the quantity A at all local particles.
 
-    A constant is reproduced to rounding. Zero where no particle lies within the support.
+    A constant is reproduced to rounding where sums are normalised. Zero where no particle lies within the support.
     """
     return _average(kernel, pairs, pairs.at_senders(sender_volumes), pairs.at_senders(sender_values).T)[0]
 
@@ -69,7 +77,7 @@ def reconstruct_on_grid(
         point, particle = point.index_select(0, near), some.index_select(0, near // side**3)
         for column, total in zip(columns, sums):
             total.index_add_(0, point, weight * column.index_select(0, particle))
-    return (sums[1:] * reciprocal(sums[0])).T
+    return (sums[1:] * normalisation(kernel, sums[0])).T
 
 
 def reconstruct_with_gradient(
@@ -78,7 +86,8 @@ def reconstruct_with_gradient(
     """`reconstruct`, and its gradient (count, components, 3), the last axis the direction of the derivative.
 
     The gradient is sum_j V_j (A_j - <A>) grad W(x - x_j) / sum_j V_j W, the asymmetric finite-particle form, and
-    exactly the derivative of the reconstructed field. Arguments as there.
+    exactly the derivative of the reconstructed field; of a kernel with a mean volume the numerator alone. Arguments as
+    there.
     """
     volume, value, distance = pairs.at_senders(sender_volumes), pairs.at_senders(sender_values).T, pairs.distance
     average, factor = _average(kernel, pairs, volume, value)
@@ -91,11 +100,53 @@ def reconstruct_with_gradient(
     return average, sums * factor[:, :, None]
 
 
+@torch.no_grad()
+def moving_least_squares(kernel: SmoothingKernel, pairs: Pairs, degree: int, mean_volume: float, sender_values: Tensor,
+                         ridge: float = RIDGE) -> tuple[Tensor, Tensor]:
+    """A field (n, c) and its gradient (n, c, 3) at the receivers: value and gradient there of the polynomial p of a
+    degree, 1 or 2, with the least
+
+        V sum_j W(x - x_j) |p(x_j) - A_j|^2 + ridge (sum of the squares of all coefficients of p but the constant),
+
+    p in (x_j - x)/h, V the mean volume of a particle, so that V sum_j W is one on average. Without a ridge polynomials
+    of this degree are exact. A constant is so always: where neighbours are few, far or badly placed, the ridge
+    outweighs them and leaves the average with W. Zero where no particle lies within the support.
+
+    Parameters
+    ----------
+    kernel : smoothing kernel that is nowhere negative, with a support that does not exceed the cutoff of the pairs.
+    pairs : receivers are the points x; particles that receive are among their own neighbours.
+    sender_values : (s, c), the field A at all local particles.
+    """
+    monomials = _monomials(-pairs.displacement.double() / kernel.support, degree)
+    weighted = (mean_volume * kernel.value(pairs.distance.double()))[:, None] * monomials
+    matrix = pairs.sum(weighted[:, :, None] * monomials[:, None, :])
+    right = pairs.sum(weighted[:, :, None] * pairs.at_senders(sender_values).double()[:, None, :])
+    size = matrix.shape[1]
+    penalty = ridge * torch.eye(size, dtype=matrix.dtype, device=matrix.device)
+    penalty[0, 0] = 0
+    factor, failed = torch.linalg.cholesky_ex(matrix + penalty)
+    failed = failed[:, None, None] > 0
+    identity = torch.eye(size, dtype=matrix.dtype, device=matrix.device)
+    found = torch.cholesky_solve(torch.where(failed, 0, right), torch.where(failed, identity, factor))
+    found = found.to(sender_values.dtype)
+    return found[:, 0], found[:, 1:4].transpose(1, 2) / kernel.support
+
+
+def _monomials(x: Tensor, degree: int) -> Tensor:
+    """1, x, y, z and, of degree 2, xx, xy, xz, yy, yz, zz of (m, 3): (m, 4 or 10)."""
+    columns = [torch.ones_like(x[:, 0]), *x.unbind(1)]
+    if degree == 2:
+        columns += [x[:, i] * x[:, j] for i in range(3) for j in range(i, 3)]
+    return torch.stack(columns, dim=1)
+
+
 def _average(kernel: SmoothingKernel, pairs: Pairs, volume: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
-    """<A> (count, components) of volumes (m,) and values (components, m) of pairs, and 1 / sum_j V_j W (count, 1)."""
+    """<A> (count, components) of volumes (m,) and values (components, m) of pairs, and by what sums are multiplied
+    (count, 1)."""
     weight = volume * kernel.value(pairs.distance)
     sums = pairs.sum(torch.cat([weight.unsqueeze(0), weight * value]).T)
-    factor = reciprocal(sums[:, :1])
+    factor = normalisation(kernel, sums[:, :1])
     return sums[:, 1:] * factor, factor
 
 
@@ -105,7 +156,9 @@ def _outer_sum(z: Tensor, y: Tensor, x: Tensor) -> Tensor:
     return (z[:, :, None, None] + plane.unsqueeze(1)).flatten()
 
 
-def reciprocal(denominator: Tensor) -> Tensor:
-    """1 / denominator, and zero where no particle contributes."""
+def normalisation(kernel: SmoothingKernel, denominator: Tensor) -> Tensor:
+    """1 / denominator, and zero where no particle contributes; one of a kernel with a mean volume."""
+    if kernel.mean_volume is not None:
+        return torch.ones_like(denominator)
     empty = denominator == 0
     return torch.where(empty, torch.zeros_like(denominator), 1 / torch.where(empty, 1, denominator))

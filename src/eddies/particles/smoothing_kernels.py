@@ -1,7 +1,8 @@
 """Smoothing kernels W(r) of compact support: SPH's own, tabulated ones, and the learned kernel after Eq. 7.
 
 Every kernel has unit integral over space, W in units of 1/length^3, is nowhere negative, and exactly zero for
-r >= support.
+r >= support. The learned kernel in the published form alone may be negative, and its integral is one as nearly as the
+loss L_n makes it; it has the `mean_volume` L^3/N of a particle, V_j of Eq. 6, and its sums are not divided by anything.
 """
 
 from __future__ import annotations
@@ -16,15 +17,21 @@ from torch import Tensor, nn
 
 from eddies.particles.dense_network import DenseNetwork
 
-# Sharpness C of the paper's sigmoid (Eq. 7): half its value is reached at r = h, a tenth lost at r = 0.89 h.
-SIGMOID_SHARPNESS = 20.0
+# Sharpness C of the paper's sigmoid (Eq. 7) with lengths in h, that of the public code; the text gives no number. Half
+# the value is lost at r = h, a tenth at r = 0.78 h.
+SIGMOID_SHARPNESS = 10.0
 KNOTS = 129                  # of a table of the learned kernel
 
 
 class SmoothingKernel(Protocol):
-    """W(r) and dW/dr for distances of any shape, zero for r >= `support`."""
+    """W(r) and dW/dr for distances of any shape, zero for r >= `support`.
+
+    With a `mean_volume` W may be negative, and <A> = V sum_j A_j W with V = L^3/N, Eq. 6 as published. Without one W is
+    nowhere negative, volumes are V_j = 1/sum_k W, and averages are normalised.
+    """
 
     support: float
+    mean_volume: float | None
 
     @property
     def pieces(self) -> Tensor:
@@ -40,6 +47,7 @@ class SmoothingKernel(Protocol):
 class _Polynomial:
     """Kernel from a shape W h^3 and its slope, functions of q = r/h on [0, 1)."""
 
+    mean_volume = None
     shape_pieces: tuple[tuple[float, ...], ...]
 
     def __init__(self, support: float) -> None:
@@ -97,17 +105,17 @@ class HermiteKernel:
     Parameters
     ----------
     support : h.
-    values, slopes : (knots,), the dimensionless W h^3, not negative, and d(W h^3)/dq; what is computed is
-        differentiable in both. Slopes of more than three times the value within a cell are lowered to that: a cubic
-        between them would be negative somewhere.
+    values, slopes : (knots,), the dimensionless W h^3 and d(W h^3)/dq; what is computed is differentiable in both.
+    mean_volume : see SmoothingKernel. Without one values are not negative, and slopes of more than three times the
+        value within a cell are lowered to that: a cubic between them would be negative somewhere.
     """
 
-    def __init__(self, support: float, values: Tensor, slopes: Tensor) -> None:
+    def __init__(self, support: float, values: Tensor, slopes: Tensor, mean_volume: float | None = None) -> None:
         if values.dim() != 1 or values.shape != slopes.shape or len(values) < 2:
             raise ValueError(f"kernel table {(*values.shape,)}, {(*slopes.shape,)}: not two equal columns")
-        self.support, self.values, self.cells = support, values, len(values) - 1
+        self.support, self.values, self.cells, self.mean_volume = support, values, len(values) - 1, mean_volume
         steepest = 3 * self.cells * values
-        self.slopes = torch.clamp(slopes, -steepest, steepest)
+        self.slopes = torch.clamp(slopes, -steepest, steepest) if mean_volume is None else slopes
         start, rise = values[:-1], values[1:] - values[:-1]
         first, last = self.slopes[:-1] / self.cells, self.slopes[1:] / self.cells
         self._coefficients = (start, first, 3 * rise - 2 * first - last, first + last - 2 * rise)
@@ -116,7 +124,9 @@ class HermiteKernel:
         """W(r) in 1/length^3, same shape as `distance`."""
         inside, cell, t = self._locate(distance)
         a, b, c, d = self._cubic(cell)
-        value = torch.clamp(a + t * (b + t * (c + t * d)), min=0)  # below zero by rounding alone
+        value = a + t * (b + t * (c + t * d))
+        if self.mean_volume is None:
+            value = torch.clamp(value, min=0)  # below zero by rounding alone
         return torch.where(inside, value, torch.zeros_like(value)) / self.support**3
 
     def derivative(self, distance: Tensor) -> Tensor:
@@ -161,7 +171,8 @@ class HermiteKernel:
 
 
 class KernelNetwork(nn.Module):
-    """The learned kernel W(r) = alpha exp(NN(r/h)) g(r/h), with unit integral by construction.
+    """The learned kernel: W(r) = alpha exp(NN(2 q^2 - 1)) g(q) with q = r/h, alpha from the unit integral, or, with a
+    `mean_volume`, W(r) = NN(q) g(q) / h^3, Eq. 7 as published.
 
     Parameters
     ----------
@@ -170,48 +181,61 @@ class KernelNetwork(nn.Module):
     cutoff : "smooth": g = (1 - q^2)^2, exactly zero with zero slope at q = r/h = 1; or "sigmoid", the paper's
         g = 1/(1 + exp(C (q - 1))), which is 1/2 at q = 1, so that the kernel ends there with a jump.
     seed : of the initial weights.
+    mean_volume : L^3/N of the published form, which may be negative; None: the positive form.
 
-    Eq. 7 has NN in place of exp(NN). That may turn negative near the edge, and where all neighbours are far away, in a
-    void, positive and negative weights then cancel in the denominator of an average, which has no bound. With positive
-    weights it lies between the values that it is taken of.
+    The alpha of the published form is part of the output layer, which the loss L_n of Eq. 11 brings to the unit
+    integral. Neither volumes 1/sum W nor normalised averages would do with it: they do not change with alpha, and their
+    denominators pass zero where weights of either sign cancel. With positive weights an average lies between the values
+    that it is taken of.
 
-    The network sees 2 q^2 - 1, so W is an even function of q: smooth at r = 0, with no slope there, as the
-    gradient of a reconstructed field needs. The output layer starts small, so that W starts near g, a bell shape.
+    The positive form sees 2 q^2 - 1, so it is an even function of q: smooth at r = 0, with no slope there, as the
+    gradient of a reconstructed field needs. Its output layer starts small, so that W starts near g, a bell shape.
     """
 
-    FORM = "exp(NN) g"  # stored with the weights, which mean nothing in another form
-
-    def __init__(
-        self, support: float, hidden: Sequence[int] = (20, 20, 20, 20), cutoff: str = "smooth", seed: int = 1
-    ) -> None:
+    def __init__(self, support: float, hidden: Sequence[int] = (20, 20, 20, 20), cutoff: str = "smooth", seed: int = 1,
+                 mean_volume: float | None = None) -> None:
         super().__init__()
         if cutoff not in ("smooth", "sigmoid"):
             raise ValueError(f'kernel cutoff "{cutoff}": "smooth" or "sigmoid"')
-        self.support, self.cutoff = support, cutoff
+        self.support, self.cutoff, self.mean_volume, self.positive = support, cutoff, mean_volume, mean_volume is None
         self.network = DenseNetwork(1, hidden, 1, seed)
-        with torch.no_grad():
-            self.network.weights[-1].mul_(0.1)
+        if self.positive:
+            with torch.no_grad():
+                self.network.weights[-1].mul_(0.1)
+
+    @property
+    def formula(self) -> str:
+        """What W is, in a word to be stored with the weights, which mean nothing in another one."""
+        bell = "g" if self.cutoff == "smooth" else f"/ (1 + exp({SIGMOID_SHARPNESS:g} (q - 1)))"
+        return f"{'exp(NN)' if self.positive else 'NN'} {bell}"
 
     def _unnormalised(self, knots: int) -> HermiteKernel:
         reference = self.network.weights[0]
         q = torch.linspace(0, 1, knots, dtype=reference.dtype, device=reference.device).unsqueeze(0)
-        exponent, rise = self.network.with_tangent(2 * q * q - 1, 4 * q)
-        shape = torch.exp(exponent)
-        slope = shape * rise
+        if self.positive:
+            exponent, rise = self.network.with_tangent(2 * q * q - 1, 4 * q)
+            shape = torch.exp(exponent)
+            slope = shape * rise
+        else:
+            shape, slope = self.network.with_tangent(q, torch.ones_like(q))
         if self.cutoff == "smooth":
             bell, bell_slope = (1 - q * q) ** 2, -4 * q * (1 - q * q)
         else:
             bell = torch.sigmoid(SIGMOID_SHARPNESS * (1 - q))
             bell_slope = -SIGMOID_SHARPNESS * bell * (1 - bell)
-        return HermiteKernel(self.support, (shape * bell)[0], (slope * bell + shape * bell_slope)[0])
+        return HermiteKernel(self.support, (shape * bell)[0], (slope * bell + shape * bell_slope)[0],
+                             self.mean_volume)
 
     def integral(self, knots: int = KNOTS) -> Tensor:
-        """1/alpha, the integral of exp(NN) g over space; the loss of Eq. 11 on it keeps alpha near one."""
+        """The integral over space before W is normalised, 1/alpha: what the loss of Eq. 11 brings near one."""
         return integral(self._unnormalised(knots))
 
     def table(self, knots: int = KNOTS) -> HermiteKernel:
-        """The kernel tabulated at `knots` points, with unit integral; differentiable in the weights."""
+        """The kernel tabulated at `knots` points, with unit integral if it is positive; differentiable in the weights.
+        """
         kernel = self._unnormalised(knots)
+        if not self.positive:
+            return kernel
         alpha = 1 / integral(kernel)
         return HermiteKernel(self.support, alpha * kernel.values, alpha * kernel.slopes)
 

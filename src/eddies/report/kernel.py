@@ -86,6 +86,11 @@ METRICS = {  # key in the report: column of the table of errors, label
     "cubic_spline_gradient_error": ("gradient_error_cubic_spline", "error of the gradient field, cubic spline"),
     "wendland_velocity_error": ("velocity_error_wendland", "error of the velocity field, Wendland C²"),
     "wendland_gradient_error": ("gradient_error_wendland", "error of the gradient field, Wendland C²"),
+    **{f"{form}_{what}_error": (f"{what}_error_{form}", f"error of the {what} field, {words}")
+       for form, words in (("linear", "linear fits with the learned kernel as weight"),
+                           ("quadratic", "quadratic fits with the learned kernel as weight"),
+                           ("kriging", "kriging, without a kernel"))
+       for what in ("velocity", "gradient")},
 }
 
 

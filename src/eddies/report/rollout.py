@@ -118,14 +118,14 @@ def _add_planes(shown: Section, run: Rollout) -> None:
     shown.add_figure(
         "figure-4-velocity", "Velocity over time (the paper's Fig. 4)",
         rollout_figures.velocity_planes(planes, run.turnover),
-        "u_x in the plane z = π, of the true tracers above and of the model below, both through the learned kernel. "
+        f"u_x in the plane z = π, of the true tracers above and of the model below, both by {run.reconstructed_by}. "
         f"Relative difference in the last plane: {normalized_l2(planes[-1].model, planes[-1].truth):.3f}.")
     rotation, energy = (Pair(time, *map(quantity, (model, truth))) for quantity in (_vorticity, _energy))
     ratios = [pair.model.mean() / pair.truth.mean() for pair in (rotation, energy)]
     shown.add_figure(
         "figure-5-vorticity-energy", "Vorticity and kinetic energy (the paper's Fig. 5)",
         rollout_figures.vorticity_and_energy(rotation, energy),
-        f"Plane z = π at t = {time / run.turnover:.2f} T, both through the learned kernel. Mean over the plane, "
+        f"Plane z = π at t = {time / run.turnover:.2f} T, both by {run.reconstructed_by}. Mean over the plane, "
         f"model / truth: vorticity {ratios[0]:.2f}, energy {ratios[1]:.2f}.")
 
 

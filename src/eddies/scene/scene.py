@@ -118,6 +118,8 @@ class Scene(Parts):
             del settings["simulation"]["step_from"]
         if self.simulation is not None:
             del settings["simulation"]["confirmed_on"]  # known by what they are, as are weights
+        if settings["kernel"] is not None:
+            del settings["kernel"]["form"]  # the weights are trained as those of averages, whatever they serve
         settings |= {f"own_{name}": origins(self._foreign_in(name)) for name in FOREIGN_IN}
         of_these = {*STAGES[stage].depends_on, stage} & {*self.stages}
         keys = [key for each in STAGES.values() if each.name in of_these for key in each.reads]
@@ -225,7 +227,8 @@ def _problems_of_variants(scene: Scene) -> Iterator[str]:
 
 
 def _differing_start(scene: Scene, variant: Scene) -> Iterator[str]:
-    """Why the rollout of a variant cannot be compared with that of the scene: another start, or other times."""
+    """Why the rollout of a variant cannot be compared with that of the scene: another start, other times, or what is
+    measured alone of it."""
     if variant.simulation is None or scene.simulation is None:
         which = "the scene" if scene.simulation is None else "it"
         yield f"{which} has no [simulation], and variants are compared by their rollouts; add it"
@@ -235,6 +238,10 @@ def _differing_start(scene: Scene, variant: Scene) -> Iterator[str]:
         if ours != theirs:
             yield (f"[simulation] {key} = {ours} where the scene has {theirs}: all variants start at the same moment "
                    "and are compared at the same times; change it for the whole scene")
+    ours, theirs = (other.kernel and other.kernel.form for other in (variant, scene))
+    if None not in (ours, theirs) and ours != theirs:
+        yield (f'[kernel] form = "{ours}" where the scene has "{theirs}": all variants are measured alike; change it '
+               "for the whole scene")
     if scene.realisations is None and variant.simulation.start is None:
         ours, theirs = (other.training and other.training.window for other in (variant, scene))
         if ours != theirs:

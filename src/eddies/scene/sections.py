@@ -183,20 +183,57 @@ class Tracers(Section):
         return 2 * round(0.875 * self.particles_per_side)
 
 
+#: What a [kernel] has without a key, and in place of that with a preset.
+KERNEL_DEFAULTS = {"form": "kriging", "positive": True, "cutoff": "smooth", "normalization_weight": 0.0,
+                   "learning_rate": 2e-3}
+KERNEL_PRESETS = {"paper": {"form": "average", "positive": False, "cutoff": "sigmoid", "normalization_weight": 1.0,
+                            "learning_rate": 1e-3, "final_learning_rate": 1e-6}}
+# Of the learning rate at the start, at the end of a training that has none of its own.
+FINAL_RATE = 0.05
+
+
 @dataclass(frozen=True, kw_only=True)
 class Kernel(Section):
-    """The smoothing kernel W, learned by reconstructing the filtered field from the particles."""
+    """The smoothing kernel W, learned by reconstructing the filtered field from the particles, and how fields are
+    reconstructed.
+
+    Once made it holds the values of all keys, and no preset.
+    """
+
+    preset: str | None = choice("values of other keys that have a name, under those that are given; paper: Eqs. 6 to "
+                                "11 as published", *KERNEL_PRESETS, default=None)
+    form: str | None = choice("how fields and gradients are reconstructed from particles: average: with weights W; "
+                              "linear, quadratic: polynomials fitted with W as weight; kriging: the best "
+                              "estimate for filtered turbulence; absent: kriging", "average", "linear", "quadratic",
+                              "kriging", default=None)
+    positive: bool | None = boolean("W = alpha exp(NN) g, of unit integral; false: NN g of Eq. 7, which may be "
+                                    "negative, and sums of Eq. 6, which nothing divides; absent: true", default=None)
 
     neighbors: float = number("mean number of particles within the support", default=NEIGHBORS, at_least=8)
     hidden: tuple[int, ...] = integers("widths of the network's tanh layers", default=(20, 20, 20, 20),
                                        at_least=1)
-    cutoff: str = choice("factor that ends the kernel at its support", "smooth", "sigmoid", default="smooth")
+    cutoff: str | None = choice("factor g that ends the kernel at its support, where the sigmoid is 1/2; absent: "
+                                "smooth", "smooth", "sigmoid", default=None)
     gradient_weight: float = number("weight of the velocity gradient in the loss", default=1.0, at_least=0)
-    normalization_weight: float = number("weight of (integral - 1)^2 of the kernel before it is normalised",
-                                         default=0.0, at_least=0)
+    normalization_weight: float | None = number("weight of (integral - 1)^2 of the kernel before it is normalised; "
+                                                "absent: 0", default=None, at_least=0)
     steps: int = integer("optimiser steps", at_least=1)
     points: int = integer("grid points drawn per step", default=2048, at_least=1)
-    learning_rate: float = number("of the optimiser", default=2e-3, above=0)
+    learning_rate: float | None = number("of the optimiser, at the start; absent: 2e-3", default=None, above=0)
+    final_learning_rate: float | None = number("of the optimiser, at the end; absent: a twentieth of the first",
+                                               default=None, above=0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for key, value in (KERNEL_DEFAULTS | KERNEL_PRESETS.get(self.preset, {})).items():
+            if getattr(self, key) is None:
+                object.__setattr__(self, key, value)
+        if self.final_learning_rate is None:
+            object.__setattr__(self, "final_learning_rate", FINAL_RATE * self.learning_rate)
+        object.__setattr__(self, "preset", None)
+        if not self.positive and self.form != "average":
+            raise KeyProblem("kernel", "form", f' = "{self.form}": its weights must be positive, and positive = false '
+                             'lets W be negative; set form = "average", or positive = true')
 
 
 @dataclass(frozen=True, kw_only=True)

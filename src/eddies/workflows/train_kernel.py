@@ -11,7 +11,8 @@ from torch import nn
 
 from eddies.io.guard import Guard
 from eddies.io.hdf5 import open_product
-from eddies.io.weights import save_weights
+from eddies.io.provenance import product_provenance
+from eddies.io.weights import load_tables, load_weights, save_weights
 from eddies.learning.kernel_training import KernelLossWeights, KernelSample, KernelTrainer
 from eddies.learning.training import Phase, Training
 from eddies.parallel.communicator import Comm
@@ -20,6 +21,8 @@ from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import StopRequest
 from eddies.particles.devices import prepare_torch
+from eddies.particles.flow_units import ReferenceScales
+from eddies.particles.forms import DEGREES, form_of
 from eddies.particles.particle_field import ParticleField
 from eddies.particles.smoothing_kernels import CubicSpline, KernelNetwork, SmoothingKernel, WendlandC2, integral
 from eddies.pipeline import STAGES
@@ -31,9 +34,10 @@ from eddies.workflows.learned.steps import take_all_steps
 
 log = logging.getLogger("eddies")
 
-FINAL_RATE_FRACTION = 0.05
 # Of those that a step has.
 LOSSES = "loss", "velocity", "gradient", "normalization"
+# Forms of reconstruction, beside averages, whose errors are measured with the learned kernel.
+OTHER_FORMS = *DEGREES, "kriging"
 
 
 def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | None = None) -> None:
@@ -51,7 +55,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         seen = np.flatnonzero(truth.fields.times <= scene.window * truth.times[-1])
         chosen = np.unique(np.linspace(0, len(seen) - 1, KERNEL_FIELDS).astype(int))
         samples = [load_sample(truth, index, support) for index in chosen]
-        unseen = load_sample(truth, len(truth.fields.times) - 1, support)
+        unseen, scales = load_sample(truth, len(truth.fields.times) - 1, support), truth.scales
     guard = Guard(comm, directory / STAGES["train-kernel"].checkpoints, scene.fingerprint("train-kernel"), stop,
                   " of the training")
     training = training_of(scene, samples)
@@ -61,8 +65,10 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         kernels = {name: network.table() for name, network in networks.items()}
         kernels |= {"cubic_spline": CubicSpline(support), "wendland": WendlandC2(support)}
         tables = {"kernels": shapes(kernels, support), "history": history, **compare(kernels, unseen)}
-    description = {"form": KernelNetwork.FORM, "support": support, "neighbors": settings.neighbors,
-                   "hidden": list(settings.hidden), "cutoff": settings.cutoff}
+        tables["errors"] |= errors_of_forms(kernels["learned"], unseen, scales)
+    description = {"form": networks["learned"].formula, "support": support, "neighbors": settings.neighbors,
+                   "hidden": list(settings.hidden), "cutoff": settings.cutoff,
+                   "mean_volume": networks["learned"].mean_volume, "reconstruction": settings.form}
     weights = {name: tensor.numpy() for name, tensor in networks["learned"].state_dict().items()}
     save_weights(comm, directory / "kernel.h5", "kernel", description, weights, scene.provenance("train-kernel"),
                  tables)
@@ -71,6 +77,20 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     log.info("kernel: velocity error %.3f (cubic spline %.3f), gradient error %.3f (cubic spline %.3f)",
              errors["velocity_error_learned"], errors["velocity_error_cubic_spline"],
              errors["gradient_error_learned"], errors["gradient_error_cubic_spline"])
+    if settings.form in OTHER_FORMS:
+        log.info('kernel: with form = "%s" velocity error %.3f, gradient error %.3f', settings.form,
+                 errors[f"velocity_error_{settings.form}"], errors[f"gradient_error_{settings.form}"])
+
+
+def keep_form(scene: Scene, comm: Comm, directory: Path) -> None:
+    """Write the form of a scene into a kernel.h5 that is trained and holds another one; its weights, what was measured
+    with it, and its id stay. All ranks call it."""
+    path, form = directory / "kernel.h5", scene.kernel.form
+    description, weights = load_weights(comm, path, "kernel")
+    if description.get("reconstruction", "average") != form:
+        origin = {**scene.provenance("train-kernel"), "id": product_provenance(path).get("id")}
+        save_weights(comm, path, "kernel", {**description, "reconstruction": form}, weights, origin, load_tables(path))
+        log.info('train-kernel: %s says now form = "%s"', path, form)
 
 
 def load_sample(truth: GroundTruth, index: int, support: float) -> KernelSample:
@@ -90,10 +110,11 @@ def load_sample(truth: GroundTruth, index: int, support: float) -> KernelSample:
 def training_of(scene: Scene, samples: list[KernelSample]) -> Training:
     """The training of both forms of the kernel, by name, one after the other."""
     settings, support, dtype = scene.kernel, scene.kernel_support, samples[0].particles.dtype
-    rates = (settings.learning_rate, FINAL_RATE_FRACTION * settings.learning_rate)
+    rates = (settings.learning_rate, settings.final_learning_rate)
     networks, phases = nn.ModuleDict(), []
     for name, gradient_weight in (("learned", settings.gradient_weight), ("learned_no_gradient", 0.0)):
-        networks[name] = KernelNetwork(support, settings.hidden, settings.cutoff, scene.seed).to(dtype)
+        networks[name] = KernelNetwork(support, settings.hidden, settings.cutoff, scene.seed,
+                                       None if settings.positive else scene.tracers.spacing**3).to(dtype)
         weights = KernelLossWeights(gradient_weight, settings.normalization_weight)
         trainer = KernelTrainer(networks[name], samples, weights, settings.points, scene.seed)
         phases.append(Phase(name, np.ones(settings.steps), rates, trainer.step))
@@ -133,6 +154,15 @@ def compare(kernels: dict[str, SmoothingKernel], sample: KernelSample) -> dict[s
         slices[f"velocity_{name}"] = _middle_plane(slab, velocity[:, 0])
         slices[f"gradient_{name}"] = _middle_plane(slab, derivative[:, 0, 0])
     return {"errors": errors, "slices": slices}
+
+
+def errors_of_forms(kernel: SmoothingKernel, sample: KernelSample, scales: ReferenceScales) -> dict[str, float]:
+    """Errors on a field of the forms other than averages, with a kernel that may be their weight; collective."""
+    errors = {}
+    for name in OTHER_FORMS if kernel.mean_volume is None else ():
+        made = form_of(name, kernel, scales.filter_width, scales.spacing**3).of(sample.particles)
+        errors[f"velocity_error_{name}"], errors[f"gradient_error_{name}"] = sample.errors_of(*made.on_grid())
+    return errors
 
 
 def _middle_plane(slab: SlabDecomposition, values: torch.Tensor) -> np.ndarray:

@@ -2,19 +2,22 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 from torch import nn
 
 from eddies.io.hdf5 import ProductError
+from eddies.io.provenance import product_provenance
 from eddies.io.weights import load_weights, save_weights
 from eddies.particles.flow_units import ReferenceScales
 from eddies.particles.smoothing_kernels import KernelNetwork
 from eddies.scene.scene import Model, SceneError, load_scene
 from eddies.scene.terms import PRESETS
-from eddies.workflows.learned.model import load_kernel, load_model, scene_model, take_from_first_rank
+from eddies.workflows.learned.model import load_form, load_kernel, load_model, scene_model, take_from_first_rank
 from eddies.workflows.learned.source import describe, differences
+from eddies.workflows.train_kernel import keep_form
 from tests.small_scene import TINY
 
 # Of the scene tiny: the filter is two spacings wide.
@@ -198,7 +201,7 @@ def write(comm, directory, **description):
 
 @pytest.mark.mpi(1)
 def test_the_kernel_is_read_as_it_was_trained(comm, tmp_path):
-    write(comm, tmp_path, form=KernelNetwork.FORM)
+    write(comm, tmp_path, form=NETWORK.formula)
     distance = torch.linspace(0, 0.8, 50)
     assert torch.equal(load_kernel(comm, tmp_path / "kernel.h5").value(distance), NETWORK.table().value(distance))
 
@@ -209,3 +212,19 @@ def test_weights_of_the_form_that_could_be_negative_are_refused(comm, tmp_path):
     write(comm, tmp_path)
     with pytest.raises(ProductError, match=r'kernel.h5: form = "NN g", .*remove it and run `eddies train-kernel`'):
         load_kernel(comm, tmp_path / "kernel.h5")
+
+
+@pytest.mark.mpi(1, 2)
+def test_another_form_of_reconstruction_is_written_beside_the_same_weights(comm, tmp_path):
+    """So a change of [kernel] form trains nothing, and what was made from the kernel still belongs to it."""
+    tmp_path = Path(comm.bcast(str(tmp_path)))
+    write(comm, tmp_path, form=NETWORK.formula, reconstruction="average")
+    path, known = tmp_path / "kernel.h5", product_provenance(tmp_path / "kernel.h5")["id"]
+    assert type(load_form(comm, path, SCALES)).__name__ == "Average"
+    for form, kind in (("quadratic", "LeastSquares"), ("kriging", "Kriging"), ("kriging", "Kriging")):
+        keep_form(load_scene(TINY, [f"kernel.form={form}"]), comm, tmp_path)
+        found = load_form(comm, path, SCALES)
+        assert type(found).__name__ == kind and found.support == pytest.approx(0.7)
+        assert product_provenance(path)["id"] == known
+    distance = torch.linspace(0, 0.8, 50)
+    assert torch.equal(load_kernel(comm, path).value(distance), NETWORK.table().value(distance))

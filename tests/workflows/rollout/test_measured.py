@@ -13,7 +13,7 @@ from eddies.io.hdf5 import ProductError, open_product
 from eddies.io.trajectories import Trajectory
 from eddies.workflows.rollout import truth_cache
 from eddies.workflows.rollout.measured import TrueParticles, open_rollout
-from eddies.workflows.rollout.particle_measures import KernelAverages, ParticleSpectra
+from eddies.workflows.rollout.particle_measures import FieldsOfParticles, ParticleSpectra
 from tests.changed_product import changed
 from tests.workflows.synthetic_run import START, write_kernel, write_rollout, write_run
 
@@ -40,7 +40,7 @@ def work(monkeypatch):
             return method(self, particles, frame, *more)
         return measure
 
-    for cls in (KernelAverages, ParticleSpectra):
+    for cls in (FieldsOfParticles, ParticleSpectra):
         monkeypatch.setattr(cls, "of", counted(cls.of, lambda particles: "truth" if isinstance(
             particles, TrueParticles) else "model"))
     return done

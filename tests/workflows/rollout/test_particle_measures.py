@@ -5,8 +5,10 @@ import pytest
 
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.flow_units import ReferenceScales
+from eddies.particles.forms import Average
 from eddies.particles.smoothing_kernels import CubicSpline
-from eddies.workflows.rollout.particle_measures import AveragedFields, KernelAverages, ParticleSpectra, WithGradients
+from eddies.workflows.rollout.particle_measures import (FieldsOfParticles, ParticleSpectra, ReconstructedFields,
+                                                           WithGradients)
 from tests.particles.configurations import positions
 from tests.validation import filtered_fields
 
@@ -85,8 +87,8 @@ def test_averages_of_a_linear_flow_are_it_but_for_what_neighbours_of_one_side_le
         def __init__(self):
             self.position, self.velocity = place, (place - LENGTH / 2) @ rotation.T
 
-    averages = KernelAverages(CubicSpline(2.2 * SPACING), SlabDecomposition(comm, LENGTH, SIDE))
-    particles, fields = WithGradients(Rotating(), averages), AveragedFields(Rotating(), averages)
+    averages = FieldsOfParticles(Average(CubicSpline(2.2 * SPACING)), SlabDecomposition(comm, LENGTH, SIDE))
+    particles, fields = WithGradients(Rotating(), averages), ReconstructedFields(Rotating(), averages)
     assert particles.columns == ("position", "velocity", "velocity_gradient") and fields.cells == SIDE
     inside = np.flatnonzero(np.abs(place - LENGTH / 2).max(axis=1) < LENGTH / 4)
     assert np.array_equal(particles.read(2, "velocity"), Rotating().read(2, "velocity"))

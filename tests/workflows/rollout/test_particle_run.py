@@ -121,7 +121,7 @@ def prepared(comm, directory, fluid="compressible", model=MODEL, start=0.3, turn
     scene = load_scene(path, overrides)
     dns.run(scene, comm, directory)
     network = KernelNetwork(scene.kernel_support, [4])
-    description = {"form": network.FORM, "support": network.support, "hidden": [4], "cutoff": "smooth"}
+    description = {"form": network.formula, "support": network.support, "hidden": [4], "cutoff": "smooth"}
     weights = {name: tensor.numpy() for name, tensor in network.state_dict().items()}
     save_weights(comm, directory / "kernel.h5", "kernel", description, weights, scene.provenance("train-kernel"), {
         "history": {"step": np.zeros(1)}})

@@ -18,6 +18,8 @@ from eddies.workflows.ground_truth.frame_counts import KERNEL_FIELDS, TESTED_FRA
 # transform of a grid point (1 + cells / CACHED times that where planes outgrow the caches), a pair of particles in a
 # sum, a weight of a network for a pair, an evaluation or iteration without its work, a message; of an idle stage.
 TRANSFORM, CACHED, PAIR, WEIGHT, CALL, MESSAGE, ROUNDS = 4e-9, 550, 2.5e-8, 6e-11, 2.5e-4, 2e-6, 4
+# What a pair costs in each form of reconstruction, of 60 neighbours, in that of averages.
+FORM_PAIRS = {"average": 1, "linear": 5, "quadratic": 8, "kriging": 27}
 START = {"dns": 0.4, "train-kernel": 0.7, "train": 1.0, "find-step": 0.5, "simulate": 0.3, "report": 2.3}
 SEARCH = 2                   # turnovers of the short rollouts that find a step, of the longest step
 COLD, ITERATION = 25, 12     # iterations of a solve from nothing; transforms of a point in one, with its splines
@@ -63,8 +65,9 @@ def seconds(scene: Scene, stage: str, ranks: int) -> float | None:
             transforms = calls * CompressibleFluid.transforms * eulerian.cells_for(tracers.filter_width) ** 3
         elif "model" in scene.simulation.needs:
             solves = rollout.evaluations * scene.simulation.scheme.iterations / COLD
-    elif rollout and kernel:       # a report averages model and truth at particles and grid points
+    elif rollout and kernel:       # a report reconstructs model and truth at particles and grid points
         pairs = 2 * (rollout.intervals + 1) * (tracers.particles + tracers.cells**3) * kernel.neighbors
+        pairs *= FORM_PAIRS[kernel.form]
     if solves and scene.resolves:
         calls += solves * COLD
         transforms += solves * COLD * ITERATION * tracers.planes**3

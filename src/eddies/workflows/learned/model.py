@@ -21,6 +21,7 @@ from eddies.parallel.communicator import Comm
 from eddies.parallel.reduction import any_rank
 from eddies.particles.feature_range import FeatureRange
 from eddies.particles.flow_units import FlowUnits, ReferenceScales
+from eddies.particles.forms import Form, form_of
 from eddies.particles.model import LagrangianModel, build_model
 from eddies.particles.smoothing_kernels import HermiteKernel, KernelNetwork
 from eddies.scene.scene import Scene, SceneError
@@ -125,14 +126,27 @@ def load_feature_range(comm: Comm, path: str | Path) -> FeatureRange:
 def load_kernel(comm: Comm, path: str | Path, device: torch.device | str = "cpu") -> HermiteKernel:
     """The trained kernel as the table that is used at run time, in single precision.
 
-    ProductError, besides the reasons of `load_weights`, where the weights are those of another form of the kernel.
+    ProductError, besides the reasons of `load_weights`, where the weights are those of another formula of the kernel.
     """
+    return _table_of(*load_weights(comm, path, "kernel"), path, device)
+
+
+def load_form(comm: Comm, path: str | Path, scales: ReferenceScales) -> Form:
+    """The form in which fields are reconstructed, as a kernel's file has it, with this kernel, in a flow of these
+    scales. Errors as of `load_kernel`."""
     description, tensors = load_weights(comm, path, "kernel")
-    form = description.get("form", "NN g")
-    if form != KernelNetwork.FORM:
-        raise ProductError(f'{path}: form = "{form}", which may be negative; the kernel is now "{KernelNetwork.FORM}": '
+    return form_of(description.get("reconstruction", "average"), _table_of(description, tensors, path),
+                   scales.filter_width, scales.spacing**3)
+
+
+def _table_of(description: Mapping[str, Any], tensors: Mapping[str, np.ndarray], path: str | Path,
+              device: torch.device | str = "cpu") -> HermiteKernel:
+    network = KernelNetwork(description["support"], description["hidden"], description["cutoff"],
+                            mean_volume=description.get("mean_volume"))
+    formula = description.get("form", "NN g")
+    if formula != network.formula:
+        raise ProductError(f'{path}: form = "{formula}", and the kernel of these settings is now "{network.formula}": '
                            "remove it and run `eddies train-kernel` again")
-    network = KernelNetwork(description["support"], description["hidden"], description["cutoff"])
     network = network.to(dtype=torch.float32, device=device)
     network.load_state_dict({name: torch.from_numpy(tensor) for name, tensor in tensors.items()})
     with torch.no_grad():

@@ -20,9 +20,9 @@ from eddies.parallel.communicator import Comm
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.devices import prepare_torch
 from eddies.workflows.ground_truth.truth import GroundTruth
-from eddies.workflows.learned.model import load_kernel
-from eddies.workflows.rollout.particle_measures import (GRADIENT, AveragedFields, KernelAverages, ParticleSpectra,
-                                                        WithGradients)
+from eddies.workflows.learned.model import load_form
+from eddies.workflows.rollout.particle_measures import (GRADIENT, FieldsOfParticles, ParticleSpectra,
+                                                        ReconstructedFields, WithGradients)
 from eddies.workflows.rollout.truth_cache import TruthCache
 
 log = logging.getLogger("eddies")
@@ -108,13 +108,14 @@ class MeasuredRollout:
     Parameters
     ----------
     rollout : what is compared. provenance : of its product.
-    averages : of the kernel. solver : of spectra. cache : of the truth. None without a kernel or a ground truth.
+    fields : as they are reconstructed. solver : of spectra. cache : of the truth. None without a kernel or a ground
+        truth.
     """
 
-    def __init__(self, rollout: Rollout, provenance: Mapping[str, Any], averages: KernelAverages | None = None,
+    def __init__(self, rollout: Rollout, provenance: Mapping[str, Any], fields: FieldsOfParticles | None = None,
                  solver: ParticleSpectra | None = None, cache: TruthCache | None = None) -> None:
         self.rollout, self.provenance = rollout, provenance
-        self.averages, self._solver, self._cache = averages, solver, cache
+        self.fields, self._solver, self._cache = fields, solver, cache
 
     @property
     def particles(self) -> dict[str, Any]:
@@ -126,11 +127,11 @@ class MeasuredRollout:
     def exported(self) -> dict[str, dict[str, Any]]:
         """Series of "fields" and "particles" by these names, the latter with velocity gradients, where there is a
         kernel."""
-        averages, runs = self.averages, self.particles
-        if averages is None:
+        fields, runs = self.fields, self.particles
+        if fields is None:
             return {"fields": {}, "particles": runs}
-        return {"fields": {name: AveragedFields(run, averages) for name, run in runs.items()},
-                "particles": {name: WithGradients(run, averages) for name, run in runs.items()}}
+        return {"fields": {name: ReconstructedFields(run, fields) for name, run in runs.items()},
+                "particles": {name: WithGradients(run, fields) for name, run in runs.items()}}
 
     @property
     def groups(self) -> dict[str, Any]:
@@ -139,10 +140,10 @@ class MeasuredRollout:
         for name, run in self.particles.items():
             if self._solver is not None:
                 found[f"spectra_of_{name}"] = Made(run.times, "energy", self.rollout.spectra[name].__getitem__)
-            if self.averages is not None:
-                found[f"fields/{name}"] = AveragedFields(run, self.averages)
+            if self.fields is not None:
+                found[f"fields/{name}"] = ReconstructedFields(run, self.fields)
                 found[f"gradients/{name}"] = Made(run.times, GRADIENT,
-                                                  lambda frame, run=run: self.averages.of(run, frame)[0])
+                                                  lambda frame, run=run: self.fields.of(run, frame)[0])
         return found
 
     def measure(self, comm: Comm, root: int = 0, whole: bool = True, late: bool = False) -> None:
@@ -183,7 +184,7 @@ class MeasuredRollout:
         tasks = [("spectra", of, int(frame)) for of in frames for frame in frames[of][shown]]
         if late:
             tasks += [("spectra", "model", int(frame)) for frame in run.late_spectra()]
-        if self.averages is not None:
+        if self.fields is not None:
             tasks += [("reconstructions", of, int(frame)) for of in frames
                       for frame in (run.before_broken(of) if whole else frames[of][-1:])]
         return list(dict.fromkeys(tasks))
@@ -235,17 +236,17 @@ def open_rollout(directory: Path, alone: Comm) -> Iterator[MeasuredRollout]:
             return
         ground = GroundTruth(truth_file, SlabDecomposition(alone, model.length, 1))
         truth = TrueParticles(ground.trajectory, attributes["start_time"], model.times)
-        kernel, averages = directory / "kernel.h5", None
+        kernel, fields = directory / "kernel.h5", None
         if kernel.exists():
             slab = SlabDecomposition(alone, model.length, ground.fields.cells)
-            averages = KernelAverages(load_kernel(alone, kernel), slab)
+            fields = FieldsOfParticles(load_form(alone, kernel, ground.scales), slab)
         solver = ParticleSpectra(ground.scales, model.length, alone)
         both = {"model": model, "truth": truth}
         spectra = {name: OnDemand(lambda frame, name=name: solver.of(both[name], frame, name)) for name in both}
-        reconstructions = None if averages is None else {
-            name: OnDemand(lambda frame, run=run: Reconstruction.of(*averages.of(run, frame)))
+        reconstructions = None if fields is None else {
+            name: OnDemand(lambda frame, run=run: Reconstruction.of(*fields.of(run, frame)))
             for name, run in both.items()}
         rollout = Rollout(attributes, model, truth, model.length, read_table(truth_file, "spectra"), ground.reference,
-                          spectra, reconstructions, **tables)
-        cache = TruthCache(directory / "ground_truth.h5", kernel if averages else None, alone)
-        yield MeasuredRollout(rollout, provenance, averages, solver, cache)
+                          spectra, reconstructions, **tables, reconstructed_by=fields.form.words if fields else "")
+        cache = TruthCache(directory / "ground_truth.h5", kernel if fields else None, alone)
+        yield MeasuredRollout(rollout, provenance, fields, solver, cache)

@@ -1,4 +1,4 @@
-"""What one rank measures of particles at one moment, whatever moves them: averages with a kernel, and spectra."""
+"""What one rank measures of particles at one moment, whatever moves them: reconstructed fields, and spectra."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from eddies.analysis.rollout import Frames
 from eddies.parallel.communicator import Comm
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.flow_units import FlowUnits, ReferenceScales
+from eddies.particles.forms import Form
 from eddies.particles.particle_field import ParticleField
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.resolved_velocity import ResolvedVelocity
-from eddies.particles.smoothing_kernels import SmoothingKernel
 
 # Where particles have gathered and left voids a solve takes more, and gains little by most: see ParticleSpectra.
 MOST_ITERATIONS = 100
 GRADIENT = "velocity_gradient"
 
 
-class KernelAverages:
-    """What averages with a kernel make of particles, frame by frame; the last frame is kept.
+class FieldsOfParticles:
+    """What a form of reconstruction makes of particles, frame by frame; the last frame is kept.
 
     Parameters
     ----------
-    kernel : of the averages. slab : of one rank, with a plane for each cell of the grid.
+    form : of the reconstruction. slab : of one rank, with a plane for each cell of the grid.
     """
 
-    def __init__(self, kernel: SmoothingKernel, slab: SlabDecomposition) -> None:
-        self.kernel, self.slab = kernel, slab
+    def __init__(self, form: Form, slab: SlabDecomposition) -> None:
+        self.form, self.slab = form, slab
         self._last: tuple[Any, Any] = None, None
 
     def of(self, particles: Frames, frame: int) -> tuple[np.ndarray, np.ndarray]:
@@ -41,40 +41,38 @@ class KernelAverages:
         if self._last[0] != asked:
             position, velocity = (torch.from_numpy(particles.read(frame, name)) for name in ("position", "velocity"))
             with torch.no_grad():
-                field = ParticleField(self.slab, self.kernel.support, position, velocity)
-                volume = field.volumes(self.kernel)
-                gradient = as_numpy(field.at_particles(self.kernel, volume)[1])
-                values = as_numpy(field.velocity_on_whole_grid(self.kernel, volume)).T
+                made = self.form.of(ParticleField(self.slab, self.form.support, position, velocity))
+                gradient, values = as_numpy(made.at_particles()[1]), as_numpy(made.velocity_on_grid()).T
             self._last = asked, (gradient, values.reshape(3, *[self.slab.planes] * 3))
         return self._last[1]
 
 
 class WithGradients:
-    """Particles with a column more, `velocity_gradient`: dv_i/dx_j through the kernel."""
+    """Particles with a column more, `velocity_gradient`: dv_i/dx_j as it is reconstructed."""
 
-    def __init__(self, particles: Any, averages: KernelAverages) -> None:
-        self._particles, self._averages, self.times = particles, averages, particles.times
+    def __init__(self, particles: Any, fields: FieldsOfParticles) -> None:
+        self._particles, self._fields, self.times = particles, fields, particles.times
         self.total, self.length, self.columns = particles.total, particles.length, (*particles.columns, GRADIENT)
 
     def read(self, frame: int, column: str, start: int = 0, stop: int | None = None) -> np.ndarray:
         """Rows start to stop of a column, in order of id."""
         if column == GRADIENT:
-            return self._averages.of(self._particles, frame)[0][start:stop]
+            return self._fields.of(self._particles, frame)[0][start:stop]
         return self._particles.read(frame, column, start, stop)
 
 
-class AveragedFields:
-    """The velocity that the kernel makes of particles on its grid, as a series of fields."""
+class ReconstructedFields:
+    """The velocity that is reconstructed from particles on a grid, as a series of fields."""
 
     variables = columns = ("velocity",)
 
-    def __init__(self, particles: Frames, averages: KernelAverages) -> None:
-        self._particles, self._averages, self.times = particles, averages, particles.times
-        self.cells = averages.slab.planes
+    def __init__(self, particles: Frames, fields: FieldsOfParticles) -> None:
+        self._particles, self._fields, self.times = particles, fields, particles.times
+        self.cells = fields.slab.planes
 
     def read(self, index: int, variable: str, start: int = 0, stop: int | None = None) -> np.ndarray:
         """Planes start to stop, (3, stop - start, y, x)."""
-        return self._averages.of(self._particles, index)[1][:, start:stop]
+        return self._fields.of(self._particles, index)[1][:, start:stop]
 
 
 class ParticleSpectra:
