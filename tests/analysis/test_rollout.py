@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from eddies.analysis.rollout import CommonFrames, Reconstruction, Rollout
+from eddies.analysis.rollout import CommonFrames, Rollout
 
 SHELLS, CELLS = np.arange(6), 12
 
@@ -64,18 +64,3 @@ def test_common_frames_are_those_of_the_same_time_before_the_model_broke():
             alone.common
     spread = CommonFrames.of(Still(range(9)), Still(range(9))).spread(3)
     assert spread.tolist() == [0, 4, 8]
-
-
-def test_a_reconstruction_has_what_is_in_the_plane_and_in_the_shells():
-    """A velocity u_x = sin 2z + cos 5y / 2: |w| = |2 cos 2z, 2.5 sin 5y|, and energies 1/4 and 1/16."""
-    z, y = (2 * np.pi * np.arange(CELLS) / CELLS for _ in range(2))
-    field = np.zeros((3, CELLS, CELLS, CELLS))
-    field[0] = np.sin(2 * z)[:, None, None] + np.cos(5 * y)[None, :, None] / 2
-    gradient = np.random.default_rng(2).standard_normal((50, 3, 3))
-    found = Reconstruction.of(gradient, field)
-    assert found.velocity.shape == (3, CELLS, CELLS) and np.array_equal(found.velocity, field[:, CELLS // 2])
-    expected = np.hypot(2 * np.cos(2 * np.pi), 2.5 * np.sin(5 * y))
-    assert found.vorticity == pytest.approx(np.tile(expected[:, None], CELLS), abs=1e-6)
-    assert found.energy[[2, 5]] == pytest.approx([1 / 4, 1 / 16])
-    assert found.energy_above(2.0) == pytest.approx(1 / 16) and found.energy_above(1.9) == pytest.approx(5 / 16)
-    assert found.invariants.second.dtype == np.float32

@@ -39,8 +39,9 @@ def waves(x):
 @pytest.mark.mpi(1, 2, 3)
 @forms
 def test_a_constant_is_exact_and_has_no_gradient(comm, name):
-    made = form(name).of(field_of(comm, lambda x: torch.full_like(x, 2.0)))
-    for velocity, gradient in (made.on_grid(), made.at_particles()):
+    field = field_of(comm, lambda x: torch.full_like(x, 2.0))
+    made = form(name).of(field)
+    for velocity, gradient in (made.at(field.points), made.at_particles()):
         assert largest(comm, velocity - 2) < 1e-9 and largest(comm, gradient) < 1e-8
 
 
@@ -66,7 +67,7 @@ def test_polynomials_are_exact_but_for_the_ridge(comm, monkeypatch, name, power)
     for ridge, error in ((None, 0.03), (0.0, 1e-9)):
         if ridge is not None:
             monkeypatch.setattr("eddies.particles.particle_field.RIDGE", ridge)
-        velocity, gradient = form(name).of(field).on_grid()
+        velocity, gradient = form(name).of(field).at(field.points)
         assert (velocity[inside] - exact).abs().max() < error * exact.abs().max()
         assert (gradient[inside] - slope).abs().max() < error * slope.abs().max()
 
@@ -78,7 +79,7 @@ def test_polynomials_are_exact_but_for_the_ridge(comm, monkeypatch, name, power)
 def test_a_smooth_field_and_its_gradient_on_any_number_of_ranks(comm, name, velocity_error, gradient_error):
     """Waves of k = 1, six supports long: an average flattens them by k^2 <x^2>/2 of 4 %, with noise of placement."""
     field = field_of(comm, waves)
-    velocity, gradient = form(name).of(field).on_grid()
+    velocity, gradient = form(name).of(field).at(field.points)
     assert largest(comm, velocity - waves(field.points)) < velocity_error
     assert largest(comm, gradient[:, 0, 1] - torch.cos(field.points[:, 1])) < gradient_error
     # What single ranks find does not depend on how many there are: sums are over the same neighbours.
@@ -97,13 +98,13 @@ def test_the_gradient_is_that_of_the_field(comm, name):
     """
     field, step = field_of(comm, waves, "lattice"), 5e-3
     made = form(name).of(field)
-    _, gradient = made.on_grid()
+    _, gradient = made.at(field.points)
     points, moved = field.points, {}
     for sign in (-1, 1):
         field.points = points + sign * step * torch.tensor([1.0, 0, 0], dtype=torch.float64)
         if "_around" in field.__dict__:
             del field._around
-        moved[sign] = form(name).of(field).on_grid()[0]
+        moved[sign] = form(name).of(field).at(field.points)[0]
     slope = (moved[1] - moved[-1]) / (2 * step)
     bound = {"average": 5e-3, "linear": 0.2, "quadratic": 0.1, "kriging": 0.2}[name]
     assert torch.quantile((slope - gradient[..., 0]).abs().amax(1), 0.95) < bound
@@ -113,12 +114,13 @@ def test_the_gradient_is_that_of_the_field(comm, name):
 @pytest.mark.parametrize("dtype, rounding", [(torch.float64, 1e-9), (torch.float32, 2e-3)])
 @forms
 def test_the_library_finds_what_torch_does(comm, monkeypatch, name, dtype, rounding):
-    made = form(name, CubicSpline(SUPPORT)).of(field_of(comm, waves, dtype=dtype))
-    found = [*made.on_grid(), *made.at_particles()]
+    field = field_of(comm, waves, dtype=dtype)
+    made = form(name, CubicSpline(SUPPORT)).of(field)
+    found = [*made.at(field.points), *made.at_particles()]
     for module in ("particle_field", "kriging"):
         monkeypatch.setattr(f"eddies.particles.{module}.kernels_serve", lambda device: False)
     made = form(name, CubicSpline(SUPPORT)).of(field_of(comm, waves, dtype=dtype))
-    for one, other in zip(found, [*made.on_grid(), *made.at_particles()], strict=True):
+    for one, other in zip(found, [*made.at(field.points), *made.at_particles()], strict=True):
         assert one.dtype == dtype and (one - other).abs().max() <= rounding * other.abs().max()
 
 
@@ -138,7 +140,7 @@ def test_voids_and_neighbours_of_one_side_leave_nothing_without_a_bound(comm, na
 
     field = field_of(comm, waves, move=move)
     made = form(name).of(field)
-    velocity, gradient = made.on_grid()
+    velocity, gradient = made.at(field.points)
     assert velocity.isfinite().all() and gradient.isfinite().all()
     # Of clusters, within which the velocity changes seven times as fast as waves do, fits go on a little way outwards.
     assert velocity.abs().max() < (5 if kind == "clusters" else 3)
@@ -170,8 +172,8 @@ def test_a_kernel_that_may_be_negative_sums_as_published(comm):
     once, twice = (form("average", kernel).of(field) for kernel in kernels)
     assert largest(comm, once.volume - SPACING**3) == 0
     assert largest(comm, 2 * once.velocity_on_grid() - twice.velocity_on_grid()) < 1e-12
-    assert largest(comm, once.on_grid()[0] - once.velocity_on_grid()) < 1e-12
-    velocity, gradient = once.on_grid()
+    assert largest(comm, once.at(field.points)[0] - once.velocity_on_grid()) < 1e-12
+    velocity, gradient = once.at(field.points)
     rows = torch.arange(0, len(field.points), 7)
     for one, other in zip((velocity, gradient), field.on_grid(kernels[0], once.volume, rows)):
         assert largest(comm, one[rows] - other) < 1e-10

@@ -30,7 +30,7 @@ def rollout(factors=FACTORS):
     attributes = {"eddy_turnover_time": 1.0, "injection_rate": 0.5, "start_time": 0.0}
     runs = {"model": Stored(columns, factors), "truth": Stored(columns, np.ones(1))}
     spectra = {name: dict(enumerate(np.outer(run.factors**2, SPECTRUM[:8]))) for name, run in runs.items()}
-    reconstructions = {name: {frame: Reconstruction(Invariants.of(factor * gradient), *[None] * 3)
+    reconstructions = {name: {frame: Reconstruction(Invariants.of(factor * gradient), *[None] * 2)
                               for frame, factor in enumerate(run.factors)} for name, run in runs.items()}
     flow = {"time": runs["model"].times}
     return Rollout(attributes, *runs.values(), 2 * np.pi, flow, {"filter_width": WIDTH}, spectra,

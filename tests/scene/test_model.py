@@ -285,7 +285,8 @@ def test_another_list_on_the_command_line_takes_the_place_of_the_file_s(tmp_path
     """Of a preset, of terms, and of a written scene, which has settings of all its terms."""
     written = load_scene("hit-small", ["model.preset=resolved + pairs", "model.pairs.hidden=[8, 8]"],
                          ["variant"]).to_toml()
-    assert load_scene("hit-small", ['model.terms=["pressure", "pairs"]'], ["variant"]).model.terms == ("pressure", "pairs")
+    other = load_scene("hit-small", ['model.terms=["pressure", "pairs"]'], ["variant"])
+    assert other.model.terms == ("pressure", "pairs")
     found = read(tmp_path, written, "model.preset=resolved").model
     assert found.terms == tuple(PRESETS["resolved"]) == tuple(found.settings)
     kept = read(tmp_path, written, 'model.terms=["pressure", "pairs"]').model

@@ -229,8 +229,8 @@ def test_each_truth_is_measured_and_read_through_once(comm, folder, monkeypatch,
             return method(self, particles, frame, *more)
         return measure
 
-    for cls in (FieldsOfParticles, ParticleSpectra):
-        monkeypatch.setattr(cls, "of", counted(cls.of))
+    for cls, method in ((FieldsOfParticles, "gradients"), (ParticleSpectra, "of")):
+        monkeypatch.setattr(cls, method, counted(getattr(cls, method)))
     monkeypatch.setattr(product_warnings, "stored_numbers", lambda file: scanned.append(file.filename) or ())
     assert run_cli("run", f"{scene}.toml", "--output", "out") == 0
     together = [each for some in comm.allgather(measured) for each in some]

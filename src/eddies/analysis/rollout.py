@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from eddies.analysis.spectra import band_ratios, energy_spectrum, spectrum_error, vorticity
+from eddies.analysis.spectra import band_ratios, spectrum_error
 from eddies.analysis.velocity_gradients import Invariants
 
 SHOWN = 3  # spectra of a rollout
@@ -69,25 +69,11 @@ class Reconstruction:
     ----------
     invariants : of the velocity gradient at the particles.
     velocity : (3, n, n) and vorticity : its magnitude (n, n), [y, x] in the plane z = pi.
-    energy : of each shell of the whole field, k = 0, 1, ...; (shells,).
     """
 
     invariants: Invariants
     velocity: np.ndarray
     vorticity: np.ndarray
-    energy: np.ndarray
-
-    @classmethod
-    def of(cls, gradient: np.ndarray, field: np.ndarray) -> "Reconstruction":
-        """Of gradients (particles, 3, 3) at the particles and the velocity (3, n, n, n) on a grid."""
-        middle = field.shape[1] // 2
-        rotation = np.linalg.norm(vorticity(field)[:, middle], axis=0)
-        return cls(Invariants.of(gradient), field[:, middle].copy(), rotation.astype(np.float32),
-                   energy_spectrum(field)[1])
-
-    def energy_above(self, wavenumber: float) -> float:
-        """Energy of the shells k > wavenumber."""
-        return float(self.energy[np.arange(len(self.energy)) > wavenumber].sum())
 
 
 @dataclass(frozen=True)

@@ -22,11 +22,11 @@ DEGREES = {"linear": 1, "quadratic": 2}
 class Reconstructed(Protocol):
     """A velocity made of particles at one moment; collective where it is asked for."""
 
-    def on_grid(self) -> tuple[Tensor, Tensor]:
-        """Velocity (m, 3) and gradient (m, 3, 3) [component, direction] at this rank's grid points, z slowest."""
+    def at(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Velocity (k, 3) and gradient (k, 3, 3) [component, direction] at points (k, 3) of this rank."""
 
     def velocity_on_grid(self) -> Tensor:
-        """The velocity alone, (m, 3)."""
+        """The velocity (m, 3) at this rank's grid points, z slowest."""
 
     def at_particles(self) -> tuple[Tensor, Tensor]:
         """Velocity (n, 3) and gradient (n, 3, 3) at the owned particles."""
@@ -66,8 +66,8 @@ class _Averaged:
     field: ParticleField
     volume: Tensor
 
-    def on_grid(self) -> tuple[Tensor, Tensor]:
-        return self.field.on_whole_grid(self.kernel, self.volume)
+    def at(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        return self.field.averaged(self.kernel, self.volume, points)
 
     def velocity_on_grid(self) -> Tensor:
         return self.field.velocity_on_whole_grid(self.kernel, self.volume)
@@ -138,11 +138,8 @@ class _AtAnyPoints:
     def __init__(self, field: ParticleField, at: Callable[[Tensor], tuple[Tensor, Tensor]]) -> None:
         self._field, self.at = field, at
 
-    def on_grid(self) -> tuple[Tensor, Tensor]:
-        return self.at(self._field.points)
-
     def velocity_on_grid(self) -> Tensor:
-        return self.on_grid()[0]
+        return self.at(self._field.points)[0]
 
     def at_particles(self) -> tuple[Tensor, Tensor]:
         return self.at(self._field.owned)

@@ -90,13 +90,15 @@ class ParticleField:
         return reconstruct_with_gradient(kernel, pairs, volume, self._velocity)
 
     @torch.no_grad()
-    def on_whole_grid(self, kernel: SmoothingKernel, volume: Tensor) -> tuple[Tensor, Tensor]:
-        """Velocity (m, 3) and gradient (m, 3, 3) at all of this rank's grid points, by the kernel's `volumes`."""
+    def averaged(self, kernel: SmoothingKernel, volume: Tensor, receivers: Tensor) -> tuple[Tensor, Tensor]:
+        """Velocity (k, 3) and gradient (k, 3, 3) at any points of this rank, by the kernel's `volumes`."""
         if kernels_serve(self.owned.device):
-            none = self._velocity.new_zeros(len(self.points), 4)
-            return self._averages(kernel, torch.cat([self.points, self._position]),
+            none = self._velocity.new_zeros(len(receivers), 4)
+            return self._averages(kernel, torch.cat([receivers, self._position]),
                                   torch.cat([none, self._columns(volume)]), none)
-        return _joined(self.on_grid(kernel, volume, block) for block in self._around.blocks(PAIRS_TOGETHER))
+        neighbors = self._neighbors_of(receivers)
+        return _joined(reconstruct_with_gradient(kernel, neighbors.pairs(receivers, self._position, block, self.dtype),
+                                                 volume, self._velocity) for block in neighbors.blocks(PAIRS_TOGETHER))
 
     @torch.no_grad()
     def velocity_on_whole_grid(self, kernel: SmoothingKernel, volume: Tensor) -> Tensor:

@@ -20,14 +20,12 @@ Series = Mapping[str, Mapping[str, np.ndarray]]  # columns over time of "truth" 
 class Disorder:
     """Shares of nearest-neighbour distances at one time, and series over time, of "truth" and "model".
 
-    distances: (bins,) each, on disorder.DISTANCE_EDGES; counts: columns time, count_variance; energies: columns time,
-    energy (of the reconstructed velocity beyond the filter wavenumber), or None without a kernel.
+    distances: (bins,) each, on disorder.DISTANCE_EDGES; counts: columns time, count_variance.
     """
 
     time: float
     distances: Mapping[str, np.ndarray]
     counts: Series
-    energies: Series | None
 
     @property
     def divergence(self) -> float:
@@ -42,54 +40,37 @@ class Disorder:
         distances = {name: disorder.distance_probabilities(getattr(position, name), run.length) for name in both}
         counts = {name: disorder.count_variance_series(frames, run.before_broken(name), run.length)
                   for name, frames in both.items()}
-        energies = None
-        if run.reconstructions is not None:
-            energies = {name: {"time": counts[name]["time"], "energy": np.array([
-                run.reconstructions[name][int(frame)].energy_above(run.filter_wavenumber)
-                for frame in run.before_broken(name)])} for name in both}
-        return cls(position.time, distances, counts, energies)
+        return cls(position.time, distances, counts)
 
 
 def add(shown: Section, run: Rollout) -> None:
-    """Put the figure and its three numbers, all at the last common time, into the section of the rollout."""
+    """Put the figure and its two numbers, all at the last common time, into the section of the rollout."""
     found, turnover = Disorder.of(run), run.turnover
     variance = {name: _at(series, found.time)["count_variance"] for name, series in found.counts.items()}
-    ratio, caption = None, ""
-    if found.energies is not None:
-        energy = {name: _at(series, found.time)["energy"] for name, series in found.energies.items()}
-        ratio = energy["model"] / energy["truth"]
-        caption = (f" C: energy of the reconstructed velocity at k > k_d; model / truth at the end: {ratio:.3g}.")
     shown.metrics += [
         Metric("nearest_distance_kl", "KL divergence of the nearest-neighbour distance PDF", found.divergence),
         Metric("count_variance_ratio", "variance of particle counts, model / truth",
                variance["model"] / variance["truth"], "too few particles to be counted in cells"),
-        Metric("high_wavenumber_energy_ratio", "energy at k > k_d, model / truth", ratio,
-               "measured through the smoothing kernel, and there is no kernel.h5"),
     ]
     shown.add_figure(
         "particle-disorder", "Disorder of the particles", draw(found, turnover),
         f"A: distance to the nearest neighbour at t = {found.time / turnover:.2f} T; KL {found.divergence:.2g}. "
         f"B: variance of the particles' number in cells of {disorder.CELL:g} mean spacings, 1 for random points; "
         f"at that time {variance['truth']:.2f} (true tracers), {variance['model']:.2f} (model): above the truth's the "
-        f"model's particles cluster.{caption}")
+        "model's particles cluster.")
 
 
 @styled
 def draw(found: Disorder, turnover: float) -> Figure:
-    """PDF of nearest-neighbour distances beside that of random points, variance of counts and energy beyond the
-    filter wavenumber over time."""
-    figure, axes = panels(1, 2 if found.energies is None else 3, (4.0, 3.1))
+    """PDF of nearest-neighbour distances beside that of random points, variance of counts over time."""
+    figure, axes = panels(1, 2, (4.0, 3.1))
     edges = disorder.DISTANCE_EDGES
     fine, centres = np.linspace(edges[0], edges[-1], 300), (edges[1:] + edges[:-1]) / 2
-    nearest, counts = axes[0, :2]
+    nearest, counts = axes[0]
     nearest.plot(fine, disorder.random_distance_density(fine), color=GUIDE, linestyle=":", label="random points")
     for name, line in LINES.items():
         nearest.plot(centres, found.distances[name] / np.diff(edges), **line)
         counts.plot(found.counts[name]["time"] / turnover, found.counts[name]["count_variance"], **line)
-        if found.energies is not None:
-            series = found.energies[name]
-            axes[0, 2].semilogy(series["time"] / turnover, series["energy"], **line)
-            axes[0, 2].set(title="Energy beyond the filter", ylabel="$E(k > k_d)$", xlabel="time $t/T$")
     nearest.set(title="Nearest neighbour", xlabel="distance / mean spacing", ylabel="PDF", ylim=(0, None))
     nearest.legend()
     counts.axhline(1, color=GUIDE, linestyle=":")

@@ -148,7 +148,8 @@ def compare(kernels: dict[str, SmoothingKernel], sample: KernelSample) -> dict[s
     slices["truth_velocity"] = _middle_plane(slab, sample.field[:, 0])
     slices["truth_gradient"] = _middle_plane(slab, sample.gradient[:, 0, 0])
     for name, kernel in kernels.items():
-        velocity, derivative = sample.particles.on_whole_grid(kernel, sample.particles.volumes(kernel))
+        velocity, derivative = sample.particles.averaged(
+            kernel, sample.particles.volumes(kernel), sample.particles.points)
         errors[f"velocity_error_{name}"], errors[f"gradient_error_{name}"] = sample.errors_of(velocity, derivative)
         errors[f"integral_{name}"] = float(integral(kernel))
         slices[f"velocity_{name}"] = _middle_plane(slab, velocity[:, 0])
@@ -161,7 +162,8 @@ def errors_of_forms(kernel: SmoothingKernel, sample: KernelSample, scales: Refer
     errors = {}
     for name in OTHER_FORMS if kernel.mean_volume is None else ():
         made = form_of(name, kernel, scales.filter_width, scales.spacing**3).of(sample.particles)
-        errors[f"velocity_error_{name}"], errors[f"gradient_error_{name}"] = sample.errors_of(*made.on_grid())
+        errors[f"velocity_error_{name}"], errors[f"gradient_error_{name}"] = sample.errors_of(
+            *made.at(sample.particles.points))
     return errors
 
 

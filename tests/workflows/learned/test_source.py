@@ -136,7 +136,8 @@ def test_a_file_never_has_a_class_imported(comm, tmp_path, own):
                                         ("hit-small", "hit-small"), ("tiny", "tiny")])
 def test_weights_of_the_first_version_are_read(comm, name, base):
     """Of a term's keys that there are no more, with the values at which they are fixed now."""
-    changes = {"hit-local": ["model.preset=local"], "tiny": ["model.preset=resolved + pairs", "model.pairs.hidden=[8, 8]"]}
+    changes = {"hit-local": ["model.preset=local"],
+               "tiny": ["model.preset=resolved + pairs", "model.pairs.hidden=[8, 8]"]}
     found = one_model(base, [*changes.get(name, ()), f"model.path=eddies:{name}"])
     source = read_source(found, comm)
     scales = ReferenceScales(**source.description["scales"])

@@ -101,5 +101,8 @@ def test_averages_of_a_linear_flow_are_it_but_for_what_neighbours_of_one_side_le
     quarter = slice(SIDE // 3, 2 * SIDE // 3)
     assert field[0][:, quarter, quarter] == pytest.approx(
         np.broadcast_to(-1.5 * grid[None, quarter, None], field[0][:, quarter, quarter].shape), abs=1e-5)
+    velocity, vorticity = averages.plane(Rotating(), 0)
+    assert velocity == pytest.approx(field[:, SIDE // 2], abs=1e-5)
+    assert vorticity[quarter, quarter] == pytest.approx(2 * gradient[inside][0][1, 0], rel=0.2)
     assert np.array_equal(particles.read(1, "velocity_gradient", 5, 9), particles.read(1, "velocity_gradient")[5:9])
     assert np.array_equal(fields.read(1, "velocity", 2, 4), fields.read(1, "velocity")[:, 2:4])

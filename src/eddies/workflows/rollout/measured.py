@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from eddies.analysis.rollout import Reconstruction, Rollout
+from eddies.analysis.velocity_gradients import Invariants
 from eddies.io.hdf5 import ProductError, open_product, read_attributes, read_table
 from eddies.io.provenance import read_provenance
 from eddies.io.trajectories import IMAGE, Trajectory
@@ -143,7 +144,7 @@ class MeasuredRollout:
             if self.fields is not None:
                 found[f"fields/{name}"] = ReconstructedFields(run, self.fields)
                 found[f"gradients/{name}"] = Made(run.times, GRADIENT,
-                                                  lambda frame, run=run: self.fields.of(run, frame)[0])
+                                                  lambda frame, run=run: self.fields.gradients(run, frame))
         return found
 
     def measure(self, comm: Comm, root: int = 0, whole: bool = True, late: bool = False) -> None:
@@ -244,7 +245,8 @@ def open_rollout(directory: Path, alone: Comm) -> Iterator[MeasuredRollout]:
         both = {"model": model, "truth": truth}
         spectra = {name: OnDemand(lambda frame, name=name: solver.of(both[name], frame, name)) for name in both}
         reconstructions = None if fields is None else {
-            name: OnDemand(lambda frame, run=run: Reconstruction.of(*fields.of(run, frame)))
+            name: OnDemand(lambda frame, run=run: Reconstruction(
+                Invariants.of(fields.gradients(run, frame)), *fields.plane(run, frame)))
             for name, run in both.items()}
         rollout = Rollout(attributes, model, truth, model.length, read_table(truth_file, "spectra"), ground.reference,
                           spectra, reconstructions, **tables, reconstructed_by=fields.form.words if fields else "")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
@@ -12,7 +13,7 @@ from eddies.analysis.rollout import Frames
 from eddies.parallel.communicator import Comm
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.flow_units import FlowUnits, ReferenceScales
-from eddies.particles.forms import Form
+from eddies.particles.forms import Form, Reconstructed
 from eddies.particles.particle_field import ParticleField
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.resolved_velocity import ResolvedVelocity
@@ -23,28 +24,50 @@ GRADIENT = "velocity_gradient"
 
 
 class FieldsOfParticles:
-    """What a form of reconstruction makes of particles, frame by frame; the last frame is kept.
+    """What a form of reconstruction makes of particles, frame by frame; what was made last is kept.
 
     Parameters
     ----------
-    form : of the reconstruction. slab : of one rank, with a plane for each cell of the grid.
+    form : of the reconstruction. slab : of one rank, with a plane for each cell of the grid, whose point i lies at
+        i L / cells.
     """
 
     def __init__(self, form: Form, slab: SlabDecomposition) -> None:
         self.form, self.slab = form, slab
         self._last: tuple[Any, Any] = None, None
 
-    def of(self, particles: Frames, frame: int) -> tuple[np.ndarray, np.ndarray]:
-        """Velocity gradients (n, 3, 3) at the particles and the velocity (3, z, y, x) on the grid, where point i lies
-        at i L / cells."""
-        asked = id(particles), frame
+    def gradients(self, particles: Frames, frame: int) -> np.ndarray:
+        """Velocity gradients (n, 3, 3) [component, direction] at the particles."""
+        return self._kept("gradients", particles, frame, lambda made: as_numpy(made.at_particles()[1]))
+
+    def velocity(self, particles: Frames, frame: int) -> np.ndarray:
+        """The velocity (3, z, y, x) on the grid."""
+        return self._kept("velocity", particles, frame, lambda made: self._by_component(made.velocity_on_grid(), 3))
+
+    def plane(self, particles: Frames, frame: int) -> tuple[np.ndarray, np.ndarray]:
+        """Velocity (3, y, x) and magnitude of the vorticity (y, x) at the grid's points in the plane z = pi."""
+        axis = torch.arange(self.slab.planes, dtype=torch.float64) * self.slab.spacing
+        y, x = torch.meshgrid(axis, axis, indexing="ij")
+        middle = torch.full_like(x, self.slab.planes // 2 * self.slab.spacing)
+        velocity, gradient = self._made(particles, frame).at(torch.stack([x, y, middle], -1).reshape(-1, 3))
+        antisymmetric = gradient - gradient.transpose(1, 2)  # its norm is that of the vorticity times sqrt(2)
+        vorticity = antisymmetric.square().sum((1, 2)).div(2).sqrt()
+        return self._by_component(velocity, 2), as_numpy(vorticity).reshape([self.slab.planes] * 2)
+
+    def _kept(self, what: str, particles: Frames, frame: int,
+              make: Callable[[Reconstructed], np.ndarray]) -> np.ndarray:
+        asked = what, id(particles), frame
         if self._last[0] != asked:
-            position, velocity = (torch.from_numpy(particles.read(frame, name)) for name in ("position", "velocity"))
-            with torch.no_grad():
-                made = self.form.of(ParticleField(self.slab, self.form.support, position, velocity))
-                gradient, values = as_numpy(made.at_particles()[1]), as_numpy(made.velocity_on_grid()).T
-            self._last = asked, (gradient, values.reshape(3, *[self.slab.planes] * 3))
+            self._last = asked, make(self._made(particles, frame))
         return self._last[1]
+
+    @torch.no_grad()
+    def _made(self, particles: Frames, frame: int) -> Reconstructed:
+        position, velocity = (torch.from_numpy(particles.read(frame, name)) for name in ("position", "velocity"))
+        return self.form.of(ParticleField(self.slab, self.form.support, position, velocity))
+
+    def _by_component(self, velocity: torch.Tensor, dimensions: int) -> np.ndarray:
+        return as_numpy(velocity).T.reshape(3, *[self.slab.planes] * dimensions)
 
 
 class WithGradients:
@@ -57,7 +80,7 @@ class WithGradients:
     def read(self, frame: int, column: str, start: int = 0, stop: int | None = None) -> np.ndarray:
         """Rows start to stop of a column, in order of id."""
         if column == GRADIENT:
-            return self._fields.of(self._particles, frame)[0][start:stop]
+            return self._fields.gradients(self._particles, frame)[start:stop]
         return self._particles.read(frame, column, start, stop)
 
 
@@ -72,7 +95,7 @@ class ReconstructedFields:
 
     def read(self, index: int, variable: str, start: int = 0, stop: int | None = None) -> np.ndarray:
         """Planes start to stop, (3, stop - start, y, x)."""
-        return self._fields.of(self._particles, index)[1][:, start:stop]
+        return self._fields.velocity(self._particles, index)[:, start:stop]
 
 
 class ParticleSpectra:

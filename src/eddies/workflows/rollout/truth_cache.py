@@ -31,7 +31,7 @@ Measures = dict[tuple[str, int], Any]
 Table = Mapping[str, np.ndarray]
 TABLE = "{}_of_truth"
 COLUMNS = {"spectra": ("frame", "energy"),
-           "reconstructions": ("frame", "second", "third", "scale", "velocity", "vorticity", "energy")}
+           "reconstructions": ("frame", "second", "third", "scale", "velocity", "vorticity")}
 
 
 class TruthCache:
@@ -107,7 +107,7 @@ def _values(found: np.ndarray | Reconstruction) -> tuple:
     if not isinstance(found, Reconstruction):
         return (found,)
     invariants = found.invariants
-    return (invariants.second, invariants.third, invariants.scale, found.velocity, found.vorticity, found.energy)
+    return (invariants.second, invariants.third, invariants.scale, found.velocity, found.vorticity)
 
 
 @functools.cache
