@@ -252,7 +252,7 @@ class Training(Section):
     @property
     def wants_fields(self) -> bool:
         """Whether each frame that is trained on needs a filtered field one frame later."""
-        return self.field_target == "flow" and self.field_weight > 0 and self.combined_steps > 0
+        return self.field_target == "flow" and self.field_weight > 0
 
     @property
     def truth_files(self) -> tuple[Path, ...]:
