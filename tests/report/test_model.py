@@ -26,6 +26,7 @@ def test_coefficients_are_written_as_learned_and_in_the_units_of_the_flow():
     one, several = _coefficients({"coefficients": COEFFICIENTS})
     assert (one.key, one.label) == ("eddy-viscosity |a_1|", "eddy-viscosity, |a_1|: friction of a pair")
     assert one.written == "0.1, that is 0.25 L/T" and several.written == "0.1, 0.2"
-    section, record = Section("model", "Model", metrics=[Metric("delay", "delay", 0.1), one]), RunRecord("run", "", "", [("stage",)])
+    section = Section("model", "Model", metrics=[Metric("delay", "delay", 0.1), one])
+    record = RunRecord("run", "", "", [("stage",)])
     assert '"value": 0.25,\n      "unit": "L/T"' in metrics_json(record, [section])
     assert "0.1, that is 0.25 L/T" in render_page(record, [section])

@@ -40,7 +40,7 @@ def test_its_coefficients_in_physical_units_are_those_of_the_physical_formula():
     """(A_1, A_2) of a = s w (-A_1 mu + A_2 mu^2) x/d with mu = x.v/(x^2 + 0.1 d^2), all in the units of the flow."""
     term = model(eddy_viscosity=dict(basis="paper", window="none"))
     linear, quadratic = term.learned_coefficients["eddy-viscosity"]
-    assert (linear["learned"], linear["unit"]) == (0.1, "L/T") and (quadratic["learned"], quadratic["unit"]) == (0.1, "L")
+    assert [(each["learned"], each["unit"]) for each in (linear, quadratic)] == [(0.1, "L/T"), (0.1, "L")]
     position = torch.tensor([[1.0, 1, 1], [1.5, 1, 1]], dtype=torch.float64)
     velocity = torch.tensor([[0.0, 0, 0], [0.6, 0, 0]], dtype=torch.float64)
     found = rates(term, position, velocity).acceleration
