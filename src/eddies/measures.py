@@ -1,6 +1,6 @@
 """The measures by which rollouts are compared with the truth: names and words, in the order of tables and figures."""
 
-#: Zero is perfect, but for the ratios.
+#: Zero is perfect, but for the ratios and the variance of counts, which are 1.
 MEASURES = {
     "velocity_error_early": "velocity error at t_η",
     "velocity_error_half": "velocity error at T/2",
@@ -22,10 +22,16 @@ MEASURES = {
     "pair_dispersion_error": "pair dispersion, rms of logarithms",
     "tetrad_size_error": "size of tetrads, rms of logarithms",
     "tetrad_shape_error": "shape of tetrads, rms of logarithms",
-    "count_variance_ratio": "variance of counts, model / truth",
+    "momentum_drift": "drift of the momentum, over N u'",
+    "momentum_drift_floor": "drift of the momentum of the true tracers",
+    "density_drift": "relative drift of the mean density",
+    "density_drift_floor": "relative drift of the mean density of the true tracers",
+    "count_variance": "variance of counts, over random points",
+    "count_variance_floor": "variance of counts of the true tracers",
 }
 #: Those that the table of variants shows, and of them those that are drawn.
 DRAWN = ("velocity_error_early", "velocity_error_half", "spectrum_error", "acceleration_kl")
 SHOWN = ("velocity_error_early", "velocity_error_half", "velocity_error_end", "spectrum_error", "energy_ratio",
          "velocity_kl", "velocity_kl_floor", "acceleration_kl", "acceleration_kl_floor", "qr_kl", "qr_kl_floor",
-         "acceleration_error")
+         "acceleration_error", "momentum_drift", "momentum_drift_floor", "density_drift", "density_drift_floor",
+         "count_variance", "count_variance_floor")

@@ -14,8 +14,10 @@ VELOCITY, ACCELERATION, GRADIENT = (RNG.normal(size=(4000, *shape)) for shape in
 START = RNG.uniform(0, LENGTH, (4000, 3))
 SPECTRUM = np.exp(-np.arange(9.0))
 # What is the truth's own, or a ratio.
-OF_THE_TRUTH = {"spectrum_error_floor", "velocity_kl_floor", "acceleration_kl_floor", "qr_kl_floor"}
-RATIOS = {"energy_ratio", "count_variance_ratio"}
+KL_FLOORS = {"velocity_kl_floor", "acceleration_kl_floor", "qr_kl_floor"}
+# What the flow itself changes.
+DRIFTS = {"momentum_drift", "density_drift", "count_variance"}
+OF_THE_TRUTH = KL_FLOORS | DRIFTS | {"spectrum_error_floor", *(f"{name}_floor" for name in DRIFTS)}
 
 
 class Stored:
@@ -53,10 +55,12 @@ def measured(growth, complete=True, model_times=TIMES, broken=None):
 def test_the_truth_itself_has_no_error():
     found = measured(0.0)
     assert found.pop("end") == 1 and list(found) == list(MEASURES)
-    assert all(found[name] == 1 for name in RATIOS)
-    assert all(found[name] == pytest.approx(0, abs=1e-12) for name in found.keys() - RATIOS - OF_THE_TRUTH)
+    assert found.pop("energy_ratio") == 1
+    assert all(found[name] == pytest.approx(0, abs=1e-12) for name in found.keys() - OF_THE_TRUTH)
     assert found["spectrum_error_floor"] == 0
-    assert all(1e-4 < found[name] < 0.1 for name in OF_THE_TRUTH - {"spectrum_error_floor"})
+    assert all(1e-4 < found[name] < 0.1 for name in KL_FLOORS)
+    assert all(found[name] == found[f"{name}_floor"] for name in DRIFTS)
+    assert found["momentum_drift"] > 0 and found["density_drift"] is None
 
 
 def test_an_error_that_grows_in_time_is_found_between_frames():

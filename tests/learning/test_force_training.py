@@ -5,12 +5,13 @@ import pytest
 import torch
 
 from eddies.flow.tracers import release
-from eddies.learning.force_training import ForceTrainer, LossWeights, TrainingFrame
+from eddies.learning.force_training import FieldLater, ForceTrainer, LossWeights, TrainingFrame
 from eddies.learning.optimization import Adam
 from eddies.learning.training import Phase, Training, TrainingDiverged
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.dynamics import ParticleDynamics
+from eddies.particles.particle_field import grid_points
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.rates import Rates
 from eddies.particles.smoothing_kernels import WendlandC2
@@ -313,3 +314,67 @@ def test_losses_without_weight_are_not_computed(comm, monkeypatch):
     assert set(rows[0]) == {"loss", "trajectory_loss", "gradient_norm"}
     # Without the field loss there is no cube: both draw the same batch.
     assert rows[0] == rows[1]
+
+
+FIELD, SPAN = LossWeights(field=1.0), 0.1
+
+
+def beside_a_flow(comm, moved=0.0, offset=(0.0, 0.0, 0.0), velocity=None):
+    """A trainer whose frame has a filtered field one frame later on a grid of 10^3 points, by then with all particles
+    `moved` upwards; the field is the velocity of a wind and an offset, the particles' that of the wind unless given."""
+    model = model_of(OWN_DENSITY, SUPPORT, 45, (8, 8))
+    frame, wind = frame_of(comm, model), torch.tensor([[0.3, -0.2, 0.5]], dtype=torch.float64)
+    position, points = frame.particles.position, grid_points(frame.decomposition, 10)
+    shift = torch.tensor([0.0, 0.0, moved], dtype=torch.float64)
+    field = (wind + torch.tensor([offset], dtype=torch.float64)).expand(len(points), 3)
+    later = FieldLater(position + shift, wind.expand_as(position) if velocity is None else velocity(position), SPAN,
+                       points, field)
+    frame.later = later
+    return ForceTrainer(model, [frame], WendlandC2(SUPPORT), FIELD, 300, seed=5)
+
+
+@pytest.mark.mpi(1)
+def test_where_the_kernel_is_exact_the_filtered_field_asks_for_what_the_true_particles_do(comm):
+    """A uniform velocity is its own average. A field that differs from it by a vector adds as much over the span."""
+    trainer = beside_a_flow(comm)
+    frame, later = trainer.frames[0], trainer.frames[0].later
+
+    def field_loss(at):
+        frame.later, frame._within = at, None
+        return row_and_gradient(trainer)
+
+    (beside, gradient), (alone, expected) = field_loss(later), field_loss(None)
+    assert beside["field_loss"] == pytest.approx(alone["field_loss"], rel=1e-9)
+    assert np.allclose(gradient, expected, rtol=1e-6, atol=1e-9 * np.abs(expected).max())
+    offset = torch.tensor([[0.03, 0.0, -0.01]], dtype=torch.float64)
+    frame.acceleration = frame.acceleration + frame.errors()["acceleration"].detach()  # no error of the force is left
+    found = field_loss(replace(later, field=later.field + offset))[0]
+    expected = float(offset.square().sum()) / 3 / SPAN**2 / frame.acceleration_rms**2
+    assert found["field_loss"] == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.mpi(2, 3)
+def test_the_filtered_field_is_the_same_on_any_number_of_ranks(comm):
+    """Also where particles have left their slabs by then."""
+    from mpi4py import MPI
+
+    def row_of(communicator):
+        return row_and_gradient(beside_a_flow(communicator, 0.1, (0.1, 0.0, 0.0), lambda position: position.sin()))
+
+    (row, gradient), (alone, expected) = row_of(comm), row_of(MPI.COMM_SELF)
+    assert row == pytest.approx(alone, rel=1e-9)
+    assert np.allclose(gradient, expected, rtol=1e-8, atol=1e-11)
+
+
+@pytest.mark.mpi(1)
+def test_gradient_beside_a_filtered_field_against_finite_differences(comm):
+    trainer = beside_a_flow(comm, 0.1, (0.1, 0.0, 0.0))
+    gradient = row_and_gradient(trainer)[1]
+
+    def loss():
+        recorder = Recorder(comm, trainer.model)
+        with torch.enable_grad():
+            return trainer.combined_step(recorder, 0)["loss"]
+
+    found, expected = slope(trainer.model, loss, gradient, 1e-6)
+    assert found == pytest.approx(expected, rel=1e-5)

@@ -77,6 +77,19 @@ def test_the_state_of_least_validation_error_is_kept(comm):
 
 
 @pytest.mark.mpi(1)
+def test_what_each_phase_cost_and_where_it_ended(comm):
+    errors = iter([4.0, 3.0, 1.0, 2.0, 8.0, 5.0, 0.5, 6.0])
+    training = training_of(comm, lambda: next(errors))
+    assert training.cost == []
+    finished(training)
+    # The first phase begins with an error of 4, the second with one of 8: the least of each is that of what is kept.
+    assert [(each["phase"], each["steps"], each["error"]) for each in training.cost] == [
+        ("phase 0", 6, 1.0), ("phase 1", 5, 0.5)]
+    assert sum(each["seconds"] for each in training.cost) == pytest.approx(training.history[-1]["seconds"])
+    assert all(each["seconds"] > 0 for each in training.cost)
+
+
+@pytest.mark.mpi(1)
 def test_a_phase_ends_with_its_patience(comm):
     """Of the first phase the error is least after two steps, looked at every other one; the second is at its best at
     its end."""

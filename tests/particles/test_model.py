@@ -1,5 +1,6 @@
 """A model is a list of terms: what it reads and gives, what it keeps of linear terms, what it refuses."""
 
+import json
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -12,7 +13,7 @@ from eddies.particles import context as context_module
 from eddies.particles.model import LagrangianModel, build_model
 from eddies.particles.rates import Rates, total
 from eddies.particles.terms.term import PairTerm, Term
-from eddies.scene.terms import PRESETS, TermError, TermSettings
+from eddies.scene.terms import PRESETS, TERMS, TermError, TermSettings
 from tests.particles.configurations import (
     FLOW, MODELS, DensityReader, Field, ReadsNothing, distributed, dynamics_of, given, model, of_terms, state,
 )
@@ -164,6 +165,24 @@ def test_what_a_model_reads_and_gives_is_what_its_terms_do():
     # The pressure gives a density, but nobody reads it.
     assert "density" in resolved.gives and not resolved.reads_density and not resolved.density_is_given
     assert [len(each.networks) for each in (given, learned, resolved)] == [1, 2, 0]
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("word", TERMS)
+def test_every_parameter_is_told_as_a_coefficient(comm, word):
+    """Each term tells as many numbers as it learns, those of a network by their count, and none below zero where the
+    size alone counts."""
+    settings = {"diffusion": 0.1} if word == "continuity" else {}
+    found = model({word: settings})
+    with torch.no_grad():
+        for parameter in found.parameters():
+            parameter.neg_()
+    told = found.learned_coefficients.get(word, [])
+    count = sum(each["learned"] if each["name"] == "weights" else np.size(each["learned"]) for each in told)
+    assert count == sum(parameter.numel() for parameter in found.parameters())
+    assert all(each["unit"] and each["meaning"] for each in told)
+    assert all(each["learned"] >= 0 and each["value"] >= 0 for each in told if each["name"].startswith("|"))
+    assert json.loads(json.dumps(told)) == told
 
 
 @pytest.mark.mpi(1)

@@ -7,6 +7,7 @@ from eddies.measures import DRAWN, MEASURES, SHOWN
 from eddies.report.variants import ErrorAgainstTime, in_symbols, scatter, section
 from eddies.report.figures import panels, styled
 from eddies.report.labels import fix_layout, place_labels
+from eddies.workflows.variant_rows import BEFORE
 
 
 def row(name, seconds, error, status="complete", stopped_at=None, kind="particle model"):
@@ -14,7 +15,7 @@ def row(name, seconds, error, status="complete", stopped_at=None, kind="particle
             "status": status, "stopped_at": stopped_at, "end": 1.0,
             "wall_seconds": seconds, "wall_seconds_low": seconds and 0.9 * seconds,
             "wall_seconds_high": seconds and 1.2 * seconds, "core_seconds": seconds,
-            "seconds_per_step": 0.1, "time_step": 0.02, "training_seconds": None, **dict.fromkeys(MEASURES, error)}
+            "seconds_per_step": 0.1, "time_step": 0.02, **dict.fromkeys(BEFORE), **dict.fromkeys(MEASURES, error)}
 
 
 ROWS = [row("learned", 20.0, 0.1), row("none", 1.0, 0.5), row("slow", 90.0, 0.2),
@@ -84,6 +85,12 @@ def test_page_tells_what_failed_and_what_the_model_is_worth():
 def test_a_measure_that_no_variant_has_is_no_column():
     rows = [{**each, "qr_kl": None} for each in ROWS]
     assert MEASURES["qr_kl"] not in section(ErrorAgainstTime(rows, "learned")).metrics[0].value
+
+
+def test_weights_without_their_cost_are_told_apart_from_methods_without_weights():
+    rows = [{**ROWS[0], "weights": 7}, {**ROWS[1], "weights": 7, "training_seconds": 2.5}, ROWS[2]]
+    shown = [metric.value["training (s)"] for metric in section(ErrorAgainstTime(rows, "learned")).metrics]
+    assert shown == ["not stored", 2.5, None]
 
 
 def test_one_variant_has_a_row_and_no_figure():

@@ -193,7 +193,8 @@ def write_rollout(comm, directory, status="complete", total=600, frames=9, broke
     attributes = {"status": status, "start_time": START, "time_step": 0.02, "integrator": "verlet",
                   "method": "learned", "terms": "pressure, pairs", "turnovers": times[-1] / TURNOVER,
                   "seconds_per_step": 0.031, "particles": total, "ranks": 1, "eddy_turnover_time": TURNOVER,
-                  "injection_rate": injection_rate, "truth_injection_rate": truth_injection_rate}
+                  "integrates_density": density, "injection_rate": injection_rate,
+                  "truth_injection_rate": truth_injection_rate}
     origin = provenance("ground_truth", "kernel", "model")
     with create_product(comm, directory / "rollout.h5", "rollout", origin) as file:
         write_attributes(file.create_group("rollout"), attributes)

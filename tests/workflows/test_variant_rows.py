@@ -1,11 +1,16 @@
 """Rows of the table of variants: what is left out where it would not compare, and what is said of that."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
+from eddies.io.hdf5 import create_product, write_attributes
+from eddies.io.weights import save_weights
 from eddies.measures import MEASURES
 from eddies.scene.scene import load_scene
 from eddies.workflows import variant_rows as module
-from eddies.workflows.variant_rows import THROUGH_KERNEL, notes, row, step_costs, together, why_not
+from eddies.workflows.variant_rows import BEFORE, THROUGH_KERNEL, before, notes, row, step_costs, together, why_not
 from eddies.workflows.variants import Place
 from tests.small_scene import TINY
 
@@ -43,7 +48,6 @@ def test_what_a_kernel_of_its_own_shows_is_left_out(tmp_path, monkeypatch, chang
     scene = scene_of(tmp_path, ("smaller", "model.pairs.hidden = [8]", "simulation.step = 0.05"), ("own", change))
     (tmp_path / "rollout.h5").touch()
     monkeypatch.setattr(module, "measured", lambda *_: REALISED)
-    monkeypatch.setattr(module, "training_seconds", lambda *_: None)
     for name, variant in scene.variant.items():
         found = row(scene, name, [Place(variant, tmp_path)], None)
         blank = {measure for measure in MEASURES if found[measure] is None}
@@ -81,3 +85,23 @@ def test_wavenumbers_that_grids_keep_are_told(tmp_path):
     # Of 18 cells the mode 18/3 = 6 is not kept; by default there are 8, the fewest.
     assert notes(scene)[1] == ("Of a grid the 2/3 rule leaves the wavenumbers |k_i| < cells/3, at most: 5 in grid-18, "
                                "5 in grid-16, 2 in grid; k_d = 3.")
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("change, stored", [
+    ("model.neighbors = 30", {"weights", "training_seconds", "training_steps"}),
+    ('model.path = "eddies:tiny"', {"weights"}), ('simulation.method = "none"', set())],
+    ids=["trained", "of weights without their cost", "no model"])
+def test_what_a_model_cost_is_what_its_file_says(comm, tmp_path, change, stored):
+    scene = scene_of(tmp_path, ("other", change, 'simulation.step = "converged"')).variant["other"]
+    phases = [{"phase": "one step", "steps": 4, "seconds": 1.5, "error": 0.1},
+              {"phase": "all losses", "steps": 2, "seconds": 0.5, "error": 0.2}]
+    description = {"training": phases} if "training_seconds" in stored else {}
+    save_weights(comm, tmp_path / "model.h5", "model", description, {"a": np.ones(3), "b": np.ones((2, 2))}, {})
+    with create_product(comm, tmp_path / "step.h5", "step", {}) as file:
+        write_attributes(file.create_group("found"), {"seconds": 7.5})
+    known = {"weights": 7, "training_seconds": 2.0, "training_steps": 6}
+    assert before(Place(scene, tmp_path), comm) == {key: known[key] for key in stored} | {"step_seconds": 7.5}
+    given = replace(scene, simulation=replace(scene.simulation, step=0.05))
+    assert "step_seconds" not in before(Place(given, tmp_path), comm)
+    assert set(before(Place(scene, tmp_path), comm)) <= set(BEFORE)

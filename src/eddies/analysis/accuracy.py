@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from eddies.analysis.against_truth import EDGES, last_invariants, pdf_divergence, sampling_floor
-from eddies.analysis.disorder import count_variance
+from eddies.analysis.drifts import drifts
 from eddies.analysis.errors import normalized_l2
 from eddies.analysis.lagrangian import differences, of_both
 from eddies.analysis.rollout import Rollout
@@ -16,8 +16,8 @@ def accuracy(run: Rollout) -> dict[str, float | None]:
     """All MEASURES and `end`, the last common time over T; None for what the rollout or the truth does not reach.
 
     The velocity error, the normalised L2 norm by particle, is interpolated linearly between frames. That at the end,
-    spectrum, energy, divergences and counts are those of the last of them, Lagrangian statistics those until then, and
-    of a rollout that is complete alone: at an earlier time than the others' they would not be comparable.
+    spectrum, energy, divergences, drifts and counts are those of the last of them, Lagrangian statistics those until
+    then, and of a rollout that is complete alone: at an earlier time than the others' they would not be comparable.
     """
     measures: dict[str, float | None] = dict.fromkeys(MEASURES)
     try:
@@ -51,7 +51,7 @@ def velocity_error_at(run: Rollout, time: float) -> float | None:
 
 def _at_the_end(run: Rollout) -> Mapping[str, float | None]:
     last = run.common.times.size - 1
-    velocity, acceleration, position = (run.pair(last, name) for name in ("velocity", "acceleration", "position"))
+    velocity, acceleration = (run.pair(last, name) for name in ("velocity", "acceleration"))
     found: dict[str, float | None] = {
         "velocity_error_end": float(normalized_l2(velocity.model, velocity.truth)),
         "energy_ratio": float(np.sum(velocity.model**2, dtype=float) / np.sum(velocity.truth**2, dtype=float)),
@@ -59,8 +59,8 @@ def _at_the_end(run: Rollout) -> Mapping[str, float | None]:
         "velocity_kl_floor": sampling_floor(velocity, EDGES["velocity"]),
         "acceleration_kl": pdf_divergence(acceleration, EDGES["acceleration"]),
         "acceleration_kl_floor": sampling_floor(acceleration, EDGES["acceleration"]),
-        "count_variance_ratio": (count_variance(position.model, run.length)
-                                 / count_variance(position.truth, run.length)),
+        **{name + end: both[of] for name, both in drifts(run).items()
+           for end, of in (("", "model"), ("_floor", "truth"))},
         **differences(*of_both(run.model, run.truth, run.common, run.length)),
     }
     if last in run.spectral():

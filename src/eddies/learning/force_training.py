@@ -48,6 +48,24 @@ class KernelNeighborhood:
     volumes: Tensor
 
 
+@dataclass(frozen=True)
+class FieldLater:
+    """One frame after a frame: where its particles are and how they move, and the filtered velocity of the flow.
+
+    Parameters
+    ----------
+    position, velocity : (n, 3) of its particles, in its rows; positions go on beyond the box.
+    span : the time from the frame before it to the frame after it.
+    points : (m, 3), those of this rank at which the filtered field is stored. field : (m, 3), its velocity there.
+    """
+
+    position: Tensor
+    velocity: Tensor
+    span: float
+    points: Tensor
+    field: Tensor
+
+
 class TrainingFrame:
     """The particles of one moment with their true rates, and the model's terms around them; making one is collective.
 
@@ -57,15 +75,17 @@ class TrainingFrame:
     particles : as they are at that moment.
     acceleration, density_rate : (n, 3) and (n,), what the model should answer; the latter None where nothing reads the
         density.
+    later : what the field loss compares with, where that is the filtered flow.
 
     `acceleration_rms` and `density_rate_rms` are their rms over all ranks, of one component; `total` is the number of
     particles of all ranks. What terms that are linear in their parameters do at these particles is computed once.
     """
 
     def __init__(self, dynamics: ParticleDynamics, particles: ParticleSet, acceleration: Tensor,
-                 density_rate: Tensor | None) -> None:
+                 density_rate: Tensor | None, later: FieldLater | None = None) -> None:
         self.dynamics, self.model, self.decomposition = dynamics, dynamics.model, dynamics.decomposition
         self.particles, self.acceleration, self.density_rate = particles, acceleration, density_rate
+        self.later = later
         self.kept = self.model.linear_rates(dynamics.context(particles))
         dynamics.release()  # weights of neighbours, which no other term may ask for
         self.acceleration_rms, self.total = self._rms(acceleration)
@@ -95,15 +115,22 @@ class TrainingFrame:
         place, wanted = place[inside], wanted[inside]
         return self._row_of_sorted[place[self._sorted_ids[place] == wanted]]
 
+    @property
+    def averaged(self) -> ParticleSet:
+        """The particles where the field loss averages over them."""
+        return self.particles if self.later is None else replace(self.particles, position=self.later.position)
+
     @torch.no_grad()
     def within(self, kernel: SmoothingKernel) -> KernelNeighborhood:
-        """What is within the support of a kernel; collective, and kept until another kernel comes."""
+        """What is within the support of a kernel of the particles where they are averaged; collective, and kept until
+        another kernel comes."""
         if self._within is None or self._within.kernel is not kernel:
-            found = self.dynamics.neighborhood
-            if found is None or found.cutoff < kernel.support * (1 - 1e-9):  # the model has no list, or a shorter one
+            found, averaged = self.dynamics.neighborhood, self.averaged
+            # The model has no list, or a shorter one, or that of another moment.
+            if found is None or found.cutoff < kernel.support * (1 - 1e-9) or self.later is not None:
                 found = Neighborhood(self.decomposition, self.decomposition.length, kernel.support, 0.0)
-                found.update(self.particles)
-            position = found.local(self.particles.position).position
+                found.update(averaged)
+            position = found.local(averaged.position).position
             pairs = found.neighbors.pairs(position[: len(self.particles)], position, dtype=self.acceleration.dtype)
             self._within = KernelNeighborhood(kernel, found, position, found.column(volumes(kernel, pairs)))
         return self._within
@@ -134,8 +161,8 @@ class ForceTrainer:
     Parameters
     ----------
     model, frames : the frames all on the same slabs.
-    kernel : of the field loss, which compares on a grid of about as many points as there are particles; None if it has
-        no weight.
+    kernel : of the field loss, which compares on a grid of about as many points as there are particles, or on that of
+        the filtered field; None if it has no weight.
     weights : of the losses. batch : particles of a step without the field loss.
     """
 
@@ -145,8 +172,9 @@ class ForceTrainer:
         self.comm, self.length = self.decomposition.comm, self.decomposition.length
         self.model, self.frames = model, frames
         self.kernel, self.weights, self.batch, self.seed = kernel, weights, min(batch, self.total), seed
-        points = grid_points(self.decomposition, round(self.total ** (1 / 3)))
-        self._points = points.to(frames[0].particles.position.device)
+        later, device = frames[0].later, frames[0].particles.position.device
+        self._points = (grid_points(self.decomposition, round(self.total ** (1 / 3))).to(device) if later is None
+                        else later.points)
 
     def trajectory_step(self, optimizer: Adam, step: int) -> dict[str, float]:
         """One step on the trajectory loss of a random batch of particles (Eq. 12), and on their power where that has a
@@ -189,15 +217,15 @@ class ForceTrainer:
         """This rank's shares of all losses, unweighted."""
         if self.weights.field > 0:
             corner, side, reach = random.uniform(0, self.length, 3), self.length / 4, self.kernel.support
-            rows = self._within(frame.particles.position, corner - reach, side + 2 * reach)
+            rows = self._within(frame.averaged.position, corner - reach, side + 2 * reach)
             count = int(global_sum(self.comm, len(rows)))
         else:
             rows, count = frame.rows(random.choice(self.total, self.batch, replace=False)), self.batch
         errors = frame.errors(rows)
         shares = self._one_step_shares(frame, rows, errors, count)
         if self.weights.field > 0:
-            points = self._points[self._within(self._points, corner, side)]
-            shares["field"] = self._field_share(frame, rows, errors["acceleration"], points)
+            inside = self._within(self._points, corner, side)
+            shares["field"] = self._field_share(frame, rows, errors["acceleration"], inside)
         return shares | self._divergence_shares(frame, rows, errors["acceleration"])
 
     def _weighted(self, shares: dict[str, Tensor]) -> Tensor:
@@ -239,18 +267,31 @@ class ForceTrainer:
             share = share + mean_square_share(errors["density_rate"], frame.density_rate_rms, count)
         return share
 
-    def _field_share(self, frame: TrainingFrame, rows: Tensor, error: Tensor, points: Tensor) -> Tensor:
-        """Eq. 13 per time step: the kernel average of the acceleration error at grid points (m, 3) of all ranks.
+    def _field_share(self, frame: TrainingFrame, rows: Tensor, error: Tensor, inside: Tensor) -> Tensor:
+        """Eq. 13 per time step: the error of the kernel average <.> at some rows of the grid points, of all ranks, over
+        the rms of the acceleration.
 
-        The velocity predicted one step ahead is compared with that of the true particles, both through the kernel:
-        its own error is many times what a step changes, and the force could not make up for it.
+        Without a field, <a - a_true> of the particles where they are: the velocity one step ahead is compared with that
+        of the true particles, both through the kernel. The kernel's own error is many times what a step changes, and
+        the force cannot make up for it.
+
+        With a filtered field u one frame later, (<v> - u) / span: v = v_before + span a is the velocity of the model's
+        particles after a step of the midpoint rule from the frame before to the frame after, span its length.
+        As a is compared with centred differences, v is the true velocity then plus span (a - a_true). The positions
+        after such a step do not depend on a, and are the true ones. So this is the error without a field plus what the
+        kernel makes wrong of the true particles, over span.
         """
-        within = frame.within(self.kernel)
-        local = within.neighborhood.column(torch.zeros_like(frame.acceleration).index_add(0, rows, error))
+        within, later, points = frame.within(self.kernel), frame.later, self._points[inside]
+        change = torch.zeros_like(frame.acceleration).index_add(0, rows, error)
+        if later is not None:
+            change = change + later.velocity / later.span
+        local = within.neighborhood.column(change)
         around = NeighborList(within.neighborhood.box, self.kernel.support, 0.0)
         around.build(points, within.position, exclude_self=False)
         pairs = around.pairs(points, within.position, dtype=error.dtype)
         field = reconstruct(self.kernel, pairs, within.volumes, local)
+        if later is not None:
+            field = field - later.field[inside] / later.span
         count = int(global_sum(self.comm, len(points)))
         return mean_square_share(field, frame.acceleration_rms, max(count, 1))
 

@@ -124,6 +124,19 @@ class Training:
         if last:
             self._begin(self.number + 1)
 
+    @property
+    def cost(self) -> list[dict[str, Any]]:
+        """Of each phase that is over: its `phase` by name, optimiser `steps`, wall `seconds` with its validations, and
+        the `error` on what is held out of the state that it left, None where it is not validated. Ready for JSON."""
+        found, before = [], 0.0
+        for number, phase in enumerate(self.phases[:self.number]):
+            rows = [row for row in self.history if row["phase"] == number]
+            errors = [row[name] for row in rows for name in ("start_error", "validation_error") if name in row]
+            found.append({"phase": phase.name, "steps": len(rows), "seconds": rows[-1]["seconds"] - before,
+                          "error": min(errors, default=None)})
+            before = rows[-1]["seconds"]
+        return found
+
     def columns(self) -> dict[str, np.ndarray]:
         """The history by column; NaN where a step had no such number."""
         names = sorted({name for row in self.history for name in row})

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from importlib import import_module
 from pkgutil import iter_modules
-from typing import cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -109,6 +109,12 @@ class LagrangianModel(nn.Module):
     def networks(self) -> list[PairTerm]:
         """The terms with a network of pairs, which can tell what it is given by `features`."""
         return [term for term in self.terms.values() if isinstance(term, PairTerm) and hasattr(term, "features")]
+
+    @property
+    def learned_coefficients(self) -> dict[str, list[dict[str, Any]]]:
+        """What the terms have learned, by their names, ready for JSON; see `Coefficient`."""
+        return {name: [asdict(each) for each in term.learned_coefficients] for name, term in self.terms.items()
+                if term.learned_coefficients}
 
     def rates(self, context: Context, kept: Mapping[str, LinearRates] | None = None) -> Rates:
         """The sum of the terms: `acceleration` (k, 3), `density_rate` (k,) and what belongs to a shift if some term

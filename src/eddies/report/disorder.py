@@ -7,8 +7,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from eddies.analysis import disorder
+from eddies.analysis.drifts import drifts
 from eddies.analysis.pdfs import kl_divergence
 from eddies.analysis.rollout import Rollout
+from eddies.measures import MEASURES
 from eddies.report.figures import GUIDE, letter, panels, styled
 from eddies.report.page import Metric, Section
 from eddies.report.rollout_figures import LINES
@@ -44,20 +46,19 @@ class Disorder:
 
 
 def add(shown: Section, run: Rollout) -> None:
-    """Put the figure and its two numbers, all at the last common time, into the section of the rollout."""
+    """Put the figure and its numbers, all at the last common time, into the section of the rollout."""
     found, turnover = Disorder.of(run), run.turnover
-    variance = {name: _at(series, found.time)["count_variance"] for name, series in found.counts.items()}
+    kept = drifts(run)
     shown.metrics += [
         Metric("nearest_distance_kl", "KL divergence of the nearest-neighbour distance PDF", found.divergence),
-        Metric("count_variance_ratio", "variance of particle counts, model / truth",
-               variance["model"] / variance["truth"], "too few particles to be counted in cells"),
+        *(Metric(key, MEASURES[key], both) for key, both in kept.items()),
     ]
     shown.add_figure(
         "particle-disorder", "Disorder of the particles", draw(found, turnover),
         f"A: distance to the nearest neighbour at t = {found.time / turnover:.2f} T; KL {found.divergence:.2g}. "
         f"B: variance of the particles' number in cells of {disorder.CELL:g} mean spacings, 1 for random points; "
-        f"at that time {variance['truth']:.2f} (true tracers), {variance['model']:.2f} (model): above the truth's the "
-        "model's particles cluster.")
+        f"at that time {kept['count_variance']['truth']:.2f} (true tracers), {kept['count_variance']['model']:.2f} "
+        "(model): above the truth's the model's particles cluster.")
 
 
 @styled

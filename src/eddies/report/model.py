@@ -1,6 +1,7 @@
 """Figures of the trained model: a-priori errors and PDFs (the paper's Fig. 3) and its training."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -9,7 +10,7 @@ from matplotlib.figure import Figure
 from eddies.analysis.pdfs import bin_edges, bin_probabilities, gaussian, kl_divergence, pdf, standardized
 from eddies.report.figures import DNS, FOURTH, GUIDE, MODEL, SECOND, TRUTH, legend_below, letter, panels, styled
 from eddies.report.learning import curves
-from eddies.report.page import Metric, Section
+from eddies.report.page import Metric, Section, shown
 
 ERRORS = (  # column of the table, label, colour, line style, marker
     ("acceleration_error", "model", MODEL, "-", "o"),
@@ -25,6 +26,12 @@ METRICS = {  # key in the report: column of the table, label
     "density_rate_error": ("density_rate_error", "density rate error at the true state"),
     "filtered_pressure_gradient_error": (
         "pressure_gradient_error", "acceleration error of the exact filtered pressure gradient"),
+}
+
+TRAINING = {
+    "training_seconds": "wall seconds of the training, without reading and testing",
+    "training_steps": "optimiser steps of the training, by phase",
+    "training_error": "error on what is held out, at the end of each phase",
 }
 
 
@@ -80,7 +87,32 @@ def _pdf_panel(axis: Axes, sample: Mapping[str, np.ndarray], title: str, symbol:
     legend_below(axis, 3)
 
 
-def section(description: Mapping[str, object], table: Mapping[str, np.ndarray],
+def _training(description: Mapping[str, Any]) -> list[Metric]:
+    """What the training cost, and the error on what is held out at the end of each phase."""
+    if "training" not in description:
+        return [Metric(key, label, None, "not stored with these weights") for key, label in TRAINING.items()]
+    phases = description["training"]
+    values = {"training_seconds": float(sum(phase["seconds"] for phase in phases)),
+              "training_steps": {phase["phase"]: phase["steps"] for phase in phases} or None,
+              "training_error": {phase["phase"]: phase["error"] for phase in phases} or None}
+    return [Metric(key, label, values[key], "nothing is learned") for key, label in TRAINING.items()]
+
+
+def _coefficients(description: Mapping[str, Any]) -> list[Metric]:
+    """What each term has learned, as the terms declare it."""
+    return [Metric(f"{term} {each['name']}", f"{term}, {each['name']}: {each['meaning']}",
+                   {key: each[key] for key in ("learned", "value", "unit", "meaning")}, written=_written(each))
+            for term, found in description.get("coefficients", {}).items() for each in found]
+
+
+def _written(coefficient: Mapping[str, Any]) -> str:
+    """As it was learned and, where that is another number, its value in the units of the flow."""
+    learned, value = (", ".join(map(shown, found if isinstance(found, list) else [found]))
+                      for found in (coefficient["learned"], coefficient["value"]))
+    return learned if coefficient["unit"] == "1" else f"{learned}, that is {value} {coefficient['unit']}"
+
+
+def section(description: Mapping[str, Any], table: Mapping[str, np.ndarray],
             acceleration: Mapping[str, np.ndarray], density_rate: Mapping[str, np.ndarray] | None,
             history: Mapping[str, np.ndarray] | None, source: str | None = None,
             others: Sequence[str] = ()) -> Section:
@@ -96,6 +128,7 @@ def section(description: Mapping[str, object], table: Mapping[str, np.ndarray],
     missing = f"terms {terms} have none"
     metrics = [Metric(key, label, at.get(column), missing) for key, (column, label) in METRICS.items()]
     metrics.append(Metric("delay", "delay of these errors after what the model was trained on", at["delay"]))
+    metrics += [*_training(description), *_coefficients(description)]
     since = "training window" if source is None else "release of the tracers, or the training window"
     trained = ""
     if others:
@@ -105,20 +138,20 @@ def section(description: Mapping[str, object], table: Mapping[str, np.ndarray],
         since = "release of the tracers"
     text = (f"Terms: {terms}.{trained} A-priori: the model sees the true particles of a frame. Numbers are of the last "
             f"frame, {at['delay']:.3g} after the {since}.")
-    shown = Section("model", "Model", text, metrics=metrics,
-                    main=("acceleration_error", "filtered_pressure_gradient_error"))
+    part = Section("model", "Model", text, metrics=metrics,
+                   main=("acceleration_error", "filtered_pressure_gradient_error"))
     truth, predicted = acceleration["truth"], acceleration["predicted"]
     divergence = kl_divergence(bin_probabilities(standardized(truth), EDGES),
                                bin_probabilities(standardized(predicted, truth), EDGES))
     beside = ", that of no model 1"
     if "pressure_gradient_error" in at:
         beside = f"; that of the exact filtered pressure gradient alone is {at['pressure_gradient_error']:.3f}{beside}"
-    shown.add_figure(
+    part.add_figure(
         "figure-3-a-priori", "A-priori errors and PDFs (the paper's Fig. 3)",
         a_priori(table, acceleration, density_rate),
         f"At the last frame the acceleration error is {at['acceleration_error']:.3f}{beside}. KL "
         f"divergence of the acceleration PDF {divergence:.2g}. Grey: frames of the training window.")
     if history is not None:
-        shown.add_figure("model-training", "Training of the model", curves(history),
-                         f"{int(history['step'][-1]) + 1} steps" + (f", in {source}." if source else "."))
-    return shown
+        part.add_figure("model-training", "Training of the model", curves(history),
+                        f"{int(history['step'][-1]) + 1} steps" + (f", in {source}." if source else "."))
+    return part

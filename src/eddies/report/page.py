@@ -43,12 +43,14 @@ pre{overflow-x:auto;background:var(--back);padding:.8rem;font-size:.85rem;border
 
 @dataclass(frozen=True)
 class Metric:
-    """One number of the report: key in metrics.json, name on the page, value, or why there is none."""
+    """One number of the report: key in metrics.json, name on the page, value, or why there is none; and how the page
+    writes the value, where not as it writes any."""
 
     key: str
     label: str
     value: Number
     reason: str = ""
+    written: str = ""
 
     def __post_init__(self):
         if isinstance(self.value, float) and not math.isfinite(self.value):
@@ -192,7 +194,7 @@ def _metric_table(metrics: Sequence[Metric]) -> str:
     rows = "".join(
         f'<tr><td>{_text(metric.label)}</td>'
         + (f'<td class="soft">not available: {_text(metric.reason)}</td>' if metric.value is None
-           else f'<td class="number">{_text(shown(metric.value))}</td>') + "</tr>"
+           else f'<td class="number">{_text(metric.written or shown(metric.value))}</td>') + "</tr>"
         for metric in metrics)
     return f'<h3>Numbers</h3><div class="wide"><table>{rows}</table></div>' if rows else ""
 

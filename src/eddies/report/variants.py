@@ -24,7 +24,9 @@ LOOKS = list(zip((MODEL, TRUTH, SECOND, FOURTH, THIRD, DNS, FILTERED), "os^DvPX"
 # Columns of the tables of the page: key in the rows, words. Measures come before them.
 COSTS = {"wall_seconds": "wall s per T", "wall_seconds_low": "lower quartile", "wall_seconds_high": "upper quartile",
          "core_seconds": "core s per T", "seconds_per_step": "s per step", "time_step": "time step",
-         "ranks": "ranks", "training_seconds": "training (s)"}
+         "ranks": "ranks", "weights": "learned numbers", "training_seconds": "training (s)",
+         "training_steps": "training (steps)", "step_seconds": "finding the step (s)"}
+OF_TRAINING = ("training_seconds", "training_steps")
 
 
 @dataclass(frozen=True)
@@ -116,7 +118,10 @@ def _notice(row: Row) -> str:
 
 
 def _with_spread(row: Row, column: str) -> Any:
-    """A number of a row, with its standard deviation over realisations where there are several."""
+    """A number of a row, with its standard deviation over realisations where there are several; of a model whose
+    weights came without their cost, that it is not stored."""
+    if column in OF_TRAINING and row[column] is None and row["weights"] is not None:
+        return "not stored"
     spread = row.get(f"{column}_spread")
     return row[column] if spread is None else f"{row[column]:.3g} ± {spread:.2g}"
 

@@ -228,6 +228,9 @@ def training_problems(scene: Parts) -> Iterator[str]:
     if training.field_weight > 0 and scene.kernel is None:
         yield (f"[training] field_weight = {training.field_weight:g}: this loss is an average with the kernel; add "
                "[kernel], or remove the key")
+    if training.field_target == "flow" and training.field_weight == 0:
+        yield ('[training] field_target = "flow": is of the field loss, which has no weight; set field_weight, or '
+               "remove the key")
     later = training.field_weight + training.velocity_kl_weight + training.acceleration_kl_weight
     if (later > 0) != (training.combined_steps > 0):
         yield (f"[training] combined_steps = {training.combined_steps}: they are the steps that use "

@@ -277,12 +277,20 @@ class Training(Section):
     final_learning_rate: float = number("of the optimiser, at the end", default=1e-4, above=0)
     precision: str = choice("of the training", "float32", "float64", default="float32")
     field_weight: float = number("weight of the field loss beside the trajectory loss", default=0.0, at_least=0)
+    field_target: str = choice("what the field loss compares with; tracers: the kernel average of the true particles; "
+                               "flow: the filtered field that is stored one frame later, on frames that have one",
+                               "tracers", "flow", default="tracers")
     velocity_kl_weight: float = number("weight of the divergence of velocity PDFs", default=0.0, at_least=0)
     acceleration_kl_weight: float = number("the same for acceleration PDFs", default=0.0, at_least=0)
     power_weight: float = number("weight of the loss of the power, of all steps: what the force does to the energy, "
                                  "in units of u'^3 over the filter width", default=0.0, at_least=0)
     combined_steps: int = integer("steps at the end that use every loss", default=0, at_least=0)
     horizons: Horizons | None = section(Horizons, default=None)
+
+    @property
+    def wants_fields(self) -> bool:
+        """Whether each frame that is trained on needs a filtered field one frame later."""
+        return self.field_target == "flow" and self.field_weight > 0
 
     @property
     def truth_files(self) -> tuple[Path, ...]:

@@ -54,7 +54,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         last = truth.last_frame_seen(scene.training.window if own is not None else 0.0)
         guard = Guard(comm, directory / STAGES["train"].checkpoints, scene.fingerprint("train"), stop,
                       " of the training")
-        history, curves = {}, None
+        history, cost, curves = {}, [], None
         phases = []
         if next(model.parameters(), None) is not None:
             phases = [*one_step_phases(scene, data, kernel), *horizon_phases(scene, data)]
@@ -64,12 +64,13 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
             training, curves = Training(comm, model, phases), LearningCurves(comm, directory / "learning.png")
             take_all_steps(training, guard, "train", "training", "lower learning_rate here or in [training.horizons], "
                            "or shorten time_step there", curves)
-            history = {"history": training.columns()}
+            history, cost = {"history": training.columns()}, training.cost
         tested = model_of(scene, truth, device, model) if own is None else own
         tables = history | evaluate(truth, tested, tests, last, data[0].dtype, device)
         if model.networks:
             tables["feature_range"] = vars(feature_range(data))
-        mach, description = truth.reference.get("mach_turbulent"), describe(scene, truth.scales)
+        mach = truth.reference.get("mach_turbulent")
+        description = describe(scene, truth.scales) | {"training": cost, "coefficients": tested.learned_coefficients}
         mach_of_truths = {str(path): each.reference.get("mach_turbulent")
                           for path, each in zip(scene.training.truth_files, trained_on)}
     weights = {name: tensor.cpu().numpy() for name, tensor in model.state_dict().items()}

@@ -11,22 +11,25 @@ from typing import Any
 import numpy as np
 
 from eddies.analysis.accuracy import accuracy
-from eddies.io.hdf5 import open_product, read_table
-from eddies.io.provenance import environment
+from eddies.io.hdf5 import open_product
+from eddies.io.provenance import environment, product_attributes, read_json
 from eddies.cores import threads
 from eddies.measures import MEASURES
 from eddies.parallel.communicator import Comm
 from eddies.pipeline import STAGES
 from eddies.scene.scene import Eulerian, Scene
+from eddies.scene.sections import CONVERGED
 from eddies.workflows.run_directory.work import FAILURE
 from eddies.workflows.variants import Place
 
 COST = ("seconds_per_step", "time_step", "wall_seconds", "wall_seconds_low", "wall_seconds_high", "core_seconds",
         "ranks")
+# What comes before a rollout: learned numbers, their training, and seconds in which its step was found.
+BEFORE = ("weights", "training_seconds", "training_steps", "step_seconds")
 # Measured on gradients that the kernel makes of the particles, of the model and of the truth.
 THROUGH_KERNEL = ("qr_kl", "qr_kl_floor")
 COLUMNS = ("name", "label", "method", "kind", "on_grid", "status", "stopped_at", "realisations", *MEASURES, "end",
-           *COST, "training_seconds", *(f"{measure}_spread" for measure in MEASURES), "settings")
+           *COST, *BEFORE, *(f"{measure}_spread" for measure in MEASURES), "settings")
 MODEL, ROLLOUT = STAGES["train"].file, STAGES["simulate"].file
 
 
@@ -45,7 +48,7 @@ def row(scene: Scene, name: str, places: Sequence[Place], alone: Comm) -> dict[s
         found |= {"status": why_not(missing[0])}
     else:
         found |= together([measured(place.directory, alone) for place in places])
-        found |= {"training_seconds": training_seconds(places[0].directory, alone)}
+        found |= before(places[0], alone)
         if has_own_kernel(scene, variant):
             found |= dict.fromkeys(THROUGH_KERNEL)
     return {key: finite(value) for key, value in found.items()}
@@ -77,14 +80,22 @@ def together(realised: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return found
 
 
-def training_seconds(directory: Path, alone: Comm) -> float | None:
-    """How long the training of a model took, or of the one that it was taken over from, where there was one."""
-    for path in (directory / MODEL, directory.parent / MODEL):
-        if path.exists():
-            with open_product(alone, path, "model") as file:
-                if "history" in file:
-                    return float(read_table(file, "history")["seconds"][-1])
-    return None
+def before(place: Place, alone: Comm) -> dict[str, float | int]:
+    """Of BEFORE what there is: of the model, where the rollout has one, the training as it is stored with its weights,
+    whoever trained them; nothing of what is not stored."""
+    found: dict[str, float | int] = {}
+    path = place.directory / MODEL
+    if place.scene.needs_model and path.exists():
+        with open_product(alone, path, "model") as file:
+            phases = read_json(file, "description").get("training")
+            found["weights"] = sum(dataset.size for dataset in file["weights"].values())
+        if phases is not None:
+            found["training_seconds"] = float(sum(phase["seconds"] for phase in phases))
+            found["training_steps"] = sum(phase["steps"] for phase in phases)
+    step = place.scene.step_file or place.directory / STAGES["find-step"].file
+    if place.scene.simulation.step == CONVERGED and step.exists():
+        found["step_seconds"] = product_attributes(step, "found")["seconds"]
+    return found
 
 
 def has_own_kernel(scene: Scene, variant: Scene) -> bool:

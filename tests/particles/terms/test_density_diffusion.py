@@ -23,6 +23,19 @@ def test_the_closed_form_for_two_particles(settings, factor):
     assert found.tolist() == pytest.approx([expected, -expected], rel=1e-10)
 
 
+def test_its_coefficients_in_physical_units_are_those_of_the_physical_formula():
+    """(B_1, B_2) of -s w (B_1 + B_2 |q|) q with q = (rho_i - rho_j)/(x^2 + 0.1 d^2), all in the units of the flow."""
+    term = model(density_diffusion=dict(window="none"))
+    linear, quadratic = term.learned_coefficients["density-diffusion"]
+    assert (linear["unit"], quadratic["unit"]) == ("L^2/T", "L^7/(M T)")
+    position = torch.tensor([[1.0, 1, 1], [1.5, 1, 1]], dtype=torch.float64)
+    density = torch.tensor([1.01, 0.98], dtype=torch.float64)
+    found = rates(term, position, torch.zeros_like(position), density).density_rate
+    q = 0.03 / (0.5**2 + 0.1 * SCALES.filter_width**2)
+    expected = -(linear["value"] + quadratic["value"] * q) * q / NEIGHBORS
+    assert float(found[0]) == pytest.approx(expected, rel=1e-10)
+
+
 def test_it_evens_out_the_density_and_keeps_its_sum():
     position, velocity, density = state()
     rate = rates(model(density_diffusion={}), position, velocity, density).density_rate

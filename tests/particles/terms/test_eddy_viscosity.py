@@ -36,6 +36,19 @@ def test_the_published_form_for_two_particles(basis):
     assert float(found[0, 0]) == pytest.approx(expected, rel=1e-5)
 
 
+def test_its_coefficients_in_physical_units_are_those_of_the_physical_formula():
+    """(A_1, A_2) of a = s w (-A_1 mu + A_2 mu^2) x/d with mu = x.v/(x^2 + 0.1 d^2), all in the units of the flow."""
+    term = model(eddy_viscosity=dict(basis="paper", window="none"))
+    linear, quadratic = term.learned_coefficients["eddy-viscosity"]
+    assert [(each["learned"], each["unit"]) for each in (linear, quadratic)] == [(0.1, "L/T"), (0.1, "L")]
+    position = torch.tensor([[1.0, 1, 1], [1.5, 1, 1]], dtype=torch.float64)
+    velocity = torch.tensor([[0.0, 0, 0], [0.6, 0, 0]], dtype=torch.float64)
+    found = rates(term, position, velocity).acceleration
+    mu = 0.5 * 0.6 / (0.5**2 + 0.1 * SCALES.filter_width**2)
+    expected = (-linear["value"] * mu + quadratic["value"] * mu**2) * -0.5 / SCALES.filter_width / NEIGHBORS
+    assert float(found[0, 0]) == pytest.approx(expected, rel=1e-12)
+
+
 def test_it_takes_energy_of_approaching_pairs_and_keeps_the_momentum():
     position, velocity, _ = state()
     force = rates(model(eddy_viscosity=dict(form="monaghan", basis="paper")), position, velocity).acceleration

@@ -9,6 +9,7 @@ import pytest
 from eddies.io.hdf5 import ProductError, open_product
 from eddies.io.trajectories import Trajectory
 from eddies.parallel.slab import SlabDecomposition
+from eddies.particles.particle_field import grid_points
 from eddies.workflows.ground_truth.truth import GroundTruth
 from tests.changed_product import changed
 from tests.workflows.synthetic_run import LENGTH, write_ground_truth
@@ -36,6 +37,22 @@ def read(comm, path, ask):
 
 def rms(values):
     return math.sqrt(np.mean(values**2))
+
+
+@pytest.mark.parametrize("density", [True])
+@pytest.mark.mpi(1, 2, 3)
+def test_a_field_at_the_points_of_all_ranks_is_the_stored_one(comm, path, density):
+    """Of slabs with a plane less than the grid, so that their faces differ."""
+    with h5py.File(path) as file:
+        stored = file["fields/filtered/velocity"][0].reshape(3, -1).T
+    cells = round(len(stored) ** (1 / 3))
+
+    def ask(truth):
+        slab = SlabDecomposition(comm, LENGTH, cells - 1)
+        return GroundTruth(truth._file, slab).field_at(0, grid_points(slab, cells))
+
+    found = np.concatenate(comm.allgather(read(comm, path, ask)[0]))
+    assert np.array_equal(found, stored)
 
 
 @every_fluid

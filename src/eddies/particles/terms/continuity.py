@@ -10,7 +10,7 @@ from eddies.particles.flow_units import FlowUnits
 from eddies.particles.pairs import CompiledSum, ScaledPairs
 from eddies.particles.rates import Rates
 from eddies.particles.smoothing_kernels import CubicSpline, over_distance
-from eddies.particles.terms.term import PairTerm
+from eddies.particles.terms.term import Coefficient, PairTerm
 from eddies.scene import terms as declared
 
 
@@ -34,6 +34,12 @@ class Continuity(PairTerm):
         self.diffusivity = flow.cutoff * flow.scales.required("sound_speed")  # 2 h c
         self.delta = nn.Parameter(torch.tensor(settings.diffusion, dtype=torch.float64)) if settings.diffusion else None
         self.parity = torch.tensor([1.0] if self.delta is None else [1.0, -1.0])
+
+    @property
+    def learned_coefficients(self) -> list[Coefficient]:
+        """|delta|, where there is one; its value is the diffusivity 2 |delta| h c."""
+        return [] if self.delta is None else [Coefficient.of(
+            "|delta|", self.delta.abs(), "diffusivity 2 |delta| h c of the density", "L^2/T", self.diffusivity)]
 
     def pair_values(self, pairs: ScaledPairs) -> Tensor:
         """m v.grad W and, with diffusion, m (rho_j - rho_i) W'/r, both over rho_i rho_j: (components, m)."""

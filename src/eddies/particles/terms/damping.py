@@ -10,7 +10,7 @@ from torch import nn
 from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.rates import Rates
-from eddies.particles.terms.term import Term
+from eddies.particles.terms.term import Coefficient, Term
 from eddies.scene import terms as declared
 from eddies.spectral.mode_operators import rising
 
@@ -32,6 +32,12 @@ class Damping(Term):
     def __init__(self, settings: declared.Damping, flow: FlowUnits) -> None:
         super().__init__(settings, flow)
         self.rates = nn.Parameter(RATES.clone())
+
+    @property
+    def learned_coefficients(self) -> list[Coefficient]:
+        """D at the six wavenumbers, in units that change with the flow."""
+        return [Coefficient.of("D/(k_c u_c)", self.rates, "rates of damping at k/k_c = 1/6, 2/6, ..., 1, u_c the rms "
+                               "of the smallest resolved scales")]
 
     def forward(self, context: Context) -> Rates:
         """Modes of the force."""

@@ -11,7 +11,7 @@ from eddies.particles.pairs import CompiledSum, ScaledPairs
 from eddies.particles.rates import Rates
 from eddies.particles.terms.eddy_viscosity import SOFTENING
 from eddies.particles.terms.pair_basis import density_rate, told, window
-from eddies.particles.terms.term import PairTerm
+from eddies.particles.terms.term import Coefficient, PairTerm
 from eddies.scene import terms as declared
 
 
@@ -30,6 +30,17 @@ class DensityDiffusion(PairTerm):
     def __init__(self, settings: declared.DensityDiffusion, flow: FlowUnits) -> None:
         super().__init__(settings, flow)
         self.coefficients = nn.Parameter(torch.full((2,), 0.1, dtype=torch.float64))
+
+    @property
+    def learned_coefficients(self) -> list[Coefficient]:
+        """|b_1| and |b_2|; their values are those of a rate of density by q in physical units."""
+        scales, (linear, quadratic) = self.flow.scales, self.coefficients.detach().abs()
+        rate = scales.required("density_rate")
+        per_difference = scales.filter_width**2 / scales.required("density")
+        return [Coefficient.of("|b_1|", linear, "diffusion of the density: its rate by the difference q of a pair",
+                               "L^2/T", rate * per_difference),
+                Coefficient.of("|b_2|", quadratic, "nonlinear diffusion of the density: its rate by |q| q",
+                               "L^7/(M T)", rate * per_difference**2)]
 
     def pair_values(self, pairs: ScaledPairs) -> Tensor:
         """-w (|b_1| + |b_2| |q|) q, (1, m)."""

@@ -12,7 +12,7 @@ from eddies.particles.rates import Rates
 from eddies.particles.terms.pair_basis import (
     SMALL, acceleration, along_separation, separation_direction, told, window,
 )
-from eddies.particles.terms.term import PairTerm
+from eddies.particles.terms.term import Coefficient, PairTerm
 from eddies.scene import terms as declared
 
 # Softens the approach speed at small distances, in squared units of the reference length.
@@ -36,6 +36,16 @@ class EddyViscosity(PairTerm):
         super().__init__(settings, flow)
         self.needs_moments = settings.basis == "corrected"
         self.coefficients = nn.Parameter(torch.full((2,), 0.1, dtype=torch.float64))
+
+    @property
+    def learned_coefficients(self) -> list[Coefficient]:
+        """|a_1| and |a_2|; their values are those of an acceleration by mu in physical units, with b_1 as it is."""
+        scales, (linear, quadratic) = self.flow.scales, self.coefficients.detach().abs()
+        per_rate = scales.filter_width / scales.velocity
+        return [Coefficient.of("|a_1|", linear, "friction of a pair: acceleration by its rate of approach mu", "L/T",
+                               scales.acceleration * per_rate),
+                Coefficient.of("|a_2|", quadratic, "repulsion of a pair: acceleration by mu^2", "L",
+                               scales.acceleration * per_rate**2)]
 
     def strength(self, distance: Tensor, approach: Tensor) -> Tensor:
         """Pi (m,) from |x| (m,) and x.v (m,)."""

@@ -9,7 +9,7 @@ from eddies.particles.context import Context
 from eddies.particles.exchanges import mean_over_ranks
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.rates import Rates
-from eddies.particles.terms.term import Term
+from eddies.particles.terms.term import Coefficient, Term
 from eddies.scene import terms as declared
 
 # Two sweeps and more reduce what has eigenvalues from this over the square of their number to 1 alike, to an eighth.
@@ -43,6 +43,11 @@ class FilteredEquations(Term):
         super().__init__(settings, flow)
         self.stress = nn.Parameter(torch.ones((), dtype=torch.float64))
         self.stiffness = flow.scales.required("sound_speed") ** 2 / flow.scales.density_mean
+
+    @property
+    def learned_coefficients(self) -> list[Coefficient]:
+        """f."""
+        return [Coefficient.of("f", self.stress, "stress of the filter over that of the gradient model")]
 
     def forward(self, context: Context) -> Rates:
         """Acceleration and rate of density."""

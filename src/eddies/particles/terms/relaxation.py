@@ -8,7 +8,7 @@ from torch import nn
 from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.rates import Rates
-from eddies.particles.terms.term import Term
+from eddies.particles.terms.term import Coefficient, Term
 from eddies.scene import terms as declared
 
 
@@ -22,6 +22,11 @@ class Relaxation(Term):
     def __init__(self, settings: declared.Relaxation, flow: FlowUnits) -> None:
         super().__init__(settings, flow)
         self.factor = nn.Parameter(torch.ones((), dtype=torch.float64))
+
+    @property
+    def learned_coefficients(self) -> list[Coefficient]:
+        """C, in units that change with the flow."""
+        return [Coefficient.of("C d/(2 u_rms)", self.factor, "rate at which a velocity relaxes to the resolved one")]
 
     def forward(self, context: Context) -> Rates:
         """The acceleration."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor, nn
 
@@ -11,6 +13,32 @@ from eddies.particles.flow_units import FlowUnits
 from eddies.particles.pairs import ScaledPairs
 from eddies.particles.rates import Rates
 from eddies.scene.terms import TermBase, TermSettings
+
+
+@dataclass(frozen=True)
+class Coefficient:
+    """What a term has learned, for reports.
+
+    Parameters
+    ----------
+    name : its symbol.
+    learned : as it is learned, dimensionless: a number, or several.
+    value : the same in `unit`, of the flow that the term is made for.
+    unit : of L, T and M (eddies.io.quantities); "1" of a pure number.
+    meaning : what it does, in words.
+    """
+
+    name: str
+    learned: float | list[float]
+    value: float | list[float]
+    unit: str
+    meaning: str
+
+    @classmethod
+    def of(cls, name: str, learned: Tensor, meaning: str, unit: str = "1", scale: float = 1.0) -> Coefficient:
+        """That of a parameter, whose value 1 is `scale` of a unit."""
+        exact = learned.detach().double()
+        return cls(name, exact.tolist(), (exact * scale).tolist(), unit, meaning)
 
 
 class Term(nn.Module, TermBase):
@@ -44,6 +72,12 @@ class Term(nn.Module, TermBase):
     def gives(self) -> Sequence[str]:
         """What it contributes to: see TermSettings."""
         return self.settings.gives
+
+    @property
+    def learned_coefficients(self) -> list[Coefficient]:
+        """What it has learned; unless a term says more, how many numbers."""
+        count = sum(parameter.numel() for parameter in self.parameters())
+        return [Coefficient("weights", count, count, "1", "learned numbers")] if count else []
 
     def forward(self, context: Context) -> Rates:
         """The contribution to all owned particles; may be collective."""

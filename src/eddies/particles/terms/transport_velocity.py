@@ -10,7 +10,7 @@ from eddies.particles.flow_units import FlowUnits
 from eddies.particles.pairs import CompiledSum, ScaledPairs
 from eddies.particles.rates import Rates
 from eddies.particles.smoothing_kernels import CubicSpline, over_distance
-from eddies.particles.terms.term import PairTerm
+from eddies.particles.terms.term import Coefficient, PairTerm
 from eddies.scene import terms as declared
 
 # p_b delta_t over rho_0 c h at first.
@@ -39,6 +39,12 @@ class TransportVelocity(PairTerm):
         self.kernel, self.mass = CubicSpline(flow.cutoff), flow.particle_mass
         self.unit = flow.scales.density_mean * flow.scales.required("sound_speed") * flow.cutoff / 2
         self.background = nn.Parameter(torch.tensor(BACKGROUND, dtype=torch.float64))
+
+    @property
+    def learned_coefficients(self) -> list[Coefficient]:
+        """|p_b delta_t|."""
+        return [Coefficient.of("|p_b delta_t|", self.background.abs(), "background pressure times the time that it "
+                               "acts; learned over rho_0 c h", "M/(L T)", self.unit)]
 
     def pair_values(self, pairs: ScaledPairs) -> Tensor:
         """-m (1/rho_i^2 + 1/rho_j^2) grad W, and the entries of -m (v_i - v_j) grad W^T/(rho_i rho_j): (12, m)."""

@@ -10,7 +10,7 @@ from eddies.particles.flow_units import FlowUnits
 from eddies.particles.pairs import CompiledSum, ScaledPairs
 from eddies.particles.rates import Rates
 from eddies.particles.smoothing_kernels import CubicSpline, over_distance
-from eddies.particles.terms.term import PairTerm
+from eddies.particles.terms.term import Coefficient, PairTerm
 from eddies.scene import terms as declared
 
 # Softens the approach rate at small distances, in squared smoothing lengths (Monaghan 1992).
@@ -48,6 +48,14 @@ class WCSPH(PairTerm):
         self.sound_speed, self.alpha, self.beta = (nn.Parameter(torch.tensor(value, dtype=torch.float64))
                                                    for value in (1.0, settings.alpha, settings.beta))
         self.c = flow.scales.required("sound_speed")
+
+    @property
+    def learned_coefficients(self) -> list[Coefficient]:
+        """|c|, |alpha| and |beta|."""
+        return [Coefficient.of("|c|", self.sound_speed.abs(), "sound speed of the pressure; learned over that of the "
+                               "flow", "L/T", self.c),
+                Coefficient.of("|alpha|", self.alpha.abs(), "linear artificial viscosity: acts like alpha c h / 10"),
+                Coefficient.of("|beta|", self.beta.abs(), "quadratic artificial viscosity")]
 
     def pair_values(self, pairs: ScaledPairs) -> Tensor:
         """What each pair (i, j) accelerates i by, (3, m)."""

@@ -22,7 +22,7 @@ def check_frames(stages: Sequence[str], scene: Scene, seen: float, frames: int) 
     at_fields = range(0, frames, scene.tracers.field_every)
     if "train" in stages:
         if scene.model.path is None and seen > 0:
-            last_trained_on(scene.training, frames)
+            trained_frames(scene.training, frames, at_fields)
         between_frames(frames, at_fields)
     if "simulate" in stages:
         rollout_start(scene, seen, frames, at_fields)
@@ -47,6 +47,24 @@ def last_trained_on(settings: Training, frames: int) -> int:
             f"with {held_out} held out for validation and horizons of {longest}; raise it or [tracers] "
             "turnovers, or lower [tracers] frame_interval or [training.horizons] frames")
     return last - held_out
+
+
+def trained_frames(settings: Training, frames: int, at_fields: Sequence[int]) -> tuple[list[int], int]:
+    """The frames that can be trained on, and the last of those held out: all up to `last_trained_on` and the last but
+    one of the window; of them, where the field loss compares with the flow, those with a filtered field one frame
+    later.
+
+    Raises SceneError where too few are left.
+    """
+    learned, last = last_trained_on(settings, frames), last_seen(settings.window, frames)
+    fields = set(at_fields)
+    usable = [frame for frame in range(1, last) if not settings.wants_fields or frame + 1 in fields]
+    trained, held_out = ([frame for frame in usable if (frame <= learned) == seen] for seen in (True, False))
+    if not trained or not held_out:
+        raise SceneError('[training] field_target = "flow": no filtered field is stored one frame after any that is '
+                         f"{'held out' if trained else 'trained on'}; lower [tracers] field_every, or set "
+                         'field_target = "tracers"')
+    return trained, held_out[-1]
 
 
 def between_frames(frames: int, at_fields: Sequence[int]) -> list[int]:

@@ -14,14 +14,16 @@ import torch
 from eddies.io.fields import FieldSeries
 from eddies.io.hdf5 import File, ProductError, read_attributes
 from eddies.io.trajectories import Trajectory
-from eddies.learning.force_training import TrainingFrame
+from eddies.learning.force_training import FieldLater, TrainingFrame
 from eddies.parallel.broadcast import on_all_ranks
 from eddies.parallel.migration import id_block, migrate
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.flow_units import RATES, ReferenceScales, measured_scales
 from eddies.particles.model import LagrangianModel
+from eddies.particles.particle_field import grid_points
 from eddies.particles.particle_set import ParticleSet
+from eddies.particles.periodic_box import PeriodicBox
 from eddies.scene.terms import Forcing
 from eddies.workflows.ground_truth.frame_counts import last_seen
 
@@ -115,6 +117,20 @@ class GroundTruth:
         """The frame taken at the time of a field."""
         return int(np.argmin(np.abs(self.times - self.fields.times[index])))
 
+    @cached_property
+    def at_fields(self) -> list[int]:
+        """The frames at whose time a filtered field is stored."""
+        return [self.frame_of_field(index) for index in range(len(self.fields))]
+
+    def field_at(self, frame: int, points: torch.Tensor) -> np.ndarray:
+        """The filtered velocity (m, 3) that is stored at the time of a frame, at the `grid_points` (m, 3) that this
+        rank's slab has of its grid."""
+        cells, index = self.fields.cells, self.at_fields.index(frame)
+        planes = len(points) // cells**2
+        first = round(float(points[0, 2]) * cells / self.decomposition.length) if planes else 0
+        field = self._together(lambda: self.fields.read(index, "velocity", first, first + planes))
+        return field.reshape(3, -1).T.astype(np.float64)
+
     def last_frame_seen(self, window: float) -> int:
         """The last frame of the training window, a fraction of the ground truth; 0 where nothing of it was seen."""
         return last_seen(window, len(self.times)) if window > 0 else 0
@@ -134,21 +150,36 @@ class GroundTruth:
         return on_all_ranks(self.decomposition.comm, read, ProductError)
 
 
-def load_frame(truth: GroundTruth, index: int, model: LagrangianModel, dtype: torch.dtype,
-               device: torch.device) -> TrainingFrame:
-    """A frame with its true rates; its particles carry the true density where the model integrates it."""
+def load_frame(truth: GroundTruth, index: int, model: LagrangianModel, dtype: torch.dtype, device: torch.device,
+               with_field: bool = False) -> TrainingFrame:
+    """A frame with its true rates, and `with_field` with the filtered field one frame later; its particles carry the
+    true density where the model integrates it."""
     columns = truth.particles_with_rates(int(index))
     rates = {name: torch.from_numpy(columns[name]).to(device, dtype)
              for name in ("acceleration", "density_rate") if name in columns}
     dynamics = ParticleDynamics(truth.decomposition, model, skin=0.0, dtype=dtype)
+    later = _field_after(truth, int(index), dtype, device) if with_field else None
     frame = TrainingFrame(dynamics, particles_for(model, columns, device), rates["acceleration"],
-                          rates.get("density_rate"))
+                          rates.get("density_rate"), later)
     solves = [] if dynamics.resolution is None else dynamics.resolution.solves
     for iterations, residual, converged in solves:
         if not converged and truth.decomposition.comm.rank == 0:
             log.warning("frame %d: the solve for the resolved velocity did not converge in %d iterations and left %.1e",
                         index, iterations, residual)
     return frame
+
+
+def _field_after(truth: GroundTruth, frame: int, dtype: torch.dtype, device: torch.device) -> FieldLater:
+    """The filtered field one frame after a frame, and where the particles of that frame are then."""
+    slab, columns = truth.decomposition, truth.window(frame, 1)  # rows as in `particles_with_rates`
+    position, later = (torch.from_numpy(columns[name]) for name in ("position", "position_later"))
+    # Positions are stored within the box; here they go on from where the particles are.
+    moved = position + PeriodicBox(slab.length).displacement(later[:, 0], position)
+    points = grid_points(slab, truth.fields.cells)
+    field = torch.from_numpy(truth.field_at(frame + 1, points))
+    return FieldLater(moved.to(device), torch.from_numpy(columns["velocity_later"][:, 0]).to(device, dtype),
+                      float(truth.times[frame + 1] - truth.times[frame - 1]), points.to(device),
+                      field.to(device, dtype))
 
 
 def particles_for(model: LagrangianModel, columns: dict[str, np.ndarray], device: torch.device) -> ParticleSet:

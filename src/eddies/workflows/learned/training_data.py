@@ -20,7 +20,7 @@ from eddies.particles.resolved_velocity import ResolvedVelocity
 from eddies.particles.smoothing_kernels import SmoothingKernel
 from eddies.scene.scene import BOX_LENGTH, Scene
 from eddies.workflows.foreseen.ranks import ALLOWED_VELOCITY
-from eddies.workflows.ground_truth.frame_counts import last_trained_on
+from eddies.workflows.ground_truth.frame_counts import last_trained_on, trained_frames
 from eddies.workflows.ground_truth.truth import GroundTruth, load_frame
 from eddies.workflows.learned.model import scene_model
 
@@ -50,11 +50,12 @@ class TrainingData:
         self.longest = max(self.settings.horizons.frames) if self.settings.horizons else 0
         self.last = truth.last_frame_seen(self.settings.window)
         self.learned = last_trained_on(self.settings, len(truth.times))
+        self.usable, self.held_out = trained_frames(self.settings, len(truth.times), truth.at_fields)
 
     @cached_property
     def frames(self) -> list[TrainingFrame]:
         """The single frames that are trained on; the first use is collective."""
-        seen = np.unique(np.linspace(1, self.learned, self.count).astype(int))
+        seen = np.array(self.usable)[np.unique(np.linspace(0, len(self.usable) - 1, self.count).astype(int))]
         progress, frames = ProgressLine("train", lambda: "prepared", unit="frame"), []
         for index in seen:
             frames.append(self._frame(index))
@@ -69,8 +70,8 @@ class TrainingData:
         return ForceTrainer(self.model, self.frames, kernel, weights, settings.batch, self.scene.seed)
 
     def validation_frame(self) -> TrainingFrame:
-        """The frame at the end of the training window; collective."""
-        return self._frame(self.last - 1)
+        """The last frame of the training window that is held out; collective."""
+        return self._frame(self.held_out)
 
     def rollout_trainer(self) -> tuple[RolloutTrainer, TrainingWindow]:
         """What trains the model on windows of frames, and the window for validation; collective."""
@@ -93,7 +94,7 @@ class TrainingData:
         return trainer, self._window(self.last - self.longest, resolution)
 
     def _frame(self, index: int) -> TrainingFrame:
-        return load_frame(self.truth, index, self.model, self.dtype, self.device)
+        return load_frame(self.truth, index, self.model, self.dtype, self.device, self.settings.wants_fields)
 
     def _window(self, start: int, resolution: ResolvedVelocity | None) -> TrainingWindow:
         columns = {name: torch.from_numpy(column).to(self.device)

@@ -29,7 +29,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path) -> None:
 
     Terms work in units of the flow (Eq. 4), so only the scales and the support are this flow's. The tables are
     the source's, but for the a-priori tests: those of this flow, beside `source_a_priori`, those of the flow on which
-    the weights were trained, if the source tested them there.
+    the weights were trained, if the source tested them there. The cost of training is what the source has stored.
     """
     device, source = prepare_torch(scene.device, comm), read_source(scene, comm)
     slab = SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes)
@@ -40,7 +40,10 @@ def run(scene: Scene, comm: Comm, directory: str | Path) -> None:
         dtype = next((parameter.dtype for parameter in model.parameters()), torch.float64)
         last = truth.last_frame_seen(scene.seen_in(Path(directory)))
         tables = evaluate(truth, model, evaluation_frames(truth), last, dtype, device)
-        mach, description = truth.reference.get("mach_turbulent"), describe(scene, truth.scales)
+        mach = truth.reference.get("mach_turbulent")
+        description = describe(scene, truth.scales) | {"coefficients": model.learned_coefficients}
+    if "training" in source.description:
+        description["training"] = source.description["training"]
     origin, own_errors = trained_on(scene, source)
     provenance = {**scene.provenance("train"), "mach_turbulent": mach, "source": origin}
     kept = source.tables | ({"source_a_priori": own_errors} if own_errors else {})

@@ -19,7 +19,7 @@ from eddies.parallel.slab import SlabDecomposition
 from eddies.pipeline import STAGES
 from eddies.scene.rules import quoted
 from eddies.scene.scene import BOX_LENGTH, Scene
-from eddies.workflows.ground_truth.frame_counts import last_trained_on
+from eddies.workflows.ground_truth.frame_counts import trained_frames
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.learned.training_data import TrainingData
 
@@ -103,4 +103,4 @@ def _problems_of(scene: Scene, comm: Comm, file: File) -> Iterator[str]:
     if settings.horizons and not math.isclose(tracers.frame_interval, interval, rel_tol=1e-6):
         yield (f"its frames are {interval:.6g} apart, and [training.horizons] counts frames of [tracers] "
                f"frame_interval = {tracers.frame_interval:g}; make them equal, or leave the horizons out")
-    last_trained_on(settings, len(truth.times))
+    trained_frames(settings, len(truth.times), truth.at_fields)

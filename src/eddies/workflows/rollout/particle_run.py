@@ -172,9 +172,9 @@ class ParticleRun:
         self._shares_outside, self._solves = (saved["series"][name] for name in ("outside_training", "closure"))
 
     def description(self) -> dict[str, float | str]:
-        """Integrator, terms, and how often the rates were evaluated for the steps."""
+        """Integrator, terms, whether they integrate a density, and how often rates were evaluated for the steps."""
         return {"integrator": self.settings.scheme.name, "terms": ", ".join(self.model.terms) or "none",
-                "evaluations": self.dynamics.evaluations}
+                "integrates_density": self.model.integrates_density, "evaluations": self.dynamics.evaluations}
 
 
 class LearnedRun(ParticleRun):
