@@ -342,12 +342,12 @@ def _published(basis: str) -> dict[str, Mapping[str, Any]]:
 
 #: Of each preset the settings that differ from the terms' own, by term, in the order of the terms.
 PRESETS: dict[str, dict[str, Mapping[str, Any]]] = {
+    "paper": _published("paper"),
+    "paper-code": _published("unit"),
     "resolved": dict.fromkeys(RESOLVED, {}),
     # The density there is that of the pressure, whose force is given: a network that is told of it learns no more, and
     # costs twice as much, as pairs then are not opposite.
     "resolved + pairs": {**dict.fromkeys(RESOLVED, {}), "pairs": {"inputs": ("distance", "speed", "approach")}},
-    "paper": _published("paper"),
-    "paper-code": _published("unit"),
     "local": {"filtered-equations": {}, "eddy-viscosity": {}},
     "wcsph": {"continuity": {}, "wcsph": LITTLE_FRICTION},
     "transport-velocity": {"continuity": {}, "wcsph": LITTLE_FRICTION, "transport-velocity": {}},
