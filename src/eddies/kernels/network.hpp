@@ -153,6 +153,7 @@ class Matrix {
 #pragma GCC unroll 4
             for (int v = 0; v < TILE_VECTORS; ++v) sums[row][v] = V{} + (biases ? biases[row] : Real(0));
         const Real* place = given.first;
+#pragma GCC unroll 4
         for (int i = 0; i < inputs_; ++i, place += given.apart, weights += rows) {
 #pragma GCC unroll 8
             for (int row = 0; row < rows; ++row)
@@ -187,7 +188,7 @@ class Network {
             for (Real& bias : biases_.back()) bias = static_cast<Real>(unit * *parameters++);
         }
         for (const int width : widths_) {
-            values_.emplace_back(width + 1);  // one more, as tanh is taken of several vectors
+            values_.emplace_back(padded_to_vectors(width) + 1);  // as much as is read of whole vectors
             deltas_.emplace_back(width);
         }
     }
@@ -266,19 +267,20 @@ class Network {
         }
     }
 
-    // Inputs of a layer point by point, zeros beyond the last.
+    // Inputs of a layer point by point; what stands beyond the last means nothing.
     void turn(int layer) {
         constexpr int lanes = VectorOf<Real>::lanes, group = GROUP<Real>;
-        const int inputs = widths_[layer], padded = padded_to_vectors(inputs);
+        const int padded = padded_to_vectors(widths_[layer]);
         for (int p = 0; p < BLOCK; p += TILE<Real>) {
             const TileRows<Real> given = tile(values_, layer, p);
             for (int begin = 0; begin < padded; begin += group)
                 for (int q = 0; q < TILE<Real>; q += lanes) {
                     Vector<Real> part[group];
-                    for (int i = 0; i < group; ++i)
-                        part[i] = begin + i < inputs ? vector_at(given[begin + i] + q) : Vector<Real>{};
+#pragma GCC unroll 8
+                    for (int i = 0; i < group; ++i) part[i] = vector_at(given[begin + i] + q);
                     transpose<Real>(part);
                     const auto* numbers = reinterpret_cast<const Real*>(part);
+#pragma GCC unroll 16
                     for (int point = 0; point < lanes; ++point)
                         std::memcpy(turned_.data() + (p + q + point) * padded + begin,
                                     numbers + point % group * lanes + point / group * group, group * sizeof(Real));
