@@ -5,6 +5,7 @@
 
 #include <cstddef>
 #include <stdexcept>
+#include <type_traits>
 #include <vector>
 
 #include "vectors.hpp"
@@ -20,19 +21,39 @@ inline V series(const Real (&coefficients)[terms], V x) {
     return sum;
 }
 
-template <typename V, typename Real>
-inline V clipped(V x, Real largest) {
-    x = x > largest ? V{} + largest : x;
-    return x < -largest ? V{} - largest : x;
-}
+// What the numbers of a tanh layer are multiplied by before `tanh_of` takes them.
+template <typename Real>
+constexpr double TANH_UNIT = 1.0;
 
-// x P(x^2) / Q(x^2), to 7e-9 of tanh up to 8, a minimax fit, and beyond as there, where 2e-7 are missing to 1.
-inline Vector<float> tanh_of(Vector<float> x) {
-    constexpr float upper[] = {1.0f, 1.34468052e-1f, 3.57432509e-3f, 2.19393224e-5f, 1.52927450e-8f};
-    constexpr float lower[] = {1.0f, 4.67801345e-1f, 2.61748484e-2f, 3.41573804e-4f, 8.54780856e-7f};
-    x = clipped(x, 8.0f);
-    const Vector<float> square = x * x;
-    return x * series(upper, square) / series(lower, square);
+// Vectors of which `tanh_of` takes each step together, as one alone would wait for each.
+constexpr int TOGETHER = 4;
+
+// tanh(x) of y = x TANH_UNIT as y P(y^2) / Q(y^2), a minimax fit up to x = 8, and beyond as there; to 4e-7, and 6e-7
+// with round-off. In that unit the highest powers of both have the factor 1, which saves a product each. Two vectors
+// share a division.
+template <>
+constexpr double TANH_UNIT<float> = 0.021518350198783773;
+
+inline void tanh_of(float* numbers) {
+    using V = Vector<float>;
+    constexpr float above[] = {8.68697404e-6f, 2.42495333e-3f, 1.19565258e-1f};
+    constexpr float below[] = {1.86929377e-7f, 1.86747455e-4f, 2.07635762e-2f, 4.49385810e-1f};
+    V* place = reinterpret_cast<V*>(numbers);
+    V x[TOGETHER], square[TOGETHER], upper[TOGETHER], lower[TOGETHER];
+    for (int v = 0; v < TOGETHER; ++v) x[v] = clipped(place[v], static_cast<float>(8 * TANH_UNIT<float>));
+    for (int v = 0; v < TOGETHER; ++v) square[v] = x[v] * x[v];
+    for (int v = 0; v < TOGETHER; ++v) upper[v] = square[v] + above[2];
+    for (int v = 0; v < TOGETHER; ++v) lower[v] = square[v] + below[3];
+#pragma GCC unroll 4
+    for (int k = 2; k >= 0; --k) {
+        for (int v = 0; v < TOGETHER; ++v) lower[v] = lower[v] * square[v] + below[k];
+        for (int v = 0; v < TOGETHER; ++v) upper[v] = k > 0 ? upper[v] * square[v] + above[k - 1] : upper[v] * x[v];
+    }
+    for (int v = 0; v < TOGETHER; v += 2) {
+        const V inverse = 1.0f / (lower[v] * lower[v + 1]);
+        place[v] = upper[v] * (lower[v + 1] * inverse);
+        place[v + 1] = upper[v + 1] * (lower[v] * inverse);
+    }
 }
 
 // 1 - 2 / (exp(2 x) + 1); exp(a) = 2^n exp(r), a = n log 2 + r, by the series of exp(r).
@@ -49,74 +70,102 @@ inline Vector<double> tanh_of(Vector<double> x) {
     return 1.0 - 2.0 / ((V)bits + 1.0);  // the exponent's bits begin at 52: times 2^n
 }
 
-// Adds numbers of a block to a vector.
-template <typename Real>
-inline void add_lanes(const Real* numbers, Real* lanes) {
-    auto* sum = reinterpret_cast<Vector<Real>*>(lanes);
-    for (int p = 0; p < BLOCK; p += VectorOf<Real>::lanes) *sum += *reinterpret_cast<const Vector<Real>*>(numbers + p);
-}
-
-// `outputs` rows of weights (outputs, inputs) times rows, added to biases.
-template <int outputs, typename Real>
-inline void multiply_rows(int inputs, const Real* weights, const Real* biases, const Real* given, Real* result) {
-    using V = Vector<Real>;
-    constexpr int lanes = VectorOf<Real>::lanes;
-    for (int p = 0; p < BLOCK; p += 2 * lanes) {
-        V sums[outputs][2];
-        for (int o = 0; o < outputs; ++o) sums[o][0] = sums[o][1] = V{} + (biases ? biases[o] : Real(0));
-        for (int i = 0; i < inputs; ++i) {
-            const V* points = reinterpret_cast<const V*>(given + i * BLOCK + p);
-            for (int o = 0; o < outputs; ++o) {
-                const Real weight = weights[o * inputs + i];
-                sums[o][0] += weight * points[0];
-                sums[o][1] += weight * points[1];
-            }
-        }
-        for (int o = 0; o < outputs; ++o) {
-            V* place = reinterpret_cast<V*>(result + o * BLOCK + p);
-            place[0] = sums[o][0];
-            place[1] = sums[o][1];
-        }
+inline void tanh_of(double* numbers) {
+    for (int v = 0; v < TOGETHER; ++v) {
+        auto& place = vector_at(numbers + v * VectorOf<double>::lanes);
+        place = tanh_of(place);
     }
 }
 
+// A layer takes a tile of points at a time, so that what it reads stays in the first-level cache, and a group of rows of
+// its weights, so that their sums stay in registers; likewise the gradient by weights, of rows and vectors of columns.
+#if defined(__AVX512F__)
+constexpr int TILE_VECTORS = 4, MOST_ROWS = 6, MOST_PRODUCTS = 4, MOST_VECTORS = 3;
+#elif defined(__AVX2__)
+constexpr int TILE_VECTORS = 2, MOST_ROWS = 6, MOST_PRODUCTS = 4, MOST_VECTORS = 3;
+#else
+constexpr int TILE_VECTORS = 1, MOST_ROWS = 4, MOST_PRODUCTS = 4, MOST_VECTORS = 1;
+#endif
+
 template <typename Real>
-void multiply(int outputs, int inputs, const Real* weights, const Real* biases, const Real* given, Real* result) {
-    int o = 0;
-    for (; o + 4 <= outputs; o += 4)
-        multiply_rows<4>(inputs, weights + o * inputs, biases ? biases + o : nullptr, given, result + o * BLOCK);
-    for (; o + 2 <= outputs; o += 2)
-        multiply_rows<2>(inputs, weights + o * inputs, biases ? biases + o : nullptr, given, result + o * BLOCK);
-    for (; o < outputs; ++o)
-        multiply_rows<1>(inputs, weights + o * inputs, biases ? biases + o : nullptr, given, result + o * BLOCK);
+constexpr int TILE = TILE_VECTORS * VectorOf<Real>::lanes;
+
+// Calls `use` with a size, which is known to the compiler.
+template <int most, typename Use>
+inline void with_size(int size, const Use& use) {
+    if constexpr (most > 1)
+        if (size < most) return with_size<most - 1>(size, use);
+    use(std::integral_constant<int, most>());
 }
 
-// Adds what a block's points give to the gradient by weights, a vector for each: `outputs` times `inputs` of them, in
-// rows of `stride`.
-template <int outputs, int inputs, typename Real>
-inline void add_products(int stride, const Real* delta, const Real* given, Real* lanes) {
-    using V = Vector<Real>;
-    V* sums = reinterpret_cast<V*>(lanes);
-    V found[outputs][inputs];
-    for (int o = 0; o < outputs; ++o)
-        for (int i = 0; i < inputs; ++i) found[o][i] = sums[o * stride + i];
-    for (int p = 0; p < BLOCK; p += VectorOf<Real>::lanes)
-        for (int o = 0; o < outputs; ++o) {
-            const V d = *reinterpret_cast<const V*>(delta + o * BLOCK + p);
+// Calls `use` with size and first of groups of at most `most` things, which are as large as each other, or nearly so.
+template <int most, typename Use>
+inline void in_groups(int count, const Use& use) {
+    int first = 0;
+    for (int left = (count + most - 1) / most; left > 0; --left) {
+        const int size = (count - first + left - 1) / left;
+        with_size<most>(size, [&](auto known) { use(known, first); });
+        first += size;
+    }
+}
+
+// Rows of a tile, so many numbers apart.
+template <typename Real>
+struct TileRows {
+    Real* first;
+    int apart;
+    Real* operator[](int row) const { return first + row * apart; }
+    operator TileRows<const Real>() const { return {first, apart}; }
+};
+
+// A matrix (outputs, inputs): of each group of rows the first column, then the second.
+template <typename Real>
+class Matrix {
+   public:
+    template <typename At>
+    Matrix(int outputs, int inputs, const At& at) : outputs_(outputs), inputs_(inputs) {
+        in_groups<MOST_ROWS>(outputs, [&](auto rows, int first) {
             for (int i = 0; i < inputs; ++i)
-                found[o][i] += d * *reinterpret_cast<const V*>(given + i * BLOCK + p);
-        }
-    for (int o = 0; o < outputs; ++o)
-        for (int i = 0; i < inputs; ++i) sums[o * stride + i] = found[o][i];
-}
+                for (int row = 0; row < rows; ++row) numbers_.push_back(static_cast<Real>(at(first + row, i)));
+        });
+    }
 
-template <int outputs, typename Real>
-inline void add_rows_of_products(int inputs, const Real* delta, const Real* given, Real* sums) {
-    constexpr int lanes = VectorOf<Real>::lanes;
-    int i = 0;
-    for (; i + 4 <= inputs; i += 4) add_products<outputs, 4>(inputs, delta, given + i * BLOCK, sums + i * lanes);
-    for (; i < inputs; ++i) add_products<outputs, 1>(inputs, delta, given + i * BLOCK, sums + i * lanes);
-}
+    // Its product with rows of a tile, added to biases unless they are null.
+    void multiply(const Real* biases, TileRows<const Real> given, TileRows<Real> result) const {
+        in_groups<MOST_ROWS>(outputs_, [&](auto rows, int first) {
+            multiply_rows<rows>(numbers_.data() + first * inputs_, biases ? biases + first : nullptr, given,
+                                {result[first], result.apart});
+        });
+    }
+
+   private:
+    int outputs_, inputs_;
+    std::vector<Real> numbers_;
+
+    template <int rows>
+    void multiply_rows(const Real* weights, const Real* biases, TileRows<const Real> given,
+                       TileRows<Real> result) const {
+        using V = Vector<Real>;
+        constexpr int lanes = VectorOf<Real>::lanes;
+        V sums[rows][TILE_VECTORS];
+#pragma GCC unroll 8
+        for (int row = 0; row < rows; ++row)
+#pragma GCC unroll 4
+            for (int v = 0; v < TILE_VECTORS; ++v) sums[row][v] = V{} + (biases ? biases[row] : Real(0));
+        const Real* place = given.first;
+#pragma GCC unroll 4
+        for (int i = 0; i < inputs_; ++i, place += given.apart, weights += rows) {
+#pragma GCC unroll 8
+            for (int row = 0; row < rows; ++row)
+#pragma GCC unroll 4
+                for (int v = 0; v < TILE_VECTORS; ++v) sums[row][v] += weights[row] * vector_at(place + v * lanes);
+        }
+#pragma GCC unroll 8
+        for (int row = 0; row < rows; ++row)
+#pragma GCC unroll 4
+            for (int v = 0; v < TILE_VECTORS; ++v) vector_at(result[row] + v * lanes) = sums[row][v];
+    }
+};
 
 // The network; its parameters, as given and as gradients, are the weights (outputs, inputs) and biases (outputs) of one
 // layer after the other.
@@ -124,22 +173,22 @@ template <typename Real>
 class Network {
    public:
     // Throws std::invalid_argument where the count is another than that of the parameters.
-    Network(std::vector<int> widths, const double* parameters, std::int64_t count) : widths_(std::move(widths)) {
+    Network(std::vector<int> widths, const double* parameters, std::int64_t count)
+        : widths_(std::move(widths)),
+          turned_(BLOCK * padded_to_vectors(*std::max_element(widths_.begin(), widths_.end()))) {
         for (int layer = 0; layer < layers(); ++layer) count -= (widths_[layer] + 1) * widths_[layer + 1];
         if (count != 0) throw std::invalid_argument("parameters of a network");
         for (int layer = 0; layer < layers(); ++layer) {
             const int inputs = widths_[layer], outputs = widths_[layer + 1];
-            weights_.emplace_back(parameters, parameters + inputs * outputs);
+            const double unit = layer + 1 < layers() ? TANH_UNIT<Real> : 1.0;
+            forth_.emplace_back(outputs, inputs, [&](int o, int i) { return unit * parameters[o * inputs + i]; });
+            back_.emplace_back(inputs, outputs, [&](int i, int o) { return parameters[o * inputs + i]; });
             parameters += inputs * outputs;
-            biases_.emplace_back(parameters, parameters + outputs);
-            parameters += outputs;
-            std::vector<Real> turned(inputs * outputs);
-            for (int o = 0; o < outputs; ++o)
-                for (int i = 0; i < inputs; ++i) turned[i * outputs + o] = weights_[layer][o * inputs + i];
-            turned_.push_back(std::move(turned));
+            biases_.emplace_back(outputs);
+            for (Real& bias : biases_.back()) bias = static_cast<Real>(unit * *parameters++);
         }
         for (const int width : widths_) {
-            values_.emplace_back(width);
+            values_.emplace_back(padded_to_vectors(width) + 1);  // as much as is read of whole vectors
             deltas_.emplace_back(width);
         }
     }
@@ -152,48 +201,122 @@ class Network {
     Rows<Real>& by_outputs() { return deltas_.back(); }
 
     void forward() {
-        for (int layer = 0; layer < layers(); ++layer) {
-            const int inputs = widths_[layer], outputs = widths_[layer + 1];
-            Real* result = values_[layer + 1][0];
-            multiply(outputs, inputs, weights_[layer].data(), biases_[layer].data(), values_[layer][0], result);
-            if (layer + 1 == layers()) return;
-            for (int p = 0; p < outputs * BLOCK; p += VectorOf<Real>::lanes) {
-                auto* place = reinterpret_cast<Vector<Real>*>(result + p);
-                *place = tanh_of(*place);
+        for (int p = 0; p < BLOCK; p += TILE<Real>)
+            for (int layer = 0; layer < layers(); ++layer) {
+                const TileRows<Real> result = tile(values_, layer + 1, p);
+                forth_[layer].multiply(biases_[layer].data(), tile(values_, layer, p), result);
+                if (layer + 1 == layers()) break;
+                const int count = widths_[layer + 1] * TILE<Real>;  // and up to what follows them, in their last row
+                for (int q = 0; q < count; q += TOGETHER * VectorOf<Real>::lanes) tanh_of(result.first + q);
             }
-        }
     }
 
-    // After `forward`: from the gradient by outputs those by parameters, added to a vector for each, and by features.
+    // After `forward`: from the gradient by outputs those by parameters, which are added, and by features.
     void backward(Real* by_parameters, bool features_too) {
-        constexpr int lanes = VectorOf<Real>::lanes;
-        for (int layer = 0; layer < layers(); ++layer)
-            by_parameters += lanes * (widths_[layer] + 1) * widths_[layer + 1];
+        for (int layer = 0; layer < layers(); ++layer) by_parameters += (widths_[layer] + 1) * widths_[layer + 1];
         for (int layer = layers() - 1; layer >= 0; --layer) {
-            const int inputs = widths_[layer], outputs = widths_[layer + 1];
-            const Real *delta = deltas_[layer + 1][0], *given = values_[layer][0];
-            by_parameters -= lanes * (inputs + 1) * outputs;
-            int o = 0;
-            for (; o + 2 <= outputs; o += 2)
-                add_rows_of_products<2>(inputs, delta + o * BLOCK, given, by_parameters + o * inputs * lanes);
-            for (; o < outputs; ++o)
-                add_rows_of_products<1>(inputs, delta + o * BLOCK, given, by_parameters + o * inputs * lanes);
-            for (o = 0; o < outputs; ++o) add_lanes(delta + o * BLOCK, by_parameters + (inputs * outputs + o) * lanes);
+            by_parameters -= (widths_[layer] + 1) * widths_[layer + 1];
+            add_by_parameters(layer, by_parameters);
             if (layer == 0 && !features_too) return;
-            Real* before = deltas_[layer][0];
-            multiply<Real>(inputs, outputs, turned_[layer].data(), nullptr, delta, before);
-            if (layer > 0)
+            for (int p = 0; p < BLOCK; p += TILE<Real>) {
+                const TileRows<Real> before = tile(deltas_, layer, p);
+                back_[layer].multiply(nullptr, tile(deltas_, layer + 1, p), before);
+                if (layer == 0) continue;
+                const Real* value = tile(values_, layer, p)[0];
 #pragma omp simd
-                for (int p = 0; p < inputs * BLOCK; ++p) before[p] *= 1 - given[p] * given[p];
+                for (int q = 0; q < widths_[layer] * TILE<Real>; ++q) before.first[q] *= 1 - value[q] * value[q];
+            }
         }
     }
 
    private:
     std::vector<int> widths_;
-    std::vector<std::vector<Real>> weights_, turned_, biases_;  // turned: (inputs, outputs)
-    std::vector<Rows<Real>> values_, deltas_;
+    std::vector<Matrix<Real>> forth_, back_;  // back: (inputs, outputs)
+    std::vector<std::vector<Real>> biases_;
+    std::vector<Rows<Real>> values_, deltas_;  // of hidden layers tile by tile
+    Aligned<Real> turned_;                     // (BLOCK, inputs padded)
 
     int layers() const { return static_cast<int>(widths_.size()) - 1; }
+
+    static int padded_to_vectors(int width) {
+        constexpr int lanes = VectorOf<Real>::lanes;
+        return (width + lanes - 1) / lanes * lanes;
+    }
+
+    // The rows of a tile that begins with point `p`.
+    TileRows<Real> tile(std::vector<Rows<Real>>& rows, int layer, int p) const {
+        if (layer == 0 || layer == layers()) return {rows[layer][0] + p, BLOCK};
+        return {rows[layer][0] + p * widths_[layer], TILE<Real>};
+    }
+
+    // Adds what a block's points give to the gradient by weights and biases of a layer.
+    void add_by_parameters(int layer, Real* by_parameters) {
+        constexpr int lanes = VectorOf<Real>::lanes;
+        const int inputs = widths_[layer], outputs = widths_[layer + 1];
+        turn(layer);
+        in_groups<MOST_VECTORS>(padded_to_vectors(inputs) / lanes, [&](auto vectors, int first) {
+            in_groups<MOST_PRODUCTS>(outputs, [&](auto rows, int output) {
+                add_products<rows, vectors>(layer, output, first * lanes, by_parameters + output * inputs);
+            });
+        });
+        for (int o = 0; o < outputs; ++o) {
+            Vector<Real> sum{};
+            for (int p = 0; p < BLOCK; p += TILE<Real>)
+                for (int q = 0; q < TILE<Real>; q += lanes) sum += vector_at(tile(deltas_, layer + 1, p)[o] + q);
+            by_parameters[inputs * outputs + o] += sum_of_lanes<Real>(sum);
+        }
+    }
+
+    // Inputs of a layer point by point; what stands beyond the last means nothing.
+    void turn(int layer) {
+        constexpr int lanes = VectorOf<Real>::lanes, group = GROUP<Real>;
+        const int padded = padded_to_vectors(widths_[layer]);
+        for (int p = 0; p < BLOCK; p += TILE<Real>) {
+            const TileRows<Real> given = tile(values_, layer, p);
+            for (int begin = 0; begin < padded; begin += group)
+                for (int q = 0; q < TILE<Real>; q += lanes) {
+                    Vector<Real> part[group];
+#pragma GCC unroll 8
+                    for (int i = 0; i < group; ++i) part[i] = vector_at(given[begin + i] + q);
+                    transpose<Real>(part);
+                    const auto* numbers = reinterpret_cast<const Real*>(part);
+#pragma GCC unroll 16
+                    for (int point = 0; point < lanes; ++point)
+                        std::memcpy(turned_.data() + (p + q + point) * padded + begin,
+                                    numbers + point % group * lanes + point / group * group, group * sizeof(Real));
+                }
+        }
+    }
+
+    // Of some outputs and some vectors of inputs.
+    template <int rows, int vectors>
+    void add_products(int layer, int output, int input, Real* by_weights) {
+        using V = Vector<Real>;
+        constexpr int lanes = VectorOf<Real>::lanes;
+        const int inputs = widths_[layer], padded = padded_to_vectors(inputs);
+        V sums[rows][vectors]{};
+        const Real* given = turned_.data() + input;
+        for (int p = 0; p < BLOCK; p += TILE<Real>) {
+            const TileRows<Real> deltas = tile(deltas_, layer + 1, p);
+            const Real* delta = deltas[output];
+#pragma GCC unroll 1
+            for (int q = 0; q < TILE<Real>; ++q, ++delta, given += padded) {
+#pragma GCC unroll 4
+                for (int row = 0; row < rows; ++row)
+#pragma GCC unroll 4
+                    for (int v = 0; v < vectors; ++v)
+                        sums[row][v] += delta[row * deltas.apart] * vector_at(given + v * lanes);
+            }
+        }
+        for (int row = 0; row < rows; ++row)
+            for (int v = 0; v < vectors; ++v) {
+                const int first = input + v * lanes;
+                Real* place = by_weights + row * inputs + first;
+                if (first + lanes <= inputs) add_unaligned(place, sums[row][v]);
+                else
+                    for (int lane = 0; first + lane < inputs; ++lane) place[lane] += sums[row][v][lane];
+            }
+    }
 };
 
 }  // namespace eddies

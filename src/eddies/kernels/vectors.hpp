@@ -84,6 +84,31 @@ inline const Vector<Real>& vector_at(const Real* place) {
     return *reinterpret_cast<const Vector<Real>*>(place);
 }
 
+// Numbers of at most that size: the nearest ones of others. What is not a number stays so.
+template <typename Real>
+inline Vector<Real> clipped(Vector<Real> x, Real largest) {
+    const Vector<Real> above = Vector<Real>{} + largest, below = -above;
+#if defined(__AVX512F__)
+    if constexpr (sizeof(Real) == 4)
+        return (Vector<Real>)_mm512_max_ps((__m512)below, _mm512_min_ps((__m512)above, (__m512)x));
+    else return (Vector<Real>)_mm512_max_pd((__m512d)below, _mm512_min_pd((__m512d)above, (__m512d)x));
+#elif defined(__AVX2__)
+    if constexpr (sizeof(Real) == 4)
+        return (Vector<Real>)_mm256_max_ps((__m256)below, _mm256_min_ps((__m256)above, (__m256)x));
+    else return (Vector<Real>)_mm256_max_pd((__m256d)below, _mm256_min_pd((__m256d)above, (__m256d)x));
+#else
+    x = above < x ? above : x;
+    return below > x ? below : x;
+#endif
+}
+
+template <typename Real>
+inline Real sum_of_lanes(Vector<Real> x) {
+    Real sum = 0;
+    for (int lane = 0; lane < VectorOf<Real>::lanes; ++lane) sum += x[lane];
+    return sum;
+}
+
 // Bits of lanes, all of whose bits are set or none, the first lane's first.
 template <typename Lanes>
 inline std::uint64_t bits(Lanes lanes) {
