@@ -9,6 +9,9 @@ from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 from eddies.report.figures import GUIDE, letter, panels, styled
 from eddies.report.page import Metric, Section
 
+# What stands for no change at all, as of a method whose steps are exact, on an axis of logarithms.
+NO_CHANGE = 1e-16
+
 
 @styled
 def convergence(found: Mapping[str, float | str], trials: Mapping[str, Mapping[str, np.ndarray]], size: str) -> Figure:
@@ -18,10 +21,11 @@ def convergence(found: Mapping[str, float | str], trials: Mapping[str, Mapping[s
     """
     figure, ((change, cost),) = panels(1, 2, (4.6, 3.2))
     for name, columns in trials.items():
-        change.loglog(columns["size"][:-1], columns["difference"][1:], marker="o", markersize=3, label=name)
+        changes = np.maximum(columns["difference"][1:], NO_CHANGE)
+        change.loglog(columns["size"][:-1], changes, marker="o", markersize=3, label=name)
         cost.loglog(columns["size"], columns["seconds_per_turnover"], marker="o", markersize=3)
     change.axhline(found["tolerance"], color=GUIDE, linestyle="--", linewidth=1.1)
-    change.plot(found["size"], found["difference"], marker="o", markersize=9, fillstyle="none", color="black")
+    change.plot(found["size"], max(found["difference"], NO_CHANGE), marker="o", markersize=9, fillstyle="none", color="black")
     cost.plot(found["size"], found["seconds_per_turnover"], marker="o", markersize=9, fillstyle="none", color="black")
     change.set(title="Change by halving the step", xlabel=size, ylabel="rms change / rms velocity")
     cost.set(title="Cost", xlabel=size, ylabel="seconds a turnover")
