@@ -1,6 +1,6 @@
 """Keeps the trained weights of a run with the package, without what only their report shows.
 
-    .venv/bin/python docs/weights.py runs/hit-small        # src/eddies/weights/hit-small.h5
+    .venv/bin/python docs/weights.py runs/hit-small/paper hit-small-paper    # src/eddies/weights/hit-small-paper.h5
 """
 
 import sys
@@ -16,17 +16,17 @@ from eddies.scene.model import WEIGHTS
 KEPT = ("a_priori", "feature_range")  # tables: errors on their own flow, and the range of what a network was given
 
 
-def keep(run: Path) -> Path:
+def keep(run: Path, name: str) -> Path:
     """Write the file of the package; returns its path."""
     comm, source = MPI.COMM_SELF, run / "model.h5"
     description, weights = load_weights(comm, source, "model")
     with open_product(comm, source, "model") as file:
         provenance = read_provenance(file)
     tables = {name: table for name, table in load_tables(source).items() if name in KEPT}
-    target = WEIGHTS / f"{run.name}.h5"
+    target = WEIGHTS / f"{name}.h5"
     save_weights(comm, target, "model", description, weights, provenance, tables)
     return target
 
 
 if __name__ == "__main__":
-    print(keep(Path(sys.argv[1])))
+    print(keep(Path(sys.argv[1]), sys.argv[2]))
