@@ -33,7 +33,9 @@ PAGES = (HERE.parent / "README.md", *sorted(HERE.glob("*.md")))
 TABLE = re.compile(r"(<!-- table of ([\w-]+): ([^\n]*)\n(.*?)-->\n).*?(?=<!-- end of table -->)", re.DOTALL)
 NUMBERS = re.compile(r"(<!-- numbers of ([\w-]+)\n(.*?)-->\n).*?(?=<!-- end of numbers -->)", re.DOTALL)
 WORDS = MEASURES | {"wall_seconds": "seconds a turnover", "core_seconds": "core seconds a turnover",
-                    "training_seconds": "training (s)", "time_step": "step"}
+                    "training_seconds": "training (s)", "time_step": "step",
+                    "step_integrator": "integrator", "step_size": "step", "step_seconds": "search (s)",
+                    "step_error_twice": "error with twice the step", "step_error": "error", "step_error_half": "with half"}
 FLOOR = "floor"
 
 
@@ -69,10 +71,12 @@ def numbers(run: str, rows: str) -> str:
 
 def number(row: Mapping[str, Any], key: str) -> str:
     """Two digits, or as many as the standard deviation tells where there is one; ratios to three digits after the
-    point; nothing without a number."""
+    point, errors of steps, which hardly differ, to four; a word as it is; nothing without a number."""
     value, spread = row.get(key), row.get(f"{key}_spread")
-    if value is None:
-        return ""
+    if value is None or isinstance(value, str):
+        return value or ""
+    if key.startswith("step_error"):
+        return f"{value:.4f}"
     if key.endswith("_ratio"):
         return f"{value:.3f}" + (f" ± {spread:.3f}" if spread is not None else "")
     if spread is None or spread == 0:

@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from eddies.io.hdf5 import create_product, write_attributes
+from eddies.io.hdf5 import create_product, write_attributes, write_table
 from eddies.io.weights import save_weights
 from eddies.measures import MEASURES
 from eddies.scene.scene import load_scene
 from eddies.workflows import variant_rows as module
-from eddies.workflows.variant_rows import BEFORE, THROUGH_KERNEL, before, notes, row, step_costs, together, why_not
+from eddies.workflows.variant_rows import (BEFORE, SEARCH, THROUGH_KERNEL, before, notes, row, step_costs, together,
+                                           why_not)
 from eddies.workflows.variants import Place
 from tests.small_scene import TINY
 
@@ -99,9 +100,12 @@ def test_what_a_model_cost_is_what_its_file_says(comm, tmp_path, change, stored)
     description = {"training": phases} if "training_seconds" in stored else {}
     save_weights(comm, tmp_path / "model.h5", "model", description, {"a": np.ones(3), "b": np.ones((2, 2))}, {})
     with create_product(comm, tmp_path / "step.h5", "step", {}) as file:
-        write_attributes(file.create_group("found"), {"seconds": 7.5})
+        write_attributes(file.create_group("found"), {"integrator": "rk2", "size": 0.1, "seconds": 7.5, "error": 0.3,
+                                                      "error_with_half": 0.2})
+        write_table(file, "trials/rk2", {"size": [0.4, 0.2, 0.1, 0.05], "error": [0.6, 0.5, 0.3, 0.2]})
     known = {"weights": 7, "training_seconds": 2.0, "training_steps": 6}
-    assert before(Place(scene, tmp_path), comm) == {key: known[key] for key in stored} | {"step_seconds": 7.5}
+    search = dict(zip(SEARCH, ("rk2", 0.1, 7.5, 0.3, 0.2, 0.5)))
+    assert before(Place(scene, tmp_path), comm) == {key: known[key] for key in stored} | search
     given = replace(scene, simulation=replace(scene.simulation, step=0.05))
     assert "step_seconds" not in before(Place(given, tmp_path), comm)
     assert set(before(Place(scene, tmp_path), comm)) <= set(BEFORE)

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from eddies.analysis.accuracy import accuracy
-from eddies.io.hdf5 import open_product
-from eddies.io.provenance import environment, product_attributes, read_json
+from eddies.io.hdf5 import open_product, read_attributes, read_table
+from eddies.io.provenance import environment, read_json
 from eddies.cores import threads
 from eddies.measures import MEASURES
 from eddies.parallel.communicator import Comm
@@ -24,8 +24,11 @@ from eddies.workflows.variants import Place
 
 COST = ("seconds_per_step", "time_step", "wall_seconds", "wall_seconds_low", "wall_seconds_high", "core_seconds",
         "ranks")
-# What comes before a rollout: learned numbers, their training, and seconds in which its step was found.
-BEFORE = ("weights", "training_seconds", "training_steps", "step_seconds")
+# Of the search for the step: integrator and step ("etdrk4" and a Courant number on a grid), seconds of the search, and
+# errors of the short rollouts with it, half and twice of it.
+SEARCH = ("step_integrator", "step_size", "step_seconds", "step_error", "step_error_half", "step_error_twice")
+# What comes before a rollout: learned numbers, their training, and the search for its step.
+BEFORE = ("weights", "training_seconds", "training_steps", *SEARCH)
 # Measured on gradients that the kernel makes of the particles, of the model and of the truth.
 THROUGH_KERNEL = ("qr_kl", "qr_kl_floor")
 COLUMNS = ("name", "label", "method", "kind", "on_grid", "status", "stopped_at", "realisations", *MEASURES, "end",
@@ -80,10 +83,10 @@ def together(realised: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return found
 
 
-def before(place: Place, alone: Comm) -> dict[str, float | int]:
+def before(place: Place, alone: Comm) -> dict[str, Any]:
     """Of BEFORE what there is: of the model, where the rollout has one, the training as it is stored with its weights,
     whoever trained them; nothing of what is not stored."""
-    found: dict[str, float | int] = {}
+    found: dict[str, Any] = {}
     path = place.directory / MODEL
     if place.scene.needs_model and path.exists():
         with open_product(alone, path, "model") as file:
@@ -94,8 +97,18 @@ def before(place: Place, alone: Comm) -> dict[str, float | int]:
             found["training_steps"] = sum(phase["steps"] for phase in phases)
     step = place.scene.step_file or place.directory / STAGES["find-step"].file
     if place.scene.simulation.step == CONVERGED and step.exists():
-        found["step_seconds"] = product_attributes(step, "found")["seconds"]
+        found |= searched(step, alone)
     return found
+
+
+def searched(path: Path, alone: Comm) -> dict[str, Any]:
+    """SEARCH as the file of a step has it; no error of twice the step where that was not tried, or went wrong."""
+    with open_product(alone, path, "step") as file:
+        step = read_attributes(file, "found")
+        tried = read_table(file, f"trials/{step['integrator']}")
+    twice = tried["error"][np.isclose(tried["size"], 2 * step["size"])]
+    return dict(zip(SEARCH, (step["integrator"], step["size"], step["seconds"], step["error"], step["error_with_half"],
+                             float(twice[0]) if len(twice) else None)))
 
 
 def has_own_kernel(scene: Scene, variant: Scene) -> bool:
