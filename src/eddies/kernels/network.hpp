@@ -237,6 +237,18 @@ class Network {
 
     int layers() const { return static_cast<int>(widths_.size()) - 1; }
 
+    // Rows of all tiles: how far a row is from the one before, and a tile.
+    struct BlockRows {
+        const Real* first;
+        std::ptrdiff_t apart, next;
+        BlockRows from(int row) const { return {first + row * apart, apart, next}; }
+    };
+
+    BlockRows block(std::vector<Rows<Real>>& rows, int layer) const {
+        const TileRows<Real> first = tile(rows, layer, 0);
+        return {first.first, first.apart, tile(rows, layer, TILE<Real>).first - first.first};
+    }
+
     // The rows of a tile that begins with point `p`.
     TileRows<Real> tile(std::vector<Rows<Real>>& rows, int layer, int p) const {
         if (layer == 0 || layer == layers()) return {rows[layer][0] + p, BLOCK};
@@ -247,36 +259,40 @@ class Network {
     void add_by_parameters(int layer, Real* by_parameters) {
         constexpr int lanes = VectorOf<Real>::lanes;
         const int inputs = widths_[layer], outputs = widths_[layer + 1];
+        const BlockRows deltas = block(deltas_, layer + 1), given = block(values_, layer);
         in_groups<2>(outputs, [&](auto rows, int output) {
             in_groups<4>(inputs, [&](auto columns, int input) {
-                add_products<rows, columns>(layer, output, input, by_parameters + (output * inputs + input) * lanes);
+                add_products<rows, columns>(deltas.from(output), given.from(input), inputs,
+                                            by_parameters + (output * inputs + input) * lanes);
             });
         });
         by_parameters += inputs * outputs * lanes;
-        for (int p = 0; p < BLOCK; p += TILE<Real>) {
-            const TileRows<Real> deltas = tile(deltas_, layer + 1, p);
-            for (int o = 0; o < outputs; ++o)
-                for (int q = 0; q < TILE<Real>; q += lanes)
-                    vector_at(by_parameters + o * lanes) += vector_at(deltas[o] + q);
+        for (int o = 0; o < outputs; ++o) {
+            Vector<Real> sum = vector_at(by_parameters + o * lanes);
+            for (int p = 0; p < BLOCK; p += lanes)
+                sum += vector_at(deltas.from(o).first + p / TILE<Real> * deltas.next + p % TILE<Real>);
+            vector_at(by_parameters + o * lanes) = sum;
         }
     }
 
-    // Of some outputs and some inputs.
+    // Of some outputs and some inputs; weights of the next output are `inputs` further.
     template <int rows, int columns>
-    void add_products(int layer, int output, int input, Real* by_weights) {
+    static void add_products(BlockRows deltas, BlockRows given, int inputs, Real* by_weights) {
         using V = Vector<Real>;
         constexpr int lanes = VectorOf<Real>::lanes;
-        const int inputs = widths_[layer];
         V sums[rows][columns];
         for (int row = 0; row < rows; ++row)
             for (int i = 0; i < columns; ++i) sums[row][i] = vector_at(by_weights + (row * inputs + i) * lanes);
-        for (int p = 0; p < BLOCK; p += TILE<Real>) {
-            const TileRows<Real> deltas = tile(deltas_, layer + 1, p), given = tile(values_, layer, p);
+        for (int p = 0; p < BLOCK; p += TILE<Real>, deltas.first += deltas.next, given.first += given.next)
+#pragma GCC unroll 4
             for (int q = 0; q < TILE<Real>; q += lanes)
-                for (int row = 0; row < rows; ++row)
+#pragma GCC unroll 2
+                for (int row = 0; row < rows; ++row) {
+                    const V delta = vector_at(deltas.first + row * deltas.apart + q);
+#pragma GCC unroll 4
                     for (int i = 0; i < columns; ++i)
-                        sums[row][i] += vector_at(deltas[output + row] + q) * vector_at(given[input + i] + q);
-        }
+                        sums[row][i] += delta * vector_at(given.first + i * given.apart + q);
+                }
         for (int row = 0; row < rows; ++row)
             for (int i = 0; i < columns; ++i) vector_at(by_weights + (row * inputs + i) * lanes) = sums[row][i];
     }
