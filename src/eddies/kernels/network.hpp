@@ -30,7 +30,7 @@ constexpr int TOGETHER = 4;
 
 // tanh(x) of y = x TANH_UNIT as y P(y^2) / Q(y^2), a minimax fit up to x = 8, and beyond as there; to 4e-7, and 6e-7
 // with round-off. In that unit the highest powers of both have the factor 1, which saves a product each. Two vectors
-// share a division.
+// share a division: what is not a number in a lane of one is not one in the other either.
 template <>
 constexpr double TANH_UNIT<float> = 0.021518350198783773;
 
@@ -84,8 +84,10 @@ constexpr int TILE_VECTORS = 4, MOST_ROWS = 6;
 #elif defined(__AVX2__)
 constexpr int TILE_VECTORS = 2, MOST_ROWS = 6;
 #else
-constexpr int TILE_VECTORS = 1, MOST_ROWS = 4;
+constexpr int TILE_VECTORS = 2, MOST_ROWS = 2;
 #endif
+// Those that share a division are of one row: no result depends on what stands beyond the last one.
+static_assert(TILE_VECTORS % 2 == 0);
 
 template <typename Real>
 constexpr int TILE = TILE_VECTORS * VectorOf<Real>::lanes;
