@@ -84,10 +84,8 @@ constexpr int TILE_VECTORS = 4, MOST_ROWS = 6;
 #elif defined(__AVX2__)
 constexpr int TILE_VECTORS = 2, MOST_ROWS = 6;
 #else
-constexpr int TILE_VECTORS = 2, MOST_ROWS = 2;
+constexpr int TILE_VECTORS = 1, MOST_ROWS = 4;
 #endif
-// Those that share a division are of one row: no result depends on what stands beyond the last one.
-static_assert(TILE_VECTORS % 2 == 0);
 
 template <typename Real>
 constexpr int TILE = TILE_VECTORS * VectorOf<Real>::lanes;
@@ -188,8 +186,8 @@ class Network {
             for (Real& bias : biases_.back()) bias = static_cast<Real>(unit * *parameters++);
         }
         for (const int width : widths_) {
-            values_.emplace_back(width + 1);  // one more, as tanh is taken of several vectors
-            deltas_.emplace_back(width);
+            values_.emplace_back(held(width));
+            deltas_.emplace_back(held(width));
         }
     }
 
@@ -206,7 +204,7 @@ class Network {
                 const TileRows<Real> result = tile(values_, layer + 1, p);
                 forth_[layer].multiply(biases_[layer].data(), tile(values_, layer, p), result);
                 if (layer + 1 == layers()) break;
-                const int count = widths_[layer + 1] * TILE<Real>;  // and up to what follows them, in their last row
+                const int count = held(widths_[layer + 1]) * TILE<Real>;
                 for (int q = 0; q < count; q += TOGETHER * VectorOf<Real>::lanes) tanh_of(result.first + q);
             }
     }
@@ -239,6 +237,9 @@ class Network {
 
     int layers() const { return static_cast<int>(widths_.size()) - 1; }
 
+    // Rows of a tile: so many that tanh is taken of whole ones; those beyond the width are zero, as tanh leaves them.
+    static int held(int width) { return (width + TOGETHER - 1) / TOGETHER * TOGETHER; }
+
     // Rows of all tiles: how far a row is from the one before, and a tile.
     struct BlockRows {
         const Real* first;
@@ -254,7 +255,7 @@ class Network {
     // The rows of a tile that begins with point `p`.
     TileRows<Real> tile(std::vector<Rows<Real>>& rows, int layer, int p) const {
         if (layer == 0 || layer == layers()) return {rows[layer][0] + p, BLOCK};
-        return {rows[layer][0] + p * widths_[layer], TILE<Real>};
+        return {rows[layer][0] + p * held(widths_[layer]), TILE<Real>};
     }
 
     // Adds what a block's points give to the gradient by weights and biases of a layer.
