@@ -153,6 +153,24 @@ def test_what_a_summand_does_not_take_is_told(library, kind, numbers, parity, pa
         pairs.sums([Summand(kind, numbers, (1.0,) * parity, scalar)], [np.zeros(parameters)])
 
 
+@pytest.mark.parametrize("dtype, error", [(np.float32, 6e-7), (np.float64, 1e-15)], ids=["single", "double"])
+def test_tanh_of_a_network(library, dtype, error):
+    """Of numbers that particles carry, each with one neighbour: a fit to 4e-7 and its round-off; to that of a sum with
+    1 in double precision."""
+    corner = np.indices((10, 10, 10)).reshape(3, -1).T * LENGTH / 10
+    position = np.concatenate([corner, corner + 0.1])
+    number = np.linspace(-12, 12, len(position)).astype(dtype)
+    number[:8] = 0, 1e-30, -1e-30, 1e-4, 1e4, -1e4, 7.999, 8.001
+    space = PairSpace(LENGTH, True, 0.2, 1.0, 1.0, mutual=False)
+    pairs = CompiledPairs(library, space, position, np.zeros_like(position), number[None].astype(float),
+                          np.ones(len(position), bool), dtype)
+    # One output of a layer of one, that is told both numbers and takes that of the particle itself.
+    network = Summand("pair-network", (1, 0, 1, 0, 0, 0, 0, 0, 0, 1), (1.0,))
+    found = pairs.sums([network], [np.array([1.0, 0, 0, 1, 0])])[0][0]
+    expected = np.tanh(number.astype(float))
+    assert np.abs(found - expected).max() <= error and np.abs(found).max() <= 1
+
+
 def kernel_sum(kernel):
     return Summand("kernel-sum", told_kernel(kernel.support, kernel.pieces.numpy()), (1.0,))
 

@@ -30,7 +30,7 @@ constexpr int TOGETHER = 4;
 
 // tanh(x) of y = x TANH_UNIT as y P(y^2) / Q(y^2), a minimax fit up to x = 8, and beyond as there; to 4e-7, and 6e-7
 // with round-off. In that unit the highest powers of both have the factor 1, which saves a product each. Two vectors
-// share a division.
+// share a division: what is not a number in a lane of one is not one in the other either.
 template <>
 constexpr double TANH_UNIT<float> = 0.021518350198783773;
 
@@ -78,13 +78,13 @@ inline void tanh_of(double* numbers) {
 }
 
 // A layer takes a tile of points at a time, so that what it reads stays in the first-level cache, and a group of rows of
-// its weights, so that their sums stay in registers; likewise the gradient by weights, of rows and vectors of columns.
+// its weights, so that their sums stay in registers.
 #if defined(__AVX512F__)
-constexpr int TILE_VECTORS = 4, MOST_ROWS = 6, MOST_PRODUCTS = 4, MOST_VECTORS = 3;
+constexpr int TILE_VECTORS = 4, MOST_ROWS = 6;
 #elif defined(__AVX2__)
-constexpr int TILE_VECTORS = 2, MOST_ROWS = 6, MOST_PRODUCTS = 4, MOST_VECTORS = 3;
+constexpr int TILE_VECTORS = 2, MOST_ROWS = 6;
 #else
-constexpr int TILE_VECTORS = 1, MOST_ROWS = 4, MOST_PRODUCTS = 4, MOST_VECTORS = 1;
+constexpr int TILE_VECTORS = 1, MOST_ROWS = 4;
 #endif
 
 template <typename Real>
@@ -173,9 +173,7 @@ template <typename Real>
 class Network {
    public:
     // Throws std::invalid_argument where the count is another than that of the parameters.
-    Network(std::vector<int> widths, const double* parameters, std::int64_t count)
-        : widths_(std::move(widths)),
-          turned_(BLOCK * padded_to_vectors(*std::max_element(widths_.begin(), widths_.end()))) {
+    Network(std::vector<int> widths, const double* parameters, std::int64_t count) : widths_(std::move(widths)) {
         for (int layer = 0; layer < layers(); ++layer) count -= (widths_[layer] + 1) * widths_[layer + 1];
         if (count != 0) throw std::invalid_argument("parameters of a network");
         for (int layer = 0; layer < layers(); ++layer) {
@@ -188,8 +186,8 @@ class Network {
             for (Real& bias : biases_.back()) bias = static_cast<Real>(unit * *parameters++);
         }
         for (const int width : widths_) {
-            values_.emplace_back(padded_to_vectors(width) + 1);  // as much as is read of whole vectors
-            deltas_.emplace_back(width);
+            values_.emplace_back(held(width));
+            deltas_.emplace_back(held(width));
         }
     }
 
@@ -206,16 +204,18 @@ class Network {
                 const TileRows<Real> result = tile(values_, layer + 1, p);
                 forth_[layer].multiply(biases_[layer].data(), tile(values_, layer, p), result);
                 if (layer + 1 == layers()) break;
-                const int count = widths_[layer + 1] * TILE<Real>;  // and up to what follows them, in their last row
+                const int count = held(widths_[layer + 1]) * TILE<Real>;
                 for (int q = 0; q < count; q += TOGETHER * VectorOf<Real>::lanes) tanh_of(result.first + q);
             }
     }
 
-    // After `forward`: from the gradient by outputs those by parameters, which are added, and by features.
+    // After `forward`: from the gradient by outputs those by parameters, added to a vector for each, and by features.
     void backward(Real* by_parameters, bool features_too) {
-        for (int layer = 0; layer < layers(); ++layer) by_parameters += (widths_[layer] + 1) * widths_[layer + 1];
+        constexpr int lanes = VectorOf<Real>::lanes;
+        for (int layer = 0; layer < layers(); ++layer)
+            by_parameters += lanes * (widths_[layer] + 1) * widths_[layer + 1];
         for (int layer = layers() - 1; layer >= 0; --layer) {
-            by_parameters -= (widths_[layer] + 1) * widths_[layer + 1];
+            by_parameters -= lanes * (widths_[layer] + 1) * widths_[layer + 1];
             add_by_parameters(layer, by_parameters);
             if (layer == 0 && !features_too) return;
             for (int p = 0; p < BLOCK; p += TILE<Real>) {
@@ -234,88 +234,70 @@ class Network {
     std::vector<Matrix<Real>> forth_, back_;  // back: (inputs, outputs)
     std::vector<std::vector<Real>> biases_;
     std::vector<Rows<Real>> values_, deltas_;  // of hidden layers tile by tile
-    Aligned<Real> turned_;                     // (BLOCK, inputs padded)
 
     int layers() const { return static_cast<int>(widths_.size()) - 1; }
 
-    static int padded_to_vectors(int width) {
-        constexpr int lanes = VectorOf<Real>::lanes;
-        return (width + lanes - 1) / lanes * lanes;
+    // Rows of a tile: so many that tanh is taken of whole ones; those beyond the width are zero, as tanh leaves them.
+    static int held(int width) { return (width + TOGETHER - 1) / TOGETHER * TOGETHER; }
+
+    // Rows of all tiles: how far a row is from the one before, and a tile.
+    struct BlockRows {
+        const Real* first;
+        std::ptrdiff_t apart, next;
+        BlockRows from(int row) const { return {first + row * apart, apart, next}; }
+    };
+
+    BlockRows block(std::vector<Rows<Real>>& rows, int layer) const {
+        const TileRows<Real> first = tile(rows, layer, 0);
+        return {first.first, first.apart, tile(rows, layer, TILE<Real>).first - first.first};
     }
 
     // The rows of a tile that begins with point `p`.
     TileRows<Real> tile(std::vector<Rows<Real>>& rows, int layer, int p) const {
         if (layer == 0 || layer == layers()) return {rows[layer][0] + p, BLOCK};
-        return {rows[layer][0] + p * widths_[layer], TILE<Real>};
+        return {rows[layer][0] + p * held(widths_[layer]), TILE<Real>};
     }
 
     // Adds what a block's points give to the gradient by weights and biases of a layer.
     void add_by_parameters(int layer, Real* by_parameters) {
         constexpr int lanes = VectorOf<Real>::lanes;
         const int inputs = widths_[layer], outputs = widths_[layer + 1];
-        turn(layer);
-        in_groups<MOST_VECTORS>(padded_to_vectors(inputs) / lanes, [&](auto vectors, int first) {
-            in_groups<MOST_PRODUCTS>(outputs, [&](auto rows, int output) {
-                add_products<rows, vectors>(layer, output, first * lanes, by_parameters + output * inputs);
+        const BlockRows deltas = block(deltas_, layer + 1), given = block(values_, layer);
+        in_groups<2>(outputs, [&](auto rows, int output) {
+            in_groups<4>(inputs, [&](auto columns, int input) {
+                add_products<rows, columns>(deltas.from(output), given.from(input), inputs,
+                                            by_parameters + (output * inputs + input) * lanes);
             });
         });
+        by_parameters += inputs * outputs * lanes;
         for (int o = 0; o < outputs; ++o) {
-            Vector<Real> sum{};
-            for (int p = 0; p < BLOCK; p += TILE<Real>)
-                for (int q = 0; q < TILE<Real>; q += lanes) sum += vector_at(tile(deltas_, layer + 1, p)[o] + q);
-            by_parameters[inputs * outputs + o] += sum_of_lanes<Real>(sum);
+            Vector<Real> sum = vector_at(by_parameters + o * lanes);
+            for (int p = 0; p < BLOCK; p += lanes)
+                sum += vector_at(deltas.from(o).first + p / TILE<Real> * deltas.next + p % TILE<Real>);
+            vector_at(by_parameters + o * lanes) = sum;
         }
     }
 
-    // Inputs of a layer point by point; what stands beyond the last means nothing.
-    void turn(int layer) {
-        constexpr int lanes = VectorOf<Real>::lanes, group = GROUP<Real>;
-        const int padded = padded_to_vectors(widths_[layer]);
-        for (int p = 0; p < BLOCK; p += TILE<Real>) {
-            const TileRows<Real> given = tile(values_, layer, p);
-            for (int begin = 0; begin < padded; begin += group)
-                for (int q = 0; q < TILE<Real>; q += lanes) {
-                    Vector<Real> part[group];
-#pragma GCC unroll 8
-                    for (int i = 0; i < group; ++i) part[i] = vector_at(given[begin + i] + q);
-                    transpose<Real>(part);
-                    const auto* numbers = reinterpret_cast<const Real*>(part);
-#pragma GCC unroll 16
-                    for (int point = 0; point < lanes; ++point)
-                        std::memcpy(turned_.data() + (p + q + point) * padded + begin,
-                                    numbers + point % group * lanes + point / group * group, group * sizeof(Real));
-                }
-        }
-    }
-
-    // Of some outputs and some vectors of inputs.
-    template <int rows, int vectors>
-    void add_products(int layer, int output, int input, Real* by_weights) {
+    // Of some outputs and some inputs; weights of the next output are `inputs` further.
+    template <int rows, int columns>
+    static void add_products(BlockRows deltas, BlockRows given, int inputs, Real* by_weights) {
         using V = Vector<Real>;
         constexpr int lanes = VectorOf<Real>::lanes;
-        const int inputs = widths_[layer], padded = padded_to_vectors(inputs);
-        V sums[rows][vectors]{};
-        const Real* given = turned_.data() + input;
-        for (int p = 0; p < BLOCK; p += TILE<Real>) {
-            const TileRows<Real> deltas = tile(deltas_, layer + 1, p);
-            const Real* delta = deltas[output];
-#pragma GCC unroll 1
-            for (int q = 0; q < TILE<Real>; ++q, ++delta, given += padded) {
-#pragma GCC unroll 4
-                for (int row = 0; row < rows; ++row)
-#pragma GCC unroll 4
-                    for (int v = 0; v < vectors; ++v)
-                        sums[row][v] += delta[row * deltas.apart] * vector_at(given + v * lanes);
-            }
-        }
+        V sums[rows][columns];
         for (int row = 0; row < rows; ++row)
-            for (int v = 0; v < vectors; ++v) {
-                const int first = input + v * lanes;
-                Real* place = by_weights + row * inputs + first;
-                if (first + lanes <= inputs) add_unaligned(place, sums[row][v]);
-                else
-                    for (int lane = 0; first + lane < inputs; ++lane) place[lane] += sums[row][v][lane];
-            }
+            for (int i = 0; i < columns; ++i) sums[row][i] = vector_at(by_weights + (row * inputs + i) * lanes);
+        for (int p = 0; p < BLOCK; p += TILE<Real>, deltas.first += deltas.next, given.first += given.next)
+#pragma GCC unroll 4
+            for (int q = 0; q < TILE<Real>; q += lanes)
+#pragma GCC unroll 2
+                for (int row = 0; row < rows; ++row) {
+                    const V delta = vector_at(deltas.first + row * deltas.apart + q);
+#pragma GCC unroll 4
+                    for (int i = 0; i < columns; ++i)
+                        sums[row][i] += delta * vector_at(given.first + i * given.apart + q);
+                }
+        for (int row = 0; row < rows; ++row)
+            for (int i = 0; i < columns; ++i) vector_at(by_weights + (row * inputs + i) * lanes) = sums[row][i];
     }
 };
 

@@ -162,7 +162,7 @@ template <typename Real>
 class Worker {
    public:
     std::vector<std::unique_ptr<Summand<Real>>> summands;
-    std::vector<std::vector<Real>> by_parameters;
+    std::vector<Aligned<Real>> by_parameters;  // a vector for each
 
     // `results` (count, width) in order of place are added to: sums, or where their gradients `by_sums` (count, width
     // of sums) are given, those by position, velocity and scalars, unless null.
@@ -172,7 +172,7 @@ class Worker {
           width_(padded<Real>(components_of(number, given))), sums_(width_), others_(width_) {
         for (std::int64_t s = 0; s < number; ++s) {
             summands.push_back(summand<Real>(given[s]));
-            by_parameters.emplace_back(given[s].parameters_count);
+            by_parameters.emplace_back(given[s].parameters_count * VectorOf<Real>::lanes);
         }
         const Particles& particles = sorted.given;
         radius_ = particles.radius;
@@ -413,9 +413,13 @@ void take_all(const Sorted<Real>& sorted, std::int64_t number, const Given* give
                 worker.finish();
                 if (!by_sums) continue;
                 double* place = by_task.data() + t * parameters;
-                for (auto& found : worker.by_parameters) {
-                    place = std::copy(found.begin(), found.end(), place);
-                    std::fill(found.begin(), found.end(), Real(0));
+                for (std::int64_t s = 0; s < number; ++s) {
+                    Real* lane = worker.by_parameters[s].data();
+                    for (std::int64_t q = 0; q < given[s].parameters_count; ++q, ++place)
+                        for (int end = 0; end < VectorOf<Real>::lanes; ++end, ++lane) {
+                            *place += *lane;
+                            *lane = 0;
+                        }
                 }
             }
         }

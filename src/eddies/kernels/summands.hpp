@@ -89,7 +89,7 @@ class Summand {
     virtual void values(const Block<Real>& pairs, Components<Real> found) = 0;
 
     // From the gradient by components: to be added to that by what the pairs carry, unless that is null, and to that by
-    // parameters.
+    // parameters, a vector for each.
     virtual void gradients(const Block<Real>&, GivenComponents<Real>, ByPairs<Real>*, Real*) {}
 };
 
@@ -195,7 +195,7 @@ class FormulaSummand : public Summand<Real> {
             for (int k = 0; k < factors; ++k) sums[k] += some.parameter[k].by;
             if constexpr (std::is_same_v<Column<Real>, Place<Real>>) some.add_to(*by, scalar_, p);
         }
-        for (int k = 0; k < factors; ++k) by_parameters[k] += sum_of_lanes<Real>(sums[k]);
+        for (int k = 0; k < factors; ++k) vector_at(by_parameters + k * lanes) += sums[k];
     }
 };
 

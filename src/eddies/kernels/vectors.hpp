@@ -89,9 +89,13 @@ template <typename Real>
 inline Vector<Real> clipped(Vector<Real> x, Real largest) {
     const Vector<Real> above = Vector<Real>{} + largest, below = -above;
 #if defined(__AVX512F__)
-    if constexpr (sizeof(Real) == 4)
-        return (Vector<Real>)_mm512_max_ps((__m512)below, _mm512_min_ps((__m512)above, (__m512)x));
-    else return (Vector<Real>)_mm512_max_pd((__m512d)below, _mm512_min_pd((__m512d)above, (__m512d)x));
+    if constexpr (sizeof(Real) == 4) {
+        const __m512 least = _mm512_maskz_min_ps(0xffff, (__m512)above, (__m512)x);
+        return (Vector<Real>)_mm512_maskz_max_ps(0xffff, (__m512)below, least);
+    } else {
+        const __m512d least = _mm512_maskz_min_pd(0xff, (__m512d)above, (__m512d)x);
+        return (Vector<Real>)_mm512_maskz_max_pd(0xff, (__m512d)below, least);
+    }
 #elif defined(__AVX2__)
     if constexpr (sizeof(Real) == 4)
         return (Vector<Real>)_mm256_max_ps((__m256)below, _mm256_min_ps((__m256)above, (__m256)x));
@@ -100,13 +104,6 @@ inline Vector<Real> clipped(Vector<Real> x, Real largest) {
     x = above < x ? above : x;
     return below > x ? below : x;
 #endif
-}
-
-template <typename Real>
-inline Real sum_of_lanes(Vector<Real> x) {
-    Real sum = 0;
-    for (int lane = 0; lane < VectorOf<Real>::lanes; ++lane) sum += x[lane];
-    return sum;
 }
 
 // Bits of lanes, all of whose bits are set or none, the first lane's first.
