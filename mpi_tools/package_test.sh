@@ -32,6 +32,6 @@ kernels='from eddies.kernels.library import in_use; print(in_use())'
 [ "$(clean/bin/python -c "$kernels")" = "$("$shared/bin/python" -c "$kernels")" ] ||
     { echo "package_test: the wheel lacks compiled kernels" >&2; exit 1; }
 clean/bin/eddies --version
-clean/bin/eddies run tiny --set kernel.steps=20 --set training.steps=20 > log || { cat log >&2; exit 1; }
+clean/bin/eddies run tiny --unset variant --set kernel.steps=20 --set training.steps=20 > log || { cat log >&2; exit 1; }
 [ -e runs/tiny/report/index.html ]
 echo "package_test: sdist and wheel build, install and run"

@@ -32,7 +32,7 @@ def test_written_scene_reads_back_equal(name, tmp_path):
 
 def test_all_values_survive_writing(tmp_path):
     scene = load_scene(TINY, ['title="a \\"quoted\\" # title"', "tracers.filter_width=0.1234567890123456",
-                                "simulation.injection=1e-7", "model.pairs.hidden=[1, 2, 3]", "simulation.start=0"])
+                              "simulation.injection=1e-7", "model.pairs.hidden=[1, 2, 3]", "simulation.start=0"])
     assert load_scene(scene_file(tmp_path, scene.to_toml())) == scene
     assert scene.simulation.start == 0.0
     assert scene.model.settings["pairs"].hidden == (1, 2, 3)

@@ -309,7 +309,7 @@ class SilentComm:
 
 def test_one_rank_sends_nothing(tmp_path):
     scene = load_scene(TINY, ["flow.cells=16", "spin_up.turnovers=0.05", "tracers.turnovers=0.05",
-                                "tracers.field_cells=8"])
+                              "tracers.field_cells=8"])
     # Any reduction, exchange or transpose would be an AttributeError.
     dns.run(scene, SilentComm(), tmp_path)
     assert (tmp_path / "ground_truth.h5").exists()

@@ -200,7 +200,7 @@ def test_what_fits_is_kept_and_what_changed_is_redone(comm, run_directory, capfd
 def test_a_trained_model_runs_on_another_flow(comm, run_directory, tmp_path):
     """At twice the Mach number, with nothing of that flow but its scales; all of it is unseen."""
     slower = load_scene(TINY, ["flow.sound_speed=11", "seed=2", "tracers.turnovers=0.25", "kernel.steps=4",
-                                 "simulation.turnovers=0.1", f"model.path={run_directory}"])
+                               "simulation.turnovers=0.1", f"model.path={run_directory}"])
     if comm.rank == 0:
         (tmp_path / "slower.toml").write_text(dataclasses.replace(slower, training=None).to_toml())
     comm.Barrier()

@@ -102,8 +102,8 @@ def test_a_step_is_confirmed_on_all_realisations(folder):
     (folder / "steps.toml").write_text('base = "base.toml"\nrealisations = [5, 6]\nsimulation.step = "converged"\n'
                                        "[variant.own]\n[variant.other]\nflow.viscosity = 0.2\n")
     scene = load_scene("steps.toml")
-    named = {str(step.directory): step.scene.simulation.confirmed_on for step in steps(scene, scene.stages_of_all,
-                                                                                      scene.directory)}
+    named = {str(step.directory): step.scene.simulation.confirmed_on
+             for step in steps(scene, scene.stages_of_all, scene.directory)}
     assert named["runs/steps/own"] == ("runs/steps/realisation-5", "runs/steps/realisation-6")
     assert named["runs/steps/other"] is None and named["runs/steps/own/realisation-5"] is None
 

@@ -25,8 +25,8 @@ def convergence(found: Mapping[str, float | str], trials: Mapping[str, Mapping[s
         change.loglog(columns["size"][:-1], changes, marker="o", markersize=3, label=name)
         cost.loglog(columns["size"], columns["seconds_per_turnover"], marker="o", markersize=3)
     change.axhline(found["tolerance"], color=GUIDE, linestyle="--", linewidth=1.1)
-    change.plot(found["size"], max(found["difference"], NO_CHANGE), marker="o", markersize=9, fillstyle="none", color="black")
-    cost.plot(found["size"], found["seconds_per_turnover"], marker="o", markersize=9, fillstyle="none", color="black")
+    for axis, value in ((change, max(found["difference"], NO_CHANGE)), (cost, found["seconds_per_turnover"])):
+        axis.plot(found["size"], value, marker="o", markersize=9, fillstyle="none", color="black")
     change.set(title="Change by halving the step", xlabel=size, ylabel="rms change / rms velocity")
     cost.set(title="Cost", xlabel=size, ylabel="seconds a turnover")
     for axis in (change, cost):

@@ -101,7 +101,7 @@ def test_particles_of_a_forced_rollout_are_told_of_shorter_steps():
 
 def test_stages_tell_what_concerns_them():
     scene = load_scene(TINY, ["flow.sound_speed=4", 'model.terms=["pairs", "density-flux", "continuity"]',
-                                "model.continuity.diffusion=0.1"])
+                              "model.continuity.diffusion=0.1"])
     by_stage = {stage: list(stage_warnings(scene, [stage])) for stage in scene.stages}
     assert [stage for stage, lines in by_stage.items() if lines] == ["dns", "train"]
     assert sum(by_stage.values(), []) == list(warnings(scene, 1))

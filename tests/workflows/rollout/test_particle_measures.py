@@ -8,7 +8,7 @@ from eddies.particles.flow_units import ReferenceScales
 from eddies.particles.forms import Average
 from eddies.particles.smoothing_kernels import CubicSpline
 from eddies.workflows.rollout.particle_measures import (FieldsOfParticles, ParticleSpectra, ReconstructedFields,
-                                                           WithGradients)
+                                                        WithGradients)
 from tests.particles.configurations import positions
 from tests.validation import filtered_fields
 

@@ -42,7 +42,7 @@ def method_of_step(scene: Scene, step: Step | None, truth: GroundTruth, start: i
         scene = replace(scene, time=replace(scene.time, courant=step.size))
     elif step is not None:
         scene = replace(scene, simulation=replace(settings, integrator=step.integrator, step=step.size, step_from=None,
-                                                     confirmed_on=None))
+                                                    confirmed_on=None))
     kind = load(settings.method) if is_path(settings.method) else METHODS[settings.method]
     method = kind(scene, truth, start, directory, device)
     if step is not None and isinstance(method, ParticleRun):
