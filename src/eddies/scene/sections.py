@@ -225,10 +225,10 @@ class Kernel(Section):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for key, value in (KERNEL_DEFAULTS | KERNEL_PRESETS.get(self.preset, {})).items():
+        for key, value in (KERNEL_DEFAULTS | KERNEL_PRESETS.get(self.preset or "", {})).items():
             if getattr(self, key) is None:
                 object.__setattr__(self, key, value)
-        if self.final_learning_rate is None:
+        if self.final_learning_rate is None and self.learning_rate is not None:
             object.__setattr__(self, "final_learning_rate", FINAL_RATE * self.learning_rate)
         object.__setattr__(self, "preset", None)
         if not self.positive and self.form != "average":

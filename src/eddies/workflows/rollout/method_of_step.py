@@ -41,8 +41,8 @@ def method_of_step(scene: Scene, step: Step | None, truth: GroundTruth, start: i
     if step is not None and settings.on_grid:
         scene = replace(scene, time=replace(scene.time, courant=step.size))
     elif step is not None:
-        scene = replace(scene, simulation=replace(settings, integrator=step.integrator, step=step.size, step_from=None,
-                                                    confirmed_on=None))
+        given = replace(settings, integrator=step.integrator, step=step.size, step_from=None, confirmed_on=None)
+        scene = replace(scene, simulation=given)
     kind = load(settings.method) if is_path(settings.method) else METHODS[settings.method]
     method = kind(scene, truth, start, directory, device)
     if step is not None and isinstance(method, ParticleRun):
