@@ -77,8 +77,8 @@ inline void tanh_of(double* numbers) {
     }
 }
 
-// A layer takes a tile of points at a time, so that what it reads stays in the first-level cache, and a group of rows of
-// its weights, so that their sums stay in registers.
+// A layer takes a tile of points at a time, so that what it reads stays in the first-level cache, and a group of rows
+// of its weights, so that their sums stay in registers.
 #if defined(__AVX512F__)
 constexpr int TILE_VECTORS = 4, MOST_ROWS = 6;
 #elif defined(__AVX2__)

@@ -1,0 +1,82 @@
+"""Sums over pairs alone, search included, and gradients by the parameters: the preset `paper`, and a network 16-16.
+
+    OMP_NUM_THREADS=1 .venv/bin/python tests/benchmarks/pairs.py [PARTICLES A SIDE] [LIBRARY ...]
+
+Seconds of processor time, the least of several by turns, at random particles with 60 neighbours in single precision;
+and what 64^3 particles take so on two cores. Libraries, as src/eddies/kernels/avx2.so, may be those of another version
+whose calls are the same: results are held against those of the first.
+"""
+
+import argparse
+import ctypes
+import math
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from eddies.kernels.library import in_use, load
+from eddies.kernels.pairs import CompiledPairs, PairSpace, Summand
+
+NEIGHBORS, REPEATS = 60, 7
+
+
+def network(*widths: int) -> np.ndarray:
+    """Parameters."""
+    random = np.random.default_rng(widths)
+    return np.concatenate([random.normal(scale=scale, size=size) for inputs, outputs in zip(widths, widths[1:])
+                           for scale, size in ((inputs**-0.5, inputs * outputs), (0.1, outputs))])
+
+
+HIDDEN = (20, 100, 20)
+# Summands with parameters, and whether each pair is evaluated once.
+MODELS = {
+    "paper": ([(Summand("pair-network", (2, 0, 1, 1, 1, 1, 0, 0, 0, *HIDDEN), (-1.0,) * 6), network(5, *HIDDEN, 2)),
+               (Summand("eddy-viscosity", (0, 0.1, 0, 0, 1), (-1.0,) * 3), np.full(2, 0.1)),
+               (Summand("pair-network", (1, 0, 1, 1, 1, 1, 0, 0, 1, *HIDDEN), (-1.0,)), network(5, *HIDDEN, 1)),
+               (Summand("density-diffusion", (0.1, 0), (-1.0,)), np.full(2, 0.1))], False),
+    "16-16": ([(Summand("pair-network", (2, 0, 0, 1, 1, 1, 0, 1, 0, 16, 16), (-1.0,) * 6),
+                network(3, 16, 16, 2))], True),
+}
+
+
+def actions(library: ctypes.CDLL, side: int) -> dict[str, Callable[[], list[np.ndarray]]]:
+    """What is timed, by name."""
+    random, count = np.random.default_rng(1), side**3
+    radius = (NEIGHBORS / count * 3 / (4 * math.pi)) ** (1 / 3)
+    columns = random.uniform(size=(count, 3)), random.normal(size=(count, 3)), random.normal(size=(1, count))
+    found: dict[str, Callable[[], list[np.ndarray]]] = {}
+    for name, (given, mutual) in MODELS.items():
+        pairs = CompiledPairs(library, PairSpace(1.0, True, radius, radius, 1.0, mutual), *columns,
+                              np.ones(count, bool), np.float32)
+        summands, parameters = zip(*given)
+        by = [random.normal(size=(len(one.parity), count)).astype(np.float32) for one in summands]
+        found[f"{name}, sums"] = lambda p=pairs, s=summands, w=parameters: p.sums(s, w)
+        found[f"{name}, gradients"] = lambda p=pairs, s=summands, w=parameters, by=by: p.gradients(s, w, by, False)[0]
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("side", nargs="?", type=int, default=20)
+    parser.add_argument("libraries", nargs="*")
+    options = parser.parse_args()
+    libraries = {path: ctypes.CDLL(path) for path in options.libraries} or {in_use(): load(in_use())}
+    timed = {name: actions(library, options.side) for name, library in libraries.items()}
+    first = next(iter(timed.values()))
+    for action in first:
+        least, found = dict.fromkeys(timed, math.inf), {}
+        for _ in range(REPEATS):
+            for name, these in timed.items():
+                start = time.process_time()
+                found[name] = these[action]()
+                least[name] = min(least[name], time.process_time() - start)
+        expected = found[next(iter(timed))]
+        for name, seconds in least.items():
+            apart = max(np.abs(one - other).max() / np.abs(other).max() for one, other in zip(found[name], expected))
+            print(f"{action:18} {seconds:.4f} s  64^3 on two cores {seconds * (64 / options.side)**3 / 2:.2f} s  "
+                  f"differs by {apart:.0e}  {name}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
