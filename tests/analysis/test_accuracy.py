@@ -46,7 +46,7 @@ def measured(growth, complete=True, model_times=TIMES, broken=None):
     flow = {"time": TIMES[::2] + 3.0, "wavenumber": np.arange(9), "filtered": np.tile(SPECTRUM, (4, 1))}
     factors = {name: 1 + run.growth * run.times for name, run in runs.items()}
     spectra = {name: dict(enumerate(np.outer(factor**2, SPECTRUM))) for name, factor in factors.items()}
-    reconstructions = {name: {frame: Reconstruction(Invariants.of(one * GRADIENT), *[None] * 3)
+    reconstructions = {name: {frame: Reconstruction(Invariants.of(one * GRADIENT), *[None] * 2)
                               for frame, one in enumerate(factor)} for name, factor in factors.items()}
     return accuracy(Rollout(attributes, *runs.values(), LENGTH, flow, {
         "kolmogorov_time": 0.15, "filter_width": np.pi / 6.0}, spectra, reconstructions))
