@@ -20,7 +20,7 @@ EXAMPLES = CHECKOUT / "docs" / "examples"
 SMALL = ["flow.cells=16", "spin_up.turnovers=0.1", "tracers.particles_per_side=8", "tracers.field_cells=12",
          "tracers.turnovers=0.3", "tracers.field_every=4", "kernel.neighbors=30", "kernel.steps=4", "kernel.points=50",
          "training.steps=8", "training.combined_steps=2", "training.frames=2", "training.batch=64",
-         "simulation.turnovers=0.05", "simulation.frame_interval=0.08"]
+         "simulation.turnovers=0.05", "simulation.frame_interval=0.08", "simulation.step=0.08"]
 
 
 def results(directory):
