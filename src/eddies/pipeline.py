@@ -18,6 +18,7 @@ class Stage:
         `Scene.fingerprint`.
     depends_on : all stages that its product depends on, those of its inputs included, of those that a scene has.
     checkpoints : the directory within the run directory where its checkpoints lie; None: it makes none.
+    but : "section.key", of the sections that it reads what its product does not depend on.
     """
 
     name: str
@@ -27,6 +28,7 @@ class Stage:
     reads: tuple[str, ...]
     depends_on: tuple[str, ...]
     checkpoints: str | None
+    but: tuple[str, ...] = ()
 
     @property
     def file(self) -> str:
@@ -39,13 +41,13 @@ STAGES = {stage.name: stage for stage in (
           ("seed", "flow", "initial", "start", "forcing", "time", "spin_up", "tracers", "own_flow", "own_initial"),
           (), "checkpoints"),
     Stage("train-kernel", "the smoothing kernel", "kernel", "kernel", ("kernel", "window"),
-          ("dns",), "checkpoints-kernel"),
+          ("dns",), "checkpoints-kernel", but=("kernel.form",)),
     Stage("train", "the model of the particles", "model", "model",
           ("device", "model", "weights", "training", "truths", "own_model"),
           ("dns", "train-kernel"), "checkpoints-train"),
     Stage("find-step", "the cheapest step of the rollout that has converged", "simulation", "step",
           ("device", "simulation", "confirming", "window", "truths", "eulerian", "own_simulation"),
-          ("dns", "train-kernel", "train"), None),
+          ("dns", "train-kernel", "train"), None, but=("simulation.turnovers", "simulation.start")),
     Stage("simulate", "the trained model, without the direct simulation", "simulation", "rollout",
           ("device", "simulation", "found_step", "window", "truths", "eulerian", "own_simulation"),
           ("dns", "train-kernel", "train", "find-step"), "checkpoints-rollout"),

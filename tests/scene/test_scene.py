@@ -153,6 +153,17 @@ def test_fingerprint_changes_from_the_stage_that_reads_the_key(override, first_c
     assert affected == list(STAGES[STAGES.index(first_changed):])
 
 
+@pytest.mark.parametrize("override, searched", [("simulation.turnovers=0.2", False), ("simulation.start=0.5", False),
+                                                ("simulation.skin=0.3", True)])
+def test_a_step_is_sought_anew_where_that_concerns_it(override, searched):
+    """Neither by how long the rollout is nor where it starts: the short rollouts have a start and a length of their
+    own."""
+    given = ["simulation.step=converged"]
+    scene, changed = load_scene(TINY, given), load_scene(TINY, [*given, override])
+    assert (scene.fingerprint("find-step") != changed.fingerprint("find-step")) is searched
+    assert scene.fingerprint("simulate") != changed.fingerprint("simulate")
+
+
 def test_fingerprint_ignores_names():
     scene, renamed = load_scene(TINY), load_scene(TINY, ["name=x", "title=y"])
     assert scene.fingerprint("report") == renamed.fingerprint("report")

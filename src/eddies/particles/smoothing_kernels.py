@@ -197,11 +197,16 @@ class KernelNetwork(nn.Module):
         super().__init__()
         if cutoff not in ("smooth", "sigmoid"):
             raise ValueError(f'kernel cutoff "{cutoff}": "smooth" or "sigmoid"')
-        self.support, self.cutoff, self.mean_volume, self.positive = support, cutoff, mean_volume, mean_volume is None
+        self.support, self.cutoff, self.mean_volume = support, cutoff, mean_volume
         self.network = DenseNetwork(1, hidden, 1, seed)
         if self.positive:
             with torch.no_grad():
                 self.network.weights[-1].mul_(0.1)
+
+    @property
+    def positive(self) -> bool:
+        """Whether W is nowhere negative: not in the published form."""
+        return self.mean_volume is None
 
     @property
     def formula(self) -> str:

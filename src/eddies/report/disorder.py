@@ -78,9 +78,3 @@ def draw(found: Disorder, turnover: float) -> Figure:
     counts.set(title="Variance of counts", ylabel="over that of random points", xlabel="time $t/T$", ylim=(0, None))
     letter(axes.flat)
     return figure
-
-
-def _at(series: Mapping[str, np.ndarray], time: float) -> dict[str, float]:
-    """The columns at the moment nearest to `time`."""
-    nearest = int(np.argmin(np.abs(series["time"] - time)))
-    return {name: float(values[nearest]) for name, values in series.items()}

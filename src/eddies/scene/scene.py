@@ -118,12 +118,11 @@ class Scene(Parts):
             del settings["simulation"]["step_from"]
         if self.simulation is not None:
             del settings["simulation"]["confirmed_on"]  # known by what they are, as are weights
-        if settings["kernel"] is not None:
-            del settings["kernel"]["form"]  # the weights are trained as those of averages, whatever they serve
         settings |= {f"own_{name}": origins(self._foreign_in(name)) for name in FOREIGN_IN}
         of_these = {*STAGES[stage].depends_on, stage} & {*self.stages}
-        keys = [key for each in STAGES.values() if each.name in of_these for key in each.reads]
-        return hashlib.sha256(json.dumps([[key, settings[key]] for key in keys]).encode()).hexdigest()
+        read = [[key, _without(settings[key], key, each.but)]
+                for each in STAGES.values() if each.name in of_these for key in each.reads]
+        return hashlib.sha256(json.dumps(read).encode()).hexdigest()
 
     def provenance(self, stage: str) -> dict[str, Any]:
         """What the product of a stage keeps of the scene: its text, the stage's fingerprint, the kinds of the products
@@ -257,6 +256,13 @@ def _differing_start(scene: Scene, variant: Scene) -> Iterator[str]:
 def builtin_scenes() -> list[tuple[str, str]]:
     """Name and title of every scene that comes with the package, by name."""
     return [(path.stem, read_document(path.stem)[1]["title"]) for path in sorted(BUILT_IN.glob("*.toml"))]
+
+
+def _without(value: Any, section: str, keys: Sequence[str]) -> Any:
+    """The values of a section without some keys "section.key"; any other value as it is."""
+    if not isinstance(value, dict):
+        return value
+    return {key: each for key, each in value.items() if f"{section}.{key}" not in keys}
 
 
 def _fingerprints(paths: Sequence[Path]) -> list[str | None]:

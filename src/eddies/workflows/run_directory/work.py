@@ -118,7 +118,7 @@ def read_stage_seconds(directory: Path) -> dict[str, float]:
 def changed_settings(stage: Stage, then: str | None, now: str | None) -> list[str]:
     """The settings that the product of a stage depends on and that differ between the texts of two scenes, each with
     both values; none where a text is missing or damaged."""
-    read = {key for name in (*stage.depends_on, stage.name) for key in STAGES[name].reads}
+    stages = [STAGES[name] for name in (*stage.depends_on, stage.name)]
     try:
         before, after = (dict(leaves(tomllib.loads(text or ""))) for text in (then, now))
     except (TypeError, ValueError):
@@ -126,7 +126,8 @@ def changed_settings(stage: Stage, then: str | None, now: str | None) -> list[st
     if not before or not after:
         return []
     return [f"{'.'.join(key)} = {_value(before, key)}, now {_value(after, key)}"
-            for key in dict.fromkeys([*after, *before]) if key[0] in read and before.get(key) != after.get(key)]
+            for key in dict.fromkeys([*after, *before]) if before.get(key) != after.get(key)
+            and any(key[0] in each.reads and ".".join(key) not in each.but for each in stages)]
 
 
 def of_other_settings(changes: Sequence[str]) -> str:
