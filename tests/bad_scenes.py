@@ -77,8 +77,8 @@ BAD_OVERRIDES = [
     ("model.closure=poisson", "[model] closure: no such key; valid here: preset, terms, neighbors, path"),
     ("model.neighbors=5", "[model] neighbors = 5: must be a number at least 8"),
     ("model.neighbors=2000", "[model] neighbors = 2000: 1728 particles reach 4.5 with the skin, and half the cube"),
-    ("model.preset=wide", '[model] preset = "wide": must be one of "paper", "paper-code", "resolved", "resolved + pairs", '
-     '"local", "wcsph", "transport-velocity" ('),
+    ("model.preset=wide", '[model] preset = "wide": must be one of "paper", "paper-code", "resolved", '
+     '"resolved + pairs", "local", "wcsph", "transport-velocity" ('),
     ("model.preset=resolve", "did you mean resolved?"),
     ("model.pairs=3", "[model] pairs: no such key"),
     ("model.pair.hidden=[8]", "[model.pair]: no such term; did you mean pairs? the terms are pressure, stress, "
