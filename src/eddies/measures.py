@@ -1,6 +1,6 @@
 """The measures by which rollouts are compared with the truth: names and words, in the order of tables and figures."""
 
-#: Zero is perfect, but for the ratios and the variance of counts, which are 1.
+#: The best value is 0; that of ratios and of the variance of counts is 1.
 MEASURES = {
     "velocity_error_early": "velocity error at t_η",
     "velocity_error_half": "velocity error at T/2",

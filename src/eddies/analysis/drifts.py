@@ -22,8 +22,11 @@ def mean_drift(start: np.ndarray, end: np.ndarray) -> float:
 
 
 def drifts(run: Rollout) -> dict[str, dict[str, float]]:
-    """Of "model" and "truth", from the first to the last common time: momentum_drift; density_drift, of a model that
-    integrates a density; and count_variance, that of particle counts over random points', at the last."""
+    """Drifts of "model" and "truth" by name, from the first to the last common time.
+
+    `momentum_drift` and, of a model that integrates a density, `density_drift`; `count_variance` is the variance of
+    particle counts at the last time over that of random points.
+    """
     last = len(run.common.times) - 1
     columns = {"momentum_drift": ("velocity", momentum_drift)}
     if run.attributes.get("integrates_density", False):

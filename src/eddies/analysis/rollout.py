@@ -63,7 +63,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """What is reconstructed from particles at one moment, of model and truth alike.
+    """The quantities that a report reconstructs from particles at one moment, by the same form for model and truth.
 
     Parameters
     ----------

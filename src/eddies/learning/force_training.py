@@ -122,8 +122,10 @@ class TrainingFrame:
 
     @torch.no_grad()
     def within(self, kernel: SmoothingKernel) -> KernelNeighborhood:
-        """What is within the support of a kernel of the particles where they are averaged; collective, and kept until
-        another kernel comes."""
+        """Halo, list and volumes within the support of a kernel, at the positions where the field loss averages.
+
+        Collective. The result is kept until another kernel is given.
+        """
         if self._within is None or self._within.kernel is not kernel:
             found, averaged = self.dynamics.neighborhood, self.averaged
             # The model has no list, or a shorter one, or that of another moment.

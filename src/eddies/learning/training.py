@@ -126,8 +126,11 @@ class Training:
 
     @property
     def cost(self) -> list[dict[str, Any]]:
-        """Of each phase that is over: its `phase` by name, optimiser `steps`, wall `seconds` with its validations, and
-        the `error` on what is held out of the state that it left, None where it is not validated. Ready for JSON."""
+        """A row for each finished phase: name `phase`, optimiser `steps`, wall `seconds` and validation `error`.
+
+        The seconds include validations. The error is that of the weights with which the phase ends; None where a phase
+        is not validated. The values can be written as JSON.
+        """
         found, before = [], 0.0
         for number, phase in enumerate(self.phases[:self.number]):
             rows = [row for row in self.history if row["phase"] == number]

@@ -105,7 +105,7 @@ class LeastSquares:
 class Kriging:
     """The best linear estimate from neighbours, for the covariance of turbulence that has passed a Gaussian filter.
 
-    Where neighbours are too many for its equations, or these are singular, `instead` serves, and it is told.
+    At points with too many neighbours, or with singular equations, `instead` is used, and the log says so.
     """
 
     covariance: Covariance
@@ -150,7 +150,7 @@ def form_of(name: str, kernel: SmoothingKernel, filter_width: float, mean_volume
 
     Parameters
     ----------
-    kernel : the learned W, whose support holds the neighbours of all forms; nowhere negative but for averages.
+    kernel : the learned W. All forms use the particles within its support. Only averages accept negative weights.
     filter_width : d of the filter that the velocities have passed. mean_volume : of a particle.
     """
     if name == "average":
