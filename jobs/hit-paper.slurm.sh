@@ -2,8 +2,8 @@
 # sbatch jobs/hit-paper.slurm.sh [options of `eddies dns`]
 # The ground truth of the scene hit-paper: 1024^3 cells on 256 ranks, 64 on each of four nodes, about 84 GB of memory a
 # node. `eddies check hit-paper` on ranks of your cluster says how many hours; a job that meets its limit is queued again
-# and goes on. What learns from the ground truth uses at most 24 ranks. Submit it afterwards:
-#   EDDIES_SCENE=hit-paper sbatch --ntasks-per-node=24 jobs/slurm.sh
+# and goes on. What learns from the ground truth uses at most 22 ranks. Submit it afterwards:
+#   EDDIES_SCENE=hit-paper sbatch --ntasks-per-node=22 jobs/slurm.sh
 # Submit from the checkout, or set EDDIES_CHECKOUT to it. Load your cluster's modules first, as for set-up.
 #SBATCH --job-name=hit-paper
 #SBATCH --nodes=4

@@ -166,7 +166,7 @@ def test_files_that_are_no_scenes(comm, tmp_path, capfd, content, told):
 def test_a_mark_of_the_encoding_is_no_part_of_a_scene(tmp_path):
     from eddies.scene.scene import load_scene
     (tmp_path / "tiny.toml").write_text("\ufeff" + TEXT, encoding="utf-8")
-    assert load_scene(tmp_path / "tiny.toml") == load_scene(TINY)
+    assert load_scene(tmp_path / "tiny.toml") == load_scene("tiny")
 
 
 @pytest.mark.parametrize("key", ["tracers.filter_width", "tracers.field_cells", "time.step", "model.path",

@@ -31,7 +31,7 @@ def averages(field, kernel):
     """Everything that a field is asked for without a gradient."""
     with torch.no_grad():
         volume = field.volumes(kernel)
-        return [volume, field.velocity_on_whole_grid(kernel, volume), *field.on_whole_grid(kernel, volume),
+        return [volume, field.velocity_on_whole_grid(kernel, volume), *field.averaged(kernel, volume, field.points),
                 *field.at_particles(kernel, volume)]
 
 

@@ -26,7 +26,7 @@ def test_constants_are_exact_and_have_no_gradient(comm):
     field = field_of(comm, lambda x: torch.full_like(x, 2.0))
     kernel = WendlandC2(2.5 * LENGTH / 16)
     volume = field.volumes(kernel)
-    for velocity, gradient in (field.on_whole_grid(kernel, volume), field.at_particles(kernel, volume)):
+    for velocity, gradient in (field.averaged(kernel, volume, field.points), field.at_particles(kernel, volume)):
         assert largest(comm, velocity - 2) < 1e-12 and largest(comm, gradient) < 1e-11
 
 
@@ -37,7 +37,7 @@ def test_velocities_spread_on_the_grid_are_those_of_the_neighbours_of_its_points
     field = field_of(comm, torch.cos, per_side=12, cells=16, placement="random")
     kernel = WendlandC2(LENGTH / 12 * (neighbors / (4 / 3 * np.pi)) ** (1 / 3))
     volume = field.volumes(kernel)
-    expected, spread = field.on_whole_grid(kernel, volume)[0], field.velocity_on_whole_grid(kernel, volume)
+    expected, spread = field.averaged(kernel, volume, field.points)[0], field.velocity_on_whole_grid(kernel, volume)
     assert spread.shape == expected.shape and largest(comm, expected) > 0.5
     # The order of summation differs, and where the sum of weights nearly vanishes, so do its last digits.
     assert largest(comm, spread - expected) < 1e-11
@@ -60,7 +60,7 @@ def test_volumes_and_their_gradient_by_entries_of_the_table(comm):
 def test_a_smooth_field_and_its_gradient_on_any_number_of_ranks(comm):
     field = field_of(comm, lambda x: torch.stack([torch.sin(x[:, 1]), torch.sin(x[:, 2]), torch.sin(x[:, 0])], dim=1))
     kernel = WendlandC2(2.5 * LENGTH / 16)
-    velocity, gradient = field.on_whole_grid(kernel, field.volumes(kernel))
+    velocity, gradient = field.averaged(kernel, field.volumes(kernel), field.points)
     points = grid_points(field.decomposition, field.decomposition.planes)
     # The kernel attenuates k = 1 by a few percent, and the jittered lattice adds noise of that order.
     assert largest(comm, velocity[:, 0] - torch.sin(points[:, 1])) < 0.12

@@ -19,7 +19,6 @@ import eddies.io.contiguous
 import eddies.io.hdf5
 import eddies.parallel.plane_halo
 import eddies.parallel.reduction
-from tests.small_scene import TINY
 
 # What of eddies breaks, and in which call of it. In each of these the other ranks wait for this one, or soon will.
 PLACES = {
@@ -30,6 +29,7 @@ PLACES = {
     "checkpoint": (eddies.io.contiguous, "_write_block", 50),  # the second checkpoint, half written
 }
 
+TINY = Path(__file__).parents[1] / "tiny.toml"
 SCENE = ["flow.cells=12", "tracers.particles_per_side=5", "tracers.field_cells=8", "spin_up.turnovers=0.01",
          "tracers.turnovers=0.15", "tracers.frame_interval=0.06", "simulation.frame_interval=0.06",
          "tracers.field_every=2", "time.max_step=0.025", "kernel.neighbors=20", "training.batch=9"]
@@ -64,7 +64,7 @@ def main():
     overrides = [word for override in SCENE for word in ("--set", override)]
     # A checkpoint before every step, so that steps and their writing alternate.
     often = ["--checkpoint-minutes", "1e-9"] if place == "checkpoint" else []
-    return eddies.cli.main(["dns", TINY, "--output", str(directory / "run"), *overrides, *often])
+    return eddies.cli.main(["dns", str(TINY), "--output", str(directory / "run"), *overrides, *often])
 
 
 sys.exit(main())

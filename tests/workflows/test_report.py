@@ -39,7 +39,7 @@ METRICS = {
               "true_density_acceleration_error", "delay"},
     "rollout": {"turnovers", "stable", "energy_ratio", "velocity_error", "spectrum_error", "velocity_kl",
                 "acceleration_kl", "qr_kl", "outside_training", "nearest_distance_kl", "momentum_drift",
-                "count_variance", "high_wavenumber_energy_ratio",
+                "count_variance",
                 "acceleration_rms_ratio", "velocity_kl_floor", "acceleration_kl_floor",
                 "qr_kl_floor", "spectrum_error_floor", "band_energy_ratios", "band_energy_ratios_floor",
                 "flatness_error", "acceleration_correlation_error", "acceleration_variance_error",

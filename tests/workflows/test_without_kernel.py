@@ -21,6 +21,7 @@ frame_interval = 0.02
 field_every = 1
 field_cells = 8
 [model]
+preset = "resolved"
 [training]
 window = 1
 frames = 2
