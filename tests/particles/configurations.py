@@ -41,7 +41,7 @@ OPEN = dict(window="none", scaling="root")
 PAIR_MODELS = {
     "paper": {"pairs": dict(basis="paper"), "density-flux": {},
               "eddy-viscosity": dict(form="two-sided", basis="paper")},
-    "published": {"pairs": dict(basis="unit", **OPEN), "eddy-viscosity": dict(basis="unit", **OPEN),
+    "published": {"pairs": dict(basis="unit", **OPEN), "eddy-viscosity": dict(basis="unit", form="bounded", **OPEN),
                   "density-flux": dict(sign=True, **OPEN), "density-diffusion": OPEN},
     "corrected": {**OWN_DENSITY, "eddy-viscosity": dict(form="monaghan")},
     "pairs": {"pairs": {}},

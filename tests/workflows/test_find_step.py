@@ -1,6 +1,7 @@
 """The step that is found for a rollout against errors that are known, and what a rollout makes of it."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,7 +9,6 @@ import pytest
 from eddies.io.hdf5 import open_product, read_attributes, read_table
 from eddies.scene.scene import SceneError
 from eddies.workflows import find_step, simulate
-from eddies.workflows.rollout.method_of_step import Step
 from tests.workflows.rollout.test_particle_run import prepared, with_method
 
 # Velocities are wrong by a constant and by what is of first order in the step.
@@ -121,13 +121,27 @@ def test_a_ground_truth_of_other_particles_confirms_nothing(comm, tmp_path):
         find_step.run(other, comm, tmp_path)
 
 
-def test_what_an_integrator_could_still_cost():
-    """Differences of 0.16 have to fall to 0.01: four halvings at first order, two at second."""
-    before = find_step.Trial(Step("rk2", 0.2), 1.0, 0.5, np.nan)
-    trial = find_step.Trial(Step("rk2", 0.1), 2.0, 0.5, 0.159)
-    assert find_step._foreseen(before, trial, 1) == pytest.approx(2.0**4)
-    assert find_step._foreseen(before, trial, 2) == pytest.approx(2.0**2)
-    assert find_step._foreseen(None, trial, 2) == 2.0
+@pytest.mark.mpi(1)
+def test_other_integrators_are_tried_where_they_may_be_cheaper(comm):
+    """Velocities of 1 + b h^p, the true one 1.3, so that ends within 2 % of 0.3 have converged: of first order up to
+    h = 0.01, of fourth order at less cost up to 0.08, and another that is given up at once."""
+    def ladder(name, evaluations, error):
+        def made(step):
+            velocity = np.full((4, 3), 1 + error(step.size))
+            return find_step.Trial(step, evaluations / step.size, velocity, abs(velocity[0, 0] - 1.3) / 1.3)
+        return find_step._Ladder(made, name, 0.32, evaluations)
+
+    search = object.__new__(find_step._Search)
+    search.comm, search.start, search._others = comm, SimpleNamespace(end=np.full((4, 3), 1.3)), []
+    search.ladders = [ladder("first", 1, lambda h: h), ladder("worse", 2, lambda h: 3 * h),
+                      ladder("fourth", 4, lambda h: 20 * h**4)]
+    found, rung = search.cheapest()
+    tried = {ladder.integrator: [trial.step.size for trial in ladder.trials.values()] for ladder in search.ladders}
+    assert tried == {"first": pytest.approx([0.32 / 2**rung for rung in range(7)]), "worse": [0.02],
+                     "fourth": [0.04, 0.08, 0.16]}
+    assert found.integrator == "fourth" and found[rung].step.size == 0.08
+    assert search.difference(found, rung + 1) == pytest.approx(20 * (0.08**4 - 0.04**4) / 1.3)
+    assert np.isnan(search.difference(found, rung - 1)) and search.table(found)["size"] == [0.16, 0.08, 0.04]
 
 
 @pytest.mark.mpi(1, 2)

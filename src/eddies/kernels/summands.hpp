@@ -420,23 +420,44 @@ inline auto window(const W& w, bool weighted) {
     return kept * w + where(within, Vector<Real>{} + (Real(1) - kept), Vector<Real>{});
 }
 
-// w Pi x/(unit |x| + length) with Pi = mu (|a_2| mu - |a_1|), mu = x.v / (|x|^2 + softening), or of approaching pairs
-// alone. Numbers: whether so, the softening, whether pairs are weighted, unit and length. Parameters: |a_1| and |a_2|.
+// tanh of a number if `bounded`, else the number itself.
+template <typename A>
+inline auto tanh_if(bool bounded, const A& a) {
+    using V = std::decay_t<decltype(value_of(a))>;
+    using Real = std::decay_t<decltype(value_of(a)[0])>;
+    V value = value_of(a);
+    if (bounded) {
+        V numbers[TOGETHER] = {value * Real(TANH_UNIT<Real>)};
+        tanh_of(reinterpret_cast<Real*>(numbers));
+        value = numbers[0];
+    }
+    if constexpr (is_node<A>)
+        return made(a, Constant<Real>(), value, bounded ? Real(1) - value * value : V{} + Real(1), V{});
+    else
+        return value;
+}
+
+// w Pi x/(unit |x| + length) with Pi = mu (|a_2| mu - |a_1|), mu = x.v / (|x|^2 + softening); or of approaching pairs
+// alone; or with tanh(x.v). Numbers: 0, 1 or 2 of these forms, the softening, whether pairs are weighted, unit and
+// length. Parameters: |a_1| and |a_2|.
 template <typename Real>
 struct EddyViscosity {
     static constexpr int components = 3, scalars = 0, parameters = 2;
+    bool bounded;
     Real limit, softening;
     bool weighted;
     Real unit, length;
 
     explicit EddyViscosity(const Given& given)
-        : limit(given.numbers[0] ? Real(0) : std::numeric_limits<Real>::infinity()), softening(given.numbers[1]),
+        : bounded(given.numbers[0] == 2),
+          limit(given.numbers[0] == 1 ? Real(0) : std::numeric_limits<Real>::infinity()), softening(given.numbers[1]),
           weighted(given.numbers[2]), unit(given.numbers[3]), length(given.numbers[4]) {}
 
     template <typename Pairs, typename Give>
     void operator()(const Pairs& pairs, const Give& give) const {
         const auto &x = pairs.x, &r = pairs.distance, &linear = pairs.parameter[0], &quadratic = pairs.parameter[1];
-        const auto rate = let(product(x, pairs.v) / (r * r + softening));
+        const auto approach = let(product(x, pairs.v));
+        const auto rate = let(tanh_if(bounded, approach) / (r * r + softening));
         const auto mu = let(at_most(rate, limit));
         const auto w = let(window(pairs.weight, weighted));
         const auto strength = let(w * mu * (quadratic * mu - linear) / (unit * r + length));

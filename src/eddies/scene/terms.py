@@ -154,8 +154,8 @@ class EddyViscosity(ForceSum):
 
     word = "eddy-viscosity"
 
-    form: str = choice("two-sided: of all pairs; monaghan: of approaching ones", "two-sided", "monaghan",
-                       default="two-sided")
+    form: str = choice("two-sided: of all pairs; monaghan: of approaching ones; bounded: of all, with tanh(x.v) for "
+                       "x.v", "two-sided", "monaghan", "bounded", default="two-sided")
     numbers_per_pair = 8
     reads = ("pairs",)
 
@@ -333,17 +333,18 @@ LITTLE_FRICTION = {"alpha": 0.05, "beta": 1.5}
 RESOLVED = ("pressure", "stress", "viscosity", "damping", "relaxation")
 
 
-def _published(basis: str) -> dict[str, Mapping[str, Any]]:
+def _published(basis: str, hidden: tuple[int, ...]) -> dict[str, Mapping[str, Any]]:
     """Eq. 3: networks of force and density, and Pi of both. What the text leaves open is as in the public code."""
-    plain, network = {"window": "none", "scaling": "root"}, {"hidden": (20, 100, 20)}
-    return {"pairs": {"basis": basis, **plain, **network}, "eddy-viscosity": {"basis": basis, **plain},
+    plain, network = {"window": "none", "scaling": "root"}, {"hidden": hidden}
+    return {"pairs": {"basis": basis, **plain, **network},
+            "eddy-viscosity": {"basis": basis, "form": "bounded", **plain},
             "density-flux": {"sign": True, **plain, **network}, "density-diffusion": plain}
 
 
 #: Of each preset the settings that differ from the terms' own, by term, in the order of the terms.
 PRESETS: dict[str, dict[str, Mapping[str, Any]]] = {
-    "paper": _published("paper"),
-    "paper-code": _published("unit"),
+    "paper": _published("paper", (20, 20, 20, 20)),
+    "paper-code": _published("unit", (20, 100, 20)),
     "resolved": dict.fromkeys(RESOLVED, {}),
     # The density there is that of the pressure, whose force is given: a network that is told of it learns no more, and
     # costs twice as much, as pairs then are not opposite.

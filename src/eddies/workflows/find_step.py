@@ -6,17 +6,19 @@ the error of the latter or 1e-4 of the velocity, whichever is larger. It must ha
 truth that the scene names as well. Coarse grids have Courant numbers in place of steps. Of the steps that have
 converged the cheapest is taken.
 
-An integrator is given up once a step that could converge would cost more than the best one so far. That step is
-foreseen from the last difference, as if it fell with the full order of the integrator, and the cost from its last rise.
+The steps of the first integrator are halved until one has converged. Those of the others are doubled, from the shortest
+one that needs no more evaluations than the best so far, for as long as they end within the tolerance of where that ends
+with half its step. An integrator whose shortest such step ends farther away is given up: longer ones end farther still.
 """
 
 from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -51,14 +53,14 @@ class Trial:
     Parameters
     ----------
     step : its step. seconds : of a turnover, without storing.
-    error, difference : rms of the velocity at the end less the true one, and less that with twice the step, over that
-        of the true one; nan where there is no such end.
+    velocity : at the end, in order of id; None where it went wrong.
+    error : rms of that velocity less the true one, over that of the true one; nan without an end.
     """
 
     step: Step
     seconds: float
+    velocity: np.ndarray | None = None
     error: float = np.nan
-    difference: float = np.nan
 
     @property
     def tolerance(self) -> float:
@@ -81,22 +83,21 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                 raise SceneError(f"{scene.name}: [simulation] confirmed_on: {path} holds {truth.total} particles, not "
                                  f"{truths[0].total}; name a run with as many")
         search = _Search(scene, truths, directory, device, stop or StopRequest(comm))
-        found, half = search.cheapest()
+        ladder, rung = search.cheapest()
+        found, half, difference = ladder[rung], ladder[rung + 1], search.difference(ladder, rung + 1)
+        tables = {ladder.integrator: search.table(ladder) for ladder in search.ladders if ladder.trials}
     seconds = time.perf_counter() - began
     with create_product(comm, directory / "step.h5", "step", scene.provenance("find-step")) as file:
         write_attributes(file.create_group("found"), {
             "integrator": found.step.integrator, "size": found.step.size, "seconds_per_turnover": found.seconds,
-            "error": found.error, "error_with_half": half.error, "difference": half.difference,
+            "error": found.error, "error_with_half": half.error, "difference": difference,
             "tolerance": half.tolerance, "seconds": seconds, "confirmed_on": len(truths) - 1,
             "turnovers": search.span / search.turnover})
-        for name in dict.fromkeys(trial.step.integrator for trial in search.trials):
-            own = [trial for trial in search.trials if trial.step.integrator == name]
-            write_table(file, f"trials/{name}", {
-                "size": [trial.step.size for trial in own], "seconds_per_turnover": [trial.seconds for trial in own],
-                "error": [trial.error for trial in own], "difference": [trial.difference for trial in own]})
+        for name, table in tables.items():
+            write_table(file, f"trials/{name}", table)
     log.info("find-step: %s, %s %.4g, %.3g s a turnover; halving it changes %.4f of an error of %.4f",
              found.step.integrator, "Courant number" if scene.simulation.on_grid else "step", found.step.size,
-             found.seconds, half.difference, half.error)
+             found.seconds, difference, half.error)
 
 
 class _Start:
@@ -115,8 +116,33 @@ class _Start:
         self.end = truth.block(self.frame + count * frames, ("velocity",))["velocity"]
 
 
+class _Ladder:
+    """Short rollouts with an integrator, made when they are asked for: rung 0 has the longest step, each other one half
+    of that before.
+
+    Parameters
+    ----------
+    make : what makes a rollout with a step.
+    evaluations : of the rates in a step.
+    trials : those that have been made, by rung.
+    """
+
+    def __init__(self, make: Callable[[Step], Trial], integrator: str, first: float, evaluations: int) -> None:
+        self._make, self.integrator, self._first, self.evaluations = make, integrator, first, evaluations
+        self.trials: dict[int, Trial] = {}
+
+    def step(self, rung: int) -> Step:
+        """The step of a rung."""
+        return Step(self.integrator, self._first / 2**rung)
+
+    def __getitem__(self, rung: int) -> Trial:
+        if rung not in self.trials:
+            self.trials[rung] = self._make(self.step(rung))
+        return self.trials[rung]
+
+
 class _Search:
-    """Short rollouts of a scene on ground truths. The first is searched, and `trials` are all that were made there."""
+    """Short rollouts of a scene on ground truths, of which the first is searched."""
 
     def __init__(self, scene: Scene, truths: Sequence[GroundTruth], directory: Path, device: torch.device,
                  stop: StopRequest) -> None:
@@ -124,42 +150,63 @@ class _Search:
         self.comm = truths[0].decomposition.comm
         self.start, *self._others = (_Start(truth, scene) for truth in truths)
         self.span, self.turnover = float(self.start.stops[-1]), self.start.turnover
-        self.trials: list[Trial] = []
+        self.ladders = [_Ladder(partial(self._try, self.start), *rungs) for rungs in self._integrators()]
 
-    def cheapest(self) -> tuple[Trial, Trial]:
-        """The cheapest trial whose step has converged, and that with half of it."""
-        best: tuple[Trial, Trial] | None = None
-        for name, first, order in self._ladders():
-            before, velocity = None, None
-            for halved in range(HALVINGS):
-                trial, ended = self._try(self.start, Step(name, first / 2**halved), velocity)
-                self.trials.append(trial)
-                if before is not None and trial.difference < trial.tolerance and self._confirmed(before, trial):
-                    if best is None or before.seconds < best[0].seconds:
-                        best = before, trial
-                    break
-                if best is not None and ended is not None and _foreseen(before, trial, order) > best[0].seconds:
-                    break
-                before, velocity = (trial, ended) if ended is not None else (None, None)
+    def cheapest(self) -> tuple[_Ladder, int]:
+        """The rung with the cheapest step that has converged, and its ladder."""
+        best: tuple[_Ladder, int] | None = None
+        for ladder in self.ladders:
+            if best is None:
+                rung = next((rung for rung in range(HALVINGS) if self._converged(ladder, rung)), None)
+            else:
+                rung = self._cheaper(ladder, *best)
+            best = best if rung is None else (ladder, rung)
         if best is None:
-            smallest = min(trial.step.size for trial in self.trials)
+            smallest = min(trial.step.size for ladder in self.ladders for trial in ladder.trials.values())
             raise SceneError(f'{self.scene.name}: [simulation] step = "converged": none has converged down to '
                              f"{smallest:.2g}; give a number")
         return best
 
-    def _confirmed(self, whole: Trial, half: Trial) -> bool:
-        """Whether a step that has converged has done so on the other ground truths as well."""
+    def difference(self, ladder: _Ladder, rung: int) -> float:
+        """Rms of the velocity at the end less that with twice the step, over that of the true one; nan where one of
+        them was not tried or has no end."""
+        return self._distance(ladder.trials.get(rung), ladder.trials.get(rung - 1), self.start)
+
+    def table(self, ladder: _Ladder) -> dict[str, list[float]]:
+        """The trials of a ladder, the longest step first."""
+        rungs = sorted(ladder.trials)
+        trials = [ladder.trials[rung] for rung in rungs]
+        return {"size": [trial.step.size for trial in trials],
+                "seconds_per_turnover": [trial.seconds for trial in trials],
+                "error": [trial.error for trial in trials],
+                "difference": [self.difference(ladder, rung) for rung in rungs]}
+
+    def _cheaper(self, ladder: _Ladder, best: _Ladder, of_best: int) -> int | None:
+        """The longest step of a ladder that has converged, if it costs less than the best one so far."""
+        most = best.evaluations / best.step(of_best).size
+        shortest = max((rung for rung in range(HALVINGS) if ladder.evaluations / ladder.step(rung).size <= most),
+                       default=-1)
+        rung, right = shortest, best[of_best + 1]
+        while rung >= 0 and self._distance(ladder[rung], right, self.start) <= right.tolerance:
+            rung -= 1
+        return next((rung for rung in range(rung + 1, shortest + 1)
+                     if ladder[rung].seconds < best[of_best].seconds and self._converged(ladder, rung)), None)
+
+    def _converged(self, ladder: _Ladder, rung: int) -> bool:
+        """Whether a step has converged on all ground truths."""
+        whole, half = ladder[rung], ladder[rung + 1]
+        if not self._distance(whole, half, self.start) < half.tolerance:
+            return False
         for number, start in enumerate(self._others, 1):
-            _, coarser = self._try(start, whole.step, None)
-            trial, ended = self._try(start, half.step, coarser)
-            if coarser is None or ended is None or not trial.difference < trial.tolerance:
+            coarser, finer = self._try(start, whole.step), self._try(start, half.step)
+            if not self._distance(coarser, finer, start) < finer.tolerance:
                 log.info("find-step: %s %.4g has not converged on ground truth %d of %d", whole.step.integrator,
                          whole.step.size, number, len(self._others))
                 return False
         return True
 
-    def _ladders(self) -> Iterator[tuple[str, float, int]]:
-        """The integrators, each with its first step and its order."""
+    def _integrators(self) -> Iterator[tuple[str, float, int]]:
+        """Those that are searched, each with its first step and its evaluations in a step."""
         settings = self.scene.simulation
         if settings.on_grid:
             yield "etdrk4", COURANT, 4
@@ -167,11 +214,10 @@ class _Search:
         # A method of the user's steps in its own way, whatever the integrator.
         for name in settings.schemes if settings.method in METHODS else settings.schemes[:1]:
             scheme = SCHEMES[name]
-            yield name, self.span if scheme.dense else self.scene.simulation.frame_interval, scheme.order
+            yield name, self.span if scheme.dense else self.scene.simulation.frame_interval, scheme.evaluations
 
-    def _try(self, start: _Start, step: Step, coarser: np.ndarray | None) -> tuple[Trial, np.ndarray | None]:
-        """A short rollout with a step, and the velocities at its end in order of id; None where it went wrong.
-        `coarser`: those with twice the step."""
+    def _try(self, start: _Start, step: Step) -> Trial:
+        """A short rollout with a step."""
         method = method_of_step(self.scene, step, start.truth, start.frame, self.directory, self.device)
         method.frame(0.0)  # the rates with which the first step begins
         began, number, complaint = time.perf_counter(), 0, None
@@ -183,28 +229,22 @@ class _Search:
         seconds = self.comm.bcast((time.perf_counter() - began) * start.turnover / max(method.time, 1e-300))
         if complaint is not None:
             log.info("find-step: %s %.4g: %s", step.integrator, step.size, complaint)
-            return Trial(step, seconds), None
+            return Trial(step, seconds)
         particles, _ = method.frame(float(start.stops[-1]))
         columns = particles.to_numpy()
         velocity = IdOrder(self.comm, columns["id"], start.truth.total).apply(columns["velocity"])
-        error = self._distance(velocity, start.end, start.end)
-        difference = np.nan if coarser is None else self._distance(velocity, coarser, start.end)
-        log.info("find-step: %s %.4g: error %.4f, difference from twice the step %.5f, %.3g s a turnover",
-                 step.integrator, step.size, error, difference, seconds)
-        return Trial(step, seconds, error, difference), velocity
+        error = self._rms(velocity, start.end, start)
+        log.info("find-step: %s %.4g: error %.4f, %.3g s a turnover", step.integrator, step.size, error, seconds)
+        return Trial(step, seconds, velocity, error)
 
-    def _distance(self, one: np.ndarray, other: np.ndarray, true: np.ndarray) -> float:
-        """Rms of the difference of two velocities, over that of a true one."""
-        sums = np.array([np.sum((one.astype(np.float64) - other) ** 2), np.sum(true.astype(np.float64) ** 2)])
+    def _distance(self, one: Trial | None, other: Trial | None, start: _Start) -> float:
+        """Between the ends of two trials, over the rms of the true velocity; nan without one of them."""
+        if one is None or other is None or one.velocity is None or other.velocity is None:
+            return np.nan
+        return self._rms(one.velocity, other.velocity, start)
+
+    def _rms(self, one: np.ndarray, other: np.ndarray, start: _Start) -> float:
+        """Rms of the difference of two velocities, over that of the true one at the end."""
+        sums = np.array([np.sum((one.astype(np.float64) - other) ** 2), np.sum(start.end.astype(np.float64) ** 2)])
         square, size = global_sum(self.comm, sums)
         return float(np.sqrt(square / size))
-
-
-def _foreseen(before: Trial | None, trial: Trial, order: int) -> float:
-    """The least that the converged step of an integrator can cost, by its last two trials; of one alone its own cost,
-    as a finer step costs at least as much."""
-    if before is None or not trial.difference > 0:
-        return trial.seconds
-    halvings = max(np.ceil(np.log2(trial.difference / trial.tolerance) / order), 0.0)
-    # The step that converges is twice the one whose difference is small enough.
-    return before.seconds * max(trial.seconds / before.seconds, 1.0) ** halvings

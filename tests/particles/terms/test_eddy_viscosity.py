@@ -23,15 +23,16 @@ def test_the_closed_form_for_two_particles(form):
         assert torch.equal(found[0], -found[1]) and found[:, 1:].abs().max() == 0
 
 
+@pytest.mark.parametrize("form", ["two-sided", "bounded"])
 @pytest.mark.parametrize("basis", ["paper", "unit"])
-def test_the_published_form_for_two_particles(basis):
-    """a_rms / sqrt(n) Pi b_1 without a window; b_1 is x, or x/|x| to a millionth."""
+def test_the_published_form_for_two_particles(basis, form):
+    """a_rms / sqrt(n) Pi b_1 without a window; b_1 is x, or x/|x| to a millionth; "bounded" has tanh(x.v)."""
     position = torch.tensor([[1.0, 1, 1], [1.5, 1, 1]], dtype=torch.float64)
     velocity = torch.tensor([[0.0, 0, 0], [0.6, 0, 0]], dtype=torch.float64)
-    settings = dict(basis=basis, window="none", scaling="root")
+    settings = dict(form=form, basis=basis, window="none", scaling="root")
     found = rates(model(eddy_viscosity=settings), position, velocity).acceleration
     x, v = -0.5 / SCALES.filter_width, -0.6 / SCALES.velocity
-    mu = x * v / (x * x + 0.1)
+    mu = (math.tanh(x * v) if form == "bounded" else x * v) / (x * x + 0.1)
     expected = SCALES.acceleration / math.sqrt(NEIGHBORS) * 0.1 * (mu * mu - mu) * (x if basis == "paper" else -1)
     assert float(found[0, 0]) == pytest.approx(expected, rel=1e-5)
 

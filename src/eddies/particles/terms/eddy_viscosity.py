@@ -17,6 +17,8 @@ from eddies.scene import terms as declared
 
 # Softens the approach speed at small distances, in squared units of the reference length.
 SOFTENING = 0.1
+# In the order that the compiled library numbers them.
+FORMS = "two-sided", "monaghan", "bounded"
 
 
 class EddyViscosity(PairTerm):
@@ -24,8 +26,9 @@ class EddyViscosity(PairTerm):
 
         Pi = -|a_1| mu + |a_2| mu^2,   mu = x.v / (|x|^2 + 0.1),
 
-    in the units of `ScaledPairs`. A positive Pi pushes apart. The two-sided form's mu^2 part also pushes apart receding
-    pairs; "monaghan" acts on approaching ones only (mu < 0), as in SPH. Both coefficients are learned.
+    in the units of `ScaledPairs`. A positive Pi pushes apart. The form "two-sided" pushes receding pairs apart as well,
+    by its part mu^2. "bounded" has tanh(x.v) in place of x.v, as in the public code of the paper: the force of a fast
+    pair has a limit. "monaghan" acts on approaching pairs only (mu < 0), as in SPH. Both coefficients are learned.
     """
 
     Settings = declared.EddyViscosity
@@ -49,6 +52,8 @@ class EddyViscosity(PairTerm):
 
     def strength(self, distance: Tensor, approach: Tensor) -> Tensor:
         """Pi (m,) from |x| (m,) and x.v (m,)."""
+        if self.settings.form == "bounded":
+            approach = torch.tanh(approach)
         mu = approach / (distance * distance + SOFTENING)
         if self.settings.form == "monaghan":
             mu = torch.clamp(mu, max=0)
@@ -65,7 +70,7 @@ class EddyViscosity(PairTerm):
         unit, weighted = told(self.settings)
         # b_1 = x / (unit |x| + length)
         length = SMALL if unit else 1.0
-        return CompiledSum("eddy-viscosity", (self.settings.form == "monaghan", SOFTENING, weighted, unit, length),
+        return CompiledSum("eddy-viscosity", (FORMS.index(self.settings.form), SOFTENING, weighted, unit, length),
                            self.coefficients.abs())
 
     def rates_of(self, sums: Tensor, context: Context) -> Rates:
