@@ -44,6 +44,8 @@ TURNOVERS = 0.25  # of a short rollout
 OF_ERROR, OF_VELOCITY = 0.02, 1e-4
 # How often a step is halved, and the Courant number that grids begin with: twice the limit of stability.
 HALVINGS, COURANT = 12, 2.8
+# Another integrator takes the place of the best one if it needs less than this share of its time: times are uncertain.
+CHEAPER = 0.9
 
 
 @dataclass(frozen=True)
@@ -186,11 +188,15 @@ class _Search:
         most = best.evaluations / best.step(of_best).size
         shortest = max((rung for rung in range(HALVINGS) if ladder.evaluations / ladder.step(rung).size <= most),
                        default=-1)
+        most_seconds = CHEAPER * best[of_best].seconds
+        # Evaluations differ in cost: of a corrected Verlet step, or where a solve starts from a good guess.
+        while 0 <= shortest < HALVINGS and 2 * ladder[shortest].seconds < most_seconds:
+            shortest += 1
         rung, right = shortest, best[of_best + 1]
         while rung >= 0 and self._distance(ladder[rung], right, self.start) <= right.tolerance:
             rung -= 1
         return next((rung for rung in range(rung + 1, shortest + 1)
-                     if ladder[rung].seconds < best[of_best].seconds and self._converged(ladder, rung)), None)
+                     if ladder[rung].seconds < most_seconds and self._converged(ladder, rung)), None)
 
     def _converged(self, ladder: _Ladder, rung: int) -> bool:
         """Whether a step has converged on all ground truths."""
