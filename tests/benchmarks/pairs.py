@@ -28,13 +28,18 @@ def network(*widths: int) -> np.ndarray:
                            for scale, size in ((inputs**-0.5, inputs * outputs), (0.1, outputs))])
 
 
-HIDDEN = (20, 100, 20)
+def published(unit: float, *hidden: int) -> tuple[list[tuple[Summand, np.ndarray]], bool]:
+    """The four sums of the published form, with `unit` vectors or not."""
+    return [(Summand("pair-network", (2, 0, 1, 1, 1, 1, unit, 0, 0, *hidden), (-1.0,) * 6), network(5, *hidden, 2)),
+            (Summand("eddy-viscosity", (2, 0.1, 0, unit, 1e-6 if unit else 1), (-1.0,) * 3), np.full(2, 0.1)),
+            (Summand("pair-network", (1, 0, 1, 1, 1, 1, 0, 0, 1, *hidden), (-1.0,)), network(5, *hidden, 1)),
+            (Summand("density-diffusion", (0.1, 0), (-1.0,)), np.full(2, 0.1))], False
+
+
 # Summands with parameters, and whether each pair is evaluated once.
 MODELS = {
-    "paper": ([(Summand("pair-network", (2, 0, 1, 1, 1, 1, 0, 0, 0, *HIDDEN), (-1.0,) * 6), network(5, *HIDDEN, 2)),
-               (Summand("eddy-viscosity", (0, 0.1, 0, 0, 1), (-1.0,) * 3), np.full(2, 0.1)),
-               (Summand("pair-network", (1, 0, 1, 1, 1, 1, 0, 0, 1, *HIDDEN), (-1.0,)), network(5, *HIDDEN, 1)),
-               (Summand("density-diffusion", (0.1, 0), (-1.0,)), np.full(2, 0.1))], False),
+    "paper": published(0, 20, 20, 20, 20),
+    "paper-code": published(1, 20, 100, 20),
     "16-16": ([(Summand("pair-network", (2, 0, 0, 1, 1, 1, 0, 1, 0, 16, 16), (-1.0,) * 6),
                 network(3, 16, 16, 2))], True),
 }

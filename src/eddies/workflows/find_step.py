@@ -1,10 +1,10 @@
 """The cheapest time step of a rollout that has converged, found by short rollouts on the ground truth.
 
 Every method goes by the same rule. For each integrator steps are halved from a generous one on. A step has converged if
-a rollout with it and one with half of it end with velocities that differ, in the root mean square, by less than 2 % of
-the error of the latter or 1e-4 of the velocity, whichever is larger. It must have converged on every further ground
-truth that the scene names as well. Coarse grids have Courant numbers in place of steps. Of the steps that have
-converged the cheapest is taken.
+a rollout with it and one with half of it end with velocities that differ, in the root mean square, by less than what
+adds 2 % to the error, or by less than 1e-4 of the velocity, whichever is larger. Independent deviations add as squares,
+so the first is a fifth of the error. It must have converged on every further ground truth that the scene names as well.
+Coarse grids have Courant numbers in place of steps. Of the steps that have converged the cheapest is taken.
 
 The steps of the first integrator are halved until one has converged. Those of the others are doubled, from the shortest
 one that needs no more evaluations than the best so far, for as long as they end within the tolerance of where that ends
@@ -14,6 +14,7 @@ with half its step. An integrator whose shortest such step ends farther away is 
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
@@ -40,7 +41,8 @@ from eddies.workflows.rollout.method_of_step import METHODS, Step, method_of_ste
 log = logging.getLogger("eddies")
 
 TURNOVERS = 0.25  # of a short rollout
-# A step has converged if halving it changes the end by less than this share of the error, or of the velocity.
+# A step has converged if what halving it changes makes less than this share of the error, or is less than this share of
+# the velocity.
 OF_ERROR, OF_VELOCITY = 0.02, 1e-4
 # How often a step is halved, and the Courant number that grids begin with: twice the limit of stability.
 HALVINGS, COURANT = 12, 2.8
@@ -66,8 +68,8 @@ class Trial:
 
     @property
     def tolerance(self) -> float:
-        """The difference below which twice the step has converged."""
-        return max(OF_ERROR * self.error, OF_VELOCITY)
+        """The difference below which twice the step has converged: its square raises that of the error to (1.02)^2."""
+        return max(math.sqrt((1 + OF_ERROR) ** 2 - 1) * self.error, OF_VELOCITY)
 
 
 def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | None = None) -> None:
