@@ -3,6 +3,7 @@ import pytest
 
 from eddies.flow import initial_fields
 from eddies.flow.tracers import FilteredField, TracerParticles, lattice_positions, random_positions, release
+from eddies.parallel.halo import HaloError
 from eddies.parallel.migration import IdOrder, census
 from eddies.parallel.reduction import global_max
 from eddies.parallel.slab import SlabDecomposition
@@ -39,6 +40,23 @@ def test_interpolation_order_against_direct_fourier_sums(comm, kind, order):
         spline = SplineInterpolation(grid, kind)
         errors.append(np.abs(spline.at(spline.coefficients(modes), points) - fourier_sum(grid, modes, points)).max())
     assert np.log2(errors[0] / errors[1]) > order - 0.5
+
+
+@pytest.mark.mpi(2, 3)
+def test_a_particle_may_move_through_as_many_planes_as_the_margin(comm):
+    """In a step with a Courant number above 1; the field is told there as on the rank that these places belong to."""
+    grid = make_grid(comm, 18)
+    slab = grid.decomposition
+    modes = initial_fields.random_velocity(grid, 7, 1.0, 1.5)
+    outside = (slab.start + slab.count + np.array([-0.5, 0.5, 1.9])) * slab.spacing
+    points = np.stack([np.full(3, 0.3), np.full(3, 1.7), outside % LENGTH], axis=1)
+    field = FilteredField(grid, 0.4, "cubic", margin=2)
+    found = comm.allgather(field.spline.at(field.velocity_coefficients(modes), points))[comm.rank - 1]
+    theirs = points.copy()
+    theirs[:, 2] = (slab.start + np.array([-0.5, 0.5, 1.9])) * slab.spacing % LENGTH
+    assert np.allclose(found, field.spline.at(field.velocity_coefficients(modes), theirs), rtol=0, atol=1e-13)
+    with pytest.raises(HaloError, match="farther out of its slab"):
+        FilteredField(grid, 0.4, "cubic").spline.at(field.velocity_coefficients(modes), points)
 
 
 @pytest.mark.mpi(1, 2, 3)

@@ -42,12 +42,16 @@ def release(decomposition: SlabDecomposition, seed: int, per_side: int, placemen
 
 
 class FilteredField:
-    """The Gaussian-filtered velocity of a state, and density of a compressible one, at any point."""
+    """The Gaussian-filtered velocity of a state, and density of a compressible one.
 
-    def __init__(self, grid: SpectralGrid, filter_width: float, interpolation: str) -> None:
+    They are told at any point of this rank's slab and of `margin` planes beside it: a particle may move as far in a
+    step.
+    """
+
+    def __init__(self, grid: SpectralGrid, filter_width: float, interpolation: str, margin: int = 1) -> None:
         self.grid = grid
         self.transfer = gaussian_transfer(grid.wavenumber_squared, filter_width).astype(grid.real)
-        self.spline = SplineInterpolation(grid, interpolation)
+        self.spline = SplineInterpolation(grid, interpolation, margin)
 
     def velocity_coefficients(self, state: np.ndarray) -> np.ndarray:
         """Spline coefficients of the filtered velocity of a state."""

@@ -2,6 +2,9 @@
 
 from dataclasses import dataclass
 
+#: The Courant number up to which ETDRK4 is stable. A search for the step of a coarse grid begins with it.
+MOST_COURANT = 1.4
+
 
 @dataclass(frozen=True, kw_only=True)
 class Scheme:

@@ -33,7 +33,7 @@ from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import StopRequest
 from eddies.particles.devices import prepare_torch
 from eddies.pipeline import STAGES
-from eddies.scene.integrators import SCHEMES
+from eddies.scene.integrators import MOST_COURANT, SCHEMES
 from eddies.scene.scene import BOX_LENGTH, Scene, SceneError
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.rollout.method_of_step import METHODS, Step, method_of_step
@@ -44,8 +44,8 @@ TURNOVERS = 0.25  # of a short rollout
 # A step has converged if what halving it changes makes less than this share of the error, or is less than this share of
 # the velocity.
 OF_ERROR, OF_VELOCITY = 0.02, 1e-4
-# How often a step is halved, and the Courant number that grids begin with: twice the limit of stability.
-HALVINGS, COURANT = 12, 2.8
+# How often a step is halved.
+HALVINGS = 12
 # Another integrator takes the place of the best one if it needs less than this share of its time: times are uncertain.
 CHEAPER = 0.9
 
@@ -217,7 +217,7 @@ class _Search:
         """Those that are searched, each with its first step and its evaluations in a step."""
         settings = self.scene.simulation
         if settings.on_grid:
-            yield "etdrk4", COURANT, 4
+            yield "etdrk4", MOST_COURANT, 4
             return
         # A method of the user's steps in its own way, whatever the integrator.
         for name in settings.schemes if settings.method in METHODS else settings.schemes[:1]:

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 from eddies.io.provenance import product_attributes
 from eddies.scene.rules import quoted
+from eddies.scene.integrators import MOST_COURANT
 from eddies.scene.scene import BOX_LENGTH, Eulerian, Scene, Tracers
 from eddies.workflows.foreseen.numbers import expected_turbulence
 
@@ -30,7 +31,10 @@ def most_ranks(scene: Scene) -> dict[str, int]:
         limits |= most_training_ranks(scene)
     if scene.simulation and scene.simulation.on_grid:
         cells = (scene.eulerian or Eulerian()).cells_for(tracers.filter_width)
-        limits["ghost planes of the coarse grid"] = max(cells // GHOST_PLANES[tracers.interpolation], 1)
+        # Particles move through as many cells in a step as the Courant number tells.
+        farther = math.ceil(max(scene.time.courant, MOST_COURANT * scene.simulation.finds_step)) - 1
+        ghosts = GHOST_PLANES[tracers.interpolation] + farther
+        limits["ghost planes of the coarse grid"] = max(cells // ghosts, 1)
     elif scene.injects:
         limits["ghost planes of the resolved velocity"] = ranks_of_resolved_grid(tracers, half_skin(scene))
     fewest = min(limits.values())

@@ -59,8 +59,8 @@ class EulerianRun:
         self.largest_energy = RUNAWAY_ENERGY * quadratic_energy(self.fluid, self.state)
         columns = truth.particles(start)
         columns = migrate(grid.decomposition, {name: columns[name] for name in ("id", "position")})
-        self.tracers = TracerParticles(FilteredField(grid, filter_left, scene.tracers.interpolation), columns,
-                                       self.state)
+        field = FilteredField(grid, filter_left, scene.tracers.interpolation, margin=math.ceil(scene.time.courant))
+        self.tracers = TracerParticles(field, columns, self.state)
         self.flow_seconds: list[float] = []
 
     @property
