@@ -1,6 +1,5 @@
 """The ground truth as it is read: scales against plain numpy, and no trace of a density that is not stored."""
 
-import math
 
 import h5py
 import numpy as np
@@ -35,10 +34,6 @@ def read(comm, path, ask):
         return answer, stored.times, columns
 
 
-def rms(values):
-    return math.sqrt(np.mean(values**2))
-
-
 @pytest.mark.parametrize("density", [True])
 @pytest.mark.mpi(1, 2, 3)
 def test_a_field_at_the_points_of_all_ranks_is_the_stored_one(comm, path, density):
@@ -57,48 +52,11 @@ def test_a_field_at_the_points_of_all_ranks_is_the_stored_one(comm, path, densit
 
 @every_fluid
 @pytest.mark.mpi(1, 2)
-def test_scales_are_those_of_the_release_or_of_a_frame(comm, path, density):
-    frames = range(1, FRAMES)
-    (release, later), times, columns = read(comm, path, lambda t: (t.scales, [t.scales_at(frame) for frame in frames]))
-    assert (release.velocity, release.acceleration, release.viscosity) == (1.0, 1.4, 0.014)  # as `reference` says
-    assert release.sound_speed == (20.0 if density else None)
-    for frame, scales in zip(frames, later):
-        interval = times[frame] - times[frame - 1]
-        velocity = columns["velocity"][frame - 1:frame + 1]
-        assert scales.velocity == pytest.approx(rms(velocity[1]), rel=1e-13)
-        assert scales.acceleration == pytest.approx(rms(np.diff(velocity, axis=0) / interval), rel=1e-13)
-        if density:
-            values = columns["density"][frame - 1:frame + 1]
-            assert scales.density == pytest.approx(rms(values[1] - 1), rel=1e-13)
-            assert scales.density_rate == pytest.approx(rms(np.diff(values, axis=0) / interval), rel=1e-13)
-        else:
-            assert scales.density is scales.density_rate is None
-        for name in ("filter_width", "spacing", "density_mean", "viscosity", "sound_speed"):
-            assert getattr(scales, name) == getattr(release, name)
-
-
-@pytest.mark.parametrize("density", [True])
-@pytest.mark.mpi(1, 2)
-def test_a_mean_velocity_counts(comm, path, density, monkeypatch):
-    plain, _, columns = read(comm, path, lambda truth: truth.scales_at(2))
-    wind = np.array([3.0, 0.0, -1.0])
-    original = Trajectory.read
-
-    def windy(self, frame, column, *block):
-        return original(self, frame, column, *block) + (wind if column == "velocity" else 0)
-
-    monkeypatch.setattr(Trajectory, "read", windy)
-    blown, _, moved = read(comm, path, lambda truth: truth.scales_at(2))
-    assert blown.velocity == pytest.approx(rms(moved["velocity"][2])) and blown.velocity > 1.5 * plain.velocity
-    assert blown.acceleration == pytest.approx(plain.acceleration)
-
-
-@every_fluid
-@pytest.mark.parametrize("frame", [0, -1, FRAMES])
-@pytest.mark.mpi(1, 2)
-def test_a_frame_without_one_before_it_has_no_scales(comm, path, density, frame):
-    with pytest.raises(ValueError, match=f"frame {frame} of {FRAMES} has no frame before it"):
-        read(comm, path, lambda truth: truth.scales_at(frame))
+def test_scales_are_those_of_the_release(comm, path, density):
+    scales, *_ = read(comm, path, lambda truth: truth.scales)
+    assert (scales.velocity, scales.acceleration, scales.viscosity) == (1.0, 1.4, 0.014)  # as `reference` says
+    assert scales.sound_speed == (20.0 if density else None)
+    assert (scales.density is None) == (scales.density_rate is None) == (not density)
 
 
 @every_fluid
@@ -127,7 +85,7 @@ def test_columns_are_those_that_are_stored(comm, path, density):
 @pytest.mark.parametrize("density", [True])
 @pytest.mark.parametrize("dataset, where, ask", [
     ("particles/tracers/velocity/value", (2, -1, 0), lambda truth: truth.particles(2)),
-    ("particles/tracers/density/value", (3, 0), lambda truth: truth.scales_at(3)),
+    ("particles/tracers/density/value", (3, 0), lambda truth: truth.particles(3)),
     ("fields/filtered/velocity", (0, 0, -1, 0, 0),
      lambda truth: truth.field(0, "velocity", SlabDecomposition(truth.decomposition.comm, LENGTH, truth.fields.cells))),
 ])

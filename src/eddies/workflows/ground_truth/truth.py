@@ -19,7 +19,7 @@ from eddies.parallel.broadcast import on_all_ranks
 from eddies.parallel.migration import id_block, migrate
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.dynamics import ParticleDynamics
-from eddies.particles.flow_units import RATES, ReferenceScales, measured_scales
+from eddies.particles.flow_units import RATES, ReferenceScales
 from eddies.particles.model import LagrangianModel
 from eddies.particles.particle_field import grid_points
 from eddies.particles.particle_set import ParticleSet
@@ -64,18 +64,6 @@ class GroundTruth:
             filter_width=r["filter_width"], spacing=r["spacing"], velocity=r["velocity_rms"],
             acceleration=r["acceleration_rms"], density_mean=r["density_mean"], viscosity=r["viscosity"],
             kolmogorov_length=r["kolmogorov_length"], **density)
-
-    def scales_at(self, frame: int) -> ReferenceScales:
-        """Reference scales of the flow at a frame, not the first, rates from the frame before; collective.
-
-        At frame 1 the rates are those of the release.
-        """
-        if not 0 < frame < len(self.times):
-            raise ValueError(f"frame {frame} of {len(self.times)} has no frame before it")
-        before, now = (self.block(other, self._evolving) for other in (frame - 1, frame))
-        interval = self.times[frame] - self.times[frame - 1]
-        measured = measured_scales(self.decomposition.comm, now, before, now, interval)
-        return replace(self.scales, **{name.removesuffix("_rms"): value for name, value in measured.items()})
 
     def particles(self, frame: int) -> dict[str, np.ndarray]:
         """id, position, velocity and, where there is one, density of this rank's particles at a frame."""

@@ -39,8 +39,8 @@ SOLVES = "solves", "iterations", "most_iterations", "residual", "not_converged"
 class ParticleRun:
     """The particles of a frame of the ground truth, moved by a model.
 
-    Its units are the scales of the flow at that frame: nothing is measured after it. A subclass says which model it is
-    (`build`), and how far a particle's density may deviate from the mean in a sound state (`largest_deviation`).
+    Its units are the scales of the flow at the release of the tracers, as in training. A subclass says which model it
+    is (`build`), and how far a particle's density may deviate from the mean in a sound state (`largest_deviation`).
     """
 
     largest_deviation = np.inf
@@ -49,7 +49,7 @@ class ParticleRun:
     limited = True
 
     def __init__(self, scene: Scene, truth: GroundTruth, start: int, directory: Path, device: torch.device) -> None:
-        self.settings, self.comm, self.scales = scene.simulation, truth.decomposition.comm, truth.scales_at(start)
+        self.settings, self.comm, self.scales = scene.simulation, truth.decomposition.comm, truth.scales
         self.flow = FlowUnits(self.scales, scene.interaction_radius, scene.neighbors, scene.seed)
         dtype = getattr(torch, self.settings.precision)
         self.model = self.build(scene, directory).forced(injection(scene, truth)).to(dtype=dtype, device=device)
