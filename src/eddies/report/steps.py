@@ -34,6 +34,9 @@ def convergence(found: Mapping[str, float | str], trials: Mapping[str, Mapping[s
         axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axis.set_major_formatter(StrMethodFormatter("{x:g}"))
         axis.set_minor_locator(NullLocator())
+    for axis in (change.xaxis, change.yaxis, error.xaxis, error.yaxis):  # a few trials may lie close to each other
+        low, high = axis.get_data_interval()
+        axis.set_view_interval(low / 2, high * 2, ignore=True)
     figure.legend(*change.get_legend_handles_labels(), loc="outside lower center", ncols=5)
     letter((change, error))
     return figure
