@@ -79,7 +79,7 @@ def test_a_network_of_the_users(example):
     run = example("own_network")
     _, terms, weights = results(run)
     assert terms["pairs"]["network"] == "own_network:Waves"
-    assert weights["terms.pairs.network.wavevectors"].shape == (140, 5)  # the invariants of Eq. 4
+    assert weights["terms.pairs.network.wavevectors"].shape == (80, 5)  # the invariants of Eq. 4
     assert "own_network:" in (run / "scene.toml").read_text()
 
 

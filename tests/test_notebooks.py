@@ -72,7 +72,7 @@ def test_a_notebook_is_kept_without_what_it_shows(name):
 
 def test_a_first_run(execute, folder):
     cells, (error, without) = execute("a-first-run", "[error.values.tolist(), without.values.tolist()]",
-                                      changes=[*SMALLER, *TRAINED_LESS, "simulation.turnovers=0.1"])
+                                      changes=[*SMALLER, "simulation.turnovers=0.1"])
     shown = figures(cells)
     assert set(shown) == {"paths", "spectra", "field", "report"} and min(map(len, shown.values())) > 9000
     assert (folder / "runs/tiny/report/index.html").exists()

@@ -1,7 +1,6 @@
-// Kriging: by which weights of what neighbours have a random field with a given covariance and an unknown mean, and its
-// derivatives, are told best at a point, where a particle sits or none, and what they tell then. Equations of receivers
-// are solved together, one in
-// each lane of a vector, and no lane's result depends on the others.
+// Kriging: the weights of the neighbours' values that give the best linear estimate of a random field and of its
+// derivatives at a point. The field has a given covariance and an unknown mean; a particle may sit at the point. The
+// equations of several receivers are solved together, one in each lane of a vector. No lane's result depends on others.
 
 #include <algorithm>
 #include <cmath>

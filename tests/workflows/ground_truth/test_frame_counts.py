@@ -31,7 +31,7 @@ def test_what_validates_is_not_trained_on(window, horizons, held_out):
 
 def test_a_field_is_compared_with_where_one_is_stored_a_frame_later():
     """Of 101 frames half are the window, 5 of these held out; rates need a frame on both sides."""
-    training = load_scene("hit-small").training
+    training = replace(load_scene("hit-small").training, window=0.5)
     assert trained_frames(training, FRAMES, range(0, FRAMES, 5)) == ([*range(1, 46)], 49)
     flow = replace(training, field_target="flow")
     assert trained_frames(flow, FRAMES, range(0, FRAMES, 5)) == ([*range(4, 45, 5)], 49)
@@ -40,6 +40,7 @@ def test_a_field_is_compared_with_where_one_is_stored_a_frame_later():
 
 @pytest.mark.parametrize("every, which", [(60, "trained on"), (30, "held out")])
 def test_a_field_too_seldom_is_refused(every, which):
-    scene = load_scene("hit-small", ["training.field_target=flow", f"tracers.field_every={every}"])
+    scene = load_scene("hit-small", ["training.field_target=flow", "training.window=0.5",
+                                     f"tracers.field_every={every}"])
     with pytest.raises(SceneError, match=f"no filtered field is stored one frame after any that is {which}; lower"):
         check_frames(["train"], scene, scene.training.window, FRAMES)
