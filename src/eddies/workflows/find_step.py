@@ -1,10 +1,10 @@
 """The cheapest time step of a rollout that has converged, found by short rollouts on the ground truth.
 
-Every method goes by the same rule. For each integrator steps are halved from a generous one on. A step has converged if
-a rollout with it and one with half of it end with velocities that differ, in the root mean square, by less than what
-adds 2 % to the error, or by less than 1e-4 of the velocity, whichever is larger. Independent deviations add as squares,
-so the first is a fifth of the error. It must have converged on every further ground truth that the scene names as well.
-Coarse grids have Courant numbers in place of steps. Of the steps that have converged the cheapest is taken.
+Every method goes by the same rule. Steps of each integrator differ by factors of two. A step has converged if a rollout
+with it and one with half of it end with velocities that differ, in the root mean square, by less than what adds 2 % to
+the error, or by less than 1e-4 of the velocity, whichever is larger. Independent deviations add as squares, so the
+first is a fifth of the error. It must have converged on every further ground truth that the scene names as well. Coarse
+grids have Courant numbers in place of steps. Of the steps that have converged the cheapest is taken.
 
 The steps of the first integrator are halved until one has converged. Those of the others are doubled, from the shortest
 one that needs no more evaluations than the best so far, for as long as they end within the tolerance of where that ends
@@ -44,7 +44,7 @@ TURNOVERS = 0.25  # of a short rollout
 # A step has converged if what halving it changes makes less than this share of the error, or is less than this share of
 # the velocity.
 OF_ERROR, OF_VELOCITY = 0.02, 1e-4
-# How often a step is halved.
+# How often a step is halved at most.
 HALVINGS = 12
 # Another integrator takes the place of the best one if it needs less than this share of its time: times are uncertain.
 CHEAPER = 0.9
