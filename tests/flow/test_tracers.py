@@ -44,7 +44,7 @@ def test_interpolation_order_against_direct_fourier_sums(comm, kind, order):
 
 @pytest.mark.mpi(2, 3)
 def test_a_particle_may_move_through_as_many_planes_as_the_margin(comm):
-    """In a step with a Courant number above 1; the field is told there as on the rank that these places belong to."""
+    """A step with a Courant number above 1 does this. There the field is that of the rank that owns these places."""
     grid = make_grid(comm, 18)
     slab = grid.decomposition
     modes = initial_fields.random_velocity(grid, 7, 1.0, 1.5)

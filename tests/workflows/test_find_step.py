@@ -143,6 +143,20 @@ def test_other_integrators_are_tried_where_they_may_be_cheaper(comm):
     assert np.isnan(search.difference(found, rung - 1)) and search.table(found)["size"] == [0.16, 0.08, 0.04]
 
 
+@pytest.mark.mpi(1)
+def test_an_integrator_of_cheap_evaluations_is_tried_with_shorter_steps(comm):
+    """The second has converged at 0.01, which needs twice the evaluations of the first at 0.01 in half of the time."""
+    def ladder(name, evaluations, seconds, error):
+        return find_step._Ladder(lambda step: find_step.Trial(
+            step, seconds / step.size, np.full((4, 3), 1 + error * step.size), 0.3), name, 0.32, evaluations)
+
+    search = object.__new__(find_step._Search)
+    search.comm, search.start, search._others = comm, SimpleNamespace(end=np.ones((4, 3))), []
+    search.ladders = [ladder("first", 1, 1.0, 10.0), ladder("cheap", 2, 0.4, 9.0)]
+    found, rung = search.cheapest()
+    assert found.integrator == "cheap" and found[rung].step.size == 0.01
+
+
 @pytest.mark.mpi(1, 2)
 def test_a_rollout_takes_the_step_that_was_found(comm, tmp_path):
     """Without a force any step is exact, so the first is taken: the whole of the short rollout."""

@@ -44,8 +44,8 @@ def release(decomposition: SlabDecomposition, seed: int, per_side: int, placemen
 class FilteredField:
     """The Gaussian-filtered velocity of a state, and density of a compressible one.
 
-    They are told at any point of this rank's slab and of `margin` planes beside it: a particle may move as far in a
-    step.
+    Points may lie in this rank's slab or in the `margin` planes beside it. A particle moves through at most `margin`
+    planes in a step.
     """
 
     def __init__(self, grid: SpectralGrid, filter_width: float, interpolation: str, margin: int = 1) -> None:

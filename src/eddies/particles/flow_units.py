@@ -121,18 +121,18 @@ class FlowUnits:
         return self.scales.density_mean * self.scales.spacing**3
 
 
-def measured_scales(comm: Comm, at: Columns, before: Columns, after: Columns, interval: float) -> dict[str, float]:
+def measured_scales(comm: Comm, at: Columns, after: Columns, interval: float) -> dict[str, float]:
     """Root mean squares over all particles, of one component where there are three; collective.
 
     velocity_rms and acceleration_rms, and with a density density_rms (of its fluctuation) and density_rate_rms: values
-    of the frame `at`, rates from the difference of two frames that are `interval` apart. Frames are this rank's rows of
-    `velocity` (n, 3) and, or not, `density` (n,), the same particles in all of them.
+    of the frame `at`, rates from the difference to the frame `after`, which is `interval` later. Frames are this rank's
+    rows of `velocity` (n, 3) and, or not, `density` (n,), the same particles in both.
     """
     scales = {}
     for name, rate in RATES.items():
         if name in at:
             scales[f"{name}_rms"] = _rms(comm, at[name] - MEANS[name])
-            scales[f"{rate}_rms"] = _rms(comm, (after[name] - before[name]) / interval)
+            scales[f"{rate}_rms"] = _rms(comm, (after[name] - at[name]) / interval)
     return scales
 
 

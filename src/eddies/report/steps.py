@@ -53,8 +53,8 @@ def section(found: Mapping[str, float | str], trials: Mapping[str, Mapping[str, 
     shown = Section(
         "step", f"Step: {found['integrator']}, {size} {found['size']:.4g}",
         f"Rollouts of {found['turnovers']:.2g} turnovers on the ground truth, without limits of stability. A step has "
-        "converged if what halving it changes of the velocities at the end adds less than 2 % to their error: here it "
-        f"may be {found['tolerance']:.2g}. The cheapest of these is taken: {found['seconds_per_turnover']:.3g} s a "
+        "converged if it adds less than 2 % to the error of the final velocities. Halving it may change them by "
+        f"{found['tolerance']:.2g}. The cheapest of these is taken: {found['seconds_per_turnover']:.3g} s a "
         f"turnover. Its error is {found['error']:.4f}, that of half the step {found['error_with_half']:.4f}. "
         f"To find it took {found['seconds']:.3g} s.", metrics=metrics, folded=True)
     shown.add_figure("step", "Convergence in the step", convergence(found, trials, size),

@@ -1,10 +1,11 @@
 """The cheapest time step of a rollout that has converged, found by short rollouts on the ground truth.
 
-Every method goes by the same rule. Steps of each integrator differ by factors of two. A step has converged if a rollout
-with it and one with half of it end with velocities that differ, in the root mean square, by less than what adds 2 % to
-the error, or by less than 1e-4 of the velocity, whichever is larger. Independent deviations add as squares, so the
-first is a fifth of the error. It must have converged on every further ground truth that the scene names as well. Coarse
-grids have Courant numbers in place of steps. Of the steps that have converged the cheapest is taken.
+Every method goes by the same rule. Steps of each integrator differ by factors of two. Two rollouts are compared, one
+with the step and one with half of it. The difference of their final velocities (rms) is taken as the error that the
+step adds. The step has converged if this raises the error by less than 2 %, or is less than 1e-4 of the velocity.
+Independent errors add as squares, so the difference may be a fifth of the error. A step must also converge on every
+further ground truth that the scene names. Coarse grids have Courant numbers in place of steps. The cheapest step that
+has converged is taken.
 
 The steps of the first integrator are halved until one has converged. Those of the others are doubled, from the shortest
 one that needs no more evaluations than the best so far, for as long as they end within the tolerance of where that ends
@@ -41,8 +42,7 @@ from eddies.workflows.rollout.method_of_step import METHODS, Step, method_of_ste
 log = logging.getLogger("eddies")
 
 TURNOVERS = 0.25  # of a short rollout
-# A step has converged if what halving it changes makes less than this share of the error, or is less than this share of
-# the velocity.
+# The share of the error that a step may add, and the share of the velocity that it may change in any case.
 OF_ERROR, OF_VELOCITY = 0.02, 1e-4
 # How often a step is halved at most.
 HALVINGS = 12
@@ -68,7 +68,7 @@ class Trial:
 
     @property
     def tolerance(self) -> float:
-        """The difference below which twice the step has converged: its square raises that of the error to (1.02)^2."""
+        """The difference d below which twice the step has converged: e^2 + d^2 = (1.02 e)^2 with the error e."""
         return max(math.sqrt((1 + OF_ERROR) ** 2 - 1) * self.error, OF_VELOCITY)
 
 

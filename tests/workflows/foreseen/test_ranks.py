@@ -32,6 +32,14 @@ def test_most_ranks_is_what_the_parts_accept(comm, neighbors, most):
             require_thick_slabs(particles, particle_reach(scene))
 
 
+@pytest.mark.parametrize("overrides, planes", [([], 4), (["simulation.step=0.1"], 3),
+                                               (["simulation.step=0.1", "time.courant=2.5"], 5)])
+def test_a_coarse_grid_has_ghost_planes_for_its_courant_number(overrides, planes):
+    """A search for the step begins with 1.4, the scene has 1."""
+    scene = load_scene("hit-small", overrides).variant["grid-32"]
+    assert most_ranks(scene)["ghost planes of the coarse grid"] == 32 // planes
+
+
 @pytest.mark.mpi(1, 2, 3)
 @pytest.mark.parametrize("frames, thick, planes", [(2, 3, 6), (4, 2, 5), (8, 2, 3), (12, 1, 2)])
 def test_ranks_for_horizons_are_those_that_the_grid_and_the_particles_accept(comm, frames, thick, planes):

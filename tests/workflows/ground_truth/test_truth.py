@@ -1,5 +1,4 @@
-"""The ground truth as it is read: scales against plain numpy, and no trace of a density that is not stored."""
-
+"""The ground truth as it is read, without any trace of a density that is not stored."""
 
 import h5py
 import numpy as np

@@ -188,6 +188,17 @@ def test_every_method_has_the_units_of_the_release_and_runs(comm, tmp_path, meth
     assert attributes.get("terms") == terms.get(method)
 
 
+@pytest.mark.mpi(2)
+def test_particles_on_a_coarse_grid_may_move_as_far_as_the_courant_number(comm, tmp_path):
+    scene = with_method(prepared(comm, tmp_path), "eulerian")
+    scene = replace(scene, time=replace(scene.time, courant=1.9))
+    _, method, *_ = method_of(comm, tmp_path, scene, 1)  # where the whole flow is stored
+    spline, slab = method.tracers.field.spline, method.tracers.decomposition
+    for planes in (-1.9, slab.count + 0.9):
+        place = (slab.start + planes) * slab.spacing % BOX_LENGTH
+        spline.around(np.array([[0.1, 0.2, place]]))
+
+
 def untrained(comm, directory, side=6):
     """A scene with all products that a rollout needs, and half of the model's inputs outside of what it has seen."""
     scene = prepared(comm, directory, side=side)

@@ -149,7 +149,7 @@ class TracerRun:
         (start, first), (end, second) = self.segments.first_frames("tracers", 2)
         return {"released_at": self.released_at, "sound_speed": self.scene.flow.sound_speed or np.inf,
                 "filter_width": self.settings.filter_width, "spacing": self.settings.spacing,
-                "density_mean": MEAN_DENSITY, **measured_scales(self.comm, first, first, second, end - start)}
+                "density_mean": MEAN_DENSITY, **measured_scales(self.comm, first, second, end - start)}
 
     def state_dict(self) -> dict[str, Any]:
         """What a checkpoint keeps beside the flow and the files of `segments`."""
