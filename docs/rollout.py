@@ -45,4 +45,4 @@ def picture(run: Path, variants: list[str]) -> bytes:
 
 if __name__ == "__main__":
     image = Image.open(io.BytesIO(picture(Path(sys.argv[1]), sys.argv[2:]))).convert("RGB")
-    image.quantize(128).save(Path(__file__).parent / "rollout.png", optimize=True)  # a fifth of the size
+    image.quantize(64).save(Path(__file__).parent / "rollout.png", optimize=True)  # a fifth of the size
