@@ -29,7 +29,7 @@ def picture(run: Path, variants: list[str]) -> bytes:
                 times = rollout.common.times[list(shown)] / rollout.turnover
                 rows["true tracers"] = [one.velocity[0] for one in truth]
             rows[variant] = [one.velocity[0] for one in model]
-    figure, axes = panels(len(rows), SHOWN, (2.5, 2.4), sharex=True, sharey=True)
+    figure, axes = panels(len(rows), SHOWN, (2.1, 2.0), sharex=True, sharey=True)
     limit = largest(*rows["true tracers"])
     for row, (name, planes) in zip(axes, rows.items()):
         for axis, plane in zip(row, planes):
@@ -45,4 +45,4 @@ def picture(run: Path, variants: list[str]) -> bytes:
 
 if __name__ == "__main__":
     image = Image.open(io.BytesIO(picture(Path(sys.argv[1]), sys.argv[2:]))).convert("RGB")
-    image.quantize(64).save(Path(__file__).parent / "rollout.png", optimize=True)  # a fifth of the size
+    image.quantize(160).save(Path(__file__).parent / "rollout.png", optimize=True)  # a third of the size
