@@ -20,8 +20,8 @@ from eddies.scene.sections import Simulation
 from eddies.scene.terms import DEFAULT_PRESET, PRESETS, TERMS
 
 CHECKOUT = Path(__file__).parents[1]
-PAGES = [CHECKOUT / "README.md", *sorted((CHECKOUT / "docs").glob("*.md")),
-         *sorted((CHECKOUT / "docs/notebooks").glob("*.ipynb"))]
+PAGES = [CHECKOUT / "README.md", *(page for pages in ("*.md", "notes/*.md", "notebooks/*.ipynb")
+                                   for page in sorted((CHECKOUT / "docs").glob(pages)))]
 # Programs of the system that are mentioned; what follows them is not looked at, but for paths.
 OF_THE_SYSTEM = ("module", "export", "source", "python3",
                  *(f".venv/bin/{name}" for name in ("pip", "sphinx-build", "jupyter")))
