@@ -108,7 +108,7 @@ def test_cheap_command_runs(comm, command, folder, capfd):
 
 
 def test_readme_is_short():
-    assert len(README.encode()) <= 12_000
+    assert len(README.encode()) <= 8_000
 
 
 def test_commands_in_the_text_exist():
