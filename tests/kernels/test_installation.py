@@ -36,7 +36,11 @@ def test_without_a_compiler_the_build_names_the_package(copy):
     assert "apt-get install g++" in lines[lines.index("[end of output]") - 1]
 
 
+# The copy comes before an installed package.
+COMMAND = "import sys; sys.path.insert(0, sys.argv.pop(1)); from eddies.cli import main; sys.exit(main())"
+
+
 def test_without_kernels_a_command_ends_with_the_remedy(copy):
-    done = run("-m", "eddies", "run", "tiny", PYTHONPATH=str(copy / "src"))
+    done = run("-c", COMMAND, str(copy / "src"), "run", "tiny")
     line, = done.stderr.splitlines()
     assert done.returncode == 2 and line.startswith("eddies: error:") and str(copy) in line and "g++" in line

@@ -14,7 +14,7 @@ from eddies.analysis.rollout import Frames, Rollout
 # Bins of the PDF of nearest-neighbour distances, in mean spacings; a share exp(-14) of random points lies beyond.
 DISTANCE_EDGES = np.linspace(0, 1.5, 31)
 SAMPLED = 2**15  # largest number of particles whose nearest neighbour is searched
-PAIRS = 2**26  # about the largest number of pairs that are listed at once, where particles have gathered
+PAIRS = 2**24  # about the largest number of pairs that are listed at once, where particles have gathered
 CELL = 2.0  # side of the cells in which particles are counted, in mean spacings: about a filter width
 
 

@@ -79,7 +79,10 @@ def first_exponent(x: np.ndarray, y: np.ndarray) -> float:
 
 
 def tracer_statistics(tracers: Frames, spectra: Mapping[str, np.ndarray], spacing: float) -> TracerStatistics:
-    """Measure tracers of mean distance `spacing`, with frames at equal intervals; `spectra` holds `time` (m,) and `filtered` (m, shells)."""
+    """Measure tracers of mean distance `spacing` in frames at equal intervals.
+
+    `spectra` holds `time` (m,) and `filtered` (m, shells).
+    """
     times, every = tracers.times, -(-tracers.total // FOLLOWED)
     velocity = np.stack([tracers.read(frame, "velocity")[::every] for frame in range(times.size)])
     interval = (times[-1] - times[0]) / (times.size - 1)
