@@ -46,7 +46,7 @@ def measured(growth, complete=True, model_times=TIMES, broken=None):
         "kolmogorov_time": 0.15, "filter_width": np.pi / 6.0}, spectra, reconstructions))
 
 
-def test_the_truth_has_no_error():
+def test_the_truth_itself_has_no_error():
     found = measured(0.0)
     assert found.pop("end") == 1 and list(found) == list(MEASURES)
     assert found.pop("energy_ratio") == 1

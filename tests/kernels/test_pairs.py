@@ -90,7 +90,7 @@ CASES = [(name, "even") for name in TERMS] + [("published", kind) for kind in CO
 
 @pytest.mark.mpi(1)
 @pytest.mark.parametrize("name, kind", CASES)
-def test_sums_and_gradients(comm, served, monkeypatch, name, kind):
+def test_sums_and_gradients_are_those_of_torch(comm, served, monkeypatch, name, kind):
     compare(monkeypatch, *set_up(TERMS[name], kind), 1e-11, rows=torch.arange(3, 128, 7))
     compare(monkeypatch, *set_up(TERMS[name], kind), 1e-11)
 

@@ -118,6 +118,6 @@ def found():
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_the_bits_do_not_depend_on_threads(found, kernel):
+def test_the_same_bits_with_any_number_of_threads_and_from_run_to_run(found, kernel):
     for name in instruction_sets():
         assert len({digests[f"{kernel} {name}"] for digests in found}) == 1
