@@ -23,20 +23,21 @@ def pairs(count, dtype, seed=1):
     return listed.pairs(position, position, dtype=dtype)
 
 
-def weights(library, offsets, displacement, width=WIDTH):
+def weights(library, offsets, displacement, width=WIDTH, sited=True):
     covariance = Covariance.of_filtered_turbulence(width)
     return kriging_weights(library, np.asarray(offsets), np.ascontiguousarray(displacement.T.numpy()), SUPPORT, NOISE,
-                           covariance.slowest, np.array(covariance.amplitudes))
+                           covariance.slowest, np.array(covariance.amplitudes), sited)
 
 
 @pytest.mark.parametrize("dtype", TOLERANCE, ids=str)
-@pytest.mark.parametrize("count, width", [(2, WIDTH), (37, WIDTH), (120, WIDTH), (120, WIDTH / 30)])
-def test_weights(library, count, width, dtype):
+@pytest.mark.parametrize("count, width, sited", [
+    (2, WIDTH, True), (37, WIDTH, False), (120, WIDTH, True), (120, WIDTH / 30, True)])
+def test_weights(library, count, width, sited, dtype):
     """Neighbours up to 1.2 filter widths away, where a series replaces the widest Gaussian, and farther."""
     listed, covariance = pairs(count, dtype), Covariance.of_filtered_turbulence(width)
-    found = weights(library, listed.offsets, listed.displacement, width)
-    expected = solved(listed.offsets, listed.displacement.double(), SUPPORT, covariance)
-    for one, other in zip(found, expected):
+    found = weights(library, listed.offsets, listed.displacement, width, sited)
+    expected = solved(listed.offsets, listed.displacement.double(), SUPPORT, covariance, sited)
+    for one, other in zip(found if sited else found[1:], expected if sited else expected[1:]):
         assert len(one) == len(other) == 10
         for row, of_row in zip(map(torch.from_numpy, one), other):
             assert row.shape == of_row.shape and row.dtype == dtype

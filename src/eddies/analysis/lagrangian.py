@@ -224,7 +224,7 @@ def pairs_at(position: np.ndarray, length: float, distances: Sequence[float], to
     for row, (others, apart) in zip(chosen, near(position, length, chosen, radius)):
         for distance, at_distance in zip(distances, pairs):
             second = others[np.abs(apart - distance) <= tolerance * distance]
-            second = np.sort(second[(second >= followed) | (second > row)])
+            second = np.sort(second[second > row])
             at_distance.append(np.stack([np.full(second.size, row), second]))
     return [np.concatenate(at_distance, axis=1) for at_distance in pairs]
 
