@@ -6,8 +6,10 @@ import pytest
 from eddies.kernels.copies import ColumnCopies, PlaneCopies
 
 TOLERANCE = {np.complex128: 1e-13, np.complex64: 1e-5}
-# Cells, cutoff, and the lines of each rank; some ranks have none.
-GRIDS = [(12, 3, (7,)), (13, 4, (5, 4)), (8, 2, (2, 2, 0, 1)), (7, 3, (4, 0, 3)), (4, 1, (1, 1, 1)), (3, 0, (1,))]
+# Cells, cutoff, the lines of each rank, of which some have none, and precision.
+GRIDS = pytest.mark.parametrize("cells, cutoff, cut, dtype", [
+    (12, 3, (7,), np.complex128), (13, 4, (5, 4), np.complex64), (8, 2, (2, 2, 0, 1), np.complex128),
+    (7, 3, (4, 0, 3), np.complex64), (4, 1, (1, 1, 1), np.complex128), (3, 0, (1,), np.complex64)])
 PLANES = [slice(0, 6), slice(2, 4), slice(6, 7)]
 
 
@@ -21,10 +23,9 @@ def kept(size, cutoff):
     return np.r_[0:cutoff + 1, size - cutoff:size]
 
 
-@pytest.mark.parametrize("dtype", TOLERANCE)
-@pytest.mark.parametrize("cells, cutoff, cut", GRIDS)
+@GRIDS
 def test_two_real_planes_are_transformed_as_one_complex_plane(library, close, cells, cutoff, cut, dtype):
-    """f + i g, f and g half a block apart: from its modes to those of f and g, to packed modes, and back to f and g."""
+    """The real planes f and g are half a block apart; the complex plane is f + i g."""
     copies, modes = PlaneCopies(library, cells, cutoff, dtype), 2 * cutoff + 1
     corner = np.ix_(kept(cells, cutoff), range(cutoff + 1))
     for planes in PLANES:
@@ -61,8 +62,7 @@ def test_modes_that_are_not_conjugate_by_round_off_are_averaged(library):
     assert packed[1, 0] == 1.25 + 1.5j and packed[4, 0] == 1.25 - 1.5j
 
 
-@pytest.mark.parametrize("dtype", TOLERANCE)
-@pytest.mark.parametrize("cells, cutoff, cut", GRIDS)
+@GRIDS
 def test_rows_are_filled_and_their_gap_stays(library, close, cells, cutoff, cut, dtype):
     copies, modes = PlaneCopies(library, cells, cutoff, dtype), 2 * cutoff + 1
     part, width = noise(3, dtype, 2, 3, modes, modes), min(cells, modes + 2)
@@ -76,13 +76,11 @@ def test_rows_are_filled_and_their_gap_stays(library, close, cells, cutoff, cut,
             close(found, expected, TOLERANCE[dtype])
 
 
-@pytest.mark.parametrize("dtype", TOLERANCE)
-@pytest.mark.parametrize("gap", [0, 3])
-@pytest.mark.parametrize("cells, cutoff, cut", GRIDS)
-def test_columns_are_copied(library, close, cells, cutoff, cut, gap, dtype):
+@GRIDS
+def test_columns_are_copied(library, close, cells, cutoff, cut, dtype):
     copies, modes, width, lines = ColumnCopies(library, cells, cutoff, dtype), 2 * cutoff + 1, cutoff + 1, 4
     cut, place = (cells - sum(cut[1:]), *cut[1:]), kept(cells, cutoff)
-    for rows in (slice(0, 1), slice(1, 4)):
+    for rows, gap in ((slice(0, 1), 0), (slice(0, 1), 3), (slice(1, 4), 0), (slice(1, 4), 3)):
         shape = (cells, rows.stop - rows.start, width)
         memory = np.zeros((cells, shape[1] * width + gap), dtype)
         column = memory[:, : shape[1] * width].reshape(shape)

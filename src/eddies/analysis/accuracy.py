@@ -16,8 +16,8 @@ def accuracy(run: Rollout) -> dict[str, float | None]:
     """All MEASURES, and `end`, the last common time over T; None for a time that rollout or truth does not reach.
 
     Velocity errors are normalised L2 norms by particle, interpolated linearly between frames. Measures at the end are
-    those of the last common frame, Lagrangian statistics those of all common frames. A rollout that is not complete has
-    none of them: it ends earlier than others.
+    taken at the last common frame, Lagrangian statistics over all common frames. A rollout that is not complete has
+    neither: it ends earlier than others.
     """
     measures: dict[str, float | None] = dict.fromkeys(MEASURES)
     try:

@@ -50,7 +50,7 @@ class PathStatistics:
 
 def of_both(model: Frames, truth: Frames, common: CommonFrames,
             length: float) -> tuple[PathStatistics, PathStatistics]:
-    """Statistics of model and truth over all common frames; tetrads are those of the truth at the first one."""
+    """Statistics of model and truth over all common frames; tetrads are found in the truth at the first one."""
     tetrads = near_tetrads(truth.read(int(common.truth[0]), "position"), length)
     return (path_statistics(model, common.model, tetrads, length),
             path_statistics(truth, common.truth, tetrads, length))

@@ -25,7 +25,7 @@ def pareto_front(cost: np.ndarray, error: np.ndarray) -> np.ndarray:
 
 
 def verdict(model: Method, others: Sequence[Method], cost: str, measures: Mapping[str, str]) -> list[str]:
-    """Two sentences: the measures in which a method is worth its cost, and those in which it is not.
+    """Two sentences: the measures in which a method is worth its cost, and the other measures.
 
     It is worth its cost if no other method that costs no more is as accurate. Errors that differ by less than the
     larger spread over realisations are equal. A method without a number counts as beaten.

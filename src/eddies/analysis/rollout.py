@@ -1,4 +1,4 @@
-"""A rollout beside the true particles: frames of both, and measures that are made of both in the same way."""
+"""A rollout and the true particles: frames of both, and measures that are taken of both in the same way."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -104,7 +104,7 @@ class SpectraAt:
 
 @dataclass(frozen=True)
 class Rollout:
-    """A rollout, the true particles beside it, and measures of both; read frame by frame.
+    """A rollout, the true particles, and measures of both; read frame by frame.
 
     Parameters
     ----------

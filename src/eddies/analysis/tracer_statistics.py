@@ -1,6 +1,6 @@
 """Statistics of the tracers of a ground truth: energy, acceleration, memory and dispersion.
 
-Tracers follow the filtered flow, so that their accelerations and small-scale separations are those of its eddies.
+Tracers follow the filtered flow: its eddies set their accelerations and small-scale separations.
 """
 
 from collections.abc import Mapping

@@ -14,14 +14,14 @@ from eddies.errors import UserError
 
 # Types of arguments and of members of structures.
 INT, NUMBER, ADDRESS = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
-# The same as in setup.py. A processor that runs one of them also runs those before it.
+# The same as in setup.py. A processor that runs one of them also runs all before it.
 INSTRUCTION_SETS = ("plain", "avx2", "avx512")
 REMEDY = ("install a C++ compiler (g++), then eddies again: `pip install --force-reinstall --no-deps .` in its sources "
           "or `bash mpi_tools/bootstrap.sh`")
 
 
 class MissingLibraryError(UserError):
-    """The compiled library is missing, does not load, or was built from other sources than those beside it."""
+    """The compiled library is missing, does not load, or was built from other sources than lie beside it."""
 
 
 @functools.cache
@@ -51,7 +51,7 @@ def in_use() -> str:
 def load(instruction_set: str) -> ctypes.CDLL:
     """The library for one instruction set.
 
-    Raises MissingLibraryError if it does not load, or if it was built from other sources than those beside it: its
+    Raises MissingLibraryError if it does not load, or if it was built from other sources than lie beside it: its
     functions may then take other arguments.
     """
     share_threads()
@@ -66,7 +66,7 @@ def load(instruction_set: str) -> ctypes.CDLL:
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest().encode()
     if sources and (built_from is None or built_from() != digest):
         raise MissingLibraryError(f"the compiled kernels in {sources[0].parent} were built from other sources than "
-                                  "those beside them: build them again with `python setup.py build_ext --inplace`")
+                                  "lie beside them: build them again with `python setup.py build_ext --inplace`")
     return loaded
 
 

@@ -3,7 +3,7 @@
 import ctypes
 import os
 
-# Parameters of glibc's mallopt. 32 MiB is its limit for blocks that come from kept memory; it maps larger ones anew.
+# Parameters of glibc's mallopt. At most 32 MiB are taken from kept memory; larger blocks are always mapped.
 TRIM_THRESHOLD, TOP_PAD, MMAP_THRESHOLD = -1, -2, -3
 KEPT = {MMAP_THRESHOLD: 2**25, TRIM_THRESHOLD: 2**30, TOP_PAD: 2**28}
 

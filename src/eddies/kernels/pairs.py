@@ -73,7 +73,7 @@ class _Given(ctypes.Structure):
 
 
 class CompiledPairs:
-    """Particles whose pairs are summed for those that are `wanted`.
+    """Particles, and sums over their pairs for the `wanted` ones.
 
     Parameters
     ----------

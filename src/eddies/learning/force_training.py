@@ -110,7 +110,7 @@ class TrainingFrame:
         return velocity * (self.model.flow.scales.filter_width / self._rms(velocity)[0] ** 3)
 
     def rows(self, ids: np.ndarray) -> Tensor:
-        """Rows of those of the given particles that this rank owns."""
+        """Rows of the given particles, as far as this rank owns them."""
         wanted = torch.from_numpy(ids).to(self._sorted_ids.device)
         place = torch.searchsorted(self._sorted_ids, wanted)
         inside = place < len(self._sorted_ids)

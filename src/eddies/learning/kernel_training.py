@@ -40,7 +40,7 @@ class KernelSample:
         self.mean_square = self._mean_squares(self.field, self.gradient)
 
     def own_rows(self, points: np.ndarray) -> Tensor:
-        """Rows of those of the given points (numbers in the whole grid, z slowest) that lie in this slab."""
+        """Rows of the given points (numbers in the whole grid, z slowest), as far as they lie in this slab."""
         n = self.decomposition.planes
         own = points[(points // n**2 >= self.decomposition.start) & (points // n**2 < self.decomposition.stop)]
         return torch.from_numpy(own - self.decomposition.start * n**2)

@@ -87,7 +87,7 @@ class Training:
 
     @property
     def seconds(self) -> float:
-        """Wall seconds of the training so far, those before a restart included."""
+        """Wall seconds of the training so far, including the time before a restart."""
         return self._seconds_before + time.perf_counter() - self._started
 
     @property
