@@ -10,10 +10,9 @@ import torch
 from torch import Tensor
 
 from eddies.kernels.library import library
-from eddies.kernels.moving_least_squares import fitted
 from eddies.kernels.neighbors import Box
 from eddies.kernels.pairs import PairSpace
-from eddies.kernels.reconstruction import GridPlanes, sums_on_grid, told_kernel
+from eddies.kernels.reconstruction import GridPlanes, fitted, sums_on_grid, told_kernel
 from eddies.parallel.halo import HaloExchange
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.devices import kernels_serve

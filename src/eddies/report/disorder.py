@@ -7,7 +7,6 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from eddies.analysis import disorder
-from eddies.analysis.drifts import drifts
 from eddies.analysis.pdfs import kl_divergence
 from eddies.analysis.rollout import Rollout
 from eddies.measures import MEASURES
@@ -48,7 +47,7 @@ class Disorder:
 def add(shown: Section, run: Rollout) -> None:
     """Put the figure and its numbers, all at the last common time, into the section of the rollout."""
     found, turnover = Disorder.of(run), run.turnover
-    kept = drifts(run)
+    kept = disorder.drifts(run)
     shown.metrics += [
         Metric("nearest_distance_kl", "KL divergence of the nearest-neighbour distance PDF", found.divergence),
         *(Metric(key, MEASURES[key], both) for key, both in kept.items()),
