@@ -26,10 +26,10 @@ import numpy as np
 from mpi4py import MPI
 
 from eddies.flow.initial_fields import balanced_density, random_velocity
-from eddies.flow.navier_stokes import AcousticBlock, CompressibleFluid, Decay
+from eddies.flow.navier_stokes import CompressibleFluid
 from eddies.kernels.copies import PlaneCopies
 from eddies.parallel.slab import SlabDecomposition
-from eddies.parallel.transpose import TransposeBuffers
+from eddies.parallel.transpose import Transpose
 from eddies.spectral.fourier_passes import PlanePass
 from eddies.spectral.spectral_grid import Collector, SpectralGrid
 from eddies.time_stepping import ETDRK4
@@ -42,7 +42,7 @@ TRIAD_BYTES = 2**25          # of an array that no cache holds
 PARTS = {
     "plane transforms": [(PlanePass, "to_physical"), (PlanePass, "to_modes")],
     "column transforms": [(SpectralGrid, "_columns_to_planes"), (Collector, "modes")],
-    "transposes": [(TransposeBuffers, "to_planes"), (TransposeBuffers, "to_columns")],
+    "transposes": [(Transpose, "to_planes"), (Transpose, "to_columns")],
     "pairs of planes": [(PlaneCopies, "pack"), (PlaneCopies, "unpack")],
     "products": [(CompressibleFluid, "_advection")],
     "linear operators": [(CompressibleFluid, "combine")],
@@ -86,14 +86,12 @@ class Stopwatch:
 
 
 def arrays_in(items: object) -> Iterable[np.ndarray]:
-    """The arrays among arguments or results, and those that operators hold."""
+    """Yield the arrays among arguments or results."""
     if isinstance(items, np.ndarray):
         yield items
     elif isinstance(items, (tuple, list)):
         for item in items:
             yield from arrays_in(item)
-    elif isinstance(items, (AcousticBlock, Decay)):
-        yield from arrays_in(list(vars(items).values()))
 
 
 class FirstOf:
@@ -163,8 +161,8 @@ def transform_bounds(grid: SpectralGrid, backward: int, sent: int, forward: int)
 
 def sent_bytes(grid: SpectralGrid) -> int:
     """Bytes that a rank sends in a step."""
-    return EVALUATIONS * sum(lines.nbytes for lines in (grid.buffers("backward", SENT)._columns,
-                                                        grid.buffers("forward", FORWARD)._planes))
+    return EVALUATIONS * sum(lines.nbytes for lines in (grid.batch("backward", SENT).transpose._columns,
+                                                        grid.batch("forward", FORWARD).transpose._planes))
 
 
 def measure(comm: MPI.Comm, watch: Stopwatch, cells: int, precision: str, steps: int, share_of: int) -> dict:

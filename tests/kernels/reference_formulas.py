@@ -43,7 +43,7 @@ class Formulas:
         return sum(_at_all_kz(factors) * state for factors, state in terms)
 
     def sum_of_acoustic_blocks(self, terms: Terms) -> np.ndarray:
-        """The sum of states (4, ...), to each of which the `AcousticBlock` of its factors is applied, n = 5."""
+        """The sum of states (4, ...), to each of which the acoustic block of its five factors is applied."""
         result = np.zeros_like(terms[0][1])
         for factors, state in terms:
             transverse, excess, elastic, identity, coupling = _at_all_kz(factors)

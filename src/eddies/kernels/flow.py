@@ -61,7 +61,7 @@ class Formulas:
         return self._sum(self._decays, [components], components, 1, terms)
 
     def sum_of_acoustic_blocks(self, terms: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-        """The sum of states (4, ...), to each of which the `AcousticBlock` of its factors is applied, n = 5."""
+        """The sum of states (4, ...), to each of which the acoustic block of its five factors is applied."""
         return self._sum(self._acoustic_blocks, [], 4, 5, terms)
 
     def _sum(self, function: Callable[..., None], counts: list[int], components: int, factors: int,
