@@ -121,8 +121,9 @@ def main():
         draw(found, given.output / "steppers.png")
         for mach, runs in found.items():
             for run in runs:
-                shown = [f"{quantity} {run[quantity]:.2e}" for quantity in QUANTITIES if quantity in run] or ["unstable"]
-                print(f"M_t {mach:g}  {run['stepper']:6}  step {run['step']:.5f}  {run['seconds']:.3g} s  ", *shown)
+                shown = [f"{quantity} {run[quantity]:.2e}" for quantity in QUANTITIES if quantity in run]
+                print(f"M_t {mach:g}  {run['stepper']:6}  step {run['step']:.5f}  {run['seconds']:.3g} s  ",
+                      *(shown or ["unstable"]))
 
 
 if __name__ == "__main__":
