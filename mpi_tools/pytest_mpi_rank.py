@@ -16,7 +16,7 @@ GRACE = 3.0  # seconds in which the other ranks must end a test that has failed 
 
 
 class InnerRun:
-    """Runs the tests of FOLDER/tests.json on this rank, except modules that other runs take; writes FOLDER/RANK.jsonl."""
+    """Runs on this rank the tests of FOLDER/tests.json in free modules, and writes FOLDER/RANK.jsonl."""
 
     def __init__(self, folder: Path):
         # A communicator of its own: messages that a failing test leaves on COMM_WORLD cannot arrive here.
