@@ -1,7 +1,5 @@
 """Time step of a flow: given by the Courant number, or fixed."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from eddies.clock import Clock, ladder_step

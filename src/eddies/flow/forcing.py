@@ -1,7 +1,5 @@
 """Deterministic linear forcing of the largest scales with a prescribed injection rate of energy."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from eddies.errors import UserError

@@ -1,7 +1,5 @@
 """Time series of a flow's statistics, and its energy budget."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping
 from typing import Any

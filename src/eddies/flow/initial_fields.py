@@ -1,7 +1,5 @@
 """Initial states: random solenoidal turbulence, and flows with known solutions. Fields are modes (c, kz, ky, kx)."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from eddies.flow.statistics import energy_spectrum

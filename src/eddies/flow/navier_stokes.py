@@ -1,7 +1,5 @@
 """The two fluids, incompressible and weakly compressible isothermal, as du/dt = L u + N(u) in Fourier space."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """Theoretical limits of the time step, and a watch that ends an unstable run and names the limit it broke."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Statistics of a flow: energy budget, scales, spectrum, moments of the velocity gradient."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from eddies.parallel.reduction import global_sum

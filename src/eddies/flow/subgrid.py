@@ -1,7 +1,5 @@
 """Subgrid closures: the force of the scales that a coarse grid or a filter leaves out, on the resolved ones."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

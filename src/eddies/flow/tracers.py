@@ -1,7 +1,5 @@
 """Tracers: fluid particles that follow the filtered velocity of a simulation."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from eddies.parallel.migration import id_block, migrate, wrap

@@ -1,7 +1,5 @@
 """Text from one rank to all, and work of some ranks whose errors all ranks raise."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, TypeVar
 

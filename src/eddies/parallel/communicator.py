@@ -1,7 +1,5 @@
 """Type of the communicator that everything below the command line gets, and the ranks of one node."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Checks whether MPI connects the ranks that a launcher has started, and whether all of them arrive at one place."""
 
-from __future__ import annotations
-
 import os
 import time
 

@@ -1,7 +1,5 @@
 """Halos: copies of the particles or grid planes just outside a slab, and the adjoint of copying."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Migration: particles move to the rank whose slab contains them, or to the rank that stores their id."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

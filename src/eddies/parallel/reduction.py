@@ -1,7 +1,5 @@
 """Sums, extrema and votes over all ranks. One rank sends nothing."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Slab decomposition: grid planes and particles are shared among ranks by one block rule."""
 
-from __future__ import annotations
-
 import numpy as np
 from mpi4py import MPI
 

@@ -1,7 +1,5 @@
 """Orderly stop: signals, a file STOP and a limit of wall time, which all ranks see at the same step."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import os

@@ -1,7 +1,5 @@
 """Global transpose of the slab transform: planes cut along z become columns cut along y."""
 
-from __future__ import annotations
-
 import numpy as np
 from mpi4py import MPI
 

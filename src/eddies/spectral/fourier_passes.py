@@ -6,8 +6,6 @@ vector width. Its real ones took 2.5 times as long at 128^2 with measured plans,
 All plans use FFTW_ESTIMATE: measured plans may differ from run to run, and with them the last bits of the results.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from typing import Any, NamedTuple

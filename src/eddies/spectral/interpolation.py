@@ -1,7 +1,5 @@
 """B-spline interpolation of fields at arbitrary points, with coefficients that are exact in Fourier space."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

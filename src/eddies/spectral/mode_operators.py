@@ -3,8 +3,6 @@
 Modes are (..., kz, ky, kx). Vectors have the order x, y, z, symmetric matrices xx, yy, zz, xy, xz, yz.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Real-to-complex Fourier transforms of slabs, with only the modes that dealiasing keeps."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -21,6 +19,14 @@ COMPLEX = {"float64": np.complex128, "float32": np.complex64}
 SYMMETRIC = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 Expansion = Callable[[np.ndarray], Sequence[Part]]
+
+
+class _Batch(NamedTuple):
+    """Transpose of a batch of components, and its blocks in the form that the copies of either side take."""
+
+    transpose: Transpose
+    columns: Any
+    planes: Any
 
 
 class SpectralGrid(ModeOperators):
@@ -191,14 +197,6 @@ class SpectralGrid(ModeOperators):
         """Return the mean over the box of each component of (c, z_local, y, x); shape (c,)."""
         total = global_sum(self.decomposition.comm, physical.sum(axis=(1, 2, 3), dtype=np.float64))
         return total / self.cells**3
-
-
-class _Batch(NamedTuple):
-    """Transpose of a batch of components, and its blocks in the form that the copies of either side take."""
-
-    transpose: Transpose
-    columns: Any
-    planes: Any
 
 
 class Collector:
