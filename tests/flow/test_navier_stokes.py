@@ -7,7 +7,7 @@ from eddies.flow import initial_fields
 from eddies.flow.forcing import ForcingError, LinearForcing
 from eddies.flow.history import FlowHistory
 from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid
-from eddies.flow.statistics import component_energies, compressible_budget, gradient_moments
+from eddies.flow.statistics import component_energies, compressible_budget, gradient_moments, turbulence_scales
 from eddies.spectral.mode_operators import gaussian_transfer
 from eddies.time_stepping import ETDRK4
 from tests.validation.flows import make_grid, march, turbulence
@@ -178,3 +178,16 @@ def test_the_energy_of_a_weak_sound_wave_is_that_of_its_compression(comm):
     state[3] = initial_fields.sound_wave_density(grid, amplitude, 2)
     energy = compressible_budget(grid, state, 0.0, sound_speed)["total_energy"]
     assert energy == pytest.approx(sound_speed**2 * amplitude**2 / 4, rel=1e-5)
+
+
+def test_scales_satisfy_the_relations_of_isotropic_turbulence():
+    """With all energy at k = 2: L = 3 pi / (4 k), Re_lambda = E (20 / (3 nu eps))^(1/2), eps = nu / t_eta^2."""
+    energy, eps, nu, spectrum = 0.6, 0.3, 0.02, np.zeros(9)
+    spectrum[2] = energy
+    scales = turbulence_scales(spectrum, eps, nu, cutoff=8)
+    assert scales["integral_scale"] == pytest.approx(3 * np.pi / 8)
+    assert 1.5 * (scales["integral_scale"] / scales["eddy_turnover_time"]) ** 2 == pytest.approx(energy)
+    assert scales["reynolds_lambda"] == pytest.approx(energy * np.sqrt(20 / (3 * nu * eps)))
+    assert nu / scales["kolmogorov_time"] ** 2 == pytest.approx(eps)
+    assert scales["kmax_eta"] ** 2 == pytest.approx(64 * nu * scales["kolmogorov_time"])
+    assert turbulence_scales(spectrum, 0.0, 0.0, cutoff=8)["reynolds_lambda"] == np.inf
