@@ -71,15 +71,15 @@ def limits_of_step(k_max: float, step: float, speed: float, viscosity: float, ex
                    sound_speed: float | None) -> list[StepLimit]:
     """Return the limits of a step; `explicit` means RK4 instead of ETDRK4, `sound_speed` is None without sound.
 
-    k_max is the cutoff of each axis. The eigenvalues of the largest modulus, all at |k| = sqrt(3) k_max, are
-    i k_max (|u| + |v| + |w|) for advection, i sqrt(3) k_max c for sound in addition, and -3 nu k_max^2 for viscosity,
-    -4 nu k_max^2 in a compressible fluid. RK4 is stable up to where its region of stability meets the axes.
+    k_max is the cutoff of each axis. The eigenvalues of the largest modulus belong to |k| = sqrt(3) k_max. They are
+    i k_max (|u| + |v| + |w|) for advection, with i sqrt(3) k_max c added for sound. For viscosity they are
+    -3 nu k_max^2, or -4 nu k_max^2 in a compressible fluid. RK4 is stable up to where its region meets the axes.
 
     ETDRK4 takes viscosity and sound exactly. Without them its region is that of RK4. Viscosity widens it: it reaches
-    3.2, 3.9 and 4.9 at nu k^2 step = 1, 3 and 5, and about 0.7 nu k^2 step beyond. Undamped sound makes it leak: in a
-    uniform flow with an advective number of 0.5, 1, 1.5 and 2, waves with c k step between 1 and 7 grow by up to 0.1,
-    2, 7 and 15 % a step. A damping 2/3 nu k^2 step of 0.0013, 0.024, 0.1 and 0.22 stops them. Turbulence, where few
-    points move at the largest speed, took 60 steps at three times the boundary without tenfold energy (12^3 cells,
+    3.2, 3.9 and 4.9 at nu k^2 step = 1, 3 and 5, and about 0.7 nu k^2 step beyond. Undamped sound makes it leak: waves
+    with c k step between 1 and 7 grow. In a uniform flow they grow by up to 0.1, 2, 7 and 15 % a step at an advective
+    number of 0.5, 1, 1.5 and 2. A damping 2/3 nu k^2 step of 0.0013, 0.024, 0.1 and 0.22 stops them. Turbulence, where
+    few points move at the largest speed, took 60 steps at three times the boundary without tenfold energy (12^3 cells,
     M_t from 0.01 to 0.5).
     """
     limits = [StepLimit("advection", "step x k_max x max(|u| + |v| + |w|)", step * k_max * speed, IMAGINARY_REACH)]

@@ -147,8 +147,10 @@ class PlanePass:
         return PlanePlans(described(rows), [described(field) for field in planes], values, plans)
 
     def _values(self, fields: int, pairs: int) -> np.ndarray:
-        """Return zeros (fields, pairs, y, 2 x) with the fields an odd number of cache lines apart, so that a loop over
-        the same point of many fields does not crowd a few sets of a cache."""
+        """Return zeros (fields, pairs, y, 2 x) with the fields an odd number of cache lines apart.
+
+        Otherwise a loop over the same point of many fields would crowd a few sets of a cache.
+        """
         n, item = self.cells, self.dtype.itemsize
         apart = (-(-pairs * n * n * item // CACHE_LINE) | 1) * CACHE_LINE
         memory = pyfftw.zeros_aligned(fields * apart, np.uint8, n=CACHE_LINE)
