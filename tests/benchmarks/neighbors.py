@@ -1,10 +1,10 @@
-"""All neighbours of random points in a periodic box, both orders of each pair: by the compiled list, by its definition
-in torch, and by vesin, at the same points and in one run.
+"""Time of neighbour lists of random points in a periodic box: the compiled one, its definition in torch, and vesin.
 
     OMP_NUM_THREADS=1 .venv/bin/python tests/benchmarks/neighbors.py [POINTS A SIDE] [--neighbors N]
 
-vesin (pip install --no-binary vesin vesin) gives the two numbers of each pair, in no order, in memory of its own; ours
-come in compressed rows. All are in double precision and on one thread. Prints a JSON line with medians of seconds.
+All lists have both orders of each pair, in double precision, on one thread, at the same points. vesin (pip install
+--no-binary vesin vesin) returns the unordered numbers of each pair in its own memory; ours returns compressed rows.
+Prints a JSON line with median seconds.
 """
 
 import argparse
@@ -27,7 +27,7 @@ LENGTH, REPEATS = 2 * math.pi, 9
 
 
 def rows(points: torch.Tensor, cutoff: float) -> tuple[np.ndarray, np.ndarray]:
-    """Compressed rows."""
+    """Compressed rows of the list."""
     found = NeighborList(PeriodicBox(LENGTH, True), cutoff, 0.0)
     found.build(points, points, exclude_self=True)
     return found.offsets.numpy(), found.senders.numpy()
@@ -57,7 +57,7 @@ def main() -> None:
     if not np.array_equal(ours, np.sort(first * len(position) + second)):
         raise SystemExit("neighbors: the lists differ")
     seconds: dict[str, list[float]] = {name: [] for name in actions}
-    for _ in range(REPEATS):  # in turn, so that all meet the same disturbances
+    for _ in range(REPEATS):  # in turn, so that all see the same load
         for name, action in actions.items():
             start = time.perf_counter()
             action()

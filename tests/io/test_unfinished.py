@@ -160,7 +160,7 @@ PROGRAM = """
 import resource, sys
 import numpy as np
 from eddies import cli
-from eddies.parallel import rendezvous
+from eddies.parallel import connection
 from eddies.io import unfinished
 from eddies.io.checksums import FOOTER, count_blocks
 from eddies.io.hdf5 import append_frame, create_product, growing_dataset
@@ -175,7 +175,7 @@ def run(scene, comm, directory, stop):
                 resource.setrlimit(resource.RLIMIT_FSIZE, (5_000_000, -1))
             append_frame(dataset, np.ones((50000, 3)), (50000 * comm.rank, 0))
 
-dns.run, rendezvous.PATIENCE = run, 0.5
+dns.run, connection.PATIENCE = run, 0.5
 sys.exit(cli.main(["dns", "tiny", "--output", sys.argv[1]]))
 """
 
