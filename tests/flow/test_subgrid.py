@@ -11,7 +11,7 @@ from eddies.flow.subgrid import DynamicStress, EddyDamping, SpectralViscosity, S
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.fourier_grid import FourierGrid
 from eddies.particles.resolved_flow import ResolvedFlow
-from eddies.particles.terms.damping import Damping
+from eddies.particles.terms.resolved_forces import Damping
 from eddies.spectral.mode_operators import gaussian_transfer
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.time_stepping import ETDRK4
