@@ -10,7 +10,7 @@ from eddies.flow.statistics import energy_spectrum
 from eddies.flow.subgrid import DynamicStress, EddyDamping, SpectralViscosity, StressModel
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.fourier_grid import FourierGrid
-from eddies.particles.resolved_flow import ResolvedFlow
+from eddies.particles.resolved_velocity import ResolvedFlow
 from eddies.particles.terms.resolved_forces import Damping
 from eddies.spectral.mode_operators import gaussian_transfer
 from eddies.spectral.spectral_grid import SpectralGrid

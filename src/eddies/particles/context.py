@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -19,14 +19,11 @@ from eddies.particles.devices import kernels_serve
 from eddies.particles.exchanges import mean_over_ranks
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.kriging import Kriging
-from eddies.particles.neighborhood import LocalParticles, Surroundings
+from eddies.particles.neighborhood import LocalParticles
 from eddies.particles.pairs import CompiledSum, ScaledPairs, compiled_sums
 from eddies.particles.particle_set import ParticleSet
+from eddies.particles.resolved_velocity import ResolvedFlow, ResolvedVelocity
 from eddies.scene.terms import TermError
-
-if TYPE_CHECKING:
-    from eddies.particles.resolved_flow import ResolvedFlow
-    from eddies.particles.resolved_velocity import ResolvedVelocity
 
 # Numbers held at once in sums over pairs without a gradient: about a core's cache, or a part of a device's memory.
 PAIR_VALUES_TOGETHER = {"cpu": 1 << 19, "cuda": 1 << 26}
@@ -66,7 +63,7 @@ class Context:
     decomposition : slabs, with the communicator.
     particles : the owned particles.
     flow : units of the model.
-    surroundings : of the particles; None if no term reads pairs.
+    local : the particles that this rank sees; None if no term reads pairs.
     resolution : finds the resolved velocity; None if no term reads it.
     rows : (k,), the particles for which acceleration and density rate are computed; None: all.
     dtype : type of the pair arithmetic; None: that of the positions.
@@ -75,40 +72,32 @@ class Context:
     """
 
     def __init__(self, decomposition: SlabDecomposition, particles: ParticleSet, flow: FlowUnits,
-                 surroundings: Surroundings | None, resolution: ResolvedVelocity | None, rows: Tensor | None = None,
+                 local: LocalParticles | None, resolution: ResolvedVelocity | None, rows: Tensor | None = None,
                  dtype: torch.dtype | None = None, density: Tensor | None = None, time: float | None = None) -> None:
         self.decomposition, self.comm = decomposition, decomposition.comm
         self.particles, self.flow, self.rows, self.density = particles, flow, rows, density
         self.dtype = dtype or particles.position.dtype
-        self._surroundings, self._resolution, self._time = surroundings, resolution, time
+        self._local, self._resolution, self._time = local, resolution, time
         self._columns: dict[str, Tensor] = {}
         self._sums: dict[PairSum, Tensor] = {}
 
     @property
-    def surroundings(self) -> Surroundings:
-        """Quantities that depend on the positions alone."""
-        if self._surroundings is None:
-            raise TermError(UNDECLARED.format("pairs"))
-        return self._surroundings
-
-    @property
     def local(self) -> LocalParticles:
-        """The particles that this rank sees, ghosts included; collective."""
-        return self.surroundings.local
+        """The particles that this rank sees, ghosts included."""
+        if self._local is None:
+            raise TermError(UNDECLARED.format("pairs"))
+        return self._local
 
     @property
     def kriging(self) -> Kriging:
         """Kriging among neighbours at all owned particles; collective."""
-        return self.surroundings.kriging
+        return self.local.kriging(self.flow.scales.filter_width, self.dtype)
 
     @property
     def everywhere(self) -> Context:
         """The same context for all owned particles instead of some rows."""
-        # Not cached on itself: a reference cycle would keep lists and weights in memory until garbage collection.
-        return self if self.rows is None else self._everywhere
-
-    @cached_property
-    def _everywhere(self) -> Context:
+        if self.rows is None:
+            return self
         whole = copy(self)
         whole.rows, whole._sums = None, {}
         vars(whole).pop("moments", None)
@@ -116,7 +105,7 @@ class Context:
 
     def column(self, name: str) -> Tensor:
         """Column "velocity" (s, 3) or "density" (s,) of the particles that this rank sees, owned first; collective."""
-        around = self.surroundings.neighborhood
+        around = self.local.neighborhood
         if name not in self._columns:
             owned = self.density if name == "density" else getattr(self.particles, name)
             if owned is None:
@@ -176,19 +165,19 @@ class Context:
         summands = [each for each in (*terms, *([_MOMENTS] if needs_moments else [])) if each not in self._sums]
         if not summands:
             return
-        mutual = self.rows is None and all(summand.mutual for summand in summands)
         requests = {summand: self._compiled_request(summand) for summand in summands}
         if compiled := {summand: request for summand, request in requests.items() if request is not None}:
-            self._sums |= zip(compiled, self._compiled_sums(compiled, mutual))
+            self._sums |= zip(compiled, self._compiled_sums(compiled))
         if rest := [summand for summand in summands if requests[summand] is None]:
-            self._sums |= zip(rest, self._mutual_sums(rest) if mutual else self._sums_of(rest))
+            self._sums |= zip(rest, self._torch_sums(rest))
 
     def _compiled_request(self, summand: PairSum) -> CompiledSum | None:
         """The sum for the compiled library; None if it does not know the summand or the device."""
         request = vars(type(summand)).get("compiled")
         return request(summand, self) if request and kernels_serve(self.particles.position.device) else None
 
-    def _compiled_sums(self, summands: Mapping[PairSum, CompiledSum], mutual: bool) -> list[Tensor]:
+    def _compiled_sums(self, summands: Mapping[PairSum, CompiledSum]) -> list[Tensor]:
+        mutual = self.rows is None and all(summand.mutual for summand in summands)
         local, flow, owned = self.local, self.flow, len(self.particles)
         wanted = np.zeros(len(local.position), bool)
         wanted[slice(owned) if self.rows is None else self.rows.numpy()] = True
@@ -199,7 +188,7 @@ class Context:
                              velocity, wanted, self.dtype)
         return [each[:, :owned] if self.rows is None else each.index_select(1, self.rows) for each in sums]
 
-    def _sums_of(self, summands: Sequence[PairSum]) -> Sequence[Tensor]:
+    def _torch_sums(self, summands: Sequence[PairSum]) -> Sequence[Tensor]:
         blocks = []
         for block in self._blocks(summands):
             pairs = self._pairs(block)
@@ -207,19 +196,9 @@ class Context:
             blocks.append(pairs.pairs.sum(torch.cat(values).T).T)
         return torch.cat(blocks, dim=1).split([len(value) for value in values])
 
-    def _mutual_sums(self, summands: Sequence[PairSum]) -> list[Tensor]:
-        """Sums that evaluate each pair of owned particles once; both ranks evaluate a pair with a ghost."""
-        totals = [self.local.position.new_zeros((len(summand.parity), len(self.particles)), dtype=self.dtype)
-                  for summand in summands]
-        for block in self._blocks(summands):
-            pairs = self._pairs(block, once=True)
-            for summand, total in zip(summands, totals):
-                pairs.pairs.add_to_both(summand.pair_values(pairs), summand.parity.to(total), total)
-        return totals
-
-    def _pairs(self, block: Tensor | slice | None, once: bool = False) -> ScaledPairs:
+    def _pairs(self, block: Tensor | slice | None) -> ScaledPairs:
         position = self.local.position
-        pairs = self.local.neighbors.pairs(position[: len(self.particles)], position, block, self.dtype, once)
+        pairs = self.local.neighbors.pairs(position[: len(self.particles)], position, block, self.dtype)
         return ScaledPairs(pairs, self.column, self.flow)
 
     def _blocks(self, summands: Sequence[PairSum]) -> Iterator[Tensor | slice | None]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -12,13 +11,11 @@ from torch import Tensor
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.context import Context
 from eddies.particles.model import LagrangianModel, LinearRates
-from eddies.particles.neighborhood import Neighborhood, Surroundings, at_home, farthest_outside
+from eddies.particles.neighborhood import LocalParticles, Neighborhood, at_home, farthest_outside
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.periodic_box import PeriodicBox
 from eddies.particles.rates import Rates
-
-if TYPE_CHECKING:
-    from eddies.particles.resolved_velocity import ResolvedVelocity
+from eddies.particles.resolved_velocity import ResolvedVelocity
 
 
 class ParticleDynamics:
@@ -45,11 +42,9 @@ class ParticleDynamics:
         self.box, self.time, self.evaluations = PeriodicBox(decomposition.length), 0.0, 0
         self.resolution: ResolvedVelocity | None = None
         self.neighborhood: Neighborhood | None = None
-        self._surroundings: Surroundings | None = None
+        self._local: LocalParticles | None = None
         if "resolved" in model.reads:
-            from eddies.particles import resolved_velocity  # imports pyfftw, only where it is needed
-            self.resolution = resolved_velocity.ResolvedVelocity.on_slabs(decomposition, model.flow, skin / 2 + drift,
-                                                                          dtype)
+            self.resolution = ResolvedVelocity.on_slabs(decomposition, model.flow, skin / 2 + drift, dtype)
         if "pairs" in model.reads:
             self.neighborhood = Neighborhood(decomposition, decomposition.length, model.flow.cutoff, skin)
 
@@ -64,7 +59,7 @@ class ParticleDynamics:
 
     def release(self) -> None:
         """Free the memory of quantities that depend on the last positions."""
-        self._surroundings = None
+        self._local = None
 
     def built_at(self, particles: ParticleSet) -> Tensor | None:
         """Positions (n, 3) of these particles at the last build of halo and list; None without a list."""
@@ -147,10 +142,9 @@ class ParticleDynamics:
         """Context for the evaluation of terms at these particles; collective."""
         if self.neighborhood is not None:
             self.neighborhood.update(particles)
-            if self._surroundings is None or not self._surroundings.fit(particles.position):
-                self._surroundings = Surroundings(particles.position, self.neighborhood, self.model.flow,
-                                                  self.dtype or particles.position.dtype)
+            if self._local is None or not self._local.fit(particles.position):
+                self._local = self.neighborhood.local(particles.position)
         if density is None and not self.model.density_is_given:
             density = particles.density
-        return Context(self.decomposition, particles, self.model.flow, self._surroundings, self.resolution, rows,
-                       self.dtype, density, time)
+        return Context(self.decomposition, particles, self.model.flow, self._local, self.resolution, rows, self.dtype,
+                       density, time)

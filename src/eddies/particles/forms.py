@@ -43,7 +43,7 @@ class Reconstructed:
 
 
 class _Averaged(Reconstructed):
-    """Kernel averages, which have faster sums on the whole grid and at the particles."""
+    """Kernel averages, which have a faster sum on the whole grid."""
 
     def __init__(self, field: ParticleField, kernel: SmoothingKernel) -> None:
         self.kernel, self.volume = kernel, field.volumes(kernel)
@@ -51,9 +51,6 @@ class _Averaged(Reconstructed):
 
     def velocity_on_grid(self) -> Tensor:
         return self.field.velocity_on_whole_grid(self.kernel, self.volume)
-
-    def at_particles(self) -> tuple[Tensor, Tensor]:
-        return self.field.at_particles(self.kernel, self.volume)
 
 
 @dataclass(frozen=True)

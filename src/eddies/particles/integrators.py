@@ -71,7 +71,7 @@ class VelocityVerlet(Integrator):
 class CorrectedVerlet(Integrator):
     """Velocity Verlet that evaluates the rates again at the final velocity and density (Besold et al. 2000, DPD-VV).
 
-    Both evaluations have the same positions and share neighbour lists and weights. For rates that depend on the velocity
+    Both evaluations have the same positions and share neighbour lists and weights. For rates that depend on velocity
     alone it is Heun's method of second order, stable up to twice the step of velocity Verlet. A shift velocity is that
     at the start of the step, of first order.
     """

@@ -51,9 +51,9 @@ class Covariance:
 def interpolated(pairs: Pairs, support: float, covariance: Covariance, sender_values: Tensor) -> tuple[Tensor, Tensor]:
     """Kriging at points that are no particles: field (n, c) and gradient (n, c, 3) from values (s, c) of the particles.
 
-    The result is sum_j w_j f_j with weights as in `kriging_weights` and b_j = C(|x - x_j|), or its derivatives by x. The
-    weights of the field add up to one and those of the gradient to zero, so a constant is exact. The result is NaN where
-    the equations cannot be solved, and zero where no particle lies within the support.
+    The result is sum_j w_j f_j with weights as in `kriging_weights` and b_j = C(|x - x_j|), or its derivatives by x.
+    The weights of the field add up to one and those of the gradient to zero, so a constant is exact. The result is NaN
+    where the equations cannot be solved, and zero where no particle lies within the support.
     """
     _, weights = kriging_weights(pairs, support, covariance, sited=False)
     values = sender_values.to(pairs.displacement.dtype).contiguous()
@@ -67,10 +67,11 @@ def kriging_weights(pairs: Pairs, support: float, covariance: Covariance,
     """Kriging weights: the best linear estimate sum_j w_j f_j of a field and its derivatives, w = K^-1 b.
 
     K_jk = C(|x_j - x_k|), plus the noise NOISE / max(1 - (r/support)^4, 1e-4) of each particle on the diagonal, r its
-    distance: neighbours at the support enter and leave without a jump. If the receiver is a particle (`sited`), its own value f_i is among the f_j. b
-    is then 1 for the particle and 0 for its neighbours in the row of the field itself, which estimates w_i times f_i
-    less the neighbours' estimate. In the rows of derivatives b is the derivative of C(|x - x_j|) by x. The mean of f is
-    unknown: a multiple of K^-1 1 is subtracted so that the weights add up to zero (ordinary kriging).
+    distance: neighbours at the support enter and leave without a jump. If the receiver is a particle (`sited`), its own
+    value f_i is among the f_j. In the row of the field b is then 1 for the particle and 0 for its neighbours: the result
+    is w_i times f_i minus the neighbours' estimate of it. In the rows of derivatives b is the derivative of C(|x - x_j|)
+    by x. The mean of f is unknown: a multiple of K^-1 1 is subtracted so that the weights add up to zero (ordinary
+    kriging).
 
     Returns
     -------

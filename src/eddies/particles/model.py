@@ -39,7 +39,7 @@ class LagrangianModel(nn.Module):
     """dv_i/dt, and d rho_i/dt if some term gives it, as the sum of terms.
 
     Terms that do not read the density are evaluated first; the density that they give is the one that others read.
-    Inputs that no term reads are not computed. Raises TermError if a term both reads the density and gives a part of it.
+    Inputs that no term reads are not computed. Raises TermError if a term reads the density and gives a part of it.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ class LagrangianModel(nn.Module):
         self.terms = cast(Mapping[str, Term], nn.ModuleDict(terms))  # nn.ModuleDict loses the type of its modules
         self.flow = flow
         for name, term in self.terms.items():
-            if "density" in term.reads and "density" in term.gives:
+            if "density" in term.settings.reads and "density" in term.settings.gives:
                 raise TermError(f'term "{name}": reads the density and gives a part of it; it can do only one of both')
 
     def forced(self, settings: TermSettings | None) -> LagrangianModel:
@@ -70,12 +70,12 @@ class LagrangianModel(nn.Module):
     @property
     def reads(self) -> set[str]:
         """All inputs of the terms."""
-        return {name for term in self.terms.values() for name in term.reads}
+        return {name for term in self.terms.values() for name in term.settings.reads}
 
     @property
     def gives(self) -> set[str]:
         """All contributions of the terms."""
-        return {name for term in self.terms.values() for name in term.gives}
+        return {name for term in self.terms.values() for name in term.settings.gives}
 
     @property
     def reads_density(self) -> bool:
@@ -104,7 +104,7 @@ class LagrangianModel(nn.Module):
 
     @property
     def _giving_rate(self) -> list[Term]:
-        return [term for term in self.terms.values() if "density_rate" in term.gives]
+        return [term for term in self.terms.values() if "density_rate" in term.settings.gives]
 
     @property
     def networks(self) -> list[PairTerm]:
@@ -120,7 +120,7 @@ class LagrangianModel(nn.Module):
     def rates(self, context: Context, kept: Mapping[str, LinearRates] | None = None) -> Rates:
         """Sum of the terms; differentiable, collective.
 
-        The result has `acceleration` (k, 3) with the `force_modes` in it, `density_rate` (k,) and the shift if some term
+        The result has `acceleration` (k, 3) with the `force_modes` in it, `density_rate` (k,) and the shift if a term
         gives them, and, if terms give it, the whole `density` (n,) instead of its deviation. `kept` replaces terms at
         these particles; see `linear_rates`.
         """
@@ -171,7 +171,7 @@ class LagrangianModel(nn.Module):
     def _stages(self) -> list[list[tuple[str, Term]]]:
         """The terms that do not read the density, then those that do."""
         named = list(self.terms.items())
-        return [[item for item in named if ("density" in item[1].reads) == reading] for reading in (False, True)]
+        return [[item for item in named if ("density" in item[1].settings.reads) == reading] for reading in (False, True)]
 
     def _at_particles(self, rates: Rates, context: Context) -> Rates:
         """Rates whose modes are interpolated to the particles.
@@ -249,7 +249,7 @@ class LinearRates:
 
 def _everywhere(term: Term) -> bool:
     """Whether a sum over pairs is needed at all particles, since others read the density that it gives."""
-    return isinstance(term, PairTerm) and "density" in term.gives
+    return isinstance(term, PairTerm) and "density" in term.settings.gives
 
 
 def _evaluated(term: Term, context: Context) -> Rates:
@@ -262,7 +262,7 @@ def _checked(result: object, term: Term) -> Rates:
     """The result of a term's forward; raises TermError unless it is Rates with the declared density."""
     if not isinstance(result, Rates):
         raise TermError(f"{type(term).__name__}: forward returns a {type(result).__name__}; it must return Rates")
-    if "density" in term.gives and result.density is None and result.pressure_modes is None:
+    if "density" in term.settings.gives and result.density is None and result.pressure_modes is None:
         raise TermError(f'{type(term).__name__}: declares that it gives "density", and returns none; take it out of '
                         "`gives` of its settings, or return density or pressure_modes")
     return result

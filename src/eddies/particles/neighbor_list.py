@@ -64,7 +64,7 @@ class NeighborList:
             yield slice(first, last)
 
     def pairs(self, receivers: Tensor, senders: Tensor, rows: Tensor | slice | None = None,
-              dtype: torch.dtype | None = None, once: bool = False) -> Pairs:
+              dtype: torch.dtype | None = None) -> Pairs:
         """Return the pairs that lie within the cutoff now; differentiable in the positions.
 
         Parameters
@@ -73,17 +73,16 @@ class NeighborList:
         rows : receivers to keep, as row numbers (k,) or a slice. Output row k belongs to the k-th of them.
         dtype : type of displacement and distance; by default that of the positions. The conversion follows the
             subtraction, so single precision loses no accuracy to the size of the box.
-        once : drop the second order of each pair of receivers. The senders must then be the receivers, then others.
         """
         dtype, total = dtype or receivers.dtype, len(self.offsets) - 1
-        numbers = rows if isinstance(rows, Tensor) else torch.arange(total, device=receivers.device)[rows or slice(None)]
+        if rows is None or isinstance(rows, slice):
+            numbers = torch.arange(total, device=receivers.device)[rows or slice(None)]
+        else:
+            numbers = rows
         recorded = torch.is_grad_enabled() and (receivers.requires_grad or senders.requires_grad)
         if kernels_serve(receivers.device) and not recorded:
-            return self._compiled_pairs(receivers, senders, numbers, dtype, once)
+            return self._compiled_pairs(receivers, senders, numbers, dtype)
         receiver, segment, sender = self._listed(numbers)
-        if once:
-            first = torch.nonzero(receiver < sender).squeeze(1)
-            receiver, segment, sender = (index.index_select(0, first) for index in (receiver, segment, sender))
         with torch.no_grad():
             square = sum(component.square() for component in self._difference(receivers, senders, receiver, sender))
             near = torch.nonzero(square < self.cutoff**2).squeeze(1)
@@ -92,10 +91,9 @@ class NeighborList:
         displacement = torch.stack([component.to(dtype) for component in components])
         return Pairs(receiver, segment, sender, displacement.T, safe_norm(displacement, dim=0), len(numbers))
 
-    def _compiled_pairs(self, receivers: Tensor, senders: Tensor, numbers: Tensor, dtype: torch.dtype,
-                        once: bool) -> Pairs:
+    def _compiled_pairs(self, receivers: Tensor, senders: Tensor, numbers: Tensor, dtype: torch.dtype) -> Pairs:
         found = pairs_within(library(), self._space, self.cutoff, receivers.detach().numpy(), senders.detach().numpy(),
-                             self.offsets.numpy(), self.senders.numpy(), numbers.numpy(), once,
+                             self.offsets.numpy(), self.senders.numpy(), numbers.numpy(), False,
                              np.dtype(str(dtype).removeprefix("torch.")))
         receiver, segment, sender, displacement, distance = map(torch.from_numpy, found)
         return Pairs(receiver, segment, sender, displacement.T, distance, len(numbers))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
@@ -17,25 +17,39 @@ from eddies.parallel.reduction import any_rank, global_max
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.exchanges import exchange_ghost_positions, exchange_ghosts
 from eddies.particles.faults import find_unplaced
-from eddies.particles.flow_units import FlowUnits
 from eddies.particles.kriging import Kriging
 from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.periodic_box import PeriodicBox
 
 
-@dataclass(frozen=True)
 class LocalParticles:
-    """The particles that a rank sees at one moment: its own rows, then the ghosts.
+    """The particles that a rank sees at one moment, and quantities that depend on their positions alone.
 
-    Parameters
-    ----------
-    position : (s, 3). On several ranks z is not periodic here, and ghosts have the z at which the slab sees them.
-    neighborhood : halo and neighbour list of these rows.
+    Evaluations at the same positions share them. Everything is computed at first use, and collective.
     """
 
-    position: Tensor
-    neighborhood: Neighborhood
+    def __init__(self, owned: Tensor, neighborhood: Neighborhood) -> None:
+        self._owned, self.neighborhood = owned, neighborhood
+        self._state = self._state_of(owned)
+        self._kriging: Kriging | None = None
+
+    def fit(self, owned: Tensor) -> bool:
+        """Whether they belong to this unchanged tensor of owned positions, the present halo and list, and the present
+        recording of gradients. The answer is the same on all ranks."""
+        return self._owned is owned and self._state == self._state_of(owned)
+
+    def _state_of(self, owned: Tensor) -> tuple[int, int, bool]:
+        return owned._version, self.neighborhood.builds, torch.is_grad_enabled() and owned.requires_grad
+
+    @cached_property
+    def position(self) -> Tensor:
+        """Positions (s, 3) of the owned particles, then of the ghosts.
+
+        On several ranks z is not periodic here, and ghosts have the z at which the slab sees them.
+        """
+        # Stored component by component, which is faster for the gathering of pairs.
+        return self.neighborhood.with_ghosts(self._owned, exchange_ghost_positions).T.contiguous().T
 
     @property
     def box(self) -> PeriodicBox:
@@ -46,6 +60,15 @@ class LocalParticles:
     def neighbors(self) -> NeighborList:
         """The neighbour list of these rows."""
         return self.neighborhood.neighbors
+
+    def kriging(self, filter_width: float, dtype: torch.dtype) -> Kriging:
+        """Kriging among neighbours at all owned particles, for fields that have passed a filter of this width."""
+        if self._kriging is None:
+            position = self.position.detach()
+            pairs = self.neighbors.pairs(position[: len(self._owned)], position, dtype=dtype)
+            self._kriging = Kriging(pairs, len(position), self.neighborhood.cutoff, filter_width,
+                                    self.neighborhood.column)
+        return self._kriging
 
 
 class Neighborhood:
@@ -103,7 +126,7 @@ class Neighborhood:
         self._ids, self._built_at = particles.id, particles.position.detach().clone()
         self.builds += 1
         with torch.no_grad():
-            self._unlisted = self._with_ghosts(particles.position, exchange_ghost_positions)
+            self._unlisted = self.with_ghosts(particles.position, exchange_ghost_positions)
 
     @property
     def neighbors(self) -> NeighborList:
@@ -114,52 +137,16 @@ class Neighborhood:
         return self._neighbors
 
     def local(self, position: Tensor) -> LocalParticles:
-        """Present positions (n, 3) of the owned particles, with ghosts."""
-        # Stored component by component, which is faster for the gathering of pairs.
-        return LocalParticles(self._with_ghosts(position, exchange_ghost_positions).T.contiguous().T, self)
+        """The particles that this rank sees, with present positions (n, 3) of the owned ones."""
+        return LocalParticles(position, self)
 
     def column(self, owned: Tensor) -> Tensor:
         """Column (n, ...) of the owned particles, followed by its ghost rows."""
-        return self._with_ghosts(owned, exchange_ghosts)
+        return self.with_ghosts(owned, exchange_ghosts)
 
-    def _with_ghosts(self, owned: Tensor, exchange) -> Tensor:
+    def with_ghosts(self, owned: Tensor, exchange: Callable[[HaloExchange, Tensor], Tensor]) -> Tensor:
+        """Column (n, ...) of the owned particles, followed by the ghost rows of an exchange."""
         return owned if self.decomposition.size == 1 else torch.cat([owned, exchange(self.halo, owned)])
-
-
-class Surroundings:
-    """Quantities that depend on the positions of the particles alone. Evaluations at the same positions share them.
-
-    Parameters
-    ----------
-    position : (n, 3) of the owned particles.
-    neighborhood : up-to-date halo and neighbour list.
-    flow : units of the model.
-    dtype : type of the pair arithmetic.
-    """
-
-    def __init__(self, position: Tensor, neighborhood: Neighborhood, flow: FlowUnits, dtype: torch.dtype) -> None:
-        self.position, self.neighborhood, self.flow, self.dtype = position, neighborhood, flow, dtype
-        self._state = self._state_of(position)
-
-    def fit(self, position: Tensor) -> bool:
-        """Whether they belong to this unchanged tensor of positions, the present halo and list, and the present
-        recording of gradients. The answer is the same on all ranks."""
-        return self.position is position and self._state == self._state_of(position)
-
-    def _state_of(self, position: Tensor) -> tuple[int, int, bool]:
-        return position._version, self.neighborhood.builds, torch.is_grad_enabled() and position.requires_grad
-
-    @cached_property
-    def local(self) -> LocalParticles:
-        """The particles that this rank sees, ghosts included; collective."""
-        return self.neighborhood.local(self.position)
-
-    @cached_property
-    def kriging(self) -> Kriging:
-        """Kriging among neighbours at all owned particles; collective."""
-        position = self.local.position.detach()
-        pairs = self.local.neighbors.pairs(position[: len(self.position)], position, dtype=self.dtype)
-        return Kriging(pairs, len(position), self.flow.cutoff, self.flow.scales.filter_width, self.neighborhood.column)
 
 
 def farthest_outside(slab: SlabDecomposition, particles: ParticleSet) -> float:

@@ -56,19 +56,14 @@ class ParticleField:
         self.points = grid_points(decomposition, decomposition.planes)
         self._entries: Tensor | None = None
 
+    @torch.no_grad()
     def volumes(self, kernel: SmoothingKernel) -> Tensor:
-        """Volumes 1 / sum_j W(x_i - x_j), i included, or the kernel's mean volume, of all local particles (s,).
-
-        Collective, differentiable.
-        """
+        """Volumes 1 / sum_j W(x_i - x_j), i included, or the kernel's mean volume, of all local particles (s,);
+        collective."""
         if kernel.mean_volume is not None:
             return self._velocity.new_full((len(self._position),), kernel.mean_volume)
-        if torch.is_grad_enabled():
-            sums = torch.cat([pairs.sum(kernel.value(pairs.distance)) for pairs in self._own_pairs])
-        else:
-            found = self._sums(kernel, "kernel-sum", 1, self._position, len(self.owned))
-            sums = found[0] + kernel.value(found.new_zeros(()))
-        return self._with_ghosts(1 / sums)
+        sums = self._sums(kernel, "kernel-sum", 1, self._position, len(self.owned))[0]
+        return self._with_ghosts(1 / (sums + kernel.value(sums.new_zeros(()))))
 
     def volumes_by_table(self, kernel: HermiteKernel) -> Tensor:
         """Volumes of all local particles (s,) for a tabulated kernel; collective, differentiable.
@@ -79,9 +74,11 @@ class ParticleField:
         if kernel.mean_volume is not None:
             return self.volumes(kernel)
         if self._entries is None or self._entries.shape[1] != len(kernel.table):
+            neighbors = self._neighbors_of(self.owned)
             with torch.no_grad():
-                self._entries = torch.cat([_table_sums(kernel, pairs) for pairs in self._own_pairs])
-            del self._own_pairs
+                self._entries = torch.cat([_table_sums(kernel, neighbors.pairs(self.owned, self._position, block,
+                                                                               self.dtype))
+                                           for block in neighbors.blocks(PAIRS_TOGETHER)])
         return self._with_ghosts(1 / (self._entries @ kernel.table))
 
     def on_grid(self, kernel: SmoothingKernel, volume: Tensor, rows: Tensor | slice) -> tuple[Tensor, Tensor]:
@@ -93,18 +90,16 @@ class ParticleField:
 
     @torch.no_grad()
     def averaged(self, kernel: SmoothingKernel, volume: Tensor, receivers: Tensor) -> tuple[Tensor, Tensor]:
-        """Average velocity (k, 3) and gradient (k, 3, 3) at any points of this rank, with the kernel's `volumes`."""
-        none = self._velocity.new_zeros(len(receivers), 4)
+        """Average velocity (k, 3) and gradient (k, 3, 3) [component, direction] at any points of this rank, with the
+        kernel's `volumes`."""
         columns = torch.cat([volume.unsqueeze(1), self._velocity], dim=1)
-        return self._averages(kernel, torch.cat([receivers, self._position]), torch.cat([none, columns]), none)
-
-    @torch.no_grad()
-    def at_particles(self, kernel: SmoothingKernel, volume: Tensor) -> tuple[Tensor, Tensor]:
-        """Average velocity (n, 3) and gradient (n, 3, 3) [component, direction] at the owned particles."""
-        columns = torch.cat([volume.unsqueeze(1), self._velocity], dim=1)
-        itself = columns[: len(self.owned)].clone()
-        itself[:, :1] *= kernel.value(itself.new_zeros(()))
-        return self._averages(kernel, self._position, columns, itself)
+        columns = torch.cat([columns.new_zeros(len(receivers), 4), columns])
+        sums = self._sums(kernel, "kernel-average", 16, torch.cat([receivers, self._position]), len(receivers),
+                          tuple(columns.T))
+        factor = normalisation(kernel, sums[:1])
+        average = sums[1:4] * factor
+        gradient = (sums[7:].reshape(3, 3, -1) - average.unsqueeze(1) * sums[4:7]) * factor
+        return average.T, gradient.permute(2, 0, 1)
 
     @torch.no_grad()
     def velocity_on_whole_grid(self, kernel: SmoothingKernel, volume: Tensor) -> Tensor:
@@ -144,22 +139,6 @@ class ParticleField:
         return _joined(interpolated(neighbors.pairs(receivers, self._position, block, self.dtype), self.support,
                                     covariance, self._velocity) for block in neighbors.blocks(KRIGED_TOGETHER))
 
-    def _averages(self, kernel: SmoothingKernel, position: Tensor, columns: Tensor,
-                  itself: Tensor) -> tuple[Tensor, Tensor]:
-        """Average (m, 3) and gradient (m, 3, 3) at the first m of some positions (s, 3), from all other positions.
-
-        `columns` (s, 4) are volume and velocity. `itself` (m, 4) are the contribution V W(0) of each receiver and the
-        velocity that others are taken relative to.
-        """
-        sums = self._sums(kernel, "kernel-average", 16, position, len(itself), tuple(columns.T))
-        weight, own = sums[:1] + itself.T[:1], itself.T[1:]
-        factor = normalisation(kernel, weight)
-        relative = sums[1:4] * factor
-        if kernel.mean_volume is not None:
-            relative = relative + (weight - 1) * own
-        gradient = (sums[7:].reshape(3, 3, -1) - relative.unsqueeze(1) * sums[4:7]) * factor
-        return (relative + own).T, gradient.permute(2, 0, 1)
-
     def _sums(self, kernel: SmoothingKernel, kind: str, components: int, position: Tensor, count: int,
               scalars: tuple[Tensor, ...] = ()) -> Tensor:
         """Sums over the particles within the support, (components, count), at the first `count` positions."""
@@ -173,13 +152,6 @@ class ParticleField:
 
     def _with_ghosts(self, own: Tensor) -> Tensor:
         return torch.cat([own, exchange_ghosts(self.halo, own)])
-
-    @cached_property
-    def _own_pairs(self) -> list[Pairs]:
-        """Pairs of the owned particles, each with itself too, in blocks."""
-        neighbors = self._neighbors_of(self.owned)
-        return [neighbors.pairs(self.owned, self._position, block, self.dtype)
-                for block in neighbors.blocks(PAIRS_TOGETHER)]
 
     @cached_property
     def _around(self) -> NeighborList:

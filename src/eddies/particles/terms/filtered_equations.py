@@ -34,8 +34,8 @@ class FilteredEquations(Term):
 
         d rho/dt = C_p (2 u'/d) (rho_0/c^2) (p - p before).
 
-    So pressure spreads from neighbour to neighbour, sweep by sweep, and no sound has to be resolved. Forces, p and s are
-    taken relative to their means over all particles.
+    So pressure spreads from neighbour to neighbour, sweep by sweep, and no sound has to be resolved. Forces, p and s
+    are taken relative to their means over all particles.
     """
 
     Settings = declared.FilteredEquations

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.rates import Rates
-from eddies.particles.resolved_flow import ResolvedFlow
+from eddies.particles.resolved_velocity import ResolvedFlow
 from eddies.particles.terms.term import Coefficient, Term
 from eddies.scene import terms as declared
 from eddies.spectral.mode_operators import rising
@@ -98,8 +98,8 @@ class Damping(Term):
     @property
     def learned_coefficients(self) -> list[Coefficient]:
         """D at the six wavenumbers, in units that follow the flow."""
-        return [Coefficient.of("D/(k_c u_c)", self.rates, "damping rates at k/k_c = 1/6, 2/6, ..., 1; u_c is the rms of "
-                               "the smallest resolved scales")]
+        return [Coefficient.of("D/(k_c u_c)", self.rates, "damping rates at k/k_c = 1/6, 2/6, ..., 1; u_c is the rms "
+                               "of the smallest resolved scales")]
 
     def forward(self, context: Context) -> Rates:
         """Modes of the force."""
@@ -140,7 +140,7 @@ class Forcing(Term):
     """f(k) = A u(k) over 0 < |k| < k_f with A = P / sum |u*(k)|^2: linear forcing of the large scales (Lundgren 2003).
 
     The flow is forced by A u*, with u* = u / G its velocity before the filter (`flow/forcing.py`), and the power P is
-    the `injection_rate` of that flow. The power in the filtered flow is smaller, A sum |u(k)|^2. Each evaluation sets A.
+    the `injection_rate` of that flow. The filtered flow receives less, A sum |u(k)|^2. Each evaluation sets A.
     """
 
     Settings = declared.Forcing

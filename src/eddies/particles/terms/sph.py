@@ -103,9 +103,9 @@ class WCSPH(_SPHTerm):
     that pressure repels and friction dissipates. Pi keeps the c of the flow: with a learned one, a large alpha would
     drive the pressure to zero. gamma is fixed, since it has no effect where the density hardly varies.
 
-    This sum gives a poor pressure gradient among random particles. Differences (P_j - P_i)/(rho_i rho_j) halve the error
-    at single moments, but they do not conserve energy: it grows until the rollout ends, unless a shift keeps particles
-    in order, and then there is no gain.
+    This sum gives a poor pressure gradient among random particles. Differences (P_j - P_i)/(rho_i rho_j) halve the
+    error at single moments, but they do not conserve energy: it grows until the rollout ends, unless a shift keeps
+    particles in order, and then there is no gain.
     """
 
     Settings = declared.WCSPH
@@ -120,8 +120,8 @@ class WCSPH(_SPHTerm):
     @property
     def learned_coefficients(self) -> list[Coefficient]:
         """|c_P|, |alpha| and |beta|."""
-        return [Coefficient.of("|c|", self.sound_speed.abs(), "sound speed of the pressure; learned relative to that of "
-                               "the flow", "L/T", self.c),
+        return [Coefficient.of("|c|", self.sound_speed.abs(), "sound speed of the pressure; learned relative to that "
+                               "of the flow", "L/T", self.c),
                 Coefficient.of("|alpha|", self.alpha.abs(), "linear artificial viscosity, about alpha c h / 10"),
                 Coefficient.of("|beta|", self.beta.abs(), "quadratic artificial viscosity")]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -61,16 +60,6 @@ class Term(nn.Module, TermBase):
     def __init__(self, settings: TermSettings, flow: FlowUnits) -> None:
         super().__init__()
         self.settings, self.flow = settings, flow
-
-    @property
-    def reads(self) -> Sequence[str]:
-        """Inputs of the term; see TermSettings."""
-        return self.settings.reads
-
-    @property
-    def gives(self) -> Sequence[str]:
-        """Contributions of the term; see TermSettings."""
-        return self.settings.gives
 
     @property
     def learned_coefficients(self) -> list[Coefficient]:
