@@ -22,7 +22,7 @@ def fitted(library: ctypes.CDLL, box: Box, degree: int, told: tuple[float, ...],
            offsets: np.ndarray, senders: np.ndarray, receivers: np.ndarray, positions: np.ndarray,
            values: np.ndarray) -> np.ndarray:
     """Value and its derivatives by x, y and z, (n, 4, 3), of the polynomials of a degree, 1 or 2, that fit three
-    columns of values best: see `eddies.particles.reconstruction.moving_least_squares`, which is the definition.
+    columns of values best: see `eddies.particles.particle_field.ParticleField.fitted` for the definition.
 
     Parameters
     ----------

@@ -34,11 +34,7 @@ UNDECLARED = 'no term of this model reads "{}": add it to the `reads` of the set
 
 
 class PairSum(Protocol):
-    """A sum over pairs: a pair term, or the moments that several terms share.
-
-    If the class itself defines `compiled(context)`, the compiled library takes the sum that it returns, unless it
-    returns None. A derived class must define it again; otherwise torch sums its `pair_values`.
-    """
+    """A sum over pairs: a pair term (see PairTerm), or the moments that several terms share."""
 
     width: int
     mutual: bool

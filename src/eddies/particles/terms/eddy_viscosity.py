@@ -42,7 +42,6 @@ class EddyViscosity(PairTerm):
 
     @property
     def learned_coefficients(self) -> list[Coefficient]:
-        """|a_1| and |a_2|; their values multiply mu and mu^2 in physical units, with b_1 as it is."""
         scales, (linear, quadratic) = self.flow.scales, self.coefficients.detach().abs()
         per_rate = scales.filter_width / scales.velocity
         return [Coefficient.of("|a_1|", linear, "friction of a pair: acceleration by its approach rate mu", "L/T",
@@ -61,14 +60,12 @@ class EddyViscosity(PairTerm):
         return strength * separation_direction(pairs, self.settings)
 
     def compiled(self, context: Context) -> CompiledSum:
-        """The same sum for the compiled library."""
         unit, weighted = compiled_switches(self.settings)
         length = SMALL if unit else 1.0  # b_1 = x / (unit |x| + length)
         return CompiledSum("eddy-viscosity", (FORMS.index(self.settings.form), SOFTENING, weighted, unit, length),
                            self.coefficients.abs())
 
     def rates_of(self, sums: Tensor, context: Context) -> Rates:
-        """The acceleration."""
         return Rates(acceleration(along_separation(sums, self.settings, context), context))
 
 
@@ -90,7 +87,6 @@ class DensityDiffusion(PairTerm):
 
     @property
     def learned_coefficients(self) -> list[Coefficient]:
-        """|b_1| and |b_2|; their values multiply q and |q| q in physical units."""
         scales, (linear, quadratic) = self.flow.scales, self.coefficients.detach().abs()
         rate = scales.required("density_rate")
         per_difference = scales.filter_width**2 / scales.required("density")
@@ -107,10 +103,8 @@ class DensityDiffusion(PairTerm):
         return -(window(pairs, self.settings) * (linear + quadratic * q.abs()) * q)[None]
 
     def compiled(self, context: Context) -> CompiledSum:
-        """The same sum for the compiled library."""
         return CompiledSum("density-diffusion", (SOFTENING, compiled_switches(self.settings)[1]),
                            self.coefficients.abs(), (context.density_fluctuation,), reads_velocity=False)
 
     def rates_of(self, sums: Tensor, context: Context) -> Rates:
-        """The density rate."""
         return density_rate(sums, self.settings, context)

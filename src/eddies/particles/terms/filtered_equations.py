@@ -49,11 +49,9 @@ class FilteredEquations(Term):
 
     @property
     def learned_coefficients(self) -> list[Coefficient]:
-        """f."""
         return [Coefficient.of("f", self.stress, "stress of the filter relative to the gradient model")]
 
     def forward(self, context: Context) -> Rates:
-        """Acceleration and density rate."""
         kriging, scales, settings = context.kriging, self.flow.scales, self.settings
         velocity = context.without_mean(context.particles.velocity)
         residual, first, second = kriging.derivatives(velocity)

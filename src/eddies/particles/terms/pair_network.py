@@ -52,11 +52,9 @@ class PairNetwork(PairTerm):
                           along_v * velocity_direction(pairs, self.settings)])
 
     def compiled(self, context: Context) -> CompiledSum | None:
-        """The same sum for the compiled library."""
         return compiled_network(self.network, self.settings, 2, self.mutual, context)
 
     def rates_of(self, sums: Tensor, context: Context) -> Rates:
-        """The acceleration."""
         return Rates(acceleration(along_separation(sums[:3], self.settings, context)
                                   + along_velocity(sums[3:], self.settings, context), context))
 
@@ -91,9 +89,7 @@ class DensityFlux(PairTerm):
         return flux * torch.sign(own - other)
 
     def compiled(self, context: Context) -> CompiledSum | None:
-        """The same sum for the compiled library."""
         return compiled_network(self.network, self.settings, 1, False, context, self.settings.sign)
 
     def rates_of(self, sums: Tensor, context: Context) -> Rates:
-        """The density rate."""
         return density_rate(sums, self.settings, context)

@@ -29,7 +29,6 @@ class Pressure(Term):
     linear = True
 
     def forward(self, context: Context) -> Rates:
-        """Modes of pressure and force."""
         grid = context.resolved.grid
         pressure = grid.pressure_of(context.resolved.products)
         return Rates(force_modes=-grid.gradient(pressure), pressure_modes=pressure)
@@ -42,7 +41,6 @@ class Viscosity(Term):
     linear = True
 
     def forward(self, context: Context) -> Rates:
-        """Modes of the force."""
         grid, velocity = context.resolved.grid, context.resolved.velocity
         return Rates(force_modes=-context.flow.scales.viscosity * grid.wavenumber_squared * velocity)
 
@@ -63,7 +61,6 @@ class Stress(Term):
     linear = True
 
     def forward(self, context: Context) -> Rates:
-        """Modes of the force and of the pressure of the stress."""
         flow = context.resolved
         stress = _deconvolved(flow) if self.settings.form == "deconvolution" else _gradient(flow)
         return flow.grid.hidden_stress(stress)
@@ -97,12 +94,10 @@ class Damping(Term):
 
     @property
     def learned_coefficients(self) -> list[Coefficient]:
-        """D at the six wavenumbers, in units that follow the flow."""
         return [Coefficient.of("D/(k_c u_c)", self.rates, "damping rates at k/k_c = 1/6, 2/6, ..., 1; u_c is the rms "
                                "of the smallest resolved scales")]
 
     def forward(self, context: Context) -> Rates:
-        """Modes of the force."""
         flow = context.resolved
         highest = 2 * math.pi / context.decomposition.length * flow.grid.resolved
         rates = rising(flow.grid.shell, flow.grid.resolved, self.rates.double().cpu()).to(flow.grid.dtype)
@@ -125,11 +120,9 @@ class Relaxation(Term):
 
     @property
     def learned_coefficients(self) -> list[Coefficient]:
-        """C in units that follow the flow."""
         return [Coefficient.of("C d/(2 u_rms)", self.factor, "relaxation rate of a velocity to the resolved one")]
 
     def forward(self, context: Context) -> Rates:
-        """The acceleration."""
         flow = context.resolved
         missing = context.without_mean(flow.missing())
         rate = (2 * flow.rms / flow.filter_width).to(missing) * self.factor.to(missing)

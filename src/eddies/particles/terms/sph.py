@@ -64,7 +64,6 @@ class Continuity(_SPHTerm):
 
     @property
     def learned_coefficients(self) -> list[Coefficient]:
-        """|delta|, if there is diffusion; its value is the diffusivity 2 |delta| h c."""
         return [] if self.delta is None else [Coefficient.of(
             "|delta|", self.delta.abs(), "diffusivity 2 |delta| h c of the density", "L^2/T", self.diffusivity)]
 
@@ -76,14 +75,12 @@ class Continuity(_SPHTerm):
         return torch.stack(values if self.delta is None else [*values, slope * (other - own)])
 
     def compiled(self, context: Context) -> CompiledSum:
-        """The same sum for the compiled library."""
         scales, support = context.flow.scales, self.kernel.support
         width, unit = scales.filter_width, self.mass / support**5
         return CompiledSum("continuity", (support / width, unit * width * scales.velocity, unit),
                            scalars=(context.column("density"),))
 
     def rates_of(self, sums: Tensor, context: Context) -> Rates:
-        """The density rate."""
         density = context.own_density.to(sums)
         rate = density**2 * sums[0]
         if self.delta is not None:
@@ -119,7 +116,6 @@ class WCSPH(_SPHTerm):
 
     @property
     def learned_coefficients(self) -> list[Coefficient]:
-        """|c_P|, |alpha| and |beta|."""
         return [Coefficient.of("|c|", self.sound_speed.abs(), "sound speed of the pressure; learned relative to that "
                                "of the flow", "L/T", self.c),
                 Coefficient.of("|alpha|", self.alpha.abs(), "linear artificial viscosity, about alpha c h / 10"),
@@ -141,7 +137,6 @@ class WCSPH(_SPHTerm):
         return -(push + viscosity) * self.slope(listed) * x
 
     def compiled(self, context: Context) -> CompiledSum:
-        """The same sum for the compiled library."""
         scales, density, support = context.flow.scales, context.column("density"), self.kernel.support
         width = scales.filter_width
         numbers = support / width, self.mass * width / support**5, SOFTENING * (support / (2 * width)) ** 2
@@ -149,7 +144,6 @@ class WCSPH(_SPHTerm):
         return CompiledSum("wcsph", numbers, viscosity, (self.pressure(density) / density**2, density))
 
     def rates_of(self, sums: Tensor, context: Context) -> Rates:
-        """The acceleration."""
         return Rates(acceleration=sums.T.to(context.particles.velocity.dtype))
 
 
@@ -176,7 +170,6 @@ class TransportVelocity(_SPHTerm):
 
     @property
     def learned_coefficients(self) -> list[Coefficient]:
-        """|p_b delta_t|."""
         return [Coefficient.of("|p_b delta_t|", self.background.abs(), "background pressure times the time that it "
                                "acts; learned in units of rho_0 c h", "M/(L T)", self.unit)]
 
@@ -188,14 +181,12 @@ class TransportVelocity(_SPHTerm):
         return -torch.cat([(own**-2 + other**-2) * slope, gradient.flatten(0, 1)])
 
     def compiled(self, context: Context) -> CompiledSum:
-        """The same sum for the compiled library."""
         scales, support = context.flow.scales, self.kernel.support
         unit = self.mass * scales.filter_width / support**5
         return CompiledSum("transport-velocity", (support / scales.filter_width, unit, unit * scales.velocity),
                            scalars=(context.column("density"),))
 
     def rates_of(self, sums: Tensor, context: Context) -> Rates:
-        """Shift velocity and shift acceleration."""
         shift = self.background.abs() * self.unit * sums[:3]
         carried = context.own_density.to(sums) * (sums[3:].unflatten(0, (3, 3)) * shift).sum(1)
         dtype = context.particles.velocity.dtype

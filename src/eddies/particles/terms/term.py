@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
-from eddies.particles.pairs import ScaledPairs
+from eddies.particles.pairs import CompiledSum, ScaledPairs
 from eddies.particles.rates import Rates
 from eddies.scene.terms import TermBase, TermSettings
 
@@ -94,6 +94,10 @@ class PairTerm(Term):
     def pair_values(self, pairs: ScaledPairs) -> Tensor:
         """Values to sum over neighbours, (components, m). They must vanish beyond the radius of interaction."""
         raise NotImplementedError(f"{type(self).__name__} has no pair_values(pairs)")
+
+    def compiled(self, context: Context) -> CompiledSum | None:
+        """The same sum for the compiled library, or None. Each class must define it itself; it is not inherited."""
+        return None
 
     def rates_of(self, sums: Tensor, context: Context) -> Rates:
         """Contribution from the sums (components, k) over each particle's neighbours."""
