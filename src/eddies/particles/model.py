@@ -26,8 +26,8 @@ from eddies.scene.terms import TermError, TermSettings
 #: The classes behind the words of [model] terms: those in the modules of eddies.particles.terms.
 TERMS: dict[str, type[Term]] = {
     kind.Settings.word: kind
-    for found in iter_modules(built_in.__path__)
-    for kind in vars(import_module(f"{built_in.__name__}.{found.name}")).values()
+    for module in iter_modules(built_in.__path__)
+    for kind in vars(import_module(f"{built_in.__name__}.{module.name}")).values()
     if isinstance(kind, type) and issubclass(kind, Term) and kind.Settings.word}
 # Name of the forcing among the terms of a model.
 FORCING = "injection"
@@ -170,11 +170,13 @@ class LagrangianModel(nn.Module):
     @property
     def _stages(self) -> list[list[tuple[str, Term]]]:
         """The terms that do not read the density, then those that do."""
-        named = list(self.terms.items())
-        return [[item for item in named if ("density" in item[1].settings.reads) == reading] for reading in (False, True)]
+        stages: list[list[tuple[str, Term]]] = [[], []]
+        for name, term in self.terms.items():
+            stages["density" in term.settings.reads].append((name, term))
+        return stages
 
     def _at_particles(self, rates: Rates, context: Context) -> Rates:
-        """Rates whose modes are interpolated to the particles.
+        """Rates with their modes interpolated to the particles.
 
         The mean of the force over the particles is subtracted, so their momentum is conserved. The mean vanishes in
         continuous space, but not if particles sample the grid unevenly.

@@ -12,6 +12,7 @@ from eddies.kernels.library import library
 from eddies.kernels.neighbors import Box, neighbors_within, pairs_within
 from eddies.particles.devices import kernels_serve
 from eddies.particles.pairs import Pairs, gather_rows
+from eddies.particles.particle_set import as_numpy
 from eddies.particles.periodic_box import PeriodicBox, safe_norm
 
 
@@ -47,9 +48,8 @@ class NeighborList:
             raise ValueError("neighbour list: a position is not finite")
         # Slightly too large: `pairs` decides for both orders of a pair alike whether it lies within the cutoff.
         reach = (self.cutoff + self.skin) * (1 + 1e-9)
-        on_host = [points.detach().cpu().numpy() for points in (receivers, senders)]
-        found = neighbors_within(library(), self._space, reach, *on_host, exclude_self)
-        self.offsets, self.senders = (torch.from_numpy(column).to(receivers.device) for column in found)
+        columns = neighbors_within(library(), self._space, reach, as_numpy(receivers), as_numpy(senders), exclude_self)
+        self.offsets, self.senders = (torch.from_numpy(column).to(receivers.device) for column in columns)
 
     def blocks(self, together: int) -> Iterator[slice]:
         """Yield consecutive receivers with about `together` listed pairs; one empty block if there are no receivers."""
@@ -92,10 +92,10 @@ class NeighborList:
         return Pairs(receiver, segment, sender, displacement.T, safe_norm(displacement, dim=0), len(numbers))
 
     def _compiled_pairs(self, receivers: Tensor, senders: Tensor, numbers: Tensor, dtype: torch.dtype) -> Pairs:
-        found = pairs_within(library(), self._space, self.cutoff, receivers.detach().numpy(), senders.detach().numpy(),
-                             self.offsets.numpy(), self.senders.numpy(), numbers.numpy(), False,
-                             np.dtype(str(dtype).removeprefix("torch.")))
-        receiver, segment, sender, displacement, distance = map(torch.from_numpy, found)
+        kind = np.dtype(str(dtype).removeprefix("torch."))
+        columns = pairs_within(library(), self._space, self.cutoff, as_numpy(receivers), as_numpy(senders),
+                               self.offsets.numpy(), self.senders.numpy(), numbers.numpy(), False, kind)
+        receiver, segment, sender, displacement, distance = map(torch.from_numpy, columns)
         return Pairs(receiver, segment, sender, displacement.T, distance, len(numbers))
 
     def _difference(self, receivers: Tensor, senders: Tensor, receiver: Tensor, sender: Tensor) -> list[Tensor]:

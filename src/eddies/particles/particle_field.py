@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from functools import cached_property
 
 import numpy as np
@@ -125,19 +124,20 @@ class ParticleField:
         result is zero where no particle lies within the support.
         """
         neighbors, slab = self._neighbors_of(receivers), self.decomposition
-        found = torch.from_numpy(fitted(library(), Box(slab.length, slab.size == 1), degree, _for_library(kernel),
-                                        mean_volume, RIDGE, neighbors.offsets.numpy(), neighbors.senders.numpy(),
-                                        receivers.numpy(), self._position.numpy(), self._velocity.numpy()))
-        found = found.to(self.dtype)
-        return found[:, 0], found[:, 1:].transpose(1, 2)
+        values = fitted(library(), Box(slab.length, slab.size == 1), degree, _for_library(kernel), mean_volume, RIDGE,
+                        neighbors.offsets.numpy(), neighbors.senders.numpy(), receivers.numpy(),
+                        self._position.numpy(), self._velocity.numpy())
+        result = torch.from_numpy(values).to(self.dtype)
+        return result[:, 0], result[:, 1:].transpose(1, 2)
 
     @torch.no_grad()
     def kriged(self, covariance: Covariance, receivers: Tensor) -> tuple[Tensor, Tensor]:
         """Velocity (k, 3) and gradient (k, 3, 3) by kriging with all neighbours within the support; see
         `interpolated`."""
         neighbors = self._neighbors_of(receivers)
-        return _joined(interpolated(neighbors.pairs(receivers, self._position, block, self.dtype), self.support,
-                                    covariance, self._velocity) for block in neighbors.blocks(KRIGED_TOGETHER))
+        blocks = [interpolated(neighbors.pairs(receivers, self._position, block, self.dtype), self.support, covariance,
+                               self._velocity) for block in neighbors.blocks(KRIGED_TOGETHER)]
+        return torch.cat([velocity for velocity, _ in blocks]), torch.cat([gradient for _, gradient in blocks])
 
     def _sums(self, kernel: SmoothingKernel, kind: str, components: int, position: Tensor, count: int,
               scalars: tuple[Tensor, ...] = ()) -> Tensor:
@@ -185,8 +185,3 @@ def _table_sums(kernel: HermiteKernel, pairs: Pairs) -> Tensor:
     total = len(kernel.table)
     sums = pairs.distance.new_zeros(pairs.count * total)
     return sums.index_add_(0, (entries + pairs.segment * total).flatten(), factors.flatten()).reshape(-1, total)
-
-
-def _joined(blocks: Iterable[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
-    velocities, gradients = zip(*blocks)
-    return torch.cat(velocities), torch.cat(gradients)
