@@ -14,10 +14,10 @@ def solved(offsets, displacement, support, covariance, sited=True):
     own, others = np.full((10, len(offsets) - 1), np.nan), np.full((10, len(away)), np.nan)
     for receiver, (first, last) in enumerate(zip(offsets[:-1], offsets[1:])):
         if last - first <= MOST_NEIGHBORS:
-            places = np.concatenate([np.zeros((sited, 3)), away[first:last]])
+            places = np.concatenate([np.zeros((int(sited), 3)), away[first:last]])
             weights = _weights(places, support, covariance, sited)
             own[:, receiver] = weights[0] if sited else 0
-            others[:, first:last] = weights[sited:].T
+            others[:, first:last] = weights[int(sited):].T
     return own, others
 
 

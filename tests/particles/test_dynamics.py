@@ -55,7 +55,7 @@ def test_rates_loss_and_gradients_do_not_depend_on_the_ranks(comm, terms):
             # Coincident particles resolve nothing: forces and derivatives are rounding.
             assert (rates[name] - reference).abs().max() <= 1e-12 * max(float(reference.abs().max()), 0.1)
         for actual, reference in zip(sums, expected_sums):
-            assert np.abs(actual - reference).max() <= 1e-12 * max(np.abs(reference).max(), 1e-10)
+            assert np.abs(actual - reference).max() <= 1e-12 * max(np.abs(reference).max(), 1e-2)
 
 
 @pytest.mark.mpi(2, 3)
@@ -126,6 +126,7 @@ def test_only_columns_that_are_read_are_sent(comm, monkeypatch, name, shapes):
 
 @pytest.mark.mpi(1, 2)
 @pytest.mark.parametrize("name", [None, "resolved"])
+@torch.no_grad()
 def test_a_model_without_pairs_has_no_list_and_no_halo(comm, monkeypatch, name):
     slab, particles = distributed(comm, *state())
     forbidden = ["HaloExchange", "NeighborList"] + ([] if name else ["migrate", "any_rank", "global_max"])

@@ -159,7 +159,7 @@ def assert_fields(grid, found, expected):
     """Modes, or fields, against fields of the whole box."""
     if found.is_complex():
         found = grid.to_fields(found if found.dim() == 4 else found[None])
-    expected = own(grid, expected if expected.ndim > 3 else expected[None])
+    expected = own(grid, expected if expected.ndim > 3 else expected[None]).numpy()
     assert np.allclose(found, expected, rtol=0, atol=1e-12 * np.abs(expected).max(initial=0.1))
 
 
