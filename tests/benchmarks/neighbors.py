@@ -1,5 +1,5 @@
-"""All neighbours of random points in a periodic box, both orders of each pair: by the compiled list and by vesin, at the
-same points and in one run.
+"""All neighbours of random points in a periodic box, both orders of each pair: by the compiled list and by vesin, at
+the same points and in one run.
 
     OMP_NUM_THREADS=1 .venv/bin/python tests/benchmarks/neighbors.py [POINTS A SIDE] [--neighbors N]
 

@@ -120,7 +120,7 @@ class WeightedMean(PairTerm):
 
 @pytest.mark.mpi(1, 2)
 def test_a_density_is_summed_for_all_particles_if_rates_are_for_some(comm):
-    """Also if both the density and the rates of some particles need moments."""
+    """Density and rates of some particles both need moments."""
     slab, particles = distributed(comm, *state())
     giving = WeightedMean(GivesDensity(), of_terms().flow).double()
     lagrangian = of_terms(giving, *model(pairs={}, eddy_viscosity={}).terms.values())

@@ -35,7 +35,7 @@ def summed_over_ranks(comm, gradients):
 @pytest.mark.mpi(2, 3)
 @every_model
 def test_rates_loss_and_gradients_do_not_depend_on_the_ranks(comm, terms):
-    """Also if all particles are in one place or on the first of three ranks."""
+    """Particles may all be in one place or on the first of three ranks."""
     force = model(terms)
     for kind in ("uneven", "void", "coincident"):
         columns = state(kind=kind)

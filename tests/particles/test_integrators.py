@@ -95,7 +95,7 @@ def test_order_with_a_shift(comm, name):
 @pytest.mark.parametrize("name, evaluations, more", [("verlet", 11, 2), ("corrected-verlet", 21, 0), ("rk2", 20, 1),
                                                      ("rk3", 30, 1), ("rk4", 40, 1)])
 def test_number_of_evaluations(comm, name, evaluations, more):
-    """In ten steps, and with rates requested after five and ten of them. Only the last request of a Runge-Kutta scheme
+    """Ten steps, and ten with rates requested after five and ten of them. Only the last request of a Runge-Kutta scheme
     costs an evaluation, none of a corrected Verlet scheme, and each of a plain one. Results do not change."""
     slab, particles = distributed(comm, *state(20))
     calls = []
@@ -143,7 +143,7 @@ GIVEN = {"paper": {"density_rate"}, "pressure": {"density"}, "without density": 
 @pytest.mark.parametrize("name", ["verlet", "corrected-verlet", "rk3"])
 @pytest.mark.parametrize("terms", GIVEN)
 def test_a_run_continues_bitwise_from_a_checkpoint(comm, name, terms):
-    """From particles, memory and the state of the dynamics; with a density of each kind, and with a shift."""
+    """A checkpoint has particles, memory and the state of the dynamics. Densities of each kind, and a shift."""
     slab, particles = distributed(comm, *state()[: 2 if terms == "without density" else 3])
 
     def start():

@@ -60,7 +60,7 @@ class LinearPairs(PairTerm):
 
 @pytest.mark.mpi(1, 2)
 def test_stored_linear_terms_give_their_rates_at_any_parameters(comm):
-    """For all particles and for some rows; also for a user's sum over pairs."""
+    """Rates of all particles and of some rows, with a user's sum over pairs among the terms."""
     slab, particles = distributed(comm, *state())
     linear = model({word: SETTINGS.get(word, {}) for word in LINEAR})
     pairs = build_model({"LinearPairs": LinearPairs.Settings()}, [f"{__name__}:LinearPairs"], FLOW)

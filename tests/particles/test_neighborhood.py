@@ -54,7 +54,7 @@ def test_all_ranks_name_a_particle_far_from_its_slab(comm, z, complaint):
 @pytest.mark.mpi(1, 2)
 @pytest.mark.parametrize("unit, cells", [(1, 4), (2**50, 4), (2**56, 1)])
 def test_particles_settle_in_order_of_cells_and_ids(comm, unit, cells):
-    """Also with ids so large that cell and id fit one integer only with fewer cells."""
+    """Ids may be so large that cell and id fit one integer only with fewer cells."""
     slab, random = SlabDecomposition(comm, 1.0, 8), np.random.default_rng(3)
     position, ids = random.random((60, 3)), unit * random.permutation(60)
     own = slice(comm.rank, None, comm.size)

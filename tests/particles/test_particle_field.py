@@ -23,7 +23,7 @@ def largest(comm, error):
 
 @pytest.mark.mpi(1, 2)
 def test_volumes_by_table_and_their_gradient(comm):
-    """For one table after the other; the gradient by the weights against a difference."""
+    """Volumes for one table after the other, and their gradient by the weights against a difference."""
     field = field_of(comm)
     for seed in (1, 2):
         network = KernelNetwork(2.5 * LENGTH / 16, (5,), seed=seed).double()

@@ -88,7 +88,7 @@ def test_modes_beyond_the_nyquist_wavenumber_are_found(comm):
 
 
 def test_the_dissipation_range_dissipates_all_energy():
-    """With E = 1.5 eps^(2/3) k^(-5/3) f(k eta) the dissipation 2 nu int k^2 E dk is eps."""
+    """The dissipation 2 nu int k^2 E dk of E = 1.5 eps^(2/3) k^(-5/3) f(k eta) is eps."""
     x = np.linspace(0, 30, 300001)
     dissipated = 2 * 1.5 * np.trapezoid(x ** (1 / 3) * dissipation_range(x), x)
     assert dissipated == pytest.approx(1, abs=0.005)  # the constants are rounded

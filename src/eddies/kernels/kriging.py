@@ -29,8 +29,8 @@ def kriging_weights(library: ctypes.CDLL, offsets: np.ndarray, displacement: np.
                     slowest: float, amplitudes: np.ndarray,
                     sited: bool = True) -> tuple[np.ndarray, list[np.ndarray]]:
     """Weights of the receivers' own values, (10, n), and of their neighbours', ten of (m,), which are small enough for
-    memory that is kept: see `eddies.particles.kriging.kriging_weights` for the definition. NaN where a receiver has more
-    than MOST_NEIGHBORS.
+    memory that is kept: see `eddies.particles.kriging.kriging_weights` for the definition. NaN where a receiver has
+    more than MOST_NEIGHBORS.
 
     Parameters
     ----------

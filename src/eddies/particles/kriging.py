@@ -69,8 +69,8 @@ def kriging_weights(pairs: Pairs, support: float, covariance: Covariance,
     K_jk = C(|x_j - x_k|), plus the noise NOISE / max(1 - (r/support)^4, 1e-4) of each particle on the diagonal. r is
     its distance, so that neighbours at the support enter and leave without a jump. If the receiver is a particle
     (`sited`), its own value f_i is among the f_j. In the row of the field b is then 1 for the particle and 0 for its
-    neighbours, and the result is w_i times f_i minus the neighbours' estimate of it. In the rows of derivatives b is
-    the derivative of C(|x - x_j|) by x. The mean of f is unknown. A multiple of K^-1 1 is subtracted so that the
+    neighbours. The result is w_i times the difference of f_i and the neighbours' estimate. In the rows of derivatives
+    b is the derivative of C(|x - x_j|) by x. The mean of f is unknown. A multiple of K^-1 1 is subtracted so that the
     weights add up to zero (ordinary kriging).
 
     Returns

@@ -120,9 +120,9 @@ class LagrangianModel(nn.Module):
     def rates(self, context: Context, kept: Mapping[str, LinearRates] | None = None) -> Rates:
         """Sum of the terms; differentiable, collective.
 
-        The result has `acceleration` (k, 3) with the `force_modes` in it, `density_rate` (k,) and the shift if a term
-        gives them, and, if terms give it, the whole `density` (n,) instead of its deviation. `kept` replaces terms at
-        these particles; see `linear_rates`.
+        The result has `acceleration` (k, 3) with the `force_modes` in it, and `density_rate` (k,) and the shift if a
+        term gives them. A `density` that terms give is the whole density (n,), not its deviation. `kept` replaces terms
+        at these particles; see `linear_rates`.
         """
         kept, sums = kept or {}, []
         for stage in self._stages if self.density_is_given and context.density is None else [list(self.terms.items())]:

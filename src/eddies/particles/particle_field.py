@@ -67,8 +67,8 @@ class ParticleField:
     def volumes_by_table(self, kernel: HermiteKernel) -> Tensor:
         """Volumes of all local particles (s,) for a tabulated kernel; collective, differentiable.
 
-        It stores the contribution of each table entry to each particle's sum, 8 bytes for each knot and particle, and
-        is therefore fast for many tables one after the other, as in training.
+        It stores the contribution of each table entry to each particle's sum, 8 bytes for each knot and particle. So it
+        is fast for many tables one after the other, as in training.
         """
         if kernel.mean_volume is not None:
             return self.volumes(kernel)

@@ -5,13 +5,20 @@ import math
 import pytest
 import torch
 
-from tests.particles.configurations import CUTOFF, NEIGHBORS, OPEN, SCALES, model, rates, state
+from tests.particles.configurations import CUTOFF, NEIGHBORS, OPEN, SCALES, by_torch, model, rates, state
 
 pytestmark = pytest.mark.mpi(1)
 POSITION = torch.tensor([[1.0, 1, 1], [1.5, 1, 1]], dtype=torch.float64)
 DENSITY = torch.tensor([1.01, 0.98], dtype=torch.float64)
 WINDOW = (1 - (0.5 / CUTOFF) ** 2) ** 2 / NEIGHBORS
 X = -0.5 / SCALES.filter_width
+
+
+@pytest.fixture(autouse=True, params=["compiled", "torch"])
+def sums(request, monkeypatch):
+    """Take the sums by the compiled library, and by the torch expressions of the terms."""
+    if request.param == "torch":
+        by_torch(monkeypatch)
 
 
 def moving(speed):

@@ -32,7 +32,7 @@ def accelerations(comm, lagrangian):
 
 @pytest.mark.mpi(1, 2, 3)
 def test_the_force_is_that_of_the_filtered_equations(comm):
-    """To the accuracy of 60 random neighbours; without its stress it is another. Equal on any number of ranks."""
+    """The error is that of 60 random neighbours; without its stress the force is another. Equal on any number of ranks."""
     found = accelerations(comm, equations())
     assert relative(found, FORCE) < 0.17
     assert np.abs(found.sum(0)).max() < 1e-9 * np.abs(found).sum()  # momentum is conserved
@@ -90,7 +90,7 @@ def test_a_divergence_is_removed_and_noise_relaxes(comm):
 @pytest.mark.mpi(1)
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=str)
 def test_the_term_is_linear_in_its_parameter(comm, dtype):
-    """In single precision to rounding, although large contributions cancel."""
+    """Large contributions cancel, and single precision still differs only by rounding."""
     slab, particles = distributed(comm, torch.from_numpy(POSITION), VELOCITY, DENSITY)
     lagrangian = equations().to(dtype)
     context = dynamics_of(slab, lagrangian, dtype=dtype).context(particles)

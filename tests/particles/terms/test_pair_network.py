@@ -132,7 +132,7 @@ class Constant(torch.nn.Module):
 
 @pytest.mark.parametrize("basis", ["paper", "corrected"])
 def test_the_sums_of_equation_3_over_one_neighbour(basis):
-    """For constant NN: a_rms/n w (2 x + 3 v), or a_rms (2 M^-1 w x + 3 w v / W) with M and W of one neighbour and their
+    """Constant NN: a_rms/n w (2 x + 3 v), or a_rms (2 M^-1 w x + 3 w v / W) with M and W of one neighbour and their
     regularisation, a thousandth of 8/315 n h^2 and of 8/35 n."""
     force = model(pairs=dict(basis=basis))
     force.terms["pairs"].network = Constant(2.0, 3.0)
