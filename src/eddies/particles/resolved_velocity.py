@@ -242,10 +242,11 @@ class ResolvedVelocity:
         """Predict the modes at a time; None without earlier evaluations.
 
         The nearer of the last two evaluations at different times is extrapolated with the rates of both (Adams and
-        Bashforth). It moves with the mean velocity (3,) of the particles. Each mode is reduced by the expected error. A flow with rms `speed` u' of a component turns the phase of a mode by theta = k u' dt in a time
-        dt, and the prediction misses (5/12) theta^3: 1.6 times the rms for normally distributed velocities. The factor
-        1 / (1 + (2 theta)^6) removes modes that two or three u' would spoil: a wrong mode is worse than a missing one,
-        since it is corrected only near particles and grows elsewhere.
+        Bashforth). It moves with the mean velocity (3,) of the particles. Each mode is reduced by the expected error: a
+        flow with rms `speed` u' of a component turns the phase of a mode by theta = k u' dt in a time dt, and the
+        prediction misses (5/12) theta^3, or 1.6 times the rms for normally distributed velocities. The factor
+        1 / (1 + (2 theta)^6) removes modes that two or three u' would spoil. A wrong mode is worse than a missing one:
+        it is corrected only near particles and grows elsewhere.
         """
         if not self._moments:
             return None

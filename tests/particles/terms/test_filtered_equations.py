@@ -32,7 +32,7 @@ def accelerations(comm, lagrangian):
 
 @pytest.mark.mpi(1, 2, 3)
 def test_the_force_is_that_of_the_filtered_equations(comm):
-    """The error is that of 60 random neighbours; without its stress the force is another. Equal on any number of ranks."""
+    """The error is that of 60 random neighbours. Without its stress the force is another. Ranks do not matter."""
     found = accelerations(comm, equations())
     assert relative(found, FORCE) < 0.17
     assert np.abs(found.sum(0)).max() < 1e-9 * np.abs(found).sum()  # momentum is conserved
