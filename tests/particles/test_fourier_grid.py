@@ -79,15 +79,15 @@ def test_adjoints_of_interpolation_and_spreading(comm):
     grid = grid_on(comm)
     position = points(comm, grid)
     values, modes = real(comm, len(position), 2), modes_like(comm, grid, 2)
-    assert_adjoint(comm, lambda modes: grid.at(modes, position), modes, values)
-    assert_adjoint(comm, lambda values: grid.spread(values, position), values, modes)
+    assert_adjoint(comm, lambda modes: grid.at(modes, grid.points(position)), modes, values)
+    assert_adjoint(comm, lambda values: grid.spread(values, grid.points(position)), values, modes)
     # They are each other's, except for the number of points and the multiplicity of modes.
     scaled = modes / (grid.multiplicity * CELLS**3)
-    assert inner(comm, grid.spread(values, position), modes) == pytest.approx(
-        inner(comm, values, grid.at(scaled, position)), rel=1e-12)
+    assert inner(comm, grid.spread(values, grid.points(position)), modes) == pytest.approx(
+        inner(comm, values, grid.at(scaled, grid.points(position))), rel=1e-12)
     # Third derivatives of splines jump at grid planes, which limits the difference.
-    assert_slope(comm, lambda x: grid.at(modes, x), position, values)
-    assert_slope(comm, lambda x: grid.spread(values, x), position, modes)
+    assert_slope(comm, lambda x: grid.at(modes, grid.points(x)), position, values)
+    assert_slope(comm, lambda x: grid.spread(values, grid.points(x)), position, modes)
 
 
 @pytest.mark.mpi(1, 2, 3)
@@ -98,10 +98,10 @@ def test_a_formula_of_all_steps_is_differentiated_automatically(comm):
     values, weights = real(comm, len(position), 3), real(comm, len(position), 4, seed=1)
 
     def force(values, position):
-        velocity = grid.solenoidal(grid.within(grid.spread(values, position)))
+        velocity = grid.solenoidal(grid.within(grid.spread(values, grid.points(position))))
         slopes = grid.slopes(velocity)
         hidden = grid.hidden_stress(grid.products(slopes, slopes))
-        return grid.at(torch.cat([hidden.force_modes, hidden.pressure_modes[None]]), position)
+        return grid.at(torch.cat([hidden.force_modes, hidden.pressure_modes[None]]), grid.points(position))
 
     assert_slope(comm, lambda x: force(x, position), values, weights)
     assert_slope(comm, lambda x: force(values, x), position, weights)

@@ -61,7 +61,7 @@ def relative_error(flow, modes):
     slab, points = flow.grid.decomposition, positions(count=900, seed=9)
     points = points[(points[:, 2] >= slab.lower) & (points[:, 2] < slab.upper)]
     exact = torch.from_numpy(filtered_fields.at(modes, points.numpy()))
-    error = flow.grid.at(flow.velocity, points) - exact
+    error = flow.grid.at(flow.velocity, flow.grid.points(points)) - exact
     squares = global_sum(slab.comm, np.array([float(each.square().sum()) for each in (error, exact)]))
     return (squares[0] / squares[1]) ** 0.5
 

@@ -58,24 +58,19 @@ class FourierGrid(ModeOperators):
         return _ToFields.apply(modes, self)
 
     def points(self, position: Tensor) -> Points:
-        """Positions for repeated use."""
+        """Positions (n, 3) on the grid."""
         return Points(self.spline, position)
 
-    def at(self, modes: Tensor, position: Tensor | Points) -> Tensor:
-        """Values (n, c) of modes at positions, by cubic splines; differentiable in both."""
-        points = self._as_points(position)
+    def at(self, modes: Tensor, points: Points) -> Tensor:
+        """Values (n, c) of modes at points, by cubic splines; differentiable in modes and positions."""
         return _Interpolated.apply(self.to_fields(modes * self.prefilter), points.position, points)
 
-    def spread(self, values: Tensor, position: Tensor | Points) -> Tensor:
-        """Modes (c, kz, ky, kx) of a sum of splines around positions with weights `values` (n, c).
+    def spread(self, values: Tensor, points: Points) -> Tensor:
+        """Modes (c, kz, ky, kx) of a sum of splines around points with weights `values` (n, c); differentiable in both.
 
-        Differentiable in both. It is the adjoint of `at` except for the number of points and the multiplicity of modes.
+        It is the adjoint of `at` except for the number of points and the multiplicity of modes.
         """
-        points = self._as_points(position)
         return self.to_modes(_Spread.apply(values, points.position, points)) * self.prefilter
-
-    def _as_points(self, position: Tensor | Points) -> Points:
-        return position if isinstance(position, Points) else self.points(position)
 
     def zeros(self, *leading: int) -> Tensor:
         """Zero modes (*leading, kz, ky, kx)."""
