@@ -18,7 +18,7 @@ def field_of(comm, per_side=16, cells=12):
 
 
 def largest(comm, error):
-    return float(global_max(comm, float(error.abs().max()) if error.numel() else 0.0))
+    return float(global_max(comm, float(error.detach().abs().max()) if error.numel() else 0.0))
 
 
 @pytest.mark.mpi(1, 2)
