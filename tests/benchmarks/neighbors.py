@@ -1,10 +1,10 @@
-"""Time of neighbour lists of random points in a periodic box: the compiled one, its definition in torch, and vesin.
+"""All neighbours of random points in a periodic box, both orders of each pair: by the compiled list and by vesin, at
+the same points and in one run.
 
     OMP_NUM_THREADS=1 .venv/bin/python tests/benchmarks/neighbors.py [POINTS A SIDE] [--neighbors N]
 
-All lists have both orders of each pair, in double precision, on one thread, at the same points. vesin (pip install
---no-binary vesin vesin) returns the unordered numbers of each pair in its own memory; ours returns compressed rows.
-Prints a JSON line with median seconds.
+vesin (pip install --no-binary vesin vesin) gives the two numbers of each pair, in no order, in memory of its own; ours
+come in compressed rows. All are in double precision and on one thread. Prints a JSON line with medians of seconds.
 """
 
 import argparse
@@ -14,7 +14,6 @@ import time
 from collections.abc import Callable
 from importlib.metadata import version
 from statistics import median
-from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -27,7 +26,7 @@ LENGTH, REPEATS = 2 * math.pi, 9
 
 
 def rows(points: torch.Tensor, cutoff: float) -> tuple[np.ndarray, np.ndarray]:
-    """Compressed rows of the list."""
+    """Compressed rows."""
     found = NeighborList(PeriodicBox(LENGTH, True), cutoff, 0.0)
     found.build(points, points, exclude_self=True)
     return found.offsets.numpy(), found.senders.numpy()
@@ -44,12 +43,8 @@ def main() -> None:
     cutoff = LENGTH / options.side * (options.neighbors * 3 / (4 * math.pi)) ** (1 / 3)
     peer = vesin.NeighborList(cutoff=cutoff, full_list=True, n_threads=1)
 
-    def definition() -> tuple[np.ndarray, np.ndarray]:
-        with patch("eddies.particles.neighbor_list.library", lambda: None):
-            return rows(points, cutoff)
-
     actions: dict[str, Callable[[], tuple[np.ndarray, np.ndarray]]] = {
-        "eddies": lambda: rows(points, cutoff), "definition": definition,
+        "eddies": lambda: rows(points, cutoff),
         "vesin": lambda: peer.compute(position, box, True, "ij", copy=False)}
     offsets, senders = actions["eddies"]()
     ours = np.sort(np.repeat(np.arange(len(position)), np.diff(offsets)) * len(position) + senders)
@@ -57,7 +52,7 @@ def main() -> None:
     if not np.array_equal(ours, np.sort(first * len(position) + second)):
         raise SystemExit("neighbors: the lists differ")
     seconds: dict[str, list[float]] = {name: [] for name in actions}
-    for _ in range(REPEATS):  # in turn, so that all see the same load
+    for _ in range(REPEATS):  # in turn, so that all meet the same disturbances
         for name, action in actions.items():
             start = time.perf_counter()
             action()
@@ -65,7 +60,7 @@ def main() -> None:
     middle = {name: median(times) for name, times in seconds.items()}
     print(json.dumps({"points": options.side, "neighbors": len(senders) / len(position), "vesin": version("vesin"),
                       "seconds": middle, "nanoseconds_per_pair": 1e9 * middle["eddies"] / len(senders),
-                      "ratio": {name: middle[name] / middle["eddies"] for name in ("definition", "vesin")}}))
+                      "ratio": {"vesin": middle["vesin"] / middle["eddies"]}}))
 
 
 if __name__ == "__main__":

@@ -9,8 +9,8 @@ from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid
 from eddies.flow.statistics import energy_spectrum
 from eddies.flow.subgrid import DynamicStress, EddyDamping, SpectralViscosity, StressModel
 from eddies.particles.fourier_grid import FourierGrid
-from eddies.particles.resolved_flow import ResolvedFlow
-from eddies.particles.terms.damping import Damping
+from eddies.particles.resolved_velocity import ResolvedFlow
+from eddies.particles.terms.resolved_forces import Damping
 from eddies.spectral.mode_operators import gaussian_transfer
 from tests.validation.flows import make_grid, march, with_density
 

@@ -1,4 +1,4 @@
-"""Compiled averages over particles against torch."""
+"""Compiled averages over particles against those of torch, for each instruction set that this processor runs."""
 
 import numpy as np
 import pytest
@@ -8,6 +8,7 @@ from eddies.flow.tracers import release
 from eddies.kernels.reconstruction import GridPlanes, sums_on_grid, told_kernel
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.particle_field import ParticleField
+from eddies.particles.reconstruction import reconstruct_with_gradient
 from eddies.particles.smoothing_kernels import CubicSpline, KernelNetwork, WendlandC2
 
 LENGTH = 2 * np.pi
@@ -28,19 +29,29 @@ def test_pieces_are_the_kernel(kind):
 
 
 def averages(field, kernel):
-    """Every average of a field that has no gradient."""
-    with torch.no_grad():
-        volume = field.volumes(kernel)
-        return [volume, field.velocity_on_whole_grid(kernel, volume), *field.averaged(kernel, volume, field.points),
-                *field.at_particles(kernel, volume), *field.fitted(kernel, 1, (LENGTH / 12) ** 3, field.points)]
+    """Averages by the compiled library: volumes, and velocity and gradient at grid points and at particles."""
+    volume = field.volumes(kernel)
+    return [volume, field.velocity_on_whole_grid(kernel, volume), *field.averaged(kernel, volume, field.points),
+            *field.averaged(kernel, volume, field.owned)]
+
+
+def averages_by_torch(field, kernel):
+    at_points, at_particles = (field._neighbors_of(points).pairs(points, field._position, dtype=field.dtype)
+                               for points in (field.points, field.owned))
+    volume = field._with_ghosts(1 / at_particles.sum(kernel.value(at_particles.distance)))
+    on_grid, on_particles = (reconstruct_with_gradient(kernel, pairs, volume, field._velocity)
+                             for pairs in (at_points, at_particles))
+    return [volume, on_grid[0], *on_grid, *on_particles]
 
 
 @pytest.mark.mpi(1, 2, 3)
-@pytest.mark.parametrize("kind, neighbors, dtype, rounding", [
-    ("cubic spline", 60, torch.float64, 1e-11), ("tabulated", 60, torch.float32, 2e-4),
-    ("wendland", 3, torch.float64, 1e-11)])
-def test_averages(comm, library, close, monkeypatch, kind, neighbors, dtype, rounding):
+@pytest.mark.parametrize("neighbors", [60, 3])
+@pytest.mark.parametrize("dtype, rounding", [(torch.float64, 1e-11), (torch.float32, 2e-4)])
+@pytest.mark.parametrize("kind", KERNELS)
+def test_averages_are_those_of_torch(comm, library, monkeypatch, kind, dtype, rounding, neighbors):
     """Also with so few neighbours that some points have none, and gradients are quotients of small numbers."""
+    if neighbors == 3 and dtype == torch.float32:
+        pytest.skip("of one neighbour at the very edge of the kernel single precision tells nothing")
     slab = SlabDecomposition(comm, LENGTH, 15)
     position = torch.from_numpy(release(slab, 3, 12, "random")["position"])
     support = LENGTH / 12 * (neighbors / (4 / 3 * np.pi)) ** (1 / 3)
@@ -49,13 +60,13 @@ def test_averages(comm, library, close, monkeypatch, kind, neighbors, dtype, rou
         kernel = KERNELS[kind](support)
     monkeypatch.setattr("eddies.particles.pairs.library", lambda: library)
     monkeypatch.setattr("eddies.particles.particle_field.library", lambda: library)
-    found = averages(field, kernel)
-    monkeypatch.setattr("eddies.particles.particle_field.kernels_serve", lambda device: False)
-    for one, other in zip(found, averages(field, kernel), strict=True):
-        close(one.numpy(), other.numpy(), rounding)
+    found, expected = averages(field, kernel), averages_by_torch(field, kernel)
+    for one, other in zip(found, expected, strict=True):
+        assert one.shape == other.shape
+        assert (one - other).abs().max() <= rounding * other.abs().max() > 0
 
 
 def test_wrong_columns_are_refused(library):
-    with pytest.raises(ValueError, match="needed"):
+    with pytest.raises(ValueError, match="four are needed"):
         sums_on_grid(library, GridPlanes(8, 0.1, 0, 8, True), told_kernel(0.2, np.ones((1, 4))), np.zeros((5, 3)),
                      np.zeros((5, 3)))

@@ -15,7 +15,7 @@ from eddies.particles.particle_field import grid_points
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.rates import Rates
 from eddies.particles.smoothing_kernels import WendlandC2
-from eddies.particles.terms.stress import Stress
+from eddies.particles.terms.resolved_forces import Stress
 from eddies.particles.terms.term import Term
 from eddies.report.learning import LOSSES
 from eddies.scene.terms import TermSettings

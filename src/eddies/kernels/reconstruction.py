@@ -67,7 +67,7 @@ def fitted(library: ctypes.CDLL, box: Box, degree: int, told: tuple[float, ...],
            values: np.ndarray) -> np.ndarray:
     """Moving least squares: values and their derivatives along x, y and z, (n, 4, 3), of the best polynomials.
 
-    Defined by `eddies.particles.reconstruction.moving_least_squares`.
+    Defined by `eddies.particles.particle_field.ParticleField.fitted`.
 
     Parameters
     ----------

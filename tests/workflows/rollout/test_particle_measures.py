@@ -5,7 +5,7 @@ import pytest
 
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.flow_units import ReferenceScales
-from eddies.particles.forms import Average
+from eddies.particles.forms import form_of
 from eddies.particles.smoothing_kernels import CubicSpline
 from eddies.workflows.rollout.particle_measures import (FieldsOfParticles, ParticleSpectra, ReconstructedFields,
                                                         WithGradients)
@@ -87,7 +87,8 @@ def test_averages_of_a_linear_flow_are_it_but_for_what_neighbours_of_one_side_le
         def __init__(self):
             self.position, self.velocity = place, (place - LENGTH / 2) @ rotation.T
 
-    averages = FieldsOfParticles(Average(CubicSpline(2.2 * SPACING)), SlabDecomposition(comm, LENGTH, SIDE))
+    form = form_of("average", CubicSpline(2.2 * SPACING), 2 * SPACING, SPACING**3)
+    averages = FieldsOfParticles(form, SlabDecomposition(comm, LENGTH, SIDE))
     particles, fields = WithGradients(Rotating(), averages), ReconstructedFields(Rotating(), averages)
     assert particles.columns == ("position", "velocity", "velocity_gradient") and fields.cells == SIDE
     inside = np.flatnonzero(np.abs(place - LENGTH / 2).max(axis=1) < LENGTH / 4)
