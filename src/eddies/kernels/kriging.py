@@ -28,8 +28,8 @@ def kriging_weights(library: ctypes.CDLL, offsets: np.ndarray, displacement: np.
                     sited: bool = True) -> tuple[np.ndarray, list[np.ndarray]]:
     """Kriging weights of the receivers' own values, (10, n), and of their neighbours' values, ten arrays (m,).
 
-    Defined by `eddies.particles.kriging.kriging_weights`. NaN for a receiver with more than MOST_NEIGHBORS neighbours. The ten
-    arrays are separate so that freed ones are small enough to be kept by the allocator.
+    Defined by `eddies.particles.kriging.kriging_weights`. NaN for a receiver with more than MOST_NEIGHBORS neighbours.
+    The ten arrays are separate so that freed ones are small enough to be kept by the allocator.
 
     Parameters
     ----------
