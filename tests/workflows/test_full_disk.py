@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from eddies.io import unfinished
+from eddies.io import new_files
 from eddies.io.errors import WriteError
 from eddies.parallel.stop import StopRequest, Stopped
 from eddies.scene.scene import load_scene
 from eddies.workflows import dns
-from tests.io.test_unfinished import largest_file
+from tests.full_disk import largest_file
 from tests.small_scene import TINY
 from tests.workflows.stopping import StopAtStep
 from tests.workflows.test_dns_restart import SPLIT, product
@@ -17,7 +17,7 @@ from tests.workflows.test_dns_restart import SPLIT, product
 @pytest.mark.mpi(1, 2, timeout=60)
 def test_a_simulation_without_room_keeps_its_checkpoint_and_goes_on(comm, tmp_path, monkeypatch):
     """In place of a full disk the last rank may write so many bytes to a file."""
-    monkeypatch.setattr(unfinished, "MARGIN_BYTES", 2**12)
+    monkeypatch.setattr(new_files, "MARGIN_BYTES", 2**12)
     scene = load_scene(TINY, SPLIT)
     run, whole, told = tmp_path / "run", tmp_path / "whole", []
     if comm.rank == 0:
