@@ -185,7 +185,12 @@ def test_checksums_do_not_depend_on_ranks(comm, tmp_path):
 
 
 @pytest.mark.mpi(1, 2)
-def test_a_file_that_another_program_locks_is_read(comm, path):
+@pytest.mark.parametrize("old", [False, True])
+def test_a_file_that_another_program_locks_is_read(comm, path, old):
+    """With checksums, and an old one without."""
+    if old and comm.rank == 0:
+        with h5py.File(path, "r+") as file:
+            del file.attrs[ATTRIBUTE]
     with open(path, "r+b") as held:
         if comm.rank == 0:
             fcntl.flock(held, fcntl.LOCK_EX)

@@ -143,7 +143,7 @@ def test_space_for_the_whole_file_is_reserved_first(comm, tmp_path, monkeypatch)
         for write in (lambda path: vtkhdf.write_images(path, FieldSeries(file, "filtered"), LENGTH, {}),
                       lambda path: vtkhdf.write_points(path, Trajectory(file, "tracers"), {})):
             write(tmp_path / "a.vtkhdf")
-            assert (tmp_path / "a.vtkhdf").stat().st_size < held[-1] - new_files.EXPORT_BYTES / 2
+            assert (tmp_path / "a.vtkhdf").stat().st_size < held[-1] - new_files.MARGIN_BYTES
             with largest_file(comm, 100_000), pytest.raises(WriteError, match="file.partial: .* bytes wanted"):
                 write(tmp_path / "file")
             assert {path.name for path in tmp_path.iterdir()} == {"p.h5", "a.vtkhdf", "file"}

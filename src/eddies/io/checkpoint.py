@@ -175,12 +175,7 @@ class CheckpointDirectory:
 class Guard:
     """Write checkpoints when they are due, and stop the run on request. All methods are collective.
 
-    Parameters
-    ----------
-    comm : the ranks of the run.
-    directory, fingerprint : of its `CheckpointDirectory`.
-    stop : the requests; None for a run that only `save` is called for.
-    of : what the steps belong to, added to the message of a stop.
+    `of`, added to the message of a stop, says what the steps belong to.
     """
 
     def __init__(self, comm: MPI.Comm, directory: Path, fingerprint: str, stop: StopRequest | None,
@@ -221,7 +216,7 @@ def checkpoints_in(path: Path) -> list[tuple[int, str]]:
 
 
 def _computed_by() -> str:
-    """What the bits of a result depend on, beside settings and ranks."""
+    """The kernels and threads; a result depends on them in its last bits."""
     return f"compiled kernels: {in_use()}, threads a rank: {threads()}"
 
 

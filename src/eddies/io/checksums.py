@@ -61,13 +61,7 @@ def open_to_read(path: str | Path) -> h5py.File:
 
 
 class CheckedFile:
-    """A file with checksums, for h5py.File(self, "r").
-
-    Parameters
-    ----------
-    path : a file that has checksums.
-    naming : whether an error names the damaged dataset and frame.
-    """
+    """A file with checksums, for h5py.File(self, "r"). With `naming`, an error names the damaged dataset and frame."""
 
     _descriptor: int | None = None
 

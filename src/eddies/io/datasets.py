@@ -30,19 +30,12 @@ EDGE = 2 * math.pi  # of the cube, in units of L
 
 @dataclass(frozen=True)
 class MadeArray:
-    """An array that no file holds; its frames, along the first axis, are computed when they are used.
+    """An array that no file holds; its frames, along the first axis, are computed when they are used."""
 
-    Parameters
-    ----------
-    place : the path that the array would have in rollout.h5, which gives its units and description.
-    shape, dtype : of the whole array.
-    make : returns the arrays of some frames.
-    """
-
-    place: str
+    place: str  # the path that it would have in rollout.h5, which gives its units and description
     shape: tuple[int, ...]
     dtype: np.dtype
-    make: Callable[[Sequence[int]], Sequence[np.ndarray]]
+    make: Callable[[Sequence[int]], Sequence[np.ndarray]]  # returns some frames
 
     @classmethod
     def of(cls, place: str, values: np.ndarray) -> MadeArray:

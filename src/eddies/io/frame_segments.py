@@ -19,30 +19,21 @@ from eddies.parallel.slab import SlabDecomposition
 
 @dataclass(frozen=True)
 class FieldLayout:
-    """A series of fields: grid points along each side, and the number of components by variable."""
+    """The content of a series of fields."""
 
-    cells: int
-    variables: Mapping[str, int]
+    cells: int  # grid points along each side
+    variables: Mapping[str, int]  # number of components
 
 
 @dataclass(frozen=True)
 class FrameLayout:
-    """The content of frames, in a segment and in the product.
+    """The content of frames, in a segment and in the product. Series may have different times."""
 
-    Parameters
-    ----------
-    total : number of particles.
-    length : side of the periodic box.
-    trajectories : shape of one particle's value by column, of each trajectory by name.
-    dtype : of the trajectories.
-    fields : each series of fields by name; they may have different times.
-    """
-
-    total: int
-    length: float
-    trajectories: Mapping[str, Mapping[str, tuple[int, ...]]]
-    dtype: type[np.floating]
-    fields: Mapping[str, FieldLayout]
+    total: int  # number of particles
+    length: float  # edge of the periodic cube
+    trajectories: Mapping[str, Mapping[str, tuple[int, ...]]]  # by name: shape of a particle's value by column
+    dtype: type[np.floating]  # of the trajectories
+    fields: Mapping[str, FieldLayout]  # by name
 
     def writers(self, file: File, images: bool = False) -> tuple[dict[str, TrajectoryWriter], dict[str, FieldWriter]]:
         """Writers of the trajectories and of the fields, by name; collective. `images` adds the column of images to

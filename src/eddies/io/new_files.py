@@ -53,7 +53,6 @@ LARGEST_BYTES = 4 * 10**9
 REMEDY = ("run on one rank, or build h5py with MPI: `CC=mpicc HDF5_MPI=ON pip install --no-binary=h5py "
           "--no-build-isolation h5py`")
 
-EXPORT_BYTES = 2**20  # upper limit of what HDF5 writes beside the large datasets of an export
 Layout = Mapping[str, tuple[tuple[int, ...], Any]]  # shape and type of each large dataset
 
 # The files that are being written, by the name that HDF5 has for them.
@@ -121,7 +120,7 @@ def create_export(path: Path, layout: Layout, provenance: Mapping[str, Any], ove
         path.parent.mkdir(parents=True, exist_ok=True)
     size = sum(math.prod(shape) * np.dtype(dtype).itemsize for shape, dtype in layout.values())
     with new_file(MPI.COMM_SELF, path, checksums=False) as file:
-        with writing(file, size + overhead + EXPORT_BYTES):
+        with writing(file, size + overhead):  # the margin suffices for the rest
             file.attrs["provenance"] = json.dumps(dict(provenance))
             for name, (shape, dtype) in layout.items():
                 file.create_dataset(name, shape, dtype)
@@ -160,10 +159,8 @@ def has_single_writer(comm: MPI.Comm) -> bool:
 
 def own_part(group: h5py.Group | h5py.Dataset, shape: tuple[int, ...], block: np.ndarray,
              offset: tuple[int, ...]) -> tuple[np.ndarray, tuple[int, ...]]:
-    """What this rank writes of an array of this shape, and at which offset, if it holds a block of it; collective.
-
-    If rank 0 writes for all, it gets the whole array and the others an empty one.
-    """
+    """The part of an array that this rank writes, and its offset: its block or, if rank 0 writes for all, the whole
+    array of this `shape` on rank 0 and nothing on the others; collective."""
     comm = _open[group.file.filename].comm
     if not has_single_writer(comm) or not shape:
         return block, offset
@@ -304,7 +301,7 @@ class _NewFile:
         self.file = h5py.File(self.path, "w", driver="core", backing_store=False)
 
     def _make_empty(self) -> None:
-        """Write an empty HDF5 file on rank 0, where a failure can still be reported."""
+        """Write an empty HDF5 file on rank 0. Without it, HDF5 could not even close the file on a full disk."""
         if self.comm.rank == 0:
             empty = io.BytesIO()
             h5py.File(empty, "w").close()

@@ -127,7 +127,7 @@ def describe(dataset: h5py.Dataset) -> None:
 
 
 def words_on(kind: str, path: str) -> dict[str, str]:
-    """These attributes of the dataset at a path in a product of a kind; empty if it is unknown."""
+    """Units, axes and description of the dataset at a path in a product of a kind; empty if it is unknown."""
     group, _, name = path.rpartition("/")
     quantity = next((each for pattern, each in QUANTITIES.items() if fnmatchcase(path, pattern)), None)
     if quantity is None and name == "time":

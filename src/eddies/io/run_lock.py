@@ -47,28 +47,16 @@ class RunTakenOver(UserError):
 
 @dataclass(frozen=True)
 class Holder:
-    """The job in a run directory, and its first rank.
+    """The job in a run directory, and its first rank."""
 
-    Parameters
-    ----------
-    job : a unique name.
-    host : name of its machine.
-    machine : identifies the boot of the machine and the process namespace; empty if unknown.
-    pid : process number.
-    born : start time of the process, in units of its machine; empty if unknown.
-    batch : number of the Slurm job, or empty.
-    restarts : how often Slurm has queued this job again.
-    start : when the job took the directory, UTC.
-    """
-
-    job: str
+    job: str  # a unique name
     host: str
-    machine: str
+    machine: str  # the boot of the machine and the process namespace; empty if unknown
     pid: int
-    born: str
-    batch: str
-    restarts: int
-    start: str
+    born: str  # start time of the process, in units of its machine; empty if unknown
+    batch: str  # number of the Slurm job, or empty
+    restarts: int  # how often Slurm has queued this job again
+    start: str  # when the job took the directory, UTC
 
     @classmethod
     def this_job(cls) -> Holder:
@@ -121,16 +109,10 @@ class FoundLock:
 
 
 class RunLock:
-    """The lock that this job holds, on rank 0. A thread gives signs of life.
+    """The lock that this job holds, on rank 0. A thread gives signs of life. A directory that the job has `made` is
+    removed at the end if it is empty."""
 
-    Parameters
-    ----------
-    directory : the run directory.
-    holder : this job.
-    made : whether the job made the directory; it is then removed at the end if it is empty.
-    """
-
-    def __init__(self, directory: Path, holder: Holder, made: bool = False) -> None:
+    def __init__(self, directory: Path, holder: Holder, made: bool) -> None:
         self.directory, self.path, self.holder, self.made = directory, directory / LOCK, holder, made
         self._look_at, self._lost = 0.0, ""
         self._ended = threading.Event()

@@ -31,24 +31,14 @@ class WorkAtStake(UserError):
 
 @dataclass(frozen=True)
 class Work:
-    """The work that stages find in a run directory.
-
-    Parameters
-    ----------
-    directory : the run directory.
-    done : the stages whose product is complete and was made with the same settings.
-    begun : the stages that continue from a checkpoint.
-    useless : the stages whose checkpoints are left over from a complete run, or belong to other settings.
-    lost : the files that the stages would replace, with their cost, as text.
-    changes : the settings that differ from those of the lost files, as text.
-    """
+    """The work that stages find in a run directory."""
 
     directory: Path
-    done: frozenset[str]
-    begun: frozenset[str]
-    useless: frozenset[str]
-    lost: tuple[str, ...]
-    changes: tuple[str, ...]
+    done: frozenset[str]  # stages whose product is complete and was made with the same settings
+    begun: frozenset[str]  # stages that continue from a checkpoint
+    useless: frozenset[str]  # stages whose checkpoints are left over from a complete run, or belong to other settings
+    lost: tuple[str, ...]  # the files that the stages would replace, with their cost
+    changes: tuple[str, ...]  # the settings that differ from those of the lost files
 
     def refuse_to_lose(self) -> None:
         """Raise WorkAtStake if anything would be replaced."""
