@@ -56,11 +56,11 @@ def find_work(stages: Sequence[str], scene: Scene, directory: Path) -> Work:
     done, begun, useless, lost, changes = set(), set(), set(), [], {}
     seconds = stage_seconds(directory)
     for stage in [STAGES[name] for name in stages if STAGES[name].product is not None]:
-        product = directory / stage.file
+        product, settings = directory / stage.file, scene.fingerprint(stage.name)
         checkpoints = checkpoints_in(directory / stage.checkpoints) if stage.checkpoints else []
-        of_others = checkpoints and scene.fingerprint(stage.name) not in [fingerprint for _, fingerprint in checkpoints]
+        of_others = checkpoints and settings not in [fingerprint for _, fingerprint in checkpoints]
         origin = product_provenance(product)
-        if is_done(stage.name, scene, directory):
+        if origin.get("fingerprint") == settings:
             done.add(stage.name)
             if not of_others:  # a scene with those settings may still continue from them
                 useless.add(stage.name)
