@@ -24,15 +24,15 @@ SHAPE = (3, 5, 7, 4)  # seven rows along the axis that is cut
 
 
 def arrays(comm, step):
-    """A state; rows of particles, the first rank of three having none; a table that all ranks hold."""
+    """Modes, rows of particles, of which the first of three ranks has none, and numbers that the ranks measured."""
     generator = np.random.default_rng(step)
     modes = generator.standard_normal(SHAPE) + 1j * generator.standard_normal(SHAPE)
     rows, table = generator.standard_normal((10, 3)), generator.standard_normal(6)
     cuts = block_starts(7, comm.size)[comm.rank:comm.rank + 2], ([0, 0, 4, 10] if comm.size == 3 else block_starts(
         10, comm.size))[comm.rank:comm.rank + 2]
     return {"modes": Block(modes[:, :, slice(*cuts[0])], int(cuts[0][0]), 7, axis=2),
-            "position": Block(rows[slice(*cuts[1])], int(cuts[1][0]), 10), "table": table,
-            "nothing": np.zeros((0, 2))}, modes, rows
+            "position": Block(rows[slice(*cuts[1])], int(cuts[1][0]), 10), "table": table + comm.rank,
+            "seconds": 10**(9 * comm.rank), "nothing": np.zeros((0, 2))}, modes, rows
 
 
 def fill(comm, path, steps, fingerprint="settings"):
@@ -46,13 +46,13 @@ def fill(comm, path, steps, fingerprint="settings"):
 @pytest.mark.mpi(1, 2, 3)
 @pytest.mark.parametrize("mpi", [True, False])
 def test_what_is_read_is_what_was_written(comm, tmp_path, monkeypatch, mpi):
-    """Also if rank 0 writes for all."""
+    """Also if rank 0 writes for all. The numbers that are no blocks are those of rank 0."""
     monkeypatch.setattr(h5py, "get_config", lambda: SimpleNamespace(mpi=mpi))
     saved = fill(comm, tmp_path, [200]).newest()
     _, modes, rows = arrays(comm, 200)
     assert (saved["time"], saved["end"]) == (200 / 3, np.inf) and saved.files == []
-    assert set(saved) == {"time", "end", "modes", "position", "table", "nothing"} and len(saved) == 6
-    assert np.array_equal(saved["table"], arrays(comm, 200)[0]["table"])
+    assert set(saved) == {"time", "end", "seconds", "modes", "position", "table", "nothing"} and len(saved) == 7
+    assert np.array_equal(saved["table"], arrays(comm, 200)[0]["table"] - comm.rank) and saved["seconds"] == 1
     assert np.array_equal(saved.read("modes"), modes) and saved.read("modes").dtype == np.complex128
     assert np.array_equal(saved.read("modes", 2, 5, axis=2), modes[:, :, 2:5])
     assert np.array_equal(saved.read("position"), rows) and np.array_equal(saved.read("position", 3, 4), rows[3:4])

@@ -26,12 +26,12 @@ from mpi4py import MPI
 
 from eddies.cores import threads
 from eddies.io.checksums import find_damage, known_sums, open_to_read
-from eddies.io.errors import WriteError
+from eddies.io.errors import WriteError, file_errors
 from eddies.io.frame_segments import FrameSegments
 from eddies.io.hdf5 import in_files, write_block
 from eddies.io.new_files import HEADER_BYTES, new_file, own_part, writing
 from eddies.kernels.library import in_use
-from eddies.parallel.broadcast import first_complaint, on_first_rank
+from eddies.parallel.broadcast import first_complaint, on_all_ranks, on_first_rank, share_text
 from eddies.parallel.stop import Stopped, StopRequest
 
 log = logging.getLogger("eddies")
@@ -94,23 +94,26 @@ class CheckpointDirectory:
     def write(self, step: int, state: Mapping[str, Any], files: Sequence[str] = ()) -> None:
         """Add a checkpoint, and keep the newest few. If it cannot be written, the earlier ones are intact.
 
-        `state` holds arrays, `Block`s of arrays, and values for JSON. All but the blocks are equal on all ranks.
-        `files` names closed files in this directory that belong to the checkpoint.
+        `state` holds `Block`s of arrays, and arrays and values for JSON, of which those of rank 0 count: the ranks may
+        have measured different times. `files` names closed files in this directory that belong to the checkpoint.
         """
         final, partial = self.path / _name(step), self.path / f"{_name(step)}.partial"
         if on_first_rank(self.comm, final.exists):
             return
         arrays = {name: part for name, part in state.items() if isinstance(part, np.ndarray | Block)}
-        plain = {name: part for name, part in state.items() if name not in arrays}
+        plain = json.dumps({name: part for name, part in state.items() if name not in arrays})
+        plain = share_text(self.comm, plain if self.comm.rank == 0 else "")  # HDF5 needs equal lengths
+        arrays = {PLAIN: np.frombuffer(plain.encode(), np.uint8), **arrays}
         content = {"step": step, "format": FORMAT, "fingerprint": self.fingerprint, "computed_by": _computed_by()}
         try:
             in_files(self.comm, partial, lambda: _make_empty(partial))
             with new_file(self.comm, partial / STATE) as file:
-                _write_array(file, PLAIN, np.frombuffer(json.dumps(plain).encode(), np.uint8))
                 for name, array in arrays.items():
-                    (_write_shared if isinstance(array, Block) else _write_array)(file, name, array)
-                with writing(file, 0):
-                    file.flush()  # to the disk, on every node
+                    if not isinstance(array, Block):
+                        array = Block(array if self.comm.rank == 0 else array[:0], 0, len(array))
+                    _write_array(file, name, array)
+            with file_errors(partial):
+                on_all_ranks(self.comm, lambda: _sync(partial / STATE))  # on every node
             in_files(self.comm, final, lambda: _finish(partial, final, content, files))
         except WriteError as error:
             if self.comm.rank == 0:
@@ -224,12 +227,7 @@ def _name(step: int) -> str:
     return f"step-{step:08d}"
 
 
-def _write_array(file: h5py.File, name: str, array: np.ndarray) -> None:
-    with writing(file, array.nbytes + HEADER_BYTES):
-        file.create_dataset(name, data=array)
-
-
-def _write_shared(file: h5py.File, name: str, block: Block) -> None:
+def _write_array(file: h5py.File, name: str, block: Block) -> None:
     """Write a global array from the blocks of all ranks, component by component if these are cut along a later axis:
     MPI counts bytes in 32 bits, and rank 0 may have to hold what is written at once."""
     values, axis = block.values, block.axis
@@ -277,7 +275,7 @@ def _finish(partial: Path, final: Path, content: Mapping[str, Any], files: Seque
     known = {name: known_sums(final.parent / name) for name in files}
     manifest = _manifest_text({**content, "state": known_sums(partial / STATE), "files": known})
     (partial / MANIFEST).write_text(manifest, encoding="utf-8")
-    for path in (*(final.parent / name for name in files), partial / STATE, partial / MANIFEST, partial):
+    for path in (*(final.parent / name for name in files), partial / MANIFEST, partial):
         _sync(path)
     partial.rename(final)
     _sync(final.parent)
