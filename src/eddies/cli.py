@@ -170,7 +170,7 @@ def end_with_error(error: BaseException, comm: Comm) -> int:
     ever; so does a file that HDF5 could not write, as it crashes in an orderly end, and an interrupt that not all ranks
     get; a second one ends the process at once.
     """
-    from eddies.io.unfinished import writing_failed
+    from eddies.io.new_files import writing_failed
     interrupted = isinstance(error, KeyboardInterrupt)
     if interrupted:
         signal.signal(signal.SIGINT, signal.SIG_DFL)

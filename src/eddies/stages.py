@@ -19,8 +19,7 @@ from eddies.io.checkpoint import CheckpointDirectory
 from eddies.io.errors import WriteError
 from eddies.io.hdf5 import in_files, open_product
 from eddies.io.run_lock import RunInUse, RunTakenOver, lock_directory, refuse_if_held
-from eddies.io.single_writer import LARGEST_BYTES, has_single_writer
-from eddies.io.whole_files import write_files
+from eddies.io.new_files import LARGEST_BYTES, has_single_writer, write_files
 from eddies.parallel.broadcast import on_first_rank, require_same
 from eddies.logs import OUTCOME
 from eddies.parallel.communicator import Comm, warn_of_few_processors

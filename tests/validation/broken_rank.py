@@ -14,7 +14,7 @@ from pathlib import Path
 from mpi4py import MPI
 
 import eddies.cli
-import eddies.io.contiguous
+import eddies.io.checkpoint
 import eddies.io.hdf5
 import eddies.parallel.halo
 import eddies.parallel.reduction
@@ -25,8 +25,8 @@ PLACES = {
     "transform": (eddies.spectral.fourier_passes.PlanePass, "to_physical", 50),  # between two transposes
     "halo": (eddies.parallel.halo.PlaneHalo, "forward", 2),
     "reduction": (eddies.parallel.reduction, "_reduce", 60),
-    "product": (eddies.io.hdf5, "_collective", 15),  # the last preparation of a collective write: the second frame
-    "checkpoint": (eddies.io.contiguous, "_write_block", 50),  # the second checkpoint, half written
+    "product": (eddies.io.hdf5, "frame_bytes", 15),  # before a collective write: the second frame
+    "checkpoint": (eddies.io.checkpoint, "own_part", 6),  # before a collective write: the second checkpoint
 }
 
 TINY = Path(__file__).parents[1] / "tiny.toml"

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from eddies.io.whole_files import write_files
+from eddies.io.new_files import write_files
 
 Number = float | int | bool | str | dict | None
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from eddies.clock import duration
-from eddies.io.single_writer import LARGEST_BYTES, has_single_writer
+from eddies.io.new_files import LARGEST_BYTES, has_single_writer
 from eddies.parallel.communicator import Comm
 from eddies.scene.scene import BOX_LENGTH, Scene
 from eddies.spectral.mode_operators import gaussian_transfer

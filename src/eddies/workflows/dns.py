@@ -10,10 +10,9 @@ import numpy as np
 
 from eddies.clock import Clock, ProgressLine
 from eddies.flow.history import FlowHistory
-from eddies.io.checkpoint import Checkpoint
+from eddies.io.checkpoint import Checkpoint, Guard
 from eddies.io.fields import FieldWriter
 from eddies.io.frame_segments import FrameSegments
-from eddies.io.guard import Guard
 from eddies.io.hdf5 import File, create_product, write_attributes, write_table
 from eddies.parallel.communicator import Comm
 from eddies.parallel.stop import StopRequest

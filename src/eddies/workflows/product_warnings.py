@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 
 from eddies.io.errors import make_again
-from eddies.io.hdf5 import File, read_attributes
+from eddies.io.hdf5 import File, read_attributes, stored_numbers
 from eddies.io.provenance import product_provenance
-from eddies.io.stored_numbers import stored_numbers
 from eddies.pipeline import MAKER_OF, STAGES
 from eddies.workflows.run_directory.work import changed_settings, of_other_settings
 

@@ -10,7 +10,7 @@ import torch
 
 from eddies.clock import pace_in_words
 from eddies.io.frame_segments import FrameSegments
-from eddies.io.guard import Guard
+from eddies.io.checkpoint import Guard
 from eddies.io.hdf5 import create_product, open_product, write_attributes, write_table
 from eddies.parallel.communicator import Comm
 from eddies.parallel.slab import SlabDecomposition

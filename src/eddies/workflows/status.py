@@ -9,13 +9,11 @@ from pathlib import Path
 from eddies.clock import duration
 from eddies.errors import UserError
 from eddies.io.checkpoint import checkpoints_in
-from eddies.io.checksums import ATTRIBUTE
+from eddies.io.checksums import ATTRIBUTE, find_damage, open_to_read
 from eddies.io.errors import ProductError, make_again
 from eddies.io.hdf5 import in_files
 from eddies.io.provenance import product_provenance
-from eddies.io.reading import open_to_read
 from eddies.io.run_lock import find_lock
-from eddies.io.verification import find_damage
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm
 from eddies.pipeline import STAGES, Stage

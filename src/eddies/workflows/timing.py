@@ -17,7 +17,7 @@ from eddies.clock import WARM_UP_STEPS, duration
 from eddies.errors import UserError
 from eddies.io.hdf5 import in_files
 from eddies.io.provenance import product_attributes
-from eddies.io.whole_files import write_files
+from eddies.io.new_files import write_files
 from eddies.learning.optimization import Adam
 from eddies.parallel.communicator import Comm
 from eddies.parallel.stop import Stopped, StopRequest

@@ -6,9 +6,9 @@ import logging
 import time
 from pathlib import Path
 
-from eddies.io.guard import Guard
+from eddies.io.checkpoint import Guard
 from eddies.io.weights import save_weights
-from eddies.io.whole_files import write_files
+from eddies.io.new_files import write_files
 from eddies.learning.training import Training
 from eddies.parallel.communicator import Comm
 from eddies.parallel.stop import StopRequest

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from eddies.io.guard import Guard
+from eddies.io.checkpoint import Guard
 from eddies.io.hdf5 import open_product
 from eddies.io.provenance import product_provenance
 from eddies.io.weights import load_tables, load_weights, save_weights

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from eddies.errors import UserError
 from eddies.flow.stability import REMEDIES, limits_of_step
-from eddies.io.single_writer import LARGEST_BYTES, REMEDY, has_single_writer
+from eddies.io.new_files import LARGEST_BYTES, REMEDY, has_single_writer
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm, node_ranks
 from eddies.pipeline import STAGES

@@ -15,10 +15,8 @@ from eddies.flow.history import FlowHistory
 from eddies.flow.navier_stokes import Fluid
 from eddies.flow.stability import StabilityWatch
 from eddies.flow.tracers import FilteredField, TracerParticles, release
-from eddies.io.checkpoint import Checkpoint
-from eddies.io.contiguous import Block
+from eddies.io.checkpoint import Block, Checkpoint, Guard
 from eddies.io.frame_segments import FrameSegments
-from eddies.io.guard import Guard
 from eddies.parallel.migration import IdOrder, id_block, migrate
 from eddies.particles.flow_units import MEAN_DENSITY, measured_scales
 from eddies.scene.scene import Scene

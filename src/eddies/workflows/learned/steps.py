@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable
 
 from eddies.clock import ProgressLine
-from eddies.io.guard import Guard
+from eddies.io.checkpoint import Guard
 from eddies.learning.training import Training, TrainingDiverged
 from eddies.parallel.halo import HaloError
 from eddies.scene.scene import SceneError

@@ -6,8 +6,7 @@ from typing import Any
 
 import torch
 
-from eddies.io.checkpoint import Checkpoint
-from eddies.io.contiguous import Block
+from eddies.io.checkpoint import Block, Checkpoint
 from eddies.particles.integrators import Integrator
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.workflows.rollout.saved_rows import restored_rows, saved_rows
