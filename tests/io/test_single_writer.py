@@ -12,9 +12,8 @@ from eddies.parallel.stop import StopRequest, Stopped
 from eddies.scene.scene import load_scene
 from eddies.stages import run_stages
 from eddies.workflows import dns
-from eddies.workflows.foreseen.problems import refusals
 from tests.io.test_unfinished import largest_file, write
-from tests.small_scene import TINY
+from tests.small_scene import TINY, problems_of
 from tests.workflows.stopping import StopAtStep
 from tests.workflows.test_dns_restart import SPLIT, product
 
@@ -109,11 +108,11 @@ def test_a_stopped_simulation_goes_on_as_with_parallel_files(comm, tmp_path, ser
 @pytest.mark.mpi(2)
 def test_what_is_too_large_for_one_rank_is_refused_before_any_work(comm, tmp_path, serial):
     scene = load_scene("hit-paper", ["flow.cells=512"])
-    assert not any("built without MPI" in line for line in refusals(scene, comm))
+    assert not any("built without MPI" in line for line in problems_of(scene, comm)[0])
     serial()
-    line, *_ = refusals(scene, comm)
-    assert line.startswith("ground_truth.h5: this h5py is built without MPI") and "up to 4 GB" in line
-    assert refusals(load_scene(TINY), comm) == []
+    line, *_ = problems_of(scene, comm)[0]
+    assert line.startswith("hit-paper: ground_truth.h5: this h5py is built without MPI") and "up to 4 GB" in line
+    assert problems_of(load_scene(TINY), comm)[0] == []
     with pytest.raises(UserError, match="hit-paper: ground_truth.h5: .* HDF5_MPI=ON"):
         run_stages(["dns"], scene, comm, tmp_path / "run", StopRequest(comm))
     assert not (tmp_path / "run").exists()

@@ -9,8 +9,7 @@ from typing import Any
 
 from eddies.clock import duration
 from eddies.parallel.communicator import Comm
-from eddies.scene.scene import BOX_LENGTH, Scene, SceneError
-from eddies.spectral.mode_operators import gaussian_transfer
+from eddies.scene.scene import Scene, SceneError
 from eddies.workflows.foreseen.numbers import (expected_step, expected_turbulence, flow_steps, largest_wavenumber, mach,
                                                rollout_of)
 from eddies.workflows.foreseen.ranks import ground_truth_alone, most_ranks
@@ -33,8 +32,8 @@ def run(scene: Scene, comm: Comm, as_json: bool = False) -> None:
         print(json.dumps(found, indent=2, allow_nan=False))
     elif comm.rank == 0:
         log.info("%s: %s", scene.name, scene.title)
-        for title, line in lines(scene, found):
-            log.info("%-12s%s", "" if title == subject else title, line)
+        for title, line in lines(found):
+            log.info("%-20s%s", "" if title == subject else title, line)
             subject = title
         for problem in found["warnings"]:
             log.warning(problem)
@@ -45,10 +44,10 @@ def run(scene: Scene, comm: Comm, as_json: bool = False) -> None:
 def numbers(scene: Scene, comm: Comm) -> dict[str, Any]:
     """All estimates by the keys that docs/check.md describes; None where a number is unknown before a run. All ranks
     call it."""
-    step, turbulence, limits = expected_step(scene), expected_turbulence(scene), most_ranks(scene)
+    step, turbulence, tracers = expected_step(scene), expected_turbulence(scene), scene.tracers
     courses = {name: rollout_of(variant) for name, variant in (scene.variant or {scene.name: scene}).items()}
     k_max, work, context = largest_wavenumber(scene), work_of(scene), here(scene, comm)
-    found = problems(scene, context)
+    found, limits = problems(scene, context), most_ranks(scene)
     costs = [cost(variant, stage, scenes, comm.size) for (variant, stage), scenes in work.items()]
     return {
         "scene": scene.name, "stages": list(scene.stages_of_all), "cells": scene.flow.cells,
@@ -56,10 +55,9 @@ def numbers(scene: Scene, comm: Comm) -> dict[str, Any]:
         "turbulence": turbulence and {**{name: getattr(turbulence, name) for name in OF_TURBULENCE},
                                       "kmax_eta": k_max * turbulence.kolmogorov_length},
         "mach_turbulent": mach(scene),
-        "particles": scene.tracers and scene.tracers.particles,
-        "filter_width": scene.tracers and scene.tracers.filter_width,
-        "kernel_support": scene.kernel_support,
-        "time_step": step and step[0], "steps": flow_steps(scene),
+        "particles": tracers and tracers.particles, "spacing": tracers and tracers.spacing,
+        "filter_width": tracers and tracers.filter_width, "kernel_support": scene.kernel_support,
+        "time_step": step and step[0], "limited_by": step and f"[time] {step[1]}", "steps": flow_steps(scene),
         "rollouts": {name: course and vars(course) for name, course in courses.items()},
         "ranks": comm.size, "most_ranks": min(limits.values()), "limits": limits,
         "most_ranks_dns": min(most_ranks(ground_truth_alone(scene)).values()),
@@ -99,59 +97,38 @@ def cost(variant: str | None, stage: str, scenes: Sequence[Scene], ranks: int) -
             "least_memory": max(memory(each, stage, most) for each in scenes)}
 
 
-def lines(scene: Scene, found: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+def lines(found: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """The same as text: subject and line."""
-    cells, tracers, turbulence, step = scene.flow.cells, scene.tracers, found["turbulence"], expected_step(scene)
-    yield "grid", f"{cells}^3 cells, spacing {BOX_LENGTH / cells:.4g}, k_max {largest_wavenumber(scene)} (2/3 rule)"
-    if turbulence is None:
-        yield "turbulence", "not known: no forcing, no random start, or no viscosity"
-    else:
-        yield "turbulence", ("expected u' {velocity_rms:.3g}, dissipation rate {dissipation_rate:.3g}, Re_lambda "
-                             "{reynolds_lambda:.3g}, turnover time {turnover_time:.3g}".format(**turbulence))
-        yield "turbulence", ("Kolmogorov length {kolmogorov_length:.3g}, time {kolmogorov_time:.3g}, k_max eta "
-                             "{kmax_eta:.3g}".format(**turbulence))
-    if found["mach_turbulent"] is not None:
-        yield "turbulence", f"turbulent Mach number {found['mach_turbulent']:.3g}"
-    if tracers:
-        passed = gaussian_transfer((tracers.particles_per_side / 2) ** 2, tracers.filter_width)
-        yield "particles", (f"{tracers.particles_per_side}^3 = {tracers.particles}, mean spacing {tracers.spacing:.4g} "
-                            f"= {tracers.spacing * cells / BOX_LENGTH:.3g} cells")
-        yield "particles", (f"filter width {tracers.filter_width:.4g}, passes {passed:.2g} of the amplitude at the "
-                            f"Nyquist wavenumber {tracers.particles_per_side / 2:g} of the particles")
-        yield "particles", (f"filtered fields on {tracers.cells}^3 points, every "
-                            f"{tracers.field_every * tracers.frame_interval:.3g}")
-    if scene.kernel:
-        yield "particles", f"kernel support {scene.kernel_support:.4g}, {scene.kernel.neighbors:g} neighbours"
-    if step is None:
-        yield "steps", "not known: the speed of the initial flow is not known"
-    else:
-        count = f", about {found['steps']} in all" if found["steps"] else ""
-        yield "steps", f"direct simulation {step[0]:.4g}, {step[1]}{count}"
-    alike: dict[str, list[str]] = {}
-    for name, rollout in found["rollouts"].items():
-        if rollout:
-            alike.setdefault("{time_step:.3g}, about {steps} for {intervals} intervals between frames, {evaluations} "
-                             "evaluations of the particles' rates".format(**rollout), []).append(name)
-    for text, names in alike.items():
-        yield "steps", f"rollout of {', '.join(names)}: {text}"
-    yield "ranks", f"at most {found['most_ranks']}; the direct simulation alone at most {found['most_ranks_dns']}"
-    for reason, ranks in found["limits"].items():
-        yield "ranks", f"    {ranks}: {reason}"
-    ranks = "1 rank" if found["ranks"] == 1 else f"{found['ranks']} ranks"
-    yield "stages", f"on {ranks}, wall time within a factor of three; and on the most ranks that can be used"
+    for key, value in found.items():
+        if key == "limits":
+            yield from ((key, f"{ranks}: {reason}") for reason, ranks in value.items())
+        elif key == "rollouts":
+            yield from ((key, f"{name}: {as_text(rollout)}") for name, rollout in value.items())
+        elif key not in ("scene", "stage_costs", "totals", "warnings", "refusals"):
+            yield key, as_text(value)
     rows = {name_of(row): row for row in found["stage_costs"]} | {"in all": found["totals"]}
     width = max(map(len, rows))
-    yield "stages", f"{'stage':{width}}  {'wall time':>12}  memory a rank      disk"
+    yield "costs", "wall time within a factor of three; on these ranks, and on the most that a stage can use"
+    yield "costs", f"{'stage':{width}}  {'wall time':>12}  memory a rank      disk"
     for name, row in rows.items():
-        size = "not known" if row["disk"] is None else in_units(row["disk"])
-        line = f"{name:{width}}  {wall_time(row['seconds']):>12}  {in_units(row['memory']):>13}  {size:>8}"
+        line = f"{name:{width}}  {wall_time(row['seconds']):>12}  {in_units(row['memory']):>13}  "
+        line += f"{'not known' if row['disk'] is None else in_units(row['disk']):>8}"
         if "most_ranks" in row:
             line += f"  {row['most_ranks']:>4}: {wall_time(row['least_seconds'])}"
             line += f", {in_units(row['least_memory'])} a rank"
-        yield "stages", line
-    yield "stages", f"at most {in_units(found['totals']['most_disk'])} of disk at any moment"
+        yield "costs", line
+    yield "costs", f"at most {in_units(found['totals']['most_disk'])} of disk at any moment"
     for problem in found["refusals"]:
         yield "fails here", problem
+
+
+def as_text(value: Any) -> str:
+    """A value of the numbers as text."""
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {as_text(part)}" for name, part in value.items())
+    if isinstance(value, list):
+        return ", ".join(value)
+    return "not known" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def name_of(row: Mapping[str, Any]) -> str:

@@ -148,33 +148,26 @@ def _endless(scene: Scene, stages: Sequence[str]) -> Iterator[str]:
         if expected is not None and span is not None:
             yield from _too_many_steps(scene, span, *expected)
         if tracers is not None and turbulence is not None:
-            yield from _too_many_frames(scene, tracers.turnovers * turbulence.turnover_time)
+            yield from _too_many("[tracers] frame_interval", tracers.frame_interval, tracers.frame_interval,
+                                 tracers.turnovers * turbulence.turnover_time)
     if "simulate" in stages:
         yield from _too_many_rollout_steps(scene, turbulence.turnover_time if turbulence else 0.0)
 
 
-def _too_many_steps(scene: Scene, span: float, step: float, limit: str) -> Iterator[str]:
+def _too_many(key: str, value: float | str, step: float, span: float) -> Iterator[str]:
     if not span <= MOST_STEPS * step:  # also where one is not a number
-        key = ("[time] step" if scene.time.step is not None else "[time] max_step" if "max_step" in limit else
-               "[time] courant, lower [flow] cells or the speed of the flow,")
-        yield (f"the direct simulation would take {span / step:.1e} steps of {step:.3g}, {limit}, for a time of "
-               f"{span:.3g}, and {MOST_STEPS:.0e} are the most; raise {key} or shorten "
-               f"{'[time] duration' if scene.tracers is None else '[tracers] or [spin_up] turnovers'}")
+        yield (f"{key} = {value}: {span / step:.1e} steps of {step:.3g} for a time of {span:.3g}, and "
+               f"{MOST_STEPS:.0e} are the most; raise it, or lower the turnovers or the duration of the run")
 
 
-def _too_many_frames(scene: Scene, span: float) -> Iterator[str]:
-    interval = scene.tracers.frame_interval
-    if not span <= MOST_STEPS * interval:
-        yield (f"[tracers] frame_interval = {interval:g}: {span / interval:.1e} frames in {scene.tracers.turnovers:g} "
-               f"turnovers, and {MOST_STEPS:.0e} are the most; raise frame_interval")
+def _too_many_steps(scene: Scene, span: float, step: float, key: str) -> Iterator[str]:
+    yield from _too_many(f"[time] {key}", getattr(scene.time, key), step, span)
 
 
 def _too_many_rollout_steps(scene: Scene, turnover_time: float) -> Iterator[str]:
     settings = scene.simulation
-    span = max(settings.frame_interval, settings.turnovers * turnover_time)
-    if span > MOST_STEPS * settings.longest_step:
-        yield (f"[simulation] step = {settings.step:g}: {span / settings.longest_step:.1e} steps for a time of "
-               f"{span:.3g}, and {MOST_STEPS:.0e} are the most; raise step or lower turnovers")
+    yield from _too_many("[simulation] step", settings.step, settings.longest_step,
+                         max(settings.frame_interval, settings.turnovers * turnover_time))
 
 
 def _too_few_frames(step: Step, made: Collection[Path]) -> Iterator[str]:
@@ -405,10 +398,10 @@ def check_span(scene: Scene, span: float, bound: float, frames: bool = False) ->
     if span == math.inf:
         raise SceneError(f"{scene.name}: the flow is at rest, so that it never turns over; start from another one")
     settings = scene.time
-    step = settings.step or min(bound, settings.max_step)
-    limit = ("fixed by [time] step" if settings.step else
-             "limited by [time] max_step" if bound >= settings.max_step else "limited by the flow")
-    for problem in [*_too_many_steps(scene, span, step, limit), *(_too_many_frames(scene, span) if frames else ())]:
+    key = "step" if settings.step else "max_step" if bound >= settings.max_step else "courant"
+    interval = scene.tracers.frame_interval if scene.tracers and frames else math.inf
+    for problem in [*_too_many_steps(scene, span, settings.step or min(bound, settings.max_step), key),
+                    *_too_many("[tracers] frame_interval", interval, interval, span)]:
         raise SceneError(f"{scene.name}: {problem}")
 
 

@@ -11,7 +11,7 @@ from eddies.io.errors import make_again
 from eddies.io.hdf5 import File, read_attributes
 from eddies.io.provenance import product_provenance
 from eddies.io.stored_numbers import stored_numbers
-from eddies.pipeline import MAKER_OF, STAGES
+from eddies.pipeline import MAKER_OF
 from eddies.workflows.run_directory.work import changed_settings, of_other_settings
 
 Provenance = Mapping[str, Any]
@@ -22,29 +22,17 @@ MOST_NAMED = 4  # places in a sentence
 
 
 def mixed_products(provenance: Mapping[str, Provenance]) -> list[str]:
-    """A sentence for each product that was made from other products than lie beside it, or does not name them.
-
-    Parameters
-    ----------
-    provenance : of the products of a run directory, by kind.
-    """
+    """A sentence for each product of a run directory, given the provenance by kind, that was made from other products
+    than lie beside it."""
     found = []
     for kind, origin in provenance.items():
-        again = make_again(kind)
-        if "made_from" not in origin:
-            beside = [STAGES[name].product for name in MAKER_OF[kind].depends_on]
-            known = [_made(needed, provenance[needed]) for needed in beside if "id" in provenance.get(needed, {})]
-            if known:
-                found.append(f"{_made(kind, origin)} does not say what it was made from: whether it belongs to "
-                             f"{' and '.join(known)} is not known; {again}")
-            continue
-        others = {needed: provenance.get(needed) for needed, known in origin["made_from"].items()
+        others = {needed: provenance.get(needed) for needed, known in origin.get("made_from", {}).items()
                   if needed not in provenance or provenance[needed].get("id") != known}
         if others:
             named = " and from ".join(_other(needed, origin, present) for needed, present in others.items())
             or_else = ("read comparisons as those of different flows or models" if any(others.values()) else
                        "bring back what is missing")
-            found.append(f"{_made(kind, origin)} was made from {named}: {again}, or {or_else}")
+            found.append(f"{_made(kind, origin)} was made from {named}: {make_again(kind)}, or {or_else}")
     return found
 
 

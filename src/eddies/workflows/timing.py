@@ -135,10 +135,9 @@ def rest_of_training(seconds: float, few: Scene, whole: Scene, directory: Path,
         for phase in [*one_step_phases(few, data, kernel), *horizon_phases(few, data)] if parameters else ():
             stop.check()
             optimizer = Adam(comm, parameters, phase.steps, *phase.rates)
-            taken = [elapsed(comm, lambda: phase.take(optimizer, index)) for index in range(min(2 * FEW, phase.steps))]
-            stepping, number = stepping + phase.steps * min(taken), number + phase.steps
-            first_draws = sum(taken) - len(taken) * min(taken)  # a frame builds its lists when it is first drawn
-            seconds += first_draws / few.training.frames * whole.training.frames
+            step = min(elapsed(comm, lambda: phase.take(optimizer, index))
+                       for index in range(min(2 * FEW, phase.steps)))
+            stepping, number = stepping + phase.steps * step, number + phase.steps
             seconds += (phase.steps // phase.validate_every + 1) * elapsed(comm, phase.validate)
     return seconds + stepping, stepping / max(number, 1), number
 

@@ -93,28 +93,21 @@ def mach(scene: Scene) -> float | None:
 
 
 def courant_bound(scene: Scene) -> float | None:
-    """Longest step that the Courant number allows; None where the speed is unknown."""
-    speed = peak_speed(scene)
+    """Longest step that the Courant number allows; None where the speed is unknown. An explicit stepper resolves
+    sound."""
+    speed, sound = peak_speed(scene), scene.flow.sound_speed if scene.time.explicit else None
     return None if speed is None else (
-        scene.time.courant * BOX_LENGTH / scene.flow.cells / (speed + explicit_sound(scene)))
-
-
-def explicit_sound(scene: Scene) -> float:
-    """sqrt(3) c where the stepper must resolve sound, else 0."""
-    return math.sqrt(3) * scene.flow.sound_speed if scene.time.explicit and scene.flow.sound_speed else 0.0
+        scene.time.courant * BOX_LENGTH / scene.flow.cells / (speed + math.sqrt(3) * (sound or 0.0)))
 
 
 def expected_step(scene: Scene) -> tuple[float, str] | None:
-    """Time step of the direct simulation and what limits it, in words; None where the speed is unknown."""
+    """Time step of the direct simulation and the key of [time] that limits it; None where the speed is unknown."""
     settings, bound = scene.time, courant_bound(scene)
     if settings.step is not None:
-        return settings.step, "fixed by [time] step"
+        return settings.step, "step"
     if bound is None:
         return None
-    if bound >= settings.max_step:
-        return settings.max_step, "limited by [time] max_step"
-    limit = "sound, which rk4 must resolve" if explicit_sound(scene) > peak_speed(scene) else "advection"
-    return ladder_step(settings.max_step, bound), f"limited by {limit}: at most {bound:.3g}"
+    return ladder_step(settings.max_step, bound), "max_step" if bound >= settings.max_step else "courant"
 
 
 def time_of(scene: Scene, turnovers: float) -> float | None:
