@@ -75,6 +75,8 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
     scene.check_variants(variants)
     check_unseen(scene, directory)
     planned, reported = steps(scene, stages, directory, variants), "report" in stages
+    for step in planned:
+        check_sections(step.stages, step.scene)
     if not planned and not reported:
         for each in [scene.variant[name] for name in variants] or [scene]:
             check_sections(stages, each)

@@ -69,11 +69,11 @@ class Problem:
     fatal: bool
 
 
-def here(scene: Scene, comm: Comm, variants: Sequence[str] = ()) -> Context:
+def here(scene: Scene, comm: Comm) -> Context:
     """All stages of a scene in its own run directory on this machine; all ranks call it."""
     place = next(path for path in (scene.directory, *scene.directory.parents) if path.is_dir())
     free = on_first_rank(comm, lambda: shutil.disk_usage(place).free)
-    return Context(comm, scene.stages_of_all, scene.directory, variants, memory_of_node(), free)
+    return Context(comm, scene.stages_of_all, scene.directory, memory=memory_of_node(), free_disk=free)
 
 
 def memory_of_node() -> int:
@@ -84,19 +84,25 @@ def memory_of_node() -> int:
 def problems(scene: Scene, context: Context) -> list[Problem]:
     """All problems of the stages of a scene, of all its variants; all ranks call it and get the same."""
     comm, planned = context.comm, steps(scene, context.stages, context.directory, context.variants)
+    beside = node_ranks(comm)
     made = {step.directory / STAGES[stage].file for step in planned for stage in step.stages}
     refused: dict[str, None] = {}
     doubts: dict[str, list[str]] = {}
     for step in planned:
         refused |= dict.fromkeys(_refusals(step, comm, made))
-        for doubt in [*_warnings(step, made), *_memory_warnings(step, context)]:
+        for doubt in _warnings(step, made):
             doubts.setdefault(doubt, []).append(step.variant or "")
+        for stage in step.stages:
+            size = memory(step.scene, stage, comm.size)
+            if beside * size > context.memory:
+                doubts[f"{stage}: {beside} ranks with about {in_units(size)} each need more than the "
+                       f"{in_units(context.memory)} of memory here; take more nodes, or fewer cells or particles"] = []
     if "report" in context.stages:
         refused |= dict.fromkeys(place_problems(("report",), comm, context.directory))
     needed = most_disk((step.scene, stage) for step in planned for stage in step.stages)
     if needed > context.free_disk:
         doubts[f"the stages need about {in_units(needed)} of disk, and {in_units(context.free_disk)} are free here; "
-               "choose another --output, or raise [tracers] frame_interval or field_every"] = [""]
+               "choose another --output, or raise [tracers] frame_interval or field_every"] = []
     named = {text: ", ".join(dict.fromkeys(filter(None, names))) for text, names in doubts.items()}
     return [*(Problem(text, True) for text in refused),
             *(Problem(f"variant {names}: {text}" if names else text, False) for text, names in named.items())]
@@ -259,14 +265,6 @@ def _warnings(step: Step, made: Collection[Path]) -> Iterator[str]:
     model = step.scene.model if "train" in step.stages else None
     if model is not None and model.path and model.weights_file not in made and not model.weights_file.is_file():
         yield f'[model] path = "{model.path}": there is no {model.weights_file} yet, which `eddies train` needs'
-
-
-def _memory_warnings(step: Step, context: Context) -> Iterator[str]:
-    ranks = node_ranks(context.comm)
-    for stage in step.stages:
-        if ranks * (size := memory(step.scene, stage, context.comm.size)) > context.memory:
-            yield (f"{stage}: {ranks} ranks with about {in_units(size)} each need more than the "
-                   f"{in_units(context.memory)} of memory here; take more nodes, or fewer cells or particles")
 
 
 def resolution(scene: Scene) -> Iterator[str]:
