@@ -4,8 +4,8 @@
     .venv/bin/python tests/benchmarks/projection.py flow hit-paper
 
 `particles` measures nothing: seconds of a call and of a unit of work of each part follow from the measured evaluations
-of 16^3 and 64^3 particles on one core; messages are those of an assumed network. It writes the rows `projected` and, for
-the measured rows, the ratio of projection and measurement, `held`, into the file, and prints the tables of
+of 16^3 and 64^3 particles on one core; messages are those of an assumed network. It writes into the file the rows
+`projected` and, in `held`, projected over measured seconds of the measured rows, and prints the tables of
 docs/performance.md. `flow` prints the formulas of `eddies check` for 1, 2, 4, ... ranks.
 """
 
