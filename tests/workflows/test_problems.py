@@ -126,7 +126,16 @@ def test_a_warning_names_the_variants_that_it_concerns(comm):
         "variant paper"]
     line, = (line for line in problems_of(load_scene("tiny", ["simulation.turnovers=5"]), comm)[1])
     assert line.startswith("variant paper, resolved, local, grid-16, grid-20, no-force: [simulation] turnovers = 5")
-    assert problems_of(load_scene("tiny", ["realisations=[2]"]), comm) == ([], [])  # weights are made by the same job
+
+
+@pytest.mark.mpi(1)
+def test_weights_that_the_same_job_makes_are_not_read(comm, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    scene = load_scene("tiny", ["realisations=[2]"])
+    assert problems_of(scene, comm) == ([], [])
+    (tmp_path / "runs/tiny/paper").mkdir(parents=True)
+    (tmp_path / "runs/tiny/paper/model.h5").write_text("of other settings")
+    assert problems_of(scene, comm) == ([], [])
 
 
 @pytest.mark.mpi(1, 2)

@@ -126,7 +126,7 @@ def _refusals(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str]:
                     *rank_problems(scene, stages, comm.size), *_single_writer(scene, stages, comm)):
         yield f"{scene.name}: {problem}"
     yield from place_problems(stages, comm, step.directory)
-    yield from _unfit_files(step, comm)
+    yield from _unfit_files(step, comm, made)
 
 
 def _endless(scene: Scene, stages: Sequence[str]) -> Iterator[str]:
@@ -234,14 +234,16 @@ def place_problems(stages: Sequence[str], comm: Comm, directory: Path) -> list[s
         return [f"{directory}: cannot be used ({error.strerror}); choose another --output"]
 
 
-def _unfit_files(step: Step, comm: Comm) -> Iterator[str]:
-    """A file to start from, trained weights or ground truths of others that do not fit; a GPU that is not there."""
+def _unfit_files(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str]:
+    """A file to start from, trained weights or other ground truths that do not fit; a missing GPU. Weights that earlier
+    steps make are not read."""
     scene, stages, model = step.scene, step.stages, step.scene.model if "train" in step.stages else None
     try:
         if "dns" in stages and scene.initial.flow.from_file:
             with stored_states(scene.initial, comm):
                 pass
-        if model is not None and model.path is not None and on_first_rank(comm, model.weights_file.is_file):
+        weights = model.weights_file if model is not None and model.path is not None else None
+        if weights is not None and weights not in made and on_first_rank(comm, weights.is_file):
             from eddies.workflows.learned.source import read_source  # imports torch
             read_source(scene, comm)
         if scene.device != "cpu" and {"train", "simulate"} & {*stages}:
