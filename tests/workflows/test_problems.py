@@ -11,6 +11,7 @@ import pytest
 from eddies.flow.forcing import ForcingError
 from eddies.parallel.slab import SlabDecomposition
 from eddies.scene.scene import SceneError, builtin_scenes, load_scene
+from eddies.workflows.foreseen.storage import memory
 from eddies.workflows.problems import Context, memory_of_node, place_problems, problems, refuse
 from tests.bad_scenes import INFEASIBLE
 from tests.changed_product import changed
@@ -143,7 +144,8 @@ def test_a_machine_that_is_too_small(comm, tmp_path):
     scene = load_scene(TINY)
     fits = Context(comm, scene.stages, tmp_path, memory=memory_of_node(), free_disk=1e9)
     assert problems(scene, fits) == []
-    small, = problems(scene, dataclasses.replace(fits, stages=["dns"], memory=1e8))
+    size = memory(scene, "dns", comm.size)
+    small, = problems(scene, dataclasses.replace(fits, stages=["dns"], memory=(comm.size - 0.5) * size))
     full, = problems(scene, dataclasses.replace(fits, free_disk=1e6))
     assert "of memory here" in small.text and "of disk" in full.text and not small.fatal and not full.fatal
 
