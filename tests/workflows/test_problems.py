@@ -306,7 +306,7 @@ def test_a_ground_truth_with_too_few_frames_or_without_motion(comm, tmp_path):
     with pytest.raises(SceneError, match="after frame 14 of 30 no filtered field is followed"):
         coarse = dataclasses.replace(scene.simulation, frame_interval=0.5)
         check_ground_truth(["simulate"], dataclasses.replace(scene, simulation=coarse), comm, tmp_path)
-    for group, value, stages, message in (("eddy_turnover_time", 1e12, ["simulate"], "3.8e.12 steps for a time of 3e"),
+    for group, value, stages, message in (("eddy_turnover_time", 1e12, ["simulate"], "3.8e.12 steps of 0.08"),
                                           ("acceleration_rms", 0.0, ["train"], "scale acceleration = 0.0: must be")):
         comm.Barrier()
         if comm.rank == 0:

@@ -36,16 +36,6 @@ def test_another_model_of_the_same_settings_and_a_ground_truth_that_is_gone():
     assert "a ground_truth.h5 that is not here" in sentence and "bring back what is missing" in sentence
 
 
-def test_a_product_without_an_id_is_named_beside_one_that_has_an_id():
-    old = {"date": "2029-12-01", "scene": ""}
-    assert mixed_products({"ground_truth": old, "model": old, "rollout": old}) == []
-    from_old = {**ROLLOUT, "made_from": {"ground_truth": None}}
-    assert mixed_products({"ground_truth": old, "rollout": from_old}) == []
-    assert len(mixed_products({"ground_truth": TRUTH, "rollout": from_old})) == 1
-    sentence, = mixed_products({"ground_truth": TRUTH, "rollout": old})
-    assert "does not say what it was made from: whether it belongs to ground_truth.h5 (made 2030-01-01)" in sentence
-
-
 @pytest.mark.mpi(1)
 def test_a_truth_of_another_run_that_has_changed_is_named(comm, tmp_path):
     write_ground_truth(comm, tmp_path)

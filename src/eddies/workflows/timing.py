@@ -55,26 +55,33 @@ class StepTimes(StopRequest):
 def run(scene: Scene, comm: Comm, signals: Sequence[int] = ()) -> None:
     """Log seconds a step and wall time of each stage, of all variants, on one ground truth; all ranks call it. Raises
     Stopped after a signal."""
-    stop, failed = StepTimes(comm, signals), set()
+    stop = StepTimes(comm, signals)
     log.info("%s: measured on %d %s", scene.name, comm.size, "rank" if comm.size == 1 else "ranks")
     log.info("%-28s  s a step     steps  wall time", "stage")
-    with temporary_directory(comm) as directory:
-        few = shortened(scene, None)
-        if scene.tracers:  # a single interval of frames tells how fast the flow turns over
-            with quiet():
-                dns.run(few.without_variants, comm, directory, stop)
-            reference = product_attributes(directory / STAGES["dns"].file, "reference")
-            few = shortened(scene, reference["eddy_turnover_time"])
-        for step in steps(few, scene.stages_of_all, directory):
-            whole = scene.variant[step.variant] if step.variant else scene.without_variants
-            in_files(comm, step.directory, lambda: link(step))
-            for stage in step.stages:
-                name = f"{step.variant}: {stage}" if step.variant else stage
-                if step.variant not in failed and not measured(name, stage, step.scene, whole, step.directory, stop):
-                    failed.add(step.variant)
-        if "report" in scene.stages_of_all:
-            in_files(comm, directory, lambda: write_files({directory / "scene.toml": few.to_toml()}))
-            measured("report", "report", few, scene, directory, stop)
+    try:
+        with temporary_directory(comm) as directory:
+            measure_stages(scene, directory, stop)
+    except Stopped:
+        raise Stopped(stop.reason, "from the beginning") from None
+
+
+def measure_stages(scene: Scene, directory: Path, stop: StepTimes) -> None:
+    """Measure the stages of a scene and of its variants one after the other in a directory."""
+    comm, few, failed = stop.comm, shortened(scene, None), set()
+    if scene.tracers:  # a single interval of frames tells how fast the flow turns over
+        with quiet():
+            dns.run(few.without_variants, comm, directory, stop)
+        few = shortened(scene, product_attributes(directory / STAGES["dns"].file, "reference")["eddy_turnover_time"])
+    for step in steps(few, scene.stages_of_all, directory):
+        whole = scene.variant[step.variant] if step.variant else scene.without_variants
+        in_files(comm, step.directory, lambda: link(step))
+        for stage in step.stages:
+            name = f"{step.variant}: {stage}" if step.variant else stage
+            if step.variant not in failed and not measured(name, stage, step.scene, whole, step.directory, stop):
+                failed.add(step.variant)
+    if "report" in scene.stages_of_all:
+        in_files(comm, directory, lambda: write_files({directory / "scene.toml": few.to_toml()}))
+        measured("report", "report", few, scene, directory, stop)
 
 
 def measured(name: str, stage: str, few: Scene, whole: Scene, directory: Path, stop: StepTimes) -> bool:
@@ -82,8 +89,6 @@ def measured(name: str, stage: str, few: Scene, whole: Scene, directory: Path, s
     try:
         with quiet():
             seconds, step, number = wall_time_of(stage, few, whole, directory, stop)
-    except Stopped:
-        raise Stopped(stop.reason, "from the beginning") from None
     except UserError as error:
         log.info("%-28s  not measured: %s", name, error)
         return False
