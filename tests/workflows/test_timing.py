@@ -41,7 +41,7 @@ def measured(comm, tmp_path, monkeypatch, no_figures, quick_solves):
     return run
 
 
-@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.mpi(1, 2)
 def test_every_stage_of_the_pipeline_is_measured(comm, measured):
     horizons = ["training.horizons.steps=5", "training.horizons.frames=[1, 2]"] if comm.size == 1 else []
     found = measured(TINY, *horizons)
@@ -75,7 +75,7 @@ def test_a_signal_ends_it_with_nothing_left(measured):
 
 @pytest.mark.parametrize("number, code", [(signal.SIGINT, 130), (signal.SIGTERM, 75)])
 def test_an_interrupt_leaves_nothing(tmp_path, number, code):
-    command = [sys.executable, LAUNCH, "-n", "2", "--", sys.executable, "-m", "eddies", "check", "hit-small", "--time"]
+    command = [sys.executable, LAUNCH, "-n", "2", "--", sys.executable, "-m", "eddies", "check", TINY, "--time"]
     # A background job of a shell ignores the interrupt, and so do its children.
     job = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, start_new_session=True,
                            env={**os.environ, "OMP_NUM_THREADS": "1"},
