@@ -5,14 +5,11 @@ import dataclasses
 import logging
 import re
 
-import numpy as np
 import pytest
 
-from eddies.flow.forcing import ForcingError
-from eddies.parallel.slab import SlabDecomposition
 from eddies.scene.scene import SceneError, builtin_scenes, load_scene
 from eddies.workflows.foreseen.storage import memory
-from eddies.workflows.problems import Context, memory_of_node, place_problems, problems, refuse
+from eddies.workflows.problems import Context, memory_of_node, problems, refuse
 from tests.bad_scenes import INFEASIBLE
 from tests.changed_product import changed
 from tests.small_scene import TINY, one_model, problems_of
@@ -208,52 +205,15 @@ def test_a_gpu_that_is_not_there(comm, tmp_path, monkeypatch, capfd):
 
 
 @pytest.mark.mpi(1, 2)
-def test_a_start_that_forcing_cannot_amplify_is_refused_as_by_the_forcing(comm):
-    from eddies.workflows.ground_truth.scene_flow import build_fluid, initial_state
-    for name, changes in (("taylor-green", ["forcing.wavenumber=1.5"]), ("taylor-green", ["forcing.wavenumber=2"]),
-                          ("abc", ["initial.wavenumber=2"]), ("abc", []), ("shear-wave", ["initial.wavenumber=3"])):
-        scene = load_scene(name, ["forcing.injection_rate=0.5", "flow.cells=16", *changes])
-        fluid = build_fluid(scene, comm)
-        try:
-            fluid.nonlinear(initial_state(scene, fluid))
-            refused = False
-        except ForcingError:
-            refused = True
-        lines = [line for line in problems_of(scene, comm)[0] if "amplify" in line]
-        assert bool(lines) == refused
-
-
-@pytest.mark.mpi(1, 2)
 def test_files_that_do_not_fit(comm, tmp_path):
-    from eddies.io.fields import FieldWriter
-    from eddies.io.hdf5 import create_product
-    path = comm.bcast(str(tmp_path / "start.h5"))
-    changes = ["initial.kind=file", f"initial.path={path}", "flow.cells=16"]
-    (line,), _ = problems_of(load_scene("taylor-green", changes), comm)
-    assert path in line
-    with create_product(comm, path, "ground_truth", {"scene": "", "fingerprint": ""}) as file:
-        slab = SlabDecomposition(comm, 1.0, 12)
-        at_rest = {"velocity": np.zeros((3, slab.count, 12, 12))}
-        FieldWriter(file, "unfiltered", 12, {"velocity": 3}).append(0.0, slab.start, at_rest)
-    assert problems_of(load_scene("taylor-green", changes), comm)[0] == []
-    (line,), _ = problems_of(load_scene("taylor-green", [*changes, "initial.state=1"]), comm)
-    assert "[initial] state = 1" in line
-    folder = comm.bcast(str(tmp_path))
+    path = comm.bcast(str(tmp_path))
+    (line,), _ = problems_of(load_scene("taylor-green", ["initial.kind=file", f"initial.path={path}/start.h5"]), comm)
+    assert f"{path}/start.h5" in line
     if comm.rank == 0:
         (tmp_path / "model.h5").write_text("nothing")
     comm.Barrier()
-    (line,), _ = problems_of(load_scene("hit-mt008", [f"model.path={folder}"], ["variant"]), comm)
-    assert f"{folder}/model.h5" in line
-
-
-@pytest.mark.mpi(1)
-def test_a_run_directory_that_is_none(comm, tmp_path):
-    (tmp_path / "file").touch()
-    (tmp_path / "run" / "rollout.h5").mkdir(parents=True)
-    (tmp_path / "run" / "report").touch()
-    found = place_problems(["dns", "simulate", "report"], comm, tmp_path / "run")
-    assert len(found) == 2 and "rollout.h5: is a directory" in found[0] and "report: is a file" in found[1]
-    assert place_problems(["dns"], comm, tmp_path / "run") == []
+    (line,), _ = problems_of(load_scene("hit-mt008", [f"model.path={path}"], ["variant"]), comm)
+    assert f"{path}/model.h5" in line
 
 
 # ---- what only the flow tells

@@ -122,8 +122,8 @@ def refuse(scene: Scene, context: Context) -> list[str]:
 
 def _refusals(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str]:
     scene, stages = step.scene, step.stages
-    for problem in (*_endless(scene, stages), *_too_few_frames(step, made), *_forced_modes(scene, stages),
-                    *rank_problems(scene, stages, comm.size), *_single_writer(scene, stages, comm)):
+    for problem in (*_endless(scene, stages), *_too_few_frames(step, made), *rank_problems(scene, stages, comm.size),
+                    *_single_writer(scene, stages, comm)):
         yield f"{scene.name}: {problem}"
     yield from place_problems(stages, comm, step.directory)
     yield from _unfit_files(step, comm, made)
@@ -191,18 +191,6 @@ def _too_few_frames(step: Step, made: Collection[Path]) -> Iterator[str]:
         except SceneError as error:
             yield (f"with at most {frames} frames, as expected of [tracers] turnovers = {scene.tracers.turnovers:g}: "
                    f"{error}")
-
-
-def _forced_modes(scene: Scene, stages: Sequence[str]) -> Iterator[str]:
-    """A start without energy at the modes that linear forcing amplifies."""
-    initial, forcing = scene.initial, scene.forcing
-    if "dns" not in stages or forcing is None or forcing.injection_rate == 0:
-        return
-    wave = initial.flow.wave and initial.flow.wave * initial.wavenumber
-    if initial.flow.sound or wave and wave >= forcing.wavenumber:
-        yield (f'[forcing] wavenumber = {forcing.wavenumber:g}: [initial] kind = "{initial.kind}" has no energy at '
-               "0 < |k| < wavenumber, which linear forcing could amplify; start from another flow, raise wavenumber, "
-               "or remove [forcing]")
 
 
 def _single_writer(scene: Scene, stages: Sequence[str], comm: Comm) -> Iterator[str]:
