@@ -119,8 +119,12 @@ def wall_time_of(stage: str, few: Scene, whole: Scene, directory: Path,
     paces = [after - before for before, after in zip(stop.times[first:], stop.times[first + 1:])]
     usual, taken = paces[WARM_UP_STEPS:] or paces or [seconds], len(paces) + 1
     step = sum(usual) / len(usual)
-    number = {"dns": lambda: flow_steps(whole), "train-kernel": lambda: 2 * whole.kernel.steps,
-              "simulate": lambda: rollout and round(taken * rollout.intervals / FEW)}[stage]()
+    if stage == "dns":
+        number = flow_steps(whole)
+    elif stage == "train-kernel":
+        number = 2 * whole.kernel.steps
+    else:
+        number = rollout and round(taken * rollout.intervals / FEW)
     return seconds + max((number or 0) - taken, 0) * step, step, number
 
 
