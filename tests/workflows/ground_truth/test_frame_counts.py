@@ -43,7 +43,8 @@ def test_the_field_loss_uses_frames_with_a_field_one_frame_later():
             check_frames(["train"], scene, scene.training.window, FRAMES)
 
 
-@pytest.mark.parametrize("frames, every", np.random.default_rng(5).integers((2, 1), (90, 12), (12, 2)).tolist())
+@pytest.mark.parametrize("frames, every", [
+    (12, 6), (13, 6), *np.random.default_rng(5).integers((2, 1), (90, 12), (8, 2)).tolist()])
 def test_a_rollout_starts_at_the_first_field_that_truth_follows(frames, every):
     tiny = load_scene(TINY)
     at_fields = range(0, frames, every)
