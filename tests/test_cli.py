@@ -208,14 +208,12 @@ def test_more_ranks_than_slabs_are_refused_before_any_work(comm, tmp_path, capfd
 
 @pytest.mark.mpi(1)
 def test_limit_of_ranks_is_that_of_the_stages(comm):
-    from types import SimpleNamespace
-
-    from eddies.scene.scene import SceneError, load_scene
-    from eddies.stages import check_ranks
-    check_ranks(["dns"], load_scene(TINY), SimpleNamespace(size=8))
-    check_ranks(load_scene("hit-small").stages, load_scene("hit-small"), SimpleNamespace(size=8))
-    with pytest.raises(SceneError, match="start at most 4"):
-        check_ranks(load_scene(TINY).stages, load_scene(TINY), SimpleNamespace(size=5))
+    from eddies.scene.scene import load_scene
+    from eddies.workflows.foreseen.ranks import rank_problems
+    scene = load_scene(TINY)
+    assert not [*rank_problems(scene, ["dns"], 8), *rank_problems(load_scene("hit-small"), ["dns", "train"], 8)]
+    problem, = rank_problems(scene, scene.stages, 5)
+    assert "start at most 4" in problem
 
 
 @pytest.mark.mpi(1)

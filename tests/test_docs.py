@@ -104,7 +104,8 @@ def test_command_exists(command, folder):
 def test_cheap_command_runs(comm, command, folder, capfd):
     assert main(shlex.split(command)[1:]) == 0
     output = capfd.readouterr().out
-    assert output and "warning" not in output
+    warnings = [line for line in output.splitlines() if "warning" in line and "of memory here" not in line]
+    assert output and warnings == []
 
 
 def test_readme_is_short():

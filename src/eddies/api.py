@@ -30,12 +30,10 @@ CHECKPOINT_SECONDS = 600.0
 
 
 def check(scene: Scene | str | Path, *, comm: Comm | None = None) -> None:
-    """Log what a scene amounts to: resolution, memory, ranks and time. Writes nothing."""
+    """Log estimates of a scene: resolution, memory, ranks and time. Writes nothing. Raises SceneError where a run would
+    be refused."""
     with _job(comm) as comm:
-        scene = _scene(scene)
-        for each in (scene, *scene.variant.values()):
-            import_module("eddies.workflows.feasibility").check_feasible(each.stages, each, comm)
-        import_module("eddies.workflows.check").run(scene, comm)
+        import_module("eddies.workflows.check").run(_scene(scene), comm)
 
 
 def run(scene: Scene | str | Path, *, stages: Sequence[str] | None = None, output: str | Path | None = None,

@@ -15,7 +15,6 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -233,26 +232,22 @@ def export_command(options: argparse.Namespace, comm: Comm) -> None:
 
 
 def check_command(options: argparse.Namespace, comm: Comm) -> None:
-    """Derived numbers and estimates of a scene."""
-    for scene in checked_scenes(options, comm):
+    """Estimates of a scene before it runs."""
+    for scene in checked_scenes(options):
         import_module("eddies.workflows.check").run(scene, comm, options.json)
 
 
 def time_command(options: argparse.Namespace, comm: Comm, signals: list[int]) -> None:
-    """Seconds of a step of each stage of a scene, measured."""
-    for scene in checked_scenes(options, comm):
+    """Measured seconds of a step of each stage of a scene."""
+    for scene in checked_scenes(options):
         import_module("eddies.workflows.timing").run(scene, comm, signals)
 
 
-def checked_scenes(options: argparse.Namespace, comm: Comm) -> Iterator[Scene]:
-    """The scene of the command line, or the variants named, each once it is known to be feasible."""
-    from eddies.workflows.feasibility import check_feasible
+def checked_scenes(options: argparse.Namespace) -> list[Scene]:
+    """The scene of the command line, or the variants that it names."""
     whole = load_scene(options.scene, options.overrides, options.removals)
     whole.check_variants(options.variants)
-    for scene in [whole.variant[name] for name in options.variants] or [whole]:
-        for each in (scene, *scene.variant.values()):
-            check_feasible(each.stages, each, comm)
-        yield scene
+    return [whole.variant[name] for name in options.variants] or [whole]
 
 
 def scenes_command(options: argparse.Namespace, comm: Comm) -> None:

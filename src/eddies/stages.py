@@ -27,11 +27,9 @@ from eddies.parallel.connection import all_arrive
 from eddies.parallel.stop import Stopped, StopRequest
 from eddies.pipeline import STAGES, Stage
 from eddies.scene.scene import Scene, SceneError
-from eddies.workflows.feasibility import check_feasible, check_ground_truth, check_places
-from eddies.workflows.foreseen.problems import single_writer, stage_warnings
-from eddies.workflows.foreseen.ranks import ground_truth_alone, most_ranks
 from eddies.workflows.foreseen.storage import in_units
 from eddies.workflows.learned.source import read_source
+from eddies.workflows.problems import Context, check_ground_truth, memory_of_node, refuse
 from eddies.workflows.run_directory.work import FAILURE, SECONDS, Work, find_work, is_done, stage_seconds
 from eddies.workflows.variants import Step, check_unseen, link, steps
 
@@ -75,17 +73,12 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
     scene.check_variants(variants)
     check_unseen(scene, directory)
     planned, reported = steps(scene, stages, directory, variants), "report" in stages
+    for step in planned:
+        check_sections(step.stages, step.scene)
     if not planned and not reported:
         for each in [scene.variant[name] for name in variants] or [scene]:
             check_sections(stages, each)
-    for step in planned:
-        check_feasible(step.stages, step.scene, comm, step.holder("dns"))
-        check_ranks(step.stages, step.scene, comm)
-        for problem in single_writer(step.stages, step.scene, comm):
-            raise SceneError(f"{step.scene.name}: {problem}")
-        check_places(step.stages, comm, step.directory)
-    if reported:
-        check_places(("report",), comm, directory)
+    warnings = refuse(scene, Context(comm, stages, directory, variants, memory_of_node()))
     if take_over:
         for step in planned:
             look_at_work(step, comm, overwrite)  # a command that is refused ends no other job
@@ -97,6 +90,8 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
         for step in planned:
             look_at_work(step, comm, overwrite)
         prepare_directory(scene, comm, directory)
+        for warning in warnings if comm.rank == 0 else ():
+            log.warning(warning)
         failures = run_steps(planned, comm, directory, stop, overwrite, take_over)
         if reported:
             run_stage(STAGES["report"], scene, comm, directory, stop, False, variants=variants)
@@ -143,7 +138,10 @@ def run_step(step: Step, comm: Comm, stop: StopRequest, overwrite: bool) -> None
     if step.links:  # else checked before any step
         check_inputs(step, comm)
     work = look_at_work(step, comm, overwrite)
-    tell(step.stages, step.scene, comm)
+    if has_single_writer(comm):
+        log.info("rank 0 writes for all, up to %s a file: this h5py is built without MPI", in_units(LARGEST_BYTES))
+    if step.scene.foreign:
+        log.info("%s: uses classes that are not of this package: %s", step.scene.name, ", ".join(step.scene.foreign))
     known = False  # that the ground truth is what the other stages need
     for stage in [STAGES[name] for name in step.stages]:
         if stage.name in work.useless:
@@ -182,17 +180,6 @@ def working_in(comm: Comm, directory: Path, stop: StopRequest, take_over: bool) 
         yield
 
 
-def tell(stages: Sequence[str], scene: Scene, comm: Comm) -> None:
-    """Log what is foreign to the package in a scene, who writes, and what its stages give reason to doubt."""
-    if has_single_writer(comm):
-        log.info("rank 0 writes for all, up to %s a file: this h5py is built without MPI", in_units(LARGEST_BYTES))
-    if scene.foreign:
-        log.info("%s: uses classes that are not of this package: %s", scene.name, ", ".join(scene.foreign))
-    if comm.rank == 0:
-        for problem in stage_warnings(scene, stages):
-            log.warning(problem)
-
-
 def run_stage(stage: Stage, scene: Scene, comm: Comm, directory: Path, stop: StopRequest, begun: bool,
               **more: Sequence[str]) -> None:
     """Run one stage, and record its wall time, also when it is stopped: if it was `begun` before, that is added.
@@ -216,15 +203,6 @@ def remove_checkpoints(stage: Stage, comm: Comm, directory: Path) -> None:
     """Remove the checkpoints of a stage, if it makes any."""
     if stage.checkpoints is not None:
         CheckpointDirectory(comm, directory / stage.checkpoints, "").remove()
-
-
-def check_ranks(stages: Sequence[str], scene: Scene, comm: Comm) -> None:
-    """Refuse more ranks than the slabs of a scene allow; its ground truth alone may use more than what learns of it."""
-    limits = most_ranks(ground_truth_alone(scene) if set(stages) == {"dns"} else scene)
-    reason = min(limits, key=lambda name: limits[name])
-    if comm.size > limits[reason]:
-        raise SceneError(f"{scene.name}: {comm.size} ranks are more than the {limits[reason]} that it can use "
-                         f"({reason}); start at most {limits[reason]}, `eddies check` gives all limits")
 
 
 def check_sections(stages: Sequence[str], scene: Scene) -> None:

@@ -67,10 +67,11 @@ def of_job(ranks: int, threads: int, program: str, *arguments: object) -> dict:
 
 
 def scene_of(side: int, model: str) -> Scene:
-    """`hit` with more particles and cells."""
+    """`hit` without variants, with other numbers of particles and cells."""
     return load_scene("hit", [f"tracers.particles_per_side={side}", f"flow.cells={4 * side}",
                               f"tracers.field_cells={round(CELLS_A_PARTICLE * side)}",
-                              f"flow.viscosity={0.0072 * (32 / side) ** (4 / 3)}", f'model.preset="{model}"'])
+                              f"flow.viscosity={0.0072 * (32 / side) ** (4 / 3)}", f'model.preset="{model}"'],
+                      ["variant"])
 
 
 def bounds(iterations: float) -> dict[str, float]:

@@ -22,10 +22,9 @@ from eddies.parallel.stop import StopRequest, Stopped
 from eddies.scene.scene import load_scene
 from eddies.stages import run_stages
 from eddies.workflows import dns
-from eddies.workflows.foreseen.problems import refusals
 from mpi_tools.launch import mpi_environment, mpirun_command
 from tests.full_disk import largest_file
-from tests.small_scene import TINY
+from tests.small_scene import TINY, problems_of
 from tests.workflows.stopping import StopAtStep
 from tests.workflows.test_dns_restart import SPLIT, product
 
@@ -156,7 +155,7 @@ PROGRAM = """
 import resource, sys
 import numpy as np
 from eddies import cli
-from eddies.parallel import rendezvous
+from eddies.parallel import connection
 from eddies.io import new_files
 from eddies.io.hdf5 import append_frame, create_product, growing_dataset
 from eddies.workflows import dns
@@ -170,7 +169,7 @@ def run(scene, comm, directory, stop):
                 resource.setrlimit(resource.RLIMIT_FSIZE, (5_000_000, -1))
             append_frame(dataset, np.ones((50000, 3)), (50000 * comm.rank, 0))
 
-dns.run, rendezvous.PATIENCE = run, 0.5
+dns.run, connection.PATIENCE = run, 0.5
 sys.exit(cli.main(["dns", "tiny", "--output", sys.argv[1]]))
 """
 
@@ -254,11 +253,11 @@ def test_a_stopped_simulation_with_a_single_writer_continues(comm, tmp_path, ser
 @pytest.mark.mpi(2)
 def test_what_is_too_large_for_a_single_writer_is_refused(comm, tmp_path, serial):
     scene = load_scene("hit-paper", ["flow.cells=512"])
-    assert not any("built without MPI" in line for line in refusals(scene, comm))
+    assert not any("built without MPI" in line for line in problems_of(scene, comm)[0])
     serial()
-    line, *_ = refusals(scene, comm)
+    line, *_ = problems_of(scene, comm)[0]
     assert line.startswith("ground_truth.h5: ") and "built without MPI" in line and "4 GB" in line
-    assert refusals(load_scene(TINY), comm) == []
+    assert problems_of(load_scene(TINY), comm)[0] == []
     with pytest.raises(UserError, match="ground_truth.h5: .* HDF5_MPI=ON"):
         run_stages(["dns"], scene, comm, tmp_path / "run", StopRequest(comm))
     assert not (tmp_path / "run").exists()

@@ -176,7 +176,7 @@ def test_a_new_ground_truth_beside_an_old_model_is_said(comm, run_directory, tmp
     for (name, stage), date, sentence in zip(stages.items(), made[1:], said, strict=True):
         assert sentence == (f"{name}.h5 (made {date}) was made from another ground_truth.h5 than the one here, made "
                             f"{made[0]} with other settings (seed = 1, now 2): remove it and run `eddies {stage}` "
-                            "again, or take what is compared as of different flows or models")
+                            "again, or read comparisons as those of different flows or models")
         assert log.count(f"warning: report: {sentence}\n") == (comm.rank == 0)
         assert html.escape(sentence) in (tmp_path / "report" / "index.html").read_text()
 

@@ -20,10 +20,10 @@ from eddies.pipeline import STAGES
 from eddies.scene.scene import Scene
 from eddies.scene.sections import SpinUp
 from eddies.time_stepping import STEPPERS
-from eddies.workflows.feasibility import check_span
 from eddies.workflows.ground_truth.flow_run import FlowRun, TracerRun
 from eddies.workflows.ground_truth.scene_flow import build_fluid, build_step_limit, initial_state
 from eddies.workflows.ground_truth.tracer_frames import frame_layout
+from eddies.workflows.problems import check_span
 
 log = logging.getLogger("eddies")
 

@@ -45,7 +45,7 @@ from eddies.report.variants import section as section_on_variants
 from eddies.report.verdict import KEY as VERDICT
 from eddies.report.verdict import arranged
 from eddies.scene.scene import Scene, SceneError, load_scene
-from eddies.workflows.feasibility import check_places
+from eddies.workflows.problems import place_problems
 from eddies.workflows.product_warnings import changed_truths, mixed_products, not_finite
 from eddies.workflows.run_directory.work import read_stage_seconds
 from eddies.workflows.variant_rows import COLUMNS, ROLLOUT, finite, machine, notes, row
@@ -90,7 +90,8 @@ def run(directory: str | Path, comm: Comm, variants: Sequence[str] = (), stop: S
     if a variant is named that the scene has not; Stopped, before a page is written, when `stop` asks for it.
     """
     directory, scanned, stop = Path(directory), {}, stop or StopRequest(comm)
-    check_places(("report",), comm, directory)
+    for problem in place_problems(("report",), comm, directory):
+        raise SceneError(problem)
     scene, places = in_files(comm, directory, lambda: stored_rollouts(directory))
     if scene is not None:
         scene.check_variants(variants)

@@ -3,7 +3,6 @@
 import json
 import shutil
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,10 +16,9 @@ from eddies.learning.losses import relative_error
 from eddies.parallel.reduction import global_sum
 from eddies.particles.model import FORCING
 from eddies.scene.scene import SceneError, load_scene
-from eddies.stages import Step, check_inputs, check_ranks
+from eddies.stages import Step, check_inputs
 from eddies.workflows import dns, train
-from eddies.workflows.foreseen.problems import warnings
-from eddies.workflows.foreseen.ranks import most_ranks
+from eddies.workflows.foreseen.ranks import most_ranks, rank_problems
 from eddies.workflows.ground_truth.truth import load_frame
 from eddies.workflows.learned import transfer
 from eddies.workflows.learned.training_data import model_of
@@ -260,10 +258,6 @@ def test_truths_that_do_not_fit_are_refused_before_any_work(comm, tmp_path, over
         check_inputs(Step(scene, ("train",), tmp_path / "own"), comm)
 
 
-def on_ranks(size):
-    return SimpleNamespace(size=size)
-
-
 @pytest.mark.mpi(1)
 def test_more_ranks_than_another_truth_can_be_cut_for_are_refused_before_any_work(comm, tmp_path):
     """Into 8 layers, of which the own has 14; no thinner than a radius of 2.5 of them, nor than what particles stray in
@@ -277,17 +271,12 @@ def test_more_ranks_than_another_truth_can_be_cut_for_are_refused_before_any_wor
         alone = scene_of(tmp_path, "tracers.particles_per_side=8", f"model={model}")
         alone = replace(alone, training=replace(alone.training, horizons=None))
         scene = trained_on(alone, tmp_path / "nowhere", tmp_path / "other")
-        check_ranks(("train",), alone, on_ranks(3))
-        check_ranks(("train",), scene, on_ranks(most))
-        with pytest.raises(SceneError) as refusal:
-            check_ranks(("train",), scene, on_ranks(3))
-        assert f"3 ranks are more than the {most} that it can use ({place}: {reason}); start at most {most}" in str(
-            refusal.value)
-        assert [line for line in warnings(scene, 3) if "ranks" in line] == [
-            f"this job has 3 ranks, and the scene can use at most {most}: start fewer"]
+        assert not [*rank_problems(alone, ("train",), 3), *rank_problems(scene, ("train",), most)]
+        problem, = rank_problems(scene, ("train",), 3)
+        assert f"3 ranks are more than the {most} that it can use ({place}: {reason}); start at most {most}" in problem
         # The ground truth of the run is made by as many as it can be cut for, and weights are taken by as many.
-        check_ranks(("dns",), scene, on_ranks(3))
-        check_ranks(("train",), replace(scene, model=replace(scene.model, path="runs/other")), on_ranks(3))
+        taken = replace(scene, model=replace(scene.model, path="runs/other"))
+        assert not [*rank_problems(scene, ("dns",), 3), *rank_problems(taken, ("train",), 3)]
 
     with changed(tmp_path / "other/ground_truth.h5") as file:
         file["reference"].attrs["velocity_rms"] = 30.0
