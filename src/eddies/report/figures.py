@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
+from matplotlib.transforms import Bbox
 
 from eddies.analysis.pdfs import gaussian, pdf, standardized
 
@@ -43,11 +44,28 @@ def styled(draw: Callable) -> Callable:
     return drawn
 
 
+class Panel(Axes):
+    """Axes whose labels are measured once for the layout. A constrained layout asks several times, and to measure tick
+    labels is most of the time of a figure."""
+
+    _around: np.ndarray | None = None
+
+    def get_tightbbox(self, renderer=None, *, for_layout_only=False, **options) -> Bbox | None:
+        """Return the box of the axes with their labels, in pixels."""
+        if not for_layout_only:
+            return super().get_tightbbox(renderer, **options)
+        if self._around is None:
+            box = super().get_tightbbox(renderer, for_layout_only=True, **options)
+            self._around = box.extents - self.bbox.extents
+        self.apply_aspect()
+        return Bbox.from_extents(self.bbox.extents + self._around)
+
+
 def panels(rows: int, columns: int, size: tuple[float, float], **sharing) -> tuple[Figure, np.ndarray]:
     """Return a figure and its axes (rows, columns); `size` is the size of one panel in inches."""
     figure = Figure(figsize=(size[0] * columns, size[1] * rows), layout="constrained")
     figure.get_layout_engine().set(w_pad=0.06, h_pad=0.06)
-    axes = figure.subplots(rows, columns, squeeze=False, **sharing)
+    axes = figure.subplots(rows, columns, squeeze=False, subplot_kw={"axes_class": Panel}, **sharing)
     for panel in axes.flat:
         # The factor of the tick labels is written to the left of the title.
         panel.yaxis.get_offset_text().set(horizontalalignment="right", x=-0.02)
@@ -65,7 +83,11 @@ def letter(axes: Sequence[Axes]) -> None:
 
 @styled
 def png(figure: Figure) -> bytes:
-    """Return the figure as a PNG image."""
+    """Return the figure as a PNG image. Logarithmic axes over two decades or more have no minor ticks: they take long."""
+    for axis in (axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis) if axis.get_scale() == "log"):
+        low, high = sorted(axis.get_view_interval())
+        if high >= 100 * low:
+            axis.set_minor_locator(NullLocator())
     buffer = io.BytesIO()
     # `Figure.savefig` draws a figure twice. Compression level 2 takes half the time of 6 and a fifth more space.
     FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": None}, pil_kwargs={"compress_level": 2})

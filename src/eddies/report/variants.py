@@ -206,9 +206,9 @@ def name_points(axis: Axes, points: np.ndarray, names: Sequence[str], bold: Sequ
     heights = sorted(range(-150, 151, 3), key=abs)
     for point, name, heavy in zip(points, names, bold):
         line = {"arrowstyle": "-", "color": "#8a8a8a", "linewidth": 0.6, "shrinkA": 0, "shrinkB": 3}
-        text = axis.annotate(name, point, xycoords="figure pixels", textcoords="offset points", va="center",
-                             fontsize=8.5, fontweight="bold" if heavy else "normal", arrowprops=line, zorder=5,
-                             path_effects=[patheffects.withStroke(linewidth=2, foreground="white")],
+        text = axis.annotate(name, point, xycoords="figure pixels", xytext=(0, 0), textcoords="offset points",
+                             va="center", fontsize=8.5, fontweight="bold" if heavy else "normal", arrowprops=line,
+                             path_effects=[patheffects.withStroke(linewidth=2, foreground="white")], zorder=5,
                              annotation_clip=False)
         for height, (side, alignment) in product(heights, ((1, "left"), (-1, "right"))):
             text.set(position=(side * (8 + abs(height) / 4), height), horizontalalignment=alignment)
