@@ -83,7 +83,8 @@ def letter(axes: Sequence[Axes]) -> None:
 
 @styled
 def png(figure: Figure) -> bytes:
-    """Return the figure as a PNG image. Logarithmic axes over two decades or more have no minor ticks: they take long."""
+    """Return the figure as a PNG image. Logarithmic axes over two decades or more get no minor ticks, which take long.
+    """
     for axis in (axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis) if axis.get_scale() == "log"):
         low, high = sorted(axis.get_view_interval())
         if high >= 100 * low:
@@ -147,10 +148,10 @@ def note(axis: Axes, text: str, place: tuple[float, float], coordinates, offset:
                   **{"fontsize": 9, **style})
 
 
-def plain_log_ticks(*axes) -> None:
+def plain_log_ticks(*axes, subs: Sequence[int] = (1, 2, 5)) -> None:
     """Label the ticks of logarithmic axes (`Axes.xaxis` or `yaxis`) as 1, 2, 5, 10, 20... and draw no minor ticks."""
     for axis in axes:
-        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.set_major_locator(LogLocator(subs=subs))
         axis.set_major_formatter(StrMethodFormatter("{x:g}"))
         axis.set_minor_locator(NullLocator())
 

@@ -7,11 +7,10 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, NullLocator, StrMethodFormatter
 
 from eddies.analysis.pdfs import bin_edges, bin_probabilities, kl_divergence, standardized
 from eddies.report.figures import (DNS, FOURTH, GUIDE, MODEL, SECOND, draw_pdfs, legend_below, letter, note, panels,
-                                   styled)
+                                   plain_log_ticks, styled)
 from eddies.report.learning import curves
 from eddies.report.page import Metric, Section, shown
 
@@ -192,8 +191,6 @@ def over_mach(flows: Sequence[FlowErrors]) -> Figure:
         note(axis, flow.name, (flow.mach, 0.02 + 0.06 * index), ("data", "axes fraction"), (0, 0), ha="center")
     axis.set(title="A-priori error", xlabel="turbulent Mach number $M_t$", ylabel="normalised L2, acceleration",
              xscale="log", xlim=(0.7 * mach[0], mach[-1] / 0.7), ylim=(0, 1.1))
-    axis.xaxis.set_major_locator(FixedLocator(0.01 * 2.0 ** np.arange(8)))
-    axis.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    axis.xaxis.set_minor_locator(NullLocator())
+    plain_log_ticks(axis.xaxis)
     legend_below(axis, 2)
     return figure

@@ -12,12 +12,12 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.text import Text
-from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 from matplotlib.transforms import Bbox
 
 from eddies.analysis.pareto import cheapest_grid, pareto_front, verdict
 from eddies.measures import DRAWN, MEASURES, SHOWN
-from eddies.report.figures import DNS, FILTERED, FOURTH, GUIDE, MODEL, SECOND, THIRD, TRUTH, letter, panels, styled
+from eddies.report.figures import (DNS, FILTERED, FOURTH, GUIDE, MODEL, SECOND, THIRD, TRUTH, letter, panels,
+                                   plain_log_ticks, styled)
 from eddies.report.page import Metric, Section
 
 Row = Mapping[str, Any]
@@ -51,9 +51,8 @@ class ErrorAgainstTime:
     @property
     def drawn(self) -> list[str]:
         """The measures of DRAWN that a row has. For rollouts shorter than T/2 the velocity error is that at the end."""
-        short = not self.finished("velocity_error_half")
-        wanted = ["velocity_error_end" if short and name == "velocity_error_half" else name for name in DRAWN]
-        return [name for name in wanted if self.finished(name)]
+        replaced = {} if self.finished("velocity_error_half") else {"velocity_error_half": "velocity_error_end"}
+        return [name for name in (replaced.get(name, name) for name in DRAWN) if self.finished(name)]
 
     @property
     def looks(self) -> dict[str, tuple[str, str]]:
@@ -184,9 +183,7 @@ def _set_limits(axis: Axes, costs: Sequence[float], errors: Sequence[float]) -> 
         lowest, highest = (min(values), max(values)) if values else (0.1, 1.0)
         span = max(np.log10(highest / lowest), 0.3)
         limit(lowest * 10 ** (-room[0] * span), highest * 10 ** (room[1] * span))
-        part.set_major_locator(LogLocator(subs=(1, 2, 5) if span < 2.5 else (1,)))
-        part.set_major_formatter(StrMethodFormatter("{x:g}"))
-        part.set_minor_locator(NullLocator())
+        plain_log_ticks(part, subs=(1, 2, 5) if span < 2.5 else (1,))
 
 
 def _top(axis: Axes) -> float:

@@ -216,8 +216,14 @@ def read_page(directory: Path, alone: Comm, measured: MeasuredRollout | None, sc
     sections on products that are links to other directories.
     """
     page = Page(directory, read_stage_seconds(directory))
-    readers = {"ground_truth": _ground_truth_sections, "kernel": _kernel_sections, "model": _model_sections,
-               "step": _step_sections, "rollout": lambda file, page: _rollout_sections(measured.rollout, page)}
+    readers = {
+        "ground_truth": _ground_truth_sections,
+        "kernel": lambda file, page: [kernel.section(read_json(file, "description")["support"], **{
+            name: read_table(file, name) for name in ("kernels", "slices", "errors", "history")})],
+        "model": _model_sections,
+        "step": lambda file, page: [steps.section(read_attributes(file, "found"), {
+            name: read_table(file, f"trials/{name}") for name in file["trials"]})],
+        "rollout": lambda file, page: _rollout_sections(measured.rollout, page)}
     for kind in KINDS:
         path = directory / f"{kind}.h5"
         if not path.exists():
@@ -291,16 +297,6 @@ def _ground_truth_sections(file: File, page: Page) -> list[Section]:
         found = tracer_statistics(Trajectory(file, "tracers"), spectra, reference["spacing"])
         sections.append(tracers.section(found, reference, power))
     return sections
-
-
-def _kernel_sections(file: File, page: Page) -> list[Section]:
-    tables = {name: read_table(file, name) for name in ("kernels", "slices", "errors", "history")}
-    return [kernel.section(read_json(file, "description")["support"], **tables)]
-
-
-def _step_sections(file: File, page: Page) -> list[Section]:
-    return [steps.section(read_attributes(file, "found"),
-                          {name: read_table(file, f"trials/{name}") for name in file["trials"]})]
 
 
 def _model_sections(file: File, page: Page) -> list[Section]:

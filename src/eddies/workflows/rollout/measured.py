@@ -156,8 +156,8 @@ class MeasuredRollout:
         prepare_torch("cpu", comm)
         tasks = on_all_ranks(comm, lambda: self._tasks(whole), ProductError)
         new = [task for task in tasks if self._key(task) not in known]
-        own = on_all_ranks(comm, lambda: {task: self._measured(task) for task in new[comm.rank::comm.size]},
-                           ProductError)
+        own = on_all_ranks(comm, lambda: {(quantity, of, frame): getattr(self.rollout, quantity)[of][frame]
+                                          for quantity, of, frame in new[comm.rank::comm.size]}, ProductError)
         for task in new:
             if task[1] == "truth":
                 known[self._key(task)] = own.get(task)
@@ -194,10 +194,6 @@ class MeasuredRollout:
             return task
         kernel = (self._directory / "kernel.h5").resolve() if quantity == "reconstructions" else None
         return (self._directory / "ground_truth.h5").resolve(), kernel, quantity, int(self.rollout.truth.frames[frame])
-
-    def _measured(self, task: Task) -> Any:
-        quantity, of, frame = task
-        return getattr(self.rollout, quantity)[of][frame]
 
 
 @contextmanager
