@@ -217,8 +217,9 @@ def check_rows(rows):
 @pytest.mark.mpi(2, timeout=300)
 @pytest.mark.usefixtures("undrawn", "quick_spectra")
 @pytest.mark.parametrize("scene, truths", [("small", 1), ("unseen", 2)])
-def test_each_truth_is_measured_and_read_through_once(comm, folder, monkeypatch, scene, truths):
-    """Whatever the number of variants and pages, on all ranks together."""
+def test_each_truth_is_measured_once(comm, folder, monkeypatch, scene, truths):
+    """By all ranks together, whatever the number of variants and pages. A rank searches a file once for numbers that
+    are not finite."""
     measured, scanned = [], []
 
     def counted(method):
@@ -237,7 +238,7 @@ def test_each_truth_is_measured_and_read_through_once(comm, folder, monkeypatch,
     assert len(set(together)) == len(together) and len({path for _, path, _ in together}) == truths
     assert {name for name, *_ in together} == {"FieldsOfParticles", "ParticleSpectra"}
     read = [os.path.realpath(path) for path in scanned]
-    assert len(set(read)) == len(read) and (len(read) > truths) == (comm.rank == 0)
+    assert len(set(read)) == len(read) > 0
 
 
 @pytest.mark.mpi(1, timeout=300)

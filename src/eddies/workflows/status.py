@@ -19,7 +19,6 @@ from eddies.parallel.communicator import Comm
 from eddies.pipeline import STAGES, Stage
 from eddies.scene.scene import Scene, SceneError, load_scene
 from eddies.workflows.foreseen.storage import in_units
-from eddies.workflows.rollout.truth_cache import KIND as TRUTH_MEASURES
 from eddies.workflows.run_directory.work import changed_settings, is_done, of_other_settings, stage_seconds
 from eddies.workflows.variants import Step, steps
 
@@ -45,9 +44,8 @@ def run(directory: Path, comm: Comm, verify: bool = False) -> None:
 
 
 def products_in(directory: Path) -> list[Path]:
-    """The products of all runs in a directory and what is kept beside them, in order of their names; of links those
-    alone that lead to others."""
-    names = [stage.file for stage in STAGES.values() if stage.product] + [f"{TRUTH_MEASURES}.h5"]
+    """The products of all runs in a directory, in order of their names; of links only those that lead elsewhere."""
+    names = [stage.file for stage in STAGES.values() if stage.product]
     found = sorted((path for name in names for path in directory.rglob(name)), key=Path.is_symlink, reverse=True)
     return sorted({path.resolve(): path for path in found}.values())
 
