@@ -9,6 +9,7 @@ from eddies.pipeline import STAGES as TABLE
 from eddies.scene.scene import Eulerian, Flow, Horizons, Scene, SceneError, Time, builtin_scenes, load_scene
 from eddies.scene.sections import CLOSURES
 from eddies.scene.values import rule_of
+from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
 from tests.bad_scenes import BAD_OVERRIDES, BAD_TEXTS
 from tests.small_scene import TINY
 
@@ -69,7 +70,7 @@ def test_without_a_learned_force_nothing_is_trained():
     scene = load_scene(TINY, ["simulation.method=none"])
     assert scene.stages == ("dns", "train-kernel", "simulate", "report")
     other = load_scene(TINY, ["simulation.method=none", "model.pairs.hidden=[4]", "training.steps=50"])
-    assert other.fingerprint("simulate") == scene.fingerprint("simulate")
+    assert stage_fingerprint(other, "simulate") == stage_fingerprint(scene, "simulate")
     bare = dataclasses.replace(scene, model=None, training=None)
     assert bare.stages == scene.stages
 
@@ -77,7 +78,7 @@ def test_without_a_learned_force_nothing_is_trained():
 def test_the_form_of_a_baseline_counts_for_its_rollout_alone():
     scene, changed = (load_scene(TINY, ["simulation.method=eulerian", f"eulerian.closure={closure}"])
                       for closure in ("none", "spectral"))
-    affected = [stage for stage in STAGES if scene.fingerprint(stage) != changed.fingerprint(stage)]
+    affected = [stage for stage in STAGES if stage_fingerprint(scene, stage) != stage_fingerprint(changed, stage)]
     assert affected == ["simulate", "report"]
 
 
@@ -85,8 +86,8 @@ def test_where_a_rollout_starts_counts_for_it_without_a_model_too():
     plain, others = (load_scene(TINY, ["simulation.method=none", *more])
                      for more in ([], ['training.truths=["runs/second", "runs/third"]']))
     assert plain.seen_in(plain.directory) > 0 == others.seen_in(others.directory)
-    assert plain.fingerprint("simulate") != others.fingerprint("simulate")
-    assert plain.fingerprint("train-kernel") == others.fingerprint("train-kernel")
+    assert stage_fingerprint(plain, "simulate") != stage_fingerprint(others, "simulate")
+    assert stage_fingerprint(plain, "train-kernel") == stage_fingerprint(others, "train-kernel")
 
 
 def test_coarse_grid_of_the_filter():
@@ -149,7 +150,7 @@ FINGERPRINTS = {"flow.viscosity=0.061": "dns", "seed=2": "dns", "kernel.steps=99
 @pytest.mark.parametrize("override, first_changed", FINGERPRINTS.items())
 def test_fingerprint_changes_from_the_stage_that_reads_the_key(override, first_changed):
     scene, changed = load_scene(TINY), load_scene(TINY, [override])
-    affected = [stage for stage in STAGES if scene.fingerprint(stage) != changed.fingerprint(stage)]
+    affected = [stage for stage in STAGES if stage_fingerprint(scene, stage) != stage_fingerprint(changed, stage)]
     assert affected == list(STAGES[STAGES.index(first_changed):])
 
 
@@ -160,13 +161,13 @@ def test_a_step_is_sought_anew_where_that_concerns_it(override, searched):
     own."""
     given = ["simulation.step=converged"]
     scene, changed = load_scene(TINY, given), load_scene(TINY, [*given, override])
-    assert (scene.fingerprint("find-step") != changed.fingerprint("find-step")) is searched
-    assert scene.fingerprint("simulate") != changed.fingerprint("simulate")
+    assert (stage_fingerprint(scene, "find-step") != stage_fingerprint(changed, "find-step")) is searched
+    assert stage_fingerprint(scene, "simulate") != stage_fingerprint(changed, "simulate")
 
 
 def test_fingerprint_ignores_names():
     scene, renamed = load_scene(TINY), load_scene(TINY, ["name=x", "title=y"])
-    assert scene.fingerprint("report") == renamed.fingerprint("report")
+    assert stage_fingerprint(scene, "report") == stage_fingerprint(renamed, "report")
 
 
 def test_fingerprint_changes_with_the_file_that_the_flow_starts_from(tmp_path):
@@ -175,21 +176,21 @@ def test_fingerprint_changes_with_the_file_that_the_flow_starts_from(tmp_path):
     for content in ("one state", "another state", "one state"):
         start.write_text(content)
         scene = load_scene("taylor-green", ["initial.kind=file", f"initial.path={start}"])
-        prints.add(scene.fingerprint("dns"))
+        prints.add(stage_fingerprint(scene, "dns"))
     assert len(prints) == 2
 
 
 def test_fingerprint_of_training_changes_with_the_weights_that_it_starts_from(tmp_path):
     scene = load_scene(TINY, [f"model.path={tmp_path}"])
-    prints = [scene.fingerprint("train")]
+    prints = [stage_fingerprint(scene, "train")]
     for content in ("some weights", "others"):
         (tmp_path / "model.h5").write_text(content)
-        prints.append(scene.fingerprint("train"))
+        prints.append(stage_fingerprint(scene, "train"))
     assert len(set(prints)) == 3
-    assert scene.fingerprint("train-kernel") == load_scene(TINY).fingerprint("train-kernel")
+    assert stage_fingerprint(scene, "train-kernel") == stage_fingerprint(load_scene(TINY), "train-kernel")
     moved = tmp_path / "moved.h5"
     (tmp_path / "model.h5").rename(moved)
-    assert load_scene(TINY, [f"model.path={moved}"]).fingerprint("train") == prints[-1]
+    assert stage_fingerprint(load_scene(TINY, [f"model.path={moved}"]), "train") == prints[-1]
 
 
 def test_trained_weights_need_no_training_and_have_seen_nothing():
@@ -217,14 +218,14 @@ def test_of_a_ground_truth_that_is_not_trained_on_nothing_is_seen(tmp_path):
 @pytest.mark.mpi(1)
 def test_fingerprint_of_training_is_that_of_the_ground_truths_too(comm, tmp_path):
     scene = load_scene(TINY, [f'training.truths=["{tmp_path}"]'])
-    prints = [scene.fingerprint("train")]
+    prints = [stage_fingerprint(scene, "train")]
     for seed in (2, 3):
         other = load_scene(TINY, [f"seed={seed}"])
-        with create_product(comm, tmp_path / "ground_truth.h5", "ground_truth", other.provenance("dns")):
+        with create_product(comm, tmp_path / "ground_truth.h5", "ground_truth", stage_provenance(other, "dns")):
             pass
-        prints.append(scene.fingerprint("train"))
+        prints.append(stage_fingerprint(scene, "train"))
     assert len(set(prints)) == 3
-    assert scene.fingerprint("train-kernel") == load_scene(TINY).fingerprint("train-kernel")
+    assert stage_fingerprint(scene, "train-kernel") == stage_fingerprint(load_scene(TINY), "train-kernel")
 
 
 def test_the_forcing_that_stays_on_needs_one_and_no_other(tmp_path):
@@ -241,7 +242,7 @@ def test_window_without_training_is_the_default_of_training():
     alone = dataclasses.replace(scene, model=None, training=None, simulation=None)
     assert alone.window == scene.window == 0.5
     assert load_scene(TINY, ["training.window=0.4"]).window == 0.4
-    assert alone.fingerprint("train-kernel") == scene.fingerprint("train-kernel")
+    assert stage_fingerprint(alone, "train-kernel") == stage_fingerprint(scene, "train-kernel")
 
 
 @pytest.mark.parametrize("text, message", BAD_TEXTS, ids=range(len(BAD_TEXTS)))
@@ -312,7 +313,7 @@ def test_every_key_is_explained():
     ([], ["ground_truth", "kernel", "model"]), (["simulation.method=none"], ["ground_truth", "kernel"])])
 def test_a_rollout_is_made_from_what_its_scene_asks_for(overrides, kinds):
     """A model that lies beside a rollout without one is none of its business."""
-    assert load_scene(TINY, overrides).provenance("simulate")["made_from"] == kinds
+    assert stage_provenance(load_scene(TINY, overrides), "simulate")["made_from"] == kinds
 
 
 @pytest.mark.parametrize("equations, closures", [
@@ -349,6 +350,6 @@ def test_polynomials_are_refused_a_weight_that_may_be_negative():
 def test_the_form_of_reconstruction_asks_for_no_training():
     scenes = [load_scene("hit-small", [f"kernel.form={form}"]) for form in ("average", "kriging")]
     for stage in ("train-kernel", "train", "simulate"):
-        assert len({scene.fingerprint(stage) for scene in scenes}) == 1
-    assert len({load_scene("hit-small", [f"kernel.cutoff={word}"]).fingerprint("train-kernel")
+        assert len({stage_fingerprint(scene, stage) for scene in scenes}) == 1
+    assert len({stage_fingerprint(load_scene("hit-small", [f"kernel.cutoff={word}"]), "train-kernel")
                 for word in ("smooth", "sigmoid")}) == 2

@@ -4,6 +4,7 @@ import pytest
 
 from eddies.scene.layers import BUILT_IN
 from eddies.scene.scene import SceneError, load_scene
+from eddies.workflows.run_directory.fingerprints import stage_fingerprint
 from tests.small_scene import TINY
 
 HEAD = f'title = "a test"\nbase = "{TINY}"\nsimulation.turnovers = 0.25\n'
@@ -31,8 +32,8 @@ def test_variants_are_the_scene_with_changes(tmp_path):
     assert (plain.training.steps, plain.simulation.turnovers, plain.training.frames) == (60, 0.25, 6)
     assert (wide.model.settings["pairs"].hidden, wide.training.steps, wide.training.frames) == ((32, 32), 70, 6)
     assert (plain.label, wide.label) == (None, "a wider network") and wide.simulation == plain.simulation
-    assert plain.fingerprint("dns") == wide.fingerprint("dns") == load_scene(TINY).fingerprint("dns")
-    assert plain.fingerprint("train") != wide.fingerprint("train")
+    assert stage_fingerprint(plain, "dns") == stage_fingerprint(wide, "dns") == stage_fingerprint(load_scene(TINY), "dns")
+    assert stage_fingerprint(plain, "train") != stage_fingerprint(wide, "train")
 
 
 @pytest.mark.parametrize("extra", [

@@ -35,6 +35,7 @@ from test_train_restart import SHORT  # noqa: E402
 from eddies.io.checkpoint import CheckpointDirectory  # noqa: E402
 from eddies.pipeline import STAGES  # noqa: E402
 from eddies.scene.scene import load_scene  # noqa: E402
+from eddies.workflows.run_directory.fingerprints import stage_fingerprint  # noqa: E402
 from mpi_tools.launch import mpi_environment, mpirun_command  # noqa: E402
 from tests.small_scene import TINY  # noqa: E402
 
@@ -74,7 +75,7 @@ class Killed:
 
     def checkpoints(self, directory):
         """Those of the stage in a run directory."""
-        fingerprint = load_scene(TINY, self.overrides).fingerprint(self.stage)
+        fingerprint = stage_fingerprint(load_scene(TINY, self.overrides), self.stage)
         return CheckpointDirectory(MPI.COMM_SELF, directory / STAGES[self.stage].checkpoints, fingerprint)
 
 

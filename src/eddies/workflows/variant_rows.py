@@ -19,6 +19,7 @@ from eddies.parallel.communicator import Comm
 from eddies.pipeline import STAGES
 from eddies.scene.scene import Eulerian, Scene
 from eddies.scene.sections import CONVERGED
+from eddies.workflows.run_directory.fingerprints import stage_fingerprint
 from eddies.workflows.run_directory.work import FAILURE
 from eddies.workflows.variants import Place
 
@@ -113,7 +114,7 @@ def searched(path: Path, alone: Comm) -> dict[str, Any]:
 
 def has_own_kernel(scene: Scene, variant: Scene) -> bool:
     """Whether a variant smooths with another kernel than the scene: what is measured through it does not compare."""
-    return len({each.fingerprint("train-kernel") for each in (scene.without_variants, variant)}) > 1
+    return len({stage_fingerprint(each, "train-kernel") for each in (scene.without_variants, variant)}) > 1
 
 
 def notes(scene: Scene) -> list[str]:

@@ -19,6 +19,7 @@ from eddies.io.reading import cannot_be_read, open_to_read, why_unreadable
 from eddies.pipeline import STAGES, Stage
 from eddies.scene.rules import quoted
 from eddies.scene.scene import Scene
+from eddies.workflows.run_directory.fingerprints import stage_fingerprint
 
 SECONDS = "stage_seconds.json"
 FAILURE = "failure.txt"  # why a variant failed
@@ -69,7 +70,8 @@ def find_work(stages: Sequence[str], scene: Scene, directory: Path) -> Work:
     for stage in [STAGES[name] for name in stages if STAGES[name].product is not None]:
         product = directory / stage.file
         checkpoints = checkpoints_in(directory / stage.checkpoints) if stage.checkpoints else []
-        of_others = checkpoints and scene.fingerprint(stage.name) not in [fingerprint for _, fingerprint in checkpoints]
+        found = [fingerprint for _, fingerprint in checkpoints]
+        of_others = checkpoints and stage_fingerprint(scene, stage.name) not in found
         origin = product_provenance(product)
         if _fits(origin, stage.name, scene):
             done.add(stage.name)
@@ -148,7 +150,7 @@ def _refuse_unreadable(product: Path) -> None:
 
 
 def _fits(origin: Mapping[str, Any], stage: str, scene: Scene) -> bool:
-    return origin.get("fingerprint") == scene.fingerprint(stage)
+    return origin.get("fingerprint") == stage_fingerprint(scene, stage)
 
 
 def _cost(origin: Mapping[str, Any], seconds: float | None) -> str:
