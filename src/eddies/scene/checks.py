@@ -233,8 +233,9 @@ def check_training(scene: Scene) -> Problems:
         yield "training.field_target", "is of the field loss, which has no weight; set field_weight, or remove the key"
     later = training.field_weight + training.velocity_kl_weight + training.acceleration_kl_weight
     if (later > 0) != (training.combined_steps > 0):
-        yield "training.combined_steps", ("they are the steps that use field_weight, velocity_kl_weight and "
-                                          "acceleration_kl_weight; give both the steps and a weight above 0, or neither")
+        yield "training.combined_steps", (
+            "they are the steps that use field_weight, velocity_kl_weight and acceleration_kl_weight; give both the "
+            "steps and a weight above 0, or neither")
 
 
 def check_simulation(scene: Scene) -> Problems:

@@ -22,7 +22,7 @@ def json_schema() -> dict[str, Any]:
     schema = _object(Scene)
     schema["properties"] |= {
         "base": {"type": "string", "description": "name or path of the scene that this one starts from"},
-        "unset": {"type": "array", "items": {"type": "string"}, "description": "keys or sections of the base to remove"},
+        "unset": {"type": "array", "items": {"type": "string"}, "description": "removed keys of the base"},
         VARIANT: {"type": "object", "additionalProperties": {"$ref": "#"}, "description": "changed keys by variant"}}
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "scene of eddies"} | schema
 

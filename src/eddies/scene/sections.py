@@ -40,25 +40,15 @@ class Flow(Section):
 
 @dataclass(frozen=True)
 class InitialFlow:
-    """Properties of an initial flow that are known before it is made.
+    """Properties of an initial flow that are known before it is made."""
 
-    Parameters
-    ----------
-    keys : keys of [initial] that it reads; a function of the user's reads all.
-    rms, peak : root mean square of |u| and largest |u| + |v| + |w|, over the amplitude; None: unknown, or at rest.
-    wave : |k| of its modes over `wavenumber`; None: it has many.
-    turbulent : it has many scales, with the spectrum's peak at `peak_wavenumber`.
-    sound : it is at rest but for sound.
-    steady : without viscosity nothing in it accelerates.
-    """
-
-    keys: tuple[str, ...] = ("amplitude", "peak_wavenumber", "wavenumber", "path", "state")
-    rms: float | None = None
-    peak: float | None = None
-    wave: float | None = None
-    turbulent: bool = False
-    sound: bool = False
-    steady: bool = False
+    keys: tuple[str, ...] = ("amplitude", "peak_wavenumber", "wavenumber", "path", "state")  # of [initial], as it reads
+    rms: float | None = None  # root mean square of |u| over the amplitude; None: unknown, or at rest
+    peak: float | None = None  # largest |u| + |v| + |w| over the amplitude; None: unknown, or at rest
+    wave: float | None = None  # |k| of its modes over `wavenumber`; None: it has many
+    turbulent: bool = False  # it has many scales, with the spectrum's peak at `peak_wavenumber`
+    sound: bool = False  # it is at rest but for sound
+    steady: bool = False  # without viscosity nothing in it accelerates
 
     @property
     def from_file(self) -> bool:
@@ -295,18 +285,11 @@ class Training(Section):
 
 @dataclass(frozen=True)
 class Method:
-    """Properties of a method that moves the particles of a rollout.
+    """Properties of a method that moves the particles of a rollout."""
 
-    Parameters
-    ----------
-    needs : a trained "model"; the "density" of the ground truth; "pairs", neighbours within the radius of interaction.
-    title : in tables and figures.
-    on_grid : a flow on a coarse grid moves the particles, as [eulerian] says.
-    """
-
-    needs: tuple[str, ...] = ()
-    title: str = "own method"
-    on_grid: bool = False
+    needs: tuple[str, ...] = ()  # of NEEDS
+    title: str = "own method"  # in tables and figures
+    on_grid: bool = False  # a flow on a coarse grid moves the particles, as [eulerian] says
 
 
 METHODS = {
@@ -314,6 +297,7 @@ METHODS = {
     "none": Method(title="no force"),
     "eulerian": Method(title="coarse grid", on_grid=True),
 }
+# A trained model; the density of the ground truth; neighbours within the radius of interaction.
 NEEDS = ("model", "density", "pairs")
 #: The value of [simulation] step that short rollouts replace by the step that they find.
 CONVERGED = "converged"
@@ -406,18 +390,11 @@ class Simulation(Section):
 
 @dataclass(frozen=True)
 class Closure:
-    """Properties of a closure of the coarse grid.
+    """Properties of a closure of the coarse grid."""
 
-    Parameters
-    ----------
-    equations : the equations that it closes.
-    constant : the key of [eulerian] with its constant; None: it has none.
-    learned : it takes the rates of damping that a model has learned.
-    """
-
-    equations: tuple[str, ...]
-    constant: str | None = None
-    learned: bool = False
+    equations: tuple[str, ...]  # that it closes
+    constant: str | None = None  # the key of [eulerian] with its constant; None: it has none
+    learned: bool = False  # it takes the rates of damping that a model has learned
 
 
 EQUATIONS = ("unfiltered", "filtered")
