@@ -102,7 +102,7 @@ def test_inputs_and_outputs_of_terms():
     (dict(terms=("pressure",), settings={"pairs": {}}), "[model.pairs]: no such term; the terms are pressure; remove"),
     (dict(terms=("pairs",), settings={"pairs": Pressure()}), "[model.pairs]: must be settings of the class"),
     (dict(terms=("pairs",), settings={"pairs": 3}), "model.pairs = 3: must be a section"),
-    (dict(terms=("pressure",), neighbors=50), "[model] neighbors = 50: none of the terms"),
+    (dict(terms=("pressure",), neighbors=50), "[model] neighbors = 50.0: none of the terms"),
     (dict(path="eddies:nothing"), '[model] path = "eddies:nothing": must be a run directory'),
     (dict(terms=("own_nowhere:Term",)), '[model] terms: "own_nowhere:Term": there is no module "own_nowhere"'),
     (dict(terms=("eddies.scene.scene:load_scene",)), "must be a class derived from eddies.Term"),

@@ -89,7 +89,7 @@ BAD = [
     ('base = "case.toml"\n', 'base = "case.toml": the scene is its own base'),
     ('unset = ["forcing"]\n', "unset: there is no base to remove keys from"),
     (HEAD + 'unset = "forcing"\n', 'unset = "forcing": must be a list of keys or sections'),
-    ('unset = ["forcng"]\n' + HEAD, "unset: forcng: there is no such key or section to remove"),
+    ('unset = ["forcng"]\n' + HEAD, "forcng: there is no such key or section to remove"),
     (HEAD + "variant = 3\n", "variant: must be sections; write [variant.NAME]"),
     (HEAD + '[variant."a/b"]\n', 'variant "a/b": name = "a/b": must be the name of a directory'),
     (HEAD + "[variant.report]\n", 'variant "report": a run directory uses this name for something else'),

@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
@@ -34,12 +34,10 @@ class Layer:
     ----------
     values : new values by dotted key, such as "flow.cells"; an empty table makes an absent section.
     unset : dotted keys and sections that are removed before.
-    source : the beginning of an error about a removal.
     """
 
     values: Mapping[str, Any]
-    unset: Sequence[str] = field(default=())
-    source: str = ""
+    unset: Sequence[str] = ()
 
     @classmethod
     def of_table(cls, table: Mapping[str, Any]) -> Layer:
@@ -48,7 +46,7 @@ class Layer:
         if not (isinstance(unset, list) and all(isinstance(entry, str) and entry for entry in unset)):
             raise SceneError(f'unset = {shortened(quoted(unset))}: must be a list of keys or sections, such as '
                              '["training", "tracers.filter_width"]', "unset")
-        return cls(dict(dotted({key: value for key, value in table.items() if key != "unset"})), unset, "unset: ")
+        return cls(dict(dotted({key: value for key, value in table.items() if key != "unset"})), unset)
 
     @property
     def keys(self) -> frozenset[str]:
@@ -83,7 +81,7 @@ class Layer:
             del table[last]
         except (KeyError, TypeError):
             valid = table if isinstance(table, dict) else document
-            raise SceneError(f"{self.source}{shortened(removal)}: there is no such key or section to remove; there "
+            raise SceneError(f"{shortened(removal)}: there is no such key or section to remove; there "
                              f"are: {', '.join(valid) or 'none'}", removal) from None
 
 

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 from eddies.import_path import ImportPathError, is_path, load, short_name
 from eddies.scene.rules import nearest, quoted
 from eddies.scene.terms import DEFAULT_PRESET, GIVES, PRESETS, READS, TERMS, TermBase, TermSettings
-from eddies.scene.values import (KeyProblem, SceneError, Section, choice, number, product_file, read_section, sections,
+from eddies.scene.values import (SceneError, Section, choice, number, product_file, read_section, sections,
                                  text, texts)
 
 COME_ALONG = "eddies:"  # the beginning of [model] path for weights of the package
@@ -43,17 +43,17 @@ class Model(Section):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.preset is not None and self.terms is not None:
-            raise SceneError(f"[model] preset = {quoted(self.preset)}: with terms = {quoted(self.terms)} the list is "
-                             "given twice; remove one of the two", "model.preset")
+            raise self.problem("preset", f"with terms = {quoted(self.terms)} the list is given twice; remove one of "
+                               "the two")
         if self.path is not None and self.path.startswith(COME_ALONG) and not self.weights_file.is_file():
-            raise KeyProblem("model", "path", f" = {quoted(self.path)}: must be a run directory, a model.h5, or one of "
-                             f"{', '.join(weights_that_come_along())}")
+            raise self.problem("path", "must be a run directory, a model.h5, or one of "
+                               f"{', '.join(weights_that_come_along())}")
         preset = PRESETS[self.preset or DEFAULT_PRESET] if self.terms is None else {}
         terms = self.terms if self.terms is not None else tuple(preset)
         named = {short_name(term): term for term in terms}
         if len(named) < len(terms) or not terms:
-            raise KeyProblem("model", "terms", f" = {quoted(terms)}: must be one or more terms, each once by its name "
-                             "(of an import path what follows the colon)")
+            raise self.problem("terms", "must be one or more terms, each once by its name, in an import path the part "
+                               "after the colon")
         for name in self.settings:
             if name not in named:
                 raise SceneError(f"[model.{name}]: no such term; {nearest(name, named)}the terms are "
@@ -64,8 +64,8 @@ class Model(Section):
         for key, value in (("preset", None), ("terms", terms), ("settings", settings)):
             object.__setattr__(self, key, value)
         if self.neighbors is not None and "pairs" not in self.reads:
-            raise KeyProblem("model", "neighbors", f" = {self.neighbors:g}: none of the terms {quoted(terms)} reads "
-                             "pairs, so nothing has a radius of interaction; remove the key")
+            raise self.problem("neighbors", f"none of the terms {quoted(terms)} reads pairs, so nothing has a radius "
+                               "of interaction; remove the key")
 
     @property
     def weights_file(self) -> Path | None:

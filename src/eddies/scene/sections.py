@@ -11,7 +11,7 @@ from pathlib import Path
 from eddies.import_path import is_path, load
 from eddies.scene.integrators import SCHEMES, Scheme
 from eddies.scene.rules import quoted
-from eddies.scene.values import (KeyProblem, SceneError, Section, boolean, choice, integer, integers, named, number,
+from eddies.scene.values import (SceneError, Section, boolean, choice, integer, integers, named, number,
                                  product_file, section, text, texts)
 
 BOX_LENGTH = 2 * math.pi
@@ -218,8 +218,8 @@ class Kernel(Section):
             object.__setattr__(self, "final_learning_rate", FINAL_RATE * self.learning_rate)
         object.__setattr__(self, "preset", None)
         if not self.positive and self.form != "average":
-            raise KeyProblem("kernel", "form", f' = "{self.form}": its weights must be positive, and positive = false '
-                             'lets W be negative; set form = "average", or positive = true')
+            raise self.problem("form", "its weights must be positive, and positive = false lets W be negative; set "
+                               'form = "average", or positive = true')
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -238,11 +238,6 @@ class Horizons(Section):
     def scheme(self) -> Scheme:
         """The properties of the integrator."""
         return SCHEMES[self.integrator]
-
-    @classmethod
-    def section_name(cls) -> str:
-        """The name of this section within [training]."""
-        return "training.horizons"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -330,11 +325,11 @@ class Simulation(Section):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.step_from is not None and self.step != CONVERGED:
-            raise KeyProblem("simulation", "step_from", f' = "{self.step_from}": step = {self.step:g} needs no other '
-                             f'run; set step = "{CONVERGED}", or remove step_from')
+            raise self.problem("step_from", f'step = {self.step:g} needs no other run; set step = "{CONVERGED}", or '
+                               "remove step_from")
         if self.confirmed_on and not self.finds_step:
-            raise KeyProblem("simulation", "confirmed_on", f" = {quoted(self.confirmed_on)}: no step is sought for "
-                             f'this rollout; set step = "{CONVERGED}" without step_from, or remove confirmed_on')
+            raise self.problem("confirmed_on", f'this rollout finds no step; set step = "{CONVERGED}" without '
+                               "step_from, or remove confirmed_on")
 
     @property
     def scheme(self) -> Scheme:
@@ -428,8 +423,8 @@ class Eulerian(Section):
         super().__post_init__()
         if self.equations not in self.form.equations:
             fitting = [name for name, closure in CLOSURES.items() if self.equations in closure.equations]
-            raise KeyProblem("eulerian", "closure", f' = "{self.closure}": with equations = "{self.equations}" it must '
-                             f"be one of {', '.join(fitting)}; change one of the two")
+            raise self.problem("closure", f'with equations = "{self.equations}" it must be one of '
+                               f"{', '.join(fitting)}; change one of the two")
 
     @property
     def form(self) -> Closure:

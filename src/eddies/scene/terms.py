@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 
 from eddies.errors import UserError
 from eddies.scene.integrators import Scheme
-from eddies.scene.values import KeyProblem, Section, boolean, choice, integer, integers, named, number, texts
+from eddies.scene.values import Section, boolean, choice, integer, integers, named, number, texts
 
 READS = ("pairs", "resolved", "density")
 GIVES = ("acceleration", "density", "density_rate", "shift_velocity")
@@ -104,8 +104,8 @@ class ForceSum(PairSum):
         super().__post_init__()
         if self.basis == "corrected" and (self.window, self.scaling) != ("smooth", "number"):
             key = "window" if self.window != "smooth" else "scaling"
-            raise KeyProblem(self.section_name(), key, f' = "{getattr(self, key)}": the moment matrix of basis = '
-                             '"corrected" takes the place of both window and scaling; set basis = "paper" or "unit"')
+            raise self.problem(key, 'the moment matrix of basis = "corrected" replaces both window and scaling; set '
+                               'basis = "paper" or "unit"')
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,9 +139,8 @@ class PairNetwork(ForceSum, NetworkSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.symmetry == "antisymmetric" and self.basis == "corrected":
-            raise KeyProblem(self.section_name(), "symmetry", f' = "{self.symmetry}": with basis = "{self.basis}" the '
-                             "forces of a pair are not opposite, as each particle has a moment matrix of its own; set "
-                             'basis = "paper", or symmetry = "none"')
+            raise self.problem("symmetry", 'with basis = "corrected" the forces of a pair are not opposite, as each '
+                               'particle has a moment matrix of its own; set basis = "paper", or symmetry = "none"')
 
 
 @dataclass(frozen=True, kw_only=True)

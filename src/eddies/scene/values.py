@@ -65,6 +65,10 @@ class Section:
         """The name of the section in errors: that of the class in the spelling of scenes."""
         return re.sub(r"(?<!^)(?=[A-Z])", "_", cls.__name__).lower()
 
+    def problem(self, key: str, problem: str) -> KeyProblem:
+        """Return an error about a key, which begins with the key and its value."""
+        return KeyProblem(self.section_name(), key, f" = {shortened(quoted(getattr(self, key)))}: {problem}")
+
     def _accepted(self, field: dataclasses.Field, value: Any) -> Any:
         rule = rule_of(type(self), field)
         if field.default is None and (value is None or isinstance(value, str) and value == ABSENT):
@@ -78,7 +82,7 @@ class Section:
             return value
         else:
             allowed, hint = f"a {field.metadata['section'].__name__}", ""
-        raise KeyProblem(self.section_name(), field.name, f" = {shortened(quoted(value))}: must be {allowed}{hint}")
+        raise self.problem(field.name, f"must be {allowed}{hint}")
 
 
 def number(about: str, default: Any = MISSING, words: tuple[str, ...] = (), **bounds: float) -> Any:
