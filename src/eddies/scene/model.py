@@ -38,7 +38,7 @@ class Model(Section):
     path: str | None = text("run directory or model.h5 whose trained weights are used, or \"eddies:NAME\", those of a "
                             "built-in scene that come with the package; absent: they are trained", default=None)
     settings: dict[str, TermSettings] = sections()
-    holder: ClassVar[str] = "settings"
+    _holder: ClassVar[str] = "settings"
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -50,10 +50,10 @@ class Section:
 
     Attributes
     ----------
-    holder : field that holds the section's own sections [section.NAME] by NAME; empty if it has none.
+    _holder : field that holds the section's own sections [section.NAME] by NAME; empty if it has none.
     """
 
-    holder: ClassVar[str] = ""
+    _holder: ClassVar[str] = ""
     __dataclass_fields__: ClassVar[dict[str, dataclasses.Field]]
 
     def __post_init__(self) -> None:
@@ -172,8 +172,8 @@ def read_section(kind: type[Section], table: Any, name: str = "", others: Sequen
         if key in fields:
             inner = fields[key].metadata.get("section")
             values[key] = read_section(inner, value, f"{name}.{key}" if name else key) if inner else value
-        elif kind.holder and isinstance(value, dict):
-            values.setdefault(kind.holder, {})[key] = value
+        elif kind._holder and isinstance(value, dict):
+            values.setdefault(kind._holder, {})[key] = value
         else:
             raise _unknown_key(key, value, name, [*fields, *others])
     for key, field in fields.items():
@@ -216,7 +216,7 @@ def write_section(section: Section, name: str = "", all_keys: bool = False) -> l
             kind = field.metadata["section"]
             inner += ["", f"# [{own}]  # {kind.__doc__.splitlines()[0]}"]
             inner += [f"# {line.removeprefix('# ')}" for line in _declared_lines(kind)]
-        elif field.name == section.holder:
+        elif field.name == section._holder:
             for key, part in value.items():
                 if written := write_section(part, all_keys=all_keys):
                     inner += ["", f"[{name}.{key}]", *written]
