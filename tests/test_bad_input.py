@@ -138,7 +138,7 @@ def test_a_byte_order_mark_is_not_part_of_a_scene(tmp_path):
 
 @pytest.mark.mpi(3)
 def test_a_rank_may_have_one_particle_or_none(comm, tmp_path):
-    few = ["tracers.particles_per_side=2", "tracers.turnovers=0.01", "flow.cells=8", "initial.peak_wavenumber=2"]
+    few = ["tracers.particles_per_side=2", "tracers.turnovers=0.01", "flow.cells=16"]
     options = [word for each in few for word in ("--set", each)]
     assert run_cli("dns", "tracers-only", *options, "--output", tmp_path) == 0
 
