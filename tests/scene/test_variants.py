@@ -45,7 +45,7 @@ def test_a_written_scene_is_read_back_equal(tmp_path, extra):
 def test_a_base_may_have_a_base_beside_the_file(tmp_path):
     folder = tmp_path / "scenes"
     folder.mkdir()
-    written(folder, HEAD + "realisations = [7]\n[variant.a]\n", "middle.toml")
+    written(folder, 'name = "another"\n' + HEAD + "realisations = [7]\n[variant.a]\n", "middle.toml")
     top = 'base = "middle.toml"\nunset = ["forcing", "training.field_weight"]\nflow.cells = 32\n'
     scene = load_scene(written(folder, top, "top.toml"))
     assert (scene.name, scene.title, scene.flow.cells, scene.forcing) == ("top", "a test", 32, None)
