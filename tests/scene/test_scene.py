@@ -219,7 +219,8 @@ def test_built_in_scenes_have_the_schema(name):
 
 @pytest.mark.parametrize("override, accepted", [
     ("flow.cells = 7", False), ("flow.cels = 8", False), ("simulation.step = 0.1", True), ("time.step = 'none'", True),
-    ("simulation.step = 'long'", False), ("model.terms = ['pairs', 'own:Drag']", True), ("model.Drag.k = 1", True),
+    ("simulation.step = 'long'", False), ("forcing.wavenumber = 1", False), ("model.Drag.k = 1", True),
+    ("model.terms = ['pairs', 'own:Drag']", True),
     ("model.terms = ['pears']", False), ("kernel.hidden = [8, 0]", False), ("variant.a.flow.cells = 7", False)])
 def test_the_schema_accepts_what_a_scene_may_hold(override, accepted):
     import tomllib
