@@ -10,17 +10,15 @@ import math
 import re
 from collections.abc import Iterator
 from itertools import chain
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from eddies.import_path import ImportPathError, load
 from eddies.pipeline import STAGES
 from eddies.scene.layers import VARIANT
+from eddies.scene.parts import Parts
 from eddies.scene.rules import quoted
 from eddies.scene.sections import INITIAL_FLOWS, Eulerian, InitialFlow
 from eddies.scene.values import SceneError, Section, import_paths, place
-
-if TYPE_CHECKING:
-    from eddies.scene.scene import Scene
 
 Problems = Iterator[tuple[str, str]]
 
@@ -35,7 +33,7 @@ REALISATION = "realisation-"
 NAME = r"[A-Za-z0-9][A-Za-z0-9._-]{,99}"
 
 
-def problems(scene: Scene) -> Iterator[SceneError]:
+def problems(scene: Parts) -> Iterator[SceneError]:
     """Yield the problems of a scene: in its names, of its sections side by side, of its variants."""
     checks = (check_names, check_foreign, check_flow, check_time, check_tracers, check_needs, check_density,
               check_training, check_simulation, check_coarse_grid, check_variants)
@@ -43,7 +41,7 @@ def problems(scene: Scene) -> Iterator[SceneError]:
         yield SceneError(f"{given(scene, key)}: {problem}", key)
 
 
-def given(scene: Scene, key: str) -> str:
+def given(scene: Parts, key: str) -> str:
     """Return a key and its value as an error begins: "[flow] cells = 8"; without the value where there is none."""
     section, _, name = key.rpartition(".")
     value: Any = scene
@@ -58,7 +56,7 @@ def given(scene: Scene, key: str) -> str:
     return f"{place(name, section)} = {f'{value:g}' if isinstance(value, float) else quoted(value)}"
 
 
-def check_names(scene: Scene) -> Problems:
+def check_names(scene: Parts) -> Problems:
     """The name of a directory, and seeds of realisations that are different."""
     if not re.fullmatch(NAME, scene.name):
         yield "name", ('must be the name of a directory: at most 100 letters, digits, ".", "_" and "-", the first a '
@@ -73,7 +71,7 @@ def check_names(scene: Scene) -> Problems:
                                    "it out")
 
 
-def check_foreign(scene: Scene) -> Problems:
+def check_foreign(scene: Parts) -> Problems:
     """Import paths that lead nowhere, or to a class without what its key needs; [model] checks those of terms."""
     sections: dict[str, Section | None] = {"flow": scene.flow, "initial": scene.initial, "simulation": scene.simulation}
     if scene.model:
@@ -92,7 +90,7 @@ def check_foreign(scene: Scene) -> Problems:
                 yield f"{section}.{key}", "must be a class derived from torch.nn.Module"
 
 
-def check_flow(scene: Scene) -> Problems:
+def check_flow(scene: Parts) -> Problems:
     """The sound speed, keys that only some initial flows read, and waves within the resolved scales."""
     flow, initial = scene.flow, scene.initial
     if flow.compressible and flow.sound_speed is None:
@@ -119,7 +117,7 @@ def check_flow(scene: Scene) -> Problems:
                         "cells")
 
 
-def check_time(scene: Scene) -> Problems:
+def check_time(scene: Parts) -> Problems:
     """One run time, and a forcing that acts in it."""
     spin_up, forcing, tracers = scene.spin_up, scene.forcing, scene.tracers
     if tracers is None and scene.time.duration is None:
@@ -140,7 +138,7 @@ def check_time(scene: Scene) -> Problems:
         yield "tracers.forced", "there is no [forcing] that could stay on; add it, or remove the key"
 
 
-def check_tracers(scene: Scene) -> Problems:
+def check_tracers(scene: Parts) -> Problems:
     """A flow that moves the tracers, fields no finer than the flow, and supports that end below half the cube."""
     tracers = scene.tracers
     if tracers is None:
@@ -161,7 +159,7 @@ def check_tracers(scene: Scene) -> Problems:
                 "lower neighbors or raise [tracers] particles_per_side")
 
 
-def check_needs(scene: Scene) -> Problems:
+def check_needs(scene: Parts) -> Problems:
     """Sections that need others."""
     needs = {"kernel": "tracers", "model": "tracers", "training": "model",
              "simulation": "model" if scene.needs_model else "tracers"}
@@ -173,7 +171,7 @@ def check_needs(scene: Scene) -> Problems:
                         "with trained weights, or remove [model]")
 
 
-def check_density(scene: Scene) -> Problems:
+def check_density(scene: Parts) -> Problems:
     """A density that is given twice, or that is read where the terms or the flow give none."""
     incompressible, rates = not scene.flow.compressible, {"density", "density_rate"}
     remedy = 'or set [flow] fluid = "compressible" and sound_speed'
@@ -205,7 +203,7 @@ def check_density(scene: Scene) -> Problems:
                                     f"another, {remedy}")
 
 
-def check_training(scene: Scene) -> Problems:
+def check_training(scene: Parts) -> Problems:
     """Steps, rates and weights that contradict each other."""
     training, tracers = scene.training, scene.tracers
     if training is None:
@@ -238,7 +236,7 @@ def check_training(scene: Scene) -> Problems:
             "steps and a weight above 0, or neither")
 
 
-def check_simulation(scene: Scene) -> Problems:
+def check_simulation(scene: Parts) -> Problems:
     """Frames at the times of the ground truth and of steps, and a start within the ground truth."""
     simulation, tracers = scene.simulation, scene.tracers
     if simulation is None or tracers is None:
@@ -257,7 +255,7 @@ def check_simulation(scene: Scene) -> Problems:
                                    "nothing after it; give start, or a smaller [training] window")
 
 
-def check_coarse_grid(scene: Scene) -> Problems:
+def check_coarse_grid(scene: Parts) -> Problems:
     """A coarse grid of its own method, no finer than the flow, and with what its fluid and closure need."""
     simulation, flow = scene.simulation, scene.flow
     if simulation is None or not simulation.on_grid:
@@ -274,7 +272,7 @@ def check_coarse_grid(scene: Scene) -> Problems:
         yield "eulerian.fluid", "[flow] fluid is incompressible and has no sound speed; set both to the same"
 
 
-def check_variants(scene: Scene) -> Problems:
+def check_variants(scene: Parts) -> Problems:
     """Variants that cannot be run beside each other, or whose rollouts cannot be compared."""
     reserved = {*RESERVED, *(name for stage in STAGES.values() for name in (stage.product, stage.checkpoints))}
     for name, variant in scene.variant.items():
@@ -292,7 +290,7 @@ def check_variants(scene: Scene) -> Problems:
             yield from ((key, problem) for problem in _different_comparison(scene, variant))
 
 
-def _different_comparison(scene: Scene, variant: Scene) -> Iterator[str]:
+def _different_comparison(scene: Parts, variant: Parts) -> Iterator[str]:
     """Keys of the start, the times and the measures of rollouts that differ between a variant and the scene."""
     same = "all variants start at the same moment and are compared at the same times; change it for the whole scene"
     start = "rollouts start after it, and all must start at the same moment; give the scene a [simulation] start"

@@ -12,7 +12,8 @@ from typing import Any
 
 from eddies.import_path import origins
 from eddies.pipeline import STAGES
-from eddies.scene.scene import FOREIGN_IN, Scene
+from eddies.scene.parts import FOREIGN_IN
+from eddies.scene.scene import Scene
 
 
 def stage_fingerprint(scene: Scene, stage: str) -> str:
