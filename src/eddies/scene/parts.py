@@ -128,8 +128,9 @@ class Parts(Section):
     def foreign_in(self, name: str) -> tuple[str, ...]:
         """The import paths of the user's classes and functions that a section names, each once."""
         part = getattr(self, name)
-        parts = (part, *part.settings.values()) if isinstance(part, Model) else (part,) if part is not None else ()
-        return tuple(dict.fromkeys(path for each in parts for _, path in import_paths(each)))
+        if isinstance(part, Model):
+            return part.foreign
+        return tuple(dict.fromkeys(path for _, path in import_paths(part))) if part is not None else ()
 
     @property
     def foreign(self) -> tuple[str, ...]:
