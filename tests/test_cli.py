@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from mpi_tools.launch import mpi_environment, mpirun_command
+from eddies.workflows.run_directory.fingerprints import stage_fingerprint
 from tests.bad_scenes import BAD_OVERRIDES, BAD_TEXTS
 from tests.small_scene import TINY
 
@@ -91,7 +92,7 @@ def test_input_of_another_version_is_one_line(comm, tmp_path, capfd):
     from eddies.scene.scene import load_scene
 
     with create_product(comm, tmp_path / "ground_truth.h5", "ground_truth",
-                        {"fingerprint": load_scene(TINY).fingerprint("dns"), "eddies": "0.1.0"}) as file:
+                        {"fingerprint": stage_fingerprint(load_scene(TINY), "dns"), "eddies": "0.1.0"}) as file:
         del file.attrs["format"]
     assert run_cli("train-kernel", TINY, "--output", tmp_path) == 2
     if comm.rank == 0:
@@ -187,7 +188,8 @@ def test_input_of_other_settings_is_refused(comm, tmp_path, capfd):
     from eddies.scene.scene import load_scene
     from eddies.stages import Step, check_inputs
     scene = load_scene(TINY)
-    with create_product(comm, tmp_path / "ground_truth.h5", "ground_truth", {"fingerprint": scene.fingerprint("dns")}):
+    with create_product(comm, tmp_path / "ground_truth.h5", "ground_truth",
+                        {"fingerprint": stage_fingerprint(scene, "dns")}):
         pass
     check_inputs(Step(scene, ("train-kernel",), tmp_path), comm)
     assert run_cli("train-kernel", TINY, "--set", "seed=2", "--output", tmp_path) == 2

@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import atexit
 import contextlib
+import json
 import logging
 import os
 import shlex
@@ -251,9 +252,11 @@ def checked_scenes(options: argparse.Namespace) -> list[Scene]:
 
 
 def scenes_command(options: argparse.Namespace, comm: Comm) -> None:
-    """The built-in scenes, or one scene in full."""
-    if options.scene:
-        text = load_scene(options.scene).to_toml()
+    """The built-in scenes, one scene with all keys, or the JSON schema of scenes."""
+    if options.schema:
+        text = json.dumps(import_module("eddies.scene.schema").json_schema(), indent=1) + "\n"
+    elif options.scene:
+        text = load_scene(options.scene).to_toml(all_keys=True)
     else:
         scenes = builtin_scenes()
         width = max(len(name) for name, _ in scenes)

@@ -15,7 +15,7 @@ class Stage:
     section : of a scene, without which there is nothing to do; None: it works with what there is.
     product : kind of the file that it makes, PRODUCT.h5 in the run directory; None: no such file.
     reads : what of a scene its product depends on beside the stages before it: sections and properties, see
-        `Scene.fingerprint`.
+        workflows/run_directory/fingerprints.py.
     depends_on : all stages that its product depends on, those of its inputs included, of those that a scene has.
     checkpoints : the directory within the run directory where its checkpoints lie; None: it makes none.
     but : "section.key", of the sections that it reads what its product does not depend on.

@@ -30,6 +30,7 @@ from eddies.scene.scene import Scene, SceneError
 from eddies.workflows.foreseen.storage import in_units
 from eddies.workflows.learned.source import read_source
 from eddies.workflows.problems import Context, check_ground_truth, memory_of_node, refuse
+from eddies.workflows.run_directory.fingerprints import stage_fingerprint
 from eddies.workflows.run_directory.work import FAILURE, SECONDS, Work, find_work, is_done, stage_seconds
 from eddies.workflows.variants import Step, check_unseen, link, steps
 
@@ -66,7 +67,8 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
         ProductError: a stage that is not among `stages` has not left the product that they start from.
         VariantsFailed: variants failed; what the others made is there.
     """
-    settings = [scene.to_toml(), *map(scene.fingerprint, scene.stages), str(directory), *stages, *variants]
+    settings = [scene.to_toml(), *(stage_fingerprint(scene, stage) for stage in scene.stages), str(directory), *stages,
+                *variants]
     require_same(comm, hashlib.sha256(json.dumps(settings).encode()).hexdigest()[:16],
                  "a scene, stages and a directory of which the SHA-256 is {}")
     warn_of_few_processors(comm)

@@ -15,6 +15,7 @@ from eddies.particles.smoothing_kernels import KernelNetwork
 from eddies.report.rollout import moved_by
 from eddies.scene.scene import BOX_LENGTH, SceneError, load_scene
 from eddies.workflows.rollout.measured import open_rollout
+from eddies.workflows.run_directory.fingerprints import stage_fingerprint
 from tests.small_scene import TINY
 
 pytestmark = pytest.mark.usefixtures("quick_spectra")
@@ -60,7 +61,7 @@ def made(comm):
     network = KernelNetwork(scene.kernel_support, [4])
     description = {"form": network.formula, "support": network.support, "hidden": [4], "cutoff": "smooth"}
     weights = {name: tensor.numpy() for name, tensor in network.state_dict().items()}
-    provenance = {"scene": SCENE, "fingerprint": scene.fingerprint("train-kernel")}
+    provenance = {"scene": SCENE, "fingerprint": stage_fingerprint(scene, "train-kernel")}
     save_weights(comm, folder / "kernel.h5", "kernel", description, weights, provenance)
     comm.Barrier()
     yield folder

@@ -9,6 +9,7 @@ import pytest
 from eddies.io.hdf5 import open_product, read_attributes, read_table
 from eddies.scene.scene import SceneError
 from eddies.workflows import find_step, simulate
+from eddies.workflows.run_directory.fingerprints import stage_fingerprint
 from tests.workflows.rollout.test_particle_run import prepared, with_method
 
 # Velocities are wrong by a constant and by what is of first order in the step.
@@ -99,7 +100,7 @@ def test_a_step_has_to_converge_on_the_other_ground_truths_too(comm, tmp_path, o
     weaker = tmp_path / "weaker"
     prepared(comm, weaker, overrides=["initial.amplitude=0.2"])
     with_it = replace(scene, simulation=replace(scene.simulation, confirmed_on=(str(weaker),)))
-    assert with_it.fingerprint("find-step") != scene.fingerprint("find-step")
+    assert stage_fingerprint(with_it, "find-step") != stage_fingerprint(scene, "find-step")
     found = {}
     for name, each in (("alone", scene), ("confirmed", with_it)):
         find_step.run(each, comm, tmp_path)

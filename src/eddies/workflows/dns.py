@@ -24,6 +24,7 @@ from eddies.workflows.ground_truth.flow_run import FlowRun, TracerRun
 from eddies.workflows.ground_truth.scene_flow import build_fluid, build_step_limit, initial_state
 from eddies.workflows.ground_truth.tracer_frames import frame_layout
 from eddies.workflows.problems import check_span
+from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
 
 log = logging.getLogger("eddies")
 
@@ -37,11 +38,11 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
 
     Raises Stopped, after a checkpoint, when `stop` asks for it.
     """
-    directory, fingerprint = Path(directory), scene.fingerprint("dns")
+    directory, fingerprint = Path(directory), stage_fingerprint(scene, "dns")
     guard = Guard(comm, directory / STAGES["dns"].checkpoints, fingerprint, stop)
     saved = guard.checkpoints.newest()
     flow = build_run(scene, comm, guard, saved)
-    with create_product(comm, directory / "ground_truth.h5", "ground_truth", scene.provenance("dns")) as file:
+    with create_product(comm, directory / "ground_truth.h5", "ground_truth", stage_provenance(scene, "dns")) as file:
         if saved is None:
             flow.history.sample(flow.state, flow.clock)
         if flow.phase == "spin-up":

@@ -38,6 +38,7 @@ from eddies.scene.integrators import MOST_COURANT, SCHEMES
 from eddies.scene.scene import BOX_LENGTH, Scene, SceneError
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.rollout.method_of_step import METHODS, Step, method_of_step
+from eddies.workflows.run_directory.fingerprints import stage_provenance
 
 log = logging.getLogger("eddies")
 
@@ -91,7 +92,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         found, half, difference = ladder[rung], ladder[rung + 1], search.difference(ladder, rung + 1)
         tables = {ladder.integrator: search.table(ladder) for ladder in search.ladders if ladder.trials}
     seconds = time.perf_counter() - began
-    with create_product(comm, directory / "step.h5", "step", scene.provenance("find-step")) as file:
+    with create_product(comm, directory / "step.h5", "step", stage_provenance(scene, "find-step")) as file:
         write_attributes(file.create_group("found"), {
             "integrator": found.step.integrator, "size": found.step.size, "seconds_per_turnover": found.seconds,
             "error": found.error, "error_with_half": half.error, "difference": difference,

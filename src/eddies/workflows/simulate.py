@@ -24,6 +24,7 @@ from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.rollout.course import Course, frame_layout
 from eddies.workflows.rollout.method_of_step import method_of_step, stored_step
 from eddies.workflows.rollout.particle_run import injection
+from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
 
 log = logging.getLogger("eddies")
 
@@ -34,7 +35,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     device = prepare_torch(scene.device, comm)
     directory, settings = Path(directory), scene.simulation
     slab = SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes)
-    guard = Guard(comm, directory / STAGES["simulate"].checkpoints, scene.fingerprint("simulate"), stop,
+    guard = Guard(comm, directory / STAGES["simulate"].checkpoints, stage_fingerprint(scene, "simulate"), stop,
                   " of the rollout")
     with open_product(comm, directory / "ground_truth.h5", "ground_truth") as truth_file, torch.no_grad():
         truth = GroundTruth(truth_file, slab)
@@ -48,7 +49,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         with segments:
             course = Course(method, segments, count, settings.frame_interval, guard, saved)
             outcome = course.run()
-            with create_product(comm, directory / "rollout.h5", "rollout", scene.provenance("simulate")) as file:
+            with create_product(comm, directory / "rollout.h5", "rollout", stage_provenance(scene, "simulate")) as file:
                 segments.assemble(file)
                 write_attributes(file.create_group("rollout"), {
                     **outcome, **method.description(), "method": settings.method,

@@ -19,6 +19,7 @@ from eddies.parallel.communicator import Comm
 from eddies.pipeline import STAGES, Stage
 from eddies.scene.scene import Scene, SceneError, load_scene
 from eddies.workflows.foreseen.storage import in_units
+from eddies.workflows.run_directory.fingerprints import stage_fingerprint
 from eddies.workflows.run_directory.work import changed_settings, is_done, of_other_settings, stage_seconds
 from eddies.workflows.variants import Step, steps
 
@@ -112,7 +113,7 @@ def stage_state(stage: Stage, scene: Scene, directory: Path) -> str:
     if is_done(stage.name, scene, directory):
         return f"complete, {in_units(product.stat().st_size)}"
     if found:
-        fits = scene.fingerprint(stage.name) in [fingerprint for _, fingerprint in found]
+        fits = stage_fingerprint(scene, stage.name) in [fingerprint for _, fingerprint in found]
         return f"stopped at step {found[-1][0]}, {'goes on' if fits else 'with other settings'}"
     if product.is_file():
         origin = product_provenance(product)

@@ -23,6 +23,7 @@ from eddies.workflows.learned.steps import take_all_steps
 from eddies.workflows.learned.training_data import model_of
 from eddies.workflows.learned.training_phases import feature_range, horizon_phases, one_step_phases
 from eddies.workflows.learned.truths import open_truths, training_data, truth_ids
+from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
 
 log = logging.getLogger("eddies")
 
@@ -52,7 +53,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         own = next((each.model for each in data if each.truth is truth), None)
         # Nothing of the run's own ground truth is seen where others are trained on.
         last = truth.last_frame_seen(scene.training.window if own is not None else 0.0)
-        guard = Guard(comm, directory / STAGES["train"].checkpoints, scene.fingerprint("train"), stop,
+        guard = Guard(comm, directory / STAGES["train"].checkpoints, stage_fingerprint(scene, "train"), stop,
                       " of the training")
         history, cost, curves = {}, [], None
         phases = []
@@ -75,7 +76,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                           for path, each in zip(scene.training.truth_files, trained_on)}
     weights = {name: tensor.cpu().numpy() for name, tensor in model.state_dict().items()}
     save_weights(comm, directory / "model.h5", "model", description, weights,
-                 {**scene.provenance("train"), "mach_turbulent": mach, "truths": truth_ids(scene),
+                 {**stage_provenance(scene, "train"), "mach_turbulent": mach, "truths": truth_ids(scene),
                   "mach_of_truths": mach_of_truths}, tables)
     guard.checkpoints.remove()
     if curves is not None:  # after the product, which no picture may cost

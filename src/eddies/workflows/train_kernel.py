@@ -31,6 +31,7 @@ from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.workflows.ground_truth.frame_counts import KERNEL_FIELDS
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.learned.steps import take_all_steps
+from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
 
 log = logging.getLogger("eddies")
 
@@ -56,7 +57,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         chosen = np.unique(np.linspace(0, len(seen) - 1, KERNEL_FIELDS).astype(int))
         samples = [load_sample(truth, index, support) for index in chosen]
         unseen, scales = load_sample(truth, len(truth.fields.times) - 1, support), truth.scales
-    guard = Guard(comm, directory / STAGES["train-kernel"].checkpoints, scene.fingerprint("train-kernel"), stop,
+    guard = Guard(comm, directory / STAGES["train-kernel"].checkpoints, stage_fingerprint(scene, "train-kernel"), stop,
                   " of the training")
     training = training_of(scene, samples)
     take_all_steps(training, guard, "kernel", "kernel", "lower learning_rate")
@@ -70,7 +71,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                    "hidden": list(settings.hidden), "cutoff": settings.cutoff,
                    "mean_volume": networks["learned"].mean_volume, "reconstruction": settings.form}
     weights = {name: tensor.numpy() for name, tensor in networks["learned"].state_dict().items()}
-    save_weights(comm, directory / "kernel.h5", "kernel", description, weights, scene.provenance("train-kernel"),
+    save_weights(comm, directory / "kernel.h5", "kernel", description, weights, stage_provenance(scene, "train-kernel"),
                  tables)
     guard.checkpoints.remove()
     errors = tables["errors"]
@@ -88,7 +89,7 @@ def keep_form(scene: Scene, comm: Comm, directory: Path) -> None:
     path, form = directory / "kernel.h5", scene.kernel.form
     description, weights = load_weights(comm, path, "kernel")
     if description.get("reconstruction", "average") != form:
-        origin = {**scene.provenance("train-kernel"), "id": product_provenance(path).get("id")}
+        origin = {**stage_provenance(scene, "train-kernel"), "id": product_provenance(path).get("id")}
         save_weights(comm, path, "kernel", {**description, "reconstruction": form}, weights, origin, load_tables(path))
         log.info('train-kernel: %s says now form = "%s"', path, form)
 

@@ -19,6 +19,7 @@ from eddies.parallel.communicator import Comm
 from eddies.pipeline import STAGES
 from eddies.scene.scene import Eulerian, Scene
 from eddies.scene.sections import CONVERGED
+from eddies.workflows.run_directory.fingerprints import stage_fingerprint
 from eddies.workflows.run_directory.work import FAILURE
 from eddies.workflows.variants import Place
 
@@ -114,7 +115,7 @@ def before(place: Place, alone: Comm) -> dict[str, Any]:
 def has_own_kernel(scene: Scene, variant: Scene) -> bool:
     """Return whether the smoothing kernel of a variant differs from that of the scene, so that the numbers of
     THROUGH_KERNEL cannot be compared."""
-    return len({each.fingerprint("train-kernel") for each in (scene.without_variants, variant)}) > 1
+    return len({stage_fingerprint(each, "train-kernel") for each in (scene.without_variants, variant)}) > 1
 
 
 def notes(scene: Scene) -> list[str]:

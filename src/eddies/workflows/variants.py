@@ -20,6 +20,7 @@ from pathlib import Path
 
 from eddies.pipeline import STAGES
 from eddies.scene.scene import REALISATION, Scene, SceneError
+from eddies.workflows.run_directory.fingerprints import stage_fingerprint
 from eddies.workflows.run_directory.work import is_done
 
 # The stages whose products all variants share where their settings agree.
@@ -90,7 +91,7 @@ def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[
     for name, own, where, possible in planned:
         working, links = [], {}
         for stage in [stage for stage in STAGES if stage in own.stages and stage in MAKING]:
-            key = stage, own.fingerprint(stage)
+            key = stage, stage_fingerprint(own, stage)
             taken_over = stage not in SHARED and own.model is not None and own.model.path is not None
             holder = None if taken_over else made.get(key)
             if holder is not None and holder != where:
@@ -152,7 +153,7 @@ def _confirmed(scene: Scene, own: Scene, directory: Path) -> Scene:
     """The scene of a variant, the step of which is to converge on all realisations of the whole scene; as it is where
     these are of another flow."""
     asked = scene.realisations and own.simulation.finds_step and own.simulation.confirmed_on is None
-    if not asked or own.fingerprint("dns") != scene.without_variants.fingerprint("dns"):
+    if not asked or stage_fingerprint(own, "dns") != stage_fingerprint(scene.without_variants, "dns"):
         return own
     named = tuple(str(directory / f"{REALISATION}{seed}") for seed in scene.realisations)
     return replace(own, simulation=replace(own.simulation, confirmed_on=named))

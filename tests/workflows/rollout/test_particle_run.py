@@ -28,6 +28,7 @@ from eddies.workflows.learned.model import scene_model
 from eddies.workflows.learned.source import describe
 from eddies.workflows.rollout.particle_run import SOLVES, LearnedRun
 from eddies.workflows.rollout.method_of_step import METHODS, method_of_step
+from eddies.workflows.run_directory.fingerprints import stage_provenance
 
 pytestmark = pytest.mark.usefixtures("quick_spectra")
 
@@ -72,6 +73,7 @@ OWN_METHOD = """
 import torch
 
 from eddies.particles.particle_set import ParticleSet
+from eddies.workflows.run_directory.fingerprints import stage_provenance
 
 
 class Swept:
@@ -123,8 +125,8 @@ def prepared(comm, directory, fluid="compressible", model=MODEL, start=0.3, turn
     network = KernelNetwork(scene.kernel_support, [4])
     description = {"form": network.formula, "support": network.support, "hidden": [4], "cutoff": "smooth"}
     weights = {name: tensor.numpy() for name, tensor in network.state_dict().items()}
-    save_weights(comm, directory / "kernel.h5", "kernel", description, weights, scene.provenance("train-kernel"), {
-        "history": {"step": np.zeros(1)}})
+    save_weights(comm, directory / "kernel.h5", "kernel", description, weights,
+                 stage_provenance(scene, "train-kernel"), {"history": {"step": np.zeros(1)}})
     return scene
 
 

@@ -10,6 +10,7 @@ from eddies.io.checkpoint import CheckpointDirectory
 from eddies.io.hdf5 import ProductError, create_product
 from eddies.pipeline import STAGES
 from eddies.scene.scene import load_scene
+from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
 from eddies.workflows.run_directory.work import WorkAtStake, find_work
 from tests.small_scene import TINY
 
@@ -24,13 +25,15 @@ def scene():
 def leave(comm, directory, scene, stages=MAKING):
     """The products of some stages of a scene, without content."""
     for stage in stages:
-        with create_product(comm, directory / STAGES[stage].file, STAGES[stage].product, scene.provenance(stage)):
+        with create_product(comm, directory / STAGES[stage].file, STAGES[stage].product,
+                            stage_provenance(scene, stage)):
             pass
 
 
 def save(comm, directory, scene, stage, step):
     """A checkpoint of a stage."""
-    CheckpointDirectory(comm, directory / STAGES[stage].checkpoints, scene.fingerprint(stage)).write(step, {"a": 1})
+    checkpoints = CheckpointDirectory(comm, directory / STAGES[stage].checkpoints, stage_fingerprint(scene, stage))
+    checkpoints.write(step, {"a": 1})
 
 
 @pytest.mark.mpi(1)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from eddies.clock import ladder_step
 from eddies.particles.flow_units import allowed_step, resolved_wavenumber
-from eddies.scene.methods import METHODS
+from eddies.scene.sections import METHODS
 from eddies.scene.scene import BOX_LENGTH, Eulerian, Scene
 
 DISSIPATION_CONSTANT = 0.5   # C_eps = eps L / u'^3 of developed turbulence

@@ -19,6 +19,7 @@ from eddies.io.provenance import product_provenance
 from eddies.pipeline import STAGES, Stage
 from eddies.scene.rules import quoted
 from eddies.scene.scene import Scene
+from eddies.workflows.run_directory.fingerprints import stage_fingerprint
 
 SECONDS = "stage_seconds.json"
 FAILURE = "failure.txt"  # the error of a failed variant
@@ -56,7 +57,7 @@ def find_work(stages: Sequence[str], scene: Scene, directory: Path) -> Work:
     done, begun, useless, lost, changes = set(), set(), set(), [], {}
     seconds = stage_seconds(directory)
     for stage in [STAGES[name] for name in stages if STAGES[name].product is not None]:
-        product, settings = directory / stage.file, scene.fingerprint(stage.name)
+        product, settings = directory / stage.file, stage_fingerprint(scene, stage.name)
         checkpoints = checkpoints_in(directory / stage.checkpoints) if stage.checkpoints else []
         of_others = checkpoints and settings not in [fingerprint for _, fingerprint in checkpoints]
         origin = product_provenance(product)
@@ -82,7 +83,7 @@ def is_done(stage: str, scene: Scene, directory: Path) -> bool:
     """Whether the product of a stage is complete and was made with the same settings; on one rank."""
     if STAGES[stage].product is None:
         return False
-    return product_provenance(directory / STAGES[stage].file).get("fingerprint") == scene.fingerprint(stage)
+    return product_provenance(directory / STAGES[stage].file).get("fingerprint") == stage_fingerprint(scene, stage)
 
 
 def stage_seconds(directory: Path) -> dict[str, float]:
