@@ -73,13 +73,14 @@ class Page:
     images: dict[str, bytes] = field(default_factory=dict)
 
     def draw(self, sections: Sequence[Section]) -> None:
-        """Draw the figures of sections. A figure that fails is left out with a warning."""
+        """Draw the figures of sections and free them. A figure that fails is left out with a warning."""
         for figure in (each for section in sections for each in section.illustrations):
             try:
                 self.images[figure.name] = figures.png(figure.image)
             except Exception as error:  # of matplotlib or its settings: the numbers and other figures are kept
                 log.warning("report: a figure is left out, %s cannot be drawn (%s: %s)", figure.name,
                             type(error).__name__, error)
+            figure.image = None
 
 
 @dataclass(frozen=True)
