@@ -234,6 +234,8 @@ def _write_array(file: h5py.File, name: str, block: Block) -> None:
     shape = (*values.shape[:axis], block.total, *values.shape[axis + 1:])
     with writing(file, math.prod(shape) * values.dtype.itemsize + HEADER_BYTES):
         dataset = file.create_dataset(name, shape, values.dtype)
+    if 0 in shape:
+        return  # HDF5 does not write an empty dataset collectively
     for lead in np.ndindex(shape[:min(axis, 1)]):
         offset = (0,) * (axis - len(lead)) + (block.start,) + (0,) * (values.ndim - axis - 1)
         part, offset = own_part(file, shape[len(lead):], np.ascontiguousarray(values[lead]), offset)
