@@ -182,7 +182,7 @@ def go_on(command, ranks, disk):
     ended = eddies(ranks, disk, *replacing(command))
     whole = ended.returncode == 0 and is_whole(command, disk)
     faults = [] if whole else [f"exit code {ended.returncode}: {ended.stderr}"]
-    if command in ("dns", "train") and "goes on from step" not in ended.stdout:
+    if command in ("dns", "train") and "continues from step" not in ended.stdout:
         faults.append("begins anew")
     return faults
 

@@ -46,7 +46,7 @@ class Field:
             truth = GroundTruth(file, slab)
             last = len(truth.fields.times) - 1
             self.sample = load_sample(truth, last, self.support)
-            columns = truth.block(truth.frame_of_field(last), ("position", "velocity"))
+            columns = truth.block(truth.at_fields[last], ("position", "velocity"))
             self.position, self.velocity = (torch.from_numpy(columns[name]) for name in ("position", "velocity"))
         chosen = np.random.default_rng(seed).choice(slab.planes**3, min(POINTS, slab.planes**3), replace=False)
         self.rows = torch.from_numpy(np.sort(chosen))

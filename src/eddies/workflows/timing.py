@@ -29,8 +29,10 @@ from eddies.workflows.foreseen.numbers import expected_step, flow_steps, rollout
 from eddies.workflows.foreseen.storage import training_steps
 from eddies.workflows.ground_truth.frame_counts import TESTED_FRAMES
 from eddies.workflows.learned.model import load_kernel
+from eddies.workflows.learned.source import ModelDefinition
+from eddies.workflows.learned.training_data import training_data
 from eddies.workflows.learned.training_phases import horizon_phases, one_step_phases
-from eddies.workflows.learned.truths import open_truths, training_data
+from eddies.workflows.learned.truths import open_truths
 
 log = logging.getLogger("eddies")
 
@@ -110,13 +112,13 @@ def rest_of_training(few: Scene, scene: Scene, comm: Comm, directory: Path, stop
     and validations of each phase; and the mean of its steps."""
     if scene.model.path is not None:
         return 0.0, 0.0
-    with open_truths(few, comm, directory) as (_, trained_on):
+    with open_truths(directory / STAGES["dns"].file, few.training.truth_files, few.tracers, comm) as (_, trained_on):
         kernel = load_kernel(comm, directory / STAGES["train-kernel"].file) if few.training.field_weight > 0 else None
-        data = training_data(few, trained_on, prepare_torch(scene.device, comm))
+        data = training_data(ModelDefinition.of(few), few.training, trained_on, prepare_torch(scene.device, comm))
         parameters = list(data[0].model.parameters())
         frames = wall_time(comm, lambda: [each.frames for each in data]) / few.training.frames
         seconds, stepping = frames * (scene.training.frames - few.training.frames + TESTED_FRAMES), 0.0
-        for phase in [*one_step_phases(few, data, kernel), *horizon_phases(few, data)] if parameters else ():
+        for phase in [*one_step_phases(data, kernel), *horizon_phases(data)] if parameters else ():
             stop.check()
             optimizer = Adam(comm, parameters, phase.steps, *phase.rates)
             steps = [wall_time(comm, lambda: phase.take(optimizer, number))

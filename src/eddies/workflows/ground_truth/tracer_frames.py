@@ -1,5 +1,4 @@
-"""What the ground truth stores of tracers: id-ordered frames, filtered fields, spectra, and here and there the whole
-unfiltered state."""
+"""Frames of the ground truth: tracers in order of id, filtered fields and spectra, and a few unfiltered flow states."""
 
 from __future__ import annotations
 
@@ -21,8 +20,7 @@ from eddies.workflows.ground_truth.frame_counts import whole_cells
 
 
 def frame_layout(settings: Tracers, compressible: bool, cutoff: int) -> FrameLayout:
-    """What the ground truth holds of tracers, of the filtered flow, and of the flow itself, whose modes reach up to
-    `cutoff`."""
+    """The datasets of the ground truth; `cutoff` is the largest wavenumber of the unfiltered flow."""
     columns, variables = {"position": (3,), "velocity": (3,)}, {"velocity": 3}
     if compressible:
         columns, variables = columns | {"density": ()}, variables | {"density": 1}
@@ -33,8 +31,8 @@ def frame_layout(settings: Tracers, compressible: bool, cutoff: int) -> FrameLay
 class TracerFrames:
     """Stores frames of tracers in segments, and collects the spectra.
 
-    Times are counted from the release. The density of a `compressible` flow is stored as well. `whole` are the numbers
-    of the frames at which the unfiltered state is stored, as far as they have filtered fields.
+    Times count from the release. The density of a `compressible` flow is stored too. `whole` are the numbers of the
+    frames, among those with filtered fields, at which the unfiltered flow is stored.
     """
 
     def __init__(self, segments: FrameSegments, tracers: TracerParticles, settings: Tracers, released_at: float,
@@ -46,7 +44,7 @@ class TracerFrames:
         self._spectra: dict[str, list] = {"time": [], "energy": [], "filtered": []}
 
     def store(self, state: np.ndarray, clock: Clock) -> None:
-        """Store a frame, and every few frames the filtered fields and spectra."""
+        """Store a frame, and every `field_every` frames the filtered fields and spectra."""
         time = clock.time - self.released_at
         order = IdOrder(self.coarse.decomposition.comm, self.tracers.columns["id"], self.settings.particles)
         frame = {"position": order.apply(self.tracers.columns["position"]),
@@ -62,7 +60,7 @@ class TracerFrames:
         self._frames += 1
 
     def state_dict(self) -> dict[str, int | np.ndarray]:
-        """What the rest of the run needs to know of the frames so far, for a checkpoint."""
+        """The number of frames and the spectra so far, for a checkpoint."""
         return {"frames": self._frames, **{f"spectra_{name}": np.array(rows) for name, rows in self._spectra.items()}}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -71,20 +69,19 @@ class TracerFrames:
         self._spectra = {name: list(state[f"spectra_{name}"]) for name in self._spectra}
 
     def write_spectra(self, file: File) -> None:
-        """Write the table of DNS and filtered energy spectra."""
+        """Write the table of unfiltered and filtered energy spectra."""
         wavenumber = np.arange(len(self._spectra["energy"][0]))
         columns = {name: np.array(rows) for name, rows in self._spectra.items()}
         write_table(file, "spectra", {"wavenumber": wavenumber, **columns})
 
     def _grid_of(self, cells: int) -> SpectralGrid:
-        """A grid of so many cells with all modes that it can hold of the flow's."""
+        """A grid of so many cells, with all modes of the flow that it can hold."""
         fine = self.tracers.field.grid
         slab = SlabDecomposition(fine.decomposition.comm, fine.decomposition.length, cells)
         return SpectralGrid(slab, fine.precision, min(fine.cutoff, (cells - 1) // 2))
 
     def _store_whole(self, state: np.ndarray, time: float) -> None:
-        """Store all modes of velocity and ln(density), as values of velocity and density on the grid that just holds
-        them."""
+        """Store velocity and density on the smallest grid that holds all their modes."""
         fine = self.tracers.field.grid
         grid = self._grid_of(whole_cells(fine.cutoff))
         values = grid.backward(regrid(fine, grid, state))

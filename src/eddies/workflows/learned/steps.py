@@ -1,4 +1,4 @@
-"""All steps of a training, from the newest checkpoint on."""
+"""The loop over the steps of a training."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ log = logging.getLogger("eddies")
 
 def take_all_steps(training: Training, guard: Guard, stage: str, section: str, remedy: str,
                    after_each: Callable[[Training], None] = lambda training: None) -> None:
-    """Take a training to its end, from its newest checkpoint if there is one; `stage` begins its lines.
+    """Run a training to its end, from its newest checkpoint if one exists. Log lines begin with `stage`.
 
-    Raises Stopped, once a checkpoint is safe, where it is asked to; SceneError, of a `section` and with the `remedy`,
-    where the training diverges.
+    Raises Stopped after a checkpoint if a stop is requested. Raises SceneError, which names the `section` and the
+    `remedy`, if the training diverges.
     """
     saved = guard.checkpoints.newest()
     if saved is not None:
         training.load_state_dict(saved)
-        log.info("%s: goes on from step %d", stage, training.steps)
+        log.info("%s: continues from step %d", stage, training.steps)
 
     def describe() -> str:
         last = training.history[-1]
