@@ -23,10 +23,9 @@ from eddies.scene.scene import Scene
 from eddies.scene.sections import SpinUp
 from eddies.time_stepping import STEPPERS
 from eddies.workflows.feasibility import check_span
-from eddies.workflows.ground_truth.flow_run import FlowRun, TracerRun
+from eddies.workflows.ground_truth.flow_run import FlowRun, TracerRun, frame_layout
 from eddies.workflows.ground_truth.frame_counts import whole_frames
 from eddies.workflows.ground_truth.scene_flow import build_fluid, build_step_limit, initial_state
-from eddies.workflows.ground_truth.tracer_frames import frame_layout
 
 log = logging.getLogger("eddies")
 
@@ -70,7 +69,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
             scales = scales_of(tracers.released) | tracers.scales()
             if fluid.forcing is not None:
                 write_attributes(file.create_group("forcing"), asdict(scene.forcing))
-            tracers.frames.write_spectra(file)
+            tracers.write_spectra(file)
         else:
             run_for(flow, scene.time.duration, partial(check_span, scene))
             write_final_fields(file, flow)

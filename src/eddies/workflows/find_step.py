@@ -193,17 +193,17 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
 
     Raises SceneError if no step converges.
     """
-    device, directory, began = prepare_torch(scene.device, comm), Path(directory), time.perf_counter()
-    slab, settings = SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes), scene.simulation
+    directory, settings, began = Path(directory), scene.simulation, time.perf_counter()
+    slab, device = SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes), prepare_torch(scene.device, comm)
     paths = [directory / STAGES["dns"].file, *settings.confirming_files]
     stop = stop or StopRequest(comm)
 
     def tried(stretch: Stretch, step: Step) -> Trial:
-        return short_rollout(make_method(scene, step, stretch.truth, stretch.frame, directory, device), step, stretch,
-                             stop)
+        return short_rollout(make_method(scene, step, stretch.truth, stretch.frame, directory), step, stretch, stop)
 
     with ExitStack() as files, torch.no_grad():
-        truths = [GroundTruth(files.enter_context(open_product(comm, path, "ground_truth")), slab) for path in paths]
+        opened = [files.enter_context(open_product(comm, path, "ground_truth")) for path in paths]
+        truths = [GroundTruth(file, slab, device) for file in opened]
         for path, truth in zip(paths, truths):
             if truth.total != truths[0].total:
                 raise SceneError(f"{scene.name}: [simulation] confirmed_on: {path} holds {truth.total} particles, not "

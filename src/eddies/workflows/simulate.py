@@ -35,18 +35,19 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     A rollout whose state becomes faulty ends there, keeps its frames and reports the fault in its status. A stopped
     rollout continues from its newest checkpoint.
     """
-    device = prepare_torch(scene.device, comm)
-    directory, settings = Path(directory), scene.simulation
+    directory, settings, device = Path(directory), scene.simulation, prepare_torch(scene.device, comm)
     slab = SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes)
     guard = Guard(comm, directory / STAGES["simulate"].checkpoints, scene.fingerprint("simulate"), stop,
                   " of the rollout")
     with open_product(comm, directory / STAGES["dns"].file, "ground_truth") as truth_file, torch.no_grad():
-        truth = GroundTruth(truth_file, slab)
+        truth = GroundTruth(truth_file, slab, device)
         start = rollout_start(scene, scene.seen_in(directory), len(truth.times), truth.at_fields)
         step = None
         if settings.step == CONVERGED:
-            step = stored_step(comm, scene.step_file or directory / STAGES["find-step"].file)
-        method = make_method(scene, step, truth, start, directory, device)
+            with open_product(comm, scene.step_file or directory / STAGES["find-step"].file, "step") as file:
+                found = read_attributes(file, "found")
+            step = Step(found["integrator"], found["size"])
+        method = make_method(scene, step, truth, start, directory)
         saved = guard.checkpoints.newest()
         layout = frame_layout(truth.total, slab.length, method.has_density)
         segments = FrameSegments(comm, guard.checkpoints.path, layout, () if saved is None else saved.files)
@@ -71,13 +72,6 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     pace = (pace_in_words(outcome["seconds_per_step"], outcome["storing_share"]) if "seconds_per_step" in outcome
             else "too few steps to time one")
     log.info("rollout: %s after %.2f turnovers, %s", outcome["status"], outcome["time"] / turnover, pace)
-
-
-def stored_step(comm: Comm, path: Path) -> Step:
-    """The step that `find-step` has stored in a file; collective."""
-    with open_product(comm, path, "step") as file:
-        found = read_attributes(file, "found")
-    return Step(found["integrator"], found["size"])
 
 
 def power_of(forcing: Forcing | None) -> float:

@@ -112,9 +112,10 @@ def rest_of_training(few: Scene, scene: Scene, comm: Comm, directory: Path, stop
     and validations of each phase; and the mean of its steps."""
     if scene.model.path is not None:
         return 0.0, 0.0
-    with open_truths(directory / STAGES["dns"].file, few.training.truth_files, few.tracers, comm) as (_, trained_on):
+    with open_truths(directory / STAGES["dns"].file, few.training.truth_files, few.tracers, comm,
+                     prepare_torch(scene.device, comm)) as (_, trained_on):
         kernel = load_kernel(comm, directory / STAGES["train-kernel"].file) if few.training.field_weight > 0 else None
-        data = training_data(ModelDefinition.of(few), few.training, trained_on, prepare_torch(scene.device, comm))
+        data = training_data(ModelDefinition.of(few), few.training, trained_on)
         parameters = list(data[0].model.parameters())
         frames = wall_time(comm, lambda: [each.frames for each in data]) / few.training.frames
         seconds, stepping = frames * (scene.training.frames - few.training.frames + TESTED_FRAMES), 0.0

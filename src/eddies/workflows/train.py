@@ -20,9 +20,8 @@ from eddies.workflows.learned import transfer
 from eddies.workflows.learned.a_priori import evaluate, evaluation_frames
 from eddies.workflows.learned.model import load_kernel
 from eddies.workflows.learned.source import ModelDefinition
-from eddies.workflows.learned.steps import take_all_steps
 from eddies.workflows.learned.training_data import model_for, training_data
-from eddies.workflows.learned.training_phases import feature_range, horizon_phases, one_step_phases
+from eddies.workflows.learned.training_phases import feature_range, horizon_phases, one_step_phases, take_all_steps
 from eddies.workflows.learned.truths import open_truths
 
 log = logging.getLogger("eddies")
@@ -41,11 +40,13 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     if scene.model.path is not None:
         transfer.run(scene, comm, directory)
         return
-    device, definition, settings = prepare_torch(scene.device, comm), ModelDefinition.of(scene), scene.training
-    with open_truths(directory / STAGES["dns"].file, settings.truth_files, scene.tracers, comm) as (truth, trained_on):
+    definition, settings, device = ModelDefinition.of(scene), scene.training, prepare_torch(scene.device, comm)
+    own_file = directory / STAGES["dns"].file
+    with open_truths(own_file, settings.truth_files, scene.tracers, comm, device) as (truth, trained_on):
         # Only the field loss averages with the kernel.
-        kernel = load_kernel(comm, directory / STAGES["train-kernel"].file, device) if settings.field_weight else None
-        data, tests = training_data(definition, settings, trained_on, device), evaluation_frames(truth)
+        kernel_file = directory / STAGES["train-kernel"].file
+        kernel = load_kernel(comm, kernel_file, truth.device) if settings.field_weight > 0 else None
+        data, tests = training_data(definition, settings, trained_on), evaluation_frames(truth)
         model, dtype = data[0].model, data[0].dtype
         for each in data:
             log.info("train: frames up to %d of the times up to %.3g of %.3g, %d held out; %d weights", each.learned,
@@ -67,8 +68,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
             take_all_steps(training, guard, "train", "training", "lower learning_rate here or in [training.horizons], "
                            "or shorten time_step there", curves)
             history, cost = {"history": training.columns()}, training.cost
-        tested = model_for(definition, truth, dtype, device, model) if own is None else own
-        tables = history | evaluate(truth, tested, tests, last, dtype, device)
+        tested = model_for(definition, truth, dtype, model) if own is None else own
+        tables = history | evaluate(truth, tested, tests, last, dtype)
         if model.networks:
             tables["feature_range"] = vars(feature_range(data))
         description = definition.describe(truth.scales) | {"training": cost,

@@ -32,7 +32,7 @@ from eddies.scene.scene import BOX_LENGTH, Kernel, Scene
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.workflows.ground_truth.frame_counts import KERNEL_FIELDS
 from eddies.workflows.ground_truth.truth import GroundTruth
-from eddies.workflows.learned.steps import take_all_steps
+from eddies.workflows.learned.training_phases import take_all_steps
 
 log = logging.getLogger("eddies")
 

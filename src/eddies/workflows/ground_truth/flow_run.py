@@ -1,4 +1,4 @@
-"""The direct simulation in time, alone or with tracers, and its state for checkpoints."""
+"""The direct simulation in time, alone or with tracers whose frames are stored, and its state for checkpoints."""
 
 from __future__ import annotations
 
@@ -14,15 +14,19 @@ from eddies.flow.courant import CourantLimit, FixedStep
 from eddies.flow.history import FlowHistory
 from eddies.flow.navier_stokes import Fluid
 from eddies.flow.stability import StabilityWatch
+from eddies.flow.statistics import energy_spectrum
 from eddies.flow.tracers import FilteredField, TracerParticles, release
 from eddies.io.checkpoint import Checkpoint
 from eddies.io.contiguous import Block
-from eddies.io.frame_segments import FrameSegments
+from eddies.io.frame_segments import FieldLayout, FrameLayout, FrameSegments
 from eddies.io.guard import Guard
+from eddies.io.hdf5 import File, write_table
 from eddies.parallel.migration import IdOrder, id_block, migrate
+from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.flow_units import MEAN_DENSITY, measured_scales
-from eddies.scene.scene import Tracers
-from eddies.workflows.ground_truth.tracer_frames import TracerFrames
+from eddies.scene.scene import BOX_LENGTH, Tracers
+from eddies.spectral.spectral_grid import SpectralGrid, regrid
+from eddies.workflows.ground_truth.frame_counts import whole_cells
 
 
 @dataclass
@@ -101,7 +105,7 @@ class TracerRun:
     flow : its forcing ends at the release unless [tracers] forced.
     segments : the files for the frames.
     settings, seed : [tracers], and the seed of random places.
-    whole : gives, for a number of frames, those at which the unfiltered flow is stored.
+    whole : gives, for a number of frames, those (with filtered fields) at which the unfiltered flow is stored.
     saved : the checkpoint, or None.
     """
 
@@ -125,12 +129,12 @@ class TracerRun:
             block = {name: saved.read(name, start, stop) for name in ("position", "velocity")}
             columns = migrate(slab, {"id": np.arange(start, stop, dtype=np.int64), **block})
         self.tracers = TracerParticles(field, columns, flow.state)
-        self.frames = TracerFrames(segments, self.tracers, settings, self.released_at, flow.fluid.compressible,
-                                   whole(self.intervals + 1))
+        self.coarse, self.whole = self._grid_of(settings.cells), whole(self.intervals + 1)
+        names = "time", "energy", "filtered"
+        self.spectra = {name: [] if saved is None else list(saved[f"spectra_{name}"]) for name in names}
+        self.stored = 0 if saved is None else saved["frames"]
         if saved is None:
-            self.frames.store(flow.state, flow.clock)
-        else:
-            self.frames.load_state_dict(saved)
+            self._store()
 
     @property
     def intervals(self) -> int:
@@ -165,7 +169,14 @@ class TracerRun:
         columns = {name: Block(order.apply(self.tracers.columns[name]), order.start, self.settings.particles)
                    for name in ("position", "velocity")}
         return {"released": self.released, "released_at": self.released_at, "interval": self.interval,
-                "step": self.step, "first_step": self.first_step, **self.frames.state_dict(), **columns}
+                "step": self.step, "first_step": self.first_step, "frames": self.stored,
+                **{f"spectra_{name}": np.array(rows) for name, rows in self.spectra.items()}, **columns}
+
+    def write_spectra(self, file: File) -> None:
+        """Write the table of unfiltered and filtered energy spectra."""
+        wavenumber = np.arange(len(self.spectra["energy"][0]))
+        columns = {name: np.array(rows) for name, rows in self.spectra.items()}
+        write_table(file, "spectra", {"wavenumber": wavenumber, **columns})
 
     def _longest_step(self) -> float:
         interval = self.settings.frame_interval
@@ -182,5 +193,47 @@ class TracerRun:
                       lambda *_: progress(self._done, flow.clock.steps - self.first_step)], FixedStep(step))
         began = time.perf_counter()
         with progress.storing():
-            self.frames.store(flow.state, flow.clock)
+            self._store()
         flow.history.leave_out(time.perf_counter() - began)
+
+    def _store(self) -> None:
+        """Store a frame, with filtered fields and spectra every `field_every` frames. Times count from the release."""
+        state, clock, columns = self.flow.state, self.flow.clock, self.tracers.columns
+        compressible, time_since = self.flow.fluid.compressible, clock.time - self.released_at
+        order = IdOrder(self.comm, columns["id"], self.settings.particles)
+        frame = {name: order.apply(columns[name]) for name in ("position", "velocity")}
+        if compressible:
+            frame["density"] = order.apply(self.tracers.density(state))
+        self.segments.open(clock.steps)
+        self.segments.trajectories["tracers"].append(clock.steps, time_since, order.start, frame)
+        if self.stored % self.settings.field_every == 0:
+            field, grid = self.tracers.field, self.coarse
+            velocity = field.transfer * state[:3]
+            modes = {"velocity": velocity} | ({"density": field.density_modes(state)} if compressible else {})
+            planes = {name: grid.backward(regrid(field.grid, grid, part)) for name, part in modes.items()}
+            self.segments.fields["filtered"].append(time_since, grid.decomposition.start, planes)
+            for name, value in (("time", time_since), ("energy", energy_spectrum(field.grid, state[:3])[1]),
+                                ("filtered", energy_spectrum(field.grid, velocity)[1])):
+                self.spectra[name].append(value)
+            if self.stored in self.whole:
+                # Velocity and density on the smallest grid that holds all their modes.
+                grid = self._grid_of(whole_cells(field.grid.cutoff))
+                values = grid.backward(regrid(field.grid, grid, state))
+                planes = {"velocity": values[:3]} | ({"density": np.exp(values[3:])} if compressible else {})
+                self.segments.fields["unfiltered"].append(time_since, grid.decomposition.start, planes)
+        self.stored += 1
+
+    def _grid_of(self, cells: int) -> SpectralGrid:
+        """A grid of so many cells, with all modes of the flow that it can hold."""
+        fine = self.flow.fluid.grid
+        slab = SlabDecomposition(self.comm, fine.decomposition.length, cells)
+        return SpectralGrid(slab, fine.precision, min(fine.cutoff, (cells - 1) // 2))
+
+
+def frame_layout(settings: Tracers, compressible: bool, cutoff: int) -> FrameLayout:
+    """The datasets of the ground truth; `cutoff` is the largest wavenumber of the unfiltered flow."""
+    columns, variables = {"position": (3,), "velocity": (3,)}, {"velocity": 3}
+    if compressible:
+        columns, variables = columns | {"density": ()}, variables | {"density": 1}
+    return FrameLayout(settings.particles, BOX_LENGTH, {"tracers": columns}, np.float64, {
+        "filtered": FieldLayout(settings.cells, variables), "unfiltered": FieldLayout(whole_cells(cutoff), variables)})

@@ -34,13 +34,15 @@ Result = TypeVar("Result")
 
 class GroundTruth:
     """An open ground_truth.h5 that all ranks read. A particle is on the rank whose slab of `decomposition` holds it.
+    Frames for training and models go to `device`.
 
     For an incompressible fluid no density is stored: `has_density` is false and columns of the density are missing.
     All ranks raise ProductError if one of them reads a value that is not finite.
     """
 
-    def __init__(self, file: File, decomposition: SlabDecomposition) -> None:
-        self.decomposition, self._file = decomposition, file
+    def __init__(self, file: File, decomposition: SlabDecomposition,
+                 device: torch.device = torch.device("cpu")) -> None:
+        self.decomposition, self.device, self._file = decomposition, device, file
         self.trajectory, self.fields = Trajectory(file, "tracers"), FieldSeries(file, "filtered")
         self.times, self.total = self.trajectory.times, self.trajectory.total
         self.reference = read_attributes(file, "reference")
@@ -133,18 +135,18 @@ class GroundTruth:
         return on_all_ranks(self.decomposition.comm, read, ProductError)
 
 
-def load_frame(truth: GroundTruth, index: int, model: LagrangianModel, dtype: torch.dtype, device: torch.device,
+def load_frame(truth: GroundTruth, index: int, model: LagrangianModel, dtype: torch.dtype,
                with_field: bool = False) -> TrainingFrame:
     """A frame with its true rates, and `with_field` also the filtered field one frame later; collective.
 
     The particles have the true density if the model integrates the density.
     """
     columns = truth.particles_with_rates(int(index))
-    rates = {name: torch.from_numpy(columns[name]).to(device, dtype)
+    rates = {name: torch.from_numpy(columns[name]).to(truth.device, dtype)
              for name in ("acceleration", "density_rate") if name in columns}
     dynamics = ParticleDynamics(truth.decomposition, model, skin=0.0, dtype=dtype)
-    later = _field_after(truth, int(index), dtype, device) if with_field else None
-    frame = TrainingFrame(dynamics, particles_for(model, columns, device), rates["acceleration"],
+    later = _field_after(truth, int(index), dtype) if with_field else None
+    frame = TrainingFrame(dynamics, particles_for(model, columns, truth.device), rates["acceleration"],
                           rates.get("density_rate"), later)
     solves = [] if dynamics.resolution is None else dynamics.resolution.solves
     for iterations, residual, converged in solves:
@@ -154,9 +156,10 @@ def load_frame(truth: GroundTruth, index: int, model: LagrangianModel, dtype: to
     return frame
 
 
-def _field_after(truth: GroundTruth, frame: int, dtype: torch.dtype, device: torch.device) -> FieldLater:
+def _field_after(truth: GroundTruth, frame: int, dtype: torch.dtype) -> FieldLater:
     """The filtered field one frame after a frame, and the positions of the particles at that time."""
-    slab, columns = truth.decomposition, truth.window(frame, 1)  # rows as in `particles_with_rates`
+    slab, device = truth.decomposition, truth.device
+    columns = truth.window(frame, 1)  # rows as in `particles_with_rates`
     position, later = (torch.from_numpy(columns[name]) for name in ("position", "position_later"))
     # Stored positions are wrapped into the box; these continue from the positions of the frame.
     moved = position + PeriodicBox(slab.length).displacement(later[:, 0], position)

@@ -30,8 +30,8 @@ def evaluation_frames(truth: GroundTruth) -> np.ndarray:
 
 
 @torch.no_grad()
-def evaluate(truth: GroundTruth, model: LagrangianModel, frames: np.ndarray, last_seen: int, dtype: torch.dtype,
-             device: torch.device) -> dict[str, dict[str, np.ndarray]]:
+def evaluate(truth: GroundTruth, model: LagrangianModel, frames: np.ndarray, last_seen: int,
+             dtype: torch.dtype) -> dict[str, dict[str, np.ndarray]]:
     """Normalised L2 errors over the delay since `last_seen`, and samples of rates at the last frame; collective.
 
     `acceleration_error`: the model as in a rollout, with the density that its terms give.
@@ -42,7 +42,7 @@ def evaluate(truth: GroundTruth, model: LagrangianModel, frames: np.ndarray, las
     rows, comm = [], truth.decomposition.comm
     progress = ProgressLine("train", lambda: "in the a-priori test", unit="frame")
     for index in frames:
-        frame = load_frame(truth, index, model, dtype, device)
+        frame = load_frame(truth, index, model, dtype)
         errors = frame.errors()
         row = {"delay": truth.times[index] - truth.times[last_seen],
                "acceleration_error": relative_error(comm, errors["acceleration"], frame.acceleration)}
@@ -52,10 +52,10 @@ def evaluate(truth: GroundTruth, model: LagrangianModel, frames: np.ndarray, las
                 exact = exact + frame.kept[FORCING].at(None).acceleration
             row["pressure_gradient_error"] = relative_error(comm, exact - frame.acceleration, frame.acceleration)
         if model.density_is_given:
-            true = torch.from_numpy(truth.particles(int(index))["density"]).to(device)
+            true = torch.from_numpy(truth.particles(int(index))["density"]).to(truth.device)
             given = frame.errors(density=true)["acceleration"]
             row["true_density_acceleration_error"] = relative_error(comm, given, frame.acceleration)
-            row["density_rate_error"] = _given_rate_error(truth, frame.dynamics, int(index), device)
+            row["density_rate_error"] = _given_rate_error(truth, frame.dynamics, int(index))
         if "density_rate" in errors:
             row["density_rate_error"] = relative_error(comm, errors["density_rate"], frame.density_rate)
         rows.append(row)
@@ -67,12 +67,12 @@ def evaluate(truth: GroundTruth, model: LagrangianModel, frames: np.ndarray, las
     return tables
 
 
-def _given_rate_error(truth: GroundTruth, dynamics: ParticleDynamics, index: int, device: torch.device) -> float:
+def _given_rate_error(truth: GroundTruth, dynamics: ParticleDynamics, index: int) -> float:
     """Error of the rate of change of the density that terms give, by centred differences along true trajectories."""
     comm, total = truth.decomposition.comm, truth.total
 
     def density(frame: int) -> np.ndarray:
-        particles = particles_for(dynamics.model, truth.particles(frame), device)
+        particles = particles_for(dynamics.model, truth.particles(frame), truth.device)
         return IdOrder(comm, as_numpy(particles.id), total).apply(as_numpy(dynamics.rates(particles).density))
 
     rate = (density(index + 1) - density(index - 1)) / (truth.times[index + 1] - truth.times[index - 1])

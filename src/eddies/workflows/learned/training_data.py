@@ -42,10 +42,10 @@ class TrainingData:
     """
 
     def __init__(self, definition: ModelDefinition, settings: Training, truth: GroundTruth, count: int,
-                 device: torch.device, like: LagrangianModel | None = None) -> None:
-        self.definition, self.settings, self.truth, self.count, self.device = definition, settings, truth, count, device
+                 like: LagrangianModel | None = None) -> None:
+        self.definition, self.settings, self.truth, self.count = definition, settings, truth, count
         self.dtype = getattr(torch, settings.precision)
-        self.model = model_for(definition, truth, self.dtype, device, like)
+        self.model = model_for(definition, truth, self.dtype, like)
         self.longest = max(settings.horizons.frames) if settings.horizons else 0
         self.last = truth.last_frame_seen(settings.window)
         self.learned = last_trained_on(settings, len(truth.times))
@@ -93,10 +93,10 @@ class TrainingData:
         return trainer, self._window(self.last - self.longest, resolution)
 
     def _frame(self, index: int) -> TrainingFrame:
-        return load_frame(self.truth, index, self.model, self.dtype, self.device, self.settings.wants_fields)
+        return load_frame(self.truth, index, self.model, self.dtype, self.settings.wants_fields)
 
     def _window(self, start: int, resolution: ResolvedVelocity | None) -> TrainingWindow:
-        columns = {name: torch.from_numpy(column).to(self.device)
+        columns = {name: torch.from_numpy(column).to(self.truth.device)
                    for name, column in self.truth.window(start, self.longest).items()}
         later = {name: columns.pop(f"{name}_later").movedim(1, 0).contiguous()
                  for name in ("position", "velocity", "density") if f"{name}_later" in columns}
@@ -113,21 +113,20 @@ class TrainingData:
         return TrainingWindow(particles, later["velocity"], later.get("density"), energies)
 
 
-def model_for(definition: ModelDefinition, truth: GroundTruth, dtype: torch.dtype, device: torch.device,
+def model_for(definition: ModelDefinition, truth: GroundTruth, dtype: torch.dtype,
               like: LagrangianModel | None = None) -> LagrangianModel:
     """The model in the units of a ground truth, with the forcing of that flow. It has initial parameters, or shares
     those of the model `like`."""
-    model = initial_model(definition, truth.scales, truth.decomposition.comm).to(dtype=dtype, device=device)
+    model = initial_model(definition, truth.scales, truth.decomposition.comm).to(dtype=dtype, device=truth.device)
     if like is not None:
         model.share_parameters(like)
     return model.forced(truth.forcing)
 
 
-def training_data(definition: ModelDefinition, settings: Training, truths: Sequence[GroundTruth],
-                  device: torch.device) -> list[TrainingData]:
+def training_data(definition: ModelDefinition, settings: Training, truths: Sequence[GroundTruth]) -> list[TrainingData]:
     """Training data of each ground truth. All share one set of parameters, and the frames are divided evenly."""
     data: list[TrainingData] = []
     for number, truth in enumerate(truths):
         count = len(range(number, settings.frames, len(truths)))
-        data.append(TrainingData(definition, settings, truth, count, device, data[0].model if data else None))
+        data.append(TrainingData(definition, settings, truth, count, data[0].model if data else None))
     return data

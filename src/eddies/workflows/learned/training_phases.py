@@ -1,19 +1,28 @@
-"""The phases of a training on one ground truth or several. The ground truths take turns, one step each; a validation
-error is the mean over them."""
+"""The phases of a training, and the loop over its steps.
+
+Several ground truths take turns, one step each, and a validation error is the mean over them.
+"""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from statistics import fmean
 from typing import TypeVar
 
 import numpy as np
 
+from eddies.clock import ProgressLine
+from eddies.io.guard import Guard
 from eddies.learning.optimization import Adam
-from eddies.learning.training import Phase
+from eddies.learning.training import Phase, Training, TrainingDiverged
+from eddies.parallel.halo import HaloError
 from eddies.particles.feature_range import FeatureRange, pair_features
 from eddies.particles.smoothing_kernels import SmoothingKernel
+from eddies.scene.scene import SceneError
 from eddies.workflows.learned.training_data import TrainingData
+
+log = logging.getLogger("eddies")
 
 # Particles for the validation error of the acceleration, and cubes or batches for that of all losses.
 VALIDATION_PARTICLES, COMBINED_DRAWS = 8192, 8
@@ -95,3 +104,36 @@ def _at_turn(trainers: Sequence[Trainer], step: int) -> Trainer:
 
 def _mean(error: Callable, trainers: Sequence, held_out: Sequence) -> Callable[[], float]:
     return lambda: fmean([error(trainer, moment) for trainer, moment in zip(trainers, held_out)])
+
+
+def take_all_steps(training: Training, guard: Guard, stage: str, section: str, remedy: str,
+                   after_each: Callable[[Training], None] = lambda training: None) -> None:
+    """Run a training to its end, from its newest checkpoint if one exists. Log lines begin with `stage`.
+
+    Raises Stopped after a checkpoint if a stop is requested. Raises SceneError, which names the `section` and the
+    `remedy`, if the training diverges.
+    """
+    saved = guard.checkpoints.newest()
+    if saved is not None:
+        training.load_state_dict(saved)
+        log.info("%s: continues from step %d", stage, training.steps)
+
+    def describe() -> str:
+        last = training.history[-1]
+        errors = [row["validation_error"] for row in training.history if "validation_error" in row]
+        shown = f"  validation error {errors[-1]:.3f}" if errors else ""
+        return f"{training.phase.name}  loss {last['loss']:.4f}{shown}"
+
+    progress = ProgressLine(stage, describe, done=training.done)
+    while training.running:
+        guard(training)
+        phase = training.number
+        try:
+            training.step()
+        except (TrainingDiverged, HaloError) as error:
+            raise SceneError(f"[{section}] {error}; {remedy}") from None
+        if training.running:
+            progress(training.done, training.steps)
+        if training.number != phase:
+            progress.renew()
+        after_each(training)

@@ -32,15 +32,15 @@ def run(scene: Scene, comm: Comm, directory: Path) -> None:
     Tables are copied from the source, except the a-priori tests, which are repeated on this flow. The tests on the flow
     of the training are kept as `source_a_priori` if the source has them. The cost of training is that of the source.
     """
-    device, source, definition = prepare_torch(scene.device, comm), read_source(scene, comm), ModelDefinition.of(scene)
-    slab = SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes)
+    source, definition = read_source(scene, comm), ModelDefinition.of(scene)
+    slab, device = SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes), prepare_torch(scene.device, comm)
     with open_product(comm, directory / STAGES["dns"].file, "ground_truth") as file:
-        truth = GroundTruth(file, slab)
+        truth = GroundTruth(file, slab, device)
         model = with_weights(definition, comm, source.description, source.weights, source.path, truth.scales).to(device)
         model = model.forced(truth.forcing)
         dtype = next((parameter.dtype for parameter in model.parameters()), torch.float64)
         last = truth.last_frame_seen(scene.seen_in(directory))
-        tables = evaluate(truth, model, evaluation_frames(truth), last, dtype, device)
+        tables = evaluate(truth, model, evaluation_frames(truth), last, dtype)
         mach = truth.reference.get("mach_turbulent")
         description = definition.describe(truth.scales) | {"coefficients": model.learned_coefficients}
     if "training" in source.description:

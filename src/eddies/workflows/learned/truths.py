@@ -8,6 +8,8 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+import torch
+
 from eddies.errors import UserError
 from eddies.io.hdf5 import File, open_product
 from eddies.io.trajectories import Trajectory
@@ -21,12 +23,12 @@ from eddies.workflows.ground_truth.truth import GroundTruth
 
 
 @contextmanager
-def open_truths(own_file: Path, named: Sequence[Path], tracers: Tracers,
-                comm: Comm) -> Iterator[tuple[GroundTruth, list[GroundTruth]]]:
+def open_truths(own_file: Path, named: Sequence[Path], tracers: Tracers, comm: Comm,
+                device: torch.device) -> Iterator[tuple[GroundTruth, list[GroundTruth]]]:
     """Open the ground truth of a run, and those that are named for training (if none, that of the run); collective."""
     with ExitStack() as files:
         def opened(path: Path) -> GroundTruth:
-            return _truth_in(files.enter_context(open_product(comm, path, "ground_truth")), tracers, comm)
+            return _truth_in(files.enter_context(open_product(comm, path, "ground_truth")), tracers, comm, device)
 
         own = opened(own_file)
         yield own, [own if path.resolve() == own_file.resolve() else opened(path) for path in named or (own_file,)]
@@ -54,11 +56,12 @@ def truth_problems(scene: Scene, comm: Comm, directory: Path) -> list[str]:
     return problems
 
 
-def _truth_in(file: File, tracers: Tracers, comm: Comm) -> GroundTruth:
+def _truth_in(file: File, tracers: Tracers, comm: Comm,
+              device: torch.device = torch.device("cpu")) -> GroundTruth:
     """An open ground truth, on slabs for its own number of particles."""
     side = round(Trajectory(file, "tracers").total ** (1 / 3))
     planes = replace(tracers, particles_per_side=side).planes
-    return GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, planes))
+    return GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, planes), device)
 
 
 def _problems_of(file: File, scene: Scene, comm: Comm) -> Iterator[str]:

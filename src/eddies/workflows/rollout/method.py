@@ -64,8 +64,7 @@ class Step:
     size: float
 
 
-def make_method(scene: Scene, step: Step | None, truth: GroundTruth, start: int, directory: Path,
-                device: torch.device) -> Method:
+def make_method(scene: Scene, step: Step | None, truth: GroundTruth, start: int, directory: Path) -> Method:
     """The method of a scene, starting at a frame of the truth. A given `step` replaces that of the scene; collective.
 
     With a given step the limit that the resolved velocity sets to steps is ignored.
@@ -77,7 +76,7 @@ def make_method(scene: Scene, step: Step | None, truth: GroundTruth, start: int,
         given = replace(settings, integrator=step.integrator, step=step.size, step_from=None, confirmed_on=None)
         scene = replace(scene, simulation=given)
     kind = load(settings.method) if is_path(settings.method) else METHODS[settings.method]
-    method = kind(scene, truth, start, directory, device)
+    method = kind(scene, truth, start, directory, truth.device)
     if step is not None and isinstance(method, ParticleRun):
         method.limited = False
     return method
