@@ -1,4 +1,4 @@
-"""The examples of the documentation: each trains, runs and reports, from any directory."""
+"""The examples of the documentation train, run and report, from any directory."""
 
 import json
 import logging
@@ -24,7 +24,7 @@ SMALL = ["flow.cells=16", "spin_up.turnovers=0.1", "tracers.particles_per_side=8
 
 
 def results(directory):
-    """Metrics of the report, and what the products say of their model."""
+    """Metrics of the report, and terms and weights of the model."""
     metrics = json.loads((directory / "report" / "metrics.json").read_text())
     assert metrics["rollout"]["status"] == "complete" and math.isfinite(metrics["model"]["acceleration_error"])
     with h5py.File(directory / "model.h5") as file:
@@ -34,7 +34,7 @@ def results(directory):
 
 @pytest.fixture
 def smaller(tmp_path, monkeypatch, no_figures, quick_solves):
-    """A folder to work in, where scenes are smaller."""
+    """The working directory, in which scenes are smaller."""
     load = eddies.load_scene
     monkeypatch.setattr(eddies, "load_scene", lambda name, overrides, removals=(): load(
         name, [*overrides, *SMALL], removals))
@@ -44,7 +44,7 @@ def smaller(tmp_path, monkeypatch, no_figures, quick_solves):
 
 @pytest.fixture
 def example(comm, smaller, examples):
-    """A function that runs an example as on the command line, with smaller scenes; gives its run directory."""
+    """A function that runs an example with smaller scenes and returns its run directory."""
     def run(name):
         runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
         comm.Barrier()
@@ -71,7 +71,7 @@ def test_a_term_of_the_users(example):
     assert metrics["rollout"]["method"].endswith("pressure, SmagorinskyStress, viscosity, relaxation, pairs")
     learned = weights["terms.SmagorinskyStress.squared_constant"]
     assert learned.shape == () and learned > 0 and learned != np.float32(0.17**2)
-    assert "own_term:" in (run / "scene.toml").read_text()  # a run says whose classes it uses
+    assert "own_term:" in (run / "scene.toml").read_text()  # the scene of a run names the classes of the user
 
 
 @pytest.mark.mpi(2)
@@ -87,7 +87,7 @@ def test_a_network_of_the_users(example):
 def test_a_flow_of_the_users(example):
     run = example("own_initial_flow")
     metrics, *_ = results(run)
-    # Spun up for a tenth of a turnover it is still what it began as: rms 1 a component, all three alike.
+    # The short spin-up hardly changes the start, which has an rms of 1 in each component.
     assert metrics["ground_truth"]["energy_budget_error"] < 1e-2
     with h5py.File(run / "ground_truth.h5") as file:
         energies = [file[f"statistics/energy_{axis}"][0] for axis in "xyz"]
@@ -96,14 +96,14 @@ def test_a_flow_of_the_users(example):
 
 @pytest.fixture
 def examples(monkeypatch):
-    """Where a scene beside the examples would find them."""
+    """Make the examples importable."""
     monkeypatch.setattr(sys, "path", [*sys.path, str(EXAMPLES)])
 
 
-@pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("constant", [0.0, 0.17, 0.3])
+@pytest.mark.mpi(2)
+@pytest.mark.parametrize("constant", [0.0, 0.3])
 def test_the_stress_of_the_example_is_linear_as_it_says(comm, examples, constant):
-    """What is kept of it is what it gives, and so is the gradient."""
+    """The stored linear part gives the same rates and gradients as the term."""
     import torch
 
     from eddies.flow.tracers import release
@@ -138,9 +138,8 @@ def test_the_stress_of_the_example_is_linear_as_it_says(comm, examples, constant
     assert constant == 0 or float(found[0][0].square().mean()) > 0
 
 
-@pytest.mark.mpi(1, 2)
-def test_a_term_that_gives_nothing_has_one_error(comm, own):
-    """What is no term or no network at all is refused where the model is made."""
+@pytest.mark.mpi(2)
+def test_a_term_that_returns_nothing_is_one_error(comm, own):
     from eddies.parallel.slab import SlabDecomposition
     from eddies.particles.dynamics import ParticleDynamics
     from eddies.particles.particle_set import ParticleSet
@@ -150,15 +149,15 @@ def test_a_term_that_gives_nothing_has_one_error(comm, own):
     dynamics = ParticleDynamics(SlabDecomposition(comm, LENGTH, 6), model_of(("wrong:Mine",), 1.5, 20, (4,)), 0.0)
     at_rest = ParticleSet.from_numpy({"id": np.array([comm.rank]), "position": np.ones((1, 3)),
                                       "velocity": np.zeros((1, 3))})
-    with pytest.raises(eddies.TermError, match="Mine: forward returns a NoneType; it must return Rates"):
+    with pytest.raises(eddies.TermError, match="Mine: forward returns a NoneType"):
         dynamics.rates(at_rest)
 
 
-@pytest.mark.mpi(1, 2)
-def test_a_wrong_initial_flow_has_one_error(comm, tmp_path, own):
+@pytest.mark.mpi(2)
+def test_a_wrong_initial_flow_is_one_error(comm, tmp_path, own):
     if comm.rank == 0:
         own("wrong", "import numpy\n\ndef flow(grid, initial, seed):\n    return numpy.zeros((3, 4, 4, 4))\n")
     comm.Barrier()
     scene = eddies.load_scene(TINY, [*SMALL, "initial.kind=wrong:flow", "initial.peak_wavenumber=3"])
-    with pytest.raises(eddies.SceneError, match=r'\[initial\] kind = "wrong:flow": returned .*must be the modes'):
+    with pytest.raises(eddies.SceneError, match=r'\[initial\] kind = "wrong:flow": returned'):
         eddies.run(scene, output=tmp_path / "run", comm=comm)

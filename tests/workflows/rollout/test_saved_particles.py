@@ -5,7 +5,7 @@ import pytest
 
 from eddies.io.checkpoint import CheckpointDirectory
 from eddies.parallel.slab import SlabDecomposition
-from eddies.workflows.rollout.saved_rows import restored_rows, saved_rows
+from eddies.workflows.rollout.saved_particles import restored_rows, saved_rows
 
 
 @pytest.mark.mpi(1, 2, 3)
