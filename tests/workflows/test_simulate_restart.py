@@ -173,7 +173,7 @@ def test_a_stopped_rollout_continues_and_leaves_nothing_else(comm, case_of):
     scene, directory = case_of("default")
     names = {path.name for path in directory.iterdir()}
     for number in (1, 2):
-        with pytest.raises(Stopped, match=f"command goes on from step {number} of the rollout"):
+        with pytest.raises(Stopped, match=f"from step {number} of the rollout"):
             simulate.run(scene, comm, directory, StopAtStep(comm, 1))
     comm.Barrier()
     assert {path.name for path in directory.iterdir()} == names | {"checkpoints-rollout"}
@@ -217,7 +217,7 @@ def test_a_method_without_a_state_begins_again(comm, products, tmp_path, own):
             (tmp_path / name).symlink_to(products[0] / "run" / name)
     comm.Barrier()
     scene = with_method(products[1], "own_restarting:Swept")
-    with pytest.raises(Stopped, match="goes on after the last finished stage"):
+    with pytest.raises(Stopped, match="after the last finished stage"):
         simulate.run(scene, comm, tmp_path, StopAtStep(comm, 1))
     simulate.run(scene, comm, tmp_path)
     assert product(comm, tmp_path)["status"] == "complete"

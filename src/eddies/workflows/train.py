@@ -58,9 +58,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         guard = Guard(comm, directory / STAGES["train"].checkpoints, scene.fingerprint("train"), stop,
                       " of the training")
         history, cost, curves = {}, [], None
-        phases = []
-        if next(model.parameters(), None) is not None:
-            phases = [*one_step_phases(data, kernel), *horizon_phases(data)]
+        learns = next(model.parameters(), None) is not None
+        phases = [*one_step_phases(data, kernel), *horizon_phases(data)] if learns else []
         if not phases:
             log.info("train: nothing to learn, because the terms have no parameters or [training] has no steps")
         else:
@@ -74,11 +73,11 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
             tables["feature_range"] = vars(feature_range(data))
         description = definition.describe(truth.scales) | {"training": cost,
                                                            "coefficients": tested.learned_coefficients}
-        mach = "mach_turbulent"
-        provenance = {**scene.provenance("train"), mach: truth.reference.get(mach),
-                      "truths": {str(path): product_provenance(path).get("id") for path in settings.truth_files},
-                      "mach_of_truths": {str(path): each.reference.get(mach)
-                                         for path, each in zip(settings.truth_files, trained_on)}}
+        of_named = {str(path): truth.reference.get("mach_turbulent")
+                    for path, truth in zip(settings.truth_files, trained_on)}
+        provenance = {**scene.provenance("train"), "mach_turbulent": truth.reference.get("mach_turbulent"),
+                      "truths": {path: product_provenance(path).get("id") for path in of_named},
+                      "mach_of_truths": of_named}
     weights = {name: tensor.cpu().numpy() for name, tensor in model.state_dict().items()}
     save_weights(comm, directory / STAGES["train"].file, "model", description, weights, provenance, tables)
     guard.checkpoints.remove()
