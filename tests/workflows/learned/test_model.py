@@ -49,11 +49,13 @@ def saved(comm, directory, of=None, change=lambda weights: weights):
 @pytest.mark.mpi(1, 2)
 def test_a_model_is_read_as_it_was_saved_for_the_scales_of_another_flow(comm, tmp_path):
     of, model, path = saved(comm, tmp_path)
-    other = replace(SCALES, velocity=3.0, sound_speed=5.0)
+    other = replace(SCALES, velocity=3.0, sound_speed=5.0, spacing=2 * SCALES.spacing,
+                    filter_width=2 * SCALES.filter_width)
     loaded = load_model(of, comm, path, other)
     assert list(loaded.terms) == list(model.terms) == list(PRESETS["resolved + pairs"])
     assert all(torch.equal(tensor, loaded.state_dict()[name]) and tensor.dtype == torch.float32
                for name, tensor in model.state_dict().items())
+    assert loaded.flow.cutoff == pytest.approx(2 * model.flow.cutoff)
     assert loaded.flow.scales == other and all(term.flow is loaded.flow for term in loaded.terms.values())
     assert load_weights(comm, path, "model")[0]["scales"] == SCALES.to_dict()
 
