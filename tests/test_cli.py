@@ -131,8 +131,8 @@ def test_what_is_done_is_kept_and_replaced_by_word_alone(comm, tmp_path, capfd):
         comm.Barrier()
         assert run_cli("dns", *ABC, "--output", tmp_path, *options) == code
         comm.Barrier()
-        told = capfd.readouterr()
-        return product.stat().st_mtime_ns > before, told.err if code else told.out
+        output, errors = capfd.readouterr()
+        return product.stat().st_mtime_ns > before, errors if code else output
 
     assert run()[0]
     for options in ((), ("--overwrite",)):

@@ -144,7 +144,7 @@ def test_an_untrained_model_of_smoothed_particles_keeps_momentum_and_integrates_
 
 
 def velocity_error(columns, frame):
-    """Of all particles together, relative to the truth."""
+    """Velocity error of all particles, relative to the truth."""
     model, truth = (columns[name]["velocity"][frame] for name in ("model", "truth"))
     return np.linalg.norm(model - truth) / np.linalg.norm(truth)
 

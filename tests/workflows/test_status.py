@@ -90,7 +90,7 @@ def test_variants_of_one_run_are_compared(comm, tmp_path, capfd):
 
 
 @pytest.mark.mpi(1, 2)
-def test_products_that_are_not_as_written_are_told(comm, tmp_path, capfd):
+def test_damaged_products_are_found(comm, tmp_path, capfd):
     """Also of variants. A link is not another product, and a product of an older version has no checksums."""
     if comm.rank == 0:
         alone = comm.Create_group(comm.group.Incl([0]))
@@ -104,14 +104,14 @@ def test_products_that_are_not_as_written_are_told(comm, tmp_path, capfd):
         write_rollout(alone, tmp_path / "a")
     comm.Barrier()
 
-    def told(code):
+    def verified(code):
         assert run_cli("status", tmp_path, "--verify") == code
         output, errors = capfd.readouterr()
         return [line for line in output.splitlines() if line.startswith(f"{tmp_path}/")], errors
 
     rest = [f"{tmp_path / 'ground_truth.h5'}: as written",
             f"{tmp_path / 'kernel.h5'}: holds no checksums, made by an earlier version"]
-    lines, _ = told(0)
+    lines, _ = verified(0)
     assert lines == ([f"{tmp_path / 'a/rollout.h5'}: as written", *rest] if comm.rank == 0 else [])
     comm.Barrier()
     if comm.rank == 0:
@@ -121,7 +121,7 @@ def test_products_that_are_not_as_written_are_told(comm, tmp_path, capfd):
             file.seek(place + 5000)
             file.write(b"other bytes")
     comm.Barrier()
-    lines, errors = told(2)
+    lines, errors = verified(2)
     if comm.rank == 0:
         assert lines[0].startswith(f"{tmp_path / 'a/rollout.h5'}: particles/model/velocity/value, frame 4")
         assert "damaged" in lines[0] and "`eddies simulate`" in lines[0]

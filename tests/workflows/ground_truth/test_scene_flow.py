@@ -21,7 +21,7 @@ def flow(x, y, z):
 
 
 def stored_velocity(cells=STORED, factor=1.0):
-    """That flow on the points of a file, plus a part with divergence."""
+    """The flow on the points of a file, plus a part with divergence."""
     z, y, x = np.meshgrid(*[2 * np.pi * np.arange(cells) / cells] * 3, indexing="ij")
     velocity = factor * flow(x, y, z)
     velocity[0] += 0.4 * np.sin(x)

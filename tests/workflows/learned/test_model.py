@@ -68,7 +68,7 @@ def test_a_model_without_parameters_is_read_too(comm, tmp_path):
 
 @pytest.mark.mpi(2)
 def test_weights_of_another_model_are_refused(comm, tmp_path):
-    """Of another shape, under another name, and of a scene with another key."""
+    """Weights of another shape or name, or of a scene with another key."""
     for change in (lambda weights: {**weights, "terms.damping.rates": weights["terms.damping.rates"][:3]},
                    lambda weights: {name.replace("factor", "strength"): each for name, each in weights.items()}):
         of, _, path = saved(comm, tmp_path, change=change)
