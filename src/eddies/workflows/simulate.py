@@ -19,7 +19,6 @@ from eddies.particles.devices import prepare_torch
 from eddies.pipeline import STAGES
 from eddies.scene.scene import BOX_LENGTH, Scene
 from eddies.scene.sections import CONVERGED
-from eddies.scene.terms import Forcing
 from eddies.workflows.ground_truth.frame_counts import rollout_start
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.rollout.course import Course, frame_layout
@@ -62,8 +61,9 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                 segments.assemble(file)
                 write_attributes(file.create_group("rollout"), {
                     **outcome, **method.description(), "method": settings.method,
-                    "turnovers": outcome["time"] / turnover, "injection_rate": power_of(forcing),
-                    "truth_injection_rate": power_of(truth.forcing),
+                    "turnovers": outcome["time"] / turnover,
+                    "injection_rate": forcing.injection_rate if forcing else 0.0,
+                    "truth_injection_rate": truth.forcing.injection_rate if truth.forcing else 0.0,
                     "eddy_turnover_time": turnover, "start_time": float(truth.times[start]),
                     "particles": truth.total, "ranks": comm.size})
                 for name, columns in method.series().items():
@@ -72,8 +72,3 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     pace = (pace_in_words(outcome["seconds_per_step"], outcome["storing_share"]) if "seconds_per_step" in outcome
             else "too few steps to time one")
     log.info("rollout: %s after %.2f turnovers, %s", outcome["status"], outcome["time"] / turnover, pace)
-
-
-def power_of(forcing: Forcing | None) -> float:
-    """Power per mass of a forcing, 0 without one."""
-    return 0.0 if forcing is None else forcing.injection_rate

@@ -13,12 +13,11 @@ import torch
 from torch import nn
 from torch.nn.parameter import is_lazy
 
-from eddies.io.hdf5 import ProductError, open_product, read_table
+from eddies.io.hdf5 import ProductError
 from eddies.io.weights import load_weights
 from eddies.parallel.broadcast import first_complaint, share_text
 from eddies.parallel.communicator import Comm
 from eddies.parallel.reduction import any_rank
-from eddies.particles.feature_range import FeatureRange
 from eddies.particles.flow_units import ReferenceScales
 from eddies.particles.forms import Form, form_of
 from eddies.particles.model import LagrangianModel, build_model
@@ -110,12 +109,6 @@ def with_weights(definition: ModelDefinition, comm: Comm, description: Mapping[s
     model.to(getattr(torch, precision))
     model.load_state_dict({name: torch.from_numpy(np.asarray(tensor)) for name, tensor in weights.items()})
     return model
-
-
-def load_feature_range(comm: Comm, path: str | Path) -> FeatureRange:
-    """The range of the network inputs that occurred in training."""
-    with open_product(comm, path, "model") as file:
-        return FeatureRange(**read_table(file, "feature_range"))
 
 
 def load_kernel(comm: Comm, path: str | Path, device: torch.device | str = "cpu") -> HermiteKernel:

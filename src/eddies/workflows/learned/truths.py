@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +17,7 @@ from eddies.parallel.communicator import Comm
 from eddies.parallel.slab import SlabDecomposition
 from eddies.pipeline import STAGES
 from eddies.scene.rules import quoted
-from eddies.scene.scene import BOX_LENGTH, Scene, Tracers
+from eddies.scene.scene import BOX_LENGTH, Scene, Tracers, Training
 from eddies.workflows.ground_truth.frame_counts import trained_frames
 from eddies.workflows.ground_truth.truth import GroundTruth
 
@@ -49,7 +49,8 @@ def truth_problems(scene: Scene, comm: Comm, directory: Path) -> list[str]:
         elif file != own:
             try:
                 with open_product(comm, path, "ground_truth") as opened:
-                    problems += [f"{place}: {problem}" for problem in _problems_of(opened, scene, comm)]
+                    found = _problems_of(opened, scene.training, scene.tracers, scene.model.reads, comm)
+                    problems += [f"{place}: {problem}" for problem in found]
             except UserError as error:
                 problems.append(f"{place}: {error}")
         seen.add(file)
@@ -64,19 +65,20 @@ def _truth_in(file: File, tracers: Tracers, comm: Comm,
     return GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, planes), device)
 
 
-def _problems_of(file: File, scene: Scene, comm: Comm) -> Iterator[str]:
-    """Reasons why an open ground truth of another run does not fit a scene."""
+def _problems_of(file: File, settings: Training, tracers: Tracers, reads: Collection[str],
+                 comm: Comm) -> Iterator[str]:
+    """Reasons why an open ground truth of another run does not fit [training], [tracers] and terms that `reads`."""
     if "particles/tracers" not in file:
         yield "holds no tracers to learn from; give the run of a scene with [tracers]"
         return
-    settings, tracers, truth = scene.training, scene.tracers, _truth_in(file, scene.tracers, comm)
+    truth = _truth_in(file, tracers, comm)
     scales = truth.scales
     here, there = tracers.filter_width / tracers.spacing, scales.filter_width / scales.spacing
     if not math.isclose(here, there, rel_tol=1e-6):
         yield (f"its filter is {there:.9g} mean spacings wide, and [tracers] filter_width = "
                f"{tracers.filter_width:.9g} is {here:.9g}; give another run, or set filter_width = "
                f"{there * tracers.spacing:.9g}")
-    if "density" in scene.model.reads and not truth.has_density:
+    if "density" in reads and not truth.has_density:
         yield ("holds no density, which the terms of [model] read; give a run of a compressible flow, or remove these "
                "terms")
     if settings.batch > truth.total:

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from eddies.io.checkpoint import Checkpoint
+from eddies.io.hdf5 import open_product, read_table
 from eddies.parallel.broadcast import first_complaint
 from eddies.parallel.halo import HaloError
 from eddies.particles.dynamics import ParticleDynamics
@@ -26,7 +27,7 @@ from eddies.scene.scene import Forcing as ForcingSection
 from eddies.scene.scene import Scene
 from eddies.scene.terms import Forcing
 from eddies.workflows.ground_truth.truth import GroundTruth, particles_for
-from eddies.workflows.learned.model import load_feature_range, load_model
+from eddies.workflows.learned.model import load_model
 from eddies.workflows.learned.source import ModelDefinition
 from eddies.workflows.rollout.saved_particles import particle_state, restored_particles
 
@@ -190,7 +191,8 @@ class LearnedRun(ParticleRun):
         if model.integrates_density and self.scales.density is not None:
             self.largest_deviation = RUNAWAY_DENSITY * self.scales.density
         if model.networks:
-            self.seen = load_feature_range(self.comm, path)
+            with open_product(self.comm, path, "model") as file:
+                self.seen = FeatureRange(**read_table(file, "feature_range"))
         return model
 
 
