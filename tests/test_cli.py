@@ -243,16 +243,6 @@ def test_exit_code_of_the_program():
     assert errors.count("did you mean cells?") == 1 and "Traceback" not in errors
 
 
-@pytest.mark.mpi(1)
-def test_threads_per_rank(comm, monkeypatch):
-    monkeypatch.setattr(os, "cpu_count", lambda: 3)
-    for given, used in ((None, "1"), ("", "1"), ("3", "3")):
-        monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
-        if given is not None:
-            monkeypatch.setenv("OMP_NUM_THREADS", given)
-        assert run_cli("scenes") == 0 and os.environ["OMP_NUM_THREADS"] == used
-
-
 @pytest.mark.parametrize("kind, code, message", [("mistake", 2, "rank 1: eddies: error: no such reactor"),
                                                  ("exit", 1, "rank 1: SystemExit: 3")])
 def test_what_ends_one_rank_ends_the_job(tmp_path, kind, code, message):

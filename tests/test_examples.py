@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 import eddies
-from tests.small_scene import TINY
 
 CHECKOUT = Path(__file__).parents[1]
 EXAMPLES = CHECKOUT / "docs" / "examples"
@@ -98,66 +97,3 @@ def test_a_flow_of_the_users(example):
 def examples(monkeypatch):
     """Make the examples importable."""
     monkeypatch.setattr(sys, "path", [*sys.path, str(EXAMPLES)])
-
-
-@pytest.mark.mpi(2)
-@pytest.mark.parametrize("constant", [0.0, 0.3])
-def test_the_stress_of_the_example_is_linear_as_it_says(comm, examples, constant):
-    """The stored linear part gives the same rates and gradients as the term."""
-    import torch
-
-    from eddies.flow.tracers import release
-    from eddies.parallel.reduction import global_sum
-    from eddies.parallel.slab import SlabDecomposition
-    from eddies.particles.dynamics import ParticleDynamics
-    from eddies.particles.particle_set import ParticleSet
-    from tests.learning.models import LENGTH, SPACING, model_of
-
-    terms = ("pressure", "own_term:SmagorinskyStress", "pairs")
-    model = model_of(terms, 1.6 * SPACING, 17, (4,))
-    slab = SlabDecomposition(comm, LENGTH, 12)
-    columns = release(slab, 3, 12, "random")
-    x, y, z = columns["position"].T
-    velocity = np.stack([np.sin(y) + np.cos(2 * z), np.sin(z), np.sin(2 * x)], axis=1)
-    particles = ParticleSet.from_numpy({**columns, "velocity": velocity})
-    dynamics = ParticleDynamics(slab, model, 0.0, torch.float64)
-    kept = model.linear_rates(dynamics.context(particles))
-    assert set(kept) == {"pressure", "SmagorinskyStress"}
-    parameter = model.terms["SmagorinskyStress"].squared_constant
-    with torch.no_grad():
-        parameter.fill_(constant**2)
-    found = []
-    for given in (kept, None):
-        rates = dynamics.rates(particles, kept=given)
-        rates.acceleration.square().sum().backward()
-        found.append((rates.acceleration.detach(), rates.density.detach(),
-                      torch.tensor(global_sum(comm, float(parameter.grad)))))
-        parameter.grad = None
-    for linear, direct in zip(*found):
-        assert torch.allclose(linear, direct, rtol=1e-10, atol=1e-12 * float(direct.abs().max()))
-    assert constant == 0 or float(found[0][0].square().mean()) > 0
-
-
-@pytest.mark.mpi(2)
-def test_a_term_that_returns_nothing_is_one_error(comm, own):
-    from eddies.parallel.slab import SlabDecomposition
-    from eddies.particles.dynamics import ParticleDynamics
-    from eddies.particles.particle_set import ParticleSet
-    from tests.learning.models import LENGTH, model_of
-
-    own("wrong", "import eddies\n\nclass Mine(eddies.Term):\n    def forward(self, context): pass\n")
-    dynamics = ParticleDynamics(SlabDecomposition(comm, LENGTH, 6), model_of(("wrong:Mine",), 1.5, 20, (4,)), 0.0)
-    at_rest = ParticleSet.from_numpy({"id": np.array([comm.rank]), "position": np.ones((1, 3)),
-                                      "velocity": np.zeros((1, 3))})
-    with pytest.raises(eddies.TermError, match="Mine: forward returns a NoneType"):
-        dynamics.rates(at_rest)
-
-
-@pytest.mark.mpi(2)
-def test_a_wrong_initial_flow_is_one_error(comm, tmp_path, own):
-    if comm.rank == 0:
-        own("wrong", "import numpy\n\ndef flow(grid, initial, seed):\n    return numpy.zeros((3, 4, 4, 4))\n")
-    comm.Barrier()
-    scene = eddies.load_scene(TINY, [*SMALL, "initial.kind=wrong:flow", "initial.peak_wavenumber=3"])
-    with pytest.raises(eddies.SceneError, match=r'\[initial\] kind = "wrong:flow": returned'):
-        eddies.run(scene, output=tmp_path / "run", comm=comm)

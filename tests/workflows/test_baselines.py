@@ -8,8 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from eddies.io.hdf5 import open_product
-from eddies.parallel.slab import SlabDecomposition
 from eddies.report.rollout import moved_by
 from eddies.scene.scene import BOX_LENGTH, SceneError, load_scene
 from eddies.workflows.rollout.measured import open_rollout
@@ -107,18 +105,6 @@ def test_particles_without_a_force_keep_their_velocity(comm, folder):
         # Positions are stored in single precision.
         assert np.abs(path - BOX_LENGTH * np.rint(path / BOX_LENGTH)).max() < 2e-6
     comm.Barrier()
-
-
-@pytest.mark.mpi(1)
-def test_without_a_force_there_is_no_list_and_no_halo(comm, folder):
-    from eddies.workflows.ground_truth.truth import GroundTruth
-    from eddies.workflows.rollout.particle_run import BallisticRun
-
-    with open_product(comm, folder / "ground_truth.h5", "ground_truth") as file:
-        truth = GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, 8))
-        run = BallisticRun(load_scene(folder / "baseline.toml"), truth, 1, folder, "cpu")
-    dynamics = run.dynamics
-    assert dynamics.neighborhood is None and dynamics.resolution is None and not dynamics.model.terms
 
 
 @pytest.mark.mpi(1, 2)

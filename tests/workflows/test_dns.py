@@ -1,5 +1,3 @@
-import subprocess
-import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,25 +15,6 @@ from eddies.workflows.ground_truth.scene_flow import build_fluid, initial_state
 from tests.small_scene import TINY
 
 SMALL = ["flow.cells=16", "tracers.particles_per_side=6", "tracers.turnovers=0.05", "tracers.field_cells=8"]
-
-LEFT_OUT = """
-import sys
-from mpi4py import MPI
-from eddies.parallel import halo
-from eddies.parallel.slab import SlabDecomposition
-from eddies.scene.scene import BOX_LENGTH, SceneError, load_scene
-from eddies.workflows import dns
-calls = []
-halo.HaloExchange.__init__ = lambda *a: calls.append("halo")
-dns.run(load_scene("{scene}", {overrides}), MPI.COMM_SELF, sys.argv[1])
-print("torch" in sys.modules, "matplotlib" in sys.modules, calls.count("halo"))
-"""
-
-
-def test_tracers_only_builds_no_particle_halo_and_imports_no_torch(tmp_path):
-    code = LEFT_OUT.format(scene="tracers-only", overrides=SMALL)
-    result = subprocess.run([sys.executable, "-c", code, tmp_path], capture_output=True, text=True, timeout=120)
-    assert result.stdout.split() == ["False", "False", "0"], result.stderr
 
 
 @pytest.mark.mpi(3)

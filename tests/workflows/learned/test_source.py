@@ -82,13 +82,6 @@ def test_a_model_of_another_form_is_refused_with_both_values(comm, tmp_path, own
 
 
 @pytest.mark.mpi(1)
-def test_a_network_with_density_inputs_is_read_by_a_scene_that_has_them(comm, tmp_path):
-    override = f"model.pairs.inputs={INPUTS}"
-    write_source(comm, tmp_path, described(override))
-    assert read_source(scene(f"model.path={tmp_path}", override), comm).description == described(override)
-
-
-@pytest.mark.mpi(1)
 @pytest.mark.parametrize("terms", [("pressure", "pairs"), ("pairs", "pressure", "stress", "damping", "relaxation")])
 def test_other_terms_are_refused_with_both_lists(comm, tmp_path, terms):
     """Another order too, because it changes the rounding of sums."""

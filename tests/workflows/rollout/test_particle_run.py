@@ -90,6 +90,8 @@ def test_every_method_runs_with_the_units_of_the_release(comm, tmp_path):
         assert (particles.density is not None) == made.has_density == (method == "learned")
         assert len(acceleration) == 6**3 and bool(torch.isfinite(acceleration).all())
         assert bool(acceleration.any()) == (method != "none")
+        if method == "none":
+            assert made.dynamics.neighborhood is None and made.dynamics.resolution is None
         simulate.run(own, comm, tmp_path)
         attributes, _, columns = read_rollout(comm, tmp_path)
         assert attributes["status"] == "complete" and attributes["method"] == method
