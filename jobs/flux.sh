@@ -4,10 +4,10 @@
 #flux: --job-name=eddies
 #flux: --nodes=1
 #flux: --nslots=8
-# With T threads a rank: T, and OMP_NUM_THREADS=T in the environment of flux.
+# For T threads per rank: T, and OMP_NUM_THREADS=T in the environment of flux.
 #flux: --cores-per-slot=1
 #flux: --time-limit=4h
-# The ranks are a job of their own inside: SIGUSR1 reaches them five minutes before its limit.
+# The ranks are a job inside the job: SIGUSR1 reaches them five minutes before its limit.
 launcher=(flux run --ntasks=8 --cores-per-task="${OMP_NUM_THREADS:-1}" --time-limit=238m --signal=USR1@5m)
 resubmit=(flux --parent batch jobs/flux.sh)
 

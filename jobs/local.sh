@@ -1,8 +1,7 @@
 #!/usr/bin/env bash
 # Sets up what is missing and runs a scene on the cores of this machine:
 #   bash jobs/local.sh [SCENE] [options of `eddies run`]        default scene: hit-small
-# EDDIES_RANKS limits the number of ranks (default: 8, or what the scene can be cut into, or the cores, where that is
-# less).
+# EDDIES_RANKS limits the number of ranks. The default is the least of 8, the cores, and the ranks that the scene can use.
 set -euo pipefail
 jobs=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 bash "$jobs/../mpi_tools/bootstrap.sh"

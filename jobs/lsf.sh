@@ -3,7 +3,7 @@
 # Submit from the checkout, or set EDDIES_CHECKOUT to it. Load your cluster's modules first, as for set-up.
 #BSUB -J eddies
 #BSUB -n 8
-# With T threads a rank: core(T), and OMP_NUM_THREADS=T in the environment of bsub.
+# For T threads per rank: core(T), and OMP_NUM_THREADS=T in the environment of bsub.
 #BSUB -R "affinity[core(1)]"
 #BSUB -W 4:00
 #BSUB -o eddies.%J.log

@@ -1,11 +1,11 @@
-# The body of every job: runs a scene and goes on after the stages that an earlier job finished. Sourced by the
-# others, which set the arrays
+# Body of every job: runs a scene and continues after the stages that an earlier job finished. The other scripts source
+# it; they set the arrays
 #   launcher  the command that starts the ranks
 #   resubmit  the command that queues this job again on exit code 75, or true
 # Read from the environment of the job:
 #   EDDIES_SCENE     built-in name or path (default: hit-small)
 #   EDDIES_OUTPUT    run directory (default: runs/NAME)
-#   OMP_NUM_THREADS  threads a rank (default: those that Slurm gives a rank, or 1)
+#   OMP_NUM_THREADS  threads per rank (default: the CPUs that Slurm gives a rank, or 1)
 # Arguments go to `eddies run`: --set section.key=value and the like.
 
 checkout=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
@@ -13,10 +13,10 @@ export OMP_NUM_THREADS=${OMP_NUM_THREADS:-${SLURM_CPUS_PER_TASK:-1}}
 arguments=(run "${EDDIES_SCENE:-hit-small}")
 if [ -n "${EDDIES_OUTPUT:-}" ]; then arguments+=(--output "$EDDIES_OUTPUT"); fi
 
-trap : USR1  # some schedulers signal this shell too; the ranks end with 75, it waits for them
+trap : USR1  # some schedulers signal this shell too; it waits for the ranks, which end with 75
 status=0
 "${launcher[@]}" "$checkout/.venv/bin/eddies" "${arguments[@]}" "$@" || status=$?
-if [ "$status" -eq 138 ]; then status=75; fi  # by SIGUSR1, before they could catch it: nothing was begun
+if [ "$status" -eq 138 ]; then status=75; fi  # SIGUSR1 came before the ranks could catch it
 if [ "$status" -eq 75 ]; then
     echo "stopped before the time limit: the same command goes on"
     "${resubmit[@]}" || echo "not queued again, do it by hand: ${resubmit[*]}" >&2

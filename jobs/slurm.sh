@@ -4,14 +4,14 @@
 #SBATCH --job-name=eddies
 #SBATCH --nodes=1
 #SBATCH --ntasks-per-node=8
-# Threads a rank:
+# Threads per rank:
 #SBATCH --cpus-per-task=1
 #SBATCH --time=04:00:00
 # SIGUSR1 to the ranks five minutes before the limit: they end with 75, and the job is queued again.
 #SBATCH --signal=USR1@300
 #SBATCH --requeue
 #SBATCH --open-mode=append
-# The environment of sbatch, modules included; of some variables alone: --export=ALL,EDDIES_SCENE=hit
+# Exports the environment of sbatch with its modules; to set a variable: --export=ALL,EDDIES_SCENE=hit
 #SBATCH --export=ALL
 # Where your cluster asks for them, with a single #:
 ##SBATCH --account=NAME

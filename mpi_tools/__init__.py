@@ -1,1 +1,1 @@
-"""Tools around MPI: set-up, launcher, doctor and the pytest plugin. None of them imports eddies."""
+"""Tools around MPI: set-up, launcher, doctor and the pytest plugin. Of eddies they import only `cores`."""

@@ -1,7 +1,6 @@
 #!/usr/bin/env bash
-# Sets eddies up in this checkout, in .venv: MPI, parallel HDF5 and h5py on it, the pinned Python packages, eddies with
-# its compiled kernels.
-# Safe to repeat and to interrupt; does nothing where nothing has changed.
+# Sets up eddies in this checkout, in .venv: MPI, parallel HDF5 with h5py, the pinned Python packages, and eddies with its
+# compiled kernels. It can be repeated and interrupted, and does nothing if nothing has changed.
 #   EDDIES_PYTHON  the Python to use (3.11 or newer); default: the first of python3, python3.13, .12, .11
 #   HDF5_DIR       parallel HDF5, built with the mpicc on the PATH; default: Debian's, or that of h5pcc
 # On a cluster load the modules for MPI and parallel HDF5 first: system packages are added only where one is missing.
@@ -106,7 +105,7 @@ installed() {
     "$venv/bin/python" -c 'import importlib.metadata, sys; print(importlib.metadata.version(sys.argv[1]))' "$1"
 }
 
-# h5py's wheels carry a serial HDF5; a parallel one is built here and kept for each set of what it depends on.
+# The wheels of h5py contain a serial HDF5. A parallel h5py is built here, and kept for each set of dependencies.
 install_h5py() {
     local hdf5 key wheels build version
     hdf5=$(find_hdf5)
@@ -148,7 +147,7 @@ make_environment
 say "installing Python packages (torch is large)"
 install setuptools wheel cython pkgconfig numpy mpi4py
 install_h5py
-rm -f src/eddies/kernels/*.so  # not written over: a job may have them loaded
+rm -f src/eddies/kernels/*.so  # not overwritten: a job may have loaded them
 if ! install --no-build-isolation --editable '.[test,docs]'; then
     fail "eddies could not be installed, see above; its kernels need a C++17 compiler with OpenMP: install g++"
 fi

@@ -1,8 +1,8 @@
-"""Say what every rank has, and whether messages and parallel files work between them.
+"""Print the libraries of every rank, and test messages and parallel files between the ranks.
 
     python mpi_tools/launch.py -- .venv/bin/python mpi_tools/doctor.py
 
-One line a rank, then a ring test: every rank sends to the next and checks each number that it gets. The exit
+Prints one line per rank. In a ring test every rank sends to the next and checks each number that it receives. The exit
 code is the number of complaints, at most 100.
 """
 
@@ -17,11 +17,11 @@ import numpy as np
 
 RING_NUMBERS = 1 << 20
 RING_ROUNDS = 20
-STARTED = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "SLURM_STEP_NUM_TASKS")  # launchers tell it; the innermost first
+STARTED = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "SLURM_STEP_NUM_TASKS")  # variables of launchers, the innermost first
 
 
 def versions() -> tuple[str, list[str]]:
-    """Versions of the libraries that eddies needs, and what is missing of them."""
+    """Return the versions of the libraries that eddies needs, and complaints about missing ones."""
     found, missing = [], []
     for name in ("numpy", "h5py", "pyfftw", "torch", "matplotlib"):
         try:
@@ -43,21 +43,21 @@ def versions() -> tuple[str, list[str]]:
 
 
 def accelerator(torch) -> str:
-    """Name of the GPU that a rank on this host would use."""
+    """Return the name of the GPU that a rank on this host would use."""
     if not torch.cuda.is_available():
         return "no GPU"
     return f"{torch.cuda.device_count()} x {torch.cuda.get_device_name(0)}"
 
 
 def unconnected(comm: MPI.Comm) -> list[str]:
-    """What to say of ranks that were started and that MPI does not connect."""
+    """Return a complaint if MPI does not connect all ranks that were started."""
     started = next((int(os.environ[name]) for name in STARTED if os.environ.get(name, "").isdecimal()), 0)
     return [f"{started} ranks were started, MPI connects {comm.size} of them: start them with the mpirun of this MPI, "
             "with Slurm by srun --mpi=pmix"] if started > comm.size else []
 
 
 def ring_bandwidth(comm: MPI.Comm) -> tuple[float, list[str]]:
-    """Bandwidth (bytes / s) to the next rank while all send at once, and what arrived wrong."""
+    """Return the bandwidth (bytes / s) to the next rank while all send at once, and complaints about wrong numbers."""
     above, below = (comm.rank + 1) % comm.size, (comm.rank - 1) % comm.size
     outgoing = comm.rank + np.arange(RING_NUMBERS, dtype=float)
     incoming = np.empty_like(outgoing)
@@ -72,7 +72,7 @@ def ring_bandwidth(comm: MPI.Comm) -> tuple[float, list[str]]:
 
 
 def parallel_file(comm: MPI.Comm) -> list[str]:
-    """Complaints about a file in the current folder that all ranks write together."""
+    """Return complaints about a file in the current folder that all ranks write together."""
     import h5py
     number = np.array([os.getpid()])  # a name of its own for each run, the same on all ranks
     comm.Bcast(number)
@@ -90,14 +90,14 @@ def parallel_file(comm: MPI.Comm) -> list[str]:
 
 
 def total(comm: MPI.Comm, number: int) -> int:
-    """Sum over the ranks."""
+    """Return the sum over the ranks."""
     result = np.zeros(1, int)
     comm.Allreduce(np.array([number]), result)
     return int(result[0])
 
 
 def print_in_turn(comm: MPI.Comm, text: str) -> None:
-    """Rank 0 prints the text of every rank, in order, up to 2000 bytes of each."""
+    """Print on rank 0 the text of every rank, in order, up to 2000 bytes of each."""
     mine = np.frombuffer(text.encode()[:2000].ljust(2000), np.uint8)
     texts = np.empty((comm.size, mine.size), np.uint8)
     comm.Gather(mine, texts)
@@ -127,7 +127,7 @@ def main() -> int:
 if __name__ == "__main__":
     try:
         code = main()
-    except Exception:  # on one rank: the others would wait for it for ever
+    except Exception:  # on one rank: the others would wait for it without end
         traceback.print_exc()
         MPI.COMM_WORLD.Abort(1)
     raise SystemExit(code)

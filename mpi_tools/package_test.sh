@@ -1,9 +1,8 @@
 #!/usr/bin/env bash
-# Builds the sdist, and from it the wheel; installs that in an environment of its own, and runs a scene there, shortened,
-# away from the checkout. Without a compiler the build of the wheel must end with what to install.
-# The environment has nothing of its own but the wheel, with --no-deps: a .pth file shows it the packages of .venv, so
-# that torch is not fetched and unpacked once more. The eddies of .venv stays out of sight, as that is itself a .pth
-# file, which Python reads in an environment's own folder alone.
+# Builds the sdist and from it the wheel, installs the wheel in a new environment, and runs a short scene there, outside
+# the checkout. Without a compiler the build of the wheel must fail with the package to install.
+# The environment contains only the wheel. A .pth file adds the packages of .venv, so that torch is not installed again.
+# The eddies of .venv stays hidden: it is itself a .pth file, which Python reads only in an environment's own folder.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 shared=$PWD/.venv

@@ -4,12 +4,12 @@
     def test_sum(comm):
         assert comm.allreduce(1) == comm.size
 
-The pytest process that the user starts (outer) never initialises MPI: Open MPI 4 cannot start mpirun from
-a process that has. It starts one `mpirun -n RANKS python -m pytest MODULES` (inner) for all selected tests with
-the same number of ranks, as starting ranks takes longer than most tests, and reports each of them from the JSON
-lines that every rank writes. Where the ranks disagree about a test, or it lasts longer than its time limit, that
-mpirun ends and a new one runs the tests after it. So tests run in the order of their ranks; those on one rank are
-shared by module among several mpirun. All ranks of a test have the same `tmp_path`, but not `tmp_path_factory`.
+The pytest process that the user starts (outer) never initialises MPI, because Open MPI 4 cannot start mpirun from a
+process that has. It starts one `mpirun -n RANKS python -m pytest MODULES` (inner) for all selected tests with the same
+number of ranks, because starting ranks takes longer than most tests. Every rank writes JSON lines, from which each test
+is reported. If the ranks disagree about a test, or it exceeds its time limit, that mpirun ends and a new one runs the
+tests after it. Tests run in the order of their ranks. Several mpirun share the modules with tests on one rank. All
+ranks of a test have the same `tmp_path`, but not the same `tmp_path_factory`.
 """
 
 import json
@@ -28,11 +28,11 @@ from mpi_tools.launch import local_cores, mpi_environment, mpirun_command
 
 TIMEOUT = 120.0  # seconds for one test on all its ranks
 STALL = 60.0     # seconds without a result, beyond the time limit, after which mpirun itself is given up
-BESIDE = 4       # mpirun of one rank that run beside each other at most, on as many cores
+BESIDE = 4       # largest number of mpirun of one rank that run at the same time
 
 
 def pytest_addoption(parser):
-    parser.addoption("--mpi-run", metavar="DIR", help="of the plugin itself: be a rank of the run in DIR")
+    parser.addoption("--mpi-run", metavar="DIR", help="internal: act as a rank of the run in DIR")
 
 
 def pytest_configure(config):
@@ -60,7 +60,7 @@ def pytest_generate_tests(metafunc):
 
 @pytest.fixture
 def mpi_ranks(request):
-    """Number of ranks of this run of the test."""
+    """Number of ranks on which the test runs."""
     return request.param
 
 
@@ -75,7 +75,7 @@ def comm(pytestconfig):
 
 @pytest.fixture
 def tmp_path(request, pytestconfig, tmp_path):
-    """As in pytest, but one folder for all ranks of an MPI test."""
+    """The tmp_path of pytest, but the same folder for all ranks of an MPI test."""
     folder = pytestconfig.getoption("--mpi-run")
     if not folder:
         return tmp_path
@@ -86,7 +86,7 @@ def tmp_path(request, pytestconfig, tmp_path):
 
 
 class OuterRun:
-    """Puts an `MpiItem` in the place of each marked test and keeps the mpirun of their ranks at hand."""
+    """Replaces each marked test by an `MpiItem` and starts the mpirun of their ranks."""
 
     def __init__(self, config):
         self.config = config
@@ -104,27 +104,27 @@ class OuterRun:
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_runtestloop(self, session):
-        """The tests on one rank run beside each other and beside those that need none: all cores are busy."""
+        """Start the tests on one rank beside each other and beside those without ranks, to keep all cores busy."""
         group, cores, shown = self.waiting.get(1), local_cores(), session.config.option.capture == "no"
         if group and cores > 1 and not shown and not session.config.option.collectonly:
-            os.environ.setdefault("OMPI_MCA_mpi_yield_when_idle", "1")  # a rank that waits leaves its core to them
+            os.environ.setdefault("OMPI_MCA_mpi_yield_when_idle", "1")  # a waiting rank yields its core
             self.start(group, min(cores, BESIDE, len({item.path for item in group})))
             self.ahead = True
 
     def pytest_runtest_logfinish(self):
-        """The next tests start when the ranks before them have ended, not only once all of those are reported."""
+        """Start the next tests when the ranks before them have ended, even if not all of those are reported yet."""
         if self.ahead and self.runs and all(run.process.poll() is not None for run in self.runs):
             later = [ranks for ranks in sorted(self.waiting) if ranks > max(run.ranks for run in self.runs)]
             for ranks in later[:1]:
                 self.start(self.waiting[ranks])
 
     def start(self, items, count=1):
-        """So many mpirun that share these tests."""
+        """Start `count` mpirun that share these tests."""
         first = RankRun(self.config, items)
         self.runs += [first, *(RankRun(self.config, items, first.taken) for _ in range(count - 1))]
 
     def records(self, item) -> list[dict]:
-        """Records of all ranks for a test; where no mpirun reaches it, one starts with it."""
+        """Return the records of all ranks for a test; if no mpirun reaches it, start one with it."""
         group = self.waiting[item.ranks]
         del group[:group.index(item)]
         run = next((run for run in self.runs if run.reaches(item)), None)
@@ -132,7 +132,7 @@ class OuterRun:
             others = [run for run in self.runs if run.ranks == item.ranks and run.process.poll() is None]
             if not others:
                 self.close(item.ranks)
-            # What is left of the module is nobody's; the others have or will take the modules after it.
+            # The rest of the module belongs to no run; other runs take the modules after it.
             self.start([other for other in group if other.path == item.path] if others else group)
             run = self.runs[-1]
             run.reaches(item)
@@ -140,7 +140,7 @@ class OuterRun:
         return run.records(item)
 
     def close(self, most=None):
-        """Ends the runs, or those of so many ranks at most."""
+        """End all runs, or those on at most this number of ranks."""
         for run in [run for run in reversed(self.runs) if most is None or run.ranks <= most]:
             self.runs.remove(run)
             run.close(self.reported)
@@ -173,7 +173,7 @@ class MpiItem(pytest.Item):
                 self.add_report_section(phase, f"{stream} of rank {record['rank']}", text)
         failed = [record for record in records if record["outcome"] == "failed"]
         if failed:
-            # The traceback of the first rank that raised, or where all of them stood.
+            # The traceback of the first rank that raised, or the stacks of all.
             raised = [record for record in failed if record["phase"]][:1]
             raise RankFailure("\n".join(self.describe(record) for record in raised or failed))
         skipped = next((record for record in records if record["outcome"] == "skipped"), None)
@@ -193,9 +193,9 @@ class MpiItem(pytest.Item):
 
 
 class RankRun:
-    """One mpirun of tests on a number of ranks: of the modules that it takes first, where others share them.
+    """One mpirun of tests on a number of ranks. Several runs may share modules; the first that takes one runs it.
 
-    To take a module is to make a link, named by its number, to one's own folder in the folder `taken` of all of them.
+    A run takes a module by a link in the common folder `taken`, named by the module's number, to its own folder.
     """
 
     def __init__(self, config, items: list[MpiItem], taken: Path | None = None):
@@ -206,10 +206,10 @@ class RankRun:
         self.taken.mkdir(exist_ok=True)
         tests = {"timeouts": {item.nodeid: item.timeout for item in items}, "taken": str(self.taken)}
         (self.folder / "tests.json").write_text(json.dumps(tests))
-        self.read, self.found = [0] * ranks, {}  # bytes of each rank's records, and what they say by event and test
+        self.read, self.found = [0] * ranks, {}  # bytes read of each rank's records; entries by event and test
         self.output = open(self.folder / "output", "w+b")
         shown = config.option.capture == "no"
-        # What the plugin left out would warn of is not shown, and it collects garbage for a second at the end.
+        # Warnings of unraisableexception are not shown, and it collects garbage for a second at the end.
         inner = [sys.executable, "-m", "pytest", *map(str, self.modules), f"--mpi-run={self.folder}", "-q",
                  "--color=no", "-p", "mpi_tools.pytest_mpi", "-p", "no:cacheprovider", "-p", "no:unraisableexception",
                  f"--rootdir={config.rootpath}", f"--tb={config.option.tbstyle}",
@@ -222,7 +222,7 @@ class RankRun:
             start_new_session=True)
 
     def entries(self, item: MpiItem, event: str) -> dict[int, dict]:
-        """What the ranks have written about the "start" or the "end" of a test so far."""
+        """Return the entries of the ranks about the "start" or the "end" of a test so far."""
         for rank in range(self.ranks):
             path = self.folder / f"{rank}.jsonl"
             if not path.exists():
@@ -239,7 +239,7 @@ class RankRun:
         return self.found.get((event, item.nodeid), {})
 
     def wait(self, item: MpiItem, event: str, ranks: int) -> dict[int, dict]:
-        """Entries of the event once so many ranks have written one, the run has ended, or another has the module."""
+        """Wait until this number of ranks have an entry of the event, the run ends, or another takes the module."""
         give_up = time.monotonic() + item.timeout + STALL
         while len(self.entries(item, event)) < ranks and self.process.poll() is None and not self.leaves(item):
             if time.monotonic() > give_up:
@@ -248,7 +248,7 @@ class RankRun:
         return self.entries(item, event)
 
     def reaches(self, item: MpiItem) -> bool:
-        """Waits until some rank starts the test; whether one did."""
+        """Wait until a rank starts the test; return whether one did."""
         return item in self.items and bool(self.wait(item, "start", ranks=1))
 
     def leaves(self, item: MpiItem) -> bool:
@@ -257,15 +257,15 @@ class RankRun:
         return link.is_symlink() and os.readlink(link) != str(self.folder)
 
     def records(self, item: MpiItem) -> list[dict]:
-        """Waits until all ranks have ended the test, or the run has; one record a rank."""
+        """Wait until all ranks have ended the test, or the run has ended; return one record per rank."""
         ended = self.wait(item, "end", self.ranks)
         return [ended[rank] if rank in ended else self.lost(rank, item) for rank in range(self.ranks)]
 
     def lost(self, rank: int, item: MpiItem) -> dict:
-        """Record of a rank that never ended the test: the stack that it left, or the output of the run."""
+        """Return the record of a rank that never ended the test: its last stack, or the output of the run."""
         path = self.folder / f"{rank}.stack"
         stack = path.read_text().splitlines() if path.exists() else []
-        # Of the stack, innermost call first, only what lies inside of the test.
+        # The part of the stack, innermost call first, that lies inside the test.
         ours = [index for index, line in enumerate(stack) if "_pytest" in line]
         stack = stack[:ours[0]] if ours else stack
         if stack and stack[0].startswith("Timeout"):
@@ -280,7 +280,7 @@ class RankRun:
                 "sections": []}
 
     def stop(self):
-        """Ends mpirun and with it its ranks."""
+        """End mpirun and its ranks."""
         for number in (signal.SIGTERM, signal.SIGKILL):
             if self.process.poll() is None:
                 os.killpg(self.process.pid, number)
@@ -290,8 +290,7 @@ class RankRun:
                     pass
 
     def close(self, reported: MpiItem | None):
-        """Gives a run whose last test is the one reported the time to end by itself, stops any other, removes the
-        folder."""
+        """Stop the run, unless its last test has been reported and it ends by itself; remove its folder."""
         try:
             self.process.wait(10 if reported is self.items[-1] else 0)
         except subprocess.TimeoutExpired:

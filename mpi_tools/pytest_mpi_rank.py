@@ -12,21 +12,20 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-GRACE = 3.0  # seconds that the other ranks get to end a test that has failed on one
+GRACE = 3.0  # seconds in which the other ranks must end a test that has failed on one
 
 
 class InnerRun:
-    """Runs the tests named in FOLDER/tests.json, of modules that no other run has taken, on this rank and writes
-    FOLDER/RANK.jsonl."""
+    """Runs on this rank the tests of FOLDER/tests.json in free modules, and writes FOLDER/RANK.jsonl."""
 
     def __init__(self, folder: Path):
-        # Of its own: what a failing test leaves unreceived on COMM_WORLD cannot be mistaken on this one.
+        # A communicator of its own: messages that a failing test leaves on COMM_WORLD cannot arrive here.
         self.comm = MPI.COMM_WORLD.Dup()
         tests = json.loads((folder / "tests.json").read_text())
         self.folder, self.taken, self.timeouts = folder, Path(tests["taken"]), tests["timeouts"]
         self.results = open(folder / f"{self.comm.rank}.jsonl", "w", buffering=1)
         self.stack = open(folder / f"{self.comm.rank}.stack", "w")
-        # mpirun ends the ranks of an aborted run with SIGTERM: each then says where it was.
+        # mpirun ends the ranks of an aborted run with SIGTERM: each then writes its stack.
         faulthandler.register(signal.SIGTERM, file=self.stack, chain=True)
 
     @pytest.hookimpl(tryfirst=True)
@@ -36,7 +35,7 @@ class InnerRun:
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_runtestloop(self, session):
-        """As that of pytest, which also ends a run whose modules cannot be collected."""
+        """Run the tests as pytest does, module by module. pytest ends a run whose modules cannot be collected."""
         if session.testsfailed:
             return None
         for number, (_, items) in enumerate(groupby(session.items, key=lambda item: item.path)):
@@ -47,7 +46,7 @@ class InnerRun:
         return True
 
     def take(self, number: int) -> bool:
-        """Whether the module of this number is this run's."""
+        """Return whether this run has the module of this number."""
         link = self.taken / str(number)
         with contextlib.suppress(FileExistsError):
             link.symlink_to(self.folder)
@@ -67,7 +66,7 @@ class InnerRun:
         agree = self.agree(record["outcome"])
         faulthandler.cancel_dump_traceback_later()
         if not agree:
-            os._exit(0)  # MPI_Finalize could wait for what a failed rank has never received
+            os._exit(0)  # MPI_Finalize could wait for a message that a failed rank never received
         return handled
 
     def pytest_runtest_logreport(self, report):
@@ -75,18 +74,18 @@ class InnerRun:
 
     def pytest_sessionfinish(self, session, exitstatus):
         if exitstatus == pytest.ExitCode.TESTS_FAILED:
-            # mpirun would abort the ranks that are still on their way out.
+            # Otherwise mpirun would abort the ranks that have not ended yet.
             session.exitstatus = pytest.ExitCode.OK
 
     def record(self) -> dict:
-        """Outcome of the test on this rank: the first of setup, call and teardown that did not pass."""
+        """Return the outcome of the test on this rank: the first of setup, call and teardown that did not pass."""
         report = next((r for r in self.reports if not r.passed), self.reports[-1])
         return {"rank": self.comm.rank, "outcome": report.outcome, "phase": report.when,
                 "text": reason(report), "expected": hasattr(report, "wasxfail"),
                 "sections": self.reports[-1].sections}
 
     def agree(self, outcome: str) -> bool:
-        """Whether all ranks had this outcome; returns when all have ended the test."""
+        """Return, when all ranks have ended the test, whether all had this outcome."""
         code = ["passed", "skipped", "failed"].index(outcome)
         mine, both = np.array([code, -code]), np.empty(2, int)
         self.comm.Allreduce(mine, both, op=MPI.MAX)
@@ -97,7 +96,7 @@ class InnerRun:
 
 
 def reason(report) -> str:
-    """Traceback, or why the test was skipped or expected to fail."""
+    """Return the traceback, or the reason why the test was skipped or expected to fail."""
     if hasattr(report, "wasxfail"):
         return report.wasxfail
     return report.longrepr[2] if report.skipped else report.longreprtext

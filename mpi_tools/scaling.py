@@ -1,9 +1,9 @@
-"""Measure the step of the direct simulation on several numbers of ranks.
+"""Measure a step of the direct simulation on several numbers of ranks.
 
     .venv/bin/python mpi_tools/scaling.py [--cells 64 128] [--ranks 1 2]
 
-The times are those of tests/benchmarks/step.py, which shows each part against its bound; speed-up and efficiency are
-against the first of RANKS. `tests/benchmarks/projection.py flow` says what larger runs take.
+The times come from tests/benchmarks/step.py, which compares each part with its bound. Speed-up and efficiency are
+relative to the first of RANKS. `tests/benchmarks/projection.py flow` projects larger runs.
 """
 
 import argparse
@@ -13,27 +13,27 @@ import sys
 from pathlib import Path
 
 CHECKOUT = Path(__file__).parents[1]
-# Columns of the table: what the parts of the step's benchmark are summed up to.
+# Columns of the table, and the parts of the step's benchmark that each adds up.
 GROUPS = {"transforms": ("plane transforms", "column transforms"),
           "transposes": ("transposes",),
           "pointwise": ("pairs of planes", "products", "linear operators", "the rest")}
 
 
 def output_of(arguments: list[str], ranks: int = 0) -> str:
-    """What a Python program prints, on so many ranks or without MPI; CalledProcessError if it fails."""
+    """Return the output of a Python program, on some ranks or without MPI; CalledProcessError if it fails."""
     launcher = [sys.executable, CHECKOUT / "mpi_tools/launch.py", "-n", str(ranks), "--"] if ranks else []
     return subprocess.run([*launcher, sys.executable, *arguments], check=True, text=True,
                           stdout=subprocess.PIPE).stdout
 
 
 def measured(cells: int, ranks: int, precision: str, steps: int) -> dict:
-    """The result of the step's benchmark."""
+    """Return the result of the step's benchmark."""
     return json.loads(output_of([str(CHECKOUT / "tests/benchmarks/step.py"), str(cells), "--precision", precision,
                                  "--steps", str(steps), "--json"], ranks))
 
 
 def row(result: dict, first: dict) -> str:
-    """A line of the table, against the result on the first number of ranks."""
+    """Return a line of the table, relative to the result on the first number of ranks."""
     speed_up = first["seconds_per_step"] / result["seconds_per_step"]
     shares = [sum(result["parts"][part] for part in parts) / result["seconds_per_step"] for parts in GROUPS.values()]
     return (f"{result['cells']:5} {result['precision']:>9} {result['ranks']:6} {result['seconds_per_step']:9.4f} "
@@ -43,7 +43,7 @@ def row(result: dict, first: dict) -> str:
 
 
 def positive(text: str) -> int:
-    """An integer of the command line that is larger than zero."""
+    """Return a positive integer of the command line."""
     if not text.isdigit() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"{text!r}: a positive integer is expected")
     return int(text)

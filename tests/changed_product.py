@@ -7,7 +7,7 @@ from pathlib import Path
 import h5py
 from mpi4py import MPI
 
-from eddies.io.verification import add_checksums
+from eddies.io.checksums import add_checksums
 
 
 @contextmanager

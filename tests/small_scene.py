@@ -12,3 +12,10 @@ TINY = str(Path(__file__).with_name("tiny.toml"))
 def one_model(name: str, overrides: Sequence[str] = (), removals: Sequence[str] = ()) -> Scene:
     """A built-in scene without its variants, with the model `resolved` in place of the paper's, and changes of both."""
     return load_scene(name, ["model.preset=resolved", *overrides], ["variant", *removals])
+
+
+def problems_of(scene: Scene, comm) -> tuple[list[str], list[str]]:
+    """Refusals and warnings of all stages of a scene."""
+    from eddies.workflows.problems import here, problems
+    found = problems(scene, here(scene, comm))
+    return [each.text for each in found if each.fatal], [each.text for each in found if not each.fatal]

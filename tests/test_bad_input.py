@@ -1,4 +1,4 @@
-"""Bad files, paths and streams: one line that names what is wrong and what to do, exit code 2, and no traceback."""
+"""Bad files, paths and streams: one line with the problem and a remedy, exit code 2, and no traceback."""
 
 import contextlib
 import json
@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+import eddies
+from eddies.scene.scene import load_scene
 from tests.changed_product import changed
 from tests.small_scene import TINY
 from tests.test_cli import LAUNCHER, run_cli
@@ -19,6 +21,7 @@ from tests.workflows.synthetic_run import write_ground_truth, write_kernel
 
 TEXT = (Path(__file__).parents[1] / "src/eddies/scenes/tiny.toml").read_text()
 NOBODY = 65534
+LONG = 300 * "o"
 
 
 def refused(capfd, comm, *command):
@@ -38,37 +41,38 @@ def program(*arguments, **options):
     return subprocess.run(line, stdin=subprocess.DEVNULL, text=True, timeout=60, stderr=subprocess.PIPE, **options)
 
 
+def python(code, **options):
+    """The ended run of a text of code."""
+    return subprocess.run([sys.executable, "-c", code], text=True, timeout=20, capture_output=True, **options)
+
+
 @pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("value", ["nonsense {", "[1]", "3", '"text"', "{}", "null", 3.5, b"\xff"], ids=repr)
-def test_provenance_that_is_none(comm, tmp_path, capfd, value):
+@pytest.mark.parametrize("value", ["nonsense {", "{}", 3.5], ids=repr)
+def test_damaged_provenance(comm, tmp_path, capfd, value):
     write_ground_truth(comm, tmp_path, frames=2)
     comm.Barrier()
     if comm.rank == 0:
         with changed(tmp_path / "ground_truth.h5") as file:
             file.attrs["provenance"] = value
     comm.Barrier()
-    told = (f"{tmp_path / 'ground_truth.h5'}: its attribute provenance is not what was written, the file is damaged; "
-            "delete it and make it again\n")
-    for command in (["report", tmp_path], ["export", tmp_path], ["simulate", TINY, "--output", tmp_path]):
-        assert refused(capfd, comm, *command).endswith(told) or comm.rank > 0
+    for command in (["report", tmp_path], ["simulate", TINY, "--output", tmp_path]):
+        error = refused(capfd, comm, *command)
+        assert comm.rank > 0 or f"{tmp_path / 'ground_truth.h5'}: its attribute provenance" in error
 
 
 @pytest.mark.mpi(1)
-@pytest.mark.parametrize("name, value, told", [
-    ("kind", 3, "is of kind 3, expected ground_truth: run `eddies dns SCENE` first"),
-    ("kind", [1, 2], "is of kind [1 2], expected ground_truth: run `eddies dns SCENE` first"),
-    ("complete", [True, True], "damaged, its attributes cannot be read"), ("complete", "", "unfinished, its writer"),
-    ("format", [3, 3], "whose ground truth this version does not read; remove it and run `eddies dns` again"),
-    ("format", "three", "whose ground truth this version does not read; remove it and run `eddies dns`")], ids=repr)
-def test_attributes_of_another_type(comm, tmp_path, capfd, name, value, told):
+@pytest.mark.parametrize("name, value, message", [
+    ("kind", [1, 2], "is of kind [1 2], expected ground_truth"), ("complete", "", "unfinished, its writer"),
+    ("complete", [True, True], "attributes cannot be read"), ("format", "three", "does not read; remove it")], ids=repr)
+def test_attributes_of_another_type(comm, tmp_path, capfd, name, value, message):
     write_ground_truth(comm, tmp_path)
     with changed(tmp_path / "ground_truth.h5") as file:
         file.attrs[name] = value
-    assert told in refused(capfd, comm, "report", tmp_path)
+    assert message in refused(capfd, comm, "report", tmp_path)
 
 
 @pytest.mark.mpi(1)
-@pytest.mark.parametrize("value", [None, "nonsense {", "[1]", 3])
+@pytest.mark.parametrize("value", [None, "nonsense {", 3])
 def test_weights_without_a_description(comm, tmp_path, value):
     from eddies.io.hdf5 import ProductError
     from eddies.io.weights import load_weights
@@ -77,131 +81,77 @@ def test_weights_without_a_description(comm, tmp_path, value):
         del file.attrs["description"]
         if value is not None:
             file.attrs["description"] = value
-    with pytest.raises(ProductError, match="kernel.h5: its attribute description is not what was written.*delete it"):
+    with pytest.raises(ProductError, match="kernel.h5: its attribute description"):
         load_weights(comm, tmp_path / "kernel.h5", "kernel")
 
 
 @pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("name, stage", [("ground_truth.h5", "dns"), ("kernel.h5", "train-kernel"),
-                                         ("model.h5", "train"), ("rollout.h5", "simulate")])
-def test_a_directory_in_place_of_a_product(comm, tmp_path, capfd, name, stage):
+@pytest.mark.parametrize("name, stage, made", [
+    ("ground_truth.h5", "dns", Path.mkdir), ("rollout.h5", "simulate", Path.mkdir), ("checkpoints", "dns", Path.touch),
+    ("report", "report", Path.touch)])
+def test_another_kind_of_file_in_place_of_a_product(comm, tmp_path, capfd, name, stage, made):
     if comm.rank == 0:
-        (tmp_path / name).mkdir()
+        made(tmp_path / name)
     comm.Barrier()
-    for command in ("run", stage):
-        told = refused(capfd, comm, command, TINY, "--output", tmp_path)
-        assert comm.rank > 0 or f"{tmp_path / name}: is a directory, and `eddies {stage}` writes a file" in told
-    told = refused(capfd, comm, "report", tmp_path)
-    again = f"{tmp_path / name}: is a directory, not a file; move it away, then run `eddies {stage} SCENE` first"
-    assert comm.rank > 0 or again in told
+    error = refused(capfd, comm, "run", TINY, "--output", tmp_path)
+    assert comm.rank > 0 or f"{tmp_path / name}: is a " in error and f"`eddies {stage}`" in error
     assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
 @pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("name, stage", [("checkpoints", "dns"), ("checkpoints-train", "train"), ("report", "report")])
-def test_a_file_in_place_of_a_directory(comm, tmp_path, capfd, name, stage):
-    if comm.rank == 0:
-        (tmp_path / name).write_text("")
-    comm.Barrier()
-    told = refused(capfd, comm, "run", TINY, "--output", tmp_path)
-    assert comm.rank > 0 or f"{tmp_path / name}: is a file, and `eddies {stage}` makes a directory of this name" in told
-    if stage == "report":
-        told = refused(capfd, comm, "report", tmp_path)
-        assert comm.rank > 0 or "report: is a file, and `eddies report` makes a directory" in told
-    assert [path.name for path in tmp_path.iterdir()] == [name]
-
-
-@pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("content", ["nonsense {", "[1]", "3", '{"dns": "long"}', '{"dns": null}'])
-def test_seconds_that_are_none(comm, tmp_path, capfd, content):
+@pytest.mark.parametrize("content", ["nonsense {", '{"dns": "long"}'])
+def test_damaged_seconds(comm, tmp_path, capfd, content):
     write_ground_truth(comm, tmp_path)
     if comm.rank == 0:
         (tmp_path / "stage_seconds.json").write_text(content)
     comm.Barrier()
-    told = refused(capfd, comm, "report", tmp_path)
-    assert comm.rank > 0 or "stage_seconds.json: is not what the stages wrote; delete it, the report does" in told
-
-
-LONG = 300 * "o"
+    assert "stage_seconds.json: " in refused(capfd, comm, "report", tmp_path) or comm.rank > 0
 
 
 @pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("command, told", [
-    (["run", TINY, "--output", ""], "an empty text is no directory"),
-    (["report", ""], "an empty text is no directory"),
-    (["dns", TINY, "--output", LONG], "cannot be used as a directory: File name too long; choose another"),
-    (["export", "", "--output", "x"], "an empty text is no directory"),
-    (["export", "runs", "--output", LONG], "cannot be used as a directory: File name too long"),
-    (["run", "compare-small", "--output", LONG], "cannot be used as a directory: File name too long"),
-    (["run", "compare-small", "--output", ""], "an empty text is no directory"),
-    (["report", LONG], "cannot be used as a directory: File name too long"),
+@pytest.mark.parametrize("command, message", [
+    (["run", TINY, "--output", ""], "an empty text is no directory"), (["export", ""], "an empty text"),
+    (["run", "compare-small", "--output", LONG], "File name too long"), (["report", LONG], "File name too long"),
     (["check", LONG], "(300 characters): cannot be read: File name too long; give the path of a TOML file"),
-    (["check", "."], ".: is a directory, not a scene; give the path of a TOML file in it"),
-    (["check", ""], "give the path of a TOML file"), (["scenes", "tin"], "tin: no such scene; did you mean tiny?"),
+    (["check", "."], ".: is a directory, not a scene"), (["scenes", "tin"], "tin: no such scene; did you mean tiny?"),
     (["export", "."], ".: holds no fields or particles"), (["report", "."], ".: holds none of ground_truth.h5"),
 ], ids=lambda value: " ".join(value)[:30] if isinstance(value, list) else "")
-def test_paths(comm, tmp_path, monkeypatch, capfd, command, told):
+def test_paths(comm, tmp_path, monkeypatch, capfd, command, message):
     monkeypatch.chdir(tmp_path)
-    assert told in refused(capfd, comm, *command) or comm.rank > 0
+    assert message in refused(capfd, comm, *command) or comm.rank > 0
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.mpi(1)
-def test_a_run_directory_of_a_program_that_is_too_long(comm, tmp_path):
-    import eddies
-    with pytest.raises(eddies.SceneError, match="cannot be used .File name too long.; choose another --output"):
+    with pytest.raises(eddies.SceneError, match="File name too long"):
         eddies.run("abc", output=tmp_path / LONG, comm=comm)
 
 
 @pytest.mark.mpi(1)
-@pytest.mark.parametrize("content, told", [
-    (b"\xff\xfe\x00", "cannot be read: 'utf-8' codec can't decode byte 0xff"),
-    (b"\x00", "not TOML: "), (b"", "[flow]: this section is missing"),
-    (b"\x89HDF\r\n\x1a\n", "cannot be read: 'utf-8'")])
-def test_files_that_are_no_scenes(comm, tmp_path, capfd, content, told):
+@pytest.mark.parametrize("content, message", [(b"\xff\xfe\x00", "cannot be read: 'utf-8'"), (b"\x00", "not TOML: ")])
+def test_files_that_are_not_scenes(comm, tmp_path, capfd, content, message):
     (tmp_path / "case.toml").write_bytes(content)
-    assert f"{tmp_path / 'case.toml'}: {told}" in refused(capfd, comm, "check", tmp_path / "case.toml")
+    assert f"{tmp_path / 'case.toml'}: {message}" in refused(capfd, comm, "check", tmp_path / "case.toml")
 
 
-def test_a_mark_of_the_encoding_is_no_part_of_a_scene(tmp_path):
-    from eddies.scene.scene import load_scene
+def test_a_byte_order_mark_is_not_part_of_a_scene(tmp_path):
     (tmp_path / "tiny.toml").write_text("\ufeff" + TEXT, encoding="utf-8")
     assert load_scene(tmp_path / "tiny.toml") == load_scene("tiny")
 
 
-@pytest.mark.parametrize("key", ["tracers.filter_width", "tracers.field_cells", "time.step", "model.path",
-                                 "model.neighbors", "simulation.start", "time.duration"])
-def test_none_is_a_key_that_is_left_out(key):
-    """As the reference of the keys in the docs calls it."""
-    from eddies.scene.scene import load_scene
-    assert load_scene(TINY, [f"{key}=none"]) == load_scene(TINY)
-
-
-def test_the_filter_of_few_particles_is_read_back(tmp_path):
-    from eddies.scene.scene import load_scene
-    scene = load_scene("tracers-only", ["tracers.particles_per_side=2"])
-    (tmp_path / "tracers-only.toml").write_text(scene.to_toml())
-    assert load_scene(tmp_path / "tracers-only.toml") == scene
-
-
 @pytest.mark.mpi(3)
-def test_a_rank_may_have_a_particle_or_none(comm, tmp_path):
-    few = ["tracers.particles_per_side=2", "tracers.turnovers=0.05", "flow.cells=16"]
-    options = [word for override in few for word in ("--set", override)]
+def test_a_rank_may_have_one_particle_or_none(comm, tmp_path):
+    few = ["tracers.particles_per_side=2", "tracers.turnovers=0.01", "flow.cells=16"]
+    options = [word for each in few for word in ("--set", each)]
     assert run_cli("dns", "tracers-only", *options, "--output", tmp_path) == 0
 
 
 def as_nobody(commands, built_in):
-    """Exit codes and the error output of commands that are run by a user without rights of root, who need not be
-    allowed to read this checkout: all modules and the compiled library are loaded before, and the folder of the
-    built-in scenes is another."""
+    """Exit codes and errors of commands of a user without rights of root, who may not read this checkout: all modules
+    are loaded before, and the folder of the built-in scenes is another."""
     code = ("import encodings.utf_8_sig, importlib, json, os, pathlib, pkgutil, sys, numpy.random, eddies.cli\n"
             "names = [found.name for found in pkgutil.walk_packages(eddies.__path__, 'eddies.')]\n"
             "others = '__main__', 'avx2', 'avx512', 'plain'  # a command, and libraries that are no modules\n"
             "[importlib.import_module(name) for name in names if name.split('.')[-1] not in others]\n"
             "eddies.kernels.library.library()\n"
-            "for module in eddies.scene.scene, eddies.scene.layers:\n"
-            "    module.BUILT_IN = pathlib.Path(sys.argv[2])\n"
+            "eddies.scene.layers.BUILT_IN = pathlib.Path(sys.argv[2])\n"
             f"os.getuid() or (os.setgroups([]), os.setgid({NOBODY}), os.setuid({NOBODY}))\n"
             "print([eddies.cli.main(command) for command in json.loads(sys.argv[1])])")
     ended = subprocess.run([sys.executable, "-c", code, json.dumps(commands), built_in], stdin=subprocess.DEVNULL,
@@ -209,43 +159,32 @@ def as_nobody(commands, built_in):
     return json.loads(ended.stdout), ended.stderr.splitlines()
 
 
-@pytest.fixture
-def open_to_all():
-    """A folder that every user can enter; those of pytest are the owner's."""
-    folder = Path(tempfile.mkdtemp())
-    folder.chmod(0o755)
-    yield folder
-    shutil.rmtree(folder)
-
-
-def test_files_that_may_not_be_read_or_written(open_to_all):
-    from eddies.scene.scene import load_scene
-    assert program("dns", "abc", "--set", "time.duration=0.1", "--output", open_to_all).returncode == 0
-    (open_to_all / "abc.toml").write_text(load_scene("abc").to_toml())  # in place of the built-in one
-    (open_to_all / "case.toml").write_text(TEXT)
-    for name in ("ground_truth.h5", "case.toml"):
-        (open_to_all / name).chmod(0o600)
-    folder = str(open_to_all)
-    cases = [
-        (["report", folder], f"{folder}: cannot be written; change its permissions, or choose another directory"),
-        (["export", folder], "ground_truth.h5: cannot be read: Permission denied; check its permissions"),
-        (["check", f"{folder}/case.toml"], "case.toml: cannot be read: Permission denied; give the path"),
-        (["dns", "abc", "--output", folder], f"{folder}: cannot be written; change its permissions"),
-        (["dns", "abc", "--output", f"{folder}/new"], "new: cannot be written (Permission denied); choose another")]
-    codes, errors = as_nobody([command for command, _ in cases], open_to_all)
+def test_files_that_may_not_be_read_or_written():
+    folder = Path(tempfile.mkdtemp())  # those of pytest are closed to other users
+    try:
+        folder.chmod(0o755)
+        (folder / "abc.toml").write_text(load_scene("abc").to_toml())  # in place of the built-in one
+        for name in ("ground_truth.h5", "case.toml"):
+            (folder / name).write_text(TEXT)
+            (folder / name).chmod(0o600)
+        cases = [(["report", f"{folder}"], f"{folder}: cannot be written"),
+                 (["export", f"{folder}"], "ground_truth.h5: cannot be read: Permission denied"),
+                 (["check", f"{folder}/case.toml"], "case.toml: cannot be read: Permission denied"),
+                 (["dns", "abc", "--output", f"{folder}/new"], "new: cannot be written (Permission denied)")]
+        codes, errors = as_nobody([command for command, _ in cases], folder)
+    finally:
+        shutil.rmtree(folder)
     assert codes == [2] * len(cases) == [2] * len(errors)
-    for line, (_, told) in zip(errors, cases):
-        assert line.startswith("eddies: error: ") and told in line
+    for line, (_, message) in zip(errors, cases):
+        assert line.startswith("eddies: error: ") and message in line
 
 
-@pytest.mark.parametrize("unbuffered", ["1", ""])
-@pytest.mark.parametrize("command", [["scenes"], ["scenes", "tiny"], ["--help"], ["--version"]], ids=" ".join)
-def test_standard_output_that_takes_nothing(command, unbuffered):
+@pytest.mark.parametrize("unbuffered, command", [("1", ["scenes", "tiny"]), ("", ["--help"])])
+def test_standard_output_on_a_full_disk(command, unbuffered):
     with open("/dev/full", "w") as full:
         ended = program(*command, stdout=full, env={**os.environ, "PYTHONUNBUFFERED": unbuffered})
-    assert ended.returncode == 2
-    assert ended.stderr == ("eddies: error: cannot write to standard output: No space left on device; make room, or "
-                            "send it elsewhere\n")
+    assert ended.returncode == 2 and ended.stderr.count("\n") == 1
+    assert ended.stderr.startswith("eddies: error: cannot write to standard output: No space left on device")
 
 
 def test_a_run_goes_on_where_its_lines_cannot_be_written(tmp_path):
@@ -255,19 +194,18 @@ def test_a_run_goes_on_where_its_lines_cannot_be_written(tmp_path):
     assert ended.stderr.count("\n") == 1 and (tmp_path / "ground_truth.h5").exists()
 
 
-@pytest.mark.parametrize("encoding", ["ascii", "latin-1"])
-def test_an_encoding_without_the_letters(encoding, tmp_path):
+def test_an_encoding_without_the_letters(tmp_path):
     (tmp_path / "case.toml").write_text(TEXT.replace('title = "', 'title = "λ ≤ η '), encoding="utf-8")
-    environment = {**os.environ, "PYTHONIOENCODING": encoding}
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
     ended = program("scenes", tmp_path / "case.toml", stdout=subprocess.PIPE, env=environment)
     assert (ended.returncode, ended.stderr) == (0, "") and 'title = "\\u03bb \\u2264 \\u03b7 ' in ended.stdout
 
 
 @contextlib.contextmanager
 def a_simulation(directory, *before):
-    """A direct simulation that is on its way."""
+    """A running direct simulation."""
     line = [*before, sys.executable, "-u", "-m", "eddies", "dns", "hit-small", "--output", directory]
-    # A shell's background job ignores the interrupt, and hands that down.
+    # A shell's background job ignores the interrupt, and its children inherit that.
     job = subprocess.Popen(list(map(str, line)), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
                            stderr=subprocess.PIPE, text=True, start_new_session=True,
                            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
@@ -286,32 +224,29 @@ def test_an_interrupt_stops_at_the_next_step(tmp_path, number):
     with a_simulation(tmp_path) as job:
         job.send_signal(number)
         errors = job.communicate(timeout=30)[1].splitlines()
-    assert job.returncode == 75 and errors[-1].startswith(f"eddies: stopped by {number.name}; the same command goes on")
-    assert errors[:-1] == ["eddies: stops after this step; a second interrupt ends it at once"] * (
-        number == signal.SIGINT)
-    assert not list(tmp_path.rglob("*.partial"))
+    assert job.returncode == 75 and f"stopped by {number.name}" in errors[-1]
+    assert len(errors) == 1 + (number == signal.SIGINT) and not list(tmp_path.rglob("*.partial"))
 
 
 def test_a_second_interrupt_ends_at_once():
-    code = ("import signal, time\nfrom eddies import cli\ncli.catch_signals()\nsignal.raise_signal(signal.SIGINT)\n"
-            "print('goes on', flush=True)\nsignal.raise_signal(signal.SIGINT)\ntime.sleep(30)\n")
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=20)
+    ended = python("import signal, time\nfrom eddies import cli\ncli.catch_signals()\n"
+                   "signal.raise_signal(signal.SIGINT)\nprint('goes on', flush=True)\n"
+                   "signal.raise_signal(signal.SIGINT)\ntime.sleep(30)\n")
     assert (ended.returncode, ended.stdout) == (-signal.SIGINT, "goes on\n")
 
 
-@pytest.mark.parametrize("number", [signal.SIGUSR1, signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGUSR1, signal.SIGINT])
 def test_a_signal_at_the_very_end_changes_nothing(number):
-    """As one that another rank was given a moment before; this one comes once Python has taken its handlers back."""
-    code = ("import ctypes, sys\nfrom eddies import cli\ncli.catch_signals()\n"
-            "send = getattr(ctypes.CDLL(None), 'raise')\nclass Last:\n"
-            f"    def __del__(self, send=send): send({int(number)})\nsys.last = Last()\nsys.exit(75)\n")
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=20)
+    """Another rank may have got it a moment before; here it comes when Python has taken its handlers back."""
+    ended = python("import ctypes, sys\nfrom eddies import cli\ncli.catch_signals()\n"
+                   "send = getattr(ctypes.CDLL(None), 'raise')\nclass Last:\n"
+                   f"    def __del__(self, send=send): send({int(number)})\nsys.last = Last()\nsys.exit(75)\n")
     assert (ended.returncode, ended.stderr) == (75, "")
 
 
 @pytest.mark.parametrize("where", ["a pipe without a reader", "closed"])
-def test_an_interrupt_that_cannot_be_answered_is_noted(tmp_path, where):
-    """Where standard error is closed, another file has its number."""
+def test_an_interrupt_with_no_standard_error_is_noted(tmp_path, where):
+    """If standard error is closed, another file has its number."""
     code = ("import os, signal\nfrom eddies import cli\nreceived = cli.catch_signals()\n"
             "other = os.open('other', os.O_WRONLY | os.O_CREAT)\nsignal.raise_signal(signal.SIGINT)\n"
             "print(received, other)\n")
@@ -324,19 +259,16 @@ def test_an_interrupt_that_cannot_be_answered_is_noted(tmp_path, where):
     assert (tmp_path / "other").read_bytes() == b""
 
 
-def test_a_signal_that_is_ignored_stays_ignored():
-    """As by nohup, and by a shell that starts a job in the background."""
-    code = ("import signal\nfrom eddies import cli\nsignal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
-            "received = cli.catch_signals()\nsignal.raise_signal(signal.SIGHUP)\nprint(received)\n")
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+def test_an_ignored_signal_stays_ignored():
+    """As with nohup, or in a background job of a shell."""
+    ended = python("import signal\nfrom eddies import cli\nsignal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
+                   "received = cli.catch_signals()\nsignal.raise_signal(signal.SIGHUP)\nprint(received)\n")
     assert (ended.returncode, ended.stdout) == (0, "[]\n")
 
 
-def test_an_interrupt_within_code_of_a_string_is_one_like_others(tmp_path):
-    (tmp_path / "job.py").write_text("from eddies import cli\n"
-                                     "cli.run = lambda arguments: exec('raise KeyboardInterrupt')\n"
-                                     "raise SystemExit(cli.main([]))\n")
-    ended = subprocess.run([sys.executable, "-m", "job"], cwd=tmp_path, capture_output=True, text=True)
+def test_an_interrupt_within_executed_text_is_one_line(tmp_path):
+    ended = python("from eddies import cli\ncli.run = lambda arguments: exec('raise KeyboardInterrupt')\n"
+                   "raise SystemExit(cli.main([]))\n", cwd=tmp_path)
     assert (ended.returncode, ended.stderr) == (130, "eddies: interrupted\n")
 
 
@@ -348,21 +280,17 @@ def test_an_interrupted_job_of_two_ranks_ends(tmp_path):
 
 
 @pytest.mark.mpi(1)
-def test_a_flow_that_overflows_is_told_without_the_warnings_of_numpy(comm, tmp_path, capfd):
-    assert "the flow is not finite. Correct what it starts from: amplitude or path" in refused(
-        capfd, comm, "dns", TINY, "--set", "initial.amplitude=1e6", "--set", "forcing.injection_rate=0",
-        "--set", "spin_up.turnovers=1e-4", "--output", tmp_path)
-
-
-@pytest.mark.mpi(1)
-def test_a_supersonic_flow_is_told_as_such(comm, tmp_path, capfd):
-    told = refused(capfd, comm, "dns", TINY, "--set", "flow.sound_speed=0.5", "--output", tmp_path)
-    assert "The flow is supersonic, its turbulent Mach number was 4.3, and shocks are not resolved: raise" in told
+@pytest.mark.parametrize("changes, message", [
+    (["initial.amplitude=1e6", "forcing.injection_rate=0", "spin_up.turnovers=1e-4"], "the flow is not finite"),
+    (["flow.sound_speed=0.5"], "The flow is supersonic")])
+def test_a_flow_that_diverges_is_one_line(comm, tmp_path, capfd, changes, message):
+    options = [word for change in changes for word in ("--set", change)]
+    assert message in refused(capfd, comm, "dns", TINY, *options, "--output", tmp_path)
     assert not list(tmp_path.rglob("*.partial"))
 
 
 @pytest.mark.mpi(1)
-def test_warnings_of_libraries_are_a_line(comm, capfd):
+def test_warnings_of_libraries_are_one_line(comm, capfd):
     import warnings
 
     from eddies.logs import show_warnings
@@ -371,7 +299,6 @@ def test_warnings_of_libraries_are_a_line(comm, capfd):
     assert capfd.readouterr().err.startswith("eddies: warning: of a kind that has lines (test_bad_input.py, line ")
 
 
-def test_years_are_told_as_such():
+def test_times_longer_than_any_run_are_in_years():
     from eddies.clock import duration
     assert duration(86400 * 365.25 * 1.2e30) == "1.2e+30 years" and duration(7500) == "2 h 05 min"
-    assert json.dumps(duration(1e300)) == '"3.2e+292 years"'

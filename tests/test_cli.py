@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from mpi_tools.launch import mpi_environment, mpirun_command
+from eddies.workflows.run_directory.fingerprints import stage_fingerprint
 from tests.bad_scenes import BAD_OVERRIDES, BAD_TEXTS
 from tests.small_scene import TINY
 
@@ -93,7 +94,7 @@ def test_input_of_another_version_is_one_line(comm, tmp_path, capfd):
     from eddies.scene.scene import load_scene
 
     with create_product(comm, tmp_path / "ground_truth.h5", "ground_truth",
-                        {"fingerprint": load_scene(TINY).fingerprint("dns"), "eddies": "0.1.0"}) as file:
+                        {"fingerprint": stage_fingerprint(load_scene(TINY), "dns"), "eddies": "0.1.0"}) as file:
         del file.attrs["format"]
     assert run_cli("train-kernel", TINY, "--output", tmp_path) == 2
     assert one_line(comm, capfd, f"{tmp_path / 'ground_truth.h5'}: written by eddies 0.1.0")
@@ -169,7 +170,8 @@ def test_input_of_other_settings_is_refused(comm, tmp_path, capfd):
     from eddies.scene.scene import load_scene
     from eddies.stages import Step, check_inputs
     scene = load_scene(TINY)
-    with create_product(comm, tmp_path / "ground_truth.h5", "ground_truth", {"fingerprint": scene.fingerprint("dns")}):
+    with create_product(comm, tmp_path / "ground_truth.h5", "ground_truth",
+                        {"fingerprint": stage_fingerprint(scene, "dns")}):
         pass
     check_inputs(Step(scene, ("train-kernel",), tmp_path), comm)
     assert run_cli("train-kernel", TINY, "--set", "seed=2", "--output", tmp_path) == 2
@@ -187,14 +189,12 @@ def test_more_ranks_than_slabs_are_refused_before_any_work(comm, tmp_path, capfd
 
 @pytest.mark.mpi(1)
 def test_limit_of_ranks_is_that_of_the_stages(comm):
-    from types import SimpleNamespace
-
-    from eddies.scene.scene import SceneError, load_scene
-    from eddies.stages import check_ranks
-    check_ranks(["dns"], load_scene(TINY), SimpleNamespace(size=8))
-    check_ranks(load_scene("hit-small").stages, load_scene("hit-small"), SimpleNamespace(size=8))
-    with pytest.raises(SceneError, match="start at most 4"):
-        check_ranks(load_scene(TINY).stages, load_scene(TINY), SimpleNamespace(size=5))
+    from eddies.scene.scene import load_scene
+    from eddies.workflows.foreseen.ranks import rank_problems
+    scene = load_scene(TINY)
+    assert not [*rank_problems(scene, ["dns"], 8), *rank_problems(load_scene("hit-small"), ["dns", "train"], 8)]
+    problem, = rank_problems(scene, scene.stages, 5)
+    assert "start at most 4" in problem
 
 
 @pytest.mark.mpi(1)

@@ -1,4 +1,4 @@
-"""Cores and threads of a process: what OMP_NUM_THREADS may be, for program and launcher alike."""
+"""Cores and threads of a process: program and launcher read OMP_NUM_THREADS alike."""
 
 import os
 import subprocess
@@ -14,7 +14,7 @@ CHECKOUT = Path(__file__).parents[1]
 
 
 @pytest.mark.parametrize("given, threads", [
-    (None, 1), ("", 1), (" ", 1), ("3", 3), (" 4 ,2", 4), ("2,1", 2), ("02", 2)])
+    (None, 1), (" ", 1), ("3", 3), (" 4 ,2", 4), ("02", 2)])
 def test_threads_are_those_of_openmp(monkeypatch, given, threads):
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     if given is not None:
@@ -28,13 +28,12 @@ def test_threads_are_those_of_openmp(monkeypatch, given, threads):
     assert os.environ["OMP_NUM_THREADS"] == started and started.strip()
 
 
-@pytest.mark.parametrize("given", [
-    "auto", "0", "-1", "2.5", "2,", "2,x", "2,0", "\u0662", "\u00b2", "1e3", "2;1", "1_0"])
-def test_what_is_no_number_of_threads_is_told(monkeypatch, given):
-    monkeypatch.setenv("OMP_NUM_THREADS", given)
-    for reader in (cores.threads, launch.default_ranks):
-        with pytest.raises(cores.ThreadsError, match="must be the number of threads that each rank takes"):
-            reader()
+def test_what_is_no_number_of_threads_is_refused(monkeypatch):
+    for given in ("auto", "0", "-1", "2.5", "2,", "2,x", "2,0", "\u0662", "\u00b2", "1e3", "2;1", "1_0"):
+        monkeypatch.setenv("OMP_NUM_THREADS", given)
+        for reader in (cores.threads, launch.default_ranks):
+            with pytest.raises(cores.ThreadsError, match=f'OMP_NUM_THREADS = "{given}": must be'):
+                reader()
 
 
 @pytest.mark.mpi(1)
@@ -42,9 +41,8 @@ def test_more_threads_than_processors_are_refused(comm, monkeypatch, capfd):
     from eddies.cli import main
     monkeypatch.setenv("OMP_NUM_THREADS", "1000")
     assert main(["scenes"]) == 2
-    assert capfd.readouterr().err == (
-        f"eddies: error: OMP_NUM_THREADS = 1000: this machine has {os.cpu_count()} processors, and more threads wait "
-        f"for one another; set it to {os.cpu_count()} or less\n")
+    errors = capfd.readouterr().err
+    assert "OMP_NUM_THREADS = 1000: " in errors and f"set it to {os.cpu_count()} or less\n" in errors
     with pytest.raises(cores.ThreadsError):
         launch.default_ranks()
 

@@ -12,16 +12,16 @@ import pytest
 
 from eddies.cli import main
 from eddies.cli_options import build_parser
-from eddies.scene.methods import METHODS
+from eddies.scene.sections import METHODS
 from eddies.scene.model import Model, settings_class
-from eddies.scene.rules import Boolean, Bounds, Choice, Integer, Integers, Number, Texts, quoted
+from eddies.scene.rules import quoted
 from eddies.scene.scene import BOX_LENGTH, Scene, builtin_scenes, load_scene
 from eddies.scene.sections import Simulation
 from eddies.scene.terms import DEFAULT_PRESET, PRESETS, TERMS
 
 CHECKOUT = Path(__file__).parents[1]
-PAGES = [CHECKOUT / "README.md", *sorted((CHECKOUT / "docs").glob("*.md")),
-         *sorted((CHECKOUT / "docs/notebooks").glob("*.ipynb"))]
+PAGES = [CHECKOUT / "README.md", *(page for pages in ("*.md", "notes/*.md", "notebooks/*.ipynb")
+                                   for page in sorted((CHECKOUT / "docs").glob(pages)))]
 # Programs of the system that are mentioned; what follows them is not looked at, but for paths.
 OF_THE_SYSTEM = ("module", "export", "source", "python3",
                  *(f".venv/bin/{name}" for name in ("pip", "sphinx-build", "jupyter")))
@@ -104,11 +104,12 @@ def test_command_exists(command, folder):
 def test_cheap_command_runs(comm, command, folder, capfd):
     assert main(shlex.split(command)[1:]) == 0
     output = capfd.readouterr().out
-    assert output and "warning" not in output
+    warnings = [line for line in output.splitlines() if "warning" in line and "of memory here" not in line]
+    assert output and warnings == []
 
 
 def test_readme_is_short():
-    assert len(README.encode()) <= 12_000
+    assert len(README.encode()) <= 8_000
 
 
 def test_commands_in_the_text_exist():
@@ -145,22 +146,16 @@ def test_table_of_scenes():
 
 def allowed(rule):
     """The values that a key may have, in few words."""
-    words = [f"`{quoted(word)}`" for word in getattr(rule, "words", ())]
-    path = " or an import path" if getattr(rule, "paths", False) else ""
-    if isinstance(rule, Choice):
-        return ", ".join(words) + path
-    if isinstance(rule, Boolean):
+    words = [f"`{quoted(word)}`" for word in rule.words]
+    if rule.kind is bool:
         return "`true`, `false`"
-    if isinstance(rule, Texts) and words:
-        return f"list of {', '.join(words)}{path}"
-    nouns = {Number: "number", Integer: "integer", Integers: "list of integers", Texts: "list of texts"}
-    noun = nouns.get(type(rule), "text")
+    if rule.kind is str and words:
+        return ("list of " if rule.many else "") + ", ".join(words) + (" or an import path" if rule.paths else "")
+    noun = {float: "number", int: "integer", str: "text"}[rule.kind]
     symbols = {"above": ">", "at_least": "≥", "below": "<", "at_most": "≤"}
-    bounds = getattr(rule, "bounds", Bounds())
-    limits = [f"{symbols[field.name]} {'π' if value == BOX_LENGTH / 2 else format(value, 'g')}"
-              for field in dataclasses.fields(bounds)
-              if (value := getattr(bounds, field.name)) != field.default]
-    return " or ".join([" ".join([noun, " and ".join(limits)]).strip(), *words])
+    limits = " and ".join(f"{symbols[name]} {'π' if bound == BOX_LENGTH / 2 else format(bound, 'g')}"
+                          for name, bound in rule.bounds.given.items())
+    return " or ".join([f"{f'list of {noun}s' if rule.many else noun} {limits}".strip(), *words])
 
 
 def key_row(field):
@@ -189,12 +184,12 @@ def scene_reference():
     fields = dataclasses.fields(Scene)
     lines += [key_row(field) for field in fields if "rule" in field.metadata]
     for field in fields:
-        if "section" in field.metadata:
+        if field.metadata.get("section"):
             kind, default = field.metadata["section"], field.default
             need = ", required" if default is dataclasses.MISSING else ", optional" if default is None else ""
             lines.append(f"| **`[{field.name}]`**{need} | | | *{kind.__doc__.splitlines()[0]}* |")
             lines += [key_row(key) for key in dataclasses.fields(kind) if "rule" in key.metadata]
-            for inner in [key for key in dataclasses.fields(kind) if "section" in key.metadata]:
+            for inner in [key for key in dataclasses.fields(kind) if key.metadata.get("section")]:
                 of_it = inner.metadata["section"]
                 lines.append(f"| **`[{field.name}.{inner.name}]`**, optional | | | *{of_it.__doc__.splitlines()[0]}* |")
                 lines += [key_row(key) for key in dataclasses.fields(of_it)]

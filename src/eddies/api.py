@@ -29,13 +29,10 @@ CHECKPOINT_SECONDS = 600.0
 
 
 def check(scene: Scene | str | Path, *, comm: Comm | None = None) -> None:
-    """Log derived numbers of a scene: resolution, memory, ranks and time. Writes no file."""
+    """Log estimates of a scene: resolution, memory, ranks and time. Writes no file. Raises SceneError where a run would
+    be refused."""
     with _job(comm) as comm:
-        if not isinstance(scene, Scene):
-            scene = load_scene(scene)
-        for each in (scene, *scene.variant.values()):
-            import_module("eddies.workflows.feasibility").check_feasible(each.stages, each, comm)
-        import_module("eddies.workflows.check").run(scene, comm)
+        import_module("eddies.workflows.check").run(scene if isinstance(scene, Scene) else load_scene(scene), comm)
 
 
 def run(scene: Scene | str | Path, *, stages: Sequence[str] | None = None, output: str | Path | None = None,
@@ -91,8 +88,7 @@ def _job(comm: Comm | None) -> Iterator[Comm]:
     from mpi4py import MPI
 
     from eddies.kernels.library import library
-    from eddies.parallel.connection import require_connected
-    from eddies.parallel.rendezvous import all_arrive
+    from eddies.parallel.connection import all_arrive, require_connected
     if comm is None:
         comm = MPI.COMM_WORLD
         require_connected(comm)

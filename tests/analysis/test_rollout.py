@@ -1,4 +1,4 @@
-"""What a rollout is compared with, and at which times."""
+"""Common frames of a rollout and its truth, and the times of its spectra."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ SHELLS, CELLS = np.arange(6), 12
 
 
 class Still:
-    """Particles at rest at some times; the velocities of one frame may not be finite."""
+    """Particles at rest; the velocities of frame `broken` are NaN."""
 
     columns = ("velocity", "acceleration")
 
@@ -21,7 +21,7 @@ class Still:
 
 
 def rollout(model=(0.0, 0.5, 1.0, 1.5), truth=(0.0, 0.5, 1.0), flow=(0.0, 1.0, 1.5, 2.0, 2.5), broken=None, shells=9):
-    """Spectra 2^-k at a time t times e^t and a factor: of the flow, 1.2 of the model and 0.9 of the truth."""
+    """Spectra e^t 2^-k of the flow at time t, 1.2 times as large for the model, 0.9 times for the truth."""
     def energies(times, size, factor=1.0):
         return factor * np.exp(np.asarray(times))[:, None] * 0.5 ** np.arange(size)
 
@@ -31,7 +31,7 @@ def rollout(model=(0.0, 0.5, 1.0, 1.5), truth=(0.0, 0.5, 1.0), flow=(0.0, 1.0, 1
     return Rollout({"start_time": 1.0}, Still(model, broken), Still(truth), 2 * np.pi, table, {}, spectra, None)
 
 
-def test_spectra_are_those_of_a_common_frame_and_of_the_flow_then():
+def test_spectra_at_a_common_frame():
     run = rollout()
     assert run.spectral().tolist() == [0, 1, 2] and run.shown_spectra().tolist() == [0, 1, 2]
     at = run.spectra_at(2)
@@ -40,27 +40,25 @@ def test_spectra_are_those_of_a_common_frame_and_of_the_flow_then():
     assert at.filtered == pytest.approx(np.e**2 * 0.5**SHELLS)
     assert at.error("truth", 4.0) == pytest.approx(1 - np.log(0.9))
     assert at.bands("model", 4.0) == pytest.approx(dict.fromkeys(("1-2", "3-4"), 1.2 / np.e))
-
-
-def test_no_shell_counts_that_one_of_them_has_not():
+    # Only the shells that all have.
     at = rollout(shells=5).spectra_at(0)
     assert list(at.bands("model", 20.0)) == ["1-2", "3-4"] and at.error("truth", 20.0) == pytest.approx(1 - np.log(0.9))
 
 
-def test_frames_between_the_flows_have_no_spectrum_until_the_truth_has_ended():
-    """The flow is known at 0 and 1 of the rollout, and there is no truth at 1.5."""
+def test_frames_without_a_spectrum_of_the_flow():
+    """The flow is stored at times 0 and 1 of the rollout; the truth ends at 1."""
     run = rollout(flow=(1.0, 2.0))
     assert run.spectral().tolist() == [0, 2] and run.late_spectra().tolist() == [2, 3]
     assert rollout(flow=(1.0,), truth=(0.0, 0.5, 1.0, 1.5)).late_spectra().tolist() == [0]
     assert rollout(broken=3).late_spectra().tolist() == [1, 2]
 
 
-def test_common_frames_are_those_of_the_same_time_before_the_model_broke():
+def test_common_frames_before_the_model_broke():
     run = rollout(model=(0.0, 0.25, 0.5, 1.0), broken=3)
     assert run.broken == 1.0 and run.common.model.tolist() == [0, 2] and run.common.truth.tolist() == [0, 1]
     assert run.before_broken("model").tolist() == [0, 1, 2] and run.before_broken("truth").tolist() == [0, 1]
     for alone in (rollout(broken=0), rollout(truth=(7.0,))):
-        with pytest.raises(ValueError, match="no finite frame at a common time"):
+        with pytest.raises(ValueError, match="common time"):
             alone.common
     spread = CommonFrames.of(Still(range(9)), Still(range(9))).spread(3)
     assert spread.tolist() == [0, 4, 8]

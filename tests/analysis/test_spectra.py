@@ -22,18 +22,20 @@ def test_single_mode_lies_in_its_shell(mode, shell):
     assert wavenumber[shell] == shell
 
 
-@pytest.mark.parametrize("cells", [7, 8, 9, 16])
+@pytest.mark.parametrize("cells", [7, 8])
 def test_parseval(cells):
     velocity = np.random.default_rng(2).normal(size=(3, cells, cells, cells))
     _, energy = energy_spectrum(velocity)
     assert energy.sum() == pytest.approx(0.5 * np.mean(np.sum(velocity**2, axis=0)), rel=1e-13)
+    with pytest.raises(ValueError, match="shape"):
+        energy_spectrum(velocity[..., 1:])
 
 
 def test_a_factor_in_every_shell_is_an_error_of_its_logarithm():
     reference = np.array([9.0, 3.0, 0.4, 1e-3, 1e-5, 1e-8])
     for factor in (0.2, -0.2):
         assert spectrum_error(reference * np.exp(factor), reference, 4.7) == pytest.approx(0.2)
-    # Shells 1 to 3 alone count: one off by a factor e^3 among three.
+    # One of the shells 1 to 3 is wrong by a factor e^3.
     energy = reference * [5, 1, 1, np.exp(3), 0, 7]
     assert spectrum_error(energy, reference, 3.9) == pytest.approx(3 / np.sqrt(3))
     assert spectrum_error(energy, reference, 0.5) == 0 and spectrum_error(energy, reference, 4) == np.inf
@@ -59,8 +61,3 @@ def test_vorticity_of_an_abc_flow_is_its_velocity(cells):
         c * np.sin(y) + b * np.cos(x),
     ])
     assert np.allclose(vorticity(flow), flow, atol=1e-13)
-
-
-def test_a_field_of_wrong_shape_is_refused():
-    with pytest.raises(ValueError, match="shape"):
-        energy_spectrum(np.zeros((3, 8, 8, 4)))

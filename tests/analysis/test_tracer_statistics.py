@@ -25,7 +25,7 @@ class Drifting:
 
 
 def spectra(energy):
-    """Those of a field with this energy in one shell, at two of the frames."""
+    """Spectra of a field with this energy in one shell, at two of the frames."""
     return {"time": np.array([0.7, 0.9]), "filtered": np.array([[0, energy], [0, energy]])}
 
 
@@ -33,7 +33,7 @@ def test_known_tracers():
     tracers = Drifting()
     found = tracer_statistics(tracers, spectra(0.5 * np.mean(np.sum(tracers.first**2, axis=1))), SPACING)
     assert found.energy_ratio[0] == pytest.approx(1.0)
-    # Velocities 0.2 later: their variance has grown by that of the acceleration times 0.2^2, to sampling accuracy.
+    # At time 0.2 the variance of the velocities has grown by that of the acceleration times 0.2^2.
     assert found.energy_ratio[1] == pytest.approx(1.04, abs=0.02)
     assert found.energy_error[0] == pytest.approx(np.sqrt(2 / 3 / TOTAL), rel=0.1)
     assert found.acceleration_rms == pytest.approx(np.sqrt(np.mean(tracers.acceleration**2)))
@@ -45,7 +45,7 @@ def test_known_tracers():
     assert distances == pytest.approx(SPACING * np.array([0.5, 1, 2, 4]))
 
 
-def test_kurtosis_is_that_of_the_distribution_and_its_pdf_keeps_its_mass():
+def test_uniform_accelerations_have_a_kurtosis_of_nine_fifths():
     flat = Drifting(acceleration=lambda random: random.uniform(-1, 1, (TOTAL, 3)))
     found = tracer_statistics(flat, spectra(1.5), SPACING)
     assert found.kurtosis == pytest.approx(1.8, abs=0.05)
@@ -58,7 +58,7 @@ def test_two_frames_have_no_exponents():
     assert found.ballistic_prefactor == pytest.approx(1)
 
 
-def test_tracers_whose_velocities_stay_have_no_kurtosis():
+def test_constant_velocities_have_no_kurtosis():
     steady = Drifting(acceleration=lambda random: np.zeros((TOTAL, 3)))
     found = tracer_statistics(steady, spectra(1.5), SPACING)
     assert found.acceleration_rms == 0 and not found.probability.any()

@@ -1,10 +1,10 @@
-"""One iteration of the closure's conjugate gradients and its parts.
+"""Time of one iteration of the closure's conjugate gradients, and of its parts.
 
     mpirun -n 2 .venv/bin/python -m mpi4py tests/benchmarks/closure_iteration.py [PARTICLES A SIDE]
         [--precision float64]
 
-Random particles on a grid of 1.75 planes a particle, modes up to 1.5 times their Nyquist wavenumber, in single
-precision unless asked otherwise, as in a rollout. Prints a JSON line with medians of seconds, of the slowest rank.
+Random particles on a grid of 1.75 planes per particle, modes up to 1.5 times their Nyquist wavenumber, by default in
+single precision, as in a rollout. Prints a JSON line with the median seconds of the slowest rank.
 """
 
 import argparse
@@ -26,7 +26,7 @@ PLANES, HIGHEST, REPEATS, ITERATIONS = 1.75, 0.75, 9, 4
 
 
 def seconds(comm: MPI.Comm, action: Callable[[], object]) -> float:
-    """Median of the times of an action, begun together, the slowest rank's each time."""
+    """Median time of an action that all ranks start together; each time is that of the slowest rank."""
     times = []
     for _ in range(REPEATS + 1):
         comm.Barrier()
@@ -37,7 +37,7 @@ def seconds(comm: MPI.Comm, action: Callable[[], object]) -> float:
 
 
 def measure(comm: MPI.Comm, side: int, dtype: torch.dtype) -> dict[str, float]:
-    """Seconds of each part."""
+    """Seconds of each part of an iteration."""
     slab = SlabDecomposition(comm, 2 * math.pi, int(PLANES * side))
     grid, random = FourierGrid(slab, int(HIGHEST * side), 1, dtype), np.random.default_rng(1)
     position, velocity = random.uniform(0, slab.length, (side**3, 3)), random.standard_normal((side**3, 3))

@@ -1,11 +1,11 @@
-"""Error over the width of the filter in Kolmogorov lengths, from the results of several comparisons.
+"""Figure of the error over the filter width in Kolmogorov lengths, from the results of several comparisons.
 
     .venv/bin/python tests/benchmarks/filter_width.py docs/results/compare-small.json docs/results/compare-hit.json \
         docs/results/compare-coarse.json docs/results/compare-256-32.json docs/results/compare-256.json \
         docs/error-over-filter-width.png
 
-Beside the variants of the same names in all of them stands, of the coarse grids that take no longer than the learned
-model in the same run, the one with the least error.
+It shows the variants of the same names in all comparisons, and the best coarse grid: the one with the smallest error
+of those that take no longer than the learned model in the same run.
 """
 
 import json
@@ -21,7 +21,7 @@ from eddies.report.variants import in_symbols, is_stable
 from eddies.report.figures import DNS, FILTERED, FOURTH, MODEL, SECOND, THIRD, TRUTH, letter, panels, png, styled
 
 DRAWN = ("velocity_error_half", "acceleration_kl")
-# Words, colour and marker of the variants.
+# Label, colour and marker of the variants.
 LOOKS = {"learned": ("the resolved velocity", MODEL, "o"), "with-pairs": ("and pairs", SECOND, "^"),
          "grid": ("best grid of its cost", TRUTH, "s"), "paper": ("the paper's form", THIRD, "D"),
          "transport-velocity": ("transport-velocity SPH", FOURTH, "v"),
@@ -36,7 +36,7 @@ def width_of(result: Mapping[str, Any]) -> float:
 
 
 def best_grid(rows: Mapping[str, Row], measure: str) -> Row | None:
-    """The coarse grid with the least error of those that take no longer than the learned model."""
+    """The coarse grid with the smallest error of those that take no longer than the learned model."""
     rivals = [row for row in rows.values() if row["method"] == "eulerian"
               and None not in (row[measure], row["wall_seconds"])
               and row["wall_seconds"] <= rows["learned"]["wall_seconds"]]
@@ -44,7 +44,7 @@ def best_grid(rows: Mapping[str, Row], measure: str) -> Row | None:
 
 
 def points(results: Iterable[Mapping[str, Any]], name: str, measure: str) -> list[tuple[float, float, float, str]]:
-    """d/eta, error, its spread, and the variant that it is of, for every comparison that has one."""
+    """d/eta, error, its spread and the name of the variant, for every comparison that has it."""
     found = []
     for result in results:
         rows = {row["name"]: row for row in result["rows"] if is_stable(row)}

@@ -1,9 +1,9 @@
-"""What a part of a scene costs: times with and without it, side by side. A script, about a minute long.
+"""Cost of the parts of a scene: times with and without each part. Takes about a minute.
 
     python mpi_tools/launch.py -n 1 -- python tests/benchmarks/leave_out.py [--repetitions 20]
 
-Prints a Markdown table: median seconds of a call and messages that it sends, with the part and without. What belongs to
-a pair is measured in turn, so that both see the same machine.
+Prints a Markdown table: median milliseconds and messages of a call, with the part and without. Both calls of a pair are
+measured in turn, so that they see the same load of the machine.
 """
 
 import argparse
@@ -18,12 +18,13 @@ from mpi4py import MPI
 HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE.parent / "validation"), str(HERE.parents[1])]
 
-from test_leave_out import CountingComm, combined_step, fluid_of, particle_step  # noqa: E402
+from test_leave_out import combined_step, fluid_of, particle_step  # noqa: E402
 
 from eddies.scene.terms import PRESETS  # noqa: E402
+from tests.parallel.counting import CountingComm  # noqa: E402
 from tests.particles.configurations import OWN_DENSITY  # noqa: E402
 
-Call = tuple[Callable[[], object], list]  # what is measured, and the list that notes its messages
+Call = tuple[Callable[[], object], list]  # a function to measure, and the list of its messages
 
 
 def step_of(comm, terms) -> Call:
@@ -38,11 +39,11 @@ def evaluation_of(comm, compressible: bool, forced: bool) -> Call:
 
 
 def pairs_of_calls(comm) -> dict[str, tuple[Call, Call]]:
-    """By part: the call with it, and without."""
+    """For each part the call with it and the call without it."""
     everything = {"field": 1.0, "velocity_kl": 0.1, "acceleration_kl": 0.1}
     without = {name: {key: weight for key, weight in everything.items() if key != name} for name in everything}
     pressure, resolved, learned = {"pressure": {}, "pairs": {}}, PRESETS["resolved"], OWN_DENSITY
-    stress = {**resolved, "pairs": {}}  # told the densities, as beside the pressure alone
+    stress = {**resolved, "pairs": {}}  # the pairs read densities, as beside the pressure alone
     steps = {
         "pair force": (learned, {}),
         "pressure and its force": (pressure, learned),
@@ -61,7 +62,7 @@ def pairs_of_calls(comm) -> dict[str, tuple[Call, Call]]:
 
 
 def measure(comm, pair: tuple[Call, Call], repetitions: int) -> list[tuple[float, int]]:
-    """Median seconds and messages of both calls."""
+    """Median seconds and number of messages of both calls."""
     seconds, messages = [[], []], [0, 0]
     for _ in range(repetitions):
         for index, (call, sent) in enumerate(pair):

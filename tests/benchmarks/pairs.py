@@ -1,10 +1,10 @@
-"""Sums over pairs alone, search included, and gradients by the parameters: the preset `paper`, and a network 16-16.
+"""Time of sums over pairs, search included, and of gradients by the parameters: the preset `paper` and a network 16-16.
 
     OMP_NUM_THREADS=1 .venv/bin/python tests/benchmarks/pairs.py [PARTICLES A SIDE] [LIBRARY ...]
 
-Seconds of processor time, the least of several by turns, at random particles with 60 neighbours in single precision;
-and what 64^3 particles take so on two cores. Libraries, as src/eddies/kernels/avx2.so, may be those of another version
-whose calls are the same: results are held against those of the first.
+Prints processor seconds, the least of several turns, for random particles with 60 neighbours in single precision, and
+the seconds that 64^3 particles would take on two cores. Libraries, such as src/eddies/kernels/avx2.so, may come from
+another version with the same calls. Results are compared with those of the first library.
 """
 
 import argparse
@@ -22,14 +22,14 @@ NEIGHBORS, REPEATS = 60, 7
 
 
 def network(*widths: int) -> np.ndarray:
-    """Parameters."""
+    """Random parameters of a network."""
     random = np.random.default_rng(widths)
     return np.concatenate([random.normal(scale=scale, size=size) for inputs, outputs in zip(widths, widths[1:])
                            for scale, size in ((inputs**-0.5, inputs * outputs), (0.1, outputs))])
 
 
 def published(unit: float, *hidden: int) -> tuple[list[tuple[Summand, np.ndarray]], bool]:
-    """The four sums of the published form, with `unit` vectors or not."""
+    """The four sums of the published form, with or without `unit` vectors."""
     return [(Summand("pair-network", (2, 0, 1, 1, 1, 1, unit, 0, 0, *hidden), (-1.0,) * 6), network(5, *hidden, 2)),
             (Summand("eddy-viscosity", (2, 0.1, 0, unit, 1e-6 if unit else 1), (-1.0,) * 3), np.full(2, 0.1)),
             (Summand("pair-network", (1, 0, 1, 1, 1, 1, 0, 0, 1, *hidden), (-1.0,)), network(5, *hidden, 1)),
@@ -46,7 +46,7 @@ MODELS = {
 
 
 def actions(library: ctypes.CDLL, side: int) -> dict[str, Callable[[], list[np.ndarray]]]:
-    """What is timed, by name."""
+    """The actions to time, by name."""
     random, count = np.random.default_rng(1), side**3
     radius = (NEIGHBORS / count * 3 / (4 * math.pi)) ** (1 / 3)
     columns = random.uniform(size=(count, 3)), random.normal(size=(count, 3)), random.normal(size=(1, count))

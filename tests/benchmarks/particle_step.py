@@ -1,12 +1,12 @@
-"""An evaluation of a particle model within a rollout, and its parts.
+"""Time of an evaluation of a particle model in a rollout, and of its parts.
 
     mpirun -n 2 .venv/bin/python -m mpi4py tests/benchmarks/particle_step.py [PARTICLES A SIDE] [--model NAME]
         [--threads T] [--precision float64]
 
-Particles at random in a solenoidal velocity of a turbulent spectrum, filtered at two particle spacings, are moved by a
-model of initial weights, but for the damping, which is that learned in hit-small. Steps are as long as a rollout takes
-them. Ten go before those that count. Prints a JSON line with medians over the steps: seconds an evaluation, of the
-slowest rank, and of it each part; iterations of a solve; evaluations and seconds for a turnover of the field.
+A model with initial weights, and the damping learned in hit-small, moves random particles in a solenoidal velocity with
+a turbulent spectrum, filtered at two particle spacings. Steps have the length of a rollout; ten steps warm up. Prints a
+JSON line with medians over the steps: seconds per evaluation of the slowest rank and of each part, iterations of a
+solve, and evaluations and seconds per turnover of the field.
 """
 
 import argparse
@@ -47,7 +47,7 @@ from eddies.spectral.spectral_grid import SpectralGrid
 
 WARM_UP, STEPS, INTEGRATOR, NEIGHBORS = 10, 6, "rk3", 60.0
 DAMPING = (0.0, 0.0, 0.01, 0.14, 1.0, 1.6)
-PAIR_SHARE = 0.03  # of the acceleration, about what a trained network adds: one that is as large blows the flow up
+PAIR_SHARE = 0.03  # of the acceleration, about the share of a trained network; a larger one makes the flow unstable
 ETA = 1.5
 PARTS = {
     "transforms": [(SpectralGrid, name) for name in ("forward", "backward", "squares")],
@@ -61,7 +61,7 @@ PARTS = {
 
 
 def filtered_velocity(comm: MPI.Comm, side: int, width: float) -> tuple[SpectralGrid, np.ndarray]:
-    """A grid of two cells a particle and direction, and modes on it: rms 1 a component before the filter."""
+    """A grid of two cells per particle and direction, and filtered modes; rms 1 per component before the filter."""
     grid = SpectralGrid(SlabDecomposition(comm, 2 * math.pi, 2 * side), cutoff=side - 1)
     modes = random_velocity(grid, 1, 1.0, side)
     k, energy = energy_spectrum(grid, modes)
@@ -73,7 +73,7 @@ def filtered_velocity(comm: MPI.Comm, side: int, width: float) -> tuple[Spectral
 
 
 class Run:
-    """Particles and what moves them, from the beginning."""
+    """Particles and the model that moves them."""
 
     def __init__(self, comm: MPI.Comm, side: int, model: str, precision: str) -> None:
         tracers = Tracers(particles_per_side=side, turnovers=1.0, frame_interval=1.0)
@@ -100,13 +100,13 @@ class Run:
 
     @staticmethod
     def _velocity(grid: SpectralGrid, modes: np.ndarray, position: np.ndarray) -> np.ndarray:
-        # The slabs of the particles are not cut where those of the field are.
+        # The slabs of particles and field have different boundaries.
         spline = SplineInterpolation(grid, "quintic", margin=2)
         return spline.at(spline.coefficients(modes), position)
 
     @property
     def step(self) -> float:
-        """As long as the flow allows."""
+        """The longest step that the flow allows."""
         resolution = self.dynamics.resolution
         if resolution is None:
             raise SystemExit("particle_step: the model has no resolved velocity, which sets the step")
@@ -119,7 +119,7 @@ class Run:
 
 
 def measure(comm: MPI.Comm, run: Run) -> dict[str, object]:
-    """Medians over steps; of each the seconds of the slowest rank."""
+    """Medians over steps of the seconds of the slowest rank."""
     watch = Stopwatch()
     for part, functions in PARTS.items():
         for owner, name in functions:
@@ -148,10 +148,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("side", nargs="?", type=int, default=64)
     parser.add_argument("--model", choices=[name for name in PRESETS if "resolved" in name], default=DEFAULT_PRESET)
-    parser.add_argument("--threads", type=int, default=threads(), help="a rank; OMP_NUM_THREADS unless given")
+    parser.add_argument("--threads", type=int, default=threads(), help="per rank; default OMP_NUM_THREADS")
     parser.add_argument("--precision", choices=("float32", "float64"), default="float32")
     options, comm = parser.parse_args(), MPI.COMM_WORLD
-    os.environ["OMP_NUM_THREADS"] = str(options.threads)  # for what is loaded and planned from here on
+    os.environ["OMP_NUM_THREADS"] = str(options.threads)  # for libraries and plans from here on
     for runtime in (torch.set_num_threads, library().omp_set_num_threads):
         runtime(options.threads)
     with torch.no_grad():

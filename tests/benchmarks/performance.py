@@ -1,12 +1,12 @@
-"""What an evaluation of a particle model costs, over particles, ranks and threads: measured and bounded.
+"""Cost of an evaluation of a particle model over particles, ranks and threads: measurements, bounds and figure.
 
     OMP_NUM_THREADS=1 .venv/bin/python tests/benchmarks/performance.py measure docs/performance.json  # 10 min
-    .venv/bin/python tests/benchmarks/projection.py particles docs/performance.json  # what follows for more cores
+    .venv/bin/python tests/benchmarks/projection.py particles docs/performance.json  # projection to more cores
     .venv/bin/python tests/benchmarks/performance.py draw docs/performance.json docs/performance.png
 
-Measures by the programs beside it, each a job of its own: `particle_step.py` on one rank, on one rank of two threads
-and on two ranks, `step.py` for the grid of 1.5 cells a particle and direction that the same filter would take, and the
-least that pairs, transforms and splines could take: their arithmetic at the speed of a matrix product, or FFTW alone.
+Runs other programs of this folder: `particle_step.py` on one rank, on one rank with two threads and on two ranks, and
+`step.py` for a grid of 1.5 cells per particle and direction, which the same filter would need. The bounds of pairs and
+splines are their arithmetic at the speed of a matrix product, that of transforms is FFTW alone.
 """
 
 import argparse
@@ -31,19 +31,19 @@ from eddies.workflows.variant_rows import processor
 
 HERE = Path(__file__).parent
 LAYOUTS, MODELS, SIDES = ((1, 1), (1, 2), (2, 1)), ("resolved", "resolved + pairs"), (16, 24, 32, 48, 64, 96)
-ALL_LAYOUTS = 64             # particles a side; on two ranks alone beyond
+ALL_LAYOUTS = 64             # particles per side; larger ones run on two ranks only
 CELLS_A_PARTICLE = 1.5
-# Of the network 16-16, once a pair: multiplications with additions, and tanh as eleven of them.
+# Operations of the network 16-16 per pair: multiplications with additions; a tanh counts as eleven.
 PAIR_FLOPS = 2 * (3 * 16 + 16 * 16 + 16 * 2 + 32 * 11)
-SPLINE_FLOPS = 2 * 4**3      # of a component at a particle
-# Components of transforms and splines in an evaluation, beside six in each iteration.
+SPLINE_FLOPS = 2 * 4**3      # per component and particle
+# Components of transforms and splines in an evaluation, in addition to six in each iteration.
 TRANSFORMED, INTERPOLATED = 31, 13
-# 64^3 particles: notebooks published with the method, force and neighbours, on two cores; the paper, on one A100.
+# Seconds for 64^3 particles: the notebooks published with the method on two cores, and the paper on one A100.
 NOTEBOOKS, PAPER = 46.0, 0.5
 
 
 def measure() -> dict:
-    """All of it."""
+    """All measurements and bounds."""
     found: dict = {"processor": processor(), "cores": os.cpu_count(), "steps": [], "grid": []}
     for side in SIDES:
         for model in MODELS:
@@ -56,7 +56,7 @@ def measure() -> dict:
 
 
 def of_job(ranks: int, threads: int, program: str, *arguments: object) -> dict:
-    """The last line of a program on so many ranks, which is JSON."""
+    """The JSON in the last line of a program on some ranks."""
     command = [sys.executable, HERE.parents[1] / "mpi_tools/launch.py", "-n", ranks, "--", sys.executable, "-m",
                "mpi4py", HERE / program, *arguments]
     done = subprocess.run(list(map(str, command)), env={**os.environ, "OMP_NUM_THREADS": str(threads)}, check=True,
@@ -67,14 +67,15 @@ def of_job(ranks: int, threads: int, program: str, *arguments: object) -> dict:
 
 
 def scene_of(side: int, model: str) -> Scene:
-    """`hit` with more particles and cells."""
+    """`hit` without variants, with other numbers of particles and cells."""
     return load_scene("hit", [f"tracers.particles_per_side={side}", f"flow.cells={4 * side}",
                               f"tracers.field_cells={round(CELLS_A_PARTICLE * side)}",
-                              f"flow.viscosity={0.0072 * (32 / side) ** (4 / 3)}", f'model.preset="{model}"'])
+                              f"flow.viscosity={0.0072 * (32 / side) ** (4 / 3)}", f'model.preset="{model}"'],
+                      ["variant"])
 
 
 def bounds(iterations: float) -> dict[str, float]:
-    """Seconds of parts of an evaluation with 64^3 particles on one core, at best."""
+    """Lower bounds of the seconds of parts of an evaluation with 64^3 particles on one core."""
     a, b = np.ones((2, 1024, 1024), np.float32)
     flops = 2 * 1024**3 / best(lambda: a @ b)
     scene = scene_of(64, MODELS[1])
@@ -88,7 +89,7 @@ def bounds(iterations: float) -> dict[str, float]:
 
 @styled
 def draw(found: dict) -> bytes:
-    """Over particles; parts and bounds; over cores."""
+    """Figure: seconds over particles, parts with bounds, and seconds over cores."""
     figure, (axes,) = panels(1, 3, (4.2, 3.6))
     over_particles(axes[0], found)
     parts(axes[1], found)
@@ -98,13 +99,13 @@ def draw(found: dict) -> bytes:
 
 
 def seconds_of(found: dict, model: str, ranks: int, threads: int) -> tuple[np.ndarray, np.ndarray]:
-    """Particles a side and seconds an evaluation of a layout."""
+    """Particles per side and seconds per evaluation of a layout."""
     rows = [row for row in found["steps"] if (row["model"], row["ranks"], row["threads"]) == (model, ranks, threads)]
     return np.array([row["particles"] for row in rows]), np.array([row["seconds_per_evaluation"] for row in rows])
 
 
 def over_particles(axis: Axes, found: dict) -> None:
-    """Seconds an evaluation on two ranks, with slopes."""
+    """Seconds per evaluation on two ranks, with slopes."""
     for model, colour in zip(MODELS, (TRUTH, MODEL)):
         side, seconds = seconds_of(found, model, 2, 1)
         slope = np.polyfit(np.log(side[2:] ** 3), np.log(seconds[2:]), 1)[0]
@@ -122,7 +123,7 @@ def over_particles(axis: Axes, found: dict) -> None:
 
 
 def parts(axis: Axes, found: dict) -> None:
-    """Parts of an evaluation with 64^3 particles by layout, and what they could take at least."""
+    """Parts of an evaluation with 64^3 particles by layout, and their lower bounds."""
     names = ("pairs", "transforms", "splines", "settle", "the rest")
     for number, (ranks, threads) in enumerate(LAYOUTS):
         row = next(row for row in found["steps"] if (row["particles"], row["model"], row["ranks"], row["threads"])
@@ -144,7 +145,7 @@ def parts(axis: Axes, found: dict) -> None:
 
 
 def over_cores(axis: Axes, found: dict) -> None:
-    """What is projected for more cores, and what was measured on one and two."""
+    """Projection to more cores, and measurements on one and two."""
     sides = dict.fromkeys(row["particles"] for row in found["projected"])
     for side, colour in zip(sides, (TRUTH, MODEL, SECOND, THIRD)):
         rows = [row for row in found["projected"] if row["particles"] == side]

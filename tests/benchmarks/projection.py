@@ -1,12 +1,12 @@
-"""What an evaluation of the particles costs on up to 4096 cores, and the direct simulation on many ranks: projected.
+"""Projected cost of an evaluation of the particles on up to 4096 cores, and of the direct simulation on many ranks.
 
     .venv/bin/python tests/benchmarks/projection.py particles docs/performance.json
     .venv/bin/python tests/benchmarks/projection.py flow hit-paper
 
-`particles` measures nothing: each part of an evaluation takes so long a call and so long a unit of its work as the
-measured evaluations of 16^3 and 64^3 particles on one core say; messages are those of a network that is assumed. It
-writes the rows into the file, `projected`, with how far the same model is off the measured rows, `held`, and prints the
-tables of docs/performance.md. `flow` prints what the formulas of `eddies check` say of 1, 2, 4, ... ranks.
+`particles` measures nothing: seconds of a call and of a unit of work of each part follow from the measured evaluations
+of 16^3 and 64^3 particles on one core; messages are those of an assumed network. It writes into the file the rows
+`projected` and, in `held`, projected over measured seconds of the measured rows, and prints the tables of
+docs/performance.md. `flow` prints the formulas of `eddies check` for 1, 2, 4, ... ranks.
 """
 
 import argparse
@@ -26,23 +26,23 @@ from eddies.workflows.foreseen.seconds import seconds
 from eddies.workflows.foreseen.storage import flow_memory, in_units
 
 SIDES, TABLE_CORES, MOST_CORES = (64, 128, 256, 512), (16, 64, 256, 1024, 4096), 4096
-# The cluster: cores of a node; bytes a second of a rank within its node, and of a node that talks to all others;
-# seconds of a message.
+# The cluster: cores of a node; bytes a second of a rank within its node, and of a node to all others; seconds of a
+# message.
 NODE_CORES, RANK_BANDWIDTH, NODE_BANDWIDTH, LATENCY = 64, 2e9, 10e9, 2e-6
 THREADED = "pairs", "splines", "transforms", "modes"  # whose loops the threads of a rank share
 COMPONENTS = {"transforms": TRANSFORMED, "splines": INTERPOLATED}
-# Transforms of an evaluation beside two in each iteration; sums over ranks beside those of the iterations, and in one;
-# columns that a settling sends.
+# Transforms of an evaluation outside the iterations, which have two each; sums over ranks outside the iterations, and
+# in each; columns that a migration sends.
 CALLS, SUMS, COLUMNS = 8, (11, 2), 8
-# Work of a grid point of a transform over that of 112^3, by cells along a side: measured to 168, beyond of the slab of
-# one of many ranks.
+# Work of a grid point of a transform over that of 112^3, by cells along a side; beyond 168 measured for the slab of one
+# of many ranks.
 GROWTH = {112: 1.0, 168: 1.4, 448: 1.4, 896: 1.9}
 MIGRATION = 1.7              # settling on several ranks over that on one
 
 
 @dataclass(frozen=True)
 class Job:
-    """An evaluation of a scene's model in so many iterations of the solve, on ranks of so many threads."""
+    """An evaluation of a scene's model with a number of iterations of the solve, on ranks of some threads."""
 
     scene: Scene
     iterations: float
@@ -51,16 +51,16 @@ class Job:
 
     @property
     def share(self) -> float:
-        """Of all planes, those of the thickest slab."""
+        """Share of the planes in the thickest slab."""
         planes = self.scene.tracers.planes
         return math.ceil(planes / self.ranks) / planes
 
     def components(self, part: str) -> float:
-        """Of transforms or splines in an evaluation."""
+        """Number of components that an evaluation transforms or interpolates."""
         return 6 * self.iterations + COMPONENTS[part]
 
     def units(self) -> dict[str, float]:
-        """What the busiest rank works on: pairs, components at particles and grid points, modes, particles."""
+        """Work of the busiest rank: pairs, components at particles and grid points, modes, particles."""
         tracers, paired = self.scene.tracers, "pairs" in self.scene.model.reads
         own, points = tracers.particles * self.share, tracers.planes**3 * self.share
         # Pairs across the faces of a slab are evaluated on both sides.
@@ -72,8 +72,8 @@ class Job:
                 "settling": own * (MIGRATION if self.ranks > 1 else 1.0)}
 
     def messages(self) -> float:
-        """Seconds of the messages: transposes from each rank to every other, ghosts and ghost planes to the two
-        beside it, particles that settle, and sums along a tree."""
+        """Seconds of the messages: transposes between all ranks, ghosts and ghost planes between neighbours, particles
+        that migrate, and sums along a tree."""
         if self.ranks == 1:
             return 0.0
         tracers, k = self.scene.tracers, resolved_shells(self.scene)
@@ -95,7 +95,7 @@ def growth(cells: int) -> float:
 
 
 def parts_of(row: dict) -> dict[str, float]:
-    """The measured parts of an evaluation under the names of their work."""
+    """Measured seconds of the parts of an evaluation, by the kind of their work."""
     parts = row["parts"]
     return {"pairs": parts["pairs"], "splines": parts["splines"], "transforms": parts["transforms"],
             "modes": parts["vectors"] + parts["solve, the rest"], "settling": parts["settle"],
@@ -103,7 +103,7 @@ def parts_of(row: dict) -> dict[str, float]:
 
 
 def rates(found: dict, model: str) -> dict[str, tuple[float, float]]:
-    """Seconds of a call and of a unit of each part, through the rows of 16^3 and 64^3 particles on one core."""
+    """Seconds of a call and of a unit of work of each part, from the rows of 16^3 and 64^3 particles on one core."""
     few, many = (next(row for row in found["steps"] if (row["particles"], row["model"], row["ranks"], row["threads"])
                       == (side, model, 1, 1)) for side in (16, 64))
     sizes = [Job(scene_of(row["particles"], model), row["iterations"]).units() for row in (few, many)]
@@ -142,7 +142,7 @@ def projected(found: dict) -> list[dict]:
 
 
 def held(found: dict) -> list[dict]:
-    """What the model says of the measured evaluations, over what they took."""
+    """Projected over measured seconds of the measured evaluations."""
     rows = []
     for row in found["steps"]:
         job = Job(scene_of(row["particles"], row["model"]), row["iterations"], row["ranks"], row["threads"])
@@ -153,7 +153,7 @@ def held(found: dict) -> list[dict]:
 
 
 def tables(found: dict) -> str:
-    """Those of docs/performance.md: seconds by cores, and deviations by layout."""
+    """The tables of docs/performance.md: seconds by cores, and deviations by layout."""
     lines = ["| cores |" + "|".join(f" {side}³ " for side in SIDES) + "|", "|---" * (1 + len(SIDES)) + "|"]
     for cores in TABLE_CORES:
         cells = [next((f" {row['ranks']} x {row['threads']}: {row['seconds']:.2g} s, {row['binds']} "

@@ -1,17 +1,17 @@
-"""Values of a velocity's three components at points, and their adjoint, by the closure's splines and by FINUFFT: the
-same points and modes, the same accuracy, one run.
+"""Time of values of a velocity at points, and of their adjoint, by the closure's splines and by FINUFFT, at the same
+points, modes and accuracy.
 
     OMP_NUM_THREADS=1 .venv/bin/python tests/benchmarks/splines.py [PARTICLES A SIDE] [--threads T]
 
-FINUFFT (pip install --no-binary finufft finufft, so that it is built for this processor) does its best: single
-precision, plans that are measured and used again, the fastest of several grids, of three transforms at once and of two,
-the first with two components as real and imaginary part. Neither this packing nor the modes kx < 0 that it wants as
-well are in its time. The velocity has the spectrum that the closure expects (`ResolvedVelocity`). Errors are against
-exact sums, at some points and in some modes, these weighted by that spectrum. Of FINUFFT's tolerances counts the
-largest that makes an error not above that of the splines, and 1e-3.
+FINUFFT (pip install --no-binary finufft finufft, to build it for this processor) gets its best settings: single
+precision, measured plans that are used again, and the fastest of several grids and of three or two transforms at once;
+the first of two holds two components as real and imaginary part. Its time excludes this packing and the additional
+modes kx < 0 that it needs. The velocity has the spectrum that the closure expects (`ResolvedVelocity`). Errors are
+relative to exact sums at some points and in some modes, weighted by that spectrum. FINUFFT's tolerance is 1e-3, or the
+largest with an error not above that of the splines.
 
-Prints JSON lines: "interpolation" is from modes to points, "spreading" from points to modes, each whole and between
-grid and points alone (FINUFFT's `spreadinterponly` with the same grid and tolerance). Seconds are medians.
+Prints JSON lines with median seconds: "interpolation" from modes to points, "spreading" from points to modes, each as a
+whole and between grid and points alone (FINUFFT's `spreadinterponly` with the same grid and tolerance).
 """
 
 import argparse
@@ -39,7 +39,7 @@ Action = Callable[[], np.ndarray]
 
 
 class Case:
-    """Points, a velocity there and its modes, and exact sums."""
+    """Points, a velocity with its values there and its modes, and exact sums."""
 
     def __init__(self, side: int) -> None:
         slab = SlabDecomposition(MPI.COMM_SELF, 2 * math.pi, int(PLANES * side))
@@ -58,7 +58,7 @@ class Case:
         self.exact = {"interpolation": self._exact_values(), "spreading": self._exact_modes()}
 
     def _modes_of_all_shells(self, random: np.random.Generator) -> np.ndarray:
-        """Some (kz, ky, kx), |k| spread evenly."""
+        """Some modes (kz, ky, kx) with evenly spread |k|."""
         direction = random.standard_normal((CHECKED, 3))
         direction /= np.linalg.norm(direction, axis=1)[:, None] * np.sign(direction[:, 2:])
         return np.rint(direction * random.uniform(1, self.grid.resolved - 1, (CHECKED, 1))).astype(int)
@@ -86,7 +86,7 @@ class Case:
 
 
 def ours(case: Case) -> dict[str, tuple[Action, Action]]:
-    """Of interpolation and spreading the whole, and the part between grid and points."""
+    """Interpolation and spreading, each as a whole and between grid and points."""
     grid, points = case.grid, case.points
     fields, count = grid.to_fields(case.modes * grid.prefilter), grid.spectral.cells**3
     return {"interpolation": (lambda: grid.at(case.modes, points).numpy(),
@@ -105,12 +105,12 @@ class Peer:
         self.given = np.ascontiguousarray(_pair(given) if packed else given, np.complex64)
 
     def whole(self, tolerance: float) -> Action:
-        """From modes to points or back."""
+        """The whole, from modes to points or back."""
         plan = self._plan(self.size, tolerance)
         return lambda: plan.execute(self.given)
 
     def part(self, tolerance: float) -> Action:
-        """Between its grid and points."""
+        """The part between its grid and points."""
         cells = _fine(self.upsampling * self.size)
         plan = self._plan(cells, tolerance, spreadinterponly=1)
         shape = (len(self.given), cells, cells, cells)
@@ -118,7 +118,7 @@ class Peer:
         return lambda: plan.execute(given)
 
     def error(self, result: np.ndarray) -> float:
-        """Of what `whole` gives."""
+        """Error of the result of `whole`."""
         if self.name == "interpolation":
             pairs = [part for one in result for part in (one.real, one.imag)] if self.packed else result.real
             return self.case.error(self.name, np.stack(pairs[:3], 1))
@@ -137,7 +137,7 @@ class Peer:
 
 
 def _all_kx(modes: np.ndarray) -> np.ndarray:
-    """Modes (c, kz, ky, kx) with those of kx < 0."""
+    """Modes (c, kz, ky, kx) completed by those of kx < 0."""
     return np.concatenate([modes, np.roll(modes[:, ::-1, ::-1, :0:-1], 1, (1, 2)).conj()], 3)
 
 
@@ -151,7 +151,7 @@ def _fine(least: float) -> int:
 
 
 def medians(actions: dict[str, Action]) -> dict[str, float]:
-    """Seconds of each, by turns."""
+    """Median seconds of each action, measured in turn."""
     seconds: dict[str, list[float]] = {name: [] for name in actions}
     for _ in range(REPEATS + 1):
         for name, action in actions.items():
@@ -162,7 +162,7 @@ def medians(actions: dict[str, Action]) -> dict[str, float]:
 
 
 def compare(case: Case, threads: int, name: str) -> list[dict[str, object]]:
-    """Interpolation or spreading by both: the fastest of FINUFFT's forms."""
+    """Interpolation or spreading by both, with the fastest of FINUFFT's forms."""
     whole, part = ours(case)[name]
     error = case.error(name, whole())
     actions, parts, errors = {"eddies": whole}, {"eddies": part}, {"eddies": error}

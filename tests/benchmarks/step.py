@@ -1,16 +1,16 @@
-"""One ETDRK4 step of the compressible fluid, its parts apart, each against its bound measured in the same run.
+"""Time of an ETDRK4 step of the compressible fluid and of its parts, each against a bound measured in the same run.
 
     mpirun -n 2 .venv/bin/python tests/benchmarks/step.py [CELLS ...] [--precision float32] [--share-of RANKS] [--json]
 
-Times of parts are means over the ranks, medians over the steps. A part that waits for another rank counts the wait.
-Below a table stands the step alone as a line of JSON, the median of the steps after the first.
+Times of parts are means over the ranks and medians over the steps. A part that waits for another rank includes the
+wait. Below the table a JSON line has the median time of a step, without the first.
 
-Bounds: the same transforms by FFTW alone, in cache; the bytes that a rank sends over the bandwidth around a ring of the
-ranks; for pointwise work the bytes of the arrays that go in and come out, each moved once, over the bandwidth of a
-triad a = b + c, of arrays that take up as much cache as a call's, or for whole states of arrays beyond all caches.
+Bounds: the same transforms by FFTW alone, in cache; the bytes that a rank sends, divided by the bandwidth in a ring of
+the ranks; for pointwise work the bytes of the input and output arrays, each moved once, divided by the bandwidth of a
+triad a = b + c, with arrays of the same size as a call's or, for whole states, larger than all caches.
 
-`--share-of` runs the share of the first of so many ranks, without the others: what they would send is zero. It tells
-the work and the memory of a rank of a grid that is far too large for this machine.
+`--share-of` runs the share of the first of many ranks, without the others, whose messages are zero. It measures work
+and memory of a rank for a grid that is too large for this machine.
 """
 
 import argparse
@@ -26,23 +26,23 @@ import numpy as np
 from mpi4py import MPI
 
 from eddies.flow.initial_fields import balanced_density, random_velocity
-from eddies.flow.navier_stokes import AcousticBlock, CompressibleFluid, Decay
+from eddies.flow.navier_stokes import CompressibleFluid
 from eddies.kernels.copies import PlaneCopies
 from eddies.parallel.slab import SlabDecomposition
-from eddies.parallel.transpose import TransposeBuffers
+from eddies.parallel.transpose import Transpose
 from eddies.spectral.fourier_passes import PlanePass
 from eddies.spectral.spectral_grid import Collector, SpectralGrid
 from eddies.time_stepping import ETDRK4
 
 EVALUATIONS = 4              # of the nonlinear term in a step
-BACKWARD, SENT, FORWARD = 15, 8, 4  # transforms of an evaluation, of those back the ones that are sent
+BACKWARD, SENT, FORWARD = 15, 8, 4  # transforms of an evaluation: back, of these the sent ones, and forth
 RING_BYTES, RING_ROUNDS = 2**23, 10
-TRIAD_BYTES = 2**25          # of an array that no cache holds
-# What belongs to a part: owner and name. What a call of one part makes of another counts for the other alone.
+TRIAD_BYTES = 2**25          # size of an array that no cache holds
+# Functions of each part, by owner and name. A call within a call of another part counts for the inner part only.
 PARTS = {
     "plane transforms": [(PlanePass, "to_physical"), (PlanePass, "to_modes")],
     "column transforms": [(SpectralGrid, "_columns_to_planes"), (Collector, "modes")],
-    "transposes": [(TransposeBuffers, "to_planes"), (TransposeBuffers, "to_columns")],
+    "transposes": [(Transpose, "to_planes"), (Transpose, "to_columns")],
     "pairs of planes": [(PlaneCopies, "pack"), (PlaneCopies, "unpack")],
     "products": [(CompressibleFluid, "_advection")],
     "linear operators": [(CompressibleFluid, "combine")],
@@ -50,24 +50,24 @@ PARTS = {
 
 
 class Stopwatch:
-    """Seconds, calls and bytes in and out of each part; what is in no part is "the rest"."""
+    """Seconds, calls and bytes in and out of each part; all other time is "the rest"."""
 
     def __init__(self) -> None:
         self.open, self.last = ["the rest"], time.perf_counter()
         self.reset()
 
     def reset(self) -> None:
-        """Begin anew."""
+        """Set all counters to zero."""
         self.seconds, self.calls, self.bytes = Counter(), Counter(), Counter()
 
     def switch(self) -> None:
-        """Book the time since the last switch on the part that is open."""
+        """Add the time since the last switch to the open part."""
         now = time.perf_counter()
         self.seconds[self.open[-1]] += now - self.last
         self.last = now
 
     def wrap(self, owner: object, name: str, part: str) -> None:
-        """Let calls of `owner.name` count for `part`."""
+        """Count calls of `owner.name` for `part`."""
         function = getattr(owner, name)
 
         @functools.wraps(function)
@@ -86,18 +86,16 @@ class Stopwatch:
 
 
 def arrays_in(items: object) -> Iterable[np.ndarray]:
-    """The arrays among arguments or results, and those that operators hold."""
+    """Yield the arrays among arguments or results."""
     if isinstance(items, np.ndarray):
         yield items
     elif isinstance(items, (tuple, list)):
         for item in items:
             yield from arrays_in(item)
-    elif isinstance(items, (AcousticBlock, Decay)):
-        yield from arrays_in(list(vars(items).values()))
 
 
 class FirstOf:
-    """Stands for the communicator of the first of `size` ranks; the others send zeros and add nothing."""
+    """Communicator of the first of `size` ranks; the others send zeros and add nothing."""
 
     rank = 0
 
@@ -114,7 +112,7 @@ class FirstOf:
 
 
 def best(action: Callable[[], object], repeats: int = 7) -> float:
-    """Shortest of several times."""
+    """The shortest of several times of an action."""
     times = []
     for _ in range(repeats):
         start = time.perf_counter()
@@ -124,7 +122,7 @@ def best(action: Callable[[], object], repeats: int = 7) -> float:
 
 
 def triad_bandwidth(size: int) -> float:
-    """Bytes a second that a rank reads and writes in a = b + c, arrays of `size` bytes."""
+    """Bytes per second that a rank reads and writes in a = b + c with arrays of `size` bytes."""
     a, b, c = np.ones((3, size // 8))
     rounds = max(1, 2**26 // size)
 
@@ -136,7 +134,7 @@ def triad_bandwidth(size: int) -> float:
 
 
 def ring_bandwidth(comm: MPI.Comm) -> float:
-    """Bytes a second that a rank sends to the next while it receives as many."""
+    """Bytes per second that a rank sends to the next while it receives as many."""
     outgoing, incoming = np.ones(RING_BYTES, np.uint8), np.zeros(RING_BYTES, np.uint8)
     above, below = (comm.rank + 1) % comm.size, (comm.rank - 1) % comm.size
 
@@ -148,7 +146,7 @@ def ring_bandwidth(comm: MPI.Comm) -> float:
 
 
 def transform_bounds(grid: SpectralGrid, backward: int, sent: int, forward: int) -> dict[str, float]:
-    """Seconds of transforms of so many components by FFTW alone, `sent` of those back along z too."""
+    """Seconds of transforms by FFTW alone; of the `backward` components, `sent` are also transformed along z."""
     count, planes = grid.decomposition.count, 0.0
     for direction, components in (("BACKWARD", backward), ("FORWARD", forward)):
         for pairs, blocks in Counter((b.stop - b.start + 1) // 2 for b in grid.plane_pass.blocks(count)).items():
@@ -163,12 +161,12 @@ def transform_bounds(grid: SpectralGrid, backward: int, sent: int, forward: int)
 
 def sent_bytes(grid: SpectralGrid) -> int:
     """Bytes that a rank sends in a step."""
-    return EVALUATIONS * sum(lines.nbytes for lines in (grid.buffers("backward", SENT)._columns,
-                                                        grid.buffers("forward", FORWARD)._planes))
+    return EVALUATIONS * sum(lines.nbytes for lines in (grid.batch("backward", SENT).transpose._columns,
+                                                        grid.batch("forward", FORWARD).transpose._planes))
 
 
 def measure(comm: MPI.Comm, watch: Stopwatch, cells: int, precision: str, steps: int, share_of: int) -> dict:
-    """Seconds of a step and of its parts, with bounds and the largest memory of a rank so far."""
+    """Seconds of a step and of its parts, their bounds, and the largest memory of a rank so far."""
     over = FirstOf(share_of) if share_of else comm
     grid = SpectralGrid(SlabDecomposition(over, 2 * np.pi, cells), precision)
     fluid = CompressibleFluid(grid, 1.2 / cells**(4 / 3), sound_speed=22.7)
@@ -223,7 +221,7 @@ def main() -> None:
     parser.add_argument("--precision", nargs="+", choices=["float64", "float32"], default=["float64", "float32"])
     parser.add_argument("--steps", type=int, default=7)
     parser.add_argument("--share-of", type=int, default=0, metavar="RANKS", help="run one rank's share alone")
-    parser.add_argument("--json", action="store_true", help="print all as a JSON object a line, no table")
+    parser.add_argument("--json", action="store_true", help="print JSON lines with all numbers, no table")
     options = parser.parse_args()
     comm, watch = MPI.COMM_WORLD, Stopwatch()
     for part, functions in PARTS.items():

@@ -1,9 +1,9 @@
-"""Forward and backward transforms of three components against mpi4py-fft, on the same arrays and in one run.
+"""Time of forward and backward transforms of three components, against mpi4py-fft on the same arrays.
 
     mpirun -n 2 .venv/bin/python tests/benchmarks/transforms.py [CELLS ...]
 
-mpi4py-fft (pip install mpi4py-fft; it needs FFTW's headers) transforms all modes and has those beyond the 2/3 rule set
-to zero between the two transforms; its plans are measured ones, as is its default. Ours drop them on the way.
+mpi4py-fft (pip install mpi4py-fft; it needs FFTW's headers) transforms all modes, and those beyond the 2/3 rule are set
+to zero between the two transforms. Its plans are measured, its default. Ours drop these modes on the way.
 """
 
 import sys
@@ -22,7 +22,7 @@ REPEATS = 15
 
 
 def peer_transform(comm: MPI.Comm, grid: SpectralGrid, field: np.ndarray) -> Callable[[], np.ndarray]:
-    """The same round trip by mpi4py-fft, slabs along z as well."""
+    """The same round trip by mpi4py-fft, also with slabs along z."""
     plan = PFFT(comm, [grid.cells] * 3, axes=(0, 1, 2), dtype=grid.real, grid=(-1,))
     given, modes, result = (newDistArray(plan, forward, rank=1) for forward in (False, True, False))
     given[:] = field

@@ -4,25 +4,16 @@ import pytest
 from eddies.clock import Clock
 from eddies.flow.forcing import LinearForcing
 from eddies.flow.history import FlowHistory
-from eddies.flow.initial_fields import balanced_density, random_velocity
-from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid
+from eddies.flow.navier_stokes import IncompressibleFluid
 from eddies.flow.stability import (
     GROWTH, IMAGINARY_REACH, REAL_REACH, FlowDiverged, StabilityWatch, advice, quadratic_energy, step_limits,
 )
-from eddies.parallel.slab import SlabDecomposition
-from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.time_stepping import ETDRK4, RungeKutta4
+from tests.validation.flows import turbulence
 
 
-def compressible(comm, precision="float64", nu=0.05, c=8.0):
-    grid = SpectralGrid(SlabDecomposition(comm, 2 * np.pi, 12), precision)
-    velocity = random_velocity(grid, 3, 1.0, 2.0)
-    state = np.concatenate([velocity, balanced_density(grid, velocity, c)[None]]).astype(grid.complex)
-    return CompressibleFluid(grid, nu, c), state
-
-
-def watched(fluid, stepper=ETDRK4):
-    return StabilityWatch(fluid, stepper(fluid), FlowHistory(fluid))
+def watched(fluid):
+    return StabilityWatch(fluid, ETDRK4(fluid), FlowHistory(fluid))
 
 
 def growth_of_rk4(z):
@@ -38,21 +29,21 @@ def test_rk4_is_stable_on_the_axes_up_to_its_reach():
 
 
 @pytest.mark.mpi(1)
-def test_numbers_of_a_step_are_those_of_the_linear_terms(comm):
+@pytest.mark.parametrize("nu, c, expected", [(0.3, 1e-3, "viscosity"), (0.0, 7.0, "sound")])
+def test_numbers_of_a_step_are_those_of_the_linear_terms(comm, nu, c, expected):
     # Power iteration on the linear terms finds their eigenvalue of the largest modulus.
-    for nu, c, expected in ((0.3, 1e-3, "viscosity"), (0.0, 7.0, "sound")):
-        fluid, state = compressible(comm, nu=nu, c=c)
-        state[3] = state[0]
-        for _ in range(60):
-            state = fluid.linear(state) / np.abs(state).max()
-        rate = np.sqrt(np.linalg.norm(fluid.linear(fluid.linear(state))) / np.linalg.norm(state))
-        limits = {limit.name: limit.number for limit in step_limits(fluid, RungeKutta4(fluid), 0.01, 0.0)}
-        assert limits[expected] == pytest.approx(0.01 * rate, rel=0.02)
+    fluid, state = turbulence(comm, 12, nu, c)
+    state[3] = state[0]
+    for _ in range(60):
+        state = fluid.linear(state) / np.abs(state).max()
+    rate = np.sqrt(np.linalg.norm(fluid.linear(fluid.linear(state))) / np.linalg.norm(state))
+    limits = {limit.name: limit.number for limit in step_limits(fluid, RungeKutta4(fluid), 0.01, 0.0)}
+    assert limits[expected] == pytest.approx(0.01 * rate, rel=0.02)
 
 
 @pytest.mark.mpi(1)
 def test_each_stepper_has_the_limits_of_what_it_does_not_take_exactly(comm):
-    fluid, _ = compressible(comm)
+    fluid, _ = turbulence(comm, 12)
     incompressible = IncompressibleFluid(fluid.grid, 0.05)
     names = [[limit.name for limit in step_limits(flow, stepper(flow), 0.1, 2.0)]
              for flow in (fluid, incompressible) for stepper in (ETDRK4, RungeKutta4)]
@@ -63,71 +54,63 @@ def test_each_stepper_has_the_limits_of_what_it_does_not_take_exactly(comm):
 
 
 @pytest.mark.mpi(1)
-def test_advice_names_what_was_broken_and_the_grid_if_nothing_was(comm):
-    fluid, _ = compressible(comm)
-    text = advice(fluid, step_limits(fluid, RungeKutta4(fluid), 0.1, 2.0), 1.0)  # sound at 4.8
-    assert "Broken: sound" in text and "= 4.76, stable up to 2.83" in text and "courant" in text
+def test_advice_names_the_broken_limit_or_the_grid(comm):
+    fluid, _ = turbulence(comm, 12)
+    text = advice(fluid, step_limits(fluid, RungeKutta4(fluid), 0.1, 2.0), 1.0)
+    assert "sound" in text and "4.76" in text and "2.83" in text and "courant" in text
     assert "advection" not in text and "cells" not in text
     text = advice(fluid, step_limits(fluid, ETDRK4(fluid), 0.1, 2.0), 0.31)
-    assert "broke no limit (advection" in text and "k_max eta was 0.31" in text and "raise cells" in text
-    assert "sound grows that is hardly damped" in text
-    inviscid, _ = compressible(comm, nu=0.0)
+    assert "advection" in text and "0.31" in text and "cells" in text and "sound" in text
+    inviscid, _ = turbulence(comm, 12, nu=0.0)
     assert "no viscosity" in advice(inviscid, [], 0.0)
+    assert "sound_speed" in advice(fluid, [], 1.0, mach=1.5)
 
 
-@pytest.mark.mpi(1, 2, 3)
-def test_quadratic_energy_is_that_of_the_fields(comm):
-    for precision, tolerance in (("float64", 1e-13), ("float32", 1e-5)):
-        fluid, state = compressible(comm, precision)
-        fields = fluid.grid.backward(state)
-        kinetic, sound = (0.5 * float(fluid.grid.mean(part**2).sum()) for part in (fields[:3], fields[3:]))
-        assert quadratic_energy(fluid, state) == pytest.approx(kinetic + 64 * sound, rel=tolerance)
+@pytest.mark.mpi(1, 3)
+@pytest.mark.parametrize("precision, tolerance", [("float64", 1e-13), ("float32", 1e-5)])
+def test_quadratic_energy_is_that_of_the_fields(comm, precision, tolerance):
+    fluid, state = turbulence(comm, 12, precision=precision)
+    fields = fluid.grid.backward(state)
+    kinetic, sound = (0.5 * float(fluid.grid.mean(part**2).sum()) for part in (fields[:3], fields[3:]))
+    assert quadratic_energy(fluid, state) == pytest.approx(kinetic + 64 * sound, rel=tolerance)
 
 
-@pytest.mark.mpi(1, 2, 3)
-@pytest.mark.parametrize("number", [np.nan, np.inf, 1e200])
-def test_one_mode_that_is_not_finite_is_seen_by_all_ranks_at_its_step(comm, number):
-    fluid, state = compressible(comm)
+@pytest.mark.mpi(3)
+@pytest.mark.parametrize("number", [np.nan, 1e200])
+def test_all_ranks_see_one_mode_that_is_not_finite_at_its_step(comm, number):
+    fluid, state = turbulence(comm, 12)
     watch, clock, harmed = watched(fluid), Clock(), state.copy()
     clock.tick(0.01)
     watch(state, state, 0.01, clock)
     if fluid.grid.index[1][0, -1, 0] == -1:  # only the rank that holds the last ky
         harmed[1, 2, -1, 1] = number
     clock.tick(0.01)
-    with pytest.raises(FlowDiverged, match="unstable at step 2, time 0.02: its energy is no longer finite"):
+    with pytest.raises(FlowDiverged, match="step 2, time 0.02: .* finite"):
         watch(state, harmed, 0.01, clock)
 
 
-@pytest.mark.mpi(1, 2)
-def test_energy_from_nowhere_is_seen_and_that_of_the_forcing_is_not(comm):
-    fluid, state = compressible(comm)
+@pytest.mark.mpi(2)
+def test_energy_without_a_source_is_seen_and_injected_energy_is_not(comm):
+    fluid, state = turbulence(comm, 12)
     grown = np.sqrt(GROWTH) * state
-    with pytest.raises(FlowDiverged, match="no more than"):
+    with pytest.raises(FlowDiverged, match="available"):
         watched(fluid)(state, 1.001 * grown, 0.01, Clock())
     watched(fluid)(state, 0.999 * grown, 0.01, Clock())
-    # The ceiling falls with the energy: what was lost cannot come back.
-    watch = watched(fluid)
+    # Lost energy cannot come back, also not after a restart.
+    watch, restored = watched(fluid), watched(fluid)
     watch(state, 0.1 * state, 0.01, Clock())
-    with pytest.raises(FlowDiverged):
-        watch(0.1 * state, 0.99 * state, 0.01, Clock())
+    restored.load_state_dict(watch.state_dict())
+    for each in (watch, restored):
+        with pytest.raises(FlowDiverged):
+            each(0.5 * state, 0.99 * state, 0.01, Clock())
+    watched(fluid)(0.5 * state, 0.99 * state, 0.01, Clock())
     fluid.forcing = LinearForcing(fluid.grid, 0.5, 2.0)
     watched(fluid)(state, 1.001 * grown, 0.1, Clock())
 
 
 @pytest.mark.mpi(1)
-def test_a_watch_that_goes_on_remembers_the_energy_before(comm):
-    fluid, state = compressible(comm)
-    watch, resumed, fresh = watched(fluid), watched(fluid), watched(fluid)
-    watch(state, 2 * state, 0.01, Clock())  # four times the energy, then four times that
-    resumed.load_state_dict(watch.state_dict())
-    fresh(2 * state, 4 * state, 0.01, Clock())
-    with pytest.raises(FlowDiverged, match="came in"):
-        resumed(2 * state, 4 * state, 0.01, Clock())
-
-
-@pytest.mark.mpi(1)
-def test_a_start_that_is_not_finite_is_told_before_the_first_step(comm):
-    fluid, state = compressible(comm)
+def test_a_start_that_is_not_finite_is_refused_before_the_first_step(comm):
+    fluid, state = turbulence(comm, 12)
     state[0, 0, 0, 1] = np.nan
-    with pytest.raises(FlowDiverged, match=r"step 0, time 0: the flow is not finite. .*amplitude or path"):
+    with pytest.raises(FlowDiverged, match="step 0, .*amplitude or path"):
         FlowHistory(fluid).sample(state, Clock())

@@ -8,24 +8,32 @@ from eddies.flow import initial_fields
 from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid
 from eddies.flow.statistics import energy_spectrum
 from eddies.flow.subgrid import DynamicStress, EddyDamping, SpectralViscosity, StressModel
-from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.fourier_grid import FourierGrid
-from eddies.particles.resolved_flow import ResolvedFlow
-from eddies.particles.terms.damping import Damping
+from eddies.particles.resolved_velocity import ResolvedFlow
+from eddies.particles.terms.resolved_forces import Damping
 from eddies.spectral.mode_operators import gaussian_transfer
-from eddies.spectral.spectral_grid import SpectralGrid
-from eddies.time_stepping import ETDRK4
+from tests.validation.flows import make_grid, march, with_density
 
-CONSTANT, WIDTH = 0.2, 0.7
-
-
-def coarse_grid(comm, cells=16):
-    return SpectralGrid(SlabDecomposition(comm, 2 * np.pi, cells))
+LENGTH = 0.14  # the mixing length of Smagorinsky's model
+DYNAMIC = pytest.mark.parametrize("width, with_gradient", [(0.0, False), (0.8, False), (0.8, True)])
 
 
-def turbulent_velocity(grid):
-    """Solenoidal, with all modes of the grid."""
+@pytest.fixture(scope="module")
+def grid(comm):
+    return make_grid(comm, 24)
+
+
+@pytest.fixture(scope="module")
+def velocity(grid):
+    """Random and solenoidal, with all modes of the grid."""
     return initial_fields.random_velocity(grid, 5, 1.0, 3.0)
+
+
+def force_of(model, velocity):
+    force = np.zeros_like(velocity)
+    model.begin_step(velocity)
+    model.add(velocity, force)
+    return force
 
 
 def power(grid, velocity, force):
@@ -33,50 +41,42 @@ def power(grid, velocity, force):
     return grid.sum_modes((velocity.conj() * force).real.sum(axis=0))
 
 
-@pytest.mark.mpi(1, 3)
-@pytest.mark.parametrize("component", range(3))
-@pytest.mark.parametrize("direction", range(3))
+@pytest.mark.mpi(3)
+@pytest.mark.parametrize("component, direction", [(0, 0), (2, 2), (0, 1), (2, 0), (1, 2)])
 def test_force_on_a_sine_is_its_fourier_series(comm, component, direction):
     """u_i = sin x_j: 2 nu_t S_ij = l^2 |cos x_j| cos x_j if i != j, and 2 2^(1/2) times that if i = j.
 
     |cos| cos is a sum of -8 sin(k pi/2) / (pi k (k^2 - 4)) cos kx over odd k.
     """
-    grid = coarse_grid(comm, 32)
+    grid = make_grid(comm, 32)
     velocity = np.zeros((3, *grid.physical_shape))
     velocity[component] = np.sin(grid.coordinates()[direction])
-    velocity, force = grid.forward(velocity), np.zeros((3, *grid.spectral_shape), complex)
-    StressModel(grid, CONSTANT * WIDTH).add(velocity, force)
-    physical = grid.backward(force)
-    amplitude = (CONSTANT * WIDTH) ** 2 * (2 * np.sqrt(2) if component == direction else 1)
+    physical = grid.backward(force_of(StressModel(grid, LENGTH), grid.forward(velocity)))
+    amplitude = LENGTH**2 * (2 * np.sqrt(2) if component == direction else 1)
     for k in (1, 3):
         expected = amplitude * 8 * np.sin(k * np.pi / 2) / (np.pi * (k**2 - 4))
         found = 2 * grid.mean(physical * np.sin(k * grid.coordinates()[direction]))
-        # The series is cut off by the grid, where its terms have fallen to 1/k^3.
+        # The grid cuts the series off where its terms have fallen to 1/k^3.
         assert found[component] == pytest.approx(expected, abs=3e-4 * amplitude)
         assert np.abs(np.delete(found, component)).max() < 1e-12
 
 
-@pytest.mark.mpi(1, 2, 3)
-def test_it_takes_the_energy_that_the_stress_dissipates(comm):
-    grid = coarse_grid(comm)
-    velocity, force = turbulent_velocity(grid), np.zeros((3, *grid.spectral_shape), complex)
-    StressModel(grid, CONSTANT * WIDTH).add(velocity, force)
+@pytest.mark.mpi(1, 2)
+def test_it_takes_the_energy_that_the_stress_dissipates(grid, velocity):
+    force = force_of(StressModel(grid, LENGTH), velocity)
     A = np.array([grid.backward(grid.gradient(component)) for component in velocity])
     S = (A + A.transpose(1, 0, 2, 3, 4)) / 2
     squared = np.einsum("ijzyx,ijzyx->zyx", S, S)
-    dissipation = grid.mean((2 * (CONSTANT * WIDTH) ** 2 * np.sqrt(2 * squared) * squared)[None])[0]
+    dissipation = grid.mean((2 * LENGTH**2 * np.sqrt(2 * squared) * squared)[None])[0]
     assert dissipation > 0.1
     assert power(grid, velocity, force) == pytest.approx(-dissipation, rel=1e-12)
     assert np.abs(force[:, grid.index_squared == 0]).max(initial=0) < 1e-15
 
 
 @pytest.mark.mpi(1)
-def test_a_closure_acts_on_the_velocity_alone_and_keeps_an_incompressible_one_solenoidal(comm):
-    grid = coarse_grid(comm)
-    velocity = turbulent_velocity(grid)
-    state = np.concatenate([velocity, initial_fields.balanced_density(grid, velocity, 8.0)[None]])
-    model, force = StressModel(grid, CONSTANT * WIDTH), np.zeros_like(velocity)
-    model.add(velocity, force)
+def test_a_closure_acts_on_the_velocity_alone_and_keeps_an_incompressible_one_solenoidal(grid, velocity):
+    model, state = StressModel(grid, LENGTH), with_density(grid, velocity, 8.0)
+    force = force_of(model, velocity)
     with_model, without = (CompressibleFluid(grid, 0.05, 8.0, None, closure).nonlinear(state)
                            for closure in (model, None))
     assert np.abs(with_model[:3] - without[:3] - force).max() < 1e-14
@@ -87,53 +87,41 @@ def test_a_closure_acts_on_the_velocity_alone_and_keeps_an_incompressible_one_so
 
 
 def hidden_stress(grid, velocity, width):
-    """What a filter hides of the velocity that has passed it: G(uu) - (Gu)(Gu), six rows."""
+    """The stress that a filter hides: G(uu) - (Gu)(Gu), six rows."""
     transfer = gaussian_transfer(grid.wavenumber_squared, width)
-    u, filtered = grid.backward(velocity), grid.backward(transfer * velocity)
-    pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-    whole, seen = (grid.forward(np.stack([a[i] * a[j] for i, j in pairs])) for a in (u, filtered))
-    return transfer * whole - seen
+    return transfer * grid.squares(velocity) - grid.squares(transfer * velocity)
 
 
-@pytest.mark.mpi(1, 2)
-def test_gradient_stress_is_the_hidden_one_to_fourth_order_in_the_filter_width(comm):
-    grid = coarse_grid(comm, 24)
+@pytest.mark.mpi(1)
+def test_gradient_stress_is_the_hidden_one_to_fourth_order_in_the_filter_width(grid):
     velocity = initial_fields.random_velocity(grid, 5, 1.0, 2.0)
-    # Products of these modes fit on the grid, so that nothing but the expansion in the width is left.
+    # Products of these modes fit on the grid, so that only the expansion in the width is left.
     velocity[:, grid.index_squared > 12] = 0
     errors = []
     for width in (0.2, 0.1):
         filtered = gaussian_transfer(grid.wavenumber_squared, width) * velocity
         exact = hidden_stress(grid, velocity, width)
         difference = StressModel(grid, filter_width=width).stress(filtered) - exact
-        squares = [grid.sum_modes((np.abs(stress) ** 2).sum(axis=0)) for stress in (difference, exact)]
-        errors.append(np.sqrt(squares[0] / squares[1]))
-    # The stress is of second order, what is left of it of fourth.
+        errors.append(np.linalg.norm(difference) / np.linalg.norm(exact))
+    # The stress is of second order, the error of fourth.
     assert errors[0] < 0.02 and errors[0] / errors[1] == pytest.approx(4, rel=0.1)
 
 
-def developed_velocity(comm, cells=24):
-    """Of a flow that has had time to send energy to its smallest scales."""
-    fluid = IncompressibleFluid(coarse_grid(comm, cells), 0.02)
-    velocity, stepper = initial_fields.random_velocity(fluid.grid, 5, 1.0, 2.0), ETDRK4(fluid)
-    for _ in range(40):
-        velocity = stepper(velocity, 0.03)
-    return fluid.grid, velocity
+@pytest.fixture(scope="module")
+def developed(grid):
+    """A flow that has had time to send energy to its smallest scales."""
+    return march(IncompressibleFluid(grid, 0.02), initial_fields.random_velocity(grid, 5, 1.0, 2.0), 0.06, 20)
 
 
-@pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("width, with_gradient", [(0.0, False), (0.8, False), (0.8, True)])
-def test_a_dynamic_coefficient_follows_the_way_that_energy_goes(comm, width, with_gradient):
-    """It is positive where energy goes to smaller scales, and 0 in the same flow run backwards, in a flow of random
-    modes between whose scales nothing passes, and in a laminar shear."""
-    grid, velocity = developed_velocity(comm)
+@pytest.mark.mpi(2)
+@DYNAMIC
+def test_a_dynamic_coefficient_follows_the_way_that_energy_goes(grid, velocity, developed, width, with_gradient):
+    """It is positive where energy goes to smaller scales. It is 0 in the same flow run backwards, in random modes,
+    between which no energy passes, and in a laminar shear."""
     model, lengths = DynamicStress(grid, width, with_gradient), []
-    y = grid.coordinates()[1]
-    shear = np.zeros((3, *grid.physical_shape))
-    shear[0] = np.sin(y)
-    shear = grid.forward(shear)
-    for flow in (velocity, -velocity, turbulent_velocity(grid), shear):
-        model.begin_step(transfer_of(grid, width) * flow)
+    transfer = gaussian_transfer(grid.wavenumber_squared, width)
+    for flow in (developed, -developed, velocity, initial_fields.shear_wave(grid, 1.0, 1)):
+        model.begin_step(transfer * flow)
         lengths.append(np.sqrt(model.squared_length))
     constant = lengths[0] / (width or np.pi / grid.cutoff)
     # The gradient part takes over most of what a viscosity would do.
@@ -141,13 +129,13 @@ def test_a_dynamic_coefficient_follows_the_way_that_energy_goes(comm, width, wit
     assert lengths[1] == 0 and lengths[2] < 0.4 * lengths[0] and lengths[3] < 1e-3 * lengths[0]
 
 
-@pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("width, with_gradient", [(0.0, False), (0.8, False), (0.8, True)])
-def test_a_dynamic_coefficient_is_found_where_the_hidden_stress_is_the_models(comm, monkeypatch, width, with_gradient):
-    """The stress between the two filters, made of the same model for either width: the squares of widths of Gaussian
+@pytest.mark.mpi(2)
+@DYNAMIC
+def test_a_dynamic_coefficient_is_found_where_the_hidden_stress_is_the_models(
+        grid, velocity, monkeypatch, width, with_gradient):
+    """The stress between the two filters is made of the same model for either width. The squares of widths of Gaussian
     filters add up, and a cut-off at half the wavenumber is twice as wide."""
-    grid, mixing_length = coarse_grid(comm, 24), 0.13
-    velocity = turbulent_velocity(grid)
+    mixing_length = 0.13
     model = DynamicStress(grid, width, with_gradient)
     if width:
         test = gaussian_transfer(grid.wavenumber_squared, 2 * width)
@@ -158,56 +146,38 @@ def test_a_dynamic_coefficient_is_found_where_the_hidden_stress_is_the_models(co
     of_gradient = width if with_gradient else 0.0
     fine, coarse = (StressModel(grid, scale * mixing_length, scale * of_gradient) for scale in (1, wider))
     between = coarse.stress(test * velocity) - test * fine.stress(velocity)
-    # What is taken for u u of the twice filtered velocity, less that filtered.
+    # Replaces the filtered products u u, and the products of the test-filtered velocity.
     squares = iter([np.zeros_like(between), -between])
     monkeypatch.setattr(grid, "squares", lambda _: next(squares))
     model.begin_step(velocity)
     assert np.sqrt(model.squared_length) == pytest.approx(mixing_length, rel=1e-9)
 
 
-def transfer_of(grid, width):
-    return gaussian_transfer(grid.wavenumber_squared, width)
-
-
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_spectral_viscosity_drains_what_an_inertial_range_brings(comm):
-    """With E = 1.4 eps^(2/3) k^(-5/3) up to the cut-off it dissipates eps, but for what a sum over shells is not an
-    integral."""
-    grid, dissipation = coarse_grid(comm, 48), 0.7
+    """With E = 1.4 eps^(2/3) k^(-5/3) up to the cut-off it dissipates eps, but for the sum over shells instead of an
+    integral. A resolved flow, without energy at the cut-off, loses nothing."""
+    grid, dissipation = make_grid(comm, 48), 0.7
     velocity = initial_fields.random_velocity(grid, 5, 1.0, 6.0)
     k, energy = energy_spectrum(grid, velocity)
     wanted = 1.4 * dissipation ** (2 / 3) * np.maximum(k, 1.0) ** (-5 / 3) * (k <= grid.cutoff) * (k > 0)
     scale = np.sqrt(np.divide(wanted, energy, out=np.zeros_like(energy), where=energy > 0))
     velocity *= scale[np.rint(np.sqrt(grid.index_squared)).astype(int)]
-    model, force = SpectralViscosity(grid), np.zeros_like(velocity)
-    model.begin_step(velocity)
-    model.add(velocity, force)
+    force = force_of(SpectralViscosity(grid), velocity)
     assert -power(grid, velocity, force) == pytest.approx(dissipation, rel=0.1)
+    resolved = initial_fields.random_velocity(grid, 5, 1.0, 2.0)
+    assert abs(power(grid, resolved, force_of(SpectralViscosity(grid), resolved))) < 1e-12
 
 
-@pytest.mark.mpi(1, 2)
-def test_learned_damping_is_that_of_the_particle_model(comm):
-    """Of the same flow, resolved by particles up to as high a wavenumber."""
-    grid = coarse_grid(comm, 24)
-    velocity = turbulent_velocity(grid)
-    velocity[:, grid.index_squared > grid.cutoff**2] = 0  # particles resolve a ball of modes
-    rates, force = np.array([0.1, 0.3, 0.2, 0.5, 0.4, 0.9]), np.zeros_like(velocity)
-    model = EddyDamping(grid, rates)
-    model.begin_step(velocity)
-    model.add(velocity, force)
+@pytest.mark.mpi(2)
+def test_learned_damping_is_that_of_the_particle_model(grid, velocity):
+    """In the same flow, which particles resolve up to the same wavenumber."""
+    velocity = np.where(grid.index_squared > grid.cutoff**2, 0, velocity)  # particles resolve a ball of modes
+    rates = np.array([0.1, 0.3, 0.2, 0.5, 0.4, 0.9])
+    force = force_of(EddyDamping(grid, rates), velocity)
     flow = ResolvedFlow(FourierGrid(grid.decomposition, grid.cutoff), torch.from_numpy(velocity), None, None, 0.0)
     term = Damping(Damping.Settings(), None)
     term.load_state_dict({"rates": torch.from_numpy(rates)})
     found = term(SimpleNamespace(resolved=flow, decomposition=grid.decomposition)).force_modes
-    assert np.abs(force).max(initial=0) > 1e-3 or not force.size
-    assert np.abs(found.detach().numpy() - force).max(initial=0) < 1e-15
-
-
-@pytest.mark.mpi(1)
-def test_a_flow_that_is_resolved_has_no_spectral_viscosity(comm):
-    grid = coarse_grid(comm, 24)
-    velocity = initial_fields.random_velocity(grid, 5, 1.0, 1.0)
-    model, force = SpectralViscosity(grid), np.zeros_like(velocity)
-    model.begin_step(velocity)
-    model.add(velocity, force)
-    assert abs(power(grid, velocity, force)) < 1e-12
+    assert np.abs(force).max() > 1e-3
+    assert np.abs(found.detach().numpy() - force).max() < 1e-15

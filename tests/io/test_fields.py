@@ -9,9 +9,6 @@ from tests.changed_product import changed
 
 CELLS = 6
 VARIABLES = {"velocity": 3, "density": 1}
-PLANES = {"even": lambda comm: np.linspace(0, CELLS, comm.size + 1).astype(int),
-          "uneven": lambda comm: np.array([0, *[CELLS - 1] * (comm.size - 1), CELLS]),
-          "all on the last rank": lambda comm: np.array([0] * comm.size + [CELLS])}
 
 
 def field(index, variable):
@@ -20,9 +17,9 @@ def field(index, variable):
 
 
 @pytest.mark.mpi(1, 2, 3)
-@pytest.mark.parametrize("planes", PLANES)
-def test_fields_survive(comm, tmp_path, planes):
-    starts = PLANES[planes](comm)
+def test_fields_survive(comm, tmp_path):
+    """The first of three ranks has all planes but one, the second none."""
+    starts = [0, *[CELLS - 1] * (comm.size - 1), CELLS]
     start, stop = starts[comm.rank], starts[comm.rank + 1]
     with create_product(comm, tmp_path / "f.h5", "ground_truth", {}) as file:
         writer = FieldWriter(file, "filtered", CELLS, VARIABLES)
@@ -42,16 +39,16 @@ def test_fields_survive(comm, tmp_path, planes):
 
 
 @pytest.mark.mpi(1)
-@pytest.mark.parametrize("change, told", [
-    (lambda group: group["time"].write_direct(np.array([0.1, 0.1])), "time, holds times that do not increase"),
-    (lambda group: group["time"].resize(1, 0), r"has the shape \(2, ., 6, 6, 6\), with 1 times, 6 cells a side"),
-    (lambda group: group.attrs.modify("cells", 8), r"has the shape \(2, ., 6, 6, 6\), with 2 times, 8 cells a side")])
-def test_series_that_no_stage_writes_are_told(comm, tmp_path, change, told):
+@pytest.mark.parametrize("change, message", [
+    (lambda group: group["time"].write_direct(np.array([0.1, 0.1])), "do not increase"),
+    (lambda group: group["time"].resize(1, 0), r"shape \(2, ., 6, 6, 6\).* 1 times"),
+    (lambda group: group.attrs.modify("cells", 8), r"shape \(2, ., 6, 6, 6\).* 8 cells")])
+def test_malformed_series_are_refused(comm, tmp_path, change, message):
     with create_product(comm, tmp_path / "f.h5", "ground_truth", {}) as file:
         writer = FieldWriter(file, "filtered", CELLS, VARIABLES)
         for index in range(2):
             writer.append(0.1 * index, 0, {name: field(index, name) for name in VARIABLES})
     with changed(tmp_path / "f.h5") as file:
         change(file["fields/filtered"])
-    with open_product(comm, tmp_path / "f.h5", "ground_truth") as file, pytest.raises(ProductError, match=told):
+    with open_product(comm, tmp_path / "f.h5", "ground_truth") as file, pytest.raises(ProductError, match=message):
         FieldSeries(file, "filtered").times

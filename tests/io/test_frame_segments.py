@@ -5,20 +5,13 @@ import pytest
 
 from eddies.io.fields import FieldSeries
 from eddies.io.frame_segments import FieldLayout, FrameLayout, FrameSegments
-from eddies.io.hdf5 import ProductError, create_product, open_product
+from eddies.io.hdf5 import create_product, open_product
 from eddies.io.trajectories import Trajectory
 from eddies.parallel.migration import id_block
 from eddies.parallel.slab import SlabDecomposition
 
 LAYOUT = FrameLayout(5, 1.0, {"all": {"velocity": (3,), "density": ()}, "some": {"density": ()}}, np.float32,
                      {"flow": FieldLayout(3, {"velocity": 2}), "finer": FieldLayout(4, {"density": 1})})
-
-
-@pytest.mark.mpi(1, 2, timeout=30)
-def test_a_directory_that_cannot_be_made_is_told_by_all(comm, tmp_path):
-    segments = FrameSegments(comm, tmp_path / "nowhere/checkpoints", FrameLayout(8, 1.0, {}, np.float64, {}))
-    with pytest.raises(ProductError, match="nowhere/checkpoints: No such file or directory; check the file"):
-        segments.open(0)
 
 
 @pytest.mark.mpi(1, 2, 3)

@@ -1,21 +1,19 @@
-"""VTKHDF files: VTK's own reader finds in them what the products hold."""
+"""VTK's own reader finds in VTKHDF files what the products hold."""
 
-import os
-import resource
 from contextlib import contextmanager
-from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 from vtkmodules.util.numpy_support import vtk_to_numpy
 
-from eddies.io import exported_file, sink, vtkhdf
+from eddies.io import new_files, vtkhdf
+from eddies.io.errors import WriteError
 from eddies.io.fields import FieldSeries, FieldWriter
-from eddies.io.hdf5 import ProductError, create_product, open_product
+from eddies.io.hdf5 import create_product, open_product
 from eddies.io.provenance import read_provenance
 from eddies.io.trajectories import Trajectory, TrajectoryWriter
-
+from tests.full_disk import largest_file
 from tests.vtk_reader import VtkFile
 
 CELLS, PARTICLES, LENGTH = 5, 7, 2 * np.pi
@@ -44,21 +42,10 @@ def product(comm, folder, times=TIMES):
         yield file
 
 
-@contextmanager
-def largest_file(size):
-    """No file may become larger: stands for a full disk."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-
-
 @pytest.mark.mpi(1)
 @pytest.mark.parametrize("block_bytes", [2**26, 1000])
 def test_fields_survive(comm, tmp_path, monkeypatch, block_bytes):
-    """At any step, in any order; with the planes that close the periodic cube, copied whole or in parts."""
+    """At any step, in any order; with the planes that close the periodic cube, copied in one or several parts."""
     monkeypatch.setattr(vtkhdf, "BLOCK_BYTES", block_bytes)
     with product(comm, tmp_path) as file:
         vtkhdf.write_images(tmp_path / "new" / "f.vtkhdf", FieldSeries(file, "filtered"), LENGTH, {})
@@ -66,11 +53,9 @@ def test_fields_survive(comm, tmp_path, monkeypatch, block_bytes):
     assert read.times == TIMES
     for frame in (2, 0, 1):
         data, arrays = read.step(frame)
-        assert data.GetClassName() == "vtkImageData"
-        assert data.GetDimensions() == (CELLS + 1,) * 3
+        assert data.GetClassName() == "vtkImageData" and data.GetDimensions() == (CELLS + 1,) * 3
         assert data.GetOrigin() == (0, 0, 0) and data.GetSpacing() == (LENGTH / CELLS,) * 3
-        assert arrays.keys() == {"velocity", "density"}
-        assert arrays["velocity"].shape == ((CELLS + 1)**3, 3) and arrays["density"].ndim == 1
+        assert arrays.keys() == {"velocity", "density"} and arrays["density"].ndim == 1
         for name, components in (("velocity", 3), ("density", 1)):
             values = np.moveaxis(arrays[name].reshape(*[CELLS + 1] * 3, components), -1, 0)
             closed = [np.arange(CELLS + 1) % CELLS] * 3
@@ -93,9 +78,12 @@ def test_components_and_axes_are_not_swapped(comm, tmp_path):
 
 
 @pytest.mark.mpi(1)
-def test_particles_survive(comm, tmp_path):
+def test_particles_and_their_origin_survive(comm, tmp_path):
     with product(comm, tmp_path) as file:
-        vtkhdf.write_points(tmp_path / "p.vtkhdf", Trajectory(file, "tracers"), {})
+        origin = read_provenance(file)
+        vtkhdf.write_points(tmp_path / "p.vtkhdf", Trajectory(file, "tracers"), origin)
+    with h5py.File(tmp_path / "p.vtkhdf") as file:
+        assert read_provenance(file) == origin and origin["scene"] == "made up"
     read = VtkFile(tmp_path / "p.vtkhdf")
     assert read.times == TIMES
     for frame in (2, 0, 1):
@@ -106,8 +94,7 @@ def test_particles_survive(comm, tmp_path):
         assert np.array_equal(vtk_to_numpy(data.GetVerts().GetConnectivityArray()), np.arange(PARTICLES))
         assert np.array_equal(arrays.pop("id"), np.arange(PARTICLES))
         assert arrays.pop("image").shape == (PARTICLES, 3)
-        assert arrays.keys() == COLUMNS.keys() - {"position"}
-        assert arrays["density"].ndim == 1
+        assert arrays.keys() == COLUMNS.keys() - {"position"} and arrays["density"].ndim == 1
         for name, values in arrays.items():
             assert np.array_equal(values.reshape(PARTICLES, *COLUMNS[name]), column(frame, name))
 
@@ -136,59 +123,30 @@ def test_a_single_frame_survives(comm, tmp_path):
         vtkhdf.write_images(tmp_path / "f.vtkhdf", FieldSeries(file, "filtered"), LENGTH, {})
         vtkhdf.write_points(tmp_path / "p.vtkhdf", Trajectory(file, "tracers"), {})
     images, points = VtkFile(tmp_path / "f.vtkhdf"), VtkFile(tmp_path / "p.vtkhdf")
-    assert images.times is None and points.times is None
     for read in (images, points):
+        assert read.times is None
         assert read.step(0)[0].GetFieldData().GetArray("time").GetValue(0) == 0.4
-    for name, components in (("velocity", 3), ("density", 1)):
-        values = images.step(0)[1][name].reshape(*[CELLS + 1] * 3, components)
-        assert np.array_equal(np.moveaxis(values, -1, 0)[:, :-1, :-1, :-1], field(0, components))
+    values = images.step(0)[1]["velocity"].reshape(*[CELLS + 1] * 3, 3)
+    assert np.array_equal(np.moveaxis(values, -1, 0)[:, :-1, :-1, :-1], field(0, 3))
     data, arrays = points.step(0)
     assert np.array_equal(vtk_to_numpy(data.GetPoints().GetData()), column(0, "position"))
     assert np.array_equal(arrays["velocity"], column(0, "velocity"))
 
 
 @pytest.mark.mpi(1)
-def test_a_file_says_where_it_comes_from(comm, tmp_path):
+def test_space_for_the_whole_file_is_reserved_first(comm, tmp_path, monkeypatch):
+    """So a disk cannot fill later. If it is full, the former file stays."""
+    held, close = [], new_files._NewFile.close
+    monkeypatch.setattr(new_files._NewFile, "close", lambda new: held.append(new._held) or close(new))
     with product(comm, tmp_path) as file:
-        origin = read_provenance(file)
-        vtkhdf.write_points(tmp_path / "p.vtkhdf", Trajectory(file, "tracers"), origin)
-    with h5py.File(tmp_path / "p.vtkhdf") as file:
-        assert read_provenance(file) == origin and origin["scene"] == "made up"
-
-
-@pytest.mark.mpi(1)
-def test_a_full_disk_leaves_what_was_there(comm, tmp_path):
-    with product(comm, tmp_path) as file:
+        (tmp_path / "file").write_text("older")
         for write in (lambda path: vtkhdf.write_images(path, FieldSeries(file, "filtered"), LENGTH, {}),
                       lambda path: vtkhdf.write_points(path, Trajectory(file, "tracers"), {})):
-            (tmp_path / "x.vtkhdf").write_text("older")
-            told = "x.vtkhdf.partial: cannot be written: File too large: .* bytes wanted"
-            with largest_file(100_000), pytest.raises(ProductError, match=told):
-                write(tmp_path / "x.vtkhdf")
-            assert {path.name for path in tmp_path.iterdir()} == {"p.h5", "x.vtkhdf"}
-            assert (tmp_path / "x.vtkhdf").read_text() == "older"
-
-
-@pytest.mark.mpi(1)
-def test_the_space_of_a_file_is_reserved_in_full(comm, tmp_path, monkeypatch):
-    """Nothing is written behind what has been reserved, so a disk cannot be found full later."""
-    reserved = {}
-
-    def reserve(descriptor, start, stop):
-        reserved[Path(os.readlink(f"/proc/self/fd/{descriptor}")).stem] = stop
-        sink.reserve(descriptor, start, stop)
-
-    monkeypatch.setattr(exported_file, "reserve", reserve)
-    with product(comm, tmp_path) as file:
-        vtkhdf.write_images(tmp_path / "f.vtkhdf", FieldSeries(file, "filtered"), LENGTH, {})
-        vtkhdf.write_points(tmp_path / "p.vtkhdf", Trajectory(file, "tracers"), {})
-    for name in ("f.vtkhdf", "p.vtkhdf"):
-        assert (tmp_path / name).stat().st_size < reserved[name] - exported_file.OVERHEAD_BYTES / 2
-
-
-@pytest.mark.mpi(1)
-def test_a_directory_that_cannot_be_made(comm, tmp_path):
-    (tmp_path / "file").write_text("")
-    with product(comm, tmp_path) as file:
-        with pytest.raises(ProductError, match="file/p.vtkhdf: cannot be written: .*check its directory"):
-            vtkhdf.write_points(tmp_path / "file" / "p.vtkhdf", Trajectory(file, "tracers"), {})
+            write(tmp_path / "a.vtkhdf")
+            assert (tmp_path / "a.vtkhdf").stat().st_size < held[-1] - new_files.MARGIN_BYTES
+            with largest_file(comm, 100_000), pytest.raises(WriteError, match="file.partial: .* bytes wanted"):
+                write(tmp_path / "file")
+            assert {path.name for path in tmp_path.iterdir()} == {"p.h5", "a.vtkhdf", "file"}
+            assert (tmp_path / "file").read_text() == "older"
+        with pytest.raises(WriteError, match="file: (Not a directory|File exists)"):
+            write(tmp_path / "file" / "p.vtkhdf")

@@ -33,12 +33,6 @@ def test_weights_survive(comm, tmp_path):
     assert tables.keys() == {"history"} and np.array_equal(tables["history"]["step"], np.arange(4))
 
 
-@pytest.mark.mpi(1, 2, timeout=30)
-def test_weights_that_cannot_be_written_are_told_by_all(comm, tmp_path):
-    with pytest.raises(ProductError, match="nowhere/m.h5.partial: cannot be written: "):
-        save(comm, tmp_path / "nowhere/m.h5")
-
-
 @pytest.mark.mpi(1, 2)
 def test_damage_is_told(comm, tmp_path):
     save_weights(comm, tmp_path / "m.h5", "model", DESCRIPTION, {"layers.0.weight": np.ones(2000)}, {})
@@ -49,28 +43,19 @@ def test_damage_is_told(comm, tmp_path):
             file.seek(place + 8000)
             file.write(np.float64(0.5).tobytes())
     comm.Barrier()
-    with pytest.raises(ProductError, match="m.h5: weights/layers.0.weight .* is not what was written.*; make it"):
+    with pytest.raises(ProductError, match="m.h5: weights/layers.0.weight .*damaged"):
         load_weights(comm, tmp_path / "m.h5", "model")
 
 
 @pytest.mark.mpi(1, 2)
-def test_values_that_are_not_finite_are_not_written(comm, tmp_path):
-    with pytest.raises(ProductError, match="m.h5: tensor scale is not finite, so nothing is written"):
-        save_weights(comm, tmp_path / "m.h5", "model", {}, {"scale": np.array([1.0, np.nan])}, {})
+def test_tensors_that_are_not_finite_are_neither_written_nor_read(comm, tmp_path, monkeypatch):
+    tensors = {"scale": np.array([1.0, np.nan])}
+    with pytest.raises(ProductError, match="m.h5: tensor scale is not finite"):
+        save_weights(comm, tmp_path / "m.h5", "model", {}, tensors, {})
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.mpi(1)
-def test_values_that_are_not_finite_are_refused(comm, tmp_path, monkeypatch):
+    comm.Barrier()
     with monkeypatch.context() as patch:
         patch.setattr(np, "isfinite", lambda _: np.array(True))
-        save_weights(comm, tmp_path / "m.h5", "model", {}, {"scale": np.array([1.0, np.nan])}, {})
-    with pytest.raises(ProductError, match="tensor scale holds values that are not finite"):
+        save_weights(comm, tmp_path / "m.h5", "model", {}, tensors, {})
+    with pytest.raises(ProductError, match="tensor scale .*not finite"):
         load_weights(comm, tmp_path / "m.h5", "model")
-
-
-@pytest.mark.mpi(1, 2)
-def test_wrong_kind(comm, tmp_path):
-    save(comm, tmp_path / "m.h5")
-    with pytest.raises(ProductError, match="expected kernel: run `eddies train-kernel SCENE` first"):
-        load_weights(comm, tmp_path / "m.h5", "kernel")

@@ -1,4 +1,4 @@
-"""A Slurm of one's own on this machine: its daemons, with ports and files that no other Slurm uses."""
+"""A Slurm on this machine for tests: its daemons, with their own ports and files."""
 
 import getpass
 import os
@@ -11,8 +11,8 @@ from pathlib import Path
 
 DAEMONS = ("munged", "slurmctld", "slurmd")
 PATH = f"{os.environ['PATH']}:/usr/sbin"
-# Processors for all jobs of the tests at once, be there fewer; pending jobs are looked at every second; a job that is
-# queued again begins after the life time of a credential. In TmpFS PMIx has folders named after jobs, not after users.
+# There are more CPUs than processors, so that all jobs of the tests run at once. Pending jobs are checked every second.
+# A job that is queued again starts after the life time of a credential. TmpFS holds the folders of PMIx, by job.
 CONFIGURATION = """\
 ClusterName=test
 SlurmctldHost={host}(127.0.0.1)
@@ -41,7 +41,7 @@ PartitionName=test Nodes=ALL Default=YES
 
 
 def missing() -> str:
-    """What keeps Slurm from running here, with the remedy; empty for nothing."""
+    """The reason why Slurm cannot run here, with the remedy; empty if it can."""
     absent = [name for name in DAEMONS if shutil.which(name, path=PATH) is None]
     if absent:
         return f"no {', '.join(absent)}: apt-get install slurm-wlm munge"
@@ -49,7 +49,7 @@ def missing() -> str:
 
 
 class Slurm:
-    """The daemons, from the begin of a `with` to its end; jobs that are left then are cancelled."""
+    """The daemons, for the time of a `with`; its end cancels the jobs that are left."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -70,7 +70,7 @@ class Slurm:
             ports = [each.getsockname()[1] for each in (first, second)]
         (folder / "slurm.conf").write_text(CONFIGURATION.format(
             folder=folder, ports=ports, user=getpass.getuser(), host=socket.gethostname().partition(".")[0]))
-        # No cgroups are used; this plugin looks for none, where a container has them read-only or not at all.
+        # No cgroups are used; a container may have none, or read-only ones.
         (folder / "cgroup.conf").write_text(f"CgroupPlugin=cgroup/v1\nCgroupMountpoint={folder}\n")
         try:
             self._start("munged", "--foreground", "--force", *(f"--{name}-file={folder}/munge.{name}" for name in (
@@ -105,7 +105,7 @@ class Slurm:
                 daemon.kill()
 
     def wait(self, ready, what: str, seconds: float = 120) -> None:
-        """Return once `ready()` holds; TimeoutError with what the daemons say where it takes longer."""
+        """Wait until `ready()` holds; raises TimeoutError with the logs of the daemons."""
         deadline = time.monotonic() + seconds
         while not ready():
             if time.monotonic() > deadline or any(daemon.poll() is not None for daemon in self._daemons):
@@ -114,22 +114,22 @@ class Slurm:
             time.sleep(0.05)
 
     def ask(self, *command: str) -> str:
-        """The output of a command of Slurm; empty where it fails."""
+        """The output of a command of Slurm; empty if it fails."""
         return subprocess.run(command, env=self.environment, stdin=subprocess.DEVNULL, capture_output=True, text=True,
                               timeout=30).stdout.strip()
 
     def submit(self, *command: object, **variables: str) -> int:
-        """Number of the job of `sbatch` with these arguments, submitted with further variables."""
+        """Submit a job with `sbatch`, these arguments and further variables; its number."""
         ended = subprocess.run(["sbatch", "--parsable", *map(str, command)], env=self.environment | variables,
                                cwd=self.folder, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=30)
         assert ended.returncode == 0, ended.stderr
         return int(ended.stdout)
 
     def job(self, number: int) -> dict[str, str]:
-        """What Slurm knows of a job, by the names that `scontrol show job` gives it."""
+        """The record of a job, by the names of `scontrol show job`."""
         return dict(re.findall(r"(\w+)=(\S*)", self.ask("scontrol", "show", "job", str(number))))
 
     def output(self, number: int) -> str:
-        """What a job has printed so far."""
+        """The output of a job so far."""
         path = self.folder / f"slurm-{number}.out"
         return path.read_text() if path.exists() else ""

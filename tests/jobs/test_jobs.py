@@ -1,5 +1,6 @@
-"""The job scripts, run in a made-up checkout where `mpirun` and `eddies` only say what they were asked; those of Slurm
-run on one (test_slurm.py)."""
+"""The job scripts, run in a made-up checkout where `mpirun` and `eddies` only print their arguments.
+
+test_slurm.py runs those of Slurm on a Slurm."""
 
 import os
 import re
@@ -36,7 +37,7 @@ def test_schedulers_differ_in_header_and_launcher_only():
 
 @pytest.fixture
 def checkout(tmp_path):
-    """A copy of jobs/ and of the launcher beside stand-ins for the set-up, mpirun and eddies."""
+    """A copy of jobs/ and of the launcher, with stand-ins for the set-up, mpirun and eddies."""
     shutil.copytree(CHECKOUT / "jobs", tmp_path / "jobs")
     (tmp_path / "mpi_tools").mkdir()
     shutil.copy(CHECKOUT / "mpi_tools/launch.py", tmp_path / "mpi_tools")
@@ -59,55 +60,37 @@ def run(checkout, script, *arguments, **variables):
                           env=ours | {"PATH": path, "CHECKED": '{"most_ranks": 8}'} | variables)
 
 
-@pytest.mark.parametrize("asked, ranks", [("1", 1), ("1000", local_cores()), (None, min(8, local_cores()))])
-def test_local_runs_on_the_cores_or_fewer(checkout, asked, ranks):
-    result = run(checkout, "local.sh", **({"EDDIES_RANKS": asked} if asked else {}))
+@pytest.mark.parametrize("scene, variables, ranks", [
+    (["abc.toml"], {"EDDIES_RANKS": "1000"}, local_cores()), ([], {}, min(8, local_cores())),
+    ([], {"CHECKED": '{"most_ranks": 1}'}, 1)])
+def test_local_runs_on_the_cores_or_as_many_ranks_as_the_scene_can_use(checkout, scene, variables, ranks):
+    result = run(checkout, "local.sh", *scene, "--set", "seed=2", **variables)
     assert result.returncode == 0, result.stderr
     assert f"mpirun -n {ranks} " in result.stdout
-    assert "eddies run hit-small; threads 1\n" in result.stdout
+    assert f"eddies run {(scene or ['hit-small'])[0]} --set seed=2; threads 1\n" in result.stdout
 
 
-def test_local_starts_no_more_ranks_than_the_scene_can_use(checkout):
-    result = run(checkout, "local.sh", "tiny", CHECKED='{"most_ranks": 1}')
-    assert "mpirun -n 1 " in result.stdout and "eddies run tiny" in result.stdout
-
-
-def test_local_ends_with_what_is_wrong_with_the_scene(checkout):
-    result = run(checkout, "local.sh", "tiny", CHECKED="", CHECK_ENDS_WITH="2")
-    assert result.returncode == 2 and "Traceback" not in result.stderr and "mpirun" not in result.stdout
-
-
-def test_local_passes_scene_and_options_on(checkout):
-    for given, scene in ((["abc.toml"], "abc.toml"), ([], "hit-small")):
-        result = run(checkout, "local.sh", *given, "--set", "seed=2")
-        assert f"eddies run {scene} --set seed=2; " in result.stdout
-
-
-@pytest.mark.parametrize("asked", ["0", "-2", "two"])
-def test_local_refuses_a_wrong_number_of_ranks(checkout, asked):
-    result = run(checkout, "local.sh", EDDIES_RANKS=asked)
-    assert result.returncode == 2
-    assert f'EDDIES_RANKS = "{asked}"' in result.stderr
-
-
-def asked_of_slurm(script):
-    """What the header of a job script asks for."""
-    return dict(re.findall(r"^#SBATCH --([a-z-]+)=(\S+)", (CHECKOUT / "jobs" / script).read_text(), re.MULTILINE))
+@pytest.mark.parametrize("variables, error", [
+    ({"CHECKED": "", "CHECK_ENDS_WITH": "2"}, ""), ({"EDDIES_RANKS": "0"}, "EDDIES_RANKS"),
+    ({"EDDIES_RANKS": "two"}, "two")])
+def test_local_refuses_a_wrong_scene_or_number_of_ranks(checkout, variables, error):
+    result = run(checkout, "local.sh", "abc.toml", **variables)
+    assert result.returncode == 2 and error in result.stderr
+    assert "Traceback" not in result.stderr and "mpirun" not in result.stdout
 
 
 def test_large_job_fits_the_scene():
-    # Ranks that all work on planes of their own, ghost planes included, in the memory of a node; those of the stages
-    # that follow, of which the comment speaks, are no more than they can use.
+    # Every rank has planes, and the ranks of a node fit its memory. The comment names the most ranks of later stages.
     from eddies.scene.scene import load_scene
     from eddies.workflows.foreseen.ranks import ground_truth_alone, most_ranks
     from eddies.workflows.foreseen.storage import flow_memory
-    scene, asked = load_scene("hit-paper"), asked_of_slurm("hit-paper.slurm.sh")
+    text = (CHECKOUT / "jobs/hit-paper.slurm.sh").read_text()
+    scene, asked = load_scene("hit-paper"), dict(re.findall(r"^#SBATCH --([a-z-]+)=(\S+)", text, re.MULTILINE))
     on_node = int(asked["ntasks-per-node"])
     ranks = int(asked["nodes"]) * on_node
     assert scene.flow.cells % ranks == 0
     assert ranks <= min(most_ranks(ground_truth_alone(scene)).values())
     assert 1.1 * on_node * flow_memory(scene, ranks) < 1e9 * int(asked["mem"].removesuffix("G"))
-    text = (CHECKOUT / "jobs/hit-paper.slurm.sh").read_text()
     most = min(most_ranks(scene).values())
     assert f"at most {most} ranks" in text
     assert int(re.search(r"--ntasks-per-node=(\d+) jobs/slurm.sh", text)[1]) <= most

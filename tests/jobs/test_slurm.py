@@ -1,4 +1,4 @@
-"""The job scripts of Slurm on a Slurm of two processors, started for these tests."""
+"""The job scripts of Slurm, on a Slurm that is started for these tests."""
 
 import re
 import shutil
@@ -14,7 +14,7 @@ from tests.jobs.slurm import Slurm, missing
 
 CHECKOUT = Path(__file__).parents[2]
 EDDIES = Path(sys.executable).with_name("eddies")
-STEPS, STEP = 60, 0.001
+STEPS, STEP = 40, 0.001
 pytestmark = pytest.mark.skipif(bool(missing()), reason=missing())
 
 
@@ -25,14 +25,14 @@ def slurm(tmp_path_factory):
 
 
 def end(slurm, job):
-    """What Slurm knows of a job that has ended, and what it has printed."""
+    """The record and the output of a job, after its end."""
     slurm.wait(lambda: slurm.job(job)["JobState"] not in ("PENDING", "RUNNING", "COMPLETING"), f"job {job}")
     return slurm.job(job), slurm.output(job)
 
 
 def test_job_is_stopped_queued_again_and_goes_on(slurm, tmp_path):
     run = tmp_path / "a run"
-    job = slurm.submit("--ntasks-per-node=2", CHECKOUT / "jobs/slurm.sh", "--verbose", "--set", "flow.cells=48",
+    job = slurm.submit("--ntasks-per-node=2", CHECKOUT / "jobs/slurm.sh", "--verbose", "--set", "flow.cells=32",
                        "--set", f"time.step={STEP}", "--set", f"time.duration={STEPS * STEP}", EDDIES_SCENE="abc",
                        EDDIES_OUTPUT=str(run), EDDIES_CHECKOUT=str(CHECKOUT), OMPI_MCA_mpi_yield_when_idle="1")
     slurm.wait(lambda: "step 3 " in slurm.output(job), "the third step")
@@ -51,7 +51,7 @@ def test_job_is_stopped_queued_again_and_goes_on(slurm, tmp_path):
 
 @pytest.fixture
 def checkout(tmp_path):
-    """A copy of jobs/ beside an eddies that says what it was asked, in a folder whose name has a space."""
+    """A copy of jobs/ with an eddies that prints its arguments, in a folder whose name has a space."""
     folder = tmp_path / "check out"
     shutil.copytree(CHECKOUT / "jobs", folder / "jobs")
     eddies = folder / ".venv/bin/eddies"
@@ -62,8 +62,8 @@ def checkout(tmp_path):
 
 
 def test_job_is_queued_again_after_a_stop_alone(slurm, checkout):
-    # Even with variables named alone, the ranks get the environment of the script. Ranks that SIGUSR1 reaches while
-    # they start end by it.
+    # The ranks get the environment of the script even if --export names single variables. SIGUSR1 ends ranks that are
+    # still starting.
     def submit(script, ends_with, *arguments):
         return slurm.submit("--nodes=1", "--ntasks-per-node=1", "--cpus-per-task=2", "--mem=0",
                             "--export=EDDIES_CHECKOUT,EDDIES_SCENE,ENDS_WITH", checkout / "jobs" / script, *arguments,
@@ -83,16 +83,16 @@ def test_job_is_queued_again_after_a_stop_alone(slurm, checkout):
             slurm.ask("scancel", str(job))
 
 
-def test_job_that_is_submitted_elsewhere_says_what_to_do(slurm):
+def test_job_that_is_submitted_elsewhere_names_the_remedy(slurm):
     job = slurm.submit("--ntasks-per-node=1", CHECKOUT / "jobs/slurm.sh")
     known, output = end(slurm, job)
     assert known["ExitCode"] == "2:0"
-    assert output == f"no {slurm.folder}/jobs/run.sh: submit from the checkout, or set EDDIES_CHECKOUT to it\n"
+    assert f"{slurm.folder}/jobs/run.sh" in output and "EDDIES_CHECKOUT" in output
 
 
 def test_ranks_that_slurm_does_not_connect_are_refused_and_no_others(slurm, tmp_path):
-    # The MPI at hand ends by itself in a step that does not connect it; where the number of the step is unset it starts
-    # as other ones do, each rank on its own.
+    # Open MPI ends by itself in a step that does not connect it. If the number of the step is unset it starts, as other
+    # MPIs do, each rank on its own.
     script = tmp_path / "script"
     script.write_text(f"""#!/bin/bash
 eddies='{EDDIES}'
@@ -109,6 +109,5 @@ wait
     said = sorted(line for line in output.splitlines() if not line.startswith("srun: "))
     assert [line for line in said if not line.startswith("eddies: ")] == [
         "in the script 0", "mpirun in a step 0", "mpirun in the script 0", "none 2", "pmix 0"], output
-    assert said[0].startswith("eddies: error: 2 ranks were started (SLURM_STEP_NUM_TASKS), MPI connects 1 of them; "
-                              "start them with `srun --mpi=pmix`")
+    assert "2 ranks were started (SLURM_STEP_NUM_TASKS)" in said[0] and "srun --mpi=pmix" in said[0]
     assert len(said) == 6 and not (tmp_path / "run").exists()

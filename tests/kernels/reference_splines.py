@@ -1,15 +1,12 @@
-"""What `eddies.kernels.splines` computes, by numpy: a class with the same methods."""
+"""Splines by numpy: a class with the methods of `eddies.kernels.splines.Splines`."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from eddies.kernels.splines import MisplacedPoint, PaddedPlanes
 
-TOGETHER = 512    # points whose splines are held at once: a few MB
-FARTHEST = 1e15   # in cells; beyond, numbers do not tell one from the next
+FARTHEST = 1e15  # in cells; beyond, floating-point numbers do not resolve a cell
 
 
 class Splines:
@@ -30,55 +27,46 @@ class Splines:
 
     def at(self, parts: Sequence[np.ndarray]) -> np.ndarray:
         """Values (n, c) of planes."""
-        return self._values(parts, None)
+        rows, weights = self._stencils()
+        return np.stack([(weights * plane.ravel()[rows]).sum(1) for plane in np.concatenate(parts, axis=1)], axis=1)
 
     def slope(self, parts: Sequence[np.ndarray], factors: np.ndarray) -> np.ndarray:
-        """Gradient (n, 3) with respect to the positions of sum_c factors_c f_c, the factors (n, c) held fixed."""
-        return np.stack([(factors * self._values(parts, axis)).sum(1) for axis in range(3)], axis=1)
+        """Gradient (n, 3) by the positions of sum_c factors_c f_c, at fixed factors (n, c)."""
+        whole, gradient = np.concatenate(parts, axis=1), np.zeros((len(self._first), 3))
+        for axis in range(3):
+            rows, weights = self._stencils(axis)
+            for plane, factor in zip(whole, factors.T):
+                gradient[:, axis] += factor * (weights * plane.ravel()[rows]).sum(1)
+        return gradient
 
     def spread(self, values: np.ndarray, parts: Sequence[np.ndarray]) -> None:
-        """Transpose of `at`: values (n, c) added to planes."""
-        cells, planes = self._padded.cells, self._padded.planes
-        added = np.zeros((values.shape[1], planes * cells**2))
-        for block, rows, weights in self._stencils():
-            for component, column in zip(added, values[block].T):
-                np.add.at(component, rows, weights * column[:, None])
+        """Add the transpose of `at`, applied to values (n, c), to planes."""
+        rows, weights = self._stencils()
+        added = np.zeros((values.shape[1], self._padded.planes * self._padded.cells**2))
+        for component, column in zip(added, values.T):
+            np.add.at(component, rows, weights * column[:, None])
         ends = np.cumsum([part.shape[1] for part in parts])
-        for part, more in zip(parts, np.split(added.reshape(-1, planes, cells, cells), ends[:-1], axis=1)):
+        shape = (-1, self._padded.planes, self._padded.cells, self._padded.cells)
+        for part, more in zip(parts, np.split(added.reshape(shape), ends[:-1], axis=1)):
             part += more
 
-    def _values(self, parts: Sequence[np.ndarray], derivative: int | None) -> np.ndarray:
-        whole = np.concatenate(parts, axis=1)
-        flat = np.ascontiguousarray(whole.reshape(len(whole), -1).T)
-        values = np.empty((len(self._first), len(whole)))
-        for block, rows, weights in self._stencils(derivative):
-            values[block] = np.matmul(weights[:, None], flat[rows])[:, 0]
-        return values
-
-    def _stencils(self, derivative: int | None = None) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
-        """Block by block of points, the splines around them: their rows (n, s) in the flattened planes, and their
-        values (n, s) at the points, or the derivatives of these along one axis."""
+    def _stencils(self, derivative: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Rows (n, s) of the splines in flattened planes, and their values or derivatives (n, s) along one axis."""
         cells, width = self._padded.cells, self.degree + 1
-        for start in range(0, len(self._first), TOGETHER):
-            block = slice(start, start + TOGETHER)
-            along = [spline_weights(self.degree, fraction) for fraction in self._fraction[block].T]
-            if derivative is not None:
-                slopes = spline_slopes(self.degree, self._fraction[block, derivative])
-                along[derivative] = slopes / self._padded.spacing
-            x, y, z = ((first[:, None] + np.arange(width)) for first in self._first[block].T)
-            rows = (z[:, :, None, None] * cells + y[:, None, :, None] % cells) * cells + x[:, None, None, :] % cells
-            weights = along[2][:, :, None, None] * along[1][:, None, :, None] * along[0][:, None, None, :]
-            yield block, rows.reshape(-1, width**3), weights.reshape(-1, width**3)
+        along = [spline_weights(self.degree, fraction) for fraction in self._fraction.T]
+        if derivative is not None:
+            along[derivative] = spline_slopes(self.degree, self._fraction[:, derivative]) / self._padded.spacing
+        x, y, z = ((first[:, None] + np.arange(width)) for first in self._first.T)
+        rows = (z[:, :, None, None] * cells + y[:, None, :, None] % cells) * cells + x[:, None, None, :] % cells
+        weights = along[2][:, :, None, None] * along[1][:, None, :, None] * along[0][:, None, None, :]
+        return rows.reshape(len(rows), width**3), weights.reshape(len(rows), width**3)
 
 
 def spline_weights(degree: int, fraction: np.ndarray) -> np.ndarray:
-    """The degree + 1 B-spline weights (n, degree + 1) of points at `fraction` (n,) of a cell.
-
-    Built up from the constant spline by the recursion of de Boor on uniform knots.
-    """
+    """B-spline weights (n, degree + 1) of points at `fraction` (n,) of a cell, by the recursion of de Boor."""
     weights = np.ones((len(fraction), 1))
     for order in range(1, degree + 1):
-        # The distance of the point from the left end of each of the `order` overlapping splines.
+        # Distance of the point from the left end of each of the `order` overlapping splines.
         left = fraction[:, None] + np.arange(order - 1, -1, -1)
         following = np.zeros((len(fraction), order + 1))
         following[:, :-1] += weights * (order - left)
@@ -88,6 +76,6 @@ def spline_weights(degree: int, fraction: np.ndarray) -> np.ndarray:
 
 
 def spline_slopes(degree: int, fraction: np.ndarray) -> np.ndarray:
-    """Derivatives (n, degree + 1) of the weights with respect to `fraction`: differences of the next lower degree."""
+    """Derivatives (n, degree + 1) of the weights by `fraction`: differences of the weights of the next lower degree."""
     lower = spline_weights(degree - 1, fraction)
     return np.pad(lower, ((0, 0), (1, 0))) - np.pad(lower, ((0, 0), (0, 1)))

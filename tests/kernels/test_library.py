@@ -1,4 +1,4 @@
-"""The library is found, or the way to it told."""
+"""The compiled library is found, or an error says how to get it; memory and threads of the process."""
 
 import os
 import shutil
@@ -16,46 +16,53 @@ from eddies.kernels import library as module
 
 @pytest.fixture
 def elsewhere(tmp_path, monkeypatch):
-    """No library where it is looked for."""
+    """An empty folder in which the library is looked for, and a function that clears what is cached."""
+    def clear():
+        for cached in (module.library, module.load):
+            cached.cache_clear()
+
     monkeypatch.setattr(module, "__file__", str(tmp_path / "library.py"))
-    for cached in (module.library, module.load):
-        cached.cache_clear()
-    yield tmp_path
-    for cached in (module.library, module.load):
-        cached.cache_clear()
+    clear()
+    yield tmp_path, clear
+    clear()
 
 
-def test_without_the_plain_one_none_is_trusted_to_run_and_a_line_tells_the_way_to_it(elsewhere):
-    (elsewhere / "avx2.so").write_bytes(b"")
+def test_without_the_plain_library_an_error_names_the_compiler(elsewhere):
+    (elsewhere[0] / "avx2.so").write_bytes(b"")
     assert module.instruction_sets() == []
     for ask in (module.library, module.in_use):
-        with pytest.raises(UserError, match=r"no compiled kernels in .*: install .* \(g\+\+\)") as raised:
+        with pytest.raises(UserError, match=r"g\+\+") as raised:
             ask()
         assert "\n" not in str(raised.value)
 
 
-def test_one_that_does_not_load_is_told(elsewhere):
-    (elsewhere / "plain.so").write_bytes(b"no library")
-    with pytest.raises(UserError, match=r"do not load \(.*plain.so: .*\): install .* \(g\+\+\)"):
+def test_a_library_that_does_not_load_is_refused(elsewhere):
+    (elsewhere[0] / "plain.so").write_bytes(b"no library")
+    with pytest.raises(UserError, match=r"plain.so.*g\+\+"):
         module.library()
 
 
-def test_one_of_other_sources_than_lie_beside_it_is_refused(elsewhere):
+def test_a_library_of_other_sources_is_refused(elsewhere):
+    folder, clear = elsewhere
     kernels = Path(errors.__file__).parent / "kernels"
-    shutil.copy(kernels / "plain.so", elsewhere)
-    for source in kernels.glob("*.?pp"):
-        shutil.copy(source, elsewhere)
+    for file in (kernels / "plain.so", *kernels.glob("*.?pp")):
+        shutil.copy(file, folder)
     assert module.library()
-    for cached in (module.library, module.load):
-        cached.cache_clear()
-    (elsewhere / "pairs.cpp").write_text("")
-    with pytest.raises(UserError, match="of other sources than lie there: build them anew"):
+    clear()
+    (folder / "pairs.cpp").write_text("")
+    with pytest.raises(UserError, match="build_ext"):
         module.library()
 
 
-def test_the_best_that_the_processor_runs_is_taken():
+def test_the_best_instruction_set_is_taken():
     found = module.instruction_sets()
     assert found[0] == "plain" and module.library() is module.load(found[-1])
+
+
+def printed(program, **environment):
+    clean = {name: value for name, value in os.environ.items() if not name.startswith("MALLOC_")}
+    return subprocess.run([sys.executable, "-c", program], env=clean | environment, check=True, capture_output=True,
+                          text=True, timeout=60).stdout.strip()
 
 
 RUNTIME = """
@@ -75,7 +82,28 @@ for line in open("/proc/self/maps"):
 
 @pytest.mark.skipif(not (Path(pyfftw.__file__).parents[1] / "pyfftw.libs").exists(), reason="pyfftw brings no OpenMP")
 @pytest.mark.parametrize("threads, runtime", [("1", ""), ("2", "pyfftw.libs")])
-def test_kernels_take_the_threads_of_the_transforms(threads, runtime):
-    found = subprocess.run([sys.executable, "-c", RUNTIME], timeout=60, check=True, capture_output=True, text=True,
-                           env={**os.environ, "OMP_NUM_THREADS": threads}).stdout.strip()
-    assert Path(found).parent.name == runtime
+def test_kernels_share_the_threads_of_the_transforms(threads, runtime):
+    assert Path(printed(RUNTIME, OMP_NUM_THREADS=threads)).parent.name == runtime
+
+
+PAGE_FAULTS = """
+import resource
+from eddies.kernels.memory import keep_freed_memory
+{keep}
+for round in range(20):
+    block = b"1" * 2**24
+    del block
+    if round == 0:
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="another C library")
+def test_freed_memory_is_used_again_unless_the_user_has_set_malloc():
+    def page_faults(keep, **environment):
+        return int(printed(PAGE_FAULTS.format(keep=keep), **environment))
+
+    kept = page_faults("keep_freed_memory()")
+    assert kept < 100 < page_faults("pass", MALLOC_MMAP_THRESHOLD_="65536")
+    assert page_faults("keep_freed_memory()", MALLOC_MMAP_THRESHOLD_="65536") > 100

@@ -8,6 +8,7 @@ from eddies.flow.tracers import release
 from eddies.kernels.reconstruction import GridPlanes, sums_on_grid, told_kernel
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.particle_field import ParticleField
+from eddies.particles.reconstruction import reconstruct_with_gradient
 from eddies.particles.smoothing_kernels import CubicSpline, KernelNetwork, WendlandC2
 
 LENGTH = 2 * np.pi
@@ -28,11 +29,19 @@ def test_pieces_are_the_kernel(kind):
 
 
 def averages(field, kernel):
-    """Everything that a field is asked for without a gradient."""
-    with torch.no_grad():
-        volume = field.volumes(kernel)
-        return [volume, field.velocity_on_whole_grid(kernel, volume), *field.averaged(kernel, volume, field.points),
-                *field.at_particles(kernel, volume)]
+    """Averages by the compiled library: volumes, and velocity and gradient at grid points and at particles."""
+    volume = field.volumes(kernel)
+    return [volume, field.velocity_on_whole_grid(kernel, volume), *field.averaged(kernel, volume, field.points),
+            *field.averaged(kernel, volume, field.owned)]
+
+
+def averages_by_torch(field, kernel):
+    at_points, at_particles = (field._neighbors_of(points).pairs(points, field._position, dtype=field.dtype)
+                               for points in (field.points, field.owned))
+    volume = field._with_ghosts(1 / at_particles.sum(kernel.value(at_particles.distance)))
+    on_grid, on_particles = (reconstruct_with_gradient(kernel, pairs, volume, field._velocity)
+                             for pairs in (at_points, at_particles))
+    return [volume, on_grid[0], *on_grid, *on_particles]
 
 
 @pytest.mark.mpi(1, 2, 3)
@@ -51,9 +60,7 @@ def test_averages_are_those_of_torch(comm, library, monkeypatch, kind, dtype, ro
         kernel = KERNELS[kind](support)
     monkeypatch.setattr("eddies.particles.pairs.library", lambda: library)
     monkeypatch.setattr("eddies.particles.particle_field.library", lambda: library)
-    found = averages(field, kernel)
-    monkeypatch.setattr("eddies.particles.particle_field.kernels_serve", lambda device: False)
-    expected = averages(field, kernel)
+    found, expected = averages(field, kernel), averages_by_torch(field, kernel)
     for one, other in zip(found, expected, strict=True):
         assert one.shape == other.shape
         assert (one - other).abs().max() <= rounding * other.abs().max() > 0

@@ -1,4 +1,4 @@
-"""Models, scales and a recorder of gradients that the tests of this folder share."""
+"""Models, scales and a recorder of gradients for the tests of this folder."""
 
 import numpy as np
 import torch
@@ -15,8 +15,7 @@ SCALES = ReferenceScales(filter_width=2 * SPACING, spacing=SPACING, velocity=1.0
 
 
 def model_of(preset, support, neighbors, hidden, **settings):
-    """The model of a preset, a list of terms or settings by term, with initial weights in double precision; `settings`
-    by term, over the widths of all networks."""
+    """The model of a preset, of terms or of settings by term, in double precision, with networks of these widths."""
     listed = {"preset": preset} if isinstance(preset, str) else {"terms": tuple(preset)}
     settings = {**(preset if isinstance(preset, dict) else {}), **settings}
     bare = Model(**listed)
@@ -27,7 +26,7 @@ def model_of(preset, support, neighbors, hidden, **settings):
 
 
 class Recorder:
-    """In place of an optimizer: takes no step but keeps the gradient, summed over ranks, and this rank's share."""
+    """An optimizer that takes no step but keeps the gradient, summed over ranks."""
 
     def __init__(self, comm, model):
         self.comm, self.model = comm, model
@@ -36,13 +35,12 @@ class Recorder:
         self.model.zero_grad()
         share.backward()
         parts = [torch.zeros_like(p) if p.grad is None else p.grad for p in self.model.parameters()]
-        self.share, self.gradient = share, global_sum(self.comm, torch.cat([part.flatten() for part in parts]).numpy())
+        self.gradient = global_sum(self.comm, torch.cat([part.flatten() for part in parts]).numpy())
         return 0.0
 
 
 def slope(model, loss, gradient, epsilon):
-    """The derivative of a loss in a random direction of all parameters: by central differences, and as the gradient
-    has it."""
+    """Derivative of a loss in a random direction of all parameters: by central differences, and by the gradient."""
     random = np.random.default_rng(1)
     direction = [torch.from_numpy(np.asarray(random.standard_normal(p.shape))) for p in model.parameters()]
     values = []

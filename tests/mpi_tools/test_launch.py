@@ -1,4 +1,4 @@
-"""Environment and ranks that the launcher chooses, and the doctor under it."""
+"""Environment, ranks and error output of the launcher, and the doctor under it."""
 
 import subprocess
 import sys
@@ -14,7 +14,7 @@ CHECKOUT = Path(__file__).parents[2]
 
 
 def launched(ranks, *python_arguments, cwd=None):
-    """A finished Python on so many ranks."""
+    """A finished Python on this many ranks."""
     launch_line = [sys.executable, CHECKOUT / "mpi_tools/launch.py", "-n", str(ranks), "--"]
     return subprocess.run([*launch_line, sys.executable, *python_arguments], cwd=cwd, timeout=120,
                           capture_output=True, text=True)
@@ -32,7 +32,7 @@ def test_ranks_are_the_cores_or_fewer(monkeypatch):
         assert launch.default_ranks() == ranks
     for asked in ("many", "0", "-1", "2.0", "\u00b2"):
         monkeypatch.setenv("EDDIES_RANKS", asked)
-        with pytest.raises(ValueError, match=f'EDDIES_RANKS = "{asked}": must be a whole number of at least 1'):
+        with pytest.raises(ValueError, match=f'EDDIES_RANKS = "{asked}"'):
             launch.default_ranks()
 
 
@@ -47,10 +47,6 @@ def test_environment_of_the_user_wins(monkeypatch):
     assert launch.mpi_environment(4)["OMP_NUM_THREADS"] == "2"
 
 
-def test_exit_code_is_that_of_the_ranks():
-    assert launched(2, "-c", "raise SystemExit(75)").returncode == 75
-
-
 RULE = 74 * "-" + "\n"
 NOTICE = (f"{RULE}Primary job  terminated normally, but 1 process returned\na non-zero exit code. Per "
           f"user-direction, the job has been aborted.\n{RULE}{RULE}mpirun detected that one or more processes exited "
@@ -60,9 +56,10 @@ NOTICE = (f"{RULE}Primary job  terminated normally, but 1 process returned\na no
 
 @pytest.mark.parametrize("before, code, after", [
     ("eddies: error: no such reactor\n", 2, ""), ("eddies: stopped\n", 75, ""), ("eddies: interrupted\n", 130, ""),
-    ("eddies: error: no such reactor\n", 2, "said later\n"), ("no line", 2, ""), (f"{RULE}mine\n{RULE}", 2, "")])
-def test_notices_of_what_ranks_have_said_are_left_out(before, code, after):
-    """However the bytes are cut, and all else is passed on as it is."""
+    ("eddies: error: no such reactor\n", 2, "said later\n"), ("no line", 2, ""), (f"{RULE}mine\n{RULE}", 2, "")],
+    ids=range(6))
+def test_notices_that_repeat_what_ranks_have_said_are_left_out(before, code, after):
+    """Wherever the bytes are cut; everything else passes unchanged."""
     content = (before + "\n" * (before == "no line") + NOTICE.replace("CODE", str(code)) + after).encode()
     for seed in range(20):
         cuts = np.sort(np.random.default_rng(seed).integers(0, len(content), 9))
@@ -73,7 +70,7 @@ def test_notices_of_what_ranks_have_said_are_left_out(before, code, after):
 
 @pytest.mark.parametrize("content", [
     NOTICE.replace("CODE", "2"), "fault\n" + NOTICE.replace("CODE", "1"), RULE, f"{RULE}mpirun det", "half a li",
-    f"a\n{RULE}MPI_ABORT was invoked on rank 1\n{RULE}", f"{RULE}{RULE}b\n", 40 * "-", "50 %\r60 %\r"])
+    f"a\n{RULE}MPI_ABORT was invoked on rank 1\n{RULE}", f"{RULE}{RULE}b\n", 40 * "-", "50 %\r60 %\r"], ids=range(9))
 def test_all_else_is_passed_on(content):
     output = launch.ErrorOutput()
     passed = b"".join(output.pass_on(bytes([byte])) for byte in content.encode())
@@ -84,22 +81,20 @@ def test_a_line_that_is_not_ended_is_passed_on_at_once():
     assert launch.ErrorOutput().pass_on(b"50 %\r") == b"50 %\r"
 
 
-def test_a_refusal_stands_alone():
-    ended = launched(2, "-m", "eddies", "check", TINY, "--set", "flow.cels=3")
-    assert ended.returncode == 2 and ended.stderr.count("\n") == 1 and "did you mean cells?" in ended.stderr
-    silent = launched(2, "-c", "raise SystemExit(2)")
-    assert silent.returncode == 2 and "non-zero" in silent.stderr
+@pytest.mark.parametrize("arguments, code, words", [
+    (["-m", "eddies", "check", TINY, "--set", "flow.cels=3"], 2, "did you mean cells?"),
+    (["-c", "raise SystemExit(2)"], 2, "non-zero"), (["-c", "raise SystemExit(75)"], 75, "")])
+def test_exit_code_is_that_of_the_ranks_and_a_refusal_is_one_line(arguments, code, words):
+    ended = launched(2, *arguments)
+    assert ended.returncode == code and words in ended.stderr
+    assert "eddies" not in arguments or ended.stderr.count("\n") == 1
 
 
-def test_doctor_finds_nothing(tmp_path):
+def test_doctor_names_what_is_missing_and_leaves_no_file(tmp_path):
     result = launched(2, CHECKOUT / "mpi_tools/doctor.py", cwd=tmp_path)
     assert result.returncode == 0, result.stdout + result.stderr
-    assert all(f"rank {rank} of 2 on" in result.stdout for rank in range(2))
-    assert "mpio" in result.stdout and "all is well" in result.stdout
+    assert "rank 0 of 2" in result.stdout and "rank 1 of 2" in result.stdout and "mpio" in result.stdout
     assert not list(tmp_path.iterdir())
-
-
-def test_doctor_names_what_is_missing(tmp_path):
     for name in ("pyfftw", "torch", "matplotlib"):  # the last two take long to import
         (tmp_path / f"{name}.py").write_text("raise ImportError('made up')")
     # A third rank that MPI does not connect.
@@ -107,5 +102,4 @@ def test_doctor_names_what_is_missing(tmp_path):
             f"runpy.run_path({str(CHECKOUT / 'mpi_tools/doctor.py')!r}, run_name='__main__')")
     result = launched(2, "-c", code, cwd=tmp_path)
     assert result.returncode == 8  # four on each of two ranks
-    assert "rank 0: 3 ranks were started, MPI connects 2 of them" in result.stdout
-    assert "rank 1: pyfftw cannot be imported (made up)" in result.stdout
+    assert "3 ranks were started" in result.stdout and "rank 1: pyfftw" in result.stdout

@@ -24,8 +24,7 @@ def run(folder, body, *options):
     return result.stdout, result.stdout.splitlines()[-1]
 
 
-def test_runs_on_each_number_of_ranks_and_leaves_mpi_alone(tmp_path):
-    output, closing = run(tmp_path, """
+PASSING = """
 @pytest.mark.mpi(1, 2, 3)
 def test_sum(comm, mpi_ranks, tmp_path):
     total = np.zeros(1)
@@ -36,12 +35,24 @@ def test_sum(comm, mpi_ranks, tmp_path):
     assert len(list(tmp_path.iterdir())) == comm.size
 
 
+@pytest.mark.mpi(2)
+@pytest.mark.parametrize("letter", ["a", "b"])
+def test_two(comm, letter):
+    pass
+
+
 def test_unmarked():
     from mpi4py import MPI
     assert not MPI.Is_initialized()
-""")
-    assert " 4 passed" in closing, output
-    assert all(f"test_sum[mpi-{ranks}] PASSED" in output for ranks in (1, 2, 3))
+"""
+
+
+@pytest.mark.parametrize("options, passed", [
+    ([], 6), (["test_made_up.py::test_sum", "test_made_up.py::test_two[mpi-2-b]", "-k", "mpi-2"], 2)])
+def test_runs_on_each_number_of_ranks_and_leaves_mpi_alone(tmp_path, options, passed):
+    output, closing = run(tmp_path, PASSING, *options)
+    assert f" {passed} passed" in closing and "failed" not in closing, output
+    assert all(f"test_sum[mpi-{ranks}] PASSED" in output for ranks in ((2,) if options else (1, 2, 3)))
 
 
 @pytest.fixture(scope="module")
@@ -56,13 +67,8 @@ def test_hangs(comm):
 
 
 @pytest.mark.mpi(2)
-def test_uneven(comm):
-    print("value", 40 + comm.rank)
-    assert comm.rank == 0
-
-
-@pytest.mark.mpi(2)
 def test_others_wait(comm):
+    print("value", 40 + comm.rank)
     if comm.rank == 1:
         raise ValueError("raised while rank 0 is in a barrier")
     comm.Barrier()
@@ -108,21 +114,17 @@ def test_without_marker(comm):
 
 def test_the_rest_runs_after_a_failure(failing):
     output, closing = failing
-    assert " 5 failed, 1 passed, 1 skipped, 1 xfailed, 1 error" in closing, output
+    assert " 4 failed, 1 passed, 1 skipped, 1 xfailed, 1 error" in closing, output
     assert "test_after[mpi-2] PASSED" in output
     assert "needs @pytest.mark.mpi" in output
 
 
-def test_a_failure_on_one_rank_is_reported(failing):
+def test_failures_on_one_rank_hanging_and_dying_ranks_are_reported(failing):
     output, _ = failing
     assert "rank 1 of 2 failed in call" in output
     assert "Captured stdout of rank 1 call" in output and "value 41" in output
     assert "ValueError: raised while rank 0 is in a barrier" in output
     assert "failed in setup" in output and "in the fixture" in output
-
-
-def test_hanging_and_dying_ranks_are_reported(failing):
-    output, _ = failing
     assert "rank 1 of 2 did not finish\nnot at its end after the time limit of 2 s" in output
     assert "test_made_up.py\", line 10 in test_hangs" in output
     assert "died; output of the run" in output
@@ -138,8 +140,9 @@ def test_meets(comm):
 
 
 @pytest.mark.skipif(local_cores() < 2, reason="nothing runs beside another on one core")
-def test_runs_on_one_rank_share_the_modules(tmp_path):
-    """Tests of two modules wait for each other; what one left when it died is done as well."""
+def test_runs_on_one_rank_share_the_modules_and_others_start_beside_them(tmp_path):
+    """Tests of two modules wait for each other. The rest of a module runs although a test of it died. Tests on two
+    ranks do not wait for tests without any."""
     (tmp_path / "test_others.py").write_text(HEAD + MEETING.format("one", "two") + """
 
 @pytest.mark.mpi(1)
@@ -151,15 +154,9 @@ def test_dies(comm):
 def test_after(comm):
     pass
 """)
-    output, closing = run(tmp_path, MEETING.format("two", "one") + "\n\ndef test_unmarked():\n    pass\n")
-    assert " 1 failed, 4 passed" in closing, output
-    assert "test_dies[mpi-1] FAILED" in output and "test_after[mpi-1] PASSED" in output
+    output, closing = run(tmp_path, MEETING.format("two", "one") + """
 
-
-@pytest.mark.skipif(local_cores() < 2, reason="nothing runs beside another on one core")
-def test_two_ranks_do_not_wait_for_tests_without_any(tmp_path):
-    output, closing = run(tmp_path, """
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_marked(comm):
     open(str(comm.size), "w").close()
 
@@ -170,27 +167,5 @@ def test_unmarked(time_left):
         time.sleep(0.1)
         assert time_left > 1
 """)
-    assert " 402 passed" in closing, output
-
-
-@pytest.mark.parametrize("options, passed", [
-    (["test_made_up.py::test_one", "test_made_up.py::test_two[mpi-2-b]", "-k", "mpi-2"], 2),
-    (["-m", "not mpi"], 1)])
-def test_selection(tmp_path, options, passed):
-    output, closing = run(tmp_path, """
-@pytest.mark.mpi(1, 2)
-def test_one(comm):
-    pass
-
-
-@pytest.mark.mpi(2)
-@pytest.mark.parametrize("letter", ["a", "b"])
-def test_two(comm, letter):
-    pass
-
-
-def test_three():
-    pass
-""", *options)
-    assert f" {passed} passed" in closing, output
-    assert "failed" not in closing
+    assert " 1 failed, 404 passed" in closing, output
+    assert "test_dies[mpi-1] FAILED" in output and "test_after[mpi-1] PASSED" in output

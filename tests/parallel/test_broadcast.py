@@ -1,15 +1,15 @@
-"""What only some ranks do is raised by all where it goes wrong."""
+"""Work of some ranks: all ranks get its result or raise its error."""
 
 import pytest
 
 from eddies.errors import UserError
-from eddies.parallel.broadcast import first_complaint, on_all_ranks, on_first_rank, share_text
+from eddies.parallel.broadcast import first_complaint, on_all_ranks, on_first_rank, require_same, share_text
 from eddies.scene.values import KeyProblem, SceneError
 
-pytestmark = pytest.mark.mpi(1, 2, 3)
+pytestmark = pytest.mark.mpi(1, 3)
 
 
-def test_what_the_first_rank_finds_is_known_to_all(comm):
+def test_all_ranks_get_what_the_first_one_finds(comm):
     asked = []
     assert on_first_rank(comm, lambda: asked.append(comm.rank) or {"rank": comm.rank}) == {"rank": 0}
     assert asked == ([0] if comm.rank == 0 else [])
@@ -42,7 +42,14 @@ def test_the_complaint_of_the_lowest_rank_counts(comm):
     assert first_complaint(comm, None) is None
 
 
+def test_ranks_that_were_started_differently_are_refused(comm):
+    require_same(comm, "tiny", "scene {}")
+    if comm.size > 1:
+        with pytest.raises(UserError, match="rank 2 was started with scene other, rank 0 with scene tiny"):
+            require_same(comm, "other" if comm.rank == 2 else "tiny", "scene {}")
+
+
 @pytest.mark.parametrize("text", ["", "λ ≤ η", "\udcff.toml"])
 def test_text_of_any_bytes_is_shared(comm, text):
-    """Arguments hold what is no UTF-8 as surrogates."""
+    """Arguments hold bytes that are not UTF-8 as surrogates."""
     assert share_text(comm, text if comm.rank == 0 else "other") == text

@@ -1,13 +1,32 @@
+"""Slabs, and halos of particles and of planes around them."""
+
 import numpy as np
 import pytest
 
-from eddies.parallel.halo import HaloError, HaloExchange
+from eddies.parallel.halo import HaloError, HaloExchange, PlaneHalo
 from eddies.parallel.migration import migrate
 from eddies.parallel.reduction import global_sum
-from eddies.parallel.slab import SlabDecomposition
+from eddies.parallel.slab import SlabDecomposition, block_starts
 
 LENGTH = 2 * np.pi
 WIDTH = 0.8
+
+
+@pytest.mark.parametrize("total, parts", [(10, 3), (2, 3), (0, 2), (7, 7)])
+def test_blocks_are_contiguous_complete_and_differ_by_at_most_one(total, parts):
+    starts = block_starts(total, parts)
+    sizes = np.diff(starts)
+    assert starts[0] == 0 and starts[-1] == total
+    assert sizes.max() - sizes.min() <= 1
+
+
+@pytest.mark.mpi(1, 3)
+def test_every_coordinate_has_the_owner_whose_bounds_hold_it(comm):
+    slab = SlabDecomposition(comm, LENGTH, 7)
+    z = np.random.default_rng(1).uniform(0, slab.length, 1000)
+    assert np.array_equal(slab.owner_of(z) == comm.rank, (z >= slab.lower) & (z < slab.upper))
+    assert slab.owner_of(np.nextafter(slab.length, 0)) == comm.size - 1
+    assert slab.owner_of(slab.lower) == comm.rank
 
 
 def slab_particles(comm, total=300, squeeze=1.0):
@@ -35,10 +54,10 @@ def test_ghosts_are_exactly_the_images_within_the_width(comm, squeeze):
 
 
 @pytest.mark.mpi(1, 2, 3)
-@pytest.mark.parametrize("squeeze, width", [(1.0, WIDTH), (0.2, WIDTH), (1.0, 4.9 * LENGTH / 17)],
-                         ids=["everywhere", "on one rank", "seen from both sides"])
+@pytest.mark.parametrize("squeeze, width", [(0.2, WIDTH), (1.0, 4.9 * LENGTH / 17)],
+                         ids=["on one rank", "seen from both sides"])
 def test_adjoint_identity(comm, squeeze, width):
-    """The thinnest slab is 5/17 of the box on three ranks and 8/17 on two: with the last width many particles have an
+    """The thinnest slab is 5/17 of the box on three ranks and 8/17 on two. With the last width many particles have an
     image on both sides, whose gradients are added."""
     slab, particles, _ = slab_particles(comm, squeeze=squeeze)
     halo = HaloExchange(slab, particles["position"], width)
@@ -48,8 +67,31 @@ def test_adjoint_identity(comm, squeeze, width):
     assert left == pytest.approx(right, rel=1e-13, abs=1e-13)
 
 
+@pytest.mark.mpi(1, 2, 3)
+def test_ghost_planes_are_those_of_the_periodic_array(comm):
+    slab = SlabDecomposition(comm, 1.0, 10)
+    whole = np.random.default_rng(5).standard_normal((3, 10, 2))
+    padded = np.concatenate(PlaneHalo(slab, 2, 3).forward(whole[:, slab.start : slab.stop]), axis=1)
+    assert np.array_equal(padded, whole[:, np.arange(slab.start - 2, slab.stop + 3) % 10])
+
+
+@pytest.mark.mpi(1, 2, 3)
+def test_adjoint_of_ghost_planes_is_the_transpose(comm):
+    slab, random = SlabDecomposition(comm, 1.0, 10), np.random.default_rng(comm.rank)
+    halo = PlaneHalo(slab, 2, 3)
+    planes, parts = random.standard_normal((3, slab.count, 4)), halo.parts(np.empty((3, slab.count, 4)))
+    for part in parts:
+        part[...] = random.standard_normal(part.shape)
+    forward = sum(np.sum(part * weight) for part, weight in zip(halo.forward(planes), parts))
+    found, expected = global_sum(comm, np.array([forward, np.sum(planes * halo.adjoint(parts))]))
+    assert found == pytest.approx(expected, rel=1e-12)
+
+
 @pytest.mark.mpi(3)
-def test_a_slab_thinner_than_the_halo_is_refused_with_the_usable_ranks(comm):
+def test_slabs_thinner_than_a_halo_are_refused_with_the_usable_ranks(comm):
     slab = SlabDecomposition(comm, LENGTH, 8)
     with pytest.raises(HaloError, match="at most 2 ranks"):
         HaloExchange(slab, np.empty((0, 3)), 4 * slab.spacing)
+    with pytest.raises(HaloError, match="at most 2 ranks"):
+        PlaneHalo(slab, 3, 4)
+    HaloExchange(slab, np.empty((0, 3)), 2 * slab.spacing)

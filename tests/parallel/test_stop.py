@@ -1,4 +1,4 @@
-"""One answer on all ranks: stop, or a checkpoint is due, whoever knows the reason."""
+"""All ranks agree that the job stops or a checkpoint is due, whichever of them has the reason."""
 
 import signal
 
@@ -7,6 +7,7 @@ import pytest
 from eddies.io.hdf5 import create_product
 from eddies.parallel import stop as module
 from eddies.parallel.stop import Stopped, StopRequest
+from tests.parallel.counting import CountingComm
 
 
 @pytest.fixture
@@ -17,7 +18,7 @@ def now(monkeypatch):
     return time
 
 
-@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.mpi(1, 3)
 def test_a_signal_of_one_rank_stops_all(comm):
     received = []
     stop = StopRequest(comm, received)
@@ -25,11 +26,11 @@ def test_a_signal_of_one_rank_stops_all(comm):
     if comm.rank == comm.size - 1:
         received.append(signal.SIGTERM)
     assert stop() and stop.checkpoint_due and stop.reason == "SIGTERM"
-    with pytest.raises(Stopped, match="stopped by SIGTERM; the same command goes on after the last"):
+    with pytest.raises(Stopped, match="SIGTERM"):
         stop.check()
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_the_stop_file_is_removed_when_obeyed(comm, tmp_path, now):
     stop = StopRequest(comm, stop_file=tmp_path / "STOP")
     assert not stop()
@@ -39,32 +40,31 @@ def test_the_stop_file_is_removed_when_obeyed(comm, tmp_path, now):
     comm.Barrier()
     assert not stop(), "looked again within the second"
     now["seconds"] = 1.5
-    assert stop() and stop.reason == "the file STOP"
+    assert stop() and "STOP" in stop.reason
     comm.Barrier()
     assert not (tmp_path / "STOP").exists()
     assert stop(), "forgot it"
 
 
-@pytest.mark.mpi(1, 2, timeout=30)
-def test_a_stop_file_that_cannot_be_removed_is_told_by_all(comm, tmp_path, now):
+@pytest.mark.mpi(2, timeout=30)
+def test_all_ranks_raise_if_the_stop_file_cannot_be_removed(comm, tmp_path, now):
     if comm.rank == 0:
         (tmp_path / "STOP").mkdir()
     comm.Barrier()
-    stop = StopRequest(comm, stop_file=tmp_path / "STOP")
     with pytest.raises(OSError, match="STOP"):
-        stop()
+        StopRequest(comm, stop_file=tmp_path / "STOP")()
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_wall_time_is_that_of_rank_0(comm, now):
     stop = StopRequest(comm, max_seconds=10)
     now["seconds"] = 9.0 if comm.rank == 0 else 99.0
     assert not stop()
     now["seconds"] = 11.0
-    assert stop() and stop.reason == "its limit of wall time"
+    assert stop() and "wall time" in stop.reason
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_checkpoints_are_due_at_intervals(comm, now):
     stop = StopRequest(comm, checkpoint_seconds=10)
     due = []
@@ -77,17 +77,13 @@ def test_checkpoints_are_due_at_intervals(comm, now):
     assert due == [False, True, False, False, True]
 
 
-class SilentComm:
-    """One rank without any means to send."""
-
-    rank, size = 0, 1
-
-
-def test_one_rank_sends_nothing():
-    assert not StopRequest(SilentComm())()
+@pytest.mark.mpi(1)
+def test_one_rank_sends_nothing(comm):
+    counting = CountingComm(comm)
+    assert not StopRequest(counting)() and counting.sent == []
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_a_stop_leaves_nothing_of_a_product(comm, tmp_path):
     with pytest.raises(Stopped), create_product(comm, tmp_path / "model.h5", "model", {}):
         StopRequest(comm, [signal.SIGUSR1]).check()

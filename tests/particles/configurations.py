@@ -1,4 +1,4 @@
-"""Configurations of particles, and models, that the tests of particles share."""
+"""Configurations of particles, models and helpers for the tests of particles."""
 
 import math
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ CONFIGURATIONS = {
     "lattice": lambda random, n: np.argwhere(np.ones((8, 8, n // 64))) * (LENGTH / 8),
     "coincident": lambda random, n: np.full((n, 3), 6.28),
 }
-#: A model with a density of its own that a term reads and changes.
+#: A model that reads and integrates a density.
 OWN_DENSITY = {"pairs": {}, "density-flux": {}, "continuity": dict(diffusion=0.1)}
 OPEN = dict(window="none", scaling="root")
 #: Models of pairs.
@@ -59,7 +59,7 @@ MODELS = PAIR_MODELS | RESOLVED_MODELS
 
 
 def positions(kind="even", count=200, seed=3):
-    """Positions (count, 3) as a tensor."""
+    """Positions (count, 3) of a configuration."""
     return torch.as_tensor(CONFIGURATIONS[kind](np.random.default_rng(seed), count) % LENGTH)
 
 
@@ -71,10 +71,16 @@ def state(count=200, seed=3, kind="even"):
     return positions(kind, count, seed), velocity, density
 
 
-def model(terms=None, flow=FLOW, **more):
-    """A model of terms by their words, each with its settings; with small networks, in double precision.
+def lattice(side, disorder=0.0):
+    """Positions (side^3, 3) at the centres of cells, each moved by up to `disorder` cells along the axes."""
+    moved = np.random.default_rng(4).uniform(-disorder, disorder, (side**3, 3))
+    return torch.as_tensor((np.argwhere(np.ones((side,) * 3)) + 0.5 + moved) * (LENGTH / side))
 
-    As keywords the words have "_" for "-". "injection" is the forcing that rollouts of forced flows have.
+
+def model(terms=None, flow=FLOW, **more):
+    """Model of terms by their words, each with its settings, with small networks in double precision.
+
+    Keywords have "_" for "-". "injection" is the forcing of rollouts.
     """
     given = {**(terms or {}), **{word.replace("_", "-"): settings for word, settings in more.items()}}
     forcing = Forcing(**given.pop(FORCING)) if FORCING in given else None
@@ -89,7 +95,7 @@ def _settings(kind, chosen):
 
 @dataclass(frozen=True, kw_only=True)
 class ReadsNothing(TermSettings):
-    """Settings of an acceleration that looks at each particle alone."""
+    """Settings of a term without inputs."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,7 +106,7 @@ class ReadsDensity(TermSettings):
 
 
 class DensityReader(Term):
-    """A term of a test that wants a density, and gives nothing."""
+    """A term that reads the density and contributes nothing."""
 
     Settings = ReadsDensity
 
@@ -113,7 +119,7 @@ class DensityReader(Term):
 
 
 class Field(Term):
-    """A term of a test: an acceleration, `function` of position and velocity."""
+    """An acceleration, a `function` of position and velocity."""
 
     Settings = ReadsNothing
 
@@ -126,12 +132,12 @@ class Field(Term):
 
 
 def of_terms(*terms, flow=FLOW):
-    """A model of terms."""
+    """Model of term objects."""
     return LagrangianModel({f"{type(term).__name__} {number}": term for number, term in enumerate(terms)}, flow)
 
 
 def dynamics_of(slab, lagrangian, skin=0.2, iterations=None, tolerance=None, **options):
-    """Dynamics; a number of iterations of the solves for a resolved velocity, or the residual at which they end."""
+    """Dynamics with a number of iterations, or a final residual, of the solves for the resolved velocity."""
     dynamics = ParticleDynamics(slab, lagrangian, skin, **options)
     if dynamics.resolution is not None:
         resolution = dynamics.resolution
@@ -142,43 +148,43 @@ def dynamics_of(slab, lagrangian, skin=0.2, iterations=None, tolerance=None, **o
 
 
 def rates(lagrangian, position, velocity, density=None, skin=0.3, dtype=None, planes=13):
-    """The model's rates for all particles of a periodic box, on one rank, in their order."""
+    """Rates of all particles of a periodic box on one rank, in their order."""
     slab = SlabDecomposition(MPI.COMM_SELF, LENGTH, planes)
     particles = ParticleSet(torch.arange(len(position)), position, velocity, density)
     return dynamics_of(slab, lagrangian, skin, dtype=dtype).rates(particles)
 
 
 def given(rates):
-    """The rates of particles that there are, by name."""
+    """The rates by particle that a model gives, by name."""
     return {name: rate for name, rate in vars(rates).items() if rate is not None and not name.endswith("modes")}
 
 
-def scaled_pairs(position, velocity, density=None, once=False, flow=FLOW):
-    """All pairs of particles of a periodic box, on one rank."""
+def scaled_pairs(position, velocity, density=None, flow=FLOW):
+    """All pairs of particles of a periodic box on one rank."""
     listed = NeighborList(PeriodicBox(LENGTH), flow.cutoff, 0.0)
     listed.build(position, position, exclude_self=True)
     columns = {"velocity": velocity, "density": density}
-    return ScaledPairs(listed.pairs(position, position, once=once), columns.__getitem__, flow)
+    return ScaledPairs(listed.pairs(position, position), columns.__getitem__, flow)
 
 
 def summed_density(position, kernel, mass):
-    """sum_j m W(x_i - x_j) of all particles of a periodic box, itself included."""
+    """sum_j m W(x_i - x_j) over all particles of a periodic box, i included."""
     apart = position[:, None] - position
     apart = apart - LENGTH * torch.round(apart.detach() / LENGTH)
     square = apart.square().sum(2)
     itself = torch.eye(len(position), dtype=torch.bool)
-    distance = torch.where(itself, torch.ones_like(square), square).sqrt()  # so that its root has a derivative
+    distance = torch.where(itself, torch.ones_like(square), square).sqrt()  # its derivative is then finite
     values = torch.where(itself, kernel.value(torch.zeros_like(square)), kernel.value(distance))
     return mass * values.sum(1)
 
 
 def by_torch(monkeypatch):
-    """Let sums over pairs be taken by the expressions of the terms, not by the compiled library."""
+    """Take sums over pairs by the torch expressions of the terms instead of the compiled library."""
     monkeypatch.setattr("eddies.particles.context.kernels_serve", lambda device: False)
 
 
 def distributed(comm, position, velocity, density=None, planes=13):
-    """The slabs, and the particles of this rank out of those of all."""
+    """The slabs, and this rank's part of the given particles."""
     slab = SlabDecomposition(comm, LENGTH, planes)
     own = np.arange(len(position)) % comm.size == comm.rank
     columns = {"id": np.arange(len(position)), "position": position.numpy(), "velocity": velocity.numpy()}
@@ -194,7 +200,7 @@ def alone(position, velocity, density=None, planes=13):
 
 
 def by_id(comm, particles, column, total):
-    """A column of all particles, in order of id, on every rank."""
+    """Column of all particles in the order of their ids, on every rank."""
     whole = np.zeros((total, *column.shape[1:]))
     whole[particles.id.numpy()] = column.detach().numpy()
     return torch.from_numpy(global_sum(comm, whole))
@@ -209,3 +215,8 @@ def along(function, inputs, direction, step):
     with torch.no_grad():
         ends = [function(*(x + sign * step * d for x, d in zip(inputs, direction))) for sign in (1, -1)]
     return (ends[0] - ends[1]) / (2 * step)
+
+
+def relative(found, exact):
+    """Relative L2 error."""
+    return float(np.linalg.norm(found - exact) / np.linalg.norm(exact))

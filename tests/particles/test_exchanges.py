@@ -27,7 +27,7 @@ def test_backward_is_the_adjoint_of_forward(comm, kind, exchange):
 
 
 @pytest.mark.mpi(2, 3)
-def test_ghosts_stand_within_the_width_of_the_slab(comm):
+def test_ghosts_lie_within_the_width_of_the_slab(comm):
     slab, particles = distributed(comm, *state())
     halo = HaloExchange(slab, particles.position.numpy(), 1.0)
     z = exchange_ghost_positions(halo, particles.position)[:, 2]

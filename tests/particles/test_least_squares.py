@@ -1,4 +1,4 @@
-"""Conjugate gradients find the modes that solve the equations."""
+"""Conjugate gradients solve the equations for the modes."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from eddies.particles.least_squares import LeastSquares
 
 
 def equations_on(comm):
-    """Equations with a penalty that grows with the wavenumber, 300 points of this rank, and values there."""
+    """Equations whose penalty grows with the wavenumber, and 300 points of this rank with values."""
     grid, random = FourierGrid(SlabDecomposition(comm, 5.0, 13), 4), np.random.default_rng(comm.rank)
     inside = (grid.shell > 0) & (grid.shell <= 4)
     slab = grid.decomposition
@@ -20,7 +20,7 @@ def equations_on(comm):
 
 
 @pytest.mark.mpi(1, 2, 3)
-def test_what_is_found_solves_the_equations(comm):
+def test_the_result_solves_the_equations(comm):
     equations, points, values = equations_on(comm)
     right = equations.gathered(values, points)
     count = 300.0 * comm.size
@@ -31,12 +31,12 @@ def test_what_is_found_solves_the_equations(comm):
     torch.testing.assert_close(found.at_points, at_points, rtol=0, atol=1e-12 * float(at_points.abs().max()))
     image = equations.gathered(at_points, points) + equations.penalty * found.modes
     assert equations.size(right - image, count) <= 1e-22 * size
-    # The descent is made in one pass where nothing is recorded.
+    # Without a gradient the descent takes one pass of the library.
     with torch.no_grad():
         descent = equations.descent(values, points, found.modes)
     recorded = equations.descent(values, points, found.modes)
     torch.testing.assert_close(descent, recorded, rtol=0, atol=1e-13 * float(right.abs().max()))
-    # A given number of iterations is taken, and what is left of the residual told.
+    # With a given number of iterations the remaining residual is reported.
     found = equations.solve(points, right, count, 0.0, 3, 100)
     image = equations.gathered(equations.grid.at(found.modes, points), points) + equations.penalty * found.modes
     assert found.iterations == 3 and equations.size(right - image, count) == pytest.approx(found.left, rel=1e-9)

@@ -3,7 +3,6 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from eddies.particles import neighbor_list
 from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.periodic_box import PeriodicBox
 from tests.particles.configurations import CONFIGURATIONS, LENGTH, positions
@@ -17,11 +16,11 @@ def listed(receivers, senders, cutoff, skin=0.0, exclude_self=True, periodic_z=T
 
 def as_set(pairs):
     found = list(zip(pairs.receiver.tolist(), pairs.sender.tolist()))
-    assert len(found) == len(set(found))
+    assert len(found) == len(set(found)) and torch.all(torch.diff(pairs.segment) >= 0)
     return set(found)
 
 
-def oracle(receivers, senders, cutoff, exclude_self, periodic_z=True):
+def tree_pairs(receivers, senders, cutoff, exclude_self=True, periodic_z=True):
     """The pairs that a k-d tree finds."""
     # Unwrapped z does not fit into a periodic tree: a period much longer than the box never wraps.
     period = [LENGTH, LENGTH, LENGTH if periodic_z else 100 * LENGTH]
@@ -32,27 +31,21 @@ def oracle(receivers, senders, cutoff, exclude_self, periodic_z=True):
 
 
 @pytest.mark.parametrize("kind", CONFIGURATIONS)
-@pytest.mark.parametrize("cutoff", [0.05, 0.47, 1.3, LENGTH / 2 * 0.999])
+@pytest.mark.parametrize("cutoff", [0.05, 1.3, LENGTH / 2 * 0.999])
 def test_pairs_are_those_of_a_tree(kind, cutoff):
     position = positions(kind, 192)
-    # A lattice has pairs at exactly the cutoff of no interest here.
+    # No pair of the lattice exactly at the cutoff.
     cutoff = cutoff * 1.0123 if kind == "lattice" and cutoff < 2 else cutoff
     pairs = listed(position, position, cutoff).pairs(position, position)
-    assert as_set(pairs) == oracle(position, position, cutoff, exclude_self=True)
+    assert as_set(pairs) == tree_pairs(position, position, cutoff)
 
 
-@pytest.mark.parametrize("kind", ["even", "uneven"])
-def test_receivers_other_than_senders(kind):
-    senders, points = positions(kind, 300), positions("lattice", 128)
-    pairs = listed(points, senders, 0.9, exclude_self=False).pairs(points, senders)
-    assert as_set(pairs) == oracle(points, senders, 0.9, exclude_self=False)
-
-
-def test_unwrapped_z_is_not_periodic():
-    senders = positions(count=300) * torch.tensor([1.0, 1.0, 1.4]) - torch.tensor([0.0, 0.0, 1.0])
-    receivers = senders[:150]
-    pairs = listed(receivers, senders, 0.8, periodic_z=False).pairs(receivers, senders)
-    assert as_set(pairs) == oracle(receivers, senders, 0.8, exclude_self=True, periodic_z=False)
+@pytest.mark.parametrize("periodic_z", [True, False])
+def test_receivers_other_than_senders(periodic_z):
+    senders = positions("uneven", 300) * torch.tensor([1.0, 1.0, 1.4]) - torch.tensor([0.0, 0.0, 1.0])
+    points = positions("lattice", 128)
+    pairs = listed(points, senders, 0.9, exclude_self=False, periodic_z=periodic_z).pairs(points, senders)
+    assert as_set(pairs) == tree_pairs(points, senders, 0.9, exclude_self=False, periodic_z=periodic_z)
 
 
 @pytest.mark.parametrize("receivers, senders", [(0, 0), (0, 5), (5, 0), (1, 1)])
@@ -60,90 +53,42 @@ def test_few_or_no_particles(receivers, senders):
     position = positions(count=5)
     neighbors = listed(position[:receivers], position[:senders], 1.0)
     pairs = neighbors.pairs(position[:receivers], position[:senders])
-    assert len(pairs.sender) == 0
-    assert pairs.sum(torch.ones(0, 2)).shape == (receivers, 2)
-    assert [block for block in neighbors.blocks(10)][-1].stop == receivers
+    assert len(pairs.sender) == 0 and pairs.sum(torch.ones(0, 2)).shape == (receivers, 2)
+    assert [*neighbors.blocks(10)][-1].stop == receivers
 
 
-@pytest.mark.parametrize("together", [1, 7, 1000])
-def test_pairs_do_not_depend_on_how_many_are_searched_together(monkeypatch, together):
-    position = positions("uneven", 150)
-    whole = listed(position, position, 0.7)
-    monkeypatch.setitem(neighbor_list.RECEIVERS_TOGETHER, "cpu", together)
-    monkeypatch.setitem(neighbor_list.CANDIDATES_TOGETHER, "cpu", together)
-    parts = listed(position, position, 0.7)
-    assert torch.equal(whole.senders, parts.senders) and torch.equal(whole.offsets, parts.offsets)
-
-
-def test_list_is_symmetric_sorted_and_compressed():
-    position = positions("uneven", 250)
-    neighbors = listed(position, position, 0.6, skin=0.2)
-    receiver = torch.repeat_interleave(torch.arange(250), torch.diff(neighbors.offsets))
-    pairs = set(zip(receiver.tolist(), neighbors.senders.tolist()))
-    assert pairs == {(j, i) for i, j in pairs}
-    assert torch.all(torch.diff(neighbors.pairs(position, position).segment) >= 0)
-
-
-def test_list_holds_while_nothing_moves_by_more_than_half_the_skin():
+def test_the_list_is_valid_while_nothing_moves_by_more_than_half_the_skin():
     position = positions(count=200)
     neighbors = listed(position, position, 0.9, skin=0.2)
     direction = torch.nn.functional.normalize(positions(count=200, seed=8) - LENGTH / 2)
     moved = position + 0.0999 * direction
-    assert as_set(neighbors.pairs(moved, moved)) == oracle(moved % LENGTH, moved % LENGTH, 0.9, True)
+    assert as_set(neighbors.pairs(moved, moved)) == tree_pairs(moved % LENGTH, moved % LENGTH, 0.9)
 
 
+@pytest.mark.parametrize("recorded", [False, True])
 @pytest.mark.parametrize("rows", [slice(20, 60), torch.tensor([7, 3, 190])], ids=["slice", "numbers"])
-def test_pairs_of_some_receivers(rows):
-    position = positions(count=200)
-    neighbors = listed(position, position, 1.0)
-    number = torch.arange(200)[rows]
+def test_pairs_of_some_receivers(rows, recorded):
+    position = positions(count=200).requires_grad_(recorded)
+    neighbors, number = listed(position, position, 1.0), torch.arange(200)[rows]
     pairs, everything = (neighbors.pairs(position, position, kept) for kept in (rows, None))
-    assert pairs.count == len(number)
-    assert torch.equal(number[pairs.segment], pairs.receiver)
+    assert pairs.count == len(number) and torch.equal(number[pairs.segment], pairs.receiver)
     assert as_set(pairs) == {pair for pair in as_set(everything) if pair[0] in number.tolist()}
 
 
-@pytest.mark.parametrize("rows", [None, slice(20, 60)], ids=["all", "slice"])
-def test_each_pair_of_receivers_once_and_every_other_sender(rows):
-    """Of 150 receivers among 200 senders."""
-    position = positions(count=200)
-    neighbors = listed(position[:150], position, 1.0)
-    once, both = (as_set(neighbors.pairs(position[:150], position, rows, once=each)) for each in (True, False))
-    assert once == {(i, j) for i, j in both if i < j} and any(j >= 150 for _, j in once)
-
-
-@pytest.mark.parametrize("parity", [1.0, -1.0])
-def test_values_of_pairs_that_stand_once_reach_both_particles_but_no_ghost(parity):
-    position = positions(count=80)
-    pairs = listed(position[:50], position, 1.5).pairs(position[:50], position, once=True)
-    values = torch.rand(2, len(pairs.sender), dtype=torch.float64, requires_grad=True)
-
-    def sums(values):
-        totals = torch.zeros(2, 50, dtype=torch.float64)
-        pairs.add_to_both(values, torch.tensor([1.0, parity], dtype=torch.float64), totals)
-        return totals
-
-    expected = torch.zeros(2, 50, dtype=torch.float64)
-    for k, (i, j) in enumerate(zip(pairs.receiver.tolist(), pairs.sender.tolist())):
-        expected[:, i] += values[:, k].detach()
-        if j < 50:
-            expected[0, j] += values[0, k].detach()
-            expected[1, j] += parity * values[1, k].detach()
-    assert torch.allclose(sums(values), expected)
-    assert torch.autograd.gradcheck(sums, values)
-
-
-def test_blocks_are_all_rows_once():
+def test_blocks_cover_all_rows_once_with_about_as_many_pairs():
     position = positions("uneven", 300)
     neighbors = listed(position, position, 0.8)
-    rows = [row for block in neighbors.blocks(100) for row in range(block.start, block.stop)]
-    assert rows == list(range(300))
+    blocks = list(neighbors.blocks(100))
+    assert [row for block in blocks for row in range(block.start, block.stop)] == list(range(300))
+    most = int(neighbors.offsets.diff().max())
+    sizes = [int(neighbors.offsets[block.stop] - neighbors.offsets[block.start]) for block in blocks]
+    assert len(blocks) > 10 and max(sizes) <= 100 + most
 
 
 def test_displacements_are_differentiable_and_nearest():
     position = positions(count=60).requires_grad_()
     pairs = listed(position, position, 1.5).pairs(position, position)
-    assert torch.allclose(pairs.distance, pairs.displacement.norm(dim=1))
+    assert torch.allclose(pairs.distance, pairs.displacement.norm(dim=1)) and pairs.distance.max() < 1.5
     weight = torch.rand(len(pairs.sender), 3, dtype=torch.float64)
     (gradient,) = torch.autograd.grad((weight * pairs.displacement).sum(), position)
     expected = torch.zeros(60, 3, dtype=torch.float64)
@@ -151,15 +96,7 @@ def test_displacements_are_differentiable_and_nearest():
     assert torch.allclose(gradient, expected)
 
 
-def test_single_precision_displacements_lose_nothing_to_the_box():
-    position = positions(count=100)
-    neighbors = listed(position, position, 1.0)
-    single, double = (neighbors.pairs(position, position, dtype=t) for t in (torch.float32, torch.float64))
-    assert single.displacement.dtype == single.distance.dtype == torch.float32
-    assert torch.equal(single.displacement, double.displacement.to(torch.float32))
-
-
-@pytest.mark.parametrize("tail", [(), (2,), (2, 3)])
+@pytest.mark.parametrize("tail", [(), (2, 3)])
 def test_segment_sum_and_its_gradient(tail):
     position = positions("uneven", 50)
     pairs = listed(position, position, 0.5).pairs(position, position)

@@ -12,7 +12,7 @@ from tests.particles.configurations import LENGTH
 
 
 def particles_at(comm, heights):
-    """This rank's particles, one at each z."""
+    """Particles of this rank, one at each z."""
     count = len(heights)
     position = torch.tensor([[1.0, 1.0, z] for z in heights], dtype=torch.float64).reshape(count, 3)
     return ParticleSet(torch.arange(count) + 10 * comm.rank, position, torch.zeros_like(position), torch.ones(count))
@@ -20,9 +20,8 @@ def particles_at(comm, heights):
 
 @pytest.mark.mpi(2, 3)
 @pytest.mark.parametrize("strayed, refused", [(0.29, False), (0.35, True)])
-def test_particles_that_stray_into_one_slab_from_both_sides_are_refused_where_they_would_see_each_other(
-        comm, strayed, refused):
-    """Through the second slab, whose owner alone sees both: at 0.35 they would be within the cutoff, but no pair."""
+def test_particles_that_enter_a_slab_from_both_sides_must_not_meet(comm, strayed, refused):
+    """Their ranks do not see each other. At 0.35 they would be within the cutoff, but form no pair."""
     slab = SlabDecomposition(comm, LENGTH, 24)
     cutoff = LENGTH / comm.size - 0.6
     heights = [slab.upper + strayed] if comm.rank == 0 else []
@@ -30,17 +29,16 @@ def test_particles_that_stray_into_one_slab_from_both_sides_are_refused_where_th
     neighborhood = Neighborhood(slab, LENGTH, cutoff, 0.0)
     assert (LENGTH / comm.size - 2 * strayed < cutoff) == refused
     if refused:
-        with pytest.raises(HaloError, match="thinner than the halo"):
+        with pytest.raises(HaloError):
             neighborhood.update(particles_at(comm, heights))
     else:
         neighborhood.update(particles_at(comm, heights))
 
 
 @pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("z, complaint", [(-0.7 * LENGTH, "farther outside its slab than the box is long"),
-                                          (math.nan, "not finite")])
-def test_a_particle_that_is_nowhere_near_its_slab_is_named_by_all_ranks(comm, z, complaint):
-    """Less than a length below the box, but more below the slab of the second rank. One rank has all periods."""
+@pytest.mark.parametrize("z, complaint", [(-0.7 * LENGTH, "outside its slab"), (math.nan, "not finite")])
+def test_all_ranks_name_a_particle_far_from_its_slab(comm, z, complaint):
+    """Below the slab of the second rank by more than the length of the box. One rank holds all periods."""
     slab = SlabDecomposition(comm, LENGTH, 24)
     below = z if comm.size > 1 else z - LENGTH
     heights = [slab.upper - 0.1, below if comm.rank == comm.size - 1 else slab.lower]
@@ -48,16 +46,15 @@ def test_a_particle_that_is_nowhere_near_its_slab_is_named_by_all_ranks(comm, z,
     if comm.size == 1 and math.isfinite(z):
         neighborhood.update(particles)
         return
-    with pytest.raises(HaloError) as told:
-        neighborhood.update(particles)
     last = comm.size - 1
-    assert f"within the step, rank {last}, particle {10 * last + 1}: {complaint}" in str(told.value)
+    with pytest.raises(HaloError, match=f"rank {last}, particle {10 * last + 1}: .*{complaint}"):
+        neighborhood.update(particles)
 
 
 @pytest.mark.mpi(1, 2)
 @pytest.mark.parametrize("unit, cells", [(1, 4), (2**50, 4), (2**56, 1)])
 def test_particles_settle_in_order_of_cells_and_ids(comm, unit, cells):
-    """Also where ids are so large that a cell and an id fit one number only if there are fewer cells."""
+    """Ids may be so large that cell and id fit one integer only with fewer cells."""
     slab, random = SlabDecomposition(comm, 1.0, 8), np.random.default_rng(3)
     position, ids = random.random((60, 3)), unit * random.permutation(60)
     own = slice(comm.rank, None, comm.size)

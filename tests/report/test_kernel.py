@@ -1,4 +1,4 @@
-"""Numbers of the report on kernels."""
+"""Numbers of the section on kernels."""
 
 import itertools
 
@@ -6,7 +6,7 @@ import pytest
 
 from eddies.report.kernel import section
 
-# What the metrics of each kernel begin with.
+# The start of the keys of each kernel.
 KERNELS = {"learned": "", "learned_no_gradient": "no_gradient_", "cubic_spline": "cubic_spline_",
            "wendland": "wendland_"}
 

@@ -6,7 +6,7 @@ from eddies.report.learning import curves
 
 
 def history(phases, **columns):
-    """Of phases with so many steps each, 2 s a step."""
+    """A history of phases with these numbers of steps, 2 s per step."""
     steps = sum(phases)
     return {"phase": np.repeat(np.arange(len(phases)), phases).astype(float), "step": np.arange(float(steps)),
             "seconds": 2.0 * np.arange(1, steps + 1), "learning_rate": np.full(steps, 1e-3),
@@ -32,7 +32,7 @@ def test_each_phase_has_its_least_error_circled():
     assert circled(axis) == [(0.75, 0.3), (2.0, 0.8)]
 
 
-def test_a_phase_that_did_only_harm_has_its_start_circled():
+def test_a_phase_without_improvement_has_its_start_circled():
     errors, starts = np.array([np.nan, 0.5, np.nan, np.inf, 0.9]), np.array([0.7, np.nan, 0.4, np.nan, np.nan])
     axis = curves(history([2, 3], validation_error=errors, start_error=starts)).axes[1]
     assert circled(axis) == [(1.0, 0.5), (1.0, 0.4)]

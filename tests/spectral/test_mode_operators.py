@@ -1,4 +1,4 @@
-"""Operators on modes: the same for arrays and tensors, of fields whose derivatives are known."""
+"""Operators on modes, against known derivatives; the same for arrays and tensors."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def modes(grid, components):
     return grid.forward(random.standard_normal((components, *grid.physical_shape)))
 
 
-def test_of_a_wave_they_are_known(grid):
+def test_operators_on_a_wave_with_known_derivatives(grid):
     """u = sin(k x) (0, 1, 2) + cos(2 k y) (1, 3, 0), whose second part has a divergence."""
     k = 2 * np.pi / LENGTH
     x, y, _ = grid.coordinates()
@@ -56,7 +56,7 @@ def test_tensors_give_what_arrays_give(grid, name, components):
     assert np.abs(found.numpy() - expected).max() <= 1e-15 * np.abs(expected).max()
 
 
-def test_rates_rise_from_one_wavenumber_to_the_next(grid):
+def test_rates_are_linear_between_wavenumbers_and_differentiable(grid):
     shell, rates = np.sqrt(grid.index_squared), np.array([0.2, 1.5, -0.3])
     expected = np.interp(shell, np.linspace(0, 3.6, 4), [0, *rates])
     assert np.abs(rising(shell, 3.6, rates) - expected).max() < 1e-15
@@ -71,8 +71,8 @@ def test_rates_rise_from_one_wavenumber_to_the_next(grid):
 
 
 def test_the_filter_has_the_second_moment_of_a_box_of_its_width(comm):
-    """A box of width d passes sin(x) / x with x = k d / 2. The Gaussian differs by (1/1152 - 1/1920) (k d)^4 and less
-    in higher powers; one of another second moment differs in (k d)^2."""
+    """The transfer of a box of width d is sin(x) / x, x = k d / 2. The Gaussian differs from it by
+    (1/1152 - 1/1920) (k d)^4; with another second moment it would differ in (k d)^2."""
     width, k = 0.7, np.array([0.05, 0.1, 0.2, 0.4])
     box = np.sinc(k * width / (2 * np.pi))
     assert np.all(np.abs(gaussian_transfer(k**2, width) - box) < 4e-4 * (k * width) ** 4)

@@ -1,8 +1,8 @@
-"""Run by test_broken_ranks.py under mpirun: a small `eddies dns` whose rank 1 breaks in the middle of its work.
+"""A small `eddies dns` whose rank 1 fails in the middle of its work; test_broken_ranks.py runs it under mpirun.
 
     broken_rank.py PLACE KIND DIRECTORY
 
-Every rank leaves its process id in DIRECTORY; rank 1 leaves the time, right before it breaks.
+Every rank leaves its process id in DIRECTORY; rank 1 leaves the time, right before it fails.
 """
 
 import os
@@ -14,19 +14,19 @@ from pathlib import Path
 from mpi4py import MPI
 
 import eddies.cli
-import eddies.spectral.fourier_passes
-import eddies.io.contiguous
+import eddies.io.checkpoint
 import eddies.io.hdf5
-import eddies.parallel.plane_halo
+import eddies.parallel.halo
 import eddies.parallel.reduction
+import eddies.spectral.fourier_passes
 
-# What of eddies breaks, and in which call of it. In each of these the other ranks wait for this one, or soon will.
+# The function that fails, and the number of the failing call. At each place the other ranks wait for this one.
 PLACES = {
     "transform": (eddies.spectral.fourier_passes.PlanePass, "to_physical", 50),  # between two transposes
-    "halo": (eddies.parallel.plane_halo.PlaneHalo, "_exchange", 4),
+    "halo": (eddies.parallel.halo.PlaneHalo, "forward", 2),
     "reduction": (eddies.parallel.reduction, "_reduce", 60),
-    "product": (eddies.io.hdf5, "_collective", 15),  # the last preparation of a collective write: the second frame
-    "checkpoint": (eddies.io.contiguous, "_write_block", 50),  # the second checkpoint, half written
+    "product": (eddies.io.hdf5, "frame_bytes", 15),  # before a collective write: the second frame
+    "checkpoint": (eddies.io.checkpoint, "own_part", 6),  # before a collective write: the second checkpoint
 }
 
 TINY = Path(__file__).parents[1] / "tiny.toml"
@@ -35,22 +35,17 @@ SCENE = ["flow.cells=12", "tracers.particles_per_side=5", "tracers.field_cells=8
          "tracers.field_every=2", "time.max_step=0.025", "kernel.neighbors=20", "training.batch=9"]
 
 
-def fail(kind, directory):
-    """Break in the way of the name of an exception or of a signal."""
-    (directory / "broke").write_text(f"{time.time():.6f}")
-    if kind.startswith("SIG"):
-        os.kill(os.getpid(), getattr(signal, kind))
-    raise {"RuntimeError": RuntimeError, "MemoryError": MemoryError}[kind]("reactor leak")
-
-
 def break_at(owner, name, call, kind, directory):
-    """Let a function of a module or class fail in its `call`-th call."""
+    """Replace a function of a module or class by one that fails in its `call`-th call."""
     sound, calls = getattr(owner, name), []
 
     def broken(*arguments):
         calls.append(name)
         if len(calls) == call:
-            fail(kind, directory)
+            (directory / "broke").write_text(f"{time.time():.6f}")
+            if kind.startswith("SIG"):
+                os.kill(os.getpid(), getattr(signal, kind))
+            raise {"RuntimeError": RuntimeError, "MemoryError": MemoryError}[kind]("reactor leak")
         return sound(*arguments)
 
     setattr(owner, name, broken)

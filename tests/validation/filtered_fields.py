@@ -1,6 +1,6 @@
-"""A velocity of few modes, filtered: the exact hidden stress, pressure and force, by plain Fourier transforms.
+"""Exact hidden stress, pressure and force of a filtered velocity of few modes, by plain Fourier transforms.
 
-Nothing of it is taken from the package: fields are arrays (c, z, y, x) of a box of 2 pi, vectors in the order x, y, z.
+The package is not used. Fields are arrays (c, z, y, x) of a box of 2 pi, vectors in the order x, y, z.
 """
 
 import numpy as np
@@ -30,10 +30,10 @@ def random_velocity(seed, highest=3):
 
 
 class Filtered:
-    """A velocity u of the given modes, seen through the Gaussian filter of width d: transfer exp(-k^2 d^2 / 24).
+    """A velocity u of the given modes behind the Gaussian filter of width d: transfer exp(-k^2 d^2 / 24).
 
     velocity : modes of u_bar.
-    stress : fields (3, 3, z, y, x) of tau_ij = filtered(u_i u_j) - u_bar_i u_bar_j, all that the filter hides.
+    stress : fields (3, 3, z, y, x) of tau_ij = filtered(u_i u_j) - u_bar_i u_bar_j, the hidden stress.
     pressure : modes of p_bar,  laplacian p_bar = -d_i d_j filtered(u_i u_j).
     hidden_pressure : modes of p_tau,  laplacian p_tau = -d_i d_j tau_ij.
     """
@@ -48,8 +48,8 @@ class Filtered:
         self.hidden_pressure = self._pressure_of(modes_of(self.stress))
 
     def force(self, viscosity=0.0, hidden=True):
-        """Modes of -grad p_bar - div tau + nu laplacian u_bar: what accelerates a particle that moves with u_bar; if
-        not `hidden`, without what tau has a part in."""
+        """Modes of -grad p_bar - div tau + nu laplacian u_bar: the acceleration of a particle that moves with u_bar; if
+        not `hidden`, without tau and its pressure."""
         pressure = self.pressure if hidden else self.pressure - self.hidden_pressure
         force = -1j * WAVE * pressure - viscosity * SQUARED * self.velocity
         return force - self.stress_divergence() if hidden else force

@@ -16,11 +16,14 @@ import torch
 from mpi4py import MPI
 
 from eddies.io.hdf5 import open_product
+from eddies.kernels.library import library
+from eddies.kernels.neighbors import Box
+from eddies.kernels.reconstruction import fitted as fitted_by
+from eddies.kernels.reconstruction import told_kernel
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.particle_field import grid_points
 from eddies.particles.periodic_box import PeriodicBox
-from eddies.particles.reconstruction import moving_least_squares
 from eddies.particles.smoothing_kernels import CubicSpline, HermiteKernel, WendlandC2
 from eddies.scene.scene import BOX_LENGTH
 from eddies.scene.sections import Tracers
@@ -107,10 +110,11 @@ def fitted(points, position, velocity, support, degree):
     that fit the velocities (n, 3) of the particles within the support best, with Wendland's weights."""
     neighbors, weights = NeighborList(PeriodicBox(BOX_LENGTH), support, 0.0), WendlandC2(support)
     neighbors.build(points, position, exclude_self=False)
-    parts = [moving_least_squares(weights, neighbors.pairs(points, position, rows, torch.float64), degree,
-                                  BOX_LENGTH**3 / len(position), velocity.double(), LEAST_WEIGHT)
-             for rows in torch.arange(len(points)).split(TOGETHER)]
-    return [torch.cat(part) for part in zip(*parts)]
+    values = torch.from_numpy(fitted_by(
+        library(), Box(BOX_LENGTH, True), degree, told_kernel(support, weights.pieces.numpy()),
+        BOX_LENGTH**3 / len(position), LEAST_WEIGHT, neighbors.offsets.numpy(), neighbors.senders.numpy(),
+        points.numpy(), position.numpy(), velocity.numpy()))
+    return values[:, 0], values[:, 1:].transpose(1, 2)
 
 
 def main():

@@ -1,13 +1,13 @@
-"""The accelerations of tracers of a filtered direct simulation, and what the resolved terms make of them.
+"""Accelerations of tracers in a filtered direct simulation against those of the resolved terms.
 
-Nothing is fitted: pressure, hidden stress and molecular viscosity. The stress must bring the model closer to the
-tracers, and only does so well with the pressure of the stress; undoing the filter must beat the leading term of its
-expansion.
+Nothing is fitted: the terms are pressure, hidden stress and molecular viscosity. The stress brings the model closer to
+the tracers, but only together with its pressure. Undoing the filter beats the leading term of its expansion.
 """
 
 import numpy as np
 import pytest
 import torch
+from flows import make_grid, march
 from mpi4py import MPI
 
 from eddies.flow import initial_fields
@@ -17,7 +17,6 @@ from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.flow_units import FlowUnits, ReferenceScales
 from eddies.particles.particle_set import ParticleSet
-from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.time_stepping import ETDRK4
 from tests.particles.configurations import LENGTH, model
 
@@ -25,12 +24,10 @@ CELLS, PER_SIDE, PLANES, VISCOSITY, STEP = 32, 24, 42, 0.03, 0.02
 WIDTH = 2 * LENGTH / PER_SIDE
 
 
-def moments_of_tracers(grid):
+def frames_of_tracers(grid):
     """Position and velocity of tracers in decaying turbulence, by id, at three successive times after 0.6."""
-    advance = ETDRK4(IncompressibleFluid(grid, VISCOSITY))
-    state = initial_fields.random_velocity(grid, 5, 1.0, 1.5)
-    for _ in range(30):
-        state = advance(state, STEP)
+    fluid = IncompressibleFluid(grid, VISCOSITY)
+    state, advance = march(fluid, initial_fields.random_velocity(grid, 5, 1.0, 1.5), 0.06, 10), ETDRK4(fluid)
     columns = release(grid.decomposition, 3, PER_SIDE, "lattice")
     tracers = TracerParticles(FilteredField(grid, WIDTH, "quintic"), columns, state)
     found = []
@@ -44,7 +41,7 @@ def moments_of_tracers(grid):
 
 @torch.no_grad()
 def modelled(now, *words, form="deconvolution"):
-    """Accelerations by these terms, and the resolved flow."""
+    """Accelerations of a model with these terms, and the resolved flow."""
     scales = ReferenceScales(filter_width=WIDTH, spacing=LENGTH / PER_SIDE, velocity=0.6, density_mean=1.0,
                              density=0.01, acceleration=1.0, density_rate=0.05, sound_speed=10.0, viscosity=VISCOSITY)
     settings = {word: dict(form=form) if word == "stress" else {} for word in words}
@@ -58,7 +55,7 @@ def modelled(now, *words, form="deconvolution"):
 
 @pytest.mark.mpi(1)
 def test_the_projected_stress_comes_closest_to_the_accelerations_of_tracers(comm):
-    before, now, after = moments_of_tracers(SpectralGrid(SlabDecomposition(comm, LENGTH, CELLS)))
+    before, now, after = frames_of_tracers(make_grid(comm, CELLS))
     exact = (after["velocity"] - before["velocity"]) / (2 * STEP)
 
     def error(acceleration):

@@ -13,6 +13,7 @@ from eddies.workflows import dns
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.learned.model import initial_model
 from eddies.workflows.learned.source import ModelDefinition
+from eddies.workflows.run_directory.fingerprints import stage_provenance
 
 SCENE = """
 [flow]
@@ -110,8 +111,8 @@ def write_kernel(comm, directory, scene):
     network = KernelNetwork(scene.kernel_support, [4])
     description = {"form": network.formula, "support": network.support, "hidden": [4], "cutoff": "smooth"}
     weights = {name: tensor.numpy() for name, tensor in network.state_dict().items()}
-    save_weights(comm, directory / "kernel.h5", "kernel", description, weights, scene.provenance("train-kernel"), {
-        "history": {"step": np.zeros(1)}})
+    save_weights(comm, directory / "kernel.h5", "kernel", description, weights,
+                 stage_provenance(scene, "train-kernel"), {"history": {"step": np.zeros(1)}})
 
 
 def scales_of(comm, directory, planes=6):

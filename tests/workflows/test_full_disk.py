@@ -1,25 +1,25 @@
-"""A direct simulation on a disk that is too small at its beginning, in a frame, or at its end; then it goes on."""
+"""A direct simulation on a disk that is full at its beginning, in a frame, and at its end; then it continues."""
 
 import numpy as np
 import pytest
 
-from eddies.io import unfinished
+from eddies.io import new_files
 from eddies.io.errors import WriteError
 from eddies.parallel.stop import StopRequest, Stopped
 from eddies.scene.scene import load_scene
 from eddies.workflows import dns
-from tests.io.test_unfinished import largest_file
+from tests.full_disk import largest_file
 from tests.small_scene import TINY
 from tests.workflows.stopping import StopAtStep
 from tests.workflows.test_dns_restart import SPLIT, product
 
 
-@pytest.mark.mpi(1, 2, timeout=60)
+@pytest.mark.mpi(2, timeout=60)
 def test_a_simulation_without_room_keeps_its_checkpoint_and_goes_on(comm, tmp_path, monkeypatch):
     """In place of a full disk the last rank may write so many bytes to a file."""
-    monkeypatch.setattr(unfinished, "MARGIN_BYTES", 2**12)
+    monkeypatch.setattr(new_files, "MARGIN_BYTES", 2**12)
     scene = load_scene(TINY, SPLIT)
-    run, whole, told = tmp_path / "run", tmp_path / "whole", []
+    run, whole, files = tmp_path / "run", tmp_path / "whole", []
     if comm.rank == 0:
         run.mkdir()
         whole.mkdir()
@@ -34,12 +34,12 @@ def test_a_simulation_without_room_keeps_its_checkpoint_and_goes_on(comm, tmp_pa
     for kilobytes in (1, 100, 400):
         with largest_file(comm, kilobytes * 1024, comm.size - 1), pytest.raises(WriteError, match="make room") as error:
             dns.run(scene, comm, run, StopRequest(comm))
-        told.append(str(error.value).split(":")[0].split("/")[-1])
+        files.append(str(error.value).split(":")[0].split("/")[-1])
         comm.Barrier()
         assert all(path.read_bytes() == content for path, content in before.items())
         assert not list(run.rglob("*.partial")) and not (run / "ground_truth.h5").exists()
         comm.Barrier()
-    assert told == ["ground_truth.h5.partial", "frames-00000014.h5.partial", "ground_truth.h5.partial"]
+    assert files == ["ground_truth.h5.partial", "frames-00000014.h5.partial", "ground_truth.h5.partial"]
     dns.run(scene, comm, run)
     truth, again = product(comm, whole), product(comm, run)
     assert all(np.array_equal(again[name], values) for name, values in truth.items())

@@ -87,9 +87,9 @@ def test_a_complete_run_shows_everything(comm, tmp_path):
     check_stationary(metrics["stationary"], page)
 
 
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("no_figures")
 @pytest.mark.mpi(1)
-def test_a_run_without_density_shows_all_but_that(comm, tmp_path):
+def test_a_run_without_density_shows_everything_else(comm, tmp_path):
     write_run(comm, tmp_path, {"stationary": True}, density=False)
     report.run(tmp_path, comm)
     metrics, page = written(tmp_path)
@@ -100,10 +100,8 @@ def test_a_run_without_density_shows_all_but_that(comm, tmp_path):
 
 
 @pytest.mark.mpi(1)
-@pytest.mark.parametrize("of_model", [True, False])
-@pytest.mark.parametrize("of_truth", [True, False])
-def test_the_series_of_a_rollout_have_the_density_that_is_stored(comm, tmp_path, of_model, of_truth):
-    """It is drawn where both have one."""
+@pytest.mark.parametrize("of_model, of_truth", [(True, True), (True, False), (False, True)])
+def test_the_density_is_drawn_if_model_and_truth_have_one(comm, tmp_path, of_model, of_truth):
     write_run(comm, tmp_path, {"density": of_truth}, density=of_model)
     with open_rollout(tmp_path, comm) as measured:
         run = measured.rollout
@@ -119,34 +117,33 @@ def test_the_series_of_a_rollout_have_the_density_that_is_stored(comm, tmp_path,
 
 
 @pytest.mark.mpi(1)
-def test_a_product_of_another_version_is_said_in_one_line(comm, tmp_path):
+def test_a_product_of_another_version_is_refused(comm, tmp_path):
     write_run(comm, tmp_path)
     with changed(tmp_path / "kernel.h5") as file:
         del file.attrs["format"]
-    with pytest.raises(ProductError, match="kernel.h5: written by eddies .* remove it and run `eddies train-kernel` "):
+    with pytest.raises(ProductError, match="kernel.h5: .*remove it and run `eddies train-kernel`"):
         report.run(tmp_path, comm)
 
 
 @pytest.mark.usefixtures("no_figures")
 @pytest.mark.mpi(1, 2, timeout=60)
-def test_a_report_that_cannot_be_written_is_told_in_one_line(comm, tmp_path, capfd):
-    """A file where a directory of it should be. All ranks end with the exit code of what the user can mend."""
+def test_a_report_that_cannot_be_written_ends_all_ranks_with_exit_code_2(comm, tmp_path, capfd):
+    """There is a file in the place of a directory."""
     write_ground_truth(comm, tmp_path)
     if comm.rank == 0:
         (tmp_path / "report").mkdir()
         (tmp_path / "report" / "figures").write_text("precious")
     comm.Barrier()
     assert cli.main(["report", str(tmp_path)]) == 2
-    told = "report/figures: File exists; check the file, its directory and the space on the disk\n"
-    assert comm.rank > 0 or capfd.readouterr().err.endswith(told)
+    assert comm.rank > 0 or "report/figures: File exists" in capfd.readouterr().err
 
 
 @pytest.mark.mpi(2, timeout=30)
-def test_a_damaged_product_is_told_by_all(comm, tmp_path):
+def test_a_damaged_product_is_refused_by_all_ranks(comm, tmp_path):
     if comm.rank == 0:
         (tmp_path / "kernel.h5").write_text("no HDF5")
     comm.Barrier()
-    with pytest.raises(ProductError, match="kernel.h5: damaged or not an HDF5 file"):
+    with pytest.raises(ProductError, match="kernel.h5: damaged"):
         report.run(tmp_path, comm)
 
 
@@ -161,13 +158,13 @@ def check_stationary(shown, page):
 
 @pytest.mark.usefixtures("no_figures")
 @pytest.mark.mpi(1)
-def test_a_span_too_short_to_average_is_said_and_the_rest_is_shown(comm, tmp_path):
+def test_a_span_too_short_to_average_has_a_notice_and_the_rest_is_shown(comm, tmp_path):
     write_ground_truth(comm, tmp_path, stationary=True)
     with changed(tmp_path / "ground_truth.h5") as file:
         file["stationary"].attrs["end"] = file["stationary"].attrs["start"]
     report.run(tmp_path, comm)
     metrics, page = written(tmp_path)
-    assert "nothing to average; raise [spin_up] stationary" in page
+    assert "raise [spin_up] stationary" in page
     assert "stationary" not in figures(tmp_path) and metrics["ground_truth"]["reynolds_lambda"] > 0
 
 
@@ -183,7 +180,7 @@ def test_numbers_of_a_known_rollout(comm, tmp_path):
     assert rollout["last_common_time"] == pytest.approx(0.5 / 1.2)
     assert rollout["velocity_error"] == pytest.approx(0.2, rel=0.15)
     assert rollout["energy_ratio"] == pytest.approx(1.04, abs=0.05)
-    # The truth ends before half a turnover. Without a force its particles would keep the velocities of the start.
+    # The truth ends before half a turnover. Without any force its particles would keep their first velocities.
     assert rollout["early_time"] == rollout["last_common_time"]
     assert rollout["early_velocity_error"] == rollout["velocity_error"]
     with h5py.File(tmp_path / "ground_truth.h5") as file:
@@ -195,40 +192,40 @@ def test_numbers_of_a_known_rollout(comm, tmp_path):
     assert set(rollout["band_energy_ratios"]) == set(rollout["band_energy_ratios_floor"]) == {"1-2", "3-4"}
     assert rollout["outside_training"] == pytest.approx(0.2e-3)  # at t = 0.4 or 0.5
     assert (rollout["closure_iterations"], rollout["closure_most_iterations"]) == (2.5, 40)
-    assert "Solves for the resolved velocity that did not converge: 1; the worst left 1.0e-03" in page
+    assert "1 solves for the resolved velocity did not converge" in page and "1.0e-03" in page
     assert 0 < rollout["velocity_kl"] < 0.1 and 0 < rollout["qr_kl"] < 0.5
     # Both start at the same random points.
     assert 0 < rollout["nearest_distance_kl"] < 0.1
     # Random points in 64 cells.
     assert all(value == pytest.approx(1, abs=0.5) for value in rollout["count_variance"].values())
-    # The mean of a perturbation by random modes, at 600 particles; that of the truth is its sampling alone.
+    # The model's error is a sum of random modes, with a mean over 600 particles. The truth has a sampling error only.
     assert 0 < rollout["momentum_drift"]["truth"] < rollout["momentum_drift"]["model"] < 0.2
     assert all(abs(value) < 1e-2 for value in rollout["density_drift"].values())
 
 
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("no_figures")
 @pytest.mark.mpi(1)
-def test_a_forced_rollout_is_compared_with_the_stationary_state_if_there_is_one(comm, tmp_path):
+def test_a_forced_rollout_is_compared_with_the_stationary_state(comm, tmp_path):
     write_run(comm, tmp_path, {"stationary": True}, injection_rate=0.5)
     report.run(tmp_path, comm)
     metrics, page = written(tmp_path)
-    assert "The model is forced with a power of 0.5 a mass, and the flow of the true tracers is not forced" in page
+    assert "The model is forced with a power of 0.5 per mass, and the flow of the true tracers is not forced" in page
     assert "forced" in figures(tmp_path)
     assert all(math.isfinite(value) for value in numbers(metrics["forced"].values()))
     write_run(comm, tmp_path, injection_rate=0.5)
     report.run(tmp_path, comm)
     metrics, page = written(tmp_path)
-    assert "from the start on they are two flows" in page and "forced" not in metrics
+    assert "two different flows" in page and "forced" not in metrics
 
 
 @pytest.mark.usefixtures("no_figures")
 @pytest.mark.mpi(1)
-def test_a_rollout_that_is_forced_as_its_truth_is_compared_with_that_and_with_the_stationary_state(comm, tmp_path):
+def test_a_rollout_with_the_forcing_of_its_truth_is_compared_with_both(comm, tmp_path):
     write_run(comm, tmp_path, {"stationary": True, "forced": True}, injection_rate=0.5, truth_injection_rate=0.5)
     report.run(tmp_path, comm)
     _, page = written(tmp_path)
-    assert "Model and truth are forced alike, with a power of 0.5 a mass" in page and "two flows" not in page
-    assert "which stays forced with a power of 0.5 a mass" in page and "forced" in figures(tmp_path)
+    assert "Model and truth are both forced with a power of 0.5 per mass" in page and "different flows" not in page
+    assert "which stays forced with a power of 0.5 per mass" in page and "forced" in figures(tmp_path)
     write_rollout(comm, tmp_path, truth_injection_rate=0.5)
     report.run(tmp_path, comm)
     _, page = written(tmp_path)
@@ -237,7 +234,7 @@ def test_a_rollout_that_is_forced_as_its_truth_is_compared_with_that_and_with_th
 
 @pytest.mark.usefixtures("no_figures")
 @pytest.mark.mpi(1)
-def test_a_stopped_rollout_is_said_to_be_stopped(comm, tmp_path):
+def test_a_stopped_rollout_is_compared_until_it_broke(comm, tmp_path):
     write_run(comm, tmp_path, status="stopped: particle 17 is not finite at t=0.62", broken=4)
     report.run(tmp_path, comm)
     metrics, page = written(tmp_path)
@@ -282,7 +279,7 @@ def test_a_model_of_another_flow_is_shown_beside_its_source(comm, tmp_path):
 
 @pytest.mark.usefixtures("no_figures")
 @pytest.mark.mpi(1)
-def test_a_source_of_unknown_mach_number_is_said(comm, tmp_path):
+def test_a_source_of_unknown_mach_number_has_a_notice(comm, tmp_path):
     write_model(comm, tmp_path, source={"path": "runs/other", "mach_turbulent": None})
     report.run(tmp_path, comm)
     assert "runs/other or this flow has no Mach number" in written(tmp_path)[1]
@@ -291,12 +288,12 @@ def test_a_source_of_unknown_mach_number_is_said(comm, tmp_path):
 
 @pytest.mark.usefixtures("no_figures")
 @pytest.mark.mpi(1)
-def test_of_weights_that_a_run_learned_from_others_alone_these_are_named(comm, tmp_path):
+def test_the_flows_that_weights_were_trained_on_are_named(comm, tmp_path):
     write_model(comm, tmp_path, source={"path": "runs/other", "truths": {"runs/a/ground_truth.h5": 0.04,
                                                                          "runs/b/ground_truth.h5": None}})
     report.run(tmp_path, comm)
-    assert ("Trained on runs/a/ground_truth.h5 (M_t = 0.040), runs/b/ground_truth.h5, and on nothing of the flow of "
-            "runs/other, where its weights come from.") in written(tmp_path)[1]
+    assert ("Trained on runs/a/ground_truth.h5 (M_t = 0.040), runs/b/ground_truth.h5, and not on the flow of "
+            "runs/other") in written(tmp_path)[1]
     assert "figure-3b-mach" not in figures(tmp_path)
 
 
@@ -322,14 +319,14 @@ def test_a_rollout_without_its_ground_truth(comm, tmp_path):
     report.run(tmp_path, comm)
     metrics, page = written(tmp_path)
     assert metrics["rollout"]["velocity_error"] is metrics["rollout"]["spectrum_error"] is None
-    assert "The rollout: complete. It is not compared: ground_truth.h5 is not here." in page
+    assert "not compared with the truth: ground_truth.h5 is not here" in page
     assert metrics["rollout"]["turnovers"] > 0 and not figures(tmp_path)
 
 
 @pytest.mark.usefixtures("no_figures")
 @pytest.mark.mpi(1)
 def test_a_rollout_of_an_earlier_version_shows_the_same(comm, tmp_path):
-    """It holds its truth, fields and spectra too."""
+    """Such a rollout also stores its truth, fields and spectra."""
     write_run(comm, tmp_path)
     report.run(tmp_path, comm)
     expected = written(tmp_path)[0]["rollout"]
@@ -342,19 +339,19 @@ def test_a_rollout_of_an_earlier_version_shows_the_same(comm, tmp_path):
 
 @pytest.mark.usefixtures("no_figures")
 @pytest.mark.mpi(1)
-def test_a_rollout_of_another_ground_truth_is_not_compared_with_this(comm, tmp_path):
-    """Of as many particles, whose errors would be those of two flows."""
+def test_a_rollout_of_another_ground_truth_is_not_compared(comm, tmp_path):
+    """The other one has the same number of particles."""
     write_run(comm, tmp_path)
     write_ground_truth(comm, tmp_path, frames=13, seed=2)
     report.run(tmp_path, comm)
     metrics, page = written(tmp_path)
-    assert "It is not compared: rollout.h5 was made from another ground_truth.h5 than the one here." in page
+    assert "rollout.h5 was made from another ground_truth.h5 than the one here" in page
     assert metrics["rollout"]["velocity_error"] is None
 
 
 @pytest.mark.usefixtures("no_figures")
 @pytest.mark.mpi(1)
-def test_figures_of_an_earlier_report_do_not_stay(comm, tmp_path):
+def test_figures_of_an_earlier_report_are_removed(comm, tmp_path):
     write_kernel(comm, tmp_path)
     report.run(tmp_path, comm)
     (tmp_path / "kernel.h5").unlink()
@@ -363,8 +360,8 @@ def test_figures_of_an_earlier_report_do_not_stay(comm, tmp_path):
     assert figures(tmp_path) == {"statistics", "spectra", "fields"}
 
 
-def told_at_the_top(directory, output):
-    """The warnings of a report by its command: the same in metrics.json, above all else on the page, and in the log."""
+def warnings_of(directory, output):
+    """The warnings of `eddies report`, which are the same in metrics.json, at the top of the page, and in the log."""
     assert cli.main(["report", str(directory)]) == 0
     metrics, page = written(directory)
     said = metrics["warnings"]
@@ -375,23 +372,23 @@ def told_at_the_top(directory, output):
 
 
 def top_of(page):
-    """What the page has before the first section of its own."""
+    """The page before its first section."""
     return page[page.index("<main>"):page.index("<section><details")]
 
 
 @pytest.mark.usefixtures("no_figures")
 @pytest.mark.mpi(1)
-def test_a_ground_truth_that_others_were_not_made_from_is_said_at_the_top(comm, tmp_path, capfd):
-    """Of the next seed, and so another flow; nothing else tells in the numbers of the model."""
+def test_products_that_were_made_from_another_ground_truth_are_named_at_the_top(comm, tmp_path, capfd):
+    """The other one has another seed, so it is another flow."""
     write_run(comm, tmp_path)
-    assert told_at_the_top(tmp_path, capfd) == [] and "Warnings" not in top_of(written(tmp_path)[1])
+    assert warnings_of(tmp_path, capfd) == [] and "Warnings" not in top_of(written(tmp_path)[1])
     write_ground_truth(comm, tmp_path, seed=2)
-    said = told_at_the_top(tmp_path, capfd)
+    said = warnings_of(tmp_path, capfd)
     assert [sentence.partition(" ")[0] for sentence in said] == ["kernel.h5", "model.h5", "rollout.h5"]
     assert all("was made from another ground_truth.h5 than the one here" in sentence
                and "with other settings (seed = 1, now 2): remove it and run" in sentence for sentence in said)
     write_run(comm, tmp_path)
-    assert told_at_the_top(tmp_path, capfd) == []
+    assert warnings_of(tmp_path, capfd) == []
 
 
 @pytest.mark.usefixtures("no_figures")
@@ -400,27 +397,26 @@ def test_a_ground_truth_that_others_were_not_made_from_is_said_at_the_top(comm, 
     ("model", "a_priori/acceleration_error", 12), ("model", "history/seconds", 3),
     ("kernel", "errors/integral_learned", ()),
     ("rollout", "closure/not_converged", 2), ("rollout", "particles/model/velocity/value", (8, 0, 0))])
-def test_numbers_that_are_not_finite_are_said_at_the_top(comm, tmp_path, capfd, kind, place, index):
+def test_numbers_that_are_not_finite_are_named_at_the_top(comm, tmp_path, capfd, kind, place, index):
     write_run(comm, tmp_path)
     with changed(tmp_path / f"{kind}.h5") as file:
         file[place][index] = math.nan
-    said, = told_at_the_top(tmp_path, capfd)
+    said, = warnings_of(tmp_path, capfd)
     assert said.startswith(f"{kind}.h5 holds numbers that are not finite ({place}")
 
 
 @pytest.mark.usefixtures("no_figures")
 @pytest.mark.mpi(1)
-def test_a_section_that_cannot_be_made_of_such_numbers_says_so(comm, tmp_path, capfd):
-    """There is no PDF of them; the other sections are there."""
+def test_a_section_that_needs_such_numbers_is_replaced_by_a_notice(comm, tmp_path, capfd):
+    """There is no PDF of numbers that are not finite. Other sections are there."""
     write_ground_truth(comm, tmp_path)
     write_kernel(comm, tmp_path)
     write_model(comm, tmp_path)
     with changed(tmp_path / "model.h5") as file:
         file["acceleration_sample/truth"][5, 1] = math.nan
-    said, = told_at_the_top(tmp_path, capfd)
+    said, = warnings_of(tmp_path, capfd)
     metrics, page = written(tmp_path)
-    assert metrics["model"] == {} and f"Not shown (a PDF needs at least one value, and finite ones only): {said}" in (
-        html.unescape(page))
+    assert metrics["model"] == {} and "Not shown (" in page and html.unescape(page).count(said) == 2
     assert metrics["kernel"]["integral"] == 1
 
 
@@ -429,21 +425,20 @@ def test_a_ground_truth_that_is_not_finite_is_refused(comm, tmp_path):
     write_ground_truth(comm, tmp_path)
     with changed(tmp_path / "ground_truth.h5") as file:
         file["fields/filtered/velocity"][0, 0, 0, 0, 0] = math.nan
-    with pytest.raises(ProductError, match="ground_truth.h5: /fields/filtered/velocity, frame 0: holds values that are "
-                                           "not finite; remove it and run `eddies dns` again"):
+    with pytest.raises(ProductError, match="ground_truth.h5: /fields/filtered/velocity, frame 0: .*not finite"):
         report.run(tmp_path, comm)
 
 
 @pytest.mark.usefixtures("no_figures")
 @pytest.mark.mpi(1)
-def test_a_rollout_of_too_few_steps_says_why_it_has_no_time_of_a_step(comm, tmp_path):
+def test_a_rollout_of_too_few_steps_has_no_time_of_a_step(comm, tmp_path):
     write_rollout(comm, tmp_path)
     with changed(tmp_path / "rollout.h5") as file:
         del file["rollout"].attrs["seconds_per_step"], file["rollout"].attrs["time_step"]
     report.run(tmp_path, comm)
     metrics, page = written(tmp_path)
     assert metrics["cost"]["seconds_per_step"] is None and metrics["cost"]["particles"] == 600
-    assert "not available: too few steps to time one: the first two" in page and "without a step" in page
+    assert "not available: too few steps to time one" in page and "without a step" in page
 
 
 @pytest.mark.mpi(1)
@@ -452,26 +447,10 @@ def test_an_empty_directory_is_refused(comm, tmp_path):
         report.run(tmp_path, comm)
 
 
-@pytest.mark.mpi(2)
-def test_ranks_share_the_drawing(comm, tmp_path):
-    alone = comm.Split(comm.rank)
-    if comm.rank == 0:
-        write_ground_truth(alone, tmp_path, stationary=True)
-    comm.Barrier()
-    report.run(tmp_path, comm)
-    if comm.rank == 0:
-        page = written(tmp_path)[1]
-        report.run(tmp_path, alone)
-        assert len(figures(tmp_path)) == 4 and written(tmp_path)[1] == page
-        images = {path.read_bytes() for path in (tmp_path / "report" / "figures").glob("*.png")}
-        assert len(images) == 4, "each has its own"
-    alone.Free()
-
-
 @pytest.mark.usefixtures("no_figures")
 @pytest.mark.mpi(1, 2)
 @pytest.mark.parametrize("looks", [0, 1])
-def test_a_report_is_stopped_before_and_after_its_figures_are_drawn(comm, tmp_path, looks):
+def test_a_report_can_be_stopped_before_and_after_its_figures_are_drawn(comm, tmp_path, looks):
     write_ground_truth(comm, tmp_path, tracers=False)
     with pytest.raises(Stopped):
         report.run_stage(load_scene(TINY), comm, tmp_path, StopAtStep(comm, looks))
@@ -495,12 +474,11 @@ def test_numbers_and_other_figures_do_not_depend_on_a_figure(comm, tmp_path, mon
     monkeypatch.setattr(module, "png", png)
     report.run(tmp_path, comm)
     told = [record.getMessage() for record in caplog.records if "a figure is left out" in record.getMessage()]
-    assert told == ["report: a figure is left out, it cannot be drawn (ZeroDivisionError: division by zero)"] * (
-        comm.rank == 0)
+    assert len(told) == (comm.rank == 0) and all("ZeroDivisionError: division by zero" in text for text in told)
     comm.Barrier()
     assert len(figures(tmp_path)) == 2 and "ground_truth" in written(tmp_path)[0]
 
 
-def test_a_backend_that_there_is_not_is_none_of_the_report_s():
+def test_an_unknown_backend_does_not_matter():
     code = "import eddies.report.figures, matplotlib; matplotlib.figure.Figure().savefig('/dev/null', format='png')"
     assert subprocess.run([sys.executable, "-c", code], env={**os.environ, "MPLBACKEND": "nonsense"}).returncode == 0

@@ -11,6 +11,7 @@ from eddies.io.checkpoint import CheckpointDirectory
 from eddies.io.hdf5 import create_product
 from eddies.scene.scene import load_scene
 from eddies.workflows.diff import diff_lines
+from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
 from eddies.workflows.status import status_lines
 from tests.small_scene import TINY
 from tests.test_cli import run_cli
@@ -27,12 +28,12 @@ def write_scene(directory, *changes):
 @pytest.mark.mpi(1)
 def test_the_state_of_every_stage(comm, tmp_path, capfd):
     scene = write_scene(tmp_path / "one")
-    checkpoints = CheckpointDirectory(comm, tmp_path / "one/checkpoints-train", scene.fingerprint("train"))
+    checkpoints = CheckpointDirectory(comm, tmp_path / "one/checkpoints-train", stage_fingerprint(scene, "train"))
     checkpoints.write(40, {"weights": np.ones(3)})
-    with create_product(comm, tmp_path / "one/ground_truth.h5", "ground_truth", scene.provenance("dns")):
+    with create_product(comm, tmp_path / "one/ground_truth.h5", "ground_truth", stage_provenance(scene, "dns")):
         pass
     before = load_scene(TINY, ["kernel.steps=7"])
-    with create_product(comm, tmp_path / "one/kernel.h5", "kernel", before.provenance("train-kernel")):
+    with create_product(comm, tmp_path / "one/kernel.h5", "kernel", stage_provenance(before, "train-kernel")):
         pass
     (tmp_path / "one/stage_seconds.json").write_text('{"dns": 75.0}')
     write_scene(tmp_path / "more/two")

@@ -233,7 +233,7 @@ def test_each_truth_is_measured_and_read_once(comm, folder, monkeypatch):
     assert len(set(together)) == len(together) and len({path for _, path, _ in together}) == truths
     assert {name for name, *_ in together} == {"FieldsOfParticles", "ParticleSpectra"}
     read = [os.path.realpath(path) for path in scanned]
-    assert len(set(read)) == len(read) and (len(read) > truths) == (comm.rank == 0)
+    assert len(set(read)) == len(read) > 0
 
 
 @pytest.mark.mpi(1, timeout=300)

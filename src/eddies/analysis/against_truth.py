@@ -20,16 +20,19 @@ def mean_energy(frames: Frames, frame: int) -> float:
 
 
 def particle_series(frames: Frames, chosen: Sequence[int]) -> dict[str, np.ndarray]:
-    """Columns over the chosen frames of one run: time, energy 1/2 <v.v>, density_rms where a density is stored."""
-    columns = {"energy": np.array([mean_energy(frames, frame) for frame in chosen])}
+    """Columns over chosen frames: time, energy <v.v>/2, and density_rms where a density is stored."""
+    columns = {"time": frames.times[np.asarray(chosen)],
+               "energy": np.array([mean_energy(frames, frame) for frame in chosen])}
     if "density" in frames.columns:
         columns["density_rms"] = np.array([np.std(frames.read(int(frame), "density")) for frame in chosen])
-    return {"time": frames.times[np.asarray(chosen)], **columns}
+    return columns
 
 
 def error_series(run: Rollout) -> dict[str, np.ndarray]:
-    """Columns over the common frames: time, velocity_error (normalised L2), velocity_kl, acceleration_kl, and the
-    velocity error no_force of particles that keep the velocity of the first of them."""
+    """Columns over the common frames: time, velocity_error (normalised L2), velocity_kl, acceleration_kl, no_force.
+
+    `no_force` is the velocity error of particles that keep their velocity at the first common frame.
+    """
     rows, first = [], run.pair(0, "velocity").truth
     for index in range(run.common.times.size):
         velocity, acceleration = run.pair(index, "velocity"), run.pair(index, "acceleration")
@@ -47,16 +50,17 @@ def pdf_divergence(pair: Pair, edges: np.ndarray) -> float:
 
 
 def sampling_floor(pair: Pair, edges: np.ndarray) -> float:
-    """The divergence of that PDF between two independent samples of the truth; that of a model whose particles are
-    still where those of the truth are can be smaller."""
+    """The divergence of the same PDF between two independent samples of the truth.
+
+    A model whose particles are still near the true ones can be below it.
+    """
     values = standardized(pair.truth)
     return sampling_divergence(len(values), lambda rows: bin_probabilities(values[rows], edges))
 
 
 @dataclass(frozen=True)
 class InvariantStatistics:
-    """Q-R statistics of both runs: cell probabilities at one time, with the divergence between two samples of the truth
-    (`sampling_floor`)."""
+    """Q-R statistics at one time: cell probabilities of both runs, and the sampling floor of their divergence."""
 
     bins: InvariantBins
     model: np.ndarray
@@ -65,8 +69,7 @@ class InvariantStatistics:
 
     @classmethod
     def of(cls, model: Invariants, truth: Invariants) -> "InvariantStatistics":
-        """Joint PDF of (Q, R). Both runs are normalised by the truth's <Q_w>, so a wrong amplitude of the model
-        shows."""
+        """Joint PDFs of (Q, R), both in units of the truth's <Q_w>, so that a wrong amplitude of the model shows."""
         model_plane, truth_plane = (run.normalized(truth.scale) for run in (model, truth))
         bins = InvariantBins.covering(*truth_plane)
         floor = sampling_divergence(len(truth.second),
@@ -80,20 +83,22 @@ class InvariantStatistics:
 
 
 def last_invariants(run: Rollout) -> InvariantStatistics:
-    """Those of a rollout with a kernel, at the last common frame."""
-    return InvariantStatistics.of(*(found.invariants for found in run.reconstructed(-1)))
+    """Q-R statistics at the last common frame of a rollout with a kernel."""
+    return InvariantStatistics.of(*(fields.invariants for fields in run.reconstructed(-1)))
 
 
 def conditional_flows(run: Rollout, bins: InvariantBins) -> tuple[ConditionalVelocity, ConditionalVelocity] | None:
-    """Conditional mean (dQ/dt, dR/dt) of model and truth over all common frames, in units of the truth's <Q_w> at the
-    time; None with fewer than two of them."""
+    """Conditional mean (dQ/dt, dR/dt) of model and truth over all common frames; None with fewer than two frames.
+
+    Units are the truth's <Q_w> at the time.
+    """
     times = run.common.times
     if times.size < 2:
         return None
     flows = ConditionalVelocity(bins.coarser()), ConditionalVelocity(bins.coarser())
-    before = [found.invariants for found in run.reconstructed(0)]
+    before = [fields.invariants for fields in run.reconstructed(0)]
     for index in range(1, times.size):
-        after = [found.invariants for found in run.reconstructed(index)]
+        after = [fields.invariants for fields in run.reconstructed(index)]
         for flow, *both in zip(flows, before, after):
             flow.add(*both, times[index] - times[index - 1], (before[1].scale + after[1].scale) / 2)
         before = after

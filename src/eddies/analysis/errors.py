@@ -4,11 +4,9 @@ import numpy as np
 
 
 def normalized_l2(prediction: np.ndarray, truth: np.ndarray) -> float:
-    """Normalised L2 error |prediction - truth| / |truth| over all entries; a prediction of zero scores
-    exactly 1.
+    """Normalised L2 error |prediction - truth| / |truth| over all entries of two arrays of one shape.
 
-    Arrays have the same shape, any number of dimensions. Raises ValueError on unlike shapes or a truth of
-    zero norm.
+    Raises ValueError if the shapes differ or the truth is zero.
     """
     prediction, truth = np.asarray(prediction, dtype=float), np.asarray(truth, dtype=float)
     if prediction.shape != truth.shape:
@@ -20,8 +18,10 @@ def normalized_l2(prediction: np.ndarray, truth: np.ndarray) -> float:
 
 
 def rms_log_ratio(prediction: np.ndarray, truth: np.ndarray) -> float:
-    """Root mean square of ln(prediction / truth) over all entries, of one shape: a is an error by a factor e^a or e^-a
-    everywhere. Not finite where one of either is not positive, or where there is none."""
+    """Root mean square of ln(prediction / truth) over all entries: a if every entry is wrong by a factor e^a or e^-a.
+
+    Not finite if an entry is not positive, NaN without entries.
+    """
     prediction, truth = np.asarray(prediction, dtype=float), np.asarray(truth, dtype=float)
     if prediction.size == 0:
         return np.nan

@@ -1,4 +1,4 @@
-"""Averages of stationary isotropic turbulence, beside the values of the literature at the same Reynolds number.
+"""Averages of stationary isotropic turbulence, and the values of the literature at the same Reynolds number.
 
 u' is the rms of a velocity component, L the integral scale, eps the dissipation rate, eta Kolmogorov's length.
 """
@@ -13,14 +13,14 @@ from eddies.analysis.block_averages import Blocks, Estimate
 # Sreenivasan, Phys. Fluids 7, 2778 (1995); Yeung & Zhou, Phys. Rev. E 56, 1746 (1997).
 KOLMOGOROV_CONSTANT = (1.5, 1.64)
 INERTIAL = (0.03, 0.2)  # of k eta, where spectra are compared with Kolmogorov's constant
-BOTTLENECK = 0.5  # largest k eta at which the maximum of a compensated spectrum is looked for
+BOTTLENECK = 0.5  # largest k eta at which the maximum of a compensated spectrum is searched
 COMPONENTS = ("energy_x", "energy_y", "energy_z")
 
 
 def gradient_skewness(reynolds_lambda: float) -> float:
     """Skewness of the longitudinal gradient, -0.32 Re_lambda^0.11 (Ishihara et al., J. Fluid Mech. 592, 335, 2007).
 
-    A fit at Re_lambda > 200; at 30 to 100 simulations find -0.45 to -0.55.
+    A fit at Re_lambda > 200. Simulations at 30 to 100 find -0.45 to -0.55.
     """
     return -0.32 * reynolds_lambda**0.11
 
@@ -31,17 +31,17 @@ def gradient_flatness(reynolds_lambda: float) -> float:
 
 
 def dissipation_constant(reynolds_lambda: float) -> float:
-    """C_eps = eps L / u'^3 = A (1 + sqrt(1 + (B / Re_lambda)^2)), A = 0.2, B = 92.
+    """C_eps = eps L / u'^3 = 0.2 (1 + sqrt(1 + (92 / Re_lambda)^2)), 0.4 at high Re_lambda.
 
-    Donzis, Sreenivasan & Yeung, J. Fluid Mech. 532, 199 (2005), a fit to forced turbulence; 0.4 at high Re_lambda.
+    A fit to forced turbulence (Donzis, Sreenivasan & Yeung, J. Fluid Mech. 532, 199, 2005).
     """
     return float(0.2 * (1 + np.sqrt(1 + (92 / reynolds_lambda) ** 2)))
 
 
 def acceleration_constant(reynolds_lambda: float) -> float:
-    """a_0 = <a^2> nu^(1/2) / eps^(3/2) of a component of the acceleration, 5 / (1 + 110 / Re_lambda).
+    """a_0 = <a^2> nu^(1/2) / eps^(3/2) = 5 / (1 + 110 / Re_lambda) of an acceleration component in an unfiltered flow.
 
-    Sawford et al., Phys. Fluids 15, 3478 (2003), of an unfiltered flow.
+    Sawford et al., Phys. Fluids 15, 3478 (2003).
     """
     return 5 / (1 + 110 / reynolds_lambda)
 
@@ -60,8 +60,11 @@ def modes_per_shell(largest: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Row:
-    """A quantity of this flow, its standard deviation in time (None: it is no average), the literature's value, and its
-    standard error (None: not known, as of an average over less than two turnovers)."""
+    """A quantity of this flow and its value in the literature.
+
+    `deviation` is its standard deviation in time, None if it is not an average. `error` is its standard error, None if
+    the average is over less than two turnovers.
+    """
 
     key: str
     label: str
@@ -73,14 +76,15 @@ class Row:
 
 
 class StationarySpan:
-    """The samples of a flow between two times, over which its stationary state is averaged.
+    """The samples of a stationary flow between two times.
 
-    Args:
-        statistics: columns (samples,) of a ground truth's table.
-        spectra: E(k) at every sample, (samples, shells), k = 0, 1, ...
-        viscosity: kinematic viscosity.
-        start, end: first and last time.
-        forced_below: modes with 0 < |k| < this are forced; 0 if none is.
+    Parameters
+    ----------
+    statistics : columns (samples,) of a ground truth's table.
+    spectra : E(k) at every sample, (samples, shells), k = 0, 1, ...
+    viscosity : kinematic viscosity.
+    start, end : first and last time.
+    forced_below : modes with 0 < |k| < this are forced; 0 without forcing.
 
     Raises ValueError if the span holds fewer than three samples.
     """
@@ -94,15 +98,10 @@ class StationarySpan:
         self.columns = {name: values[inside] for name, values in statistics.items()}
         self.viscosity, self.forced_below = viscosity, forced_below
         interval = np.diff(self.columns["time"])
-        # Trapezoidal rule: samples are a number of steps apart, not a time.
+        # Trapezoidal rule: steps, and so the intervals between samples, vary.
         self._weights = (np.append(interval, 0) + np.append(0, interval)) / (2 * interval.sum())
         self.spectra = spectra[inside]
         self.spectrum = self._weights @ self.spectra
-
-    @property
-    def duration(self) -> float:
-        """Time from the first to the last sample."""
-        return float(self.columns["time"][-1] - self.columns["time"][0])
 
     @property
     def turnovers(self) -> float:
@@ -111,7 +110,7 @@ class StationarySpan:
 
     @property
     def steps_per_turnover(self) -> float:
-        """Time steps to a turnover."""
+        """Mean number of time steps per turnover."""
         return float(np.sum(np.diff(self.columns["time"]) / self.columns["time_step"][1:]) / self.turnovers)
 
     def mean(self, name: str) -> float:
@@ -124,13 +123,12 @@ class StationarySpan:
         return mean, float(np.sqrt(self._weights @ (values - mean) ** 2))
 
     def block_mean(self, values: np.ndarray) -> Estimate:
-        """Time average of values (samples,) with its standard error, that of blocks of a turnover or more."""
+        """Time average of values (samples,) with its standard error from blocks of at least a turnover."""
         return Estimate(self.average(values)[0], self._blocks.mean(values).error)
 
     @property
     def energy_trend(self) -> Estimate:
-        """Slope of a straight line through the energy, relative to its mean, per turnover, from blocks of a turnover or
-        more."""
+        """Slope of the regression line of the energy over its mean, per turnover."""
         return self._blocks.trend(self.columns["energy"] / self.mean("energy"))
 
     @property
@@ -140,8 +138,8 @@ class StationarySpan:
     @property
     def energy_imbalance(self) -> float:
         """(mean injection - mean dissipation - growth of the energy per time) / mean dissipation."""
-        energy, dissipation = self.columns["total_energy"], self.mean("dissipation_rate")
-        growth = (energy[-1] - energy[0]) / self.duration
+        energy, time, dissipation = self.columns["total_energy"], self.columns["time"], self.mean("dissipation_rate")
+        growth = (energy[-1] - energy[0]) / (time[-1] - time[0])
         return float((self.mean("injection_rate") - dissipation - growth) / dissipation)
 
     @property
@@ -152,8 +150,8 @@ class StationarySpan:
     def compensated_spectrum(self) -> tuple[np.ndarray, np.ndarray]:
         """k eta and eps^(-2/3) k^(5/3) E(k) of the mean spectrum, for k = 1 to the last complete shell.
 
-        The lattice of modes fills its shells unevenly (k = 1: 18 modes on 4 pi k^2 = 12.6): E(k) is the mean energy of
-        a shell's modes times 4 pi k^2.
+        The lattice fills its shells unevenly (k = 1: 18 modes on 4 pi k^2 = 12.6). So E(k) is the mean energy of the
+        shell's modes times 4 pi k^2.
         """
         cutoff = int(np.rint(self.columns["kmax_eta"][-1] / self.columns["kolmogorov_length"][-1]))
         k = np.arange(1, cutoff + 1)
@@ -161,17 +159,17 @@ class StationarySpan:
         return k * self.kolmogorov_length, self.mean("dissipation_rate") ** (-2 / 3) * k ** (5 / 3) * energy
 
     def unforced(self) -> tuple[np.ndarray, np.ndarray]:
-        """The `compensated_spectrum` of the shells without a forced mode."""
+        """`compensated_spectrum` in the shells without a forced mode."""
         k_eta, compensated = self.compensated_spectrum()
         free = np.arange(1, len(k_eta) + 1) >= self.forced_below + 0.5
         return k_eta[free], compensated[free]
 
     def enstrophy_skewness(self) -> np.ndarray:
-        """Skewness of the longitudinal gradient that isotropy asks for at each sample, (samples,).
+        """Skewness S of the longitudinal gradient from the enstrophy budget of an isotropic flow, (samples,).
 
-        -S (35/2) (W/15)^(3/2) = nu <|grad w|^2> + 1/2 dW/dt, where W = <w.w> = eps/nu is the enstrophy and
-        <|grad w|^2> = 2 sum k^4 E(k) (Batchelor & Townsend, Proc. R. Soc. A 190, 534, 1947). The enstrophy that the
-        forcing brings is neglected: 1 % at Re_lambda = 85, 8 % at 25.
+        -S (35/2) (W/15)^(3/2) = nu <|grad w|^2> + 1/2 dW/dt with the enstrophy W = <w.w> = eps/nu and
+        <|grad w|^2> = 2 sum k^4 E(k) (Batchelor & Townsend, Proc. R. Soc. A 190, 534, 1947). The enstrophy from the
+        forcing is neglected: 1 % at Re_lambda = 85, 8 % at 25.
         """
         enstrophy = self.columns["dissipation_rate"] / self.viscosity
         destroyed = 2 * self.viscosity * self.spectra @ np.arange(self.spectra.shape[1]) ** 4.0
@@ -179,13 +177,13 @@ class StationarySpan:
         return -(destroyed + growth) / (17.5 * (enstrophy / 15) ** 1.5)
 
     def component_shares(self) -> np.ndarray:
-        """Energy of the three components over their mean, (3, samples)."""
+        """Energy of each velocity component over the mean of the three, (3, samples)."""
         energies = np.array([self.columns[name] for name in COMPONENTS])
         return energies / energies.mean(axis=0)
 
 
 def comparison(span: StationarySpan) -> list[Row]:
-    """What is known of isotropic turbulence, as it is in this flow and as it should be at its Re_lambda."""
+    """Quantities of isotropic turbulence in this flow, and their values in the literature at its Re_lambda."""
     def averaged(key: str, label: str, values: np.ndarray, *literature) -> Row:
         error = span.block_mean(values).known_error
         return replace(Row(key, label, *span.average(values), *literature), error=error)
@@ -220,7 +218,7 @@ def comparison(span: StationarySpan) -> list[Row]:
 
 
 def _spectrum_rows(span: StationarySpan) -> list[Row]:
-    """Mean and maximum of the compensated spectrum, where the flow has shells for them."""
+    """Mean and maximum of the compensated spectrum, if the flow has shells in their ranges."""
     k_eta, compensated = span.unforced()
     inertial = compensated[(k_eta >= INERTIAL[0]) & (k_eta <= INERTIAL[1])]
     constant = "{}–{}, a bottleneck above".format(*KOLMOGOROV_CONSTANT)
@@ -239,10 +237,10 @@ def _spectrum_rows(span: StationarySpan) -> list[Row]:
 
 
 def _compressibility_rows(span: StationarySpan) -> list[Row]:
-    """M_t and what follows from it as long as it is small.
+    """M_t, and quantities that scale with a power of a small M_t.
 
-    Density follows the pressure of the incompressible flow: rho' = p / c^2, so rho_rms ~ M_t^2, and the velocity that
-    brings this density about is ~ M_t^2 u' (pseudo-sound: Ristorcelli, J. Fluid Mech. 347, 37, 1997).
+    The density follows the pressure of the incompressible flow, rho' = p / c^2, so that rho_rms ~ M_t^2. The
+    compressible velocity is ~ M_t^2 u' (pseudo-sound: Ristorcelli, J. Fluid Mech. 347, 37, 1997).
     """
     c, squared = span.columns, span.columns["mach_turbulent"] ** 2
     longitudinal = np.sqrt(c["compressible_fraction"])

@@ -1,37 +1,38 @@
-"""Lagrangian statistics of particles: what they remember, how they are accelerated and spread.
+"""Lagrangian statistics of particles: memory, accelerations, and dispersion.
 
-Of model and truth they are measured over the same frames, of the same particles.
+Model and truth are measured over the same frames, with the same particles.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from eddies.analysis.errors import rms_log_ratio
 from eddies.analysis.rollout import CommonFrames, Frames
+from eddies.kernels.library import library
+from eddies.kernels.neighbors import Box, neighbors_within
 
-VALUES = 2**22  # of a column of vectors that are held at once, over all frames
-LAGS = 18       # at most
+VALUES = 2**22  # numbers of a column of vectors that are held at once, over all frames
+LAGS = 18       # largest number of lags
 TETRADS = 1000  # particles around which pairs and tetrads are followed
 CORNERS = 4
 
 
 @dataclass(frozen=True)
 class PathStatistics:
-    """What particles do over frames at equal intervals.
+    """Statistics of particle paths over m frames at equal intervals.
 
     Parameters
     ----------
-    times : of the frames, (m,).
-    lags : times, (l,). structure, flatness : of the increments of a velocity component over a lag, <dv^2> and
-        <dv^4>/<dv^2>^2, of a normal distribution 3; (l,).
+    times : of the frames, (m,). lags : times, (l,).
+    structure, flatness : <dv^2> and <dv^4>/<dv^2>^2 of the increments dv of a velocity component over a lag, (l,).
     velocity_correlation : with the first frame, (m,).
     acceleration_correlation : over the lags, (l,). acceleration_variance : of a component, (m,).
-    pair_dispersion : <|r(t) - r(0)|^2> of nearest neighbours in units of <r(0)^2>, (m,).
-    tetrad_size : <R^2> of a particle and its three nearest neighbours over that at the start, R^2 = sum |x_i - x|^2,
-        x their mean; (m,).
-    tetrad_shape : mean eigenvalues of sum (x_i - x)(x_i - x)^T over R^2, the largest first, 1/3 each of a regular
+    pair_dispersion : <|r(t) - r(0)|^2> / <r(0)^2> of nearest neighbours, (m,).
+    tetrad_size : <R^2> over its value at the start, of a particle and its three nearest neighbours: R^2 is the sum of
+        |x_i - x|^2, x the mean of the four positions; (m,).
+    tetrad_shape : mean eigenvalues of sum (x_i - x)(x_i - x)^T over R^2, the largest first; 1/3 each for a regular
         tetrahedron (Chertkov, Pumir & Shraiman 1999); (m, 3).
     """
 
@@ -49,15 +50,25 @@ class PathStatistics:
 
 def of_both(model: Frames, truth: Frames, common: CommonFrames,
             length: float) -> tuple[PathStatistics, PathStatistics]:
-    """Statistics of model and truth over all common frames, of the same particles, near each other at the first."""
+    """Statistics of model and truth over all common frames; tetrads are found in the truth at the first one."""
     tetrads = near_tetrads(truth.read(int(common.truth[0]), "position"), length)
     return (path_statistics(model, common.model, tetrads, length),
             path_statistics(truth, common.truth, tetrads, length))
 
 
+def evenly(total: int, most: int) -> np.ndarray:
+    """At most `most` of the rows 0 ... total - 1, evenly spread from the first to the last."""
+    return np.unique(np.linspace(0, total - 1, min(total, most)).astype(int))
+
+
+def lags_of(longest: int) -> np.ndarray:
+    """At most LAGS lags from 1 to `longest` in frames, about evenly spread in the logarithm."""
+    return np.unique(np.rint(np.geomspace(1, longest, LAGS)).astype(int)) if longest else np.empty(0, int)
+
+
 def near_tetrads(position: np.ndarray, length: float) -> np.ndarray:
-    """Rows (4, m) of particles (n, 3) and of the nearest three others of each, of at most `TETRADS` chosen evenly."""
-    chosen = np.unique(np.linspace(0, len(position) - 1, min(len(position), TETRADS)).astype(int))
+    """Rows (4, m) of at most TETRADS evenly chosen particles (n, 3) and of their three nearest neighbours."""
+    chosen = evenly(len(position), TETRADS)
     return np.concatenate([chosen[None], nearest_rows(position, length, chosen, CORNERS - 1)])
 
 
@@ -66,21 +77,21 @@ def path_statistics(run: Frames, chosen: Sequence[int], tetrads: np.ndarray, len
     chosen = [int(frame) for frame in chosen]
     times = run.times[chosen] - run.times[chosen[0]]
     velocity, acceleration = (_sample(run, chosen, column) for column in ("velocity", "acceleration"))
-    longest = len(chosen) - 1
-    steps = np.unique(np.rint(np.geomspace(1, longest, LAGS)).astype(int)) if longest else np.empty(0, int)
+    lags = lags_of(len(chosen) - 1)
     return PathStatistics(
-        times, times[steps], structure_function(velocity, steps), increment_flatness(velocity, steps),
+        times, times[lags], structure_function(velocity, lags), increment_flatness(velocity, lags),
         np.array([correlation(velocity[0], later) for later in velocity]),
-        np.array([np.mean([correlation(earlier, later) for earlier, later in zip(acceleration, acceleration[step:])])
-                  for step in steps]),
+        _over_lags(acceleration, lags, correlation),
         np.array([np.var(values, dtype=float) for values in acceleration]),
-        *_spreading(run, chosen, tetrads, length))
+        *_dispersion(run, chosen, tetrads, length))
 
 
 def differences(model: PathStatistics, truth: PathStatistics) -> dict[str, float]:
-    """A number for each of these measures, model against truth: the rms of the logarithm of their ratio over lags, or
-    over times after the first, when both are the same particles; of correlations, which change sign, of their
-    difference."""
+    """Errors of the model by name: rms of ln(model / truth) over lags or times.
+
+    Dispersion and tetrads leave out the first time, at which both are equal. The correlation of accelerations, which
+    changes sign, has the rms of the difference.
+    """
     def log_ratio(name: str, first: int = 0) -> float:
         return rms_log_ratio(getattr(model, name)[first:], getattr(truth, name)[first:])
 
@@ -98,13 +109,12 @@ def differences(model: PathStatistics, truth: PathStatistics) -> dict[str, float
 
 def _sample(run: Frames, chosen: Sequence[int], column: str) -> np.ndarray:
     """A column of vectors (m, n, 3) of evenly chosen particles."""
-    first = run.read(chosen[0], column)
-    every = -(-first.size * len(chosen) // VALUES)
+    every = -(-run.read(chosen[0], column).size * len(chosen) // VALUES)
     return np.stack([run.read(frame, column)[::every] for frame in chosen])
 
 
-def _spreading(run: Frames, chosen: Sequence[int], tetrads: np.ndarray,
-               length: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _dispersion(run: Frames, chosen: Sequence[int], tetrads: np.ndarray,
+                length: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Dispersion of the pairs of the first two corners, size and shape of the tetrads, over the frames."""
     first = np.tile(tetrads[0], CORNERS - 1)
     paths = separations((run.read(frame, "position") for frame in chosen), tetrads[1:].ravel(), first, length)
@@ -127,39 +137,39 @@ def tetrad_moments(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return size, eigenvalues / size[:, None]
 
 
-# ---- of arrays
-
-
 def correlation(initial: np.ndarray, later: np.ndarray) -> float:
-    """Lagrangian correlation <v(0).v(t)> / sqrt(<v(0)^2> <v(t)^2>): both (n, 3), by particle; not a number at rest."""
+    """<v(0).v(t)> / sqrt(<v(0)^2> <v(t)^2>) of the same particles (n, 3) at two times; NaN at rest."""
     with np.errstate(invalid="ignore"):
         return float(np.sum(initial * later) / np.sqrt(np.sum(initial**2) * np.sum(later**2)))
 
 
 def structure_function(velocity: Sequence[np.ndarray], lags: np.ndarray) -> np.ndarray:
-    """Second-order Lagrangian structure function <|v(t + lag) - v(t)|^2> / 3 per component.
+    """Second-order Lagrangian structure function <|v(t + lag) - v(t)|^2> / 3 of a component, (m,).
 
     velocity (frames, n, 3) at equal intervals, lags (m,) in frames; mean over particles and all start frames.
-    (m,).
     """
-    return np.array([np.mean([np.mean((velocity[start + lag] - velocity[start]) ** 2)
-                              for start in range(len(velocity) - lag)]) for lag in lags])
+    return _over_lags(velocity, lags, lambda earlier, later: np.mean((later - earlier) ** 2))
 
 
 def increment_flatness(velocity: Sequence[np.ndarray], lags: np.ndarray) -> np.ndarray:
-    """Flatness <dv^4> / <dv^2>^2 of the increments dv = v_i(t + lag) - v_i(t) of a component, 3 of normal ones.
+    """Flatness <dv^4> / <dv^2>^2 of the increments of a velocity component over lags, (m,): 3 if they are normal.
 
-    As for `structure_function`; a mean over start frames, so that the decay of a flow does not widen the tails. Not a
-    number of a velocity that does not change.
+    Arguments as for `structure_function`. The flatness is averaged over start frames, so that the decay of a flow does
+    not widen the tails. NaN for a constant velocity.
     """
+    def flatness(earlier: np.ndarray, later: np.ndarray) -> float:
+        square = np.square(later - earlier, dtype=float)
+        return np.mean(square**2) / np.mean(square) ** 2
+
     with np.errstate(invalid="ignore"):
-        return np.array([np.mean([_flatness(velocity[start + lag] - velocity[start])
-                                  for start in range(len(velocity) - lag)]) for lag in lags])
+        return _over_lags(velocity, lags, flatness)
 
 
-def _flatness(values: np.ndarray) -> float:
-    square = np.square(values, dtype=float)
-    return np.mean(square**2) / np.mean(square) ** 2
+def _over_lags(values: Sequence[np.ndarray], lags: np.ndarray,
+               function: Callable[[np.ndarray, np.ndarray], float]) -> np.ndarray:
+    """Mean over all start frames of a function of the values at two frames, for each lag."""
+    return np.array([np.mean([function(earlier, later) for earlier, later in zip(values, values[lag:])])
+                     for lag in lags])
 
 
 def minimum_image(displacement: np.ndarray, length: float) -> np.ndarray:
@@ -169,22 +179,20 @@ def minimum_image(displacement: np.ndarray, length: float) -> np.ndarray:
 
 def separations(position: Iterable[np.ndarray], first: np.ndarray, second: np.ndarray,
                 length: float) -> Iterator[np.ndarray]:
-    """Separation x_first - x_second of pairs over time: frames (n, 3) -> as many (m, 3), frame by frame.
+    """Separations x_first - x_second (m, 3) of pairs, frame by frame, from positions (n, 3) of each frame.
 
-    Positions may be wrapped into the box; separations start as the nearest image and are continuous, as long as none
-    changes by more than length / 2 between two frames. `first` and `second` (m,) are rows.
+    Positions may be wrapped into the box. Separations start at the nearest image and are continuous, if none changes by
+    more than length / 2 between two frames. `first` and `second` (m,) are rows.
     """
-    separation = None
+    separation = 0.0
     for frame in position:
         wrapped = frame[first] - frame[second]
-        previous = 0.0 if separation is None else separation
-        separation = previous + minimum_image(wrapped - previous, length)
+        separation = separation + minimum_image(wrapped - separation, length)
         yield separation
 
 
 def pair_dispersion(position: Iterable[np.ndarray], groups: Sequence[np.ndarray], length: float) -> np.ndarray:
-    """Mean-square change of separation <|r(t) - r(0)|^2> of groups of pairs, rows (2, m), which are followed together:
-    (frames, n, 3) -> (groups, frames)."""
+    """<|r(t) - r(0)|^2> of groups of pairs, rows (2, m), over frames of positions (n, 3): (groups, frames)."""
     paths = separations(position, *np.concatenate(groups, axis=1), length)
     start, ends = next(paths), np.cumsum([pairs.shape[1] for pairs in groups])[:-1]
     spread = [[0.0] * len(groups)]
@@ -194,61 +202,45 @@ def pair_dispersion(position: Iterable[np.ndarray], groups: Sequence[np.ndarray]
     return np.transpose(spread)
 
 
+def near(position: np.ndarray, length: float, chosen: np.ndarray,
+         radius: float) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """The other rows of positions (n, 3) within a radius of each chosen row, in any order, and their distances."""
+    offsets, rows = neighbors_within(library(), Box(length, True), radius, position[chosen], position, False)
+    for row, first, last in zip(chosen, offsets, offsets[1:]):
+        others = rows[first:last]
+        others = others[others != row]
+        apart = minimum_image(position[others] - position[row], length)
+        yield others, np.sqrt(np.sum(apart**2, axis=1))
+
+
 def pairs_at(position: np.ndarray, length: float, distances: Sequence[float], tolerance: float,
              followed: int) -> list[np.ndarray]:
-    """Rows (2, m) of the pairs at each distance, within a fraction `tolerance` of it, among particles (n, 3).
+    """Rows (2, m) of the pairs at each distance, to a fraction `tolerance` of it, among particles (n, 3).
 
-    The first of a pair is one of the first `followed` rows, which are compared with all.
+    The first particle of a pair is one of the first `followed` rows. Each pair appears once.
     """
     pairs = [[np.empty((2, 0), int)] for _ in distances]
-    slabs, reach = _Slabs(position, length), 1.001 * (1 + tolerance) * max(distances, default=0.0)
-    for row in range(min(followed, len(position))):
-        near, squared = slabs.around(row, reach)
-        apart = np.sqrt(squared)
-        for distance, found in zip(distances, pairs):
-            others = near[np.abs(apart - distance) <= tolerance * distance]
-            others = np.sort(others[(others >= followed) | (others > row)])  # each pair once
-            found.append(np.stack([np.full(others.size, row), others]))
-    return [np.concatenate(found, axis=1) for found in pairs]
+    chosen, radius = np.arange(min(followed, len(position))), 1.001 * (1 + tolerance) * max(distances, default=0.0)
+    for row, (others, apart) in zip(chosen, near(position, length, chosen, radius)):
+        for distance, at_distance in zip(distances, pairs):
+            second = others[np.abs(apart - distance) <= tolerance * distance]
+            second = np.sort(second[second > row])
+            at_distance.append(np.stack([np.full(second.size, row), second]))
+    return [np.concatenate(at_distance, axis=1) for at_distance in pairs]
 
 
 def nearest_rows(position: np.ndarray, length: float, chosen: np.ndarray, count: int) -> np.ndarray:
-    """Rows of the `count` nearest others of each chosen row (m,) of positions (n, 3), the nearest first: (count, m).
+    """Rows (count, m) of the nearest other particles of each chosen row (m,) of positions (n, 3), nearest first.
 
-    Raises ValueError where there are no so many others.
+    Raises ValueError with fewer other particles than `count`.
     """
     if len(position) <= count:
-        raise ValueError(f"{len(position)} particles: none has {count} neighbours")
-    slabs, mean_distance = _Slabs(position, length), length / len(position) ** (1 / 3)
-    found = np.empty((count, chosen.size), int)
-    for number, row in enumerate(chosen):
-        reach, near = mean_distance, np.empty(0, int)
-        while near.size <= count:
-            reach *= 2
-            near, squared = slabs.around(row, reach)
-        squared[near == row] = -1.0  # before any other in the same place
-        found[:, number] = near[np.lexsort((near, squared))[1:count + 1]]
-    return found
-
-
-class _Slabs:
-    """Positions (n, 3) in a periodic box, sorted along x, so that those near a plane lie together."""
-
-    def __init__(self, position: np.ndarray, length: float) -> None:
-        wrapped = position[:, 0] % length
-        rows = np.argsort(wrapped)
-        # The box twice, so that a slab that leaves it at one face goes on from there.
-        self.rows, self.along = np.tile(rows, 2), np.concatenate([wrapped[rows], wrapped[rows] + length])
-        self.components = np.ascontiguousarray(position[self.rows].T)
-        self.position, self.length = position, length
-
-    def around(self, row: int, reach: float) -> tuple[np.ndarray, np.ndarray]:
-        """Rows within a distance of a row, itself among them, in any order, and their squared distances."""
-        first, last, wider = 0, len(self.position), 1.001 * reach  # what is wrapped is rounded
-        if wider < self.length / 2:
-            low = (self.position[row, 0] - wider) % self.length
-            first, last = np.searchsorted(self.along, (low, low + 2 * wider))
-        apart = minimum_image(self.components[:, first:last] - self.position[row][:, None], self.length)
-        squared = np.sum(apart**2, axis=0)
-        inside = squared <= reach**2
-        return self.rows[first:last][inside], squared[inside]
+        raise ValueError(f"{len(position)} particles: at least {count + 1} are needed")
+    nearest = np.full((count, chosen.size), -1)
+    missing, radius = np.arange(chosen.size), 2 * length / len(position) ** (1 / 3)
+    while missing.size:
+        for number, (others, apart) in zip(missing, near(position, length, chosen[missing], radius)):
+            if others.size >= count:
+                nearest[:, number] = others[np.lexsort((others, apart))[:count]]
+        missing, radius = np.flatnonzero(nearest[0] < 0), 2 * radius
+    return nearest

@@ -1,15 +1,17 @@
-"""Error against cost: what nothing else beats, and in words where a model is worth its cost."""
+"""Error against cost: the Pareto front, and sentences that say where a model is worth its cost."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+Method = Mapping[str, Any]  # `label`, a cost and errors by key, None where unknown; KEY_spread: standard deviations
+
 
 def pareto_front(cost: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """Indices of what is not dominated, from the cheapest on; entries with a NaN are on no front.
+    """Indices of the points (n,) that no other one dominates, from the cheapest on; points with NaN are left out.
 
-    One dominates another if neither its cost nor its error is larger, and one of them is smaller. cost, error: (n,).
+    A point dominates another if neither its cost nor its error is larger and one of them is smaller.
     """
     cost, error = np.asarray(cost, float), np.asarray(error, float)
     known = np.flatnonzero(np.isfinite(cost) & np.isfinite(error))
@@ -22,14 +24,15 @@ def pareto_front(cost: np.ndarray, error: np.ndarray) -> np.ndarray:
     return np.array(sorted(front, key=lambda index: (cost[index], error[index])), dtype=int)
 
 
-def verdict(model: Mapping[str, Any], others: Sequence[Mapping[str, Any]], cost: str,
-            measures: Mapping[str, str]) -> list[str]:
-    """Two sentences: in which measures a method is worth its cost beside others, and in which it is not.
+def verdict(model: Method, others: Sequence[Method], cost: str, measures: Mapping[str, str]) -> list[str]:
+    """Two sentences: the measures in which a method is worth its cost, and the other measures.
 
-    It is worth it where no other one that costs no more is as accurate. Rows hold `label`, `cost` and the measures by
-    key, None where there is no number, and may hold their standard deviations over realisations as `KEY_spread`: what
-    differs by less than the larger of two is as accurate. `measures` gives their names in words. A row without a
-    number counts as beaten.
+    It is worth its cost if no other method that costs no more is as accurate. Errors that differ by less than the
+    larger spread over realisations are equal. A method without a number counts as beaten.
+
+    Parameters
+    ----------
+    cost : key of the cost. measures : keys of the errors, with their names in words.
     """
     if not others:
         return ["No other method was run."]
@@ -57,12 +60,13 @@ def verdict(model: Mapping[str, Any], others: Sequence[Mapping[str, Any]], cost:
             "There is no measure in which another method is as accurate and no slower."]
 
 
-def cheapest_grid(model: Mapping[str, Any], grids: Sequence[Mapping[str, Any]], cost: str,
-                  times: Mapping[str, str]) -> str:
-    """A sentence: the grid of least cost that keeps the velocity error at or below the model's at some times, by key in
-    `times` with words for each, or that none does. Of several realisations it is of means. "" where the model has not
-    all numbers."""
-    def errors(row: Mapping[str, Any]) -> str:
+def cheapest_grid(model: Method, grids: Sequence[Method], cost: str, times: Mapping[str, str]) -> str:
+    """A sentence that names the cheapest grid whose velocity error is at most the model's at all `times`.
+
+    `times` are keys of the errors, with the times in words. Means over realisations are compared. "" if the model has
+    not all numbers.
+    """
+    def errors(row: Method) -> str:
         return ", ".join(f"{row[key]:.3g}" for key in times)
 
     if not times or None in [model[key] for key in (cost, *times)]:
@@ -77,11 +81,11 @@ def cheapest_grid(model: Mapping[str, Any], grids: Sequence[Mapping[str, Any]], 
             f"{best[cost] / model[cost]:.2g} of its cost.")
 
 
-def _worse(row: Mapping[str, Any], model: Mapping[str, Any], key: str) -> bool:
-    """Whether the error of a row is larger, by more than either's spread."""
+def _worse(row: Method, model: Method, key: str) -> bool:
+    """Whether the error of a row is larger, by more than either spread."""
     spread = max(one.get(f"{key}_spread") or 0.0 for one in (row, model))
     return row[key] > model[key] + spread
 
 
-def _compared(row: Mapping[str, Any], model: Mapping[str, Any], key: str, cost: str) -> str:
+def _compared(row: Method, model: Method, key: str, cost: str) -> str:
     return f"{row['label']}, {row[key]:.3g} in {row[cost] / model[cost]:.2g} of its time"

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-FLOOR = 1e-6  # added to every bin's probability before a divergence: an empty bin must not make it infinite
+FLOOR = 1e-6  # added to the probability of every bin, so that an empty bin does not make a divergence infinite
 
 
 def bin_edges(half_width: float, bins: int) -> np.ndarray:
@@ -13,10 +13,9 @@ def bin_edges(half_width: float, bins: int) -> np.ndarray:
 
 
 def bin_probabilities(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Fraction of all values in each bin (bins,), summing to 1: values beyond the ends count in the end bins.
+    """Fraction of the values, of any shape, in each bin (bins,); values beyond the ends count in the end bins.
 
-    `values` may have any shape; only their number matters. Raises ValueError if there is none or one is not
-    finite.
+    Raises ValueError without values, or if one is not finite.
     """
     values = np.asarray(values, dtype=float).ravel()
     if values.size == 0 or not np.isfinite(values).all():
@@ -26,47 +25,34 @@ def bin_probabilities(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
 
 
 def pdf(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Probability density (bins,) on the bins: its integral over them is exactly 1."""
+    """Probability density (bins,); its integral over the bins is 1."""
     return bin_probabilities(values, edges) / np.diff(edges)
 
 
-def joint_probabilities(
-    first: np.ndarray, second: np.ndarray, first_edges: np.ndarray, second_edges: np.ndarray
-) -> np.ndarray:
-    """Fraction of the value pairs in each cell, (first bins, second bins), outliers in the outer cells."""
-    first = np.clip(np.ravel(first), first_edges[0], first_edges[-1])
-    second = np.clip(np.ravel(second), second_edges[0], second_edges[-1])
-    counts, _, _ = np.histogram2d(first, second, (first_edges, second_edges))
-    return counts / first.size
+def kl_divergence(truth: np.ndarray, prediction: np.ndarray) -> float:
+    """Forward Kullback-Leibler divergence sum p ln(p / q) of bin probabilities, truth p and prediction q (Eq. 14).
 
-
-def kl_divergence(truth: np.ndarray, prediction: np.ndarray, floor: float = FLOOR) -> float:
-    """Forward Kullback-Leibler divergence sum p ln(p / q) of the truth p from the prediction q, in nats (P:
-    Eq. 14).
-
-    Both are bin probabilities on the same bins, of one shape. `floor` is added to every bin of both, which
-    are then normalised again. Zero if and only if they are equal.
+    FLOOR is added to every bin of both, which are then normalised again. Raises ValueError if the shapes differ.
     """
     if truth.shape != prediction.shape:
         raise ValueError(f"the bins differ: {truth.shape} and {prediction.shape}")
-    p = (truth + floor) / (truth + floor).sum()
-    q = (prediction + floor) / (prediction + floor).sum()
+    p = (truth + FLOOR) / (truth + FLOOR).sum()
+    q = (prediction + FLOOR) / (prediction + FLOOR).sum()
     return float(np.sum(p * np.log(p / q)))
 
 
 def sampling_divergence(rows: int, probabilities: Callable[[np.ndarray], np.ndarray]) -> float:
-    """The divergence to expect of two samples of one distribution, each of so many `rows`: what a perfect model is
-    found to have whose particles are others than those of the truth.
+    """Expected divergence between two independent samples of `rows` rows: the value of a perfect model.
 
-    Half of what two halves, drawn from a fixed seed, have: it falls as one over the number of rows. `probabilities` of
-    the bins are those of the rows that it is given.
+    It is half the divergence between two random halves of the sample, as it falls with 1 / rows. `probabilities`
+    returns the bin probabilities of chosen rows.
     """
     shuffled = np.random.default_rng(0).permutation(rows)
     return kl_divergence(*(probabilities(half) for half in np.array_split(shuffled, 2))) / 2
 
 
 def standardized(values: np.ndarray, reference: np.ndarray | None = None) -> np.ndarray:
-    """(values - mean) / standard deviation, both taken from `reference` (default: the values themselves)."""
+    """(values - mean) / standard deviation, both of `reference` (default: of the values)."""
     reference = values if reference is None else reference
     deviation = np.std(reference)
     if deviation == 0:

@@ -1,4 +1,4 @@
-"""A rollout beside the true particles: frames of both, and what is measured of them alike."""
+"""A rollout and the true particles: frames of both, and measures that are taken of both in the same way."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -10,15 +10,17 @@ import numpy as np
 from eddies.analysis.spectra import band_ratios, spectrum_error
 from eddies.analysis.velocity_gradients import Invariants
 
-SHOWN = 3  # spectra of a rollout
+SHOWN = 3  # spectra of a rollout in a report
 Table = Mapping[str, np.ndarray]  # columns wavenumber (shells,), time (m,), energy or others (m, shells)
 
 
 class Frames(Protocol):
-    """Particles at several times."""
+    """Particles at several times: `total` of them, in a periodic box of edge `length`."""
 
     times: np.ndarray
     columns: Collection[str]
+    total: int
+    length: float
 
     def read(self, frame: int, column: str, start: int = 0, stop: int | None = None) -> np.ndarray:
         """Rows start to stop of one column of one frame, in order of id."""
@@ -34,7 +36,7 @@ class CommonFrames:
 
     @classmethod
     def of(cls, model: Frames, truth: Frames, until: float = np.inf) -> "CommonFrames":
-        """Pair the frames before `until` whose times agree to 1e-6; raises ValueError if there is none."""
+        """Pair the frames before `until` whose times agree to 1e-6. Raises ValueError without such frames."""
         gap = np.abs(model.times[:, None] - truth.times[None, :])
         same = gap <= 1e-6 * max(1.0, np.ptp(model.times))
         rows, columns = np.nonzero(same & (model.times < until)[:, None])
@@ -44,12 +46,7 @@ class CommonFrames:
 
     def spread(self, count: int) -> np.ndarray:
         """At most `count` positions in this list, evenly spread from the first to the last."""
-        return spread(np.arange(self.times.size), count)
-
-
-def spread(values: np.ndarray, count: int) -> np.ndarray:
-    """At most `count` of values (m,), evenly spread from the first to the last."""
-    return values[np.unique(np.rint(np.linspace(0, len(values) - 1, count)).astype(int))]
+        return _spread(np.arange(self.times.size), count)
 
 
 @dataclass(frozen=True)
@@ -63,12 +60,12 @@ class Pair:
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """The quantities that a report reconstructs from particles at one moment, by the same form for model and truth.
+    """Quantities reconstructed from particles at one time, in the same way for model and truth.
 
     Parameters
     ----------
     invariants : of the velocity gradient at the particles.
-    velocity : (3, n, n) and vorticity : its magnitude (n, n), [y, x] in the plane z = pi.
+    velocity, vorticity : (3, n, n) and magnitude (n, n), [y, x] in the plane z = pi.
     """
 
     invariants: Invariants
@@ -78,8 +75,10 @@ class Reconstruction:
 
 @dataclass(frozen=True)
 class SpectraAt:
-    """Spectra at one time, (shells,) each from k = 0 on: of the model's particles and of the true ones, found alike in
-    their velocities; and of the filtered flow itself."""
+    """Energy spectra (shells,) at one time, k = 0, 1, ...
+
+    `model` and `truth` come from the velocities of the particles, `filtered` from the filtered flow.
+    """
 
     time: float
     model: np.ndarray
@@ -92,11 +91,11 @@ class SpectraAt:
         return np.arange(len(self.model))
 
     def error(self, of: str, filter_wavenumber: float) -> float:
-        """`spectrum_error` of "model" or "truth" against the filtered flow, up to k_d or the last shell there is."""
+        """`spectrum_error` of "model" or "truth" against the filtered flow, up to k_d or the last shell."""
         return spectrum_error(getattr(self, of), self.filtered, self._largest(filter_wavenumber))
 
     def bands(self, of: str, filter_wavenumber: float) -> dict[str, float]:
-        """`band_ratios` of "model" or "truth" to the filtered flow, as far."""
+        """`band_ratios` of "model" or "truth" to the filtered flow, up to the same wavenumber."""
         return band_ratios(getattr(self, of), self.filtered, self._largest(filter_wavenumber))
 
     def _largest(self, filter_wavenumber: float) -> float:
@@ -105,23 +104,22 @@ class SpectraAt:
 
 @dataclass(frozen=True)
 class Rollout:
-    """A rollout, the true particles beside it, and what is measured of both alike; read frame by frame.
+    """A rollout, the true particles, and measures of both; read frame by frame.
 
     Parameters
     ----------
     attributes : of the group `rollout` of the product.
-    model, truth : particles, at times since the start of the rollout. The truth may end earlier, and has no frame where
-        there is no ground truth to compare with; `without_truth` says why.
+    model, truth : particles, at times since the start of the rollout. The truth may end earlier. Without a ground truth
+        it has no frame; `without_truth` is the reason.
     length : edge of the box.
-    flow : table `spectra` of the ground truth, with `energy` and `filtered`; its times count from the release of the
-        tracers, as `start_time` does.
+    flow : table `spectra` of the ground truth, with `energy` and `filtered`. Its times and `start_time` count from the
+        release of the tracers.
     reference : scales of the ground truth.
-    spectra : of "model" and "truth", by frame: the energy (shells,) of the modes that least squares find in the
-        particles' velocities.
-    reconstructions : of both likewise, by frame; None without a kernel.
+    spectra : energy (shells,) by frame, of "model" and "truth": least squares for the modes of the particles' velocity.
+    reconstructions : by frame, of "model" and "truth"; None without a kernel.
     outside_training : share of the pairs outside the training range, (frames,), where it was counted.
-    reconstructed_by : the form of the reconstructions, in words.
     closure : columns over the frames on the solves for the resolved velocity, where there were any.
+    reconstructed_by : the form of the reconstructions in words.
     """
 
     attributes: Mapping[str, float | str]
@@ -144,7 +142,7 @@ class Rollout:
 
     @property
     def start_time(self) -> float:
-        """When it starts, since the release of the tracers."""
+        """Start of the rollout, since the release of the tracers."""
         return float(self.attributes["start_time"])
 
     @property
@@ -159,18 +157,18 @@ class Rollout:
 
     @property
     def forced(self) -> bool:
-        """Whether its large scales were forced."""
+        """Whether the large scales of the model are forced."""
         return self.powers[0] > 0
 
     @property
     def powers(self) -> tuple[float, float]:
-        """With which its large scales were forced and those of the true tracers, a mass."""
+        """Power per mass of the forcing of the model, and of the true flow."""
         model, truth = (float(self.attributes.get(name, 0.0)) for name in ("injection_rate", "truth_injection_rate"))
         return model, truth
 
     @property
     def status(self) -> str:
-        """How it ended: "complete", or "stopped: reason"."""
+        """The end of the rollout: "complete", or "stopped: reason"."""
         return str(self.attributes["status"])
 
     @cached_property
@@ -183,8 +181,7 @@ class Rollout:
 
     @cached_property
     def common(self) -> CommonFrames:
-        """The frames of both at the same times, before the model broke, if it did. Raises ValueError, with the reason,
-        if there is none."""
+        """The common frames before the model broke. Raises ValueError, with the reason, without such frames."""
         if not len(self.truth.times) and self.without_truth:
             raise ValueError(self.without_truth)
         return CommonFrames.of(self.model, self.truth, self.broken)
@@ -200,33 +197,32 @@ class Rollout:
                     self.truth.read(int(common.truth[index]), column))
 
     def reconstructed(self, index: int) -> tuple[Reconstruction, Reconstruction]:
-        """What the kernel makes of model and truth at a common frame."""
+        """Reconstructions of model and truth at a common frame."""
         assert self.reconstructions is not None
         return (self.reconstructions["model"][int(self.common.model[index])],
                 self.reconstructions["truth"][int(self.common.truth[index])])
 
-    def has_flow(self, times: np.ndarray) -> np.ndarray:
-        """At which times the spectrum of the flow itself is known, (m,) booleans."""
-        return _contained(self.start_time + times, self.flow["time"])
-
     def spectral(self) -> np.ndarray:
-        """The common frames at which the spectrum of the flow itself is known."""
-        return np.flatnonzero(self.has_flow(self.common.times))
+        """The common frames at which the spectrum of the flow is stored."""
+        return np.flatnonzero(self._has_flow(self.common.times))
 
     def shown_spectra(self) -> np.ndarray:
         """A few of these frames, from the first to the last."""
-        return spread(self.spectral(), SHOWN)
+        return _spread(self.spectral(), SHOWN)
 
     def late_spectra(self) -> np.ndarray:
-        """Frames of the model over which its spectrum is averaged: in the second half of the rollout until it broke,
-        those at which the flow's is known, or where the truth has ended; the last such frame where there are none."""
+        """Frames of the model over which its spectrum is averaged, in the second half before it broke.
+
+        They are at times at which the flow's spectrum is stored, or after the end of the truth; the last such frame
+        before the second half if it has none.
+        """
         times = self.model.times
-        frames = np.flatnonzero((self.has_flow(times) | ~_contained(times, self.truth.times)) & (times < self.broken))
-        late = second_half(times[frames], float(times[self.before_broken("model")[-1]]))
-        return frames[late]
+        chosen = self._has_flow(times) | ~_contained(times, self.truth.times)
+        frames = np.flatnonzero(chosen & (times < self.broken))
+        return frames[second_half(times[frames], float(times[self.before_broken("model")[-1]]))]
 
     def spectra_at(self, index: int) -> SpectraAt:
-        """The spectra at a common frame, of as many shells as all have; of the flow at the nearest time."""
+        """The spectra at a common frame, with the flow's at the nearest time; only the shells that all of them have."""
         common = self.common
         model, truth = (self.spectra[of][int(frames[index])]
                         for of, frames in (("model", common.model), ("truth", common.truth)))
@@ -235,13 +231,21 @@ class Rollout:
         return SpectraAt(float(common.times[index]), model[:shells], truth[:shells],
                          self.flow["filtered"][nearest][:shells])
 
-
-def _contained(times: np.ndarray, among: np.ndarray) -> np.ndarray:
-    """Which of times (m,) are among others (l,), to 1e-6."""
-    return (np.abs(times[:, None] - among[None, :]) < 1e-6).any(axis=1)
+    def _has_flow(self, times: np.ndarray) -> np.ndarray:
+        return _contained(self.start_time + times, self.flow["time"])
 
 
 def second_half(times: np.ndarray, end: float) -> np.ndarray:
-    """Rows of the second half of what ends at a time; the last row before it, where there is none."""
+    """Rows of rising times within [end / 2, end]; without such a time, the last row before `end`."""
     rows = np.flatnonzero((times >= end / 2) & (times <= end * (1 + 1e-9)))
     return rows if rows.size else np.array([max(int(np.searchsorted(times, end, "right")) - 1, 0)])
+
+
+def _spread(values: np.ndarray, count: int) -> np.ndarray:
+    """At most `count` of values (m,), evenly spread from the first to the last."""
+    return values[np.unique(np.rint(np.linspace(0, len(values) - 1, count)).astype(int))]
+
+
+def _contained(times: np.ndarray, among: np.ndarray) -> np.ndarray:
+    """Whether each of times (m,) is among others (l,), to 1e-6."""
+    return (np.abs(times[:, None] - among[None, :]) < 1e-6).any(axis=1)

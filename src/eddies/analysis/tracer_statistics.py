@@ -1,38 +1,27 @@
-"""Statistics of the tracers of a ground truth: energy, acceleration, memory and spreading.
+"""Statistics of the tracers of a ground truth: energy, acceleration, memory and dispersion.
 
-Tracers follow the filtered flow: their accelerations and small-scale separations are those of its eddies.
+Tracers follow the filtered flow: its eddies set their accelerations and small-scale separations.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
-from eddies.analysis.lagrangian import pair_dispersion, pairs_at, structure_function
+from eddies.analysis.lagrangian import lags_of, pair_dispersion, pairs_at, structure_function
 from eddies.analysis.pdfs import bin_edges, pdf
+from eddies.analysis.rollout import Frames
 
-FOLLOWED = 2**14  # tracers of which all velocities are held at once
-CENTRES = 1000  # tracers around which pairs are looked for
-PAIRS, FEWEST = 10_000, 30  # pairs of a distance: at most, at least
-SEPARATIONS, TOLERANCE = (0.5, 1.0, 2.0, 4.0), 0.1  # initial distances of pairs in mean spacings, and how exactly
-EDGES = bin_edges(12, 120)  # of the PDF of accelerations, in their standard deviations
-
-
-class Tracers(Protocol):
-    """A trajectory as stored, its frames at equal intervals."""
-
-    times: np.ndarray
-    total: int
-    length: float
-
-    def read(self, frame: int, column: str, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Rows start to stop of one column of one frame."""
+FOLLOWED = 2**14  # tracers whose velocities at all times are held at once
+CENTRES = 1000  # tracers around which pairs are searched
+PAIRS, FEWEST = 10_000, 30  # largest and smallest number of pairs at a distance
+SEPARATIONS, TOLERANCE = (0.5, 1.0, 2.0, 4.0), 0.1  # initial distances of pairs in mean spacings; relative tolerance
+EDGES = bin_edges(12, 120)  # bins of the PDF of accelerations, in standard deviations
 
 
 @dataclass(frozen=True)
 class Dispersion:
-    """Pairs that start `distance` apart: <|r(t) - r(0)|^2> (frames,), and <|v_1 - v_2|^2> when they start."""
+    """Pairs that start `distance` apart: <|r(t) - r(0)|^2> (frames,), and <|v_1 - v_2|^2> at the start."""
 
     distance: float
     pairs: int
@@ -42,13 +31,17 @@ class Dispersion:
 
 @dataclass(frozen=True)
 class TracerStatistics:
-    """What the tracers of a run do.
+    """Statistics of the tracers of a run.
 
-    energy_ratio: <v.v> of the tracers over that of the filtered field at `field_times`; energy_error: its standard
-    deviation for as many points put at random; both (fields,). probability: PDF (bins,) of a component of the
-    acceleration between EDGES, in units of its rms at the time, from differences of successive frames; kurtosis: of the
-    same, Gaussian 3; acceleration_rms: of the first interval. structure: Lagrangian structure function at `lags`
-    (times).
+    Parameters
+    ----------
+    energy_ratio : <v.v> of the tracers over that of the filtered field, at `field_times`, (fields,).
+    energy_error : standard deviation of this ratio for as many random points, (fields,).
+    probability : PDF (bins,) on EDGES of an acceleration component in units of its rms at the time, from differences of
+        successive frames.
+    kurtosis : of the same, 3 if it is Gaussian.
+    acceleration_rms : over the first interval.
+    structure : Lagrangian structure function at the times `lags`.
     """
 
     times: np.ndarray
@@ -64,12 +57,12 @@ class TracerStatistics:
 
     @property
     def structure_exponent(self) -> float:
-        """Power of the lag with which the structure function starts: 2 where accelerations are resolved."""
+        """First exponent of the structure function over the lag: 2 if accelerations are resolved."""
         return first_exponent(self.lags, self.structure)
 
     @property
     def ballistic_exponent(self) -> float:
-        """Power of time with which pairs start to part, mean over the distances: 2 while velocities are kept."""
+        """First exponent of the pair dispersion over time, mean over the distances: 2 while velocities last."""
         exponents = [first_exponent(self.times[1:], pairs.spread[1:]) for pairs in self.dispersion]
         return float(np.mean(exponents)) if exponents else np.nan
 
@@ -81,16 +74,19 @@ class TracerStatistics:
 
 
 def first_exponent(x: np.ndarray, y: np.ndarray) -> float:
-    """Slope of log y over log x between the first two points; not a number with fewer, or where y is 0."""
+    """Slope of log y over log x between the first two points; NaN with fewer points, or if y is 0."""
     return float(np.log(y[1] / y[0]) / np.log(x[1] / x[0])) if len(x) > 1 and y[0] > 0 else np.nan
 
 
-def tracer_statistics(tracers: Tracers, spectra: Mapping[str, np.ndarray], spacing: float) -> TracerStatistics:
-    """Measure the tracers; `spectra` holds `time` (m,) and `filtered` (m, shells), their mean distance is `spacing`."""
+def tracer_statistics(tracers: Frames, spectra: Mapping[str, np.ndarray], spacing: float) -> TracerStatistics:
+    """Measure tracers of mean distance `spacing` in frames at equal intervals.
+
+    `spectra` holds `time` (m,) and `filtered` (m, shells).
+    """
     times, every = tracers.times, -(-tracers.total // FOLLOWED)
     velocity = np.stack([tracers.read(frame, "velocity")[::every] for frame in range(times.size)])
     interval = (times[-1] - times[0]) / (times.size - 1)
-    lags = np.unique(np.rint(np.geomspace(1, max(times.size // 2, 1), 18)).astype(int))
+    lags = lags_of(max(times.size // 2, 1))
     probability, kurtosis = _accelerations(velocity)
     return TracerStatistics(
         times - times[0], spectra["time"], *_energy_ratio(tracers, spectra), probability, kurtosis,
@@ -98,7 +94,7 @@ def tracer_statistics(tracers: Tracers, spectra: Mapping[str, np.ndarray], spaci
         lags * interval, structure_function(velocity, lags), _dispersion(tracers, spacing))
 
 
-def _energy_ratio(tracers: Tracers, spectra: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def _energy_ratio(tracers: Frames, spectra: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     ratios, errors = [], []
     for time, filtered in zip(spectra["time"], spectra["filtered"]):
         frame = int(np.argmin(np.abs(tracers.times - time)))
@@ -109,7 +105,7 @@ def _energy_ratio(tracers: Tracers, spectra: Mapping[str, np.ndarray]) -> tuple[
 
 
 def _accelerations(velocity: np.ndarray) -> tuple[np.ndarray, float]:
-    """PDF and kurtosis, means over the intervals, so that the decay of the flow does not widen the tails."""
+    """PDF and kurtosis, averaged over the intervals, so that the decay of the flow does not widen the tails."""
     probability, kurtosis = [], []
     for earlier, later in zip(velocity, velocity[1:]):
         rms = np.sqrt(np.mean((later - earlier) ** 2))
@@ -121,16 +117,16 @@ def _accelerations(velocity: np.ndarray) -> tuple[np.ndarray, float]:
     return np.mean(probability, axis=0), float(np.mean(kurtosis))
 
 
-def _dispersion(tracers: Tracers, spacing: float) -> list[Dispersion]:
+def _dispersion(tracers: Frames, spacing: float) -> list[Dispersion]:
     start, velocity = (tracers.read(0, column) for column in ("position", "velocity"))
     distances = [spacing * factor for factor in SEPARATIONS if spacing * factor < tracers.length / 2]
-    found = [(distance, pairs[:, ::-(-pairs.shape[1] // PAIRS)]) for distance, pairs
-             in zip(distances, pairs_at(start, tracers.length, distances, TOLERANCE, CENTRES))
-             if pairs.shape[1] >= FEWEST]
-    if not found:
+    groups = {distance: pairs[:, ::-(-pairs.shape[1] // PAIRS)] for distance, pairs
+              in zip(distances, pairs_at(start, tracers.length, distances, TOLERANCE, CENTRES))
+              if pairs.shape[1] >= FEWEST}
+    if not groups:
         return []
     frames = (tracers.read(frame, "position") for frame in range(tracers.times.size))
-    spreads = pair_dispersion(frames, [pairs for _, pairs in found], tracers.length)
+    spreads = pair_dispersion(frames, list(groups.values()), tracers.length)
     return [Dispersion(distance, pairs.shape[1], spread,
                        float(np.mean(np.sum((velocity[pairs[0]] - velocity[pairs[1]]) ** 2, axis=1))))
-            for (distance, pairs), spread in zip(found, spreads)]
+            for (distance, pairs), spread in zip(groups.items(), spreads)]

@@ -4,32 +4,26 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from eddies.analysis.pdfs import joint_probabilities
-
-
-def anisotropic_part(gradient: np.ndarray) -> np.ndarray:
-    """A* = A - 1/3 Tr(A) I for gradients (..., 3, 3)."""
-    trace = np.trace(gradient, axis1=-2, axis2=-1)
-    return gradient - trace[..., None, None] / 3 * np.eye(3)
-
 
 def invariants(gradient: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Q = -1/2 Tr(A* A*) and R = -1/3 Tr(A* A* A*), A_ij = dv_i/dx_j (Eqs. 16-17), each (...)."""
+    """Q = -1/2 Tr(A* A*) and R = -1/3 Tr(A* A* A*), A* = A - 1/3 Tr(A) I, A_ij = dv_i/dx_j: (..., 3, 3) -> (...)."""
+    trace = np.trace(gradient, axis1=-2, axis2=-1)
+    traceless = gradient - trace[..., None, None] / 3 * np.eye(3)
     # Components first: passes over particles take half the time of products of many small matrices.
-    traceless = np.ascontiguousarray(np.moveaxis(anisotropic_part(gradient), (-2, -1), (0, 1)))
+    traceless = np.ascontiguousarray(np.moveaxis(traceless, (-2, -1), (0, 1)))
     squared = np.einsum("ik...,kj...->ij...", traceless, traceless)
     return -np.trace(squared) / 2, -np.einsum("ij...,ji...->...", squared, traceless) / 3
 
 
 def enstrophy_scale(gradient: np.ndarray) -> float:
-    """<Q_w> = <W_ij W_ij> / 2 with W the antisymmetric part: the unit of Q; that of R is its power 3/2."""
+    """<Q_w> = <W_ij W_ij> / 2, W the antisymmetric part: the unit of Q; the unit of R is its power 3/2."""
     rotation = (gradient - np.swapaxes(gradient, -1, -2)) / 2
     return float(np.mean(np.sum(rotation**2, axis=(-2, -1))) / 2)
 
 
 @dataclass(frozen=True)
 class Invariants:
-    """Q and R (n,) of particles at a moment, in single precision, with <Q_w>, the unit of Q."""
+    """Q and R (n,) of particles at one time, in single precision, and <Q_w>."""
 
     second: np.ndarray
     third: np.ndarray
@@ -37,7 +31,7 @@ class Invariants:
 
     @classmethod
     def of(cls, gradient: np.ndarray) -> "Invariants":
-        """Of velocity gradients (n, 3, 3)."""
+        """Invariants of velocity gradients (n, 3, 3)."""
         second, third = invariants(gradient)
         return cls(second.astype(np.float32), third.astype(np.float32), enstrophy_scale(gradient))
 
@@ -47,30 +41,32 @@ class Invariants:
 
 
 def vieillefosse_line(third_invariant: np.ndarray) -> np.ndarray:
-    """Q of the zero-discriminant line 27/4 R^2 + Q^3 = 0, for given R."""
+    """Q on the line of zero discriminant 27/4 R^2 + Q^3 = 0, for given R."""
     return -np.cbrt(27 / 4 * np.asarray(third_invariant) ** 2)
 
 
 @dataclass(frozen=True)
 class InvariantBins:
-    """Shared bins of the plane: edges of Q / <Q_w> and of R / <Q_w>^(3/2)."""
+    """Bins of the plane, shared by model and truth: edges of Q / <Q_w> and of R / <Q_w>^(3/2)."""
 
     second: np.ndarray
     third: np.ndarray
 
     @classmethod
     def covering(cls, second: np.ndarray, third: np.ndarray, quantile: float = 0.999) -> "InvariantBins":
-        """Symmetric ranges that hold this fraction of the sample; 12 to 64 bins, as its size allows."""
+        """Symmetric ranges that hold this fraction of the sample, in 12 to 64 bins for its size."""
         bins = int(np.clip(round(second.size ** (1 / 3)), 12, 64))
         limits = [np.quantile(np.abs(values), quantile) for values in (second, third)]
         return cls(*(np.linspace(-limit, limit, bins + 1) for limit in limits))
 
     def probabilities(self, second: np.ndarray, third: np.ndarray) -> np.ndarray:
         """Probability of each cell (Q bins, R bins); outliers count in the outer cells."""
-        return joint_probabilities(second, third, self.second, self.third)
+        clipped = [np.clip(values, edges[0], edges[-1])
+                   for values, edges in ((second, self.second), (third, self.third))]
+        return np.histogram2d(*clipped, (self.second, self.third))[0] / second.size
 
     def coarser(self) -> "InvariantBins":
-        """The same ranges in at most 18 bins, for conditional means, which need more particles a cell."""
+        """The same ranges in at most 18 bins: conditional means need more particles per cell."""
         edges = min(18, self.second.size - 1) + 1
         return InvariantBins(*(np.linspace(fine[0], fine[-1], edges) for fine in (self.second, self.third)))
 
@@ -81,10 +77,9 @@ class InvariantBins:
 
 @dataclass
 class ConditionalVelocity:
-    """Mean (dQ/dt, dR/dt) of Lagrangian particles on condition of (Q, R): sums over bins, filled step by
-    step.
+    """Mean (dQ/dt, dR/dt) of Lagrangian particles at given (Q, R): sums over bins.
 
-    Rates are in units <Q_w>^(3/2) and <Q_w>^2; particles outside the bins are left out.
+    Rates are in units of <Q_w>^(3/2) and <Q_w>^2. Particles outside the bins are left out.
     """
 
     bins: InvariantBins
@@ -97,10 +92,9 @@ class ConditionalVelocity:
         self.count, self.second_rate, self.third_rate = np.zeros(shape), np.zeros(shape), np.zeros(shape)
 
     def add(self, before: Invariants, after: Invariants, interval: float, scale: float) -> None:
-        """Add the same particles at two successive moments, `interval` apart.
+        """Add the same particles at two times, `interval` apart; `scale` is <Q_w>.
 
-        The rate is the difference over the interval and belongs to the mean of both moments (second order).
-        `scale` is <Q_w>.
+        The rate is the difference over the interval. It belongs to the mean of both times (second order).
         """
         q0, r0, q1, r1 = (values.astype(float) for values in (before.second, before.third, after.second, after.third))
         middle = (q0 + q1) / 2 / scale, (r0 + r1) / 2 / scale**1.5
@@ -111,7 +105,7 @@ class ConditionalVelocity:
         self.third_rate += np.histogram2d(*middle, edges, weights=rates[1])[0]
 
     def mean(self, at_least: int) -> tuple[np.ndarray, np.ndarray]:
-        """Mean (dQ/dt, dR/dt) per cell, NaN where fewer than `at_least` particles passed."""
+        """Mean (dQ/dt, dR/dt) of each cell, NaN in cells that fewer than `at_least` particles passed."""
         with np.errstate(invalid="ignore", divide="ignore"):
             means = self.second_rate / self.count, self.third_rate / self.count
         return tuple(np.where(self.count >= at_least, mean, np.nan) for mean in means)

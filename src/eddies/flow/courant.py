@@ -1,6 +1,4 @@
-"""The time step that the flow allows."""
-
-from __future__ import annotations
+"""Time step of a flow: given by the Courant number, or fixed."""
 
 import numpy as np
 
@@ -12,10 +10,11 @@ from eddies.spectral.spectral_grid import SpectralGrid
 
 
 class CourantLimit:
-    """Steps from the ladder largest * 2^-m with  step * (max(|u| + |v| + |w|) + sqrt(3) c) <= courant * dx.
+    """Time step with  step * (max(|u| + |v| + |w|) + sqrt(3) c) <= courant * dx.
 
-    `sound_speed` c is counted for a stepper that treats sound explicitly only (0 otherwise); sqrt(3) because sound that
-    runs diagonally has the largest wavenumber (`stability.step_limits`). The speed is measured every `every` steps.
+    Steps are taken from the ladder largest * 2^-m. The sound speed c counts only for a stepper that treats sound
+    explicitly; otherwise pass 0. The factor sqrt(3) belongs to sound that travels along the diagonal. The speed is
+    measured every `every` steps.
     """
 
     def __init__(self, grid: SpectralGrid, courant: float, largest: float, sound_speed: float = 0.0,
@@ -24,21 +23,21 @@ class CourantLimit:
         self._bound = 0.0
 
     def __call__(self, state: np.ndarray, clock: Clock) -> float:
-        """The next step: from the ladder, shortened to end at the clock's end."""
+        """Return the next step; the last one is shortened to end at the clock's end."""
         if clock.steps % self.every == 0 or self._bound == 0.0:
             self._bound = self.bound(state, clock)
         return min(ladder_step(self.largest, self._bound), clock.remaining)
 
     def state_dict(self) -> dict[str, float]:
-        """What the next step depends on besides the flow, for a checkpoint."""
+        """Return the last measured bound, for a checkpoint."""
         return {"bound": self._bound}
 
     def load_state_dict(self, state: dict[str, float]) -> None:
-        """Inverse of `state_dict`."""
+        """Restore the last measured bound."""
         self._bound = state["bound"]
 
     def bound(self, state: np.ndarray, clock: Clock) -> float:
-        """The longest step that the Courant number allows now; FlowDiverged if the flow is not finite."""
+        """Return the longest step that the Courant number allows now. Raises FlowDiverged if the flow is not finite."""
         speed = float(global_max(self.grid.decomposition.comm, advective_speed(self.grid, state[:3])))
         FlowDiverged.unless_finite(speed, clock)
         speed += np.sqrt(3) * self.sound_speed
@@ -46,23 +45,23 @@ class CourantLimit:
 
 
 class FixedStep:
-    """The same step always, but for the last, which ends at the clock's end."""
+    """Constant time step; the last one is shortened to end at the clock's end."""
 
     def __init__(self, step: float) -> None:
         self.step = step
 
     def __call__(self, state: np.ndarray, clock: Clock) -> float:
-        """The next step."""
-        # A remainder within round-off of the step is the step: another size would need operators of its own.
+        """Return the next step."""
+        # A remainder that differs from the step by round-off is a full step: another size would need new operators.
         return self.step if clock.remaining > self.step * (1 - 1e-6) else clock.remaining
 
     def state_dict(self) -> dict[str, float]:
-        """Nothing: the step is a setting."""
+        """Return nothing: the step comes from the scene."""
         return {}
 
     def load_state_dict(self, state: dict[str, float]) -> None:
-        """Nothing to remember."""
+        """Restore nothing."""
 
     def bound(self, state: np.ndarray, clock: Clock) -> float:
-        """The longest step."""
+        """Return the step."""
         return self.step

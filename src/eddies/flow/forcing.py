@@ -1,6 +1,4 @@
-"""Deterministic linear forcing of the largest scales with a prescribed rate of energy injection."""
-
-from __future__ import annotations
+"""Deterministic linear forcing of the largest scales with a prescribed injection rate of energy."""
 
 import numpy as np
 
@@ -9,24 +7,24 @@ from eddies.parallel.reduction import global_sum
 from eddies.spectral.mode_operators import ModeOperators, gaussian_transfer
 from eddies.spectral.spectral_grid import SpectralGrid
 
-# Share of the kinetic energy at the forced modes that round-off alone may leave there.
+# Largest share of the kinetic energy that round-off alone can leave at the forced modes.
 SILENT = {"float64": 1e-20, "float32": 1e-10}
 
 
 class ForcingError(UserError, ValueError):
-    """The flow cannot be forced."""
+    """The flow has no energy that the forcing could amplify."""
 
 
 class LinearForcing:
-    """f(k) = A u_s(k) for 0 < |k| < k_f with A = rate / sum |u_s|^2, so that the mean of u.f is `injection_rate`.
+    """Force f(k) = A u_s(k) for 0 < |k| < `wavenumber`, with A = rate / sum |u_s|^2, so that <u.f> = `injection_rate`.
 
-    u_s is the solenoidal part of the velocity. Where that is what a filter of `filter_width` has left, the sum is that
-    of the modes with the filter undone: then f is the filtered forcing of the flow. Its form is that of Lundgren (2003)
-    and Petersen and Livescu (2010), with the amplitude set at every evaluation. `wavenumber` is k_f.
+    u_s is the solenoidal part of the velocity. This is the form of Lundgren (2003) and of Petersen and Livescu (2010);
+    A is computed at every evaluation. If the velocity has passed a Gaussian filter of `filter_width`, the sum uses the
+    unfiltered modes, and f is the filtered force of the unfiltered flow.
 
-    The few forced modes are collected on all ranks in one message. Their mirror images in the plane kx = 0 are made
-    exact conjugates there: otherwise round-off in the part that no real field has would be amplified by the forcing.
-    Raises ForcingError at the first evaluation if the velocity has no energy, but round-off, at the forced modes.
+    All ranks hold the few forced modes; one reduction collects them. In the plane kx = 0 mirror modes are made
+    conjugate, because the forcing would amplify a part that no real field has. The first evaluation raises ForcingError
+    if the velocity has no energy at the forced modes.
     """
 
     def __init__(self, grid: SpectralGrid, injection_rate: float, wavenumber: float,
@@ -41,14 +39,14 @@ class LinearForcing:
         self._forced = (squared > 0) & (squared < wavenumber**2)
         unit = 2 * np.pi / grid.decomposition.length
         self._weights = np.where(kx == 0, 1, 2) / gaussian_transfer(unit**2 * squared, filter_width) ** 2
-        # Where the forced modes of this rank stand in its spectral array, and in the small block.
+        # Rows of ky of the forced modes, in this rank's array and in the block of all of them.
         own_ky = grid.index[1].ravel()
         self._own_rows = np.flatnonzero(np.abs(own_ky) <= reach)
         self._block_rows = own_ky[self._own_rows] + reach
-        self._planes = signed % grid.modes
+        self._own = np.ix_(range(3), signed % grid.modes, self._own_rows, range(reach + 1))
 
     def add(self, velocity: np.ndarray, tendency: np.ndarray) -> None:
-        """Add the force to the velocity components of `tendency` in place; both (3, kz, ky, kx), Fourier space."""
+        """Add the force to the velocity's `tendency` in place; both are modes (3, kz, ky, kx)."""
         if self.injection_rate == 0:
             return
         block = self._forced_modes(velocity)
@@ -56,11 +54,10 @@ class LinearForcing:
         if not self._checked:
             self._require_energy(energy, velocity)
         force = self.injection_rate / energy * block
-        where = np.ix_(range(3), self._planes, self._own_rows, range(self.reach + 1))
-        tendency[where] += force[:, :, self._block_rows, :].astype(tendency.dtype)
+        tendency[self._own] += force[:, :, self._block_rows, :].astype(tendency.dtype)
 
     def _require_energy(self, forced: float, velocity: np.ndarray) -> None:
-        # Once is enough: modes that are forced do not run out of energy, and the sum costs a message.
+        # Once is enough: forced modes do not lose all their energy, and the sum costs a message.
         total = self.grid.sum_modes((np.abs(velocity) ** 2).sum(axis=0))
         if forced <= SILENT[self.grid.precision] * total:
             raise ForcingError("[forcing]: the flow has no energy at 0 < |k| < wavenumber = "
@@ -69,10 +66,9 @@ class LinearForcing:
         self._checked = True
 
     def _forced_modes(self, velocity: np.ndarray) -> np.ndarray:
-        """Solenoidal velocity of the forced modes on every rank: (3, 2 reach + 1, 2 reach + 1, reach + 1)."""
+        """Return the solenoidal velocity of the forced modes, (3, kz, ky, kx), on every rank."""
         block = np.zeros((3, *self._forced.shape), np.complex128)
-        own = velocity[np.ix_(range(3), self._planes, self._own_rows, range(self.reach + 1))]
-        block[:, :, self._block_rows] = own
+        block[:, :, self._block_rows] = velocity[self._own]
         block = global_sum(self.grid.decomposition.comm, block)
         block[..., 0] = (block[..., 0] + block[:, ::-1, ::-1, 0].conj()) / 2
         return self._operators.solenoidal(block) * self._forced

@@ -1,6 +1,4 @@
-"""The statistics of a flow over time, and its energy budget."""
-
-from __future__ import annotations
+"""Time series of a flow's statistics, and its energy budget."""
 
 import time
 from collections.abc import Mapping
@@ -21,11 +19,10 @@ EVERY = 4  # steps between two samples
 
 
 class FlowHistory:
-    """An observer that measures a flow every few steps: for each sample a row in `rows` and E(k) in `spectra`.
+    """Observer that measures a flow every few steps: `rows` has one entry a sample, `spectra` the E(k) of each.
 
-    Whoever needs the flow of a certain time, such as the last of a run, takes a `sample` then.
-    Also integrates the energy budget: `budget_error` is |E(t) - E(0) - integral of (injection - dissipation)| over
-    the dissipated energy (over E(0) where nothing is dissipated).
+    It also integrates the energy budget. `budget_error` is |E(t) - E(0) - integral of (injection - dissipation)|
+    divided by the dissipated energy, or by E(0) where nothing is dissipated.
     """
 
     def __init__(self, fluid: Fluid, every: int = EVERY) -> None:
@@ -41,7 +38,7 @@ class FlowHistory:
             self.sample(state, clock)
 
     def sample(self, state: np.ndarray, clock: Clock) -> dict[str, float]:
-        """The row of now, measured and added unless the last one is of this very step.
+        """Return the row of this step; measure and store it unless the last row is of this step.
 
         Raises FlowDiverged if the flow is not finite.
         """
@@ -49,39 +46,37 @@ class FlowHistory:
             return self.rows[-1]
         row, spectrum = self._measure(state)
         FlowDiverged.unless_finite(row["total_energy"], clock)
+        now, steps = time.perf_counter(), max(clock.steps - self._steps, 1)
+        row |= {"turnovers": 0.0, "time": clock.time, "time_step": 0.0, "seconds_per_step": (now - self._wall) / steps}
         if self.rows:
             last, elapsed = self.rows[-1], clock.time - self.rows[-1]["time"]
             self._injected += elapsed * row["injection_rate"]
             self._dissipated += elapsed / 2 * (last["dissipation_rate"] + row["dissipation_rate"])
             row["turnovers"] = last["turnovers"] + elapsed / row["eddy_turnover_time"]
-        else:
-            row["turnovers"] = 0.0
-        now, steps = time.perf_counter(), max(clock.steps - self._steps, 1)
-        row |= {"time": clock.time, "time_step": (clock.time - self.rows[-1]["time"]) / steps if self.rows else 0.0,
-                "seconds_per_step": (now - self._wall) / steps}
+            row["time_step"] = elapsed / steps
         self._wall, self._steps = now, clock.steps
         self.rows.append(row)
         self.spectra.append(spectrum)
         return row
 
     def leave_out(self, seconds: float) -> None:
-        """Count wall time since the last sample as no part of the steps."""
+        """Exclude wall time since the last sample from the seconds per step."""
         self._wall += seconds
 
     @property
     def budget_error(self) -> float:
-        """Normalised error of the energy budget from the first sample to the last."""
+        """Normalised error of the energy budget between the first and the last sample."""
         first, last = self.rows[0]["total_energy"], self.rows[-1]["total_energy"]
         defect = abs(last - first - self._injected + self._dissipated)
         scale = self._dissipated if self._dissipated > 0 else first
         return defect / scale if scale > 0 else defect
 
     def columns(self) -> dict[str, np.ndarray]:
-        """All rows as columns."""
+        """Return all rows as columns."""
         return {name: np.array([row[name] for row in self.rows]) for name in self.rows[0]}
 
     def state_dict(self) -> dict[str, Any]:
-        """All that goes on, for a checkpoint: columns of `rows`, `spectra`, and the work done since the first."""
+        """Return rows, spectra and the integrals of the budget, for a checkpoint."""
         columns = self.columns()
         return {"history": {"injected": self._injected, "dissipated": self._dissipated, "steps": self._steps,
                             "columns": list(columns)},
@@ -89,22 +84,22 @@ class FlowHistory:
                 **{f"history_{name}": values for name, values in columns.items()}}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Inverse of `state_dict`."""
-        known = state["history"]
-        columns = {name: state[f"history_{name}"] for name in known["columns"]}
+        """Restore what `state_dict` returned."""
+        saved = state["history"]
+        columns = {name: state[f"history_{name}"] for name in saved["columns"]}
         self.spectra = list(state["spectra_of_history"])
         self.rows = [dict(zip(columns, map(float, row))) for row in zip(*columns.values())]
-        self._injected, self._dissipated, self._steps = known["injected"], known["dissipated"], int(known["steps"])
+        self._injected, self._dissipated, self._steps = saved["injected"], saved["dissipated"], int(saved["steps"])
         self._wall = time.perf_counter()
 
     def describe(self) -> str:
-        """The last sample in a few words."""
+        """Return the last sample as text for the progress line."""
         row = self.rows[-1]
         return (f"t {row['time']:.3f} ({row['turnovers']:.2f} turnovers)  dt {row['time_step']:.4f}  "
                 f"energy {row['energy']:.4f}  dissipation {row['dissipation_rate']:.4f}  "
                 f"Re_lambda {row['reynolds_lambda']:.1f}")
 
-    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # what is not finite is told by who takes a sample
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # `sample` reports what is not finite
     def _measure(self, state: np.ndarray) -> tuple[dict[str, float], np.ndarray]:
         fluid, grid = self.fluid, self.fluid.grid
         velocity = state[:3]

@@ -1,34 +1,28 @@
-"""Initial states: random solenoidal turbulence, and the flows with known solutions."""
-
-from __future__ import annotations
+"""Initial states: random solenoidal turbulence, and flows with known solutions. Fields are modes (c, kz, ky, kx)."""
 
 import numpy as np
 
-from eddies.parallel.reduction import global_sum
+from eddies.flow.statistics import energy_spectrum
 from eddies.spectral.spectral_grid import SpectralGrid
 
 
 def random_velocity(grid: SpectralGrid, seed: int, amplitude: float, peak_wavenumber: float) -> np.ndarray:
-    """Gaussian solenoidal velocity with the spectrum E(k) ~ k^4 exp(-2 (k / k_p)^2); (3, kz, ky, kx).
+    """Return a Gaussian solenoidal velocity (3, kz, ky, kx) with the spectrum E(k) ~ k^4 exp(-2 (k / k_p)^2).
 
-    `amplitude` is the rms of one component. Random numbers are keyed by (seed, ky, kz) and drawn along kx, so the
-    field depends neither on the number of ranks nor on the resolution. Every shell carries exactly its energy.
+    `amplitude` is the rms of one component. Random numbers are keyed by (seed, ky, kz) and drawn along kx, so the field
+    depends neither on the number of ranks nor on the resolution. Every shell has exactly its energy.
     """
     velocity = grid.solenoidal(_gaussian_modes(grid, seed))
     velocity[:, grid.index_squared == 0] = 0
-    shell = np.rint(np.sqrt(grid.index_squared)).astype(int)
-    shells = int(np.ceil(np.sqrt(3) * grid.cutoff)) + 1
-    density = 0.5 * grid.multiplicity * (np.abs(velocity) ** 2).sum(axis=0)
-    energy = global_sum(grid.decomposition.comm, np.bincount(shell.ravel(), density.ravel(), minlength=shells))
-    k = np.arange(shells)
+    k, energy = energy_spectrum(grid, velocity)
     target = k**4 * np.exp(-2 * (k / peak_wavenumber) ** 2)
     target *= 1.5 * amplitude**2 / target[energy > 0].sum()
-    scale = np.sqrt(np.divide(target, energy, out=np.zeros(shells), where=energy > 0))
-    return (velocity * scale[shell]).astype(grid.complex)
+    scale = np.sqrt(np.divide(target, energy, out=np.zeros(len(k)), where=energy > 0))
+    return (velocity * scale[grid.shell_number]).astype(grid.complex)
 
 
 def _gaussian_modes(grid: SpectralGrid, seed: int) -> np.ndarray:
-    """Complex normal numbers for each mode and component, conjugate in mirror modes: (3, kz, ky, kx)."""
+    """Return complex normal numbers (3, kz, ky, kx), conjugate in mirror modes."""
     def line(ky: int, kz: int) -> np.ndarray:
         # Negative wavenumbers are folded to odd numbers, because seeds must not be negative.
         fold = [2 * k if k >= 0 else -2 * k - 1 for k in (ky, kz)]
@@ -45,37 +39,37 @@ def _gaussian_modes(grid: SpectralGrid, seed: int) -> np.ndarray:
 
 
 def taylor_green(grid: SpectralGrid, amplitude: float) -> np.ndarray:
-    """Taylor-Green vortex (sin x cos y cos z, -cos x sin y cos z, 0), energy amplitude^2 / 8."""
+    """Return the Taylor-Green vortex (sin x cos y cos z, -cos x sin y cos z, 0), energy amplitude^2 / 8."""
     x, y, z = grid.coordinates()
     u = np.sin(x) * np.cos(y) * np.cos(z)
     v = -np.cos(x) * np.sin(y) * np.cos(z)
-    return _transformed(grid, amplitude, [u, v, 0.0])
+    return _modes(grid, amplitude, [u, v, 0.0])
 
 
 def abc(grid: SpectralGrid, amplitude: float, wavenumber: int) -> np.ndarray:
-    """Arnold-Beltrami-Childress flow with A = B = C; vorticity = k velocity, so it decays as exp(-nu k^2 t)."""
+    """Return the Arnold-Beltrami-Childress flow with A = B = C. Vorticity = k velocity: it decays as exp(-nu k^2 t)."""
     x, y, z = (wavenumber * axis for axis in grid.coordinates())
-    return _transformed(grid, amplitude, [np.sin(z) + np.cos(y), np.sin(x) + np.cos(z), np.sin(y) + np.cos(x)])
+    return _modes(grid, amplitude, [np.sin(z) + np.cos(y), np.sin(x) + np.cos(z), np.sin(y) + np.cos(x)])
 
 
 def shear_wave(grid: SpectralGrid, amplitude: float, wavenumber: int) -> np.ndarray:
-    """u_x = sin(k y), an exact solution of both fluids that decays as exp(-nu k^2 t)."""
+    """Return u_x = amplitude sin(k y), an exact solution of both fluids that decays as exp(-nu k^2 t)."""
     _, y, _ = grid.coordinates()
-    return _transformed(grid, amplitude, [np.sin(wavenumber * y), 0.0, 0.0])
+    return _modes(grid, amplitude, [np.sin(wavenumber * y), 0.0, 0.0])
 
 
 def sound_wave_density(grid: SpectralGrid, amplitude: float, wavenumber: int) -> np.ndarray:
-    """ln(rho / rho_0) = amplitude cos(k x) of a standing sound wave that starts from rest; (kz, ky, kx)."""
+    """Return ln(rho / rho_0) = amplitude cos(k x) of a standing sound wave that starts at rest; (kz, ky, kx)."""
     x, _, _ = grid.coordinates()
-    return grid.forward(np.broadcast_to(amplitude * np.cos(wavenumber * x), (1, *grid.physical_shape)))[0]
+    return _modes(grid, amplitude, [np.cos(wavenumber * x)])[0]
 
 
 def balanced_density(grid: SpectralGrid, velocity: np.ndarray, sound_speed: float) -> np.ndarray:
-    """s = p / c^2 with the incompressible pressure of the velocity, so that the start makes no sound; (kz, ky, kx)."""
+    """Return s = p / c^2 (kz, ky, kx) with the incompressible pressure p: the start emits almost no sound."""
     return grid.pressure_of(grid.squares(velocity)) / sound_speed**2
 
 
-#: Initial velocities by the words of [initial] kind, from the grid, the section's values and the seed: (3, kz, ky, kx).
+#: Initial velocity by [initial] kind: functions of the grid, the section [initial] and the seed.
 INITIAL_FLOWS = {
     "random": lambda grid, initial, seed: random_velocity(grid, seed, initial.amplitude, initial.peak_wavenumber),
     "taylor-green": lambda grid, initial, seed: taylor_green(grid, initial.amplitude),
@@ -85,6 +79,7 @@ INITIAL_FLOWS = {
 }
 
 
-def _transformed(grid: SpectralGrid, amplitude: float, components: list) -> np.ndarray:
+def _modes(grid: SpectralGrid, amplitude: float, components: list) -> np.ndarray:
+    """Return the modes of fields at the grid points, times the amplitude."""
     field = np.stack([np.broadcast_to(np.asarray(c, grid.real), grid.physical_shape) for c in components])
     return grid.forward(amplitude * field)

@@ -1,6 +1,4 @@
-"""What is measured of a flow: energy budget, scales, Reynolds and Mach number, spectrum, gradient moments."""
-
-from __future__ import annotations
+"""Statistics of a flow: energy budget, scales, spectrum, moments of the velocity gradient."""
 
 import numpy as np
 
@@ -9,26 +7,25 @@ from eddies.spectral.spectral_grid import SpectralGrid
 
 
 def energy_spectrum(grid: SpectralGrid, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Wavenumbers k = 0, 1, ... and E(k), the energy of the modes with |k| rounding to k; sum E = <u.u>/2."""
-    shell = np.rint(np.sqrt(grid.index_squared)).astype(int)
+    """Return k = 0, 1, ... and E(k), the energy of the modes with |k| rounded to k; sum E = <u.u>/2."""
     shells = int(np.ceil(np.sqrt(3) * grid.cutoff)) + 1
     density = 0.5 * grid.multiplicity * (np.abs(velocity) ** 2).sum(axis=0)
-    spectrum = np.bincount(shell.ravel(), density.ravel().astype(float), minlength=shells)
+    spectrum = np.bincount(grid.shell_number.ravel(), density.ravel().astype(float), minlength=shells)
     return np.arange(shells), global_sum(grid.decomposition.comm, spectrum)
 
 
 def component_energies(grid: SpectralGrid, velocity: np.ndarray) -> dict[str, float]:
-    """Energies <u_i^2>/2 of the components, which add up to <u.u>/2: energy_x, energy_y, energy_z."""
+    """Return the energies <u_i^2>/2 of the components as energy_x, energy_y and energy_z."""
     halves = np.array([0.5 * np.sum(grid.multiplicity * np.abs(component) ** 2, dtype=float) for component in velocity])
     total = global_sum(grid.decomposition.comm, halves)
     return {f"energy_{axis}": float(energy) for axis, energy in zip("xyz", total)}
 
 
 def turbulence_scales(spectrum: np.ndarray, dissipation_rate: float, viscosity: float, cutoff: int) -> dict[str, float]:
-    """Scales of isotropic turbulence from E(k), the dissipation rate and the viscosity.
+    """Return scales of isotropic turbulence from E(k), the dissipation rate eps and the viscosity nu.
 
     u' = sqrt(2E/3), L = pi/(2u'^2) sum E/k, T = L/u', lambda = sqrt(15 nu u'^2/eps), Re_lambda = u' lambda/nu,
-    eta = (nu^3/eps)^(1/4), t_eta = sqrt(nu/eps) (Pope 2000, chapter 6). Without viscosity those with it are 0 or inf.
+    eta = (nu^3/eps)^(1/4), t_eta = sqrt(nu/eps) (Pope 2000, chapter 6). Without viscosity viscous scales are 0 or inf.
     """
     energy = spectrum.sum()
     u_rms = np.sqrt(2 * energy / 3)
@@ -51,7 +48,7 @@ def turbulence_scales(spectrum: np.ndarray, dissipation_rate: float, viscosity: 
 
 
 def gradient_moments(grid: SpectralGrid, velocity: np.ndarray) -> tuple[float, float]:
-    """Skewness and flatness of du/dx, dv/dy and dw/dz of the modes (3, kz, ky, kx) of a velocity, averaged."""
+    """Return skewness and flatness of the longitudinal gradient, averaged over du/dx, dv/dy and dw/dz."""
     def longitudinal(modes: np.ndarray) -> list[np.ndarray]:
         return [(grid.d_dx, modes[1:2]), (grid.d_dy, modes[2:3]), modes[3:]]
 
@@ -62,14 +59,14 @@ def gradient_moments(grid: SpectralGrid, velocity: np.ndarray) -> tuple[float, f
 
 
 def _powers(values: np.ndarray) -> np.ndarray:
-    """Sums of squares, cubes and fourth powers of fields (c, planes, y, x): (3, c)."""
+    """Return sums of squares, cubes and fourth powers of fields (c, planes, y, x): (3, c)."""
     flat = values.reshape(len(values), -1).astype(float, copy=False)
     squares = flat**2
     return np.stack([squares.sum(axis=1), (squares * flat).sum(axis=1), (squares * squares).sum(axis=1)])
 
 
 def _skewness_and_flatness(moments: np.ndarray) -> tuple[float, float]:
-    """Averages over the components of the second, third and fourth moments (3, c)."""
+    """Return averages over the components of the second, third and fourth moments (3, c)."""
     second, third, fourth = moments
     if not np.all(second > 0):
         return 0.0, 0.0
@@ -77,7 +74,7 @@ def _skewness_and_flatness(moments: np.ndarray) -> tuple[float, float]:
 
 
 def incompressible_budget(grid: SpectralGrid, velocity: np.ndarray, viscosity: float) -> dict[str, float]:
-    """Total energy <u.u>/2 and dissipation rate nu <|grad u|^2>, exact in Fourier space."""
+    """Return the total energy <u.u>/2 and the dissipation rate nu <|grad u|^2>."""
     squared = (np.abs(velocity) ** 2).sum(axis=0)
     return {"total_energy": 0.5 * grid.sum_modes(squared),
             "dissipation_rate": viscosity * grid.sum_modes(grid.wavenumber_squared * squared)}
@@ -85,10 +82,10 @@ def incompressible_budget(grid: SpectralGrid, velocity: np.ndarray, viscosity: f
 
 def compressible_budget(grid: SpectralGrid, state: np.ndarray, viscosity: float,
                         sound_speed: float) -> dict[str, float]:
-    """Total energy <rho |u|^2/2 + c^2 (rho ln rho - rho + 1)>, dissipation nu <rho (2 S:S - 2/3 (div u)^2)>.
+    """Return the total energy <rho |u|^2/2 + c^2 (rho ln rho - rho + 1)> and the rate nu <rho (2 S:S - 2/3 (div u)^2)>.
 
-    Without forcing the first decays at exactly the second. Also the rms of the density, the share of the kinetic energy
-    in the longitudinal velocity, and the `gradient_moments`, for which the same gradients serve.
+    Without forcing the energy decays at exactly this rate. The result also has the rms of the density, the share of
+    the kinetic energy in the longitudinal velocity, and the moments of `gradient_moments`.
     """
     def with_gradients(modes: np.ndarray) -> list[np.ndarray]:
         return [modes[:4], (grid.d_dx, modes[:3]), (grid.d_dy, modes[:3]), modes[4:]]

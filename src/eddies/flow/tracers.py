@@ -1,6 +1,4 @@
-"""Fluid particles that follow the filtered velocity of a simulation."""
-
-from __future__ import annotations
+"""Tracers: fluid particles that follow the filtered velocity of a simulation."""
 
 import numpy as np
 
@@ -12,17 +10,17 @@ from eddies.spectral.spectral_grid import SpectralGrid
 
 
 def random_positions(seed: int, total: int, start: int, stop: int, length: float) -> np.ndarray:
-    """Uniformly random positions (stop - start, 3) of the particles with ids start ... stop - 1.
+    """Return uniformly random positions (stop - start, 3) of the particles with ids start ... stop - 1.
 
-    The numbers are keyed by id (a counter-based generator, jumped ahead), so they do not depend on the ranks.
+    The numbers are keyed by id, so they do not depend on the number of ranks.
     """
-    # Philox yields four 64-bit numbers per counter value; one counter value a particle leaves each its own.
+    # Philox yields four 64-bit numbers per counter value; each particle takes one counter value.
     generator = np.random.Generator(np.random.Philox(key=[seed, total]).advance(start))
     return length * generator.random((stop - start, 4))[:, :3]
 
 
 def lattice_positions(seed: int, per_side: int, start: int, stop: int, length: float) -> np.ndarray:
-    """Positions of ids start ... stop - 1 on a cubic lattice, each displaced at random by up to a quarter cell."""
+    """Return positions of ids start ... stop - 1 on a cubic lattice, displaced at random by up to a quarter cell."""
     ids = np.arange(start, stop)
     cell = length / per_side
     corner = np.stack([ids % per_side, ids // per_side % per_side, ids // per_side**2], axis=1)
@@ -31,7 +29,7 @@ def lattice_positions(seed: int, per_side: int, start: int, stop: int, length: f
 
 
 def release(decomposition: SlabDecomposition, seed: int, per_side: int, placement: str) -> dict[str, np.ndarray]:
-    """Ids and positions of per_side^3 new particles, each on the rank whose slab holds it."""
+    """Return ids and positions of per_side^3 new particles, each on the rank whose slab holds it."""
     total = per_side**3
     start, stop = id_block(decomposition.comm, total)
     if placement == "random":
@@ -42,10 +40,10 @@ def release(decomposition: SlabDecomposition, seed: int, per_side: int, placemen
 
 
 class FilteredField:
-    """The Gaussian-filtered velocity of a state, and density of a compressible one.
+    """Gaussian-filtered velocity of a state, and filtered density of a compressible one, at arbitrary points.
 
-    Points may lie in this rank's slab or in the `margin` planes beside it. A particle moves through at most `margin`
-    planes in a step.
+    Points may lie in this rank's slab or in the `margin` planes beside it. A particle crosses at most `margin` planes
+    in a step.
     """
 
     def __init__(self, grid: SpectralGrid, filter_width: float, interpolation: str, margin: int = 1) -> None:
@@ -53,20 +51,20 @@ class FilteredField:
         self.transfer = gaussian_transfer(grid.wavenumber_squared, filter_width).astype(grid.real)
         self.spline = SplineInterpolation(grid, interpolation, margin)
 
-    def velocity_coefficients(self, state: np.ndarray) -> np.ndarray:
-        """Spline coefficients of the filtered velocity of a state."""
+    def velocity_coefficients(self, state: np.ndarray) -> list[np.ndarray]:
+        """Return the spline coefficients of the filtered velocity."""
         return self.spline.coefficients(self.transfer * state[:3])
 
     def density_modes(self, state: np.ndarray) -> np.ndarray:
-        """Modes (1, kz, ky, kx) of the filtered density exp(s) of a compressible flow."""
+        """Return the modes (1, kz, ky, kx) of the filtered density exp(s)."""
         return self.transfer * self.grid.forward(np.exp(self.grid.backward(state[3:])))
 
 
 class TracerParticles:
     """Advection dx/dt = v(x, t) by the filtered velocity with Heun's method, second order in time.
 
-    `columns` holds this rank's `id`, `position` and `velocity` (the filtered velocity at the particle, now, taken from
-    `state` if it is not among the given columns).
+    `columns` holds this rank's `id`, `position` and `velocity`, the filtered velocity at the particle. If the velocity
+    is not given, it is taken from `state`.
     """
 
     def __init__(self, field: FilteredField, columns: dict[str, np.ndarray], state: np.ndarray) -> None:
@@ -78,7 +76,7 @@ class TracerParticles:
             self.columns = {**columns, "velocity": velocity}
 
     def advance(self, state: np.ndarray, step: float) -> None:
-        """Move on by one step, to the time of `state`, the flow one step later."""
+        """Advance the particles by one step; `state` is the flow at its end."""
         coefficients = self.field.velocity_coefficients(state)
         position, velocity = self.columns["position"], self.columns["velocity"]
         predicted = position + step * velocity
@@ -87,6 +85,6 @@ class TracerParticles:
         self.columns = migrate(self.decomposition, {**self.columns, "position": position, "velocity": velocity})
 
     def density(self, state: np.ndarray) -> np.ndarray:
-        """Filtered density (n,) at the particles, in a compressible flow."""
+        """Return the filtered density (n,) at the particles of a compressible flow."""
         coefficients = self.field.spline.coefficients(self.field.density_modes(state))
         return self.field.spline.at(coefficients, self.columns["position"])[:, 0]

@@ -1,135 +1,174 @@
-"""Checksums of files: the CRC-32 of every 4096 bytes, in a table behind the end of what HDF5 reads.
+"""Checksums of HDF5 files: the CRC-32 of every 4096 bytes, in a table after the end of the HDF5 data.
 
-They cover all bytes, those of HDF5's own structure too. Bytes of a file that has them are compared before HDF5 sees
-them: a reader of some frames compares these alone, on any number of ranks. io/verification.py makes them.
+They cover all bytes, also those of HDF5's own structure. `open_to_read` opens a file so that each block is compared
+with its checksum before HDF5 sees it: a reader of a few frames compares only these, on any number of ranks.
+`add_checksums` and `find_damage` treat a whole file; the ranks share the blocks. Only they load MPI.
 """
 
 from __future__ import annotations
 
+import errno
 import itertools
 import os
+import stat
 import struct
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import h5py
 import numpy as np
 
-from eddies.io.errors import ProductError, make_again
+from eddies.io.errors import ProductError, file_errors, make_again
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
 
 BLOCK_BYTES = 2**12
-# What follows the table: how many bytes it covers, and a mark.
+# After the table: the number of covered bytes, and a mark.
 FOOTER, MARK = struct.Struct("<Q16s"), b"eddies CRC-32 4K"
-# The attribute of a file that tells of its table. Where that is gone, another program has cut it off.
+# A file with this attribute had a table. If the table is missing, another program has cut it off.
 ATTRIBUTE = "checksums"
 WORDS = f"behind the end of the HDF5 file: CRC-32 of every {BLOCK_BYTES} bytes, as little-endian integers of 4 bytes"
 MISSING = "its checksums are missing: it was cut off, or another program has changed it"
-PIECE = 2**10  # blocks that are read at once
-NAMED = 3  # places that a block may touch
+PIECE = 2**10  # blocks per read
+NAMED = 3  # datasets that an error names
+
+
+def open_to_read(path: str | Path) -> h5py.File:
+    """Open any HDF5 file for reading, with comparison if it has checksums.
+
+    HDF5's own file lock is not used: some network file systems have none. A run directory has a lock of its own, and a
+    product gets its name only when it is complete.
+
+    Raises:
+        OSError: the file cannot be opened.
+        ProductError: here or at a later read, bytes differ from their checksums.
+    """
+    if not stat.S_ISREG(os.stat(path).st_mode):  # opening a pipe would wait for its writer
+        raise OSError(errno.EINVAL, "not a regular file", str(path))
+    with _opened(path) as descriptor:
+        checked = _covered_bytes(descriptor) is not None
+    if checked:
+        return h5py.File(CheckedFile(path), "r")
+    file = h5py.File(path, "r", locking=False)
+    if ATTRIBUTE in file.attrs:
+        file.close()
+        raise OSError(MISSING)
+    return file
 
 
 class CheckedFile:
-    """A file with checksums as h5py reads it: h5py.File(self, "r").
+    """A file with checksums, for h5py.File(self, "r"). With `naming`, an error names the damaged dataset and frame."""
 
-    Parameters
-    ----------
-    path : of a file that has checksums.
-    naming : whether an error looks for the dataset and frame that are damaged.
-    """
-
-    _descriptor: int | None = None  # where the file cannot be opened
+    _descriptor: int | None = None
 
     def __init__(self, path: str | Path, naming: bool = True) -> None:
         self.path, self._naming, self._at = Path(path), naming, 0
         self._descriptor = os.open(path, os.O_RDONLY)
-        self._size = covered_bytes(self._descriptor) or 0
+        self._size = _covered_bytes(self._descriptor) or 0
 
     def __repr__(self) -> str:
-        return str(self.path)  # the name of the file for h5py
+        return str(self.path)  # h5py takes it as the name of the file
 
     def __del__(self) -> None:
         if self._descriptor is not None:
             os.close(self._descriptor)
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> None:
-        """Go to a place, as in files."""
+        """Go to a position."""
         self._at = offset + (self._size if whence == os.SEEK_END else 0)
 
     def tell(self) -> int:
-        """The place."""
+        """The position."""
         return self._at
 
     def readinto(self, buffer: memoryview) -> int:
-        """Fill a buffer from there on. ProductError, which names dataset and frame, where bytes are not as written."""
+        """Fill a buffer from the position on; ProductError if bytes differ from their checksums."""
         done, size = 0, min(len(buffer), self._size - self._at)
         while done < size:
             first, skipped = divmod(self._at + done, BLOCK_BYTES)
             part = memoryview(buffer)[done:min(size, done + PIECE * BLOCK_BYTES - skipped)]
-            wrong = compare(self._descriptor, first, part, self._size, skipped)
+            wrong = _first_wrong(self._descriptor, first, part, self._size, skipped)
             if wrong is not None:
-                words = damage_words(self.path, wrong, self._naming)
+                words = _damage(self.path, wrong, self._naming)
                 raise ProductError(f"{words}; {make_again(self.path.stem)}")
             done += len(part)
         return done
 
-    read = readinto  # h5py wants to see one, and takes the other
+    read = readinto  # h5py asks for a method of this name, but calls the other
 
 
-def has_checksums(path: str | Path) -> bool:
-    """Whether a table of checksums stands at the end of a file; OSError where it cannot be read."""
-    with opened(path) as descriptor:
-        return covered_bytes(descriptor) is not None
+def add_checksums(comm: MPI.Comm, path: Path) -> None:
+    """Append checksums to a file that all ranks have closed; collective. WriteError on all ranks."""
+    from eddies.parallel.broadcast import on_all_ranks, on_first_rank
+    from eddies.parallel.reduction import global_sum
+    comm.Barrier()  # all have closed it
+    with file_errors(path):
+        size = on_first_rank(comm, lambda: path.stat().st_size)
+        sums = np.zeros(_count_blocks(size), np.uint32)
+
+        def read() -> None:
+            with _opened(path) as descriptor:
+                for first, part in _own_pieces(comm, size):
+                    own = _read_sums(descriptor, first, part, size)
+                    sums[first:first + len(own)] = own
+
+        on_all_ranks(comm, read)
+    table = global_sum(comm, sums).astype("<u4").tobytes() + FOOTER.pack(size, MARK)
+
+    def append() -> None:
+        with open(path, "ab") as file:
+            file.write(table)
+
+    with file_errors(path, len(table)):
+        on_first_rank(comm, append)
 
 
-def damage_words(path: Path, block: int, naming: bool = True) -> str:
-    """That a block is not what was written, in a line that names file, dataset and frame."""
-    start, stop = block * BLOCK_BYTES, (block + 1) * BLOCK_BYTES
-    place = f"bytes {start} to {stop}"
-    place = f"{_place(path, start, stop)} ({place})" if naming else place
-    return f"{path}: {place} is not what was written, the file is damaged"
+def known_sums(path: Path) -> int | None:
+    """A checksum of a file's checksums, which identifies the file; None if it has none."""
+    with _opened(path) as descriptor:
+        size = _covered_bytes(descriptor)
+        return None if size is None else zlib.crc32(_read_table(descriptor, 0, _count_blocks(size), size), size)
 
 
-def count_blocks(size: int) -> int:
-    """How many blocks so many bytes fill, the last one perhaps in part."""
-    return -(-size // BLOCK_BYTES)
+def find_damage(comm: MPI.Comm, path: Path, known: int | None = None) -> str | None:
+    """Compare a file with its checksums; collective.
 
+    Returns a line with file, dataset and frame of the first damage, or None. `known` is the result of `known_sums` for
+    the expected file.
+    """
+    from eddies.parallel.broadcast import on_all_ranks, on_first_rank
+    from eddies.parallel.reduction import global_min
 
-def covered_bytes(descriptor: int) -> int | None:
-    """How many bytes the checksums at the end of a file cover; None if there are none."""
-    end = os.fstat(descriptor).st_size - FOOTER.size
-    size, mark = FOOTER.unpack(os.pread(descriptor, FOOTER.size, end)) if end > 0 else (0, b"")
-    return size if mark == MARK and size + 4 * count_blocks(size) == end else None
+    def look() -> int | str:
+        if not path.is_file():
+            return f"{path}: missing"
+        with _opened(path) as descriptor:
+            size = _covered_bytes(descriptor)
+        if size is not None and known not in (None, known_sums(path)):
+            return f"{path}: is another file than was written"
+        return f"{path}: {MISSING}" if size is None else size
 
+    def first_wrong() -> int:
+        with _opened(path) as descriptor:
+            wrong = (_first_wrong(descriptor, first, part, size) for first, part in _own_pieces(comm, size))
+            return next((block for block in wrong if block is not None), _count_blocks(size))
 
-def compare(descriptor: int, first: int, part: memoryview, size: int, skipped: int = 0) -> int | None:
-    """Read a part of a file, of whose bytes `size` are covered, `skipped` bytes after the beginning of block `first`;
-    the first block of it that is not as written, None if all are."""
-    sums = read_sums(descriptor, first, part, size, skipped)
-    wrong = np.flatnonzero(sums != read_table(descriptor, first, first + len(sums), size))
-    return first + int(wrong[0]) if wrong.size else None
-
-
-def read_table(descriptor: int, first: int, last: int, size: int) -> np.ndarray:
-    """Checksums of blocks first to last of a file, as they stand behind its `size` bytes."""
-    return np.frombuffer(os.pread(descriptor, 4 * (min(last, count_blocks(size)) - first), size + 4 * first), "<u4")
-
-
-def read_sums(descriptor: int, first: int, part: memoryview, size: int, skipped: int = 0) -> np.ndarray:
-    """Read a part of a file as `compare` does; the checksums of its blocks, those that it has in part as a whole."""
-    start, end = first * BLOCK_BYTES, first * BLOCK_BYTES + skipped + len(part)
-    head, tail = bytearray(skipped), bytearray(min(count_blocks(end) * BLOCK_BYTES, size) - end)
-    os.preadv(descriptor, [head, part, tail], start)
-    sums = [zlib.crc32(part[:BLOCK_BYTES - skipped], zlib.crc32(head))]
-    sums += [zlib.crc32(part[at:at + BLOCK_BYTES]) for at in range(BLOCK_BYTES - skipped, len(part), BLOCK_BYTES)]
-    sums[-1] = zlib.crc32(tail, sums[-1])
-    return np.array(sums, np.uint32)
+    try:
+        size = on_first_rank(comm, look)
+        if isinstance(size, str):
+            return size
+        block = int(global_min(comm, on_all_ranks(comm, first_wrong)))
+    except OSError as error:
+        return f"{path}: cannot be read ({error})"
+    return on_first_rank(comm, lambda: _damage(path, block)) if block < _count_blocks(size) else None
 
 
 @contextmanager
-def opened(path: str | Path) -> Iterator[int]:
-    """The descriptor of a file that is read."""
+def _opened(path: str | Path) -> Iterator[int]:
     descriptor = os.open(path, os.O_RDONLY)
     try:
         yield descriptor
@@ -137,27 +176,78 @@ def opened(path: str | Path) -> Iterator[int]:
         os.close(descriptor)
 
 
+def _count_blocks(size: int) -> int:
+    return -(-size // BLOCK_BYTES)
+
+
+def _covered_bytes(descriptor: int) -> int | None:
+    """The number of bytes that the checksums cover; None if the file has none."""
+    end = os.fstat(descriptor).st_size - FOOTER.size
+    size, mark = FOOTER.unpack(os.pread(descriptor, FOOTER.size, end)) if end > 0 else (0, b"")
+    return size if mark == MARK and size + 4 * _count_blocks(size) == end else None
+
+
+def _own_pieces(comm: MPI.Comm, size: int) -> Iterator[tuple[int, memoryview]]:
+    """This rank's share of the blocks of a file, in pieces: the first block, and a buffer for the piece."""
+    from eddies.parallel.slab import block_starts
+    start, stop = map(int, block_starts(_count_blocks(size), comm.size)[comm.rank:comm.rank + 2])
+    buffer = memoryview(bytearray(PIECE * BLOCK_BYTES))
+    for first in range(start, stop, PIECE):
+        yield first, buffer[:min(size, stop * BLOCK_BYTES) - first * BLOCK_BYTES]
+
+
+def _first_wrong(descriptor: int, first: int, part: memoryview, size: int, skipped: int = 0) -> int | None:
+    """Fill `part` as `_read_sums` does; the first block that differs from its checksum, or None."""
+    sums = _read_sums(descriptor, first, part, size, skipped)
+    wrong = np.flatnonzero(sums != _read_table(descriptor, first, first + len(sums), size))
+    return first + int(wrong[0]) if wrong.size else None
+
+
+def _read_table(descriptor: int, first: int, last: int, size: int) -> np.ndarray:
+    """The stored checksums of blocks first to last."""
+    return np.frombuffer(os.pread(descriptor, 4 * (min(last, _count_blocks(size)) - first), size + 4 * first), "<u4")
+
+
+def _read_sums(descriptor: int, first: int, part: memoryview, size: int, skipped: int = 0) -> np.ndarray:
+    """Fill `part` with the bytes of a file, of which `size` are covered, from `skipped` bytes after the beginning of
+    block `first` on. Returns the checksums of all blocks that the part touches."""
+    start, end = first * BLOCK_BYTES, first * BLOCK_BYTES + skipped + len(part)
+    head, tail = bytearray(skipped), bytearray(min(_count_blocks(end) * BLOCK_BYTES, size) - end)
+    os.preadv(descriptor, [head, part, tail], start)
+    sums = [zlib.crc32(part[:BLOCK_BYTES - skipped], zlib.crc32(head))]
+    sums += [zlib.crc32(part[at:at + BLOCK_BYTES]) for at in range(BLOCK_BYTES - skipped, len(part), BLOCK_BYTES)]
+    sums[-1] = zlib.crc32(tail, sums[-1])
+    return np.array(sums, np.uint32)
+
+
+def _damage(path: Path, block: int, naming: bool = True) -> str:
+    start, stop = block * BLOCK_BYTES, (block + 1) * BLOCK_BYTES
+    place = f"bytes {start} to {stop}"
+    place = f"{_place(path, start, stop)} ({place})" if naming else place
+    return f"{path}: {place} is not what was written, the file is damaged"
+
+
 def _place(path: Path, start: int, stop: int) -> str:
-    """Which datasets and frames lie between bytes of a file."""
-    found: list[str] = []
+    """Names of the datasets and frames between two bytes of a file."""
+    names: list[str] = []
 
     def look(name: str, item: h5py.Group | h5py.Dataset) -> None:
         for row, offset, size in _extents(item) if isinstance(item, h5py.Dataset) else ():
             if offset < stop and start < offset + size:
                 rows = item.chunks[0] if item.chunks else 0
                 frame = row + max(start - offset, 0) * rows // size
-                found.append(f"{name}, frame {frame}" if item.chunks else name)
+                names.append(f"{name}, frame {frame}" if item.chunks else name)
 
     try:
         with h5py.File(CheckedFile(path, naming=False), "r") as file:
             file.visititems(look)
-    except ProductError:  # the very bytes tell where datasets are
-        found.append("the structure of the file, or what lies beside it,")
-    return " or ".join(found[:NAMED]) or "the structure of the file"
+    except ProductError:  # the damaged bytes say where the datasets are
+        names.append("the structure of the file, or what lies beside it,")
+    return " or ".join(names[:NAMED]) or "the structure of the file"
 
 
 def _extents(dataset: h5py.Dataset) -> Iterator[tuple[int, int, int]]:
-    """First row, offset and bytes of each part of a dataset that lies in the file as one."""
+    """First row, offset and bytes of each contiguous part of a dataset in the file."""
     if dataset.chunks is None:
         if dataset.id.get_offset() is not None:
             yield 0, dataset.id.get_offset(), dataset.nbytes

@@ -1,5 +1,5 @@
-"""Groups of stored arrays for programs: as an xarray Dataset whose values are read when they are asked for, or, without
-xarray, as a dictionary of numpy arrays."""
+"""Groups of arrays for programs and notebooks: an xarray Dataset that reads values when they are used or, without
+xarray, a dictionary of numpy arrays."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from typing import Any
 import h5py
 import numpy as np
 
+from eddies.io.checksums import open_to_read
 from eddies.io.errors import ProductError
-from eddies.io.quantities import words_on
-from eddies.io.reading import open_to_read
+from eddies.io.quantities import python_value, words_on
 
 try:
     import xarray
@@ -30,23 +30,16 @@ EDGE = 2 * math.pi  # of the cube, in units of L
 
 @dataclass(frozen=True)
 class MadeArray:
-    """An array that no file holds: what is asked of it is made then, frame by frame along its first axis.
+    """An array that no file holds; its frames, along the first axis, are computed when they are used."""
 
-    Parameters
-    ----------
-    place : where a rollout.h5 would have it, which says what it is.
-    shape, dtype : of the whole.
-    make : what it is at frames, one array each.
-    """
-
-    place: str
+    place: str  # the path that it would have in rollout.h5, which gives its units and description
     shape: tuple[int, ...]
     dtype: np.dtype
-    make: Callable[[Sequence[int]], Sequence[np.ndarray]]
+    make: Callable[[Sequence[int]], Sequence[np.ndarray]]  # returns some frames
 
     @classmethod
     def of(cls, place: str, values: np.ndarray) -> MadeArray:
-        """Of values that are known."""
+        """An array with known values."""
         return cls(place, values.shape, values.dtype, lambda frames: [values[frame] for frame in frames])
 
     @property
@@ -69,104 +62,83 @@ class MadeArray:
 
 
 def open_group(path: Path, name: str) -> Any:
-    """The arrays of a group of a product, by name: those of all its elements, the `value` of each, with their times.
+    """The arrays of a group of a product, by name; for a group of trajectories the `value` of each column.
 
-    ProductError where there is no such group, or no such file.
+    ProductError if there is no such group or file.
     """
+    def read(array: str, key: tuple) -> np.ndarray:
+        with opened(path) as file:
+            return np.asarray(file[array][key])
+
     with opened(path) as file:
         group = file.get(name)
         if not isinstance(group, h5py.Group):
             raise ProductError(f"{path}: holds no {name}; it holds: {', '.join(groups_in(file))}")
-        elements = {key: item.get("value") if isinstance(item, h5py.Group) else item for key, item in group.items()}
-        arrays = {key: item for key, item in elements.items() if isinstance(item, h5py.Dataset)}
+        columns = {key: item.get("value") if isinstance(item, h5py.Group) else item for key, item in group.items()}
+        arrays = {key: item for key, item in columns.items() if isinstance(item, h5py.Dataset)}
         if xarray is None:
             return {key: array[()] for key, array in arrays.items()}
-        return dataset_of({key: (array, StoredArray(path, array)) for key, array in arrays.items()}, dict(group.attrs))
+        attributes = {key: python_value(value) for key, value in group.attrs.items()}
+        return _dataset({key: (array, lambda part, array=array.name: read(array, part))
+                         for key, array in arrays.items()}, attributes)
 
 
 def made_group(arrays: Mapping[str, MadeArray]) -> Any:
-    """Arrays that are made when they are asked for, as those of a group that is stored."""
+    """The same of arrays that are computed."""
     if xarray is None:
         return {key: array[:] for key, array in arrays.items()}
-    return dataset_of({key: (array, LazyArray(array)) for key, array in arrays.items()}, {})
+    return _dataset({key: (array, array.__getitem__) for key, array in arrays.items()}, {})
 
 
 def groups_in(file: h5py.File) -> list[str]:
-    """The groups with arrays of their own, or of their elements."""
-    found = []
+    """The names of the groups that hold arrays, or columns of a trajectory."""
+    names = []
 
     def look(name: str, item: h5py.Group | h5py.Dataset) -> None:
         if isinstance(item, h5py.Group) and any(isinstance(one, h5py.Dataset) for one in item.values()):
             if "value" not in item and not name.endswith("/box"):
-                found.append(name)
+                names.append(name)
 
     file.visititems(look)
-    return found
+    return names
 
 
 def opened(path: Path) -> h5py.File:
-    """A product, for one process; ProductError where there is none."""
+    """A product, for one process; ProductError if it cannot be opened."""
     try:
         return open_to_read(path)
     except OSError as error:
         raise ProductError(f"{path}: cannot be opened ({error}); make it with the stage of this name") from None
 
 
-def dataset_of(arrays: Mapping[str, tuple[Any, Any]], attributes: Mapping[str, Any]) -> Any:
-    """An xarray Dataset with the axes that the arrays name, each with what reads it when it is used; times, ids,
-    wavenumbers and points are its coordinates."""
+def _dataset(arrays: Mapping[str, tuple[Any, Callable[[tuple], np.ndarray]]], attributes: Mapping[str, Any]) -> Any:
+    """An xarray Dataset of arrays, each with a function that reads a part of it. Times, ids, wavenumbers and points
+    become coordinates."""
     variables, coordinates = {}, {}
-    for key, (array, lazy) in arrays.items():
+    for key, (array, read) in arrays.items():
         axes = array.attrs.get("axes", "").split()
         axes = axes if len(axes) == array.ndim else [f"{key}_{axis}" for axis in range(array.ndim)]
         words = {name: array.attrs[name] for name in ("units", "description") if name in array.attrs}
-        own = axes == [key] or (key == "id" and axes == ["particle"])
-        if own:
+        if axes == [key] or (key == "id" and axes == ["particle"]):
             coordinates[axes[0]] = (axes, array[()], words)
         else:
-            found = xarray.Variable(axes, LazilyIndexedArray(lazy), words)
-            # A scalar has no components.
+            variable = xarray.Variable(axes, LazilyIndexedArray(LazyArray(array, read)), words)
             scalar = "component" in axes and array.shape[axes.index("component")] == 1
-            variables[key] = found.isel(component=0) if scalar else found
+            variables[key] = variable.isel(component=0) if scalar else variable
         for axis, size in zip(axes, array.shape):
             if axis in AXES and size == len(AXES[axis]):
                 coordinates.setdefault(axis, ([axis], AXES[axis]))
             elif axis in ("x", "y", "z"):
                 coordinates.setdefault(axis, ([axis], EDGE * np.arange(size) / size, {"units": "L"}))
-    return xarray.Dataset(variables, coordinates, {name: plain(value) for name, value in attributes.items()})
-
-
-def plain(value: Any) -> Any:
-    """A number or text of an attribute as Python has it."""
-    return value.item() if isinstance(value, np.generic) else value
+    return xarray.Dataset(variables, coordinates, attributes)
 
 
 if xarray is not None:
-    class StoredArray(BackendArray):
-        """An array of a file that is opened whenever a part of it is read."""
+    class LazyArray(BackendArray):
+        """An array of which xarray reads the parts that are used."""
 
-        def __init__(self, path: Path, array: h5py.Dataset) -> None:
-            self.path, self.name, self.shape, self.dtype = path, array.name, array.shape, array.dtype
+        def __init__(self, array: h5py.Dataset | MadeArray, read: Callable[[tuple], np.ndarray]) -> None:
+            self.shape, self.dtype, self._read = array.shape, array.dtype, read
 
         def __getitem__(self, key: BasicIndexer | OuterIndexer) -> np.ndarray:
             return explicit_indexing_adapter(key, self.shape, IndexingSupport.OUTER_1VECTOR, self._read)
-
-        def _read(self, key: tuple) -> np.ndarray:
-            with opened(self.path) as file:
-                # HDF5 reads indices that increase.
-                vector = next((axis for axis, index in enumerate(key) if isinstance(index, np.ndarray)), None)
-                if vector is None:
-                    return np.asarray(file[self.name][key])
-                wanted, back = np.unique(key[vector], return_inverse=True)
-                values = file[self.name][(*key[:vector], wanted, *key[vector + 1:])]
-                dropped = sum(isinstance(index, int | np.integer) for index in key[:vector])
-                return np.take(values, back, axis=vector - dropped)
-
-    class LazyArray(BackendArray):
-        """A made array."""
-
-        def __init__(self, array: MadeArray) -> None:
-            self.array, self.shape, self.dtype = array, array.shape, array.dtype
-
-        def __getitem__(self, key: BasicIndexer | OuterIndexer) -> np.ndarray:
-            return explicit_indexing_adapter(key, self.shape, IndexingSupport.BASIC, self.array.__getitem__)

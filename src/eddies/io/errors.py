@@ -1,55 +1,61 @@
-"""What is wrong with a file, for its user."""
+"""Errors about files that users see: file, reason and remedy in one line."""
 
 from __future__ import annotations
 
 import errno
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from eddies.errors import UserError
 from eddies.pipeline import MAKER_OF
 
-# A full disk, a used up quota, a file that is longer than it may be.
+# A full disk, a used-up quota, a file above the limit of its size.
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 class ProductError(UserError, RuntimeError):
-    """A product is missing, unfinished, damaged or of the wrong kind: the text says which and what to do."""
+    """A product is missing, unfinished, damaged or of the wrong kind."""
 
 
 class WriteError(ProductError):
-    """A file cannot be written. All ranks that write it raise this at the same place, so that they can end other files
-    together."""
+    """A file cannot be written. All ranks that write it raise this error at the same place, so they can close and
+    remove files together."""
 
 
-class NoRoom(OSError):
-    """An OSError that knows how many bytes were `wanted`."""
-
-    wanted = 0
-
-    @classmethod
-    def of(cls, error: OSError, path: Path | str, wanted: int) -> NoRoom:
-        """What was met when so many bytes were wanted for a file."""
-        found = cls(error.errno, error.strerror, str(path))
-        found.wanted = wanted
-        return found
+def write_error(path: Path | str, error: OSError, wanted: int = 0) -> WriteError:
+    """The error of a file that cannot be written, read or removed; if the disk is full, with the bytes wanted."""
+    reason = error.strerror or error
+    if error.errno in NO_ROOM:
+        return WriteError(f"{path}: cannot be written: {reason}: {room(path, wanted)}; make room, then run the command "
+                          "again")
+    return WriteError(f"{path}: {reason}; check the file, its directory and the space on the disk")
 
 
-def write_error(path: Path | str, error: OSError, otherwise: str) -> WriteError:
-    """The error of a file that cannot be written: where room lacks, with the bytes wanted and free, or `otherwise`."""
-    if error.errno not in NO_ROOM:
-        return WriteError(otherwise)
-    path = error.filename or path
-    lack = wanted_and_free(path, getattr(error, "wanted", 0))
-    return WriteError(f"{path}: cannot be written: {error.strerror}: {lack}; make room, then run the command again")
+@contextmanager
+def file_errors(path: Path | str, wanted: int = 0) -> Iterator[None]:
+    """Convert an OSError inside the block to a WriteError."""
+    try:
+        yield
+    except OSError as error:
+        raise write_error(error.filename or path, error, wanted) from None
 
 
-def wanted_and_free(path: Path | str, wanted: int) -> str:
-    """Bytes wanted for a file, and those free where it is."""
+def room(path: Path | str, wanted: int) -> str:
+    """The bytes wanted for a file and the free bytes of its file system, as text."""
     disk = os.statvfs(next(place for place in Path(path).absolute().parents if place.is_dir()))
     return f"{wanted} bytes wanted, {disk.f_bavail * disk.f_frsize} free"
 
 
+def unreadable(path: Path | str, error: OSError) -> ProductError | None:
+    """The error of a file that the system does not let us read; None if HDF5 has found its content damaged."""
+    if error.errno is None:
+        return None
+    return ProductError(f"{path}: cannot be read: {os.strerror(error.errno)}; check its permissions, its directory and "
+                        "the file system, or give another path")
+
+
 def make_again(kind: str) -> str:
-    """What to do with a product that is of no use; as it is there, its stage would keep it."""
+    """The remedy for a useless product. Its stage would keep the file, so the user has to remove it."""
     return f"remove it and run `eddies {MAKER_OF[kind].name}` again" if kind in MAKER_OF else "make it again"

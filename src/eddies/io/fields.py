@@ -12,11 +12,12 @@ from eddies.io.hdf5 import append_frame, find_group, growing_dataset, read_frame
 class FieldWriter:
     """Adds fields on cells^3 points to /fields/NAME in float32. Making one and `append` are collective.
 
-    Args:
-        file: an open product.
-        name: the group under /fields.
-        cells: grid points along each side; point i lies at i L / cells.
-        variables: number of components of each variable, such as {"velocity": 3, "density": 1}.
+    Parameters
+    ----------
+    file : an open product.
+    name : the group under /fields.
+    cells : grid points along each side; point i is at i L / cells.
+    variables : number of components of each variable, such as {"velocity": 3, "density": 1}.
     """
 
     def __init__(self, file: h5py.File, name: str, cells: int, variables: Mapping[str, int]) -> None:
@@ -34,35 +35,25 @@ class FieldWriter:
 
 
 class FieldSeries:
-    """Reads /fields/NAME of an open product; ProductError if there is none, or it is not what a stage writes."""
+    """Reads /fields/NAME of an open product; ProductError if it is missing or malformed."""
 
     def __init__(self, file: h5py.File, name: str) -> None:
         self.file, self._group = file, find_group(file, f"fields/{name}")
+        self.cells = int(self._group.attrs["cells"])  # grid points along each side
+        self.variables = tuple(variable for variable in self._group if variable != "time")
 
     def __len__(self) -> int:
-        """Number of stored fields."""
         return len(self.times)
 
     @cached_property
     def times(self) -> np.ndarray:
         """Time of each field, (frames,)."""
         times = read_times(self._group["time"])
-        for found in (self._group[name] for name in self.variables):
-            if (found.shape[0], *found.shape[2:]) != (len(times), *[self.cells] * 3):
-                raise unfit(found, f"has the shape {found.shape}, with {len(times)} times, {self.cells} cells a side")
+        for dataset in (self._group[name] for name in self.variables):
+            if (dataset.shape[0], *dataset.shape[2:]) != (len(times), *[self.cells] * 3):
+                raise unfit(dataset, f"has the shape {dataset.shape}; expected {len(times)} times, {self.cells} cells")
         return times
 
-    @property
-    def cells(self) -> int:
-        """Grid points along each side."""
-        return int(self._group.attrs["cells"])
-
-    @property
-    def variables(self) -> tuple[str, ...]:
-        """Names of the stored variables."""
-        return tuple(name for name in self._group if name != "time")
-
     def read(self, index: int, variable: str, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Planes start to stop of a variable, (components, stop - start, y, x). ProductError where one is not
-        finite."""
+        """Planes start to stop of a variable, (components, stop - start, y, x); ProductError if one is not finite."""
         return read_frame(self._group[variable], index, (slice(None), slice(start, stop)))

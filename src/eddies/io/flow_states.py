@@ -1,10 +1,10 @@
-"""States of a whole flow in a file: those of a ground truth, or velocities on a periodic cube that other codes stored.
+"""States of a whole flow to start from: of a ground truth, or velocities on a periodic cube from other codes.
 
-Layouts of others, with arrays [z, y, x] as here and points from the corner of the cube on:
+Supported layouts of other codes, with arrays [z, y, x] and points from the corner of the cube on:
 
 - cutouts of the Johns Hopkins Turbulence Databases (JHTDB), as pyJHTDB, giverny and givernylocal write them:
   `Velocity_0001`, ... (z, y, x, component), numbered in time, and the points of each axis in `xcoor`, `ycoor` and
-  `zcoor`, of a cube of edge 2 pi. Coordinates tell whether it is the whole cube.
+  `zcoor`, of a cube of edge 2 pi. The points show whether the cutout is the whole cube.
 - files `state_phys*.h5` and `.nc` of fluidsim: `state_phys/vx`, `vy` and `vz` (z, y, x) and the attributes `Lx`, `Ly`,
   `Lz` of `info_simul/params/oper`.
 """
@@ -22,18 +22,17 @@ import h5py
 import numpy as np
 from mpi4py import MPI
 
+from eddies.io.checksums import open_to_read
 from eddies.io.errors import ProductError
 from eddies.io.fields import FieldSeries
 from eddies.io.hdf5 import open_product
 from eddies.io.provenance import read_provenance
-from eddies.io.reading import open_to_read
 from eddies.parallel.broadcast import on_all_ranks, on_first_rank
 
 CUTOUT_EDGE = 2 * math.pi
 CUTOUT_NAME = re.compile(r"Velocity_(\d+)")
 FLUIDSIM_PARAMETERS = "info_simul/params/oper"
-# Of a grid step: coordinates of cutouts are stored in single precision.
-PLACE_TOLERANCE = 0.01
+PLACE_TOLERANCE = 0.01  # of a grid step: coordinates of cutouts have single precision
 
 
 class StoredStates(FieldSeries):
@@ -41,18 +40,15 @@ class StoredStates(FieldSeries):
 
     @property
     def sound_speed(self) -> float | None:
-        """That of the fluid; None without one."""
+        """Sound speed of the fluid; None if it is incompressible."""
         return tomllib.loads(read_provenance(self.file)["scene"])["flow"].get("sound_speed")
 
 
 class VelocityCubes:
-    """Velocities of another code at one or more times, read as fields of a product are.
+    """Velocities of another code at one or more times, with the interface of `FieldSeries`.
 
-    Args:
-        states: for each time the dataset (z, y, x, component), or one (z, y, x) for each component.
-
-    Raises:
-        ProductError: these are not velocities on equally many points along each axis.
+    `states` has for each time one dataset (z, y, x, component), or three (z, y, x). ProductError if they are not
+    velocities on equally many points along each axis.
     """
 
     variables, sound_speed = ("velocity",), None
@@ -73,19 +69,15 @@ class VelocityCubes:
         return len(self._states)
 
     def read(self, index: int, variable: str, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Planes start to stop of the velocity, (3, stop - start, y, x), of a state. ProductError where it cannot be
-        read or a value is not finite."""
+        """Planes start to stop of the velocity, (3, stop - start, y, x); ProductError if they are damaged."""
         return np.concatenate([_read_planes(dataset, start, stop) for dataset in self._states[index]])
 
 
 @contextmanager
 def open_states(comm: MPI.Comm, path: str | Path) -> Iterator[StoredStates | VelocityCubes]:
-    """The states of the whole flow that a file holds; all ranks call it, and if one cannot read it, all raise.
+    """The states of the whole flow in a file; all ranks call it, and if one cannot read it, all raise ProductError.
 
-    A ground truth has them at its end, or, where it followed tracers, at a few times with them.
-
-    Raises:
-        ProductError: no such file, of no known layout, no whole periodic cube, or what `open_product` refuses.
+    A ground truth with tracers has states at a few times, one without has its last state.
     """
     if on_first_rank(comm, lambda: _is_product(Path(path))):
         with open_product(comm, path, "ground_truth") as file:
@@ -96,7 +88,7 @@ def open_states(comm: MPI.Comm, path: str | Path) -> Iterator[StoredStates | Vel
 
 
 def _is_product(path: Path) -> bool:
-    """Whether a file is one of eddies; or none of HDF5 at all, of which `open_product` knows what to say."""
+    """Whether a file is a product, or unreadable, which `open_product` reports best."""
     try:
         with open_to_read(path) as file:
             return "kind" in file.attrs
@@ -153,7 +145,7 @@ def _fluidsim_state(file: h5py.File) -> VelocityCubes:
 
 
 def _read_planes(dataset: h5py.Dataset, start: int, stop: int | None) -> np.ndarray:
-    """Planes of a vector, or of a component of one: (components, z, y, x)."""
+    """Planes of a vector or of one component, (components, z, y, x)."""
     try:
         values = dataset[start:stop]
     except OSError as error:

@@ -1,4 +1,4 @@
-"""Frames in segments: files that are closed at each checkpoint, so that no later accident harms them."""
+"""Frames in segments: files that are closed at each checkpoint, so that a later failure cannot damage them."""
 
 from __future__ import annotations
 
@@ -19,34 +19,25 @@ from eddies.parallel.slab import SlabDecomposition
 
 @dataclass(frozen=True)
 class FieldLayout:
-    """A series of fields: grid points along each side, and the number of components by variable."""
+    """The content of a series of fields."""
 
-    cells: int
-    variables: Mapping[str, int]
+    cells: int  # grid points along each side
+    variables: Mapping[str, int]  # number of components
 
 
 @dataclass(frozen=True)
 class FrameLayout:
-    """What frames hold, in a segment as in the product.
+    """The content of frames, in a segment and in the product. Series may have different times."""
 
-    Parameters
-    ----------
-    total : number of particles.
-    length : side of the periodic box.
-    trajectories : shape of one particle's value by column, of each trajectory by name.
-    dtype : of the trajectories.
-    fields : each series of fields by name; not all need to have a field at the same times.
-    """
-
-    total: int
-    length: float
-    trajectories: Mapping[str, Mapping[str, tuple[int, ...]]]
-    dtype: type[np.floating]
-    fields: Mapping[str, FieldLayout]
+    total: int  # number of particles
+    length: float  # edge of the periodic cube
+    trajectories: Mapping[str, Mapping[str, tuple[int, ...]]]  # by name: shape of a particle's value by column
+    dtype: type[np.floating]  # of the trajectories
+    fields: Mapping[str, FieldLayout]  # by name
 
     def writers(self, file: File, images: bool = False) -> tuple[dict[str, TrajectoryWriter], dict[str, FieldWriter]]:
-        """Of the trajectories and of the fields, by name; collective. `images`: whether those with positions count how
-        often particles have left the box."""
+        """Writers of the trajectories and of the fields, by name; collective. `images` adds the column of images to
+        trajectories with positions."""
         return ({name: TrajectoryWriter(file, name, self.total, self.length, columns, self.dtype,
                                         images and "position" in columns)
                  for name, columns in self.trajectories.items()},
@@ -54,10 +45,9 @@ class FrameLayout:
 
 
 class FrameSegments:
-    """The files frames-NNNNNNNN.h5 of a directory, named after their first step; `names` are those that are closed.
+    """The files frames-NNNNNNNN.h5 of a directory, named after their first step; `names` lists the closed ones.
 
-    A context manager: leaving it by an exception leaves the open segment unfinished. `assemble` copies all frames into
-    the product at the end.
+    If the context ends with an exception, the open segment is removed. `assemble` copies all frames into the product.
     """
 
     def __init__(self, comm: MPI.Comm, directory: Path, layout: FrameLayout, names: Sequence[str] = ()) -> None:
@@ -65,7 +55,7 @@ class FrameSegments:
         self._name, self._file = "", ExitStack()
 
     def open(self, step: int) -> None:
-        """Begin a segment, unless one is open: `trajectories` and `fields`, by name, take its frames."""
+        """Begin a segment, unless one is open. Its writers are `trajectories` and `fields`, by name."""
         if self._name:
             return
         in_files(self.comm, self.directory, lambda: self.directory.mkdir(exist_ok=True))
@@ -74,23 +64,23 @@ class FrameSegments:
         self.trajectories, self.fields = self.layout.writers(file)
 
     def close(self) -> None:
-        """End the open segment, if there is one."""
+        """Close the open segment, if any."""
         if self._name:
             self._file.close()
             self.names.append(self._name)
             self._name = ""
 
     def first_frames(self, name: str, count: int) -> list[tuple[float, dict[str, np.ndarray]]]:
-        """Time and this rank's block of the first frames of a trajectory that every segment has; of closed segments."""
+        """Time and this rank's block of the first frames of a trajectory, from closed segments, which all have it."""
         frames: list[tuple[float, dict[str, np.ndarray]]] = []
-        for segment in self.names[:count]:  # each may hold one frame alone
+        for segment in self.names[:count]:  # each holds one frame or more
             with open_product(self.comm, self.directory / segment, "frames") as file:
                 stored = Trajectory(file, name)
                 frames += [(time, self._values(stored, frame)) for frame, time in enumerate(stored.times[:count])]
         return frames[:count]
 
     def assemble(self, file: File) -> None:
-        """Copy the frames of all segments into a product; images are counted there, over all of them."""
+        """Copy the frames of all segments into a product, which also counts the images."""
         self.close()
         trajectories, fields = self.layout.writers(file, images=True)
         slabs = {name: SlabDecomposition(self.comm, self.layout.length, series.cells)

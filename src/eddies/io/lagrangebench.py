@@ -1,8 +1,8 @@
-"""Trajectories as learned simulators of particles read them: a data set in the layout of LagrangeBench.
+"""Trajectories as a data set for learned particle simulators, in the layout of LagrangeBench.
 
-Layout: what the reader of LagrangeBench (Toshev et al., NeurIPS 2023, Datasets and Benchmarks) indexes, and the keys
-of its metadata. A directory holds train.h5, valid.h5 and test.h5, each with a trajectory `00000` of consecutive frames,
-and metadata.json. Velocities and accelerations are differences between frames, in units of length.
+Layout: Toshev et al., NeurIPS 2023, Datasets and Benchmarks. A directory holds train.h5, valid.h5 and test.h5, each
+with a trajectory `00000` of consecutive frames, and metadata.json. Velocities and accelerations are differences between
+frames, in units of length.
 """
 
 from __future__ import annotations
@@ -17,25 +17,24 @@ from typing import Any
 import h5py
 import numpy as np
 
-from eddies.io.exported_file import create_export
+from eddies.io.new_files import create_export, write_files
 from eddies.io.trajectories import Trajectory
-from eddies.io.whole_files import write_files
 
 SPLITS = ("train", "valid", "test")
-FRAMES_OF_A_SPLIT = 3  # an acceleration needs as many
+FRAMES_OF_A_SPLIT = 3  # the least number, which an acceleration needs
 FLUID = 0  # the type of all particles
-CONNECTIVITY = 1.45  # radius of the pairs of the data sets of LagrangeBench, in mean distances between particles
-SMALLEST_DEVIATION = 1e-7  # what varies less is not divided by its standard deviation
+CONNECTIVITY = 1.45  # radius of pairs in the data sets of LagrangeBench, in mean distances between particles
+SMALLEST_DEVIATION = 1e-7  # a smaller standard deviation is stored as 1: the reader divides by it
 
 
 def split_frames(frames: int) -> list[int]:
-    """Frames of train, valid and test, as LagrangeBench shares one long trajectory: about 2 : 1 : 1."""
+    """Numbers of frames for train, valid and test, about 2 : 1 : 1 as in LagrangeBench."""
     held_out = math.ceil(frames / 4)
     return [frames - 2 * held_out, held_out, held_out]
 
 
 def shortcoming(trajectory: Trajectory) -> str | None:
-    """Why a trajectory makes no data set; None if it does."""
+    """Why a trajectory cannot become a data set; None if it can."""
     times = trajectory.times
     if min(split_frames(len(times))) < FRAMES_OF_A_SPLIT:
         return f"has {len(times)} frames, too few for three parts with {FRAMES_OF_A_SPLIT} each"
@@ -48,17 +47,8 @@ def shortcoming(trajectory: Trajectory) -> str | None:
 
 
 def write_dataset(directory: Path, trajectory: Trajectory, case: str, provenance: Mapping[str, Any]) -> None:
-    """Write a data set of three consecutive parts of a trajectory in which `shortcoming` finds nothing; one rank calls
-    it.
-
-    Args:
-        directory: of the data set; it is made if there is none.
-        trajectory: the particles.
-        case: what the metadata call it.
-        provenance: JSON-able, stored in every file.
-
-    Raises:
-        ProductError: a file cannot be written; those that were there are as they were.
+    """Write a data set, named `case` in its metadata, of three consecutive parts of a trajectory without `shortcoming`;
+    on one rank. ProductError if a file cannot be written; existing files are then unchanged.
     """
     total, start, moments = trajectory.total, 0, []
     lengths = split_frames(len(trajectory.times))
@@ -75,11 +65,11 @@ def write_dataset(directory: Path, trajectory: Trajectory, case: str, provenance
 
 
 def _copy_frames(trajectory: Trajectory, start: int, positions: h5py.Dataset) -> np.ndarray:
-    """Copy frames from `start` on; mean and mean square of their velocities and accelerations: (2, 2, 3)."""
+    """Copy frames from `start` on. Returns mean and mean square of velocity and acceleration, (2, 2, 3)."""
     length, sums, before, velocity_before = trajectory.length, np.zeros((2, 2, 3)), None, None
     for row in range(len(positions)):
         stored = trajectory.read(start + row, "position").astype(np.float32)
-        stored[stored >= length] = 0  # rounded up to the edge, where no particle may be
+        stored[stored >= length] = 0  # float32 may round up to the edge
         positions[row] = stored
         position = stored.astype(np.float64)
         if before is not None:
@@ -95,14 +85,13 @@ def _copy_frames(trajectory: Trajectory, start: int, positions: h5py.Dataset) ->
 
 
 def _statistics(moments: np.ndarray) -> dict[str, list[float]]:
-    """Mean and standard deviation of velocity and acceleration by component, of moments (parts, 2, 2, 3): all parts
-    count the same, however long."""
-    found = {}
+    """Mean and standard deviation of velocity and acceleration from moments (parts, 2, 2, 3), averaged over parts."""
+    statistics = {}
     for name, (mean, square) in zip(("vel", "acc"), moments.mean(axis=0)):
         deviation = np.sqrt(np.maximum(square - mean**2, 0))
-        found[f"{name}_mean"] = mean.tolist()
-        found[f"{name}_std"] = np.where(deviation < SMALLEST_DEVIATION, 1.0, deviation).tolist()
-    return found
+        statistics[f"{name}_mean"] = mean.tolist()
+        statistics[f"{name}_std"] = np.where(deviation < SMALLEST_DEVIATION, 1.0, deviation).tolist()
+    return statistics
 
 
 def _metadata(trajectory: Trajectory, lengths: list[int]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Where a product comes from: id, versions, commit, ranks, date and what it was made from, as JSON in every file."""
+"""The origin of a product, stored in it as JSON: id, versions, commit, ranks, date and ids of what it was made from."""
 
 import datetime
 import functools
@@ -15,24 +15,24 @@ import numpy as np
 from mpi4py import MPI
 
 import eddies
+from eddies.io.checksums import open_to_read
 from eddies.io.errors import ProductError
-from eddies.io.reading import open_to_read
 from eddies.kernels.library import in_use
 from eddies.pipeline import MAKER_OF
 
-# Of the products of this version: no other is read. 1 is that of eddies 0.1, whose files do not say so. Since 2 scales
-# are those of the release, and a model is a list of terms, since 3 the filter width has its own name.
+# Of the products of this version; no other is read. 1, of eddies 0.1, is not stored in the file. Since 2 the scales are
+# those at the release, and a model is a list of terms. Since 3 the filter width has its own name.
 FORMAT = 3
 LIBRARIES = ("numpy", "mpi4py", "h5py", "pyfftw", "torch")
 
 
 def environment(ranks: int) -> dict[str, object]:
-    """Versions of this package and its libraries, the commit in a checkout, number of ranks, date."""
+    """Versions of this package and its libraries, the commit of the checkout, number of ranks, date."""
     return {"eddies": eddies.__version__, "commit": commit(), "libraries": versions(), "kernels": in_use(),
             "ranks": ranks, "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")}
 
 
-@functools.cache  # files with long texts are read for some of them
+@functools.cache  # it reads long files of the installation
 def versions() -> dict[str, str]:
     """Versions of the libraries that this process has loaded."""
     found = {"python": platform.python_version(), "hdf5": h5py.version.hdf5_version,
@@ -46,7 +46,7 @@ def versions() -> dict[str, str]:
 
 
 def commit() -> str | None:
-    """The git commit of the checkout this package runs from, or None; starts no process (MPI dislikes it)."""
+    """The git commit of the checkout that this package runs from, or None. It starts no process, which MPI dislikes."""
     git = Path(eddies.__file__).parents[2] / ".git"
     try:
         head = (git / "HEAD").read_text().strip()
@@ -62,37 +62,38 @@ def commit() -> str | None:
 
 
 def identity(directory: Path, kinds: Iterable[str]) -> dict[str, Any]:
-    """A new `id`, and `made_from`: of the products of these kinds those that lie in a directory, with their ids; None
-    is that of one made before there were ids."""
+    """A new `id`, and `made_from`: the ids of the products of these kinds in a directory. Old products have id None."""
     beside = {kind: product_provenance(directory / MAKER_OF[kind].file) for kind in kinds}
     return {"id": uuid.uuid4().hex, "made_from": {kind: origin.get("id") for kind, origin in beside.items() if origin}}
 
 
 def product_provenance(path: str | Path) -> dict[str, Any]:
-    """Where a complete product of this format comes from, as `read_provenance`; empty if there is none."""
+    """`read_provenance` of a complete product of this format; empty if there is no such product."""
     return _read_sound(path, read_provenance)
 
 
 def product_attributes(path: str | Path, group: str) -> dict[str, Any]:
-    """The attributes of a group of a complete product of this format; empty if there is none."""
+    """The attributes of a group of a complete product of this format; empty if there is no such product."""
     return _read_sound(path, lambda file: dict(file[group].attrs))
 
 
 def product_fingerprint(path: str | Path) -> str | None:
-    """The scene's fingerprint stored in a complete product of this format; None if there is none."""
+    """The scene's fingerprint in a complete product of this format; None if there is no such product."""
     return product_provenance(path).get("fingerprint")
 
 
 def others_trained_on(origin: Mapping[str, Any]) -> list[str]:
-    """The ground truths that a model was trained on where that of its own run is none of them; `origin` is the
-    provenance of the model."""
+    """The ground truths that a model was trained on, if its own run's is not among them; `origin` is the model's
+    provenance."""
     truths = origin.get("truths", {})
     return [] if origin.get("made_from", {}).get("ground_truth") in truths.values() else list(truths)
 
 
 def read_provenance(file: h5py.File) -> dict[str, Any]:
-    """Where an open product comes from: scene text, fingerprint, versions, ranks, date, and but for those made before
-    there were ids `id` and `made_from`; ProductError where it is not what a product holds."""
+    """Scene text, fingerprint, versions, ranks, date, id and `made_from` of an open product; old products have no id.
+
+    Raises ProductError if the attribute is damaged.
+    """
     found = read_json(file, "provenance")
     whole = {"eddies", "commit", "libraries", "ranks", "date"} <= found.keys()
     if not whole or not isinstance(found.get("made_from", {}), dict):
@@ -101,7 +102,7 @@ def read_provenance(file: h5py.File) -> dict[str, Any]:
 
 
 def read_json(file: h5py.File, name: str) -> dict[str, Any]:
-    """The dict that an attribute of an open product holds as JSON; ProductError where it holds none."""
+    """The dict that an attribute of an open product holds as JSON; ProductError if it holds none."""
     try:
         found = json.loads(file.attrs[name])
     except (KeyError, TypeError, ValueError, OSError):
@@ -111,20 +112,19 @@ def read_json(file: h5py.File, name: str) -> dict[str, Any]:
     return found
 
 
+def has_this_format(file: h5py.File) -> bool:
+    """Whether an open product has the format that this version reads."""
+    return bool(np.array_equal(file.attrs.get("format", 1), FORMAT))
+
+
 def _read_sound(path: str | Path, read: Callable[[h5py.File], dict[str, Any]]) -> dict[str, Any]:
-    """What is read of a complete product of this format; empty if there is none."""
     try:
         with open_to_read(path) as file:
             return read(file) if file.attrs.get("complete", False) and has_this_format(file) else {}
-    except (OSError, ValueError, KeyError, TypeError, RuntimeError):  # ProductError is one of the last
+    except (OSError, ValueError, KeyError, TypeError, RuntimeError):  # ProductError is a RuntimeError
         return {}
 
 
 def _damaged(file: h5py.File, name: str) -> ProductError:
     return ProductError(f"{file.filename}: its attribute {name} is not what was written, the file is damaged; delete "
                         "it and make it again")
-
-
-def has_this_format(file: h5py.File) -> bool:
-    """Whether an open product is of the format that this version reads."""
-    return bool(np.array_equal(file.attrs.get("format", 1), FORMAT))

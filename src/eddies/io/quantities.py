@@ -1,18 +1,19 @@
-"""What the datasets of a product say of themselves: units, axes, and what they are.
+"""Units, axes and descriptions of the datasets of products, stored as their attributes.
 
-Units are made of L, the edge of the cube over 2 pi, T, the time that follows from lengths and velocities, and M, so
-that the mean density is 1 M/L^3.
+Units: L is the edge of the cube over 2 pi, T follows from lengths and velocities, M makes the mean density 1 M/L^3.
 """
 
 from __future__ import annotations
 
 from fnmatch import fnmatchcase
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import h5py
+import numpy as np
 
+# The origin of the times in a product, by kind.
 BEGINNING = {"ground_truth": "since the release of the tracers", "rollout": "since the start of the rollout"}
-# What holds for a whole product, by kind: attributes of the file.
+# Attributes of a file with a flow.
 CONVENTIONS = {
     "units": "L: edge of the cube over 2 pi; T: follows from lengths and velocities; M: so that the mean density is "
              "1 M/L^3",
@@ -27,7 +28,7 @@ ORIGINS = {
 
 
 class Quantity(NamedTuple):
-    """Of a dataset: its units, the names of its axes, what it is."""
+    """Units, names of the axes and description of a dataset."""
 
     units: str
     axes: str
@@ -36,7 +37,7 @@ class Quantity(NamedTuple):
 
 PARTICLES, FIELD, ROW = "time particle", "time component z y x", "row"
 POINTS = "at the points i edge / cells of the periodic cube, i = 0, 1, ..."
-# By path in the file, the first that fits.
+# By path in the file; the first match counts.
 QUANTITIES = {
     "particles/*/id": Quantity("1", "particle", "of the particle in each row of every frame"),
     "particles/*/step": Quantity("1", "time", "number of the time step"),
@@ -110,23 +111,27 @@ QUANTITIES = {
 
 
 def conventions(kind: str) -> dict[str, str]:
-    """Attributes of a product that say what its numbers are in, where t = 0 is, and in which box; none of a product
-    without a flow."""
+    """Attributes of a product with units, box and origin of time; empty for a product without a flow."""
     return {**CONVENTIONS, "time_origin": ORIGINS[kind]} if kind in ORIGINS else {}
 
 
+def python_value(value: Any) -> Any:
+    """A number or text of an attribute as a Python object."""
+    return value.item() if isinstance(value, np.generic) else value
+
+
 def describe(dataset: h5py.Dataset) -> None:
-    """Write the attributes `units`, `axes` and `description`; nothing of a dataset that no rule knows. Collective."""
+    """Write the attributes `units`, `axes` and `description` of a known dataset; collective."""
     for name, words in words_on(dataset.file.attrs.get("kind", ""), dataset.name.strip("/")).items():
         dataset.attrs[name] = words
 
 
 def words_on(kind: str, path: str) -> dict[str, str]:
-    """These attributes of what a product of a kind has at a path; empty of what no rule knows."""
+    """Units, axes and description of the dataset at a path in a product of a kind; empty if it is unknown."""
     group, _, name = path.rpartition("/")
-    known = next((known for pattern, known in QUANTITIES.items() if fnmatchcase(path, pattern)), None)
-    if known is None and name == "time":
+    quantity = next((each for pattern, each in QUANTITIES.items() if fnmatchcase(path, pattern)), None)
+    if quantity is None and name == "time":
         beginning = "since the start of the simulation" if group == "fields/final" else BEGINNING.get(kind, "")
-        known = Quantity("T", "time", beginning)
-    return {} if known is None else {"units": known.units, "axes": known.axes,
-                                     "description": known.description.format(name=name.replace("_", " "))}
+        quantity = Quantity("T", "time", beginning)
+    return {} if quantity is None else {"units": quantity.units, "axes": quantity.axes,
+                                        "description": quantity.description.format(name=name.replace("_", " "))}

@@ -1,7 +1,6 @@
 """Particle trajectories in the H5MD 1.1 layout (de Buyl, Colberg & Höfling, Comput. Phys. Commun. 185, 1546).
 
-Row k of every frame belongs to the particle with id k, so a frame needs no sorting to be compared with
-another.
+Row k of every frame belongs to the particle with id k, so frames can be compared without sorting.
 """
 
 from collections.abc import Mapping
@@ -14,7 +13,6 @@ import eddies
 from eddies.io.hdf5 import (append_frame, find_group, growing_dataset, read_frame, read_times, unfit, write_array,
                             write_attributes)
 
-
 IMAGE = "image"
 ROUNDING = 1e-6  # of positions in single precision
 
@@ -22,16 +20,17 @@ ROUNDING = 1e-6  # of positions in single precision
 class TrajectoryWriter:
     """Adds frames of `total` particles to /particles/NAME. Making one and every `append` are collective.
 
-    Args:
-        file: an open product.
-        name: the group under /particles.
-        total: number of particles over all ranks.
-        length: edge of the periodic cube.
-        columns: shape of one particle's value by column, such as {"position": (3,), "density": ()}.
-        dtype: of every column in the file.
-        images: count as well, in the column `image` (3,), how often a particle has left the cube along each axis since
-            the first frame: position + edge * image goes on beyond it, as long as a particle moves by less than half an
-            edge between frames. Then every `append` of a rank has the same rows.
+    Parameters
+    ----------
+    file : an open product.
+    name : the group under /particles.
+    total : number of particles over all ranks.
+    length : edge of the periodic cube.
+    columns : shape of one particle's value by column, such as {"position": (3,), "density": ()}.
+    dtype : of every column in the file.
+    images : whether to add the column `image` (3,). It counts how often a particle has left the cube along each axis
+        since the first frame, so that position + edge * image is a continuous path. Particles must move by less than
+        half an edge between frames, and every `append` of a rank must have the same rows.
     """
 
     def __init__(self, file: h5py.File, name: str, total: int, length: float,
@@ -46,7 +45,9 @@ class TrajectoryWriter:
         self._time = growing_dataset(self._group, "time", (), np.float64)
         self._columns = {column: self._element(column, (total, *shape), dtype)
                          for column, shape in columns.items()}
-        self._images = _Images(length) if images else None
+        self._length, self._images = length, images
+        self._before: np.ndarray | None = None
+        self._image: np.ndarray | int = 0
         if images:
             self._columns[IMAGE] = self._element(IMAGE, (total, 3), np.int16)
 
@@ -54,29 +55,20 @@ class TrajectoryWriter:
         """Add a frame: this rank holds rows start, start + 1, ... of every column, by id; maybe none."""
         append_frame(self._step, np.array(step), ())
         append_frame(self._time, np.array(time), ())
-        if self._images is not None:
-            columns = {**columns, IMAGE: self._images.after(columns["position"])}
+        if self._images:
+            columns = {**columns, IMAGE: self._count_images(columns["position"])}
         for column, dataset in self._columns.items():
             append_frame(dataset, columns[column], (start,) + (0,) * (dataset.ndim - 2))
 
     def _element(self, column: str, frame_shape: tuple[int, ...], dtype: str | np.dtype) -> h5py.Dataset:
         element = self._group.create_group(column)
-        # Hard links: all elements share their times.
+        # Hard links: all columns share their times.
         element["step"], element["time"] = self._step, self._time
         return growing_dataset(element, "value", frame_shape, dtype)
 
-
-class _Images:
-    """How often particles have left a cube along each axis since the first frame."""
-
-    def __init__(self, length: float) -> None:
-        self.length = length
-        self._before: np.ndarray | None = None
-        self._image: np.ndarray | int = 0
-
-    def after(self, position: np.ndarray) -> np.ndarray:
-        """The counts (n, 3) when the same particles are at wrapped positions (n, 3), those of the next frame."""
-        left = np.zeros_like(position) if self._before is None else np.rint((self._before - position) / self.length)
+    def _count_images(self, position: np.ndarray) -> np.ndarray:
+        """The images (n, 3) of this rank's particles at the wrapped positions (n, 3) of the next frame."""
+        left = np.zeros_like(position) if self._before is None else np.rint((self._before - position) / self._length)
         # A rollout may end with positions that are not finite.
         self._image = self._image + np.nan_to_num(left, posinf=0, neginf=0).astype(np.int16)
         self._before = position
@@ -84,21 +76,24 @@ class _Images:
 
 
 class Trajectory:
-    """Reads /particles/NAME of an open product; ProductError if there is none, or it is not what a stage writes."""
+    """Reads /particles/NAME of an open product; ProductError if it is missing or malformed."""
 
     def __init__(self, file: h5py.File, name: str) -> None:
-        self._group = find_group(file, f"particles/{name}")
-        self._in_order: set[tuple[int, int | None]] = set()  # rows whose ids have been looked at
+        self._group = group = find_group(file, f"particles/{name}")
+        self.total = group["id"].shape[0]  # number of particles
+        self.length = float(group["box/edges"][0])  # edge of the periodic cube
+        self.columns = tuple(column for column in group if f"{column}/value" in group)
+        self._in_order: set[tuple[int, int | None]] = set()  # rows whose ids have been checked
 
     @cached_property
     def times(self) -> np.ndarray:
         """Time of each frame, (frames,)."""
         times = read_times(self._group["time"])
         for column in self.columns:
-            found = self._group[column]["value"]
-            if found.shape[:2] != (len(times), self.total):
-                raise unfit(found, f"holds {found.shape[:2]} frames and particles where there are "
-                                   f"{(len(times), self.total)} times and ids")
+            dataset = self._group[column]["value"]
+            if dataset.shape[:2] != (len(times), self.total):
+                raise unfit(dataset, f"holds {dataset.shape[:2]} frames and particles, but there are "
+                                     f"{(len(times), self.total)} times and ids")
         return times
 
     @cached_property
@@ -106,24 +101,11 @@ class Trajectory:
         """Step number of each frame, (frames,)."""
         return self._group["step"][()]
 
-    @property
-    def total(self) -> int:
-        """Number of particles."""
-        return self._group["id"].shape[0]
-
-    @property
-    def length(self) -> float:
-        """Edge of the periodic cube."""
-        return float(self._group["box/edges"][0])
-
-    @property
-    def columns(self) -> tuple[str, ...]:
-        """Names of the stored columns."""
-        return tuple(name for name in self._group if f"{name}/value" in self._group)
-
     def read(self, frame: int, column: str, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Rows start to stop of a column at a frame, (stop - start, ...), in order of id. ProductError where one is not
-        finite, or a position outside of the cube."""
+        """Rows start to stop of a column at a frame, (stop - start, ...), in order of id.
+
+        Raises ProductError if a number is not finite, or a position is outside of the cube.
+        """
         rows, ids = slice(start, stop), self._group["id"]
         if (start, stop) not in self._in_order:
             if not np.array_equal(ids[rows], np.arange(*rows.indices(self.total))):

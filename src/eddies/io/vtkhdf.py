@@ -1,10 +1,8 @@
 """VTKHDF files: a series of fields or of particles in one file that ParaView opens.
 
-Layout: "VTKHDF file format" in the documentation of VTK, version 2.0 of the format, which VTK 9.3 (ParaView 5.12) and
-all later ones read. A file is a copy and needs no other; it appears under its name once it is whole.
-
-The reader takes a file of one step for one without time, and fails on an axis of time in it. A single frame is
-therefore written without steps; its time is the field data `time`.
+Layout: "VTKHDF file format" in the documentation of VTK, version 2.0, which VTK 9.3 (ParaView 5.12) and later versions
+read. A file needs no other file. The reader fails on a time axis with one step. A single frame is therefore written
+without steps; its time is the field data `time`.
 """
 
 import math
@@ -16,30 +14,21 @@ from typing import Any
 import h5py
 import numpy as np
 
-from eddies.io.exported_file import Layout, create_export
 from eddies.io.fields import FieldSeries
 from eddies.io.hdf5 import write_attributes
+from eddies.io.new_files import Layout, create_export
 from eddies.io.trajectories import Trajectory
 
 VERSION = (2, 0)
-BLOCK_BYTES = 2**26  # of a field at once in memory
-OVERHEAD_BYTES_PER_STEP = 2**10  # above its large datasets: far more than is needed
+BLOCK_BYTES = 2**26  # of a field in memory at once
+STEP_BYTES = 2**10  # an upper limit of what a step takes beside the large datasets
 
 
 def write_images(path: Path, series: FieldSeries, length: float, provenance: Mapping[str, Any]) -> None:
-    """Write a series of fields as ImageData, a step for each frame; called by one rank.
+    """Write a series of fields in a cube of edge `length` as ImageData, a step for each frame; on one rank.
 
-    The values are point data. The plane at L, by periodicity equal to that at 0, is added along each axis, so that
-    the (cells + 1)^3 points span the whole cube and every particle lies between them.
-
-    Args:
-        path: of the file; its directory is made if there is none.
-        series: the fields, at least one frame.
-        length: edge L of the periodic cube.
-        provenance: JSON-able, stored as in a product.
-
-    Raises:
-        ProductError: the file cannot be written.
+    The values are point data. The plane at L, equal to that at 0 by periodicity, is added along each axis, so that the
+    (cells + 1)^3 points span the whole cube. ProductError if the file cannot be written.
     """
     cells, frames, layout = series.cells, len(series.times), {}
     for variable in series.variables:
@@ -57,18 +46,10 @@ def write_images(path: Path, series: FieldSeries, length: float, provenance: Map
 
 
 def write_points(path: Path, trajectory: Trajectory, provenance: Mapping[str, Any]) -> None:
-    """Write trajectories as PolyData, a step for each frame, a vertex for each particle; called by one rank.
+    """Write trajectories as PolyData, a step for each frame and a vertex for each particle; on one rank.
 
-    Point data are the particle's `id` and all columns but the position, of a 3 x 3 column the 9 components, row by row;
-    with the column `image` Points + length * image go on beyond the cube.
-
-    Args:
-        path: of the file; its directory is made if there is none.
-        trajectory: the particles, at least one frame.
-        provenance: JSON-able, stored as in a product.
-
-    Raises:
-        ProductError: the file cannot be written.
+    Point data are the particle's `id` and all columns except the position; a 3 x 3 column has 9 components, row by row.
+    ProductError if the file cannot be written.
     """
     frames, total, layout = len(trajectory.times), trajectory.total, {}
     names = {column: "Points" if column == "position" else f"PointData/{column}" for column in trajectory.columns}
@@ -92,9 +73,9 @@ def write_points(path: Path, trajectory: Trajectory, provenance: Mapping[str, An
 @contextmanager
 def _create(path: Path, kind: str, frames: int, layout: Layout,
             provenance: Mapping[str, Any]) -> Iterator[h5py.Group]:
-    """The group VTKHDF of a new file, with empty datasets; the file appears under `path` once the block ends well."""
+    """The group VTKHDF of a new file, with empty datasets."""
     within = {f"VTKHDF/{name}": dataset for name, dataset in layout.items()}
-    with create_export(path, within, provenance, OVERHEAD_BYTES_PER_STEP * frames) as file:
+    with create_export(path, within, provenance, STEP_BYTES * frames) as file:
         root = file["VTKHDF"]
         # The reader wants the type as a string of fixed length.
         write_attributes(root, {"Version": np.array(VERSION), "Type": np.bytes_(kind)})
@@ -102,7 +83,7 @@ def _create(path: Path, kind: str, frames: int, layout: Layout,
 
 
 def _write_steps(root: h5py.Group, times: np.ndarray, offsets: Mapping[str, np.ndarray]) -> None:
-    """The time of each step, and where it begins in each dataset."""
+    """Write the times of the steps, and their offsets in each dataset."""
     if len(times) == 1:
         root["FieldData/time"] = times
         return
@@ -128,7 +109,7 @@ def _copy_field(series: FieldSeries, frame: int, variable: str, dataset: h5py.Da
 
 
 def _write_cells(root: h5py.Group, total: int) -> None:
-    """Number of points, and of cells: a vertex at each point; of the other kinds, which the reader asks for, none."""
+    """Write the number of points and of cells: a vertex at each point, and no lines, polygons and strips."""
     root["NumberOfPoints"] = np.array([total])
     for cells, count in (("Vertices", total), ("Lines", 0), ("Polygons", 0), ("Strips", 0)):
         root[f"{cells}/NumberOfCells"] = root[f"{cells}/NumberOfConnectivityIds"] = np.array([count])
@@ -137,7 +118,7 @@ def _write_cells(root: h5py.Group, total: int) -> None:
 
 
 def _point_offsets(frames: int, total: int, names: Iterable[str]) -> dict[str, np.ndarray]:
-    """Where each step begins in each dataset. All steps share the ids and the cells, which are stored once."""
+    """The offsets of the steps in each dataset. All steps share the ids and the cells, which are stored once."""
     shared = np.zeros(frames, np.int64)
     offsets = {"NumberOfParts": shared + 1, "PartOffsets": shared, "PointDataOffsets/id": shared}
     for name in ("CellOffsets", "ConnectivityIdOffsets"):
@@ -148,5 +129,5 @@ def _point_offsets(frames: int, total: int, names: Iterable[str]) -> dict[str, n
 
 
 def _offsets_of(name: str) -> str:
-    """Where the offsets of a dataset stand among the steps."""
+    """The dataset of a dataset's offsets, among the steps."""
     return "PointOffsets" if name == "Points" else name.replace("PointData/", "PointDataOffsets/")

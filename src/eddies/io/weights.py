@@ -1,4 +1,4 @@
-"""Trained weights: plain tensors with a description, checked when they are read. Nothing is pickled."""
+"""Trained weights: plain tensors with a description. Nothing is pickled."""
 
 import json
 from collections.abc import Mapping
@@ -15,9 +15,9 @@ from eddies.io.provenance import read_json
 def save_weights(comm: MPI.Comm, path: str | Path, kind: str, description: Mapping[str, Any],
                  tensors: Mapping[str, np.ndarray], provenance: Mapping[str, Any],
                  tables: Mapping[str, Mapping[str, np.ndarray]] | None = None) -> None:
-    """Write rank 0's tensors, a JSON-able description and small tables as one product; all ranks call it.
+    """Write rank 0's tensors, a JSON-able description and small tables as one product; collective.
 
-    ProductError on all ranks where it cannot be written, or a tensor is not finite.
+    Raises ProductError on all ranks if the file cannot be written or a tensor is not finite.
     """
     def write() -> None:
         for name, tensor in tensors.items():
@@ -33,11 +33,7 @@ def save_weights(comm: MPI.Comm, path: str | Path, kind: str, description: Mappi
 
 
 def load_weights(comm: MPI.Comm, path: str | Path, kind: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Description and tensors of a product; all ranks call it, and all get everything.
-
-    Raises:
-        ProductError: besides the reasons of `open_product`, a tensor is not finite.
-    """
+    """Description and tensors of a product, on all ranks; collective. ProductError also if a tensor is not finite."""
     with open_product(comm, path, kind) as file:
         description, tensors = read_json(file, "description"), read_table(file, "weights")
     for name, tensor in tensors.items():
@@ -47,6 +43,6 @@ def load_weights(comm: MPI.Comm, path: str | Path, kind: str) -> tuple[dict[str,
 
 
 def load_tables(path: str | Path) -> dict[str, dict[str, np.ndarray]]:
-    """The tables saved with the weights, by name; sends nothing. ProductError as `open_product`."""
+    """The tables saved with the weights, by name; on one rank."""
     with open_product(MPI.COMM_SELF, path, None) as file:
         return {name: read_table(file, name) for name in file if name != "weights"}

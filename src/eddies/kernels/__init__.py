@@ -1,1 +1,1 @@
-"""Loops for the processor, compiled at installation: the only compiled code, behind a plain C interface."""
+"""Compiled loops for the processor, called through a plain C interface."""

@@ -1,4 +1,4 @@
-"""Weights of kriging, and what they tell, by the compiled library."""
+"""Weights of kriging, and sums of neighbours' values with these weights."""
 
 from __future__ import annotations
 
@@ -7,86 +7,76 @@ from collections.abc import Sequence
 
 import numpy as np
 
-MOST_SCALES = 8
-# Of a receiver: its equations are 64 MB then, a vector of them in single precision.
+from eddies.kernels.library import ADDRESS, INT, NUMBER, address, members, require
+
+# Neighbours of a receiver. With so many, the equations of a vector of receivers take 64 MB in single precision.
 MOST_NEIGHBORS = 1024
 
 
 class _Kriging(ctypes.Structure):
-    _fields_ = ([("receivers", ctypes.c_int64), ("pairs", ctypes.c_int64), ("sited", ctypes.c_int64),
-                 ("offsets", ctypes.c_void_p), ("displacement", ctypes.c_void_p), ("support", ctypes.c_double),
-                 ("noise", ctypes.c_double),
-                 ("most", ctypes.c_int64), ("scales", ctypes.c_int64), ("slowest", ctypes.c_double)]
-                + [(name, ctypes.c_void_p) for name in ("amplitudes", "own", "weights")])
+    _fields_ = (members(INT, "receivers pairs sited") + members(ADDRESS, "offsets displacement")
+                + members(NUMBER, "support noise") + members(INT, "most scales") + members(NUMBER, "slowest")
+                + members(ADDRESS, "amplitudes own weights"))
 
 
 class _Told(ctypes.Structure):
-    _fields_ = ([(name, ctypes.c_int64) for name in ("receivers", "rows", "columns")]
-                + [(name, ctypes.c_void_p) for name in ("offsets", "senders", "own", "weights", "field", "result")])
+    _fields_ = members(INT, "receivers rows columns") + members(ADDRESS, "offsets senders own weights field result")
 
 
 def kriging_weights(library: ctypes.CDLL, offsets: np.ndarray, displacement: np.ndarray, support: float, noise: float,
                     slowest: float, amplitudes: np.ndarray,
                     sited: bool = True) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Weights of the receivers' own values, (10, n), and of their neighbours', ten of (m,), which are small enough for
-    memory that is kept: see `eddies.particles.kriging.solved`, which is the definition. NaN where a receiver has more
-    than MOST_NEIGHBORS.
+    """Kriging weights of the receivers' own values, (10, n), and of their neighbours' values, ten arrays (m,).
+
+    Defined by `eddies.particles.kriging.kriging_weights`. NaN for a receiver with more than MOST_NEIGHBORS neighbours.
+    The ten arrays are separate so that freed ones are small enough to be kept by the allocator.
 
     Parameters
     ----------
     offsets : int64 (n + 1,), each receiver's pairs.
-    displacement : (3, m), x_i - x_j, contiguous, of single or double precision.
-    support : beyond which there are no neighbours. noise : variance of what is not part of the field.
-    slowest, amplitudes : of the covariance sum_m amplitudes[m] exp(-slowest 2^m r^2), at most eight.
+    displacement : (3, m), x_i - x_j, contiguous, in single or double precision.
+    support : distance beyond which a receiver has no neighbours.
+    noise : variance of the part of a value that does not belong to the field.
+    slowest, amplitudes : of the covariance sum_m amplitudes[m] exp(-slowest 2^m r^2), at most eight terms.
     sited : whether receivers are particles, whose own values count.
 
-    Raises ValueError for arrays of another kind.
     """
     dtype, pairs = displacement.dtype, displacement.shape[-1]
     offsets, amplitudes = np.ascontiguousarray(offsets, np.int64), np.ascontiguousarray(amplitudes, np.float64)
-    if (dtype not in (np.float32, np.float64) or displacement.shape != (3, pairs) or len(amplitudes) > MOST_SCALES
-            or not displacement.flags.c_contiguous or offsets[-1] != pairs):
-        raise ValueError(f"kriging: contiguous displacements (3, {offsets[-1]}) of single or double precision and at "
-                         f"most {MOST_SCALES} amplitudes are needed; found {dtype} {displacement.shape} and "
-                         f"{len(amplitudes)}")
+    require(displacement, (3, int(offsets[-1])), dtype)
     own, weights = np.empty((10, len(offsets) - 1), dtype), [np.empty(pairs, dtype) for _ in range(10)]
-    rows = np.array([row.ctypes.data for row in weights], np.uint64)
-    given = _Kriging(len(offsets) - 1, pairs, sited, offsets.ctypes.data, displacement.ctypes.data, support, noise,
-                     MOST_NEIGHBORS, len(amplitudes), slowest,
-                     *(array.ctypes.data for array in (amplitudes, own, rows)))
+    rows = np.array([address(row) for row in weights], np.uint64)
+    given = _Kriging(len(offsets) - 1, pairs, sited, address(offsets), address(displacement), support, noise,
+                     MOST_NEIGHBORS, len(amplitudes), slowest, *map(address, (amplitudes, own, rows)))
     getattr(library, f"kriging_{dtype}")(ctypes.byref(given))
     return own, weights
 
 
 def told(library: ctypes.CDLL, offsets: np.ndarray, senders: np.ndarray, own: Sequence[np.ndarray] | None,
          weights: Sequence[np.ndarray], field: np.ndarray) -> np.ndarray:
-    """own_i f_i + sum_j weights_ij f_j by one, three, four or ten rows of weights, (n, c, rows).
+    """own_i f_i + sum_j weights_ij f_j, (n, c, rows), for one, three, four or ten rows of weights.
 
     Parameters
     ----------
-    offsets, senders : int64 (n + 1,) and (m,), each receiver's pairs, and who sends.
-    own, weights : rows of (n,) and of (m,), contiguous, of the precision of the field; no `own` of receivers that are
-        no particles.
-    field : (s, c), contiguous, of single or double precision, the receivers first, if they are particles; no sender is
-        beyond it.
+    offsets, senders : int64 (n + 1,) and (m,), each receiver's pairs, and their senders.
+    own, weights : rows (n,) and rows (m,); no `own` if the receivers are not particles.
+    field : (s, c), in single or double precision, as the weights are. It begins with the receivers if these are
+        particles.
 
-    Raises ValueError for arrays of another kind.
+    Raises ValueError for arrays of another shape or type, and for arrays that are not contiguous.
     """
     receivers, rows, dtype, sited = len(offsets) - 1, len(weights), field.dtype, own is not None
     own = own if sited else []
-    if (rows not in (1, 3, 4, 10) or len(own) != rows * sited or dtype not in (np.float32, np.float64)
-            or field.ndim != 2
-            or len(field) < receivers * sited or offsets[-1] != len(senders)
-            or any(array.dtype != np.int64 or not array.flags.c_contiguous for array in (offsets, senders))
-            or any(array.dtype != dtype or not array.flags.c_contiguous for array in (field, *own, *weights))
-            or any(row.shape != (receivers,) for row in own) or any(row.shape != senders.shape for row in weights)):
-        raise ValueError(f"told: 1, 3, 4 or 10 contiguous rows of weights of {receivers} receivers and {len(senders)} "
-                         f"pairs are needed, of the precision of the field; found {len(own)} and {rows}, and a "
-                         f"field {dtype} {field.shape}")
+    require(offsets, (receivers + 1,), np.int64)
+    require(senders, (int(offsets[-1]),), np.int64)
+    require(field, (len(field), field.shape[-1]), dtype)
+    for row in own:
+        require(row, (receivers,), dtype)
+    for row in weights:
+        require(row, senders.shape, dtype)
     result = np.empty((receivers, field.shape[1], rows), dtype)
-    places = [np.array([row.ctypes.data for row in some], np.uint64) for some in (own, weights)]
-    given = _Told(receivers, rows, field.shape[1], offsets.ctypes.data, senders.ctypes.data,
-                  places[0].ctypes.data if sited else None,
-                  *(array.ctypes.data for array in (places[1], field, result)))
+    of_own, of_weights = (np.array([address(row) for row in some], np.uint64) for some in (own, weights))
+    given = _Told(receivers, rows, field.shape[1], address(offsets), address(senders),
+                  address(of_own) if sited else None, *map(address, (of_weights, field, result)))
     getattr(library, f"told_{dtype}")(ctypes.byref(given))
     return result

@@ -1,4 +1,4 @@
-"""The compiled library: one shared object for each instruction set, of which the processor gets its best."""
+"""The compiled library: one shared object for each instruction set. The best one that the processor runs is loaded."""
 
 from __future__ import annotations
 
@@ -7,27 +7,31 @@ import functools
 import hashlib
 from pathlib import Path
 
+import numpy as np
+
 from eddies.cores import threads
 from eddies.errors import UserError
 
-# As setup.py has them; a processor that runs one runs those before it.
+# Types of arguments and of members of structures.
+INT, NUMBER, ADDRESS = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
+# The same as in setup.py. A processor that runs one of them also runs all before it.
 INSTRUCTION_SETS = ("plain", "avx2", "avx512")
-REMEDY = ("install a C++ compiler (g++), then eddies anew: `pip install --force-reinstall --no-deps .` in its sources, "
+REMEDY = ("install a C++ compiler (g++), then eddies again: `pip install --force-reinstall --no-deps .` in its sources "
           "or `bash mpi_tools/bootstrap.sh`")
 
 
 class MissingLibraryError(UserError):
-    """The compiled library is not there, does not load, or is not of the sources beside it."""
+    """The compiled library is missing, does not load, or was built from other sources than lie beside it."""
 
 
 @functools.cache
 def library() -> ctypes.CDLL:
-    """The library for this processor. Raises MissingLibraryError where there is none."""
+    """The library for this processor. Raises MissingLibraryError."""
     return load(in_use())
 
 
 def instruction_sets() -> list[str]:
-    """Those that the library is built for and this processor runs, the best one last."""
+    """The instruction sets that the library was built for and this processor runs, the best one last."""
     built = [name for name in INSTRUCTION_SETS if _path(name).exists()]
     if "plain" not in built:
         return []
@@ -36,49 +40,69 @@ def instruction_sets() -> list[str]:
 
 
 def in_use() -> str:
-    """The instruction set of the library that serves this process. Raises MissingLibraryError where there is none."""
-    found = instruction_sets()
-    if not found:
+    """The instruction set of the library that this process uses. Raises MissingLibraryError."""
+    available = instruction_sets()
+    if not available:
         raise MissingLibraryError(f"no compiled kernels in {_path('plain').parent}: {REMEDY}")
-    return found[-1]
+    return available[-1]
 
 
 @functools.cache
 def load(instruction_set: str) -> ctypes.CDLL:
-    """The library for an instruction set that it is built for. Raises MissingLibraryError where it does not load, and
-    where it was built from other sources than lie beside it, as they do in a checkout: what it is called with may have
-    changed."""
+    """The library for one instruction set.
+
+    Raises MissingLibraryError if it does not load, or if it was built from other sources than lie beside it: its
+    functions may then take other arguments.
+    """
     share_threads()
     try:
-        found = ctypes.CDLL(str(_path(instruction_set)))
+        loaded = ctypes.CDLL(str(_path(instruction_set)))
     except OSError as error:
         raise MissingLibraryError(f"the compiled kernels do not load ({error}): {REMEDY}") from error
-    sources = sorted(_path("plain").parent.glob("*.?pp"))
-    built_from = getattr(found, "kernel_sources", None)
+    sources = sorted(_path("plain").parent.glob("*.?pp"))  # only a checkout has them
+    built_from = getattr(loaded, "kernel_sources", None)
     if built_from is not None:
         built_from.restype = ctypes.c_char_p
-    told = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest().encode()
-    if sources and (built_from is None or built_from() != told):
-        raise MissingLibraryError(f"the compiled kernels in {sources[0].parent} are of other sources than lie there: "
-                                  "build them anew with `python setup.py build_ext --inplace`")
-    return found
+    digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest().encode()
+    if sources and (built_from is None or built_from() != digest):
+        raise MissingLibraryError(f"the compiled kernels in {sources[0].parent} were built from other sources than "
+                                  "lie beside them: build them again with `python setup.py build_ext --inplace`")
+    return loaded
 
 
 @functools.cache
 def share_threads() -> None:
-    """Let kernels, and torch if it is loaded later, use the OpenMP runtime that pyfftw's wheel brings along. The
-    threads of two runtimes would wait for each other, spinning on the same cores: a step of the direct simulation took
-    twenty times as long."""
+    """Make kernels, and torch if it is loaded later, use the OpenMP runtime of pyfftw's wheel.
+
+    The threads of two runtimes wait for each other, spinning on the same cores: a step of the direct simulation took
+    twenty times as long.
+    """
     maps = Path("/proc/self/maps")
     if threads() == 1 or not maps.exists():
         return
     import pyfftw
-    places = (line.split(maxsplit=5)[5] for line in maps.read_text().splitlines() if "/libgomp" in line)
-    # As maps have it, also where the way to it is a link; elsewhere it has that of the system, as all do.
-    brought = Path(pyfftw.__file__).resolve().parents[1] / "pyfftw.libs"
-    for place in dict.fromkeys(places):
-        if Path(place).parent == brought:
-            ctypes.CDLL(place, mode=ctypes.RTLD_GLOBAL)
+    runtimes = (line.split(maxsplit=5)[5] for line in maps.read_text().splitlines() if "/libgomp" in line)
+    # The maps hold real paths, without links. Without a wheel, pyfftw uses the system's runtime, as all others do.
+    of_wheel = Path(pyfftw.__file__).resolve().parents[1] / "pyfftw.libs"
+    for path in dict.fromkeys(runtimes):
+        if Path(path).parent == of_wheel:
+            ctypes.CDLL(path, mode=ctypes.RTLD_GLOBAL)
+
+
+def members(kind: type, names: str) -> list[tuple[str, type]]:
+    """Members of a ctypes structure that have one type; `names` are separated by spaces."""
+    return [(name, kind) for name in names.split()]
+
+
+def address(array: np.ndarray) -> int:
+    """Address of the first element. The caller keeps the array alive until the call of the library has ended."""
+    return array.ctypes.data
+
+
+def require(array: np.ndarray, shape: tuple[int, ...], dtype: np.dtype) -> None:
+    """Raise ValueError if an array has another shape or type, or is not contiguous."""
+    if array.shape != shape or array.dtype != dtype or not array.flags.c_contiguous:
+        raise ValueError(f"{array.dtype} {array.shape}: contiguous {dtype} {shape} is needed")
 
 
 def _path(instruction_set: str) -> Path:

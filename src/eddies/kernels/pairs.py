@@ -1,4 +1,4 @@
-"""Sums over pairs of particles within a radius, and gradients through them, by the compiled library."""
+"""Sums over pairs of particles within a radius, and gradients through them."""
 
 from __future__ import annotations
 
@@ -8,16 +8,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from eddies.kernels.library import ADDRESS, INT, NUMBER, address, members
+
 MOST_SCALARS = 4
-# What calls return: else the first particle whose position is not finite.
+# Results of calls. Any other result is the number of the first particle whose position is not finite.
 DONE, UNKNOWN, NO_GRADIENT = -1, -2, -3
 
 
 @dataclass(frozen=True)
 class Summand:
-    """One thing to sum: its `kind`, by the name that summands.hpp declares; the numbers that it takes; what the second
-    particle of a mutual pair gets of each component, times that of the first; and the first of those columns of numbers
-    of particles that it reads."""
+    """A quantity to sum over pairs.
+
+    Parameters
+    ----------
+    kind : its name in summands.hpp. numbers : its constants there.
+    parity : (components,); the second particle of a mutual pair gets the first one's value times this.
+    scalar : index of the first column of scalars that it reads.
+    """
 
     kind: str
     numbers: tuple[float, ...]
@@ -26,19 +33,25 @@ class Summand:
 
 
 def kinds(library: ctypes.CDLL) -> list[str]:
-    """Names of the summands that the library has."""
+    """Names of the summands in the library."""
     library.pair_summand.restype = ctypes.c_char_p
-    found: list[str] = []
-    while name := library.pair_summand(ctypes.c_int64(len(found))):
-        found.append(name.decode())
-    return found
+    names: list[str] = []
+    while name := library.pair_summand(INT(len(names))):
+        names.append(name.decode())
+    return names
 
 
 @dataclass(frozen=True)
 class PairSpace:
-    """Where pairs are: a box of this `length`, periodic along z or not, the `radius` within which particles are pairs,
-    and the units of what they carry; `mutual`: each pair is evaluated once, as what j gets of i follows from what i
-    gets of j."""
+    """The box of the pairs and their units.
+
+    Parameters
+    ----------
+    length, periodic_z : edge of the box, and whether it is periodic along z.
+    radius : distance within which two particles are a pair.
+    length_unit, velocity_unit : units of the summands.
+    mutual : whether each pair is evaluated once, for both particles.
+    """
 
     length: float
     periodic_z: bool
@@ -49,26 +62,23 @@ class PairSpace:
 
 
 class _Particles(ctypes.Structure):
-    _fields_ = ([(name, ctypes.c_int64) for name in ("count", "scalars")]
-                + [(name, ctypes.c_void_p) for name in ("position", "velocity", "scalar", "wanted")]
-                + [("length", ctypes.c_double), ("periodic_z", ctypes.c_int64)]
-                + [(name, ctypes.c_double) for name in ("radius", "length_unit", "velocity_unit")]
-                + [("mutual", ctypes.c_int64)])
+    _fields_ = (members(INT, "count scalars") + members(ADDRESS, "position velocity scalar wanted")
+                + members(NUMBER, "length") + members(INT, "periodic_z")
+                + members(NUMBER, "radius length_unit velocity_unit") + members(INT, "mutual"))
 
 
 class _Given(ctypes.Structure):
-    _fields_ = ([("kind", ctypes.c_char_p)]
-                + [(name, ctypes.c_int64) for name in ("numbers_count", "parameters_count", "components", "scalar")]
-                + [(name, ctypes.c_void_p) for name in ("numbers", "parameters", "parity", "sums", "by_sums",
-                                                        "by_parameters")])
+    _fields_ = (members(ctypes.c_char_p, "kind") + members(INT, "numbers_count parameters_count components scalar")
+                + members(ADDRESS, "numbers parameters parity sums by_sums by_parameters"))
 
 
 class CompiledPairs:
-    """Pairs of particles, of which sums are asked for at those `wanted`.
+    """Particles, and sums over their pairs for the `wanted` ones.
 
     Parameters
     ----------
-    position, velocity : (n, 3). scalars : (k, n), k at most MOST_SCALARS, in the units of the summands.
+    position, velocity : (n, 3).
+    scalars : (k, n), at most MOST_SCALARS columns, in the units of the summands.
     wanted : bool (n,).
     kind : float32 or float64, of the arithmetic.
     """
@@ -78,29 +88,34 @@ class CompiledPairs:
         count = len(position)
         if position.shape != (count, 3) or velocity.shape != (count, 3) or wanted.shape != (count,) or \
                 scalars.shape[1:] != (count,) or len(scalars) > MOST_SCALARS:
-            raise ValueError(f"columns {position.shape}, {velocity.shape}, {scalars.shape}, {wanted.shape} are not "
-                             "those of one set of particles")
+            raise ValueError(f"columns {position.shape}, {velocity.shape}, {scalars.shape}, {wanted.shape} do not "
+                             "belong to one set of particles")
         self._library, self._kind, self._count = library, np.dtype(kind), count
         self._columns = [np.ascontiguousarray(column, np.float64) for column in (position, velocity, scalars)]
         self._columns.append(np.ascontiguousarray(wanted, np.uint8))
         self._particles = _Particles(
-            count, len(scalars), *map(_address, self._columns), space.length, space.periodic_z, space.radius,
+            count, len(scalars), *map(address, self._columns), space.length, space.periodic_z, space.radius,
             space.length_unit, space.velocity_unit, space.mutual)
 
     def sums(self, summands: Sequence[Summand], parameters: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """The sums of each summand with its parameters, (components, n): only of those wanted to be used. Raises
-        ValueError where a position is not finite, and where the library has no such summand."""
-        found = [np.empty((len(summand.parity), self._count), self._kind) for summand in summands]
-        self._call("pair_sums", summands, parameters, "sums", found)
-        return found
+        """The sums of each summand with its parameters, (components, n), valid at the wanted particles.
+
+        Raises ValueError if a position is not finite or the library has no such summand.
+        """
+        sums = [np.empty((len(summand.parity), self._count), self._kind) for summand in summands]
+        self._call("pair_sums", summands, parameters, "sums", sums)
+        return sums
 
     def gradients(self, summands: Sequence[Summand], parameters: Sequence[np.ndarray], by_sums: Sequence[np.ndarray],
                   columns: bool) -> tuple[list[np.ndarray], tuple[np.ndarray, ...]]:
-        """From gradients by the sums, zero where none are wanted: those by the parameters, and, if asked for, by
-        position, velocity and scalars. Raises ValueError as `sums`, and where a summand has none."""
+        """Gradients by parameters and, if `columns`, by position, velocity and scalars.
+
+        `by_sums` are gradients by the sums, zero at particles that are not wanted. Raises ValueError as `sums` does,
+        and if a summand has no gradient.
+        """
         by_parameters = [np.zeros(len(values)) for values in parameters]
         by_columns = tuple(np.empty_like(column) for column in self._columns[:3]) if columns else ()
-        given = (ctypes.c_void_p * 3)(*map(_address, by_columns))
+        given = (ADDRESS * 3)(*map(address, by_columns))
         self._call("pair_gradients", summands, parameters, "by_sums",
                    [np.ascontiguousarray(by, self._kind) for by in by_sums], by_parameters, ctypes.byref(given))
         return by_parameters, by_columns
@@ -114,17 +129,13 @@ class CompiledPairs:
             given = structures[number]
             given.kind, given.scalar = summand.kind.encode(), summand.scalar
             given.numbers_count, given.parameters_count, given.components = map(len, arrays)
-            given.numbers, given.parameters, given.parity = map(_address, arrays)
-            setattr(given, field, _address(columns))
+            given.numbers, given.parameters, given.parity = map(address, arrays)
+            setattr(given, field, address(columns))
             if by_parameters:
-                given.by_parameters = _address(by_parameters[number])
+                given.by_parameters = address(by_parameters[number])
         function = getattr(self._library, f"{name}_{self._kind}")
-        function.restype = ctypes.c_int64
-        result = function(ctypes.byref(self._particles), ctypes.c_int64(len(summands)), structures, *more)
+        function.restype = INT
+        result = function(ctypes.byref(self._particles), INT(len(summands)), structures, *more)
         if result != DONE:
-            told = {UNKNOWN: f"no such summands: {summands}", NO_GRADIENT: f"one without a gradient of {summands}"}
-            raise ValueError(f"pairs: {told.get(result, f'the position of particle {result} is not finite')}")
-
-
-def _address(array: np.ndarray) -> int:
-    return array.ctypes.data
+            reasons = {UNKNOWN: f"no such summands: {summands}", NO_GRADIENT: f"no gradient of one of {summands}"}
+            raise ValueError(f"pairs: {reasons.get(result, f'the position of particle {result} is not finite')}")

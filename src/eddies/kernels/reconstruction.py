@@ -1,4 +1,4 @@
-"""Sums over particles at the points of a regular grid, by the compiled library."""
+"""Fields from particles: sums at the points of a regular grid, and moving least squares at any points."""
 
 from __future__ import annotations
 
@@ -7,11 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from eddies.kernels.library import ADDRESS, INT, NUMBER, address, members
+from eddies.kernels.neighbors import Box
+
+FITS = {1: "fit_linear", 2: "fit_quadratic"}
+
 
 @dataclass(frozen=True)
 class GridPlanes:
-    """Planes of a grid of `cells`^2 points each, `spacing` apart, from number `first` on, `planes` of them; periodic
-    along z or not."""
+    """Planes `first` to `first + planes` of a grid with `cells`^2 points each, `spacing` apart."""
 
     cells: int
     spacing: float
@@ -21,27 +25,62 @@ class GridPlanes:
 
 
 class _Reconstruction(ctypes.Structure):
-    _fields_ = ([(name, ctypes.c_int64) for name in ("particles", "cells", "first_plane", "planes", "periodic_z")]
-                + [("spacing", ctypes.c_double), ("support", ctypes.c_double)]
-                + [(name, ctypes.c_void_p) for name in ("position", "kernel", "columns", "sums")])
+    _fields_ = (members(INT, "particles cells first_plane planes periodic_z") + members(NUMBER, "spacing support")
+                + members(ADDRESS, "position kernel columns sums"))
+
+
+class _Fit(ctypes.Structure):
+    _fields_ = (members(INT, "receivers periodic_z") + members(NUMBER, "length volume ridge")
+                + members(ADDRESS, "offsets senders receiver position value kernel found"))
+
+
+def told_kernel(support: float, pieces: np.ndarray, signed: bool = False) -> tuple[float, ...]:
+    """A smoothing kernel W as numbers for the library.
+
+    Parameters
+    ----------
+    pieces : W in equally long pieces of the support, (pieces, coefficients): the coefficients of u^0, u^1, ..., where u
+        falls from 1 to 0 along a piece.
+    signed : whether W may be negative.
+    """
+    return support, -np.inf if signed else 0.0, *map(float, pieces.shape), *map(float, pieces.ravel())
 
 
 def sums_on_grid(library: ctypes.CDLL, grid: GridPlanes, told: tuple[float, ...], position: np.ndarray,
                  columns: np.ndarray) -> np.ndarray:
-    """sum_j c_j W(x - x_j) of columns c (n, 4) of particles (n, 3) at the points of the planes, (points, 4), in the
-    precision of the columns; W as `told_kernel` tells it."""
+    """sum_j c_j W(x - x_j) of columns c (n, 4) of particles (n, 3) at the points of the planes, (points, 4).
+
+    `told` is W as `told_kernel` returns it. The result has the precision of the columns.
+    """
     position, columns = np.ascontiguousarray(position, np.float64), np.ascontiguousarray(columns)
     if columns.shape != (len(position), 4):
         raise ValueError(f"columns {columns.shape} of {len(position)} particles: four are needed")
-    sums = np.empty((grid.planes * grid.cells**2, 4), columns.dtype)
-    kernel = np.array(told)
+    sums, kernel = np.empty((grid.planes * grid.cells**2, 4), columns.dtype), np.array(told)
     given = _Reconstruction(len(position), grid.cells, grid.first, grid.planes, grid.periodic_z, grid.spacing, told[0],
-                            *(array.ctypes.data for array in (position, kernel, columns, sums)))
+                            *map(address, (position, kernel, columns, sums)))
     getattr(library, f"reconstruction_sums_{columns.dtype}")(ctypes.byref(given))
     return sums
 
 
-def told_kernel(support: float, pieces: np.ndarray, signed: bool = False) -> tuple[float, ...]:
-    """A smoothing kernel as the library wants it: where it ends, its least value (none of a `signed` one), and W in
-    each of equally long pieces, the coefficients of u^0, u^1, ... for u = 1 ... 0 there, (pieces, coefficients)."""
-    return support, -np.inf if signed else 0.0, *map(float, pieces.shape), *map(float, pieces.ravel())
+def fitted(library: ctypes.CDLL, box: Box, degree: int, told: tuple[float, ...], volume: float, ridge: float,
+           offsets: np.ndarray, senders: np.ndarray, receivers: np.ndarray, positions: np.ndarray,
+           values: np.ndarray) -> np.ndarray:
+    """Moving least squares: values and their derivatives along x, y and z, (n, 4, 3), of the best polynomials.
+
+    Defined by `eddies.particles.particle_field.ParticleField.fitted`.
+
+    Parameters
+    ----------
+    degree : of the polynomials, 1 or 2. told : the weight W as `told_kernel` returns it.
+    volume : mean volume of a particle. ridge : see the definition.
+    offsets, senders : int64 (n + 1,) and (m,), the particles listed near each receiver; some may be too far.
+    receivers (n, 3), positions and values (s, 3), in double precision.
+    """
+    kernel = np.array(told)
+    offsets, senders = (np.ascontiguousarray(numbers, np.int64) for numbers in (offsets, senders))
+    receivers, positions, values = (np.ascontiguousarray(a, np.float64) for a in (receivers, positions, values))
+    found = np.empty((len(receivers), 4, 3))
+    given = _Fit(len(receivers), box.periodic_z, box.length, volume, ridge,
+                 *map(address, (offsets, senders, receivers, positions, values, kernel, found)))
+    getattr(library, FITS[degree])(ctypes.byref(given))
+    return found

@@ -1,1 +1,1 @@
-"""Training on particles shared among ranks: losses that are global, gradients that are summed."""
+"""Training on particles shared among ranks: losses are global, gradients are summed over ranks."""

@@ -23,14 +23,13 @@ from eddies.particles.particle_set import ParticleSet
 from eddies.particles.reconstruction import reconstruct, volumes
 from eddies.particles.smoothing_kernels import SmoothingKernel
 
-# Histograms of the divergence losses: bins over this many standard deviations to each side.
+# Histograms of the divergence losses: number of bins, and reach to each side in standard deviations.
 HISTOGRAM_BINS, HISTOGRAM_REACH = 41, 5.0
 
 
 @dataclass(frozen=True)
 class LossWeights:
-    """Weights of Eq. 15 in units of that of the trajectory loss: field, and the divergences of velocity and
-    acceleration; and that of the power, which is no part of it."""
+    """Weights over that of the trajectory loss: of the other losses of Eq. 15, and of the power, which is not in it."""
 
     field: float = 0.0
     velocity_kl: float = 0.0
@@ -40,7 +39,7 @@ class LossWeights:
 
 @dataclass(frozen=True)
 class KernelNeighborhood:
-    """Halo and list within a kernel's support, positions (s, 3) and volumes (s,) of the particles and their ghosts."""
+    """Halo and list within a kernel's support; position (s, 3) and volumes (s,) of the particles and their ghosts."""
 
     kernel: SmoothingKernel
     neighborhood: Neighborhood
@@ -50,13 +49,13 @@ class KernelNeighborhood:
 
 @dataclass(frozen=True)
 class FieldLater:
-    """One frame after a frame: where its particles are and how they move, and the filtered velocity of the flow.
+    """Particles and filtered flow one frame after a frame.
 
     Parameters
     ----------
-    position, velocity : (n, 3) of its particles, in its rows; positions go on beyond the box.
-    span : the time from the frame before it to the frame after it.
-    points : (m, 3), those of this rank at which the filtered field is stored. field : (m, 3), its velocity there.
+    position, velocity : (n, 3), in the rows of the frame's particles; positions are not wrapped into the box.
+    span : time from the frame before the frame to the frame after it.
+    points, field : this rank's grid points (m, 3), and the filtered velocity (m, 3) there.
     """
 
     position: Tensor
@@ -67,18 +66,19 @@ class FieldLater:
 
 
 class TrainingFrame:
-    """The particles of one moment with their true rates, and the model's terms around them; making one is collective.
+    """The particles of one frame with their true rates, and the model's terms around them; collective.
+
+    Terms that are linear in their parameters are evaluated once, here.
 
     Parameters
     ----------
-    dynamics : of the model that is trained, on the slabs of the particles; for this frame alone.
-    particles : as they are at that moment.
-    acceleration, density_rate : (n, 3) and (n,), what the model should answer; the latter None where nothing reads the
-        density.
-    later : what the field loss compares with, where that is the filtered flow.
+    dynamics : of the model, on the slabs of the particles; for this frame alone.
+    particles : at the time of the frame.
+    acceleration, density_rate : true rates (n, 3) and (n,); no density rate if no term reads the density.
+    later : the filtered flow for the field loss; without it that loss compares with the true particles.
 
     `acceleration_rms` and `density_rate_rms` are their rms over all ranks, of one component; `total` is the number of
-    particles of all ranks. What terms that are linear in their parameters do at these particles is computed once.
+    particles of all ranks.
     """
 
     def __init__(self, dynamics: ParticleDynamics, particles: ParticleSet, acceleration: Tensor,
@@ -87,7 +87,7 @@ class TrainingFrame:
         self.particles, self.acceleration, self.density_rate = particles, acceleration, density_rate
         self.later = later
         self.kept = self.model.linear_rates(dynamics.context(particles))
-        dynamics.release()  # weights of neighbours, which no other term may ask for
+        dynamics.release()  # kriging weights, which the other terms may not need
         self.acceleration_rms, self.total = self._rms(acceleration)
         self.density_rate_rms = None if density_rate is None else self._rms(density_rate)[0]
         self._sorted_ids, self._row_of_sorted = torch.sort(particles.id)
@@ -101,14 +101,16 @@ class TrainingFrame:
 
     @cached_property
     def fluctuation(self) -> Tensor:
-        """Velocities (n, 3) less their mean, times d / u'^3: an acceleration times them is what it adds to the energy
-        in units of u'^3 / d, u' the rms of a component as it is then, d the width of the filter; collective."""
+        """(v - <v>) d / u'^3 (n, 3), d the filter width, u' the rms of a component of v - <v>; collective.
+
+        Its product with an acceleration is the power in units of u'^3 / d.
+        """
         velocity = self.particles.velocity
         velocity = velocity - mean_over_ranks(self.decomposition.comm, velocity)
         return velocity * (self.model.flow.scales.filter_width / self._rms(velocity)[0] ** 3)
 
     def rows(self, ids: np.ndarray) -> Tensor:
-        """Rows of those of the given particles that this rank owns."""
+        """Rows of the given particles, as far as this rank owns them."""
         wanted = torch.from_numpy(ids).to(self._sorted_ids.device)
         place = torch.searchsorted(self._sorted_ids, wanted)
         inside = place < len(self._sorted_ids)
@@ -117,39 +119,41 @@ class TrainingFrame:
 
     @property
     def averaged(self) -> ParticleSet:
-        """The particles where the field loss averages over them."""
+        """The particles at the positions at which the field loss averages over them."""
         return self.particles if self.later is None else replace(self.particles, position=self.later.position)
 
     @torch.no_grad()
     def within(self, kernel: SmoothingKernel) -> KernelNeighborhood:
-        """Halo, list and volumes within the support of a kernel, at the positions where the field loss averages.
+        """Halo, list and volumes of the `averaged` particles within a kernel's support; collective.
 
-        Collective. The result is kept until another kernel is given.
+        The result is kept until another kernel is given.
         """
         if self._within is None or self._within.kernel is not kernel:
-            found, averaged = self.dynamics.neighborhood, self.averaged
-            # The model has no list, or a shorter one, or that of another moment.
-            if found is None or found.cutoff < kernel.support * (1 - 1e-9) or self.later is not None:
-                found = Neighborhood(self.decomposition, self.decomposition.length, kernel.support, 0.0)
-                found.update(averaged)
-            position = found.local(averaged.position).position
-            pairs = found.neighbors.pairs(position[: len(self.particles)], position, dtype=self.acceleration.dtype)
-            self._within = KernelNeighborhood(kernel, found, position, found.column(volumes(kernel, pairs)))
+            around, averaged = self.dynamics.neighborhood, self.averaged
+            # The model's list serves if it reaches as far and belongs to the same positions.
+            if around is None or around.cutoff < kernel.support * (1 - 1e-9) or self.later is not None:
+                around = Neighborhood(self.decomposition, self.decomposition.length, kernel.support, 0.0)
+                around.update(averaged)
+            position = around.local(averaged.position).position
+            pairs = around.neighbors.pairs(position[: len(self.particles)], position, dtype=self.acceleration.dtype)
+            self._within = KernelNeighborhood(kernel, around, position, around.column(volumes(kernel, pairs)))
         return self._within
 
     def errors(self, rows: Tensor | None = None, density: Tensor | None = None) -> dict[str, Tensor]:
-        """Predicted minus true "acceleration" (k, 3), and "density_rate" (k,) if the model has one, at all owned
-        particles or some of their rows; with another `density` (n,) than terms give. Collective."""
-        kept = slice(None) if rows is None else rows
+        """Predicted minus true "acceleration" (k, 3) and, if the model has one, "density_rate" (k,); collective.
+
+        At all owned particles, or at some `rows`; with the density of the terms, or with another `density` (n,).
+        """
+        chosen = slice(None) if rows is None else rows
         rates = self.dynamics.rates(self.particles, rows, self.kept, density)
-        errors = {"acceleration": rates.acceleration.to(self.acceleration) - self.acceleration[kept]}
+        errors = {"acceleration": rates.acceleration.to(self.acceleration) - self.acceleration[chosen]}
         if rates.density_rate is not None:
-            errors["density_rate"] = rates.density_rate.to(self.density_rate) - self.density_rate[kept]
+            errors["density_rate"] = rates.density_rate.to(self.density_rate) - self.density_rate[chosen]
         return errors
 
     @torch.no_grad()
     def seen(self) -> ParticleSet:
-        """The particles with the density that the model sees; collective."""
+        """The particles with the density that the model's terms read; collective."""
         rates = self.dynamics.rates(self.particles, self._row_of_sorted[:0], self.kept)
         return self.particles if rates.density is None else replace(self.particles, density=rates.density)
 
@@ -157,14 +161,15 @@ class TrainingFrame:
 class ForceTrainer:
     """Trains a particle model, first on trajectories and power, then on all losses of Eq. 15 together.
 
-    Every step draws a frame, and then either `batch` particles by their ids, or for the field loss all particles in
-    and around a cube of the box; both from (seed, step) alone. So the loss is the same on any number of ranks.
+    Every step draws a frame, and then `batch` particles by their ids or, for the field loss, all particles in and
+    around a cube of the box. Both are drawn from (seed, step) alone, so that the loss is the same on any number of
+    ranks.
 
     Parameters
     ----------
     model, frames : the frames all on the same slabs.
-    kernel : of the field loss, which compares on a grid of about as many points as there are particles, or on that of
-        the filtered field; None if it has no weight.
+    kernel : of the field loss; None without that loss. Its grid has about as many points as there are particles, or is
+        that of the filtered field.
     weights : of the losses. batch : particles of a step without the field loss.
     """
 
@@ -179,21 +184,21 @@ class ForceTrainer:
                         else later.points)
 
     def trajectory_step(self, optimizer: Adam, step: int) -> dict[str, float]:
-        """One step on the trajectory loss of a random batch of particles (Eq. 12), and on their power where that has a
-        weight; returns the losses."""
+        """One step on the trajectory loss (Eq. 12), and on the power, of a random batch; returns the losses."""
         frame, random = self._drawn(step)
         rows = frame.rows(random.choice(self.total, self.batch, replace=False))
         return self._step(optimizer, self._one_step_shares(frame, rows, frame.errors(rows), self.batch))
 
     def combined_step(self, optimizer: Adam, step: int) -> dict[str, float]:
-        """One step on all losses: of the particles in and around a random cube where the field loss is among them, of
-        a random batch otherwise; returns the losses."""
+        """One step on all losses, in a random cube with the field loss, else on a random batch; returns the losses."""
         return self._step(optimizer, self._combined_shares(*self._drawn(step)))
 
     @torch.no_grad()
     def one_step_error(self, frame: TrainingFrame, most: int) -> float:
-        """Normalised L2 error of the acceleration on a fixed sample of at most so many particles of a frame, and the
-        root of the sum of its square and the weighted loss of the power where that has a weight; collective."""
+        """Normalised L2 error of the acceleration on a fixed sample of at most `most` particles of a frame; collective.
+
+        With a loss of the power, the root of the sum of its square and that weighted loss.
+        """
         count = min(most, self.total)
         rows = frame.rows(np.random.default_rng(self.seed).choice(self.total, count, replace=False))
         errors = frame.errors(rows)
@@ -205,13 +210,13 @@ class ForceTrainer:
 
     @torch.no_grad()
     def combined_error(self, frame: TrainingFrame, draws: int) -> float:
-        """Root of the weighted sum of all losses on one frame, in the mean of always the same draws; collective."""
+        """Root of the weighted sum of all losses on one frame, averaged over always the same draws; collective."""
         shares = [self._weighted(self._combined_shares(frame, np.random.default_rng([self.seed, draw])))
                   for draw in range(draws)]
         return float(shared_values(self.comm, {"loss": sum(shares)})["loss"] / draws) ** 0.5
 
     def _drawn(self, step: int) -> tuple[TrainingFrame, np.random.Generator]:
-        """The frame of a step, and what draws its particles."""
+        """The frame of a step, and the generator that draws its particles."""
         random = np.random.default_rng([self.seed, step])
         return self.frames[random.integers(len(self.frames))], random
 
@@ -219,14 +224,14 @@ class ForceTrainer:
         """This rank's shares of all losses, unweighted."""
         if self.weights.field > 0:
             corner, side, reach = random.uniform(0, self.length, 3), self.length / 4, self.kernel.support
-            rows = self._within(frame.averaged.position, corner - reach, side + 2 * reach)
+            rows = self._in_cube(frame.averaged.position, corner - reach, side + 2 * reach)
             count = int(global_sum(self.comm, len(rows)))
         else:
             rows, count = frame.rows(random.choice(self.total, self.batch, replace=False)), self.batch
         errors = frame.errors(rows)
         shares = self._one_step_shares(frame, rows, errors, count)
         if self.weights.field > 0:
-            inside = self._within(self._points, corner, side)
+            inside = self._in_cube(self._points, corner, side)
             shares["field"] = self._field_share(frame, rows, errors["acceleration"], inside)
         return shares | self._divergence_shares(frame, rows, errors["acceleration"])
 
@@ -242,46 +247,41 @@ class ForceTrainer:
 
     def _one_step_shares(self, frame: TrainingFrame, rows: Tensor, errors: dict[str, Tensor],
                          count: int) -> dict[str, Tensor]:
-        """Those of the losses of a step without the kernel and histograms."""
-        shares = {"trajectory": self._trajectory_share(frame, errors, count)}
+        """Shares of the losses without kernel and histograms, over `count` particles of all ranks.
+
+        The trajectory loss is Eq. 12 with centred differences. Each rate is in units of its rms at the time: all frames
+        of a decaying flow count alike. A rate of density counts unless one of its terms is learned through several
+        steps of the simulation.
+        """
+        share = mean_square_share(errors["acceleration"], frame.acceleration_rms, count)
+        if self.model.regresses_density:
+            share = share + mean_square_share(errors["density_rate"], frame.density_rate_rms, count)
+        shares = {"trajectory": share}
         if self.weights.power > 0:
             shares["power"] = self._power_share(frame, rows, errors["acceleration"], count)
         return shares
 
     def _power_share(self, frame: TrainingFrame, rows: Tensor, error: Tensor, count: int) -> Tensor:
-        """((d / u'^3) <u . (a - a_true)>)^2, the mean over `count` particles of all ranks: what the force adds to the
-        energy or takes out beside what it should.
+        """((d / u'^3) <u . (a - a_true)>)^2, the mean over `count` particles: the squared error of the power.
 
-        Coefficients that are fitted to accelerations alone drain too little: what is told of the flow is not the flow,
-        so a regression on it is too flat.
+        Coefficients that are fitted to accelerations alone drain too little energy: the features are noisy, so that
+        the regression is attenuated.
         """
         power = sum_over_ranks(self.comm, (frame.fluctuation[rows].to(error) * error).sum()[None] / count)
         return power.square().sum() / self.comm.size  # every rank has the whole, so its share is an equal part
 
-    def _trajectory_share(self, frame: TrainingFrame, errors: dict[str, Tensor], count: int) -> Tensor:
-        """Eq. 12 with centred differences, each rate in units of its rms at that moment, so that all moments of a
-        decaying flow count alike.
-
-        A rate of density counts only if none of its terms has to be learned through several steps of the simulation.
-        """
-        share = mean_square_share(errors["acceleration"], frame.acceleration_rms, count)
-        if self.model.regresses_density:
-            share = share + mean_square_share(errors["density_rate"], frame.density_rate_rms, count)
-        return share
-
     def _field_share(self, frame: TrainingFrame, rows: Tensor, error: Tensor, inside: Tensor) -> Tensor:
-        """Eq. 13 per time step: the error of the kernel average <.> at some rows of the grid points, of all ranks, over
-        the rms of the acceleration.
+        """Eq. 13 per time step: squared error of the kernel average <.> at some grid points of all ranks, over the mean
+        square of the acceleration.
 
-        Without a field, <a - a_true> of the particles where they are: the velocity one step ahead is compared with that
-        of the true particles, both through the kernel. The kernel's own error is many times what a step changes, and
-        the force cannot make up for it.
+        Without a field the error is <a - a_true> at the true positions: both velocities one step ahead are averaged by
+        the kernel. The kernel's own error is far larger than the change in a step, and the force cannot correct it.
 
-        With a filtered field u one frame later, (<v> - u) / span: v = v_before + span a is the velocity of the model's
-        particles after a step of the midpoint rule from the frame before to the frame after, span its length.
-        As a is compared with centred differences, v is the true velocity then plus span (a - a_true). The positions
-        after such a step do not depend on a, and are the true ones. So this is the error without a field plus what the
-        kernel makes wrong of the true particles, over span.
+        With a filtered field u one frame later, the error is (<v> - u) / span. Here v = v_before + span a is the
+        model's velocity after a midpoint step from the frame before to the frame after, span its length. As a is
+        compared with centred differences, v is the true velocity then plus span (a - a_true). The positions after such
+        a step do not depend on a: they are the true ones. So this error is the one without a field plus the kernel's
+        error for the true particles over span.
         """
         within, later, points = frame.within(self.kernel), frame.later, self._points[inside]
         change = torch.zeros_like(frame.acceleration).index_add(0, rows, error)
@@ -298,25 +298,26 @@ class ForceTrainer:
         return mean_square_share(field, frame.acceleration_rms, max(count, 1))
 
     def _divergence_shares(self, frame: TrainingFrame, rows: Tensor, error: Tensor) -> dict[str, Tensor]:
-        """Eq. 14, components together, for the acceleration, and for the velocity that the error of the acceleration
-        leads to after a time v_rms / a_rms."""
-        shares = {}
-        scales, truth = self.model.flow.scales, frame.acceleration[rows]
+        """Eq. 14 over all components, for the acceleration and for the velocity.
+
+        The velocity is the true one plus the effect of the error of the acceleration after a time v_rms / a_rms.
+        """
+        shares, truth = {}, frame.acceleration[rows]
         if self.weights.acceleration_kl > 0:
             shares["acceleration_kl"] = self._divergence(truth / frame.acceleration_rms, error / frame.acceleration_rms)
         if self.weights.velocity_kl > 0:
-            velocity = frame.particles.velocity[rows].to(truth) / scales.velocity
+            velocity = frame.particles.velocity[rows].to(truth) / self.model.flow.scales.velocity
             shares["velocity_kl"] = self._divergence(velocity, error / frame.acceleration_rms)
         return shares
 
     def _divergence(self, truth: Tensor, error: Tensor) -> Tensor:
         with torch.no_grad():
             expected = soft_histogram(self.comm, truth, HISTOGRAM_BINS, HISTOGRAM_REACH)
-        found = soft_histogram(self.comm, truth + error, HISTOGRAM_BINS, HISTOGRAM_REACH)
+        predicted = soft_histogram(self.comm, truth + error, HISTOGRAM_BINS, HISTOGRAM_REACH)
         # Every rank has the whole divergence, so its share is an equal part.
-        return kullback_leibler(expected, found) / self.comm.size
+        return kullback_leibler(expected, predicted) / self.comm.size
 
-    def _within(self, points: Tensor, corner: np.ndarray, side: float) -> Tensor:
-        """Rows of the points (m, 3) that lie in a periodic cube."""
+    def _in_cube(self, points: Tensor, corner: np.ndarray, side: float) -> Tensor:
+        """Rows of the points (m, 3) in a periodic cube."""
         offset = (points - torch.from_numpy(corner).to(points.device)) % self.length
         return torch.nonzero((offset < side).all(1)).squeeze(1)

@@ -17,50 +17,48 @@ from eddies.particles.smoothing_kernels import KernelNetwork
 
 @dataclass(frozen=True)
 class KernelLossWeights:
-    """Weights of Eq. 8 besides that of the velocity, which is 1."""
+    """Weights of Eq. 8; that of the velocity is 1."""
 
     gradient: float = 1.0
     normalization: float = 0.0
 
 
 class KernelSample:
-    """A filtered field on the grid points of a slab and the particles in it, at one moment.
+    """A filtered field on the grid points of a slab and the particles in it, at one time.
 
     Parameters
     ----------
     particles : with their velocities.
-    field : (m, 3) and gradient (m, 3, 3) [component, direction], the filtered velocity at the m grid points, z slowest.
+    field, gradient : velocity (m, 3) and gradient (m, 3, 3) [component, direction] at the m grid points, z slowest.
+
+    `mean_square` holds the mean squares of a component of both, over the whole grid.
     """
 
     def __init__(self, particles: ParticleField, field: Tensor, gradient: Tensor) -> None:
         self.particles, self.decomposition = particles, particles.decomposition
         self.field, self.gradient = field.to(particles.dtype), gradient.to(particles.dtype)
-        self.mean_square = self._mean_squares()
+        self.mean_square = self._mean_squares(self.field, self.gradient)
 
     def own_rows(self, points: np.ndarray) -> Tensor:
-        """Rows of those of the given points (numbers in the whole grid, z slowest) that lie in this slab."""
+        """Rows of the given points (numbers in the whole grid, z slowest), as far as they lie in this slab."""
         n = self.decomposition.planes
         own = points[(points // n**2 >= self.decomposition.start) & (points // n**2 < self.decomposition.stop)]
         return torch.from_numpy(own - self.decomposition.start * n**2)
 
     def errors_of(self, velocity: Tensor, gradient: Tensor) -> tuple[float, float]:
-        """Normalised L2 errors over the whole grid of a reconstruction of all grid points; collective."""
-        squares = [(velocity - self.field).double().square().sum(), (gradient - self.gradient).double().square().sum()]
-        totals = global_sum(self.decomposition.comm, np.array([float(square) for square in squares]))
-        points = self.decomposition.planes**3
-        return tuple(np.sqrt(total / (points * components * mean)) for total, components, mean
-                     in zip(totals, (3, 9), self.mean_square))
+        """Normalised L2 errors of a reconstruction (m, 3) and (m, 3, 3) over the whole grid; collective."""
+        squares = self._mean_squares(velocity - self.field, gradient - self.gradient)
+        return tuple(np.sqrt(np.array(squares) / self.mean_square))
 
-    def _mean_squares(self) -> tuple[float, float]:
-        """Mean square of one component of the velocity and of one of its gradient, over the whole grid."""
-        sums = np.array([float(part.double().square().sum()) for part in (self.field, self.gradient)])
+    def _mean_squares(self, velocity: Tensor, gradient: Tensor) -> tuple[float, float]:
+        sums = np.array([float(part.double().square().sum()) for part in (velocity, gradient)])
         return tuple(global_sum(self.decomposition.comm, sums) / (self.decomposition.planes**3 * np.array([3, 9])))
 
 
 class KernelTrainer:
-    """Fits a kernel network to samples: at each step the loss of Eq. 8 on random grid points of one of them.
+    """Fits a kernel network to samples: the loss of Eq. 8 on random grid points of one of them at each step.
 
-    Points are drawn from (seed, step) alone, so the loss is the same on any number of ranks.
+    Points are drawn from (seed, step) alone, so that the loss is the same on any number of ranks.
     """
 
     def __init__(self, network: KernelNetwork, samples: list[KernelSample], weights: KernelLossWeights, points: int,
@@ -76,7 +74,7 @@ class KernelTrainer:
         rows = sample.own_rows(np.sort(random.choice(self.total, self.points, replace=False)))
         kernel = self.network.table()
         velocity, gradient = sample.particles.on_grid(kernel, sample.particles.volumes_by_table(kernel), rows)
-        # Each term in units of the mean square of what it reconstructs.
+        # Each term in units of the mean square of the reconstructed quantity.
         error = velocity - sample.field[rows]
         shares = {"velocity": mean_square_share(error, sample.mean_square[0] ** 0.5, self.points)}
         total = shares["velocity"]

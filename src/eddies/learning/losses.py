@@ -1,4 +1,4 @@
-"""Losses of Eqs. 12 to 15, each as this rank's share of a global mean; and the divergence of histograms."""
+"""Losses of Eqs. 12 to 15, as this rank's share of a global mean, and the divergence of histograms."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from eddies.particles.exchanges import sum_over_ranks
 
 
 def mean_square_share(error: Tensor, scale: float, total: int) -> Tensor:
-    """This rank's share of the mean of |error|^2 / scale^2 over `total` rows and all components: a scalar.
+    """This rank's share of the mean of |error|^2 / scale^2 over `total` rows of all ranks and all components.
 
-    `total` is the global number of rows; shares add up to the mean (Eq. 12 with each component scaled to one).
+    Shares add up to the mean (Eq. 12 with each component scaled to one).
     """
     components = error.shape[1] if error.dim() > 1 else 1
     return (error / scale).square().sum() / (components * total)
@@ -28,10 +28,10 @@ def relative_error(comm: Comm, error: Tensor, exact: Tensor) -> float:
 
 
 def soft_histogram(comm: Comm, values: Tensor, bins: int, reach: float) -> Tensor:
-    """Global histogram of `values` (any shape) over [-reach, reach], mass 1, differentiable: (bins,).
+    """Differentiable global histogram (bins,) of values of any shape over [-reach, reach], of mass 1; collective.
 
-    Each value spreads its mass linearly over the two nearest bin centres. Values beyond the ends count at the ends, so
-    no mass is lost. NaN where a value is NaN. Collective.
+    Each value spreads its mass linearly over the two nearest bin centres. Values beyond the ends count at the ends. NaN
+    if a value is NaN.
     """
     position = (values.flatten().clamp(-reach, reach) + reach) * ((bins - 1) / (2 * reach))
     lower = position.detach().nan_to_num().floor().clamp(max=bins - 2).long()
@@ -43,6 +43,6 @@ def soft_histogram(comm: Comm, values: Tensor, bins: int, reach: float) -> Tenso
 
 
 def kullback_leibler(truth: Tensor, predicted: Tensor, floor: float = 1e-6) -> Tensor:
-    """sum_k P log(P / Q) of two histograms (bins,) (Eq. 14). `floor` is added to every bin of both."""
+    """sum_k P log(P / Q) of two histograms (bins,) (Eq. 14), after `floor` is added to every bin of both."""
     truth, predicted = (truth + floor) / (truth + floor).sum(), (predicted + floor) / (predicted + floor).sum()
     return (truth * torch.log(truth / predicted)).sum()

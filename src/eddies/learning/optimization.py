@@ -1,4 +1,4 @@
-"""Gradient descent by ranks that each differentiate their share of one global loss."""
+"""Gradient descent on a global loss of which each rank differentiates its share."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.optim.adam import adam  # not the class around it: making one loads torch's compiler, two seconds for nothing
+from torch.optim.adam import adam  # not the class around it, which loads torch's compiler for two seconds
 
 from eddies.parallel.communicator import Comm
 from eddies.parallel.reduction import global_sum, sum_flat
@@ -17,8 +17,8 @@ from eddies.parallel.reduction import global_sum, sum_flat
 class Adam:
     """Adam (Kingma and Ba 2014) with a learning rate that falls geometrically over `steps` steps.
 
-    The loss given to `step` is this rank's share: the shares of all ranks add up to the global loss. Gradients are
-    summed over ranks in one message, so all ranks, also those without particles, take the same step.
+    The loss given to `step` is this rank's share of the global loss. Gradients are summed over ranks in one message, so
+    that all ranks, also those without particles, take the same step.
     """
 
     def __init__(self, comm: Comm, parameters: Iterable[nn.Parameter], steps: int, first_rate: float,
@@ -26,7 +26,7 @@ class Adam:
         self.comm, self.parameters = comm, list(parameters)
         self.steps, self.first_rate, self.last_rate = steps, first_rate, last_rate
         self.taken = 0
-        # Adam's running means of the gradient and of its square, by name.
+        # Running means of the gradient and of its square.
         self._moments = {name: [torch.zeros_like(p) for p in self.parameters]
                          for name in ("exp_avg", "exp_avg_sq")}
 
@@ -39,7 +39,7 @@ class Adam:
         """One step down the gradient of the sum of all shares; returns the norm of that gradient."""
         for parameter in self.parameters:
             parameter.grad = None
-        if share.requires_grad:  # not where all that is left to learn shows through several steps alone
+        if share.requires_grad:  # a loss of single frames may not depend on any parameter
             share.backward()
         # A rank whose share does not depend on a parameter still takes part in the sum.
         gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in self.parameters]
@@ -48,28 +48,25 @@ class Adam:
         for gradient, summed in zip(gradients, on_host):
             gradient.copy_(summed)
         norm = float(sum(gradient.double().square().sum() for gradient in on_host) ** 0.5)
+        steps = [torch.tensor(float(self.taken)) for _ in self.parameters]  # `adam` counts them up
         with torch.no_grad():
-            adam(self.parameters, gradients, *self._moments.values(), [], self._steps(), amsgrad=False, beta1=0.9,
+            adam(self.parameters, gradients, *self._moments.values(), [], steps, amsgrad=False, beta1=0.9,
                  beta2=0.999, lr=self.learning_rate, weight_decay=0.0, eps=1e-8, maximize=False)
         self.taken += 1
         return norm
 
     def state_dict(self) -> dict[str, int | np.ndarray]:
-        """What there is besides the parameters: the steps taken, and Adam's running means; the same on all ranks."""
+        """The state besides the parameters: number of steps taken and running means, equal on all ranks."""
         means = {f"{name}_{number}": mean.cpu().numpy() for name, means in self._moments.items()
                  for number, mean in enumerate(means)}
         return {"taken": self.taken, **means}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Inverse of `state_dict`, with the parameters of then."""
+        """Inverse of `state_dict`."""
         self.taken = state["taken"]
         for name, means in self._moments.items():
             for number, mean in enumerate(means):
                 mean.copy_(torch.from_numpy(state[f"{name}_{number}"]).reshape(mean.shape))
-
-    def _steps(self) -> list[Tensor]:
-        """The number of steps taken, as `adam` wants it: by parameter, and to be counted up there."""
-        return [torch.tensor(float(self.taken)) for _ in self.parameters]
 
 
 def shared_values(comm: Comm, shares: Mapping[str, Tensor]) -> dict[str, float]:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,20 +20,20 @@ from eddies.particles.integrators import Integrator
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.resolved_velocity import ResolvedVelocity
 
-# A band that loses less than this share of what the fastest loses counts as if it lost that.
+# A band's mean loss is at least this share of the largest one.
 SLOWEST = 0.1
 
 
 @dataclass(frozen=True)
 class TrainingWindow:
-    """Particles at one moment and what is true of them later.
+    """Particles at one time and their true future.
 
     Parameters
     ----------
     particles : at the start.
-    velocity : (frames, n, 3), true velocities at the end of frame intervals 1, 2, ...; rows as in `particles`.
-    density : (frames, n), the same for the density; or None.
-    energies : (frames + 1, bands), the kinetic energy by bands of wavenumbers, at the start and then as above; or None.
+    velocity, density : true values (frames, n, 3) and (frames, n) at the end of frame intervals 1, 2, ...; rows as in
+        `particles`; the density may be None.
+    energies : (frames + 1, bands), true kinetic energy by bands of wavenumbers, from the start on; or None.
     """
 
     particles: ParticleSet
@@ -42,28 +43,28 @@ class TrainingWindow:
 
 
 class RolloutTrainer:
-    """Trains a model on what its simulation makes of true initial states.
+    """Trains a model on rollouts from true initial states.
 
-    Every step draws a window from (seed, step), advances all its particles by the integrator of the simulation, and
-    takes for each frame k that is reached the mean of |v - v_true|^2 / |v_true - v_start|^2: the velocity error in
-    units of that of particles without acceleration, so that all frames count alike. A density whose rate is learned
-    counts in the same way. Added with a weight is the mean over bands of wavenumbers of the squared error of their
-    kinetic energy, in units of what the band loses in that time on average over all windows: fitted forces are
-    attenuated where what they are fitted to is noisy, they take too much from some scales and too little from others,
-    and an energy off by little at every step is hardly seen in the error of the velocity.
+    Every step draws a window from (seed, step) and advances all its particles by the integrator of the simulation. The
+    loss of frame k is <|v - v_true|^2> / <|v_true - v_start|^2>, 1 for particles without acceleration, so that all
+    frames count alike. A density whose rate is learned has the same loss.
+
+    The energy loss is the mean over bands of wavenumbers of the squared error of their kinetic energy, over the mean
+    energy that the band loses in that time. Fitted forces are attenuated where their features are noisy: they take too
+    much energy from some scales and too little from others, which the error of the velocity hardly shows.
 
     The gradient goes through all steps: force, neighbours, halo, and the grid of the resolved velocity. Each step is
-    computed anew on the way back, so that memory holds one step and not all.
+    computed again on the way back, so that memory holds one step.
 
     Parameters
     ----------
     integrator : of dynamics with fixed ranks.
     windows : on the slabs of the dynamics.
     frame_interval : time between frames. steps_per_frame : time steps in it.
-    energy_weight : of the energies beside the velocity; if it is zero, windows give none.
-    resolution : gives the energies of particles; not asked if the weight is zero.
-    stationary : whether the flow is kept up, so that a band loses as much as it gains; then what its energy changes by
-        counts, its rms, instead of what it loses on average.
+    energy_weight : of the energy loss; if it is zero, windows need no energies.
+    resolution : gives the energies of particles; unused if the weight is zero.
+    stationary : whether the flow is forced, so that its bands lose no energy on average; the rms change of a band's
+        energy then takes the place of its mean loss.
     """
 
     def __init__(self, comm: Comm, integrator: Integrator, windows: Sequence[TrainingWindow], frame_interval: float,
@@ -98,26 +99,24 @@ class RolloutTrainer:
 
     @torch.no_grad()
     def validation_error(self, window: TrainingWindow, horizon: int) -> float:
-        """Root of the loss of a window: but for the energy 1 without acceleration."""
+        """Root of the loss of a window; without the energy loss it is 1 for particles without acceleration."""
         shares = self.loss_shares(window, horizon)
         return sum(shared_values(self.comm, shares).values()) ** 0.5
 
     def _energy_share(self, window: TrainingWindow, frame: int, particles: ParticleSet) -> Tensor:
-        """This rank's part of the squared error of the energies by bands; all ranks' parts are equal."""
-        # From nothing, as the truth's: what is foreseen leaves in the energies what only forecasts tell. On the way
-        # back from the solution itself, so that nothing is left to solve.
+        """This rank's equal part of the squared error of the energies by bands."""
+        # The solve starts from zero, as for the truth: a forecast would leave its traces in the energies. On the way
+        # back it starts from its own solution, so that it takes no iteration.
         near: Tensor | None = None
 
-        def found(position: Tensor, velocity: Tensor) -> Tensor:
+        def energies_of(position: Tensor, velocity: Tensor) -> Tensor:
             nonlocal near
             moved = replace(particles, position=position, velocity=velocity)
             energies = self.resolution.band_energies(moved, near=near)
             near = self.resolution.found
             return energies
 
-        columns = particles.position, particles.velocity
-        energies = checkpoint(found, *columns, use_reentrant=False, preserve_rng_state=False) \
-            if torch.is_grad_enabled() else found(*columns)
+        energies = _recomputed(energies_of, particles.position, particles.velocity)
         true = window.energies[frame + 1]
         return ((energies - true) / (true * self.losses * (frame + 1))).square().mean() / self.comm.size
 
@@ -131,13 +130,13 @@ class RolloutTrainer:
             yield reached, particles
 
     def _advanced(self, particles: ParticleSet, memory: dict[str, Tensor]) -> tuple[ParticleSet, dict[str, Tensor]]:
-        """One time step; where gradients are recorded, without keeping what happens within it."""
+        """One time step; only its end is kept for the gradient."""
         given, carried, after = particles.columns(), list(memory), ([], [])
         state = self.integrator.dynamics.state_dict()
         del given["id"]
 
         def advance(*columns: Tensor) -> tuple[Tensor, ...]:
-            # Lists built anew and the same foreseen, so that the way back does the very same.
+            # New lists and the same forecasts, so that the way back repeats the step exactly.
             self.integrator.dynamics.forget()
             self.integrator.dynamics.load_state_dict(state)
             start = ParticleSet(particles.id, **dict(zip(given, columns)))
@@ -147,31 +146,33 @@ class RolloutTrainer:
             after[0][:], after[1][:] = end, self.integrator.memory
             return *end.values(), *self.integrator.memory.values()
 
-        columns = *given.values(), *memory.values()
-        if torch.is_grad_enabled():
-            columns = checkpoint(advance, *columns, use_reentrant=False, preserve_rng_state=False)
-        else:
-            columns = advance(*columns)
+        columns = _recomputed(advance, *given.values(), *memory.values())
         moved = ParticleSet(particles.id, **dict(zip(after[0], columns)))
         return moved, dict(zip(after[1], columns[len(after[0]):]))
 
     def _errors(self, window: TrainingWindow, frame: int,
                 particles: ParticleSet) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-        """Error, truth, and value at the start of the velocity, and of a density whose rate is learned."""
+        """Error, true value and start value: of the velocity, and of a density whose rate is learned."""
         yield particles.velocity - window.velocity[frame], window.velocity[frame], window.particles.velocity
         if self.integrator.dynamics.model.learns_density:
             yield particles.density - window.density[frame], window.density[frame], window.particles.density
 
     def _scale(self, true: Tensor, start: Tensor) -> float:
-        """Root mean square of the change of one component."""
+        """Root mean square of the true change of one component, over all ranks."""
         squares = global_sum(self.comm, float((true - start).double().square().sum()))
         return float(np.sqrt(squares / (self.total * math.prod(true.shape[1:]))))
 
 
 def mean_losses(windows: Sequence[TrainingWindow], stationary: bool = False) -> Tensor:
-    """The share of its energy that each band loses or gains in a frame interval, on average over windows, in a
-    `stationary` flow its rms: (bands,)."""
+    """Change of ln(energy) of each band per frame interval, (bands,): mean over windows, or rms if `stationary`."""
     changes = torch.stack([window.energies[-1] / window.energies[0] for window in windows]).log()
     change = changes.square().mean(0).sqrt() if stationary else changes.mean(0)
     losses = (change / (len(windows[0].energies) - 1)).abs()
     return losses.clamp_min(SLOWEST * float(losses.max()))
+
+
+def _recomputed(function: Callable[..., Any], *columns: Tensor) -> Any:
+    """The result of a function that is called again for the gradient, instead of keeping its intermediate results."""
+    if not torch.is_grad_enabled():
+        return function(*columns)
+    return checkpoint(function, *columns, use_reentrant=False, preserve_rng_state=False)

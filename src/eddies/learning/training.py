@@ -1,4 +1,4 @@
-"""The course of a training: phases of descent, validation, the best state, and what a checkpoint must hold."""
+"""The course of a training: phases of descent, validation, the best state, and the state for a checkpoint."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from eddies.parallel.halo import HaloError
 
 @dataclass(frozen=True)
 class Phase:
-    """A stretch of training with one fall of the learning rate and one measure of success.
+    """Steps with one fall of the learning rate and one validation error.
 
     Parameters
     ----------
     name : for the progress line.
-    work : cost of each optimiser step, in any unit common to the phases, for the time left.
+    work : cost of each optimiser step, in a unit common to all phases, to estimate the time left.
     rates : learning rate of the first and of the last step.
-    take : one step of the optimiser, given the number of the step within the phase; returns losses by name.
-    validate : error on what is not trained on; the state where it was least is kept. None: the last state is.
-    validate_every : steps between two validations. The last step is always followed by one.
-    patience : steps without a smaller error on what is held out after which the phase ends; None: it takes all steps.
+    take : takes one step of the optimiser, given its number within the phase; returns losses by name.
+    validate : error on held-out data; the phase ends with the state of least error. None: with the last state.
+    validate_every : steps between two validations; the last step is validated too.
+    patience : the phase ends after so many steps without a smaller validation error. None: it takes all steps.
     """
 
     name: str
@@ -46,19 +46,15 @@ class Phase:
 
 
 class TrainingDiverged(ValueError):
-    """A loss or a gradient is no longer finite, or the error on what is held out never was; the same on all ranks."""
+    """A loss or a gradient is not finite, or no validation error of a phase was; raised by all ranks."""
 
 
 class Training:
-    """Takes a model through phases. It returns at the end of each that is validated to the state of least error, its
-    start included.
+    """Trains a model in phases, in order, each of at least one step.
 
-    Parameters
-    ----------
-    phases : in order, each of at least one step.
+    A validated phase ends with its state of least error, which may be its first. All ranks hold the same state.
 
-    `history` holds a row for each step, with `start_error` in the first of each phase: the validation error before it.
-    All ranks hold the same state.
+    `history` has a row for each step. The first row of a phase has `start_error`, the validation error before it.
     """
 
     def __init__(self, comm: Comm, model: nn.Module, phases: Sequence[Phase]) -> None:
@@ -69,7 +65,7 @@ class Training:
         self._begin(0)
 
     def _begin(self, number: int) -> None:
-        """Be at the start of a phase."""
+        """Begin a phase."""
         self.number, self.best_error, self.best, self.best_at = number, np.inf, self._weights(), 0
         if self.running:
             self.optimizer = Adam(self.comm, self.model.parameters(), self.phase.steps, *self.phase.rates)
@@ -81,7 +77,7 @@ class Training:
 
     @property
     def phase(self) -> Phase:
-        """The present one."""
+        """The current phase."""
         return self.phases[self.number]
 
     @property
@@ -91,18 +87,18 @@ class Training:
 
     @property
     def seconds(self) -> float:
-        """Wall seconds of the training so far, in all its parts."""
+        """Wall seconds of the training so far, including the time before a restart."""
         return self._seconds_before + time.perf_counter() - self._started
 
     @property
     def done(self) -> float:
-        """The fraction of all work that is done."""
+        """Fraction of the work of all phases that is done."""
         before = [phase.work for phase in self.phases[:self.number]]
         done = sum(work.sum() for work in (*before, self.phase.work[:self.optimizer.taken]))
         return float(done / sum(phase.work.sum() for phase in self.phases))
 
     def step(self) -> None:
-        """One step of the present phase, and the validation that may be due after it."""
+        """One step of the current phase, and a validation if one is due."""
         phase, rate = self.phase, self.optimizer.learning_rate
         start = {"start_error": self._error_of(phase.validate)} if phase.validate and self.optimizer.taken == 0 else {}
         row = {"phase": float(self.number), "step": float(self.steps), "learning_rate": rate, **start,
@@ -117,7 +113,7 @@ class Training:
             last = last or phase.patience is not None and self.optimizer.taken - self.best_at >= phase.patience
         if phase.validate and last:
             if self.best_error == np.inf:
-                raise TrainingDiverged(f"{place}: at no time of this phase was the error on what is held out finite")
+                raise TrainingDiverged(f"{place}: no validation error of this phase was finite")
             self._load(self.best)
         row["seconds"] = self.seconds
         self.history.append(row)
@@ -126,27 +122,26 @@ class Training:
 
     @property
     def cost(self) -> list[dict[str, Any]]:
-        """A row for each finished phase: name `phase`, optimiser `steps`, wall `seconds` and validation `error`.
+        """A row for each finished phase: name `phase`, optimiser `steps`, wall `seconds` with validations, and `error`.
 
-        The seconds include validations. The error is that of the weights with which the phase ends; None where a phase
-        is not validated. The values can be written as JSON.
+        The error is the validation error of the weights at its end, None without validation.
         """
-        found, before = [], 0.0
+        finished, before = [], 0.0
         for number, phase in enumerate(self.phases[:self.number]):
             rows = [row for row in self.history if row["phase"] == number]
             errors = [row[name] for row in rows for name in ("start_error", "validation_error") if name in row]
-            found.append({"phase": phase.name, "steps": len(rows), "seconds": rows[-1]["seconds"] - before,
-                          "error": min(errors, default=None)})
+            finished.append({"phase": phase.name, "steps": len(rows), "seconds": rows[-1]["seconds"] - before,
+                             "error": min(errors, default=None)})
             before = rows[-1]["seconds"]
-        return found
+        return finished
 
     def columns(self) -> dict[str, np.ndarray]:
-        """The history by column; NaN where a step had no such number."""
+        """The history by column; NaN where a row has no such number."""
         names = sorted({name for row in self.history for name in row})
         return {name: np.array([row.get(name, np.nan) for row in self.history]) for name in names}
 
     def state_dict(self) -> dict[str, Any]:
-        """All that goes on, for a checkpoint: numbers and arrays by name."""
+        """The whole state for a checkpoint: numbers and arrays by name."""
         parts = {"model": self._weights(), "best": self.best, "history": self.columns(),
                  "optimizer": self.optimizer.state_dict()}
         return {"number": self.number, "best_error": self.best_error, "best_at": self.best_at,
@@ -167,7 +162,7 @@ class Training:
         self._seconds_before = self.history[-1]["seconds"] if self.history else 0.0
 
     def _error_of(self, validate: Callable[[], float]) -> float:
-        """The error on what is held out; infinite where it is no number, or particles outrun their slabs."""
+        """The validation error, infinite if it is not finite or particles leave their slabs; keeps the best state."""
         try:
             error = validate()
         except HaloError:

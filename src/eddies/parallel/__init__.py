@@ -1,1 +1,1 @@
-"""Slab decomposition, transposes, particle migration, ghost-particle halos and reductions: the messages of eddies."""
+"""Messages between ranks: slabs, transposes, migration of particles, halos, reductions and votes."""

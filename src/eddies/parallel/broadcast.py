@@ -1,6 +1,4 @@
-"""Words from one rank to all, and work that only some ranks do: what goes wrong on one is raised by all."""
-
-from __future__ import annotations
+"""Text from one rank to all, and work of some ranks whose errors all ranks raise."""
 
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -15,7 +13,7 @@ Result = TypeVar("Result")
 
 
 def share_text(comm: MPI.Comm, text: str, root: int = 0) -> str:
-    """The text of rank `root` on every rank, such as an argument of any bytes. One rank sends nothing."""
+    """Return the text of rank `root` on every rank. The text may hold any bytes, as surrogates."""
     if comm.size == 1:
         return text
     encoded = np.frombuffer(text.encode(errors="surrogateescape"), np.uint8)
@@ -27,16 +25,13 @@ def share_text(comm: MPI.Comm, text: str, root: int = 0) -> str:
 
 
 def first_complaint(comm: MPI.Comm, complaint: str | None) -> str | None:
-    """The complaint of the lowest rank that has one, on every rank; None where no rank has."""
+    """Return the complaint of the lowest rank that has one, on every rank; None if no rank has one."""
     rank = int(global_min(comm, comm.size if complaint is None else comm.rank))
     return None if rank == comm.size else share_text(comm, complaint or "", rank)
 
 
 def require_same(comm: MPI.Comm, own: str, words: str) -> None:
-    """Refuse ranks that were started with something else than rank 0; `words` say what, with a place {} for it.
-
-    Raises UserError, on all ranks.
-    """
+    """Raise UserError on all ranks if one was started with another text than rank 0. `words` has a place {} for it."""
     first = share_text(comm, own)
     complaint = first_complaint(comm, None if own == first else (
         f"rank {comm.rank} was started with {words.format(own)}, rank 0 with {words.format(first)}; start all ranks "
@@ -46,8 +41,10 @@ def require_same(comm: MPI.Comm, own: str, words: str) -> None:
 
 
 def on_first_rank(comm: MPI.Comm, action: Callable[[], Result]) -> Result:
-    """What an action gives on rank 0, the only one that does it, on every rank. All ranks raise
-    the UserError or OSError that it raises there. One rank sends nothing."""
+    """Run an action on rank 0 only and return its result on every rank. One rank sends nothing.
+
+    All ranks raise the UserError or OSError that it raises.
+    """
     result: Any = None
     error: Exception | None = None
     if comm.rank == 0:
@@ -56,20 +53,22 @@ def on_first_rank(comm: MPI.Comm, action: Callable[[], Result]) -> Result:
         except (UserError, OSError) as raised:
             error = raised
     if comm.size > 1:
-        result, kind, arguments, known = comm.bcast((result, type(error), _arguments(error), getattr(
-            error, "__dict__", {})))
+        result, kind, arguments, attributes = comm.bcast((result, type(error), _arguments(error),
+                                                          getattr(error, "__dict__", {})))
         if arguments and comm.rank > 0:
-            error = kind.__new__(kind, *arguments)  # not made anew: the text is all there, for each class another way
+            error = kind.__new__(kind, *arguments)  # without __init__, which would build the text again
             error.args = arguments
-            vars(error).update(known)
+            vars(error).update(attributes)
     if error is not None:
         raise error
     return result
 
 
 def on_all_ranks(comm: MPI.Comm, action: Callable[[], Result], kind: type[Exception] = OSError) -> Result:
-    """What an action gives on this rank. All ranks raise an error of this kind that it raises on some, with the words
-    of the lowest of these."""
+    """Run an action on all ranks and return its result on this one.
+
+    If it raises an error of this kind on some ranks, all ranks raise it with the text of the lowest of these.
+    """
     result: Any = None
     complaint = None
     try:
@@ -83,7 +82,7 @@ def on_all_ranks(comm: MPI.Comm, action: Callable[[], Result], kind: type[Except
 
 
 def _arguments(error: Exception | None) -> tuple:
-    """What makes an error say the same on another rank; empty for none."""
+    """Return the arguments that give an error the same text on another rank; empty for no error."""
     if isinstance(error, OSError) and error.errno is not None:
         return error.errno, error.strerror, error.filename and str(error.filename)
     return () if error is None else (str(error),)

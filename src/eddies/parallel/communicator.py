@@ -1,25 +1,45 @@
-"""The type of the communicator that everything below the command line is given, and where a rank stands on its node."""
+"""Type of the communicator that everything below the command line gets, and the ranks of one node."""
 
-from __future__ import annotations
+import contextlib
+import logging
+from collections.abc import Iterator
 
 from mpi4py import MPI
 from mpi4py.MPI import Comm
 
-__all__ = ["Comm", "node_rank", "node_ranks"]
+from eddies.cores import processors, threads, within_quota
+
+__all__ = ["Comm", "node_rank", "node_ranks", "warn_of_few_processors"]
+
+log = logging.getLogger("eddies")
 
 
 def node_rank(comm: Comm) -> int:
-    """Number of this rank among the ranks that share its memory; collective."""
-    return _on_node(comm)[0]
+    """Return the number of this rank among the ranks of its node; collective."""
+    with _node(comm) as node:
+        return node.rank
 
 
 def node_ranks(comm: Comm) -> int:
-    """The most ranks that share a memory; collective."""
-    return int(comm.allreduce(_on_node(comm)[1], MPI.MAX))
+    """Return the largest number of ranks on one node; collective."""
+    with _node(comm) as node:
+        return int(comm.allreduce(node.size, MPI.MAX))
 
 
-def _on_node(comm: Comm) -> tuple[int, int]:
+def warn_of_few_processors(comm: Comm) -> None:
+    """Log a warning on rank 0 if its ranks take more threads than their node has processors for; collective."""
+    with _node(comm) as node:
+        together = within_quota(set().union(*node.allgather(processors())))
+        own, number = max(min(within_quota(processors()), together // node.size), 1), threads()
+    if comm.rank == 0 and 1 < number > own:
+        log.warning("OMP_NUM_THREADS = %d: each rank has %d of the processors here, so that its threads wait for one "
+                    "another; set it to %d, start fewer ranks, or bind each to %d processors (mpirun --map-by "
+                    "slot:PE=%d)", number, own, own, number, number)
+
+
+@contextlib.contextmanager
+def _node(comm: Comm) -> Iterator[Comm]:
+    """Communicator of the ranks that share memory with this one."""
     node = comm.Split_type(MPI.COMM_TYPE_SHARED)
-    place = node.rank, node.size
+    yield node
     node.Free()
-    return place

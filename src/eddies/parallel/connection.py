@@ -1,23 +1,23 @@
-"""Whether MPI connects the ranks that a launcher has started."""
-
-from __future__ import annotations
+"""Checks whether MPI connects the ranks that a launcher has started, and whether all of them arrive at one place."""
 
 import os
+import time
 
 from mpi4py import MPI
 
 from eddies.errors import UserError
 
-# Where launchers write the number of ranks, and each rank's own. The first that is set counts: mpirun within a Slurm
-# step inherits the variables of that step.
+# Variables in which launchers write the number of ranks, and each rank's number. The first that is set counts: mpirun
+# within a Slurm step inherits the variables of that step.
 LAUNCHERS = {"OMPI_COMM_WORLD_SIZE": "OMPI_COMM_WORLD_RANK", "PMI_SIZE": "PMI_RANK",
              "SLURM_STEP_NUM_TASKS": "SLURM_PROCID"}
-# The shell of `srun --pty` is one of the tasks; what is started in it by hand inherits the variables of Slurm.
+# The shell of `srun --pty` is one of the tasks; a program started in it by hand inherits the variables of Slurm.
 SHELL = "SLURM_PTY_PORT"
+PATIENCE = 5.0  # seconds that a rank waits for the others to reach the same error
 
 
 class NotConnected(UserError):
-    """MPI connects fewer ranks than were started; `first` tells whether this rank is the first of them."""
+    """MPI connects fewer ranks than were started; `first` is whether this rank is the first of them."""
 
     def __init__(self, message: str, first: bool) -> None:
         super().__init__(message)
@@ -25,9 +25,9 @@ class NotConnected(UserError):
 
 
 def require_connected(world: MPI.Comm) -> None:
-    """Raise NotConnected where the launcher has started more ranks than `world`, all that MPI connects, has.
+    """Raise NotConnected if the launcher has started more ranks than `world` has.
 
-    Without a launcher, or where it tells no number, nothing is known and nothing raised.
+    Without a launcher, or if it gives no number, the check passes.
     """
     names = list(LAUNCHERS)[:1] if SHELL in os.environ else LAUNCHERS
     size = next((name for name in names if os.environ.get(name, "").isdecimal()), None)
@@ -36,7 +36,17 @@ def require_connected(world: MPI.Comm) -> None:
     library = MPI.Get_library_version().split(",")[0].strip("\0\n ")
     remedy = f"with the mpirun of {library}"
     if size != "OMPI_COMM_WORLD_SIZE" and "SLURM_STEP_NUM_TASKS" in os.environ:
-        remedy = f"with `srun --mpi=pmix`, or what else {library} and `srun --mpi=list` know"
+        remedy = f"with `srun --mpi=pmix`, or another type that {library} and `srun --mpi=list` both have"
     raise NotConnected(
         f"{os.environ[size]} ranks were started ({size}), MPI connects {world.size} of them; start them {remedy}; "
         f"for a program on its own unset {size}", os.environ.get(LAUNCHERS[size], "0") == "0")
+
+
+def all_arrive(comm: MPI.Comm) -> bool:
+    """Return whether all ranks call this within PATIENCE seconds; `comm` must serve no other purpose."""
+    request, deadline = comm.Ibarrier(), time.monotonic() + PATIENCE
+    while not request.Test():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.01)
+    return True

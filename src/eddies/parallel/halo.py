@@ -1,6 +1,6 @@
-"""Ghost particles: copies of the particles within a given width of a slab's faces, and the adjoint of copying."""
+"""Halos: copies of the particles or grid planes just outside a slab, and the adjoint of copying."""
 
-from __future__ import annotations
+from collections.abc import Sequence
 
 import numpy as np
 from mpi4py import MPI
@@ -10,22 +10,22 @@ from eddies.parallel.slab import SlabDecomposition
 
 
 class HaloError(UserError, ValueError):
-    """A slab is thinner than the halo."""
+    """A slab is thinner than the halo, or a particle is outside the halo."""
 
 
 class HaloExchange:
-    """Copies of the neighbours' particles within `width` of this slab; planned once, applied to any column.
+    """Ghost particles: the neighbours' particles within `width` of this slab. Planned once, applied to any column.
 
     Parameters
     ----------
-    decomposition : slabs
-    positions : float array (n, 3), owned particles, z within this rank's slab.
-    width : float, how far beyond its faces a rank needs to see.
+    decomposition : slabs.
+    positions : (n, 3), owned particles with z within this rank's slab.
+    width : distance beyond its faces that a rank needs to see.
 
     Each rank sends the particles near its lower face down and those near its upper face up. The two faces stay
-    apart even where both neighbours are the same rank, so a particle can have two images there, told apart by the
-    period added to their z. Ghost rows stand in the order: from above, then from below. One rank sends nothing.
-    Raises HaloError if a slab is thinner than `width`.
+    separate even if both neighbours are the same rank: a particle then may have two images, which differ in z by a
+    period. Ghost rows from above come first, then those from below. One rank sends nothing. Raises HaloError if a slab
+    is thinner than `width`.
     """
 
     def __init__(self, decomposition: SlabDecomposition, positions: np.ndarray, width: float) -> None:
@@ -39,22 +39,22 @@ class HaloExchange:
         self._down = np.flatnonzero(z < decomposition.lower + width)
         self._up = np.flatnonzero(z >= decomposition.upper - width)
         below, above = decomposition.below, decomposition.above
-        self._from_above = int(self._exchange(np.array([len(self._down)]), below, above, (1,))[0])
-        self._from_below = int(self._exchange(np.array([len(self._up)]), above, below, (1,))[0])
+        self._from_above = int(_exchange(decomposition, np.array([len(self._down)]), below, above, (1,))[0])
+        self._from_below = int(_exchange(decomposition, np.array([len(self._up)]), above, below, (1,))[0])
         self.count = self._from_above + self._from_below
 
     def forward(self, owned: np.ndarray) -> np.ndarray:
-        """Ghost rows (count, ...) of a column of owned rows (n, ...)."""
+        """Return the ghost rows (count, ...) of a column of owned rows (n, ...)."""
         owned = np.asarray(owned)
-        if self.decomposition.size == 1:
-            return np.empty((0, *owned.shape[1:]), owned.dtype)
         slab, tail = self.decomposition, owned.shape[1:]
-        from_above = self._exchange(owned[self._down], slab.below, slab.above, (self._from_above, *tail))
-        from_below = self._exchange(owned[self._up], slab.above, slab.below, (self._from_below, *tail))
-        return np.concatenate([from_above, from_below])
+        if slab.size == 1:
+            return np.empty((0, *tail), owned.dtype)
+        return np.concatenate([
+            _exchange(slab, owned[self._down], slab.below, slab.above, (self._from_above, *tail)),
+            _exchange(slab, owned[self._up], slab.above, slab.below, (self._from_below, *tail))])
 
     def forward_positions(self, positions: np.ndarray) -> np.ndarray:
-        """Ghost positions (count, 3), moved by one period in z where the image lies beyond the periodic face."""
+        """Return ghost positions (count, 3), shifted by a period in z across the periodic face."""
         ghosts = self.forward(positions)
         slab = self.decomposition
         if slab.size > 1 and slab.rank == slab.size - 1:
@@ -64,36 +64,73 @@ class HaloExchange:
         return ghosts
 
     def adjoint(self, ghosts: np.ndarray) -> np.ndarray:
-        """Transpose of `forward`: ghost rows (count, ...) sent home and added, per owned row (n, ...).
-
-        For all x, y: sum over ranks of forward(x).y equals the sum over ranks of x.adjoint(y).
-        """
+        """Apply the transpose of `forward`: send ghost rows (count, ...) home and add them per owned row (n, ...)."""
         ghosts = np.asarray(ghosts)
         slab, tail = self.decomposition, ghosts.shape[1:]
         owned = np.zeros((self.owned, *tail), ghosts.dtype)
-        if slab.size == 1:
-            return owned
-        down = self._exchange(ghosts[: self._from_above], slab.above, slab.below, (len(self._down), *tail))
-        up = self._exchange(ghosts[self._from_above :], slab.below, slab.above, (len(self._up), *tail))
-        # Within one face each owned row appears once, so plain indexed addition is exact.
-        owned[self._down] += down
-        owned[self._up] += up
+        if slab.size > 1:
+            # Each owned row occurs once per face, so plain indexed addition is exact.
+            owned[self._down] += _exchange(slab, ghosts[: self._from_above], slab.above, slab.below,
+                                           (len(self._down), *tail))
+            owned[self._up] += _exchange(slab, ghosts[self._from_above :], slab.below, slab.above,
+                                         (len(self._up), *tail))
         return owned
 
-    def _exchange(self, rows: np.ndarray, destination: int, source: int, shape: tuple[int, ...]) -> np.ndarray:
-        received = np.empty(shape, rows.dtype)
-        self.decomposition.comm.Sendrecv(
-            [np.ascontiguousarray(rows), MPI.BYTE], destination, recvbuf=[received, MPI.BYTE], source=source
-        )
-        return received
+
+class PlaneHalo:
+    """Ghost planes: `below` and `above` planes of the neighbouring slabs, periodically, around this rank's planes.
+
+    One rank copies its own planes and sends nothing. Raises HaloError if a slab has fewer planes than either number.
+    """
+
+    def __init__(self, decomposition: SlabDecomposition, below: int, above: int) -> None:
+        self.decomposition, self.below, self.above = decomposition, below, above
+        _require_planes(decomposition, max(below, above), "the interpolation")
+
+    def forward(self, planes: np.ndarray) -> list[np.ndarray]:
+        """Return [(c, below, ...), planes, (c, above, ...)] around planes (c, z_local, ...)."""
+        slab, count = self.decomposition, planes.shape[1]
+        lowest, highest = planes[:, : self.above], planes[:, count - self.below :]
+        if slab.size == 1:
+            return [highest, planes, lowest]
+        from_above = _exchange(slab, lowest, slab.below, slab.above, lowest.shape)
+        from_below = _exchange(slab, highest, slab.above, slab.below, highest.shape)
+        return [from_below, planes, from_above]
+
+    def parts(self, planes: np.ndarray) -> list[np.ndarray]:
+        """Return planes (c, z_local, ...) between ghost planes of zeros, to be filled for `adjoint`."""
+        below, above = (np.zeros((len(planes), count, *planes.shape[2:]), planes.dtype)
+                        for count in (self.below, self.above))
+        return [below, planes, above]
+
+    def adjoint(self, parts: Sequence[np.ndarray]) -> np.ndarray:
+        """Apply the transpose of `forward`: add ghost planes at home, in place, to the planes (c, z_local, ...)."""
+        highest, planes, lowest = parts
+        slab, count = self.decomposition, planes.shape[1]
+        if slab.size > 1:
+            lowest, highest = (_exchange(slab, lowest, slab.above, slab.below, lowest.shape),
+                               _exchange(slab, highest, slab.below, slab.above, highest.shape))
+        planes[:, : self.above] += lowest
+        planes[:, count - self.below :] += highest
+        return planes
 
 
 def require_thick_slabs(decomposition: SlabDecomposition, width: float) -> None:
-    """Raise HaloError, naming the largest usable number of ranks, if a slab is thinner than `width`."""
-    needed = int(np.ceil(width / decomposition.spacing - 1e-9))
-    if decomposition.size > 1 and decomposition.thinnest() < needed:
-        usable = max(decomposition.planes // needed, 1)
-        raise HaloError(
-            f"{decomposition.size} ranks make slabs of {decomposition.thinnest()} planes, thinner than the halo of "
-            f"{needed} planes (width {width:.4g}); use at most {usable} ranks"
-        )
+    """Raise HaloError, which names the largest usable number of ranks, if a slab is thinner than `width`."""
+    if decomposition.size > 1:
+        _require_planes(decomposition, int(np.ceil(width / decomposition.spacing - 1e-9)), f"width {width:.4g}")
+
+
+def _require_planes(slab: SlabDecomposition, needed: int, purpose: str) -> None:
+    if slab.thinnest() < needed:
+        raise HaloError(f"{slab.size} ranks make slabs of {slab.thinnest()} planes, thinner than the halo of {needed} "
+                        f"planes ({purpose}); use at most {max(slab.planes // needed, 1)} ranks")
+
+
+def _exchange(slab: SlabDecomposition, sent: np.ndarray, destination: int, source: int,
+              shape: tuple[int, ...]) -> np.ndarray:
+    """Send an array to one neighbour and return the array of this shape that another one sends."""
+    received = np.empty(shape, sent.dtype)
+    slab.comm.Sendrecv([np.ascontiguousarray(sent), MPI.BYTE], destination, recvbuf=[received, MPI.BYTE],
+                       source=source)
+    return received

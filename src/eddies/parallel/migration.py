@@ -1,6 +1,4 @@
-"""Particles change rank: to the slab that contains them, or to the rank that stores their id."""
-
-from __future__ import annotations
+"""Migration: particles move to the rank whose slab contains them, or to the rank that stores their id."""
 
 import math
 
@@ -16,14 +14,10 @@ class ParticleLossError(RuntimeError):
 
 
 class Redistribution:
-    """Sends each row to a given rank; planned once, then applied to any column.
+    """Sends each row to a given rank; planned once, applied to any column.
 
-    Parameters
-    ----------
-    comm : communicator
-    destination : int array (n,), the rank each row goes to.
-
-    Received rows are ordered by the rank they come from, then as they stood there. One rank sends nothing.
+    `destination` (n,) is the rank that each row goes to. Received rows are ordered by their source rank, then as they
+    were there. One rank sends nothing.
     """
 
     def __init__(self, comm: MPI.Comm, destination: np.ndarray) -> None:
@@ -36,28 +30,21 @@ class Redistribution:
         comm.Alltoall(self._sent, self._received)
 
     def apply(self, column: np.ndarray) -> np.ndarray:
-        """The rows of `column` (n, ...) that belong to this rank after the exchange: (m, ...), same type."""
+        """Return the rows (m, ...) of a column (n, ...) that belong to this rank after the exchange."""
         column = np.asarray(column)
         if self.comm.size == 1:
             return column.copy()
         sent = np.take(column, self._order, axis=0)
         received = np.empty((int(self._received.sum()), *column.shape[1:]), column.dtype)
-        # Counts are in rows: in bytes they would leave the range of MPI's integers above 2 GiB.
+        # Counts are in rows: in bytes they would exceed the range of MPI's integers above 2 GiB.
         row = MPI.BYTE.Create_contiguous(column.dtype.itemsize * math.prod(column.shape[1:])).Commit()
         self.comm.Alltoallv([sent, self._sent, row], [received, self._received, row])
         row.Free()
         return received
 
 
-class Migration(Redistribution):
-    """Sends each particle to the slab that holds its z coordinate; `positions` (n, 3) lie in [0, length)."""
-
-    def __init__(self, decomposition: SlabDecomposition, positions: np.ndarray) -> None:
-        super().__init__(decomposition.comm, decomposition.owner_of(np.asarray(positions)[:, 2]))
-
-
 def wrap(positions: np.ndarray, length: float) -> np.ndarray:
-    """Positions moved by whole periods into [0, length)."""
+    """Return positions shifted by whole periods into [0, length)."""
     wrapped = np.mod(positions, length)
     # The remainder of a tiny negative number rounds to `length` itself.
     wrapped[wrapped >= length] = 0.0
@@ -65,7 +52,7 @@ def wrap(positions: np.ndarray, length: float) -> np.ndarray:
 
 
 def census(comm: MPI.Comm, ids: np.ndarray) -> tuple[int, int, int]:
-    """Number of particles on all ranks, the sum of their ids, and the exclusive-or of their ids."""
+    """Return the number of particles on all ranks, the sum of their ids, and the exclusive-or of their ids."""
     count, total = global_sum(comm, np.array([len(ids), ids.sum()], np.int64))
     parity = np.array(np.bitwise_xor.reduce(ids) if len(ids) else 0, np.int64)
     if comm.size > 1:
@@ -74,16 +61,16 @@ def census(comm: MPI.Comm, ids: np.ndarray) -> tuple[int, int, int]:
 
 
 def migrate(decomposition: SlabDecomposition, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """All columns of a particle set after each particle moved to the slab that contains it.
+    """Return all columns of a particle set after each particle has moved to the slab that contains it.
 
-    `columns` holds at least `id` (n,) and `position` (n, 3); positions are wrapped into the box first.
-    Raises ParticleLossError when count, id sum or id parity differ before and after.
+    `columns` holds at least `id` (n,) and `position` (n, 3); positions are wrapped into the box first. Raises
+    ParticleLossError if the number of particles, the id sum or the id parity changes.
     """
     columns = {**columns, "position": wrap(columns["position"], decomposition.length)}
     if decomposition.size == 1:
         return columns
     before = census(decomposition.comm, columns["id"])
-    migration = Migration(decomposition, columns["position"])
+    migration = Redistribution(decomposition.comm, decomposition.owner_of(columns["position"][:, 2]))
     moved = {name: migration.apply(column) for name, column in columns.items()}
     after = census(decomposition.comm, moved["id"])
     if before != after:
@@ -92,16 +79,16 @@ def migrate(decomposition: SlabDecomposition, columns: dict[str, np.ndarray]) ->
 
 
 def id_block(comm: MPI.Comm, total: int) -> tuple[int, int]:
-    """First id and end of the contiguous block of `total` ids that this rank stores."""
+    """Return the first id and the end of the block of `total` ids that this rank stores."""
     starts = block_starts(total, comm.size)
     return int(starts[comm.rank]), int(starts[comm.rank + 1])
 
 
 class IdOrder:
-    """Brings particles, wherever they are, into blocks of consecutive ids, one block a rank.
+    """Moves particles from any distribution into blocks of consecutive ids, one block a rank.
 
     `ids` (n,) are this rank's; the ids of all ranks are 0 ... total - 1, each once. `start` and `stop` bound the
-    block that `apply` returns in order of id.
+    block that `apply` returns. Raises ParticleLossError if an id of the block is missing or occurs twice.
     """
 
     def __init__(self, comm: MPI.Comm, ids: np.ndarray, total: int) -> None:
@@ -114,5 +101,5 @@ class IdOrder:
             raise ParticleLossError(f"ids {self.start} to {self.stop - 1} are not each present exactly once")
 
     def apply(self, column: np.ndarray) -> np.ndarray:
-        """This rank's block of `column` (n, ...), ordered by id: (stop - start, ...)."""
+        """Return this rank's block (stop - start, ...) of a column (n, ...), ordered by id."""
         return np.take(self._redistribution.apply(column), self._order, axis=0)

@@ -1,7 +1,5 @@
 """Sums, extrema and votes over all ranks. One rank sends nothing."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
@@ -17,35 +15,33 @@ def _reduce(comm: MPI.Comm, value: ArrayLike, operation: MPI.Op) -> np.ndarray:
 
 
 def global_sum(comm: MPI.Comm, value: ArrayLike) -> np.ndarray:
-    """Sum of a scalar or array over ranks; a new array of the same shape and type."""
+    """Return the sum of a scalar or array over ranks, as a new array of the same shape and type."""
     return _reduce(comm, value, MPI.SUM)
 
 
 def global_max(comm: MPI.Comm, value: ArrayLike) -> np.ndarray:
-    """Element-wise largest value over ranks; a new array of the same shape and type."""
+    """Return the element-wise maximum over ranks, as a new array of the same shape and type."""
     return _reduce(comm, value, MPI.MAX)
 
 
 def global_min(comm: MPI.Comm, value: ArrayLike) -> np.ndarray:
-    """Element-wise smallest value over ranks; a new array of the same shape and type."""
+    """Return the element-wise minimum over ranks, as a new array of the same shape and type."""
     return _reduce(comm, value, MPI.MIN)
 
 
 def any_rank(comm: MPI.Comm, condition: bool) -> bool:
-    """Whether the condition holds on at least one rank; the same answer on all."""
+    """Return, on every rank, whether the condition holds on at least one."""
     return bool(_reduce(comm, np.int32(bool(condition)), MPI.MAX))
 
 
 def sum_flat(comm: MPI.Comm, arrays: Sequence[np.ndarray]) -> None:
     """Replace each array (all of one type) by its sum over ranks, in place and in one message.
 
-    This is the gradient sum of data-parallel training: each rank differentiates its own share of one global loss.
+    Data-parallel training sums its gradients so: each rank differentiates its share of one global loss.
     """
     if comm.size == 1 or not arrays:
         return
     flat = np.concatenate([array.ravel() for array in arrays])
     comm.Allreduce(MPI.IN_PLACE, flat, op=MPI.SUM)
-    start = 0
-    for array in arrays:
-        array[...] = flat[start : start + array.size].reshape(array.shape)
-        start += array.size
+    for array, total in zip(arrays, np.split(flat, np.cumsum([array.size for array in arrays])[:-1])):
+        array[...] = total.reshape(array.shape)

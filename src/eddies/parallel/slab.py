@@ -1,13 +1,11 @@
-"""The one block rule by which grid planes and particles are shared among ranks."""
-
-from __future__ import annotations
+"""Slab decomposition: grid planes and particles are shared among ranks by one block rule."""
 
 import numpy as np
 from mpi4py import MPI
 
 
 def block_starts(total: int, parts: int) -> np.ndarray:
-    """First index of each of `parts` consecutive blocks of `total` items, and `total` itself; shape (parts + 1,).
+    """Return the first index of each of `parts` consecutive blocks of `total` items, then `total`: (parts + 1,).
 
     The first `total % parts` blocks hold one item more than the others.
     """
@@ -19,8 +17,8 @@ def block_starts(total: int, parts: int) -> np.ndarray:
 class SlabDecomposition:
     """Slabs of a periodic cube of side `length`, cut along z into blocks of `planes` equal layers.
 
-    Grid planes and particles follow the same rule, so that a particle and the grid planes around it are on the
-    same rank. `start`, `stop` and `count` are this rank's planes; `lower` and `upper` its bounds in z.
+    A particle and the grid planes around it are on the same rank. `start`, `stop` and `count` are this rank's planes,
+    `lower` and `upper` its bounds in z, `below` and `above` the neighbouring ranks.
     """
 
     def __init__(self, comm: MPI.Comm, length: float, planes: int) -> None:
@@ -35,11 +33,11 @@ class SlabDecomposition:
         self._owner = np.repeat(np.arange(self.size), np.diff(self.starts))
 
     def owner_of(self, z: np.ndarray) -> np.ndarray:
-        """Rank that owns each coordinate `z` in [0, length); same shape as `z`."""
+        """Return the rank that owns each coordinate `z` in [0, length)."""
         plane = np.floor(np.asarray(z) / self.spacing).astype(np.int64)
-        # z just below `length` may round up to the plane that does not exist.
+        # z just below `length` may round up to a plane that does not exist.
         return self._owner[np.clip(plane, 0, self.planes - 1)]
 
     def thinnest(self) -> int:
-        """Number of planes of the thinnest slab."""
+        """Return the number of planes of the thinnest slab."""
         return int(np.diff(self.starts).min())

@@ -1,6 +1,4 @@
-"""Orderly ends: signals, a file named STOP and a limit of wall time, seen by all ranks at the same step."""
-
-from __future__ import annotations
+"""Orderly stop: signals, a file STOP and a limit of wall time, which all ranks see at the same step."""
 
 import contextlib
 import math
@@ -17,32 +15,32 @@ from eddies.errors import UserError
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.reduction import global_max
 
-LOOK_SECONDS = 1.0  # between two looks for the file: a look at a network file system may take longer than a step
+LOOK_SECONDS = 1.0  # between two checks for the file: on a network file system a check may take longer than a step
 
-# What the ranks tell each other, the largest counts: nothing, a checkpoint is due, or why to stop (a signal: its number
-# above _SIGNALS), or that the job has no right to go on.
+# Votes of the ranks; the largest counts. A signal is its number above _SIGNALS; _LOST means that the job has lost its
+# run directory.
 _NOTHING, _CHECKPOINT, _TIME, _FILE, _SIGNALS = range(5)
 _LOST = 1000
 
-# What is to be raised, if anything.
+# Returns the error to raise, or None.
 Loss = Callable[[], UserError | None]
 
 
 class Stopped(Exception):
-    """The job was asked to end and does so, all ranks at the same place. The next one goes on as `goes_on` says."""
+    """The job stops on request, all ranks at the same place. `goes_on` says where the next job continues."""
 
     def __init__(self, reason: str, goes_on: str = "after the last finished stage") -> None:
         super().__init__(f"stopped by {reason}; the same command goes on {goes_on}")
 
 
 class StopRequest:
-    """Asks whether the job is to end, or a checkpoint is due; one small message a call, none on one rank.
+    """Decides on all ranks whether the job stops or a checkpoint is due. A call costs one small message.
 
     Parameters
     ----------
-    comm : communicator of the job
-    signals : numbers of the signals that this rank has got so far; a handler appends to it.
-    stop_file : rank 0 looks for it, at most once a second, and removes it when the job stops.
+    comm : communicator of the job.
+    signals : numbers of the signals that this rank has received; a handler appends to it.
+    stop_file : file that rank 0 looks for at most once a second, and removes when the job stops.
     max_seconds : wall time from now on after which the job stops.
     checkpoint_seconds : wall time between two checkpoints.
     """
@@ -58,7 +56,7 @@ class StopRequest:
 
     @contextlib.contextmanager
     def watching(self, loss: Loss) -> Iterator[None]:
-        """Within, the next look raises, on all ranks, what `loss` gives on rank 0; nothing is written any more then."""
+        """Within this context, the next call raises on all ranks the error that `loss` returns on rank 0."""
         self._losses.append(loss)
         try:
             yield
@@ -66,10 +64,7 @@ class StopRequest:
             self._losses.remove(loss)
 
     def __call__(self) -> bool:
-        """Whether any rank knows a reason to stop; the same answer on all ranks, which must all call.
-
-        Raises what a loss that is watched gives.
-        """
+        """Return, on all ranks, whether any rank has a reason to stop; collective. Raises a watched loss."""
         if self._answer <= _CHECKPOINT:
             self._answer = int(global_max(self.comm, self._own_answer()))
             if self._answer == _LOST:
@@ -79,24 +74,24 @@ class StopRequest:
         return self._answer > _CHECKPOINT
 
     def check(self) -> None:
-        """Raise Stopped, on all ranks alike, if there is a reason to stop."""
+        """Raise Stopped on all ranks if there is a reason to stop."""
         if self():
             raise Stopped(self.reason)
 
     @property
     def checkpoint_due(self) -> bool:
-        """Whether the last call found that the time for a checkpoint has come, or that the job is to stop."""
+        """Whether the last call found that a checkpoint is due or the job is to stop."""
         return self._answer >= _CHECKPOINT
 
     @property
     def reason(self) -> str:
-        """What stops the job, in a word or two."""
+        """The reason of the stop, in a few words."""
         if self._answer > _SIGNALS:
             return signal.Signals(self._answer - _SIGNALS).name
         return {_FILE: "the file STOP", _TIME: "its limit of wall time"}[self._answer]
 
     def checkpoint_done(self) -> None:
-        """Start the time to the next checkpoint."""
+        """Start the interval to the next checkpoint."""
         self._checkpoint_at = time.monotonic() + self._interval
 
     def _raise_loss(self) -> None:
@@ -113,7 +108,7 @@ class StopRequest:
         now = time.monotonic()
         if self.stop_file is not None and now >= self._look_at:
             self._look_at = now + LOOK_SECONDS
-            if os.path.exists(self.stop_file):  # raises nothing, which the others would not know of
+            if os.path.exists(self.stop_file):  # unlike Path.exists this raises nothing on one rank alone
                 return _FILE
         if now >= self._end:
             return _TIME

@@ -1,4 +1,4 @@
-"""What terms may ask for when they are evaluated: built at first use, then shared."""
+"""Context of an evaluation: what terms may use, computed at first use and then shared."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -18,32 +18,23 @@ from eddies.particles import moments
 from eddies.particles.devices import kernels_serve
 from eddies.particles.exchanges import mean_over_ranks
 from eddies.particles.flow_units import FlowUnits
+from eddies.particles.kriging import Kriging
 from eddies.particles.neighborhood import LocalParticles
 from eddies.particles.pairs import CompiledSum, ScaledPairs, compiled_sums
 from eddies.particles.particle_set import ParticleSet
-from eddies.particles.surroundings import Surroundings
+from eddies.particles.resolved_velocity import ResolvedFlow, ResolvedVelocity
 from eddies.scene.terms import TermError
 
-if TYPE_CHECKING:
-    from eddies.particles.kriging import Kriging
-    from eddies.particles.resolved_flow import ResolvedFlow
-    from eddies.particles.resolved_velocity import ResolvedVelocity
-
-# Numbers held at once while pairs are summed without a gradient: about a core's cache, or a part of a
-# device's memory.
+# Numbers held at once in sums over pairs without a gradient: about a core's cache, or a part of a device's memory.
 PAIR_VALUES_TOGETHER = {"cpu": 1 << 19, "cuda": 1 << 26}
-# Added to moment matrices and sums of weights, as a fraction of their values for evenly spread neighbours:
-# they stay invertible without neighbours or with coplanar ones, at a bias of a tenth of a percent elsewhere.
+# Added to moment matrices and sums of weights, as a fraction of their values for evenly spread neighbours. They can
+# then be inverted without neighbours or with coplanar ones; elsewhere the bias is a tenth of a percent.
 REGULARISATION = 1e-3
-UNSEEN = 'no term of this model reads "pairs": add it to the `reads` of the settings'
+UNDECLARED = 'no term of this model reads "{}": add it to the `reads` of the settings'
 
 
 class PairSum(Protocol):
-    """What is summed over pairs: a pair term, or the moments that several of them share.
-
-    Where a class of its own defines `compiled(context)`, the compiled library is told by that what to sum, unless it
-    returns None; classes derived from it define it anew, or are summed by their `pair_values`.
-    """
+    """A sum over pairs: a pair term (see PairTerm), or the moments that several terms share."""
 
     width: int
     mutual: bool
@@ -54,7 +45,7 @@ class PairSum(Protocol):
 
 @dataclass(frozen=True)
 class Moments:
-    """Moments of the particles' neighbourhoods: inverse (6, k), of sum_j w x x^T, and weight (1, k), sum_j w."""
+    """Moments of the particles' neighbourhoods: inverse (6, k) of sum_j w x x^T, and weight (1, k), sum_j w."""
 
     inverse: Tensor
     weight: Tensor
@@ -66,70 +57,61 @@ class Context:
     Parameters
     ----------
     decomposition : slabs, with the communicator.
-    particles : the owned ones.
+    particles : the owned particles.
     flow : units of the model.
-    surroundings : of the particles; None where no term looks at others.
-    resolution : what resolves the particles' velocity; None where no term reads it.
-    rows : (k,), the particles whose acceleration and density rate are asked for; None: all.
-    dtype : of the pair arithmetic; None: that of the positions.
+    local : the particles that this rank sees; None if no term reads pairs.
+    resolution : finds the resolved velocity; None if no term reads it.
+    rows : (k,), the particles for which acceleration and density rate are computed; None: all.
+    dtype : type of the pair arithmetic; None: that of the positions.
     density : (n,), the particles' density unless terms give it.
-    time : of the evaluation, where others before it tell what to expect; None: it stands alone.
+    time : of the evaluation within a run, for which earlier evaluations predict the modes; None: independent of them.
     """
 
     def __init__(self, decomposition: SlabDecomposition, particles: ParticleSet, flow: FlowUnits,
-                 surroundings: Surroundings | None, resolution: ResolvedVelocity | None, rows: Tensor | None = None,
+                 local: LocalParticles | None, resolution: ResolvedVelocity | None, rows: Tensor | None = None,
                  dtype: torch.dtype | None = None, density: Tensor | None = None, time: float | None = None) -> None:
         self.decomposition, self.comm = decomposition, decomposition.comm
         self.particles, self.flow, self.rows, self.density = particles, flow, rows, density
         self.dtype = dtype or particles.position.dtype
-        self._surroundings, self._resolution, self._time = surroundings, resolution, time
+        self._local, self._resolution, self._time = local, resolution, time
         self._columns: dict[str, Tensor] = {}
         self._sums: dict[PairSum, Tensor] = {}
 
     @property
-    def surroundings(self) -> Surroundings:
-        """What the places of the particles tell."""
-        if self._surroundings is None:
-            raise TermError(UNSEEN)
-        return self._surroundings
-
-    @property
     def local(self) -> LocalParticles:
-        """The particles that this rank sees, ghosts included, without columns; collective."""
-        return self.surroundings.local
+        """The particles that this rank sees, ghosts included."""
+        if self._local is None:
+            raise TermError(UNDECLARED.format("pairs"))
+        return self._local
 
     @property
     def kriging(self) -> Kriging:
-        """What neighbours tell of smooth fields at all owned particles; collective."""
-        return self.surroundings.kriging
+        """Kriging among neighbours at all owned particles; collective."""
+        return self.local.kriging(self.flow.scales.filter_width, self.dtype)
 
     @property
     def everywhere(self) -> Context:
-        """The same where all owned particles are asked for."""
-        # Not cached: an object that holds itself stays until a collector comes by, with all lists and weights.
-        return self if self.rows is None else self._whole
-
-    @cached_property
-    def _whole(self) -> Context:
+        """The same context for all owned particles instead of some rows."""
+        if self.rows is None:
+            return self
         whole = copy(self)
         whole.rows, whole._sums = None, {}
         vars(whole).pop("moments", None)
         return whole
 
     def column(self, name: str) -> Tensor:
-        """"velocity" (s, 3) or "density" (s,) of the particles that this rank sees, owned first; collective."""
-        around = self.surroundings.neighborhood
+        """Column "velocity" (s, 3) or "density" (s,) of the particles that this rank sees, owned first; collective."""
+        around = self.local.neighborhood
         if name not in self._columns:
             owned = self.density if name == "density" else getattr(self.particles, name)
             if owned is None:
-                raise TermError(f'no term of this model reads "{name}": add it to the `reads` of the settings; or the '
-                                "particles have none")
+                raise TermError(UNDECLARED.format(name) + "; or the particles have none")
             self._columns[name] = around.column(owned)
         return self._columns[name]
 
     @property
     def own_density(self) -> Tensor:
-        """The density (k,) of the particles that are asked for."""
+        """Density (k,) of the particles for which rates are computed."""
         density = self.column("density")[: len(self.particles)]
         return density if self.rows is None else density[self.rows]
 
@@ -145,23 +127,23 @@ class Context:
     def resolved(self) -> ResolvedFlow:
         """The velocity that the particles resolve; collective."""
         if self._resolution is None:
-            raise TermError('no term of this model reads "resolved": add it to the `reads` of the settings')
+            raise TermError(UNDECLARED.format("resolved"))
         return self._resolution.of(self.particles, self._time)
 
     def without_mean(self, rows: Tensor) -> Tensor:
-        """Rows (n, c) of the owned particles less their mean over all particles of all ranks; collective."""
+        """Rows (n, c) of the owned particles minus their mean over all particles of all ranks; collective."""
         return rows - mean_over_ranks(self.comm, rows)
 
     # ---- sums over pairs
 
     def pair_sums(self, term: PairSum) -> Tensor:
-        """Sums (components, k) of a term's pair values over each particle's neighbours."""
+        """Sums (components, k) of a term's pair values over each particle's neighbours; collective."""
         if term not in self._sums:
             self.sum_pairs([term])
         return self._sums[term]
 
     def forget_sums(self, term: object) -> None:
-        """Take a term's sums over pairs anew when they are asked for next: its parameters are others."""
+        """Discard a term's sums over pairs after a change of its parameters."""
         self._sums = {summand: sums for summand, sums in self._sums.items() if summand is not term}
 
     @cached_property
@@ -174,37 +156,35 @@ class Context:
                        sums[:1] + REGULARISATION * moments.expected_weight(flow.neighbors))
 
     def sum_pairs(self, terms: Sequence[PairSum]) -> None:
-        """Take the sums of terms together, with the moments that some of them need; collective."""
-        moments_too = any(getattr(term, "needs_moments", False) for term in terms)
-        summands = [summand for summand in (*terms, *([_MOMENTS] if moments_too else [])) if summand not in self._sums]
+        """Compute the sums of terms together, with the moments if a term needs them; collective."""
+        needs_moments = any(getattr(term, "needs_moments", False) for term in terms)
+        summands = [each for each in (*terms, *([_MOMENTS] if needs_moments else [])) if each not in self._sums]
         if not summands:
             return
+        requests = {summand: self._compiled_request(summand) for summand in summands}
+        if compiled := {summand: request for summand, request in requests.items() if request is not None}:
+            self._sums |= zip(compiled, self._compiled_sums(compiled))
+        if rest := [summand for summand in summands if requests[summand] is None]:
+            self._sums |= zip(rest, self._torch_sums(rest))
+
+    def _compiled_request(self, summand: PairSum) -> CompiledSum | None:
+        """The sum for the compiled library; None if it does not know the summand or the device."""
+        request = vars(type(summand)).get("compiled")
+        return request(summand, self) if request and kernels_serve(self.particles.position.device) else None
+
+    def _compiled_sums(self, summands: Mapping[PairSum, CompiledSum]) -> list[Tensor]:
         mutual = self.rows is None and all(summand.mutual for summand in summands)
-        told = {summand: self._told(summand) for summand in summands}
-        if compiled := {summand: known for summand, known in told.items() if known is not None}:
-            self._sums |= zip(compiled, self._compiled_sums(compiled, mutual))
-        if rest := [summand for summand in summands if told[summand] is None]:
-            self._sums |= zip(rest, self._mutual_sums(rest) if mutual else self._sums_of(rest))
-
-    def _told(self, summand: PairSum) -> CompiledSum | None:
-        """What the compiled library is told of a summand; None where it does not know it, or serves no such device."""
-        tell = vars(type(summand)).get("compiled")
-        return tell(summand, self) if tell and kernels_serve(self.particles.position.device) else None
-
-    def _compiled_sums(self, summands: Mapping[PairSum, CompiledSum], mutual: bool) -> list[Tensor]:
         local, flow, owned = self.local, self.flow, len(self.particles)
         wanted = np.zeros(len(local.position), bool)
-        wanted[: owned if self.rows is None else 0] = True
-        if self.rows is not None:
-            wanted[self.rows.numpy()] = True
+        wanted[slice(owned) if self.rows is None else self.rows.numpy()] = True
         space = PairSpace(local.box.length, local.box.periodic_z, flow.cutoff, flow.scales.filter_width,
                           flow.scales.velocity, mutual)
-        velocity = self.column("velocity") if any(told.reads_velocity for told in summands.values()) else None
-        found = compiled_sums(space, list(summands.values()), [summand.parity for summand in summands], local.position,
-                              velocity, wanted, self.dtype)
-        return [sums[:, :owned] if self.rows is None else sums.index_select(1, self.rows) for sums in found]
+        velocity = self.column("velocity") if any(each.reads_velocity for each in summands.values()) else None
+        sums = compiled_sums(space, list(summands.values()), [summand.parity for summand in summands], local.position,
+                             velocity, wanted, self.dtype)
+        return [each[:, :owned] if self.rows is None else each.index_select(1, self.rows) for each in sums]
 
-    def _sums_of(self, summands: Sequence[PairSum]) -> Sequence[Tensor]:
+    def _torch_sums(self, summands: Sequence[PairSum]) -> Sequence[Tensor]:
         blocks = []
         for block in self._blocks(summands):
             pairs = self._pairs(block)
@@ -212,31 +192,20 @@ class Context:
             blocks.append(pairs.pairs.sum(torch.cat(values).T).T)
         return torch.cat(blocks, dim=1).split([len(value) for value in values])
 
-    def _mutual_sums(self, summands: Sequence[PairSum]) -> list[Tensor]:
-        """Each pair of owned particles evaluated once; those with ghosts on both sides."""
-        totals = [self.local.position.new_zeros((len(summand.parity), len(self.particles)), dtype=self.dtype)
-                  for summand in summands]
-        for block in self._blocks(summands):
-            pairs = self._pairs(block, once=True)
-            for summand, total in zip(summands, totals):
-                pairs.pairs.add_to_both(summand.pair_values(pairs), summand.parity.to(total), total)
-        return totals
-
-    def _pairs(self, block: Tensor | slice | None, once: bool = False) -> ScaledPairs:
+    def _pairs(self, block: Tensor | slice | None) -> ScaledPairs:
         position = self.local.position
-        pairs = self.local.neighbors.pairs(position[: len(self.particles)], position, block, self.dtype, once)
+        pairs = self.local.neighbors.pairs(position[: len(self.particles)], position, block, self.dtype)
         return ScaledPairs(pairs, self.column, self.flow)
 
     def _blocks(self, summands: Sequence[PairSum]) -> Iterator[Tensor | slice | None]:
-        """Receivers to take together: few enough for the cache, or all where a gradient is recorded."""
+        """Receivers to take together: as many as fit the cache, or all if a gradient is recorded."""
         if self.rows is not None or torch.is_grad_enabled():
             yield self.rows
             return
         yield from self.blocks(max(summand.width for summand in summands))
 
     def blocks(self, width: int) -> Iterator[slice]:
-        """Consecutive particles whose pairs hold about as many numbers as fit the cache, `width` for each pair; at
-        least one block."""
+        """Consecutive particles whose pairs, with `width` numbers each, fit the cache; at least one block."""
         together = max(PAIR_VALUES_TOGETHER[self.particles.position.device.type] // width, 1)
         yield from self.local.neighbors.blocks(together)
 
@@ -252,11 +221,9 @@ class _SharedMoments:
     width, mutual, parity = 8, True, torch.ones(7)
 
     def pair_values(self, pairs: ScaledPairs) -> Tensor:
-        weighted = pairs.weight * pairs.x
-        return torch.stack([pairs.weight, *moments.products(weighted, pairs.x)])
+        return torch.stack([pairs.weight, *moments.products(pairs.weight * pairs.x, pairs.x)])
 
     def compiled(self, context: Context) -> CompiledSum:
-        """The same for the compiled library."""
         return CompiledSum("moments", reads_velocity=False)
 
 

@@ -1,22 +1,22 @@
-"""Where torch computes, and with how many threads."""
+"""The device and the number of threads of torch."""
 
 from __future__ import annotations
 
 import torch
 
-from eddies.errors import UserError
 from eddies.cores import threads
+from eddies.errors import UserError
 from eddies.parallel.communicator import Comm, node_rank
 
 
 class DeviceError(UserError, RuntimeError):
-    """There is no such device here."""
+    """The requested device does not exist."""
 
 
 def prepare_torch(device: str, comm: Comm) -> torch.device:
-    """The device of this rank; sets the number of threads to OMP_NUM_THREADS (default 1 a rank).
+    """Return the device of this rank, and set the number of threads to OMP_NUM_THREADS (default 1 a rank).
 
-    Ranks share the GPUs of a node in turn. Raises DeviceError where a GPU is asked for and there is none.
+    Ranks share the GPUs of a node in turn. Raises DeviceError if a GPU is requested and there is none.
     """
     torch.set_num_threads(threads())
     if device == "cpu":
@@ -27,5 +27,5 @@ def prepare_torch(device: str, comm: Comm) -> torch.device:
 
 
 def kernels_serve(device: torch.device) -> bool:
-    """Whether the compiled library takes tensors on a device; on others torch's expressions do the same."""
+    """Whether the compiled library computes pairs on this device; torch's expressions do on others."""
     return device.type == "cpu"

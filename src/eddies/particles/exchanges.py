@@ -1,5 +1,4 @@
-"""What ranks tell each other of their particles, as differentiable operations: copies of the neighbouring ones, sums
-and means."""
+"""Differentiable communication between ranks: ghost particles, sums and means."""
 
 from __future__ import annotations
 
@@ -13,10 +12,10 @@ from eddies.particles.particle_set import as_numpy
 
 
 class _GhostExchange(torch.autograd.Function):
-    """Rows of owned particles to the ranks that see them; backwards, gradients of the copies to their owners.
+    """Send rows of owned particles to the ranks that see them; backwards, send gradients of the copies to the owners.
 
-    Both directions are collective: as long as all ranks compute the same expression, whatever their number of
-    particles, all of them also take part in the backward exchange, in the same order.
+    Both directions are collective. If all ranks compute the same expression, with any number of particles, they also
+    take part in the backward exchanges in the same order.
     """
 
     @staticmethod
@@ -36,7 +35,7 @@ def exchange_ghosts(halo: HaloExchange, owned: Tensor) -> Tensor:
 
 
 def exchange_ghost_positions(halo: HaloExchange, positions: Tensor) -> Tensor:
-    """Ghost positions (halo.count, 3), moved by one period in z beyond the periodic face; collective."""
+    """Ghost positions (halo.count, 3), shifted by one period in z beyond the periodic face; collective."""
     return _GhostExchange.apply(positions, halo, True)
 
 
@@ -59,7 +58,9 @@ def sum_over_ranks(comm: Comm, values: Tensor) -> Tensor:
 
 
 def mean_over_ranks(comm: Comm, rows: Tensor) -> Tensor:
-    """Mean (k,) of rows (n, k) over the particles of all ranks, of which there is one at least; in one message,
-    differentiable, collective both ways."""
+    """Mean (k,) of rows (n, k) over the particles of all ranks, in one message; differentiable, collective both ways.
+
+    There must be at least one particle.
+    """
     total = sum_over_ranks(comm, torch.cat([rows.sum(0), rows.new_tensor([len(rows)])]))
     return total[:-1] / total[-1]

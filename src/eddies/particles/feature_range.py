@@ -1,4 +1,4 @@
-"""Which inputs a network has seen, and how many of those that it is given lie outside of them."""
+"""Range of the inputs on which a network was trained, and the share of later inputs outside it."""
 
 from __future__ import annotations
 
@@ -16,11 +16,10 @@ from eddies.particles.particle_set import ParticleSet
 
 
 def pair_features(dynamics: ParticleDynamics, particles: ParticleSet) -> Iterator[Tensor]:
-    """What the networks of a model are given of particles with the density that it sees, in blocks (features, m), those
-    of all networks one after the other; collective, with at least one block on each rank.
+    """Yield the inputs of a model's networks in blocks (features, m), one network after the other; collective.
 
-    Each pair stands in both orders, on the rank that owns its first particle, also where a term needs one order
-    alone: so counts are the same on any number of ranks.
+    Particles have the density that the model sees. Each rank yields at least one block. Each pair appears in both
+    orders, on the rank that owns its first particle, so counts are the same on any number of ranks.
     """
     terms = dynamics.model.networks
     context = dynamics.context(particles, density=particles.density)
@@ -30,9 +29,9 @@ def pair_features(dynamics: ParticleDynamics, particles: ParticleSet) -> Iterato
 
 @dataclass(frozen=True)
 class FeatureRange:
-    """Smallest and largest value of each input of a network over all pairs that it was trained on, (features,) each.
+    """Smallest and largest value of each input of a network over all pairs of its training, (features,) each.
 
-    Beyond them tanh layers go on smoothly, but what they give was never compared with anything.
+    Outside of them the network extrapolates, smoothly but without a comparison with the truth.
     """
 
     low: np.ndarray
@@ -40,13 +39,15 @@ class FeatureRange:
 
     @classmethod
     def of(cls, comm: Comm, blocks: Iterable[Tensor]) -> FeatureRange:
-        """The range of blocks (features, m) of all ranks, of which each has at least one; collective."""
+        """Range of blocks (features, m) of all ranks, at least one on each rank; collective."""
         low, high = zip(*map(_extrema, blocks))
         return cls(global_min(comm, np.min(low, axis=0)), global_max(comm, np.max(high, axis=0)))
 
     def share_outside(self, comm: Comm, blocks: Iterable[Tensor]) -> float:
-        """The share of the pairs in blocks (features, m) of all ranks of which some feature lies outside the range, or
-        is not a number; collective. Zero without pairs."""
+        """Share of the pairs in blocks (features, m) of all ranks with a feature outside the range or NaN; collective.
+
+        It is zero without pairs.
+        """
         counts = np.zeros(2, np.int64)
         for block in blocks:
             low, high = (torch.from_numpy(bound).to(block).unsqueeze(1) for bound in (self.low, self.high))

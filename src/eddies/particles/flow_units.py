@@ -1,5 +1,4 @@
-"""What a model is told of the flow that it is used on: measured scales, by which it is made dimensionless, and the
-neighbourhoods of particles."""
+"""Units of a flow: measured scales that make a model dimensionless, and the neighbourhoods of particles."""
 
 from __future__ import annotations
 
@@ -13,12 +12,12 @@ from eddies.errors import UserError
 from eddies.parallel.communicator import Comm
 from eddies.parallel.reduction import global_sum
 
-# The highest wavenumber that particles resolve: in units of their Nyquist wavenumber; in units of 1/eta, where
-# turbulence ends; and the least that the filter may leave of a mode, as it is undone. Measured in docs/closure.md.
+# The highest wavenumber that particles resolve, in units of their Nyquist wavenumber and of 1/eta, where turbulence
+# ends; and the least transfer of the filter there, since the filter is inverted. Measured in docs/closure.md.
 BEYOND_NYQUIST, BEYOND_DISSIPATION, LEAST_TRANSFER = 1.5, 1.05, 0.02
 MAY_VANISH = ("viscosity", "kolmogorov_length")
 MEAN_DENSITY = 1.0
-# What changes along a trajectory, and the name of its rate of change.
+# Columns that change along a trajectory, the names of their rates of change, and their means.
 RATES = {"velocity": "acceleration", "density": "density_rate"}
 MEANS = {"velocity": 0.0, "density": MEAN_DENSITY}
 
@@ -26,12 +25,12 @@ Columns = Mapping[str, np.ndarray]
 
 
 class ScaleError(UserError, ValueError):
-    """A scale vanishes by which a model would divide."""
+    """A scale by which a model divides is zero or not finite."""
 
 
 @dataclass(frozen=True)
 class ReferenceScales:
-    """Scales of one flow, all measured on its filtered ground truth, in the units of the simulation.
+    """Scales of one flow, measured on its filtered ground truth, in the units of the simulation.
 
     Parameters
     ----------
@@ -44,12 +43,10 @@ class ReferenceScales:
     density : rms of the density fluctuation rho - rho_0.
     density_rate : rms of the rate of change of density along trajectories.
     sound_speed : speed of sound c.
-    kolmogorov_length : eta of the flow that was filtered, beyond whose wavenumber there is next to nothing; 0 without
-        viscosity.
+    kolmogorov_length : eta of the flow before the filter; its spectrum ends near 1/eta. 0 without viscosity.
 
-    Those of density and sound are None for a ground truth without density, that of an incompressible fluid. A flow at
-    another Mach number supplies its own scales to the same network. Raises ScaleError unless all that are given are
-    finite and positive.
+    Scales of density and sound are None for an incompressible ground truth. A flow at another Mach number supplies its
+    own scales to the same network. Raises ScaleError unless all given scales are finite and positive.
     """
 
     filter_width: float
@@ -64,18 +61,18 @@ class ReferenceScales:
     kolmogorov_length: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in MAY_VANISH:
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0):
+        for name, value in asdict(self).items():
+            if value is None:
+                continue
+            if name in MAY_VANISH and not (math.isfinite(value) and value >= 0):
                 raise ScaleError(f"reference scale {name} = {value}: must be finite and not negative; start from "
                                  "another flow ([initial])")
-        for name, value in asdict(self).items():
-            if name not in MAY_VANISH and value is not None and not (math.isfinite(value) and value > 0):
+            if name not in MAY_VANISH and not (math.isfinite(value) and value > 0):
                 raise ScaleError(f"reference scale {name} = {value}: must be finite and positive, as a model is made "
                                  "dimensionless by it; start from a flow that moves and changes ([initial], [forcing])")
 
     def required(self, name: str) -> float:
-        """A scale that must be there; ValueError where the flow has no density, and so none of it or of sound."""
+        """A scale by name. Raises ValueError if the flow has no density, and so no scale of density or sound."""
         value = getattr(self, name)
         if value is None:
             raise ValueError(f"reference scale {name}: a flow without density has none")
@@ -87,24 +84,26 @@ class ReferenceScales:
 
 
 def resolved_wavenumber(spacing: float, filter_width: float, kolmogorov_length: float) -> float:
-    """k_c, the highest wavenumber of a filtered velocity that particles so far apart resolve."""
+    """k_c, the highest wavenumber of a filtered velocity that particles with this spacing resolve."""
     highest = min(BEYOND_NYQUIST * math.pi / spacing, math.sqrt(-24 * math.log(LEAST_TRANSFER)) / filter_width)
     return min(highest, BEYOND_DISSIPATION / kolmogorov_length) if kolmogorov_length > 0 else highest
 
 
 def allowed_step(angle: float, highest: float, speed: float) -> float:
-    """The longest time step where velocities are resolved up to a wavenumber k_c = `highest`: in it the rms `speed` u'
-    of a component carries particles by an `angle` of that wave, in radians. Infinite at rest."""
+    """Longest time step for velocities resolved up to a wavenumber k_c = `highest`; infinite at rest.
+
+    In this step the rms `speed` u' of a component moves particles by an `angle` of that wave, in radians.
+    """
     return angle / (highest * speed) if speed > 0 else math.inf
 
 
 @dataclass(frozen=True)
 class FlowUnits:
-    """The scales of a flow, by which terms are made dimensionless, and the neighbourhoods of its particles.
+    """Scales of a flow, which make terms dimensionless, and the neighbourhoods of its particles.
 
     Parameters
     ----------
-    scales : measured where the flow starts.
+    scales : measured at the start of the flow.
     cutoff : h, the radius of interaction of pairs.
     neighbors : n, the expected number of particles within it.
     seed : of initial parameters.
@@ -117,16 +116,16 @@ class FlowUnits:
 
     @property
     def particle_mass(self) -> float:
-        """Mass of a particle: that of all fluid over the number of particles."""
+        """Mass of a particle: mass of the fluid over the number of particles."""
         return self.scales.density_mean * self.scales.spacing**3
 
 
 def measured_scales(comm: Comm, at: Columns, after: Columns, interval: float) -> dict[str, float]:
-    """Root mean squares over all particles, of one component where there are three; collective.
+    """Root mean squares over all particles, of one component of vectors; collective.
 
-    velocity_rms and acceleration_rms, and with a density density_rms (of its fluctuation) and density_rate_rms: values
-    of the frame `at`, rates from the difference to the frame `after`, which is `interval` later. Frames are this rank's
-    rows of `velocity` (n, 3) and, or not, `density` (n,), the same particles in both.
+    velocity_rms and acceleration_rms, and with a density density_rms (of its fluctuation) and density_rate_rms. Values
+    are those of the frame `at`; rates are differences to the frame `after`, an `interval` later. Frames are this rank's
+    rows of `velocity` (n, 3) and, optionally, `density` (n,), of the same particles.
     """
     scales = {}
     for name, rate in RATES.items():

@@ -1,11 +1,10 @@
-"""The forms in which velocities and their gradients are reconstructed from particles, behind one interface."""
+"""Forms of reconstruction: velocities and their gradients from particles, behind one interface."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -17,144 +16,94 @@ from eddies.particles.smoothing_kernels import SmoothingKernel
 log = logging.getLogger("eddies")
 
 DEGREES = {"linear": 1, "quadratic": 2}
+WORDS = {"average": "averages with the learned kernel", "kriging": "kriging among neighbours",
+         **{name: f"polynomials of degree {degree} fitted to neighbours" for name, degree in DEGREES.items()}}
 
 
-class Reconstructed(Protocol):
-    """A velocity made of particles at one moment; collective where it is asked for."""
+class Reconstructed:
+    """Velocity reconstructed from particles at one moment. All methods are collective.
 
-    def at(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Velocity (k, 3) and gradient (k, 3, 3) [component, direction] at points (k, 3) of this rank."""
+    Parameters
+    ----------
+    field : the particles.
+    at : function that returns velocity (k, 3) and gradient (k, 3, 3) [component, direction] at points (k, 3) of this
+        rank.
+    """
+
+    def __init__(self, field: ParticleField, at: Callable[[Tensor], tuple[Tensor, Tensor]]) -> None:
+        self.field, self.at = field, at
 
     def velocity_on_grid(self) -> Tensor:
-        """The velocity (m, 3) at this rank's grid points, z slowest."""
+        """Velocity (m, 3) at this rank's grid points, z slowest."""
+        return self.at(self.field.points)[0]
 
     def at_particles(self) -> tuple[Tensor, Tensor]:
         """Velocity (n, 3) and gradient (n, 3, 3) at the owned particles."""
+        return self.at(self.field.owned)
 
 
-class Form(Protocol):
-    """A way to reconstruct a velocity from the particles within `support`; `words` name it."""
+class _Averaged(Reconstructed):
+    """Kernel averages, which have a faster sum on the whole grid."""
 
-    support: float
-    words: str
-
-    def of(self, field: ParticleField) -> Reconstructed:
-        """What it makes of particles; collective."""
-
-
-@dataclass(frozen=True)
-class Average:
-    """Averages with a kernel, Eqs. 5 and 6, as `reconstruct` has them; the gradient of normalised ones is exactly that
-    of the reconstructed field."""
-
-    kernel: SmoothingKernel
-    words = "averages with the learned kernel"
-
-    @property
-    def support(self) -> float:
-        """h."""
-        return self.kernel.support
-
-    def of(self, field: ParticleField) -> _Averaged:
-        """See Form."""
-        return _Averaged(self.kernel, field, field.volumes(self.kernel))
-
-
-@dataclass(frozen=True)
-class _Averaged:
-    kernel: SmoothingKernel
-    field: ParticleField
-    volume: Tensor
-
-    def at(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        return self.field.averaged(self.kernel, self.volume, points)
+    def __init__(self, field: ParticleField, kernel: SmoothingKernel) -> None:
+        self.kernel, self.volume = kernel, field.volumes(kernel)
+        super().__init__(field, lambda points: field.averaged(kernel, self.volume, points))
 
     def velocity_on_grid(self) -> Tensor:
         return self.field.velocity_on_whole_grid(self.kernel, self.volume)
 
-    def at_particles(self) -> tuple[Tensor, Tensor]:
-        return self.field.at_particles(self.kernel, self.volume)
-
 
 @dataclass(frozen=True)
-class LeastSquares:
-    """Moving least squares of a degree, 1 or 2, with a kernel as weight: exact for polynomials of this degree where
-    there are enough neighbours. The gradient is that of the polynomial. `mean_volume`: of a particle."""
+class Form:
+    """A way to reconstruct the velocity from the particles within the support of the kernel.
 
+    Parameters
+    ----------
+    name : "average", Eqs. 5 and 6; "linear" or "quadratic", moving least squares (`ParticleField.fitted`); or
+        "kriging", the best linear estimate for the covariance of filtered turbulence.
+    kernel : the learned W. Only averages accept negative weights.
+    filter_width : d of the filter that the velocities have passed.
+    mean_volume : mean volume of a particle.
+    """
+
+    name: str
     kernel: SmoothingKernel
-    degree: int
+    filter_width: float
     mean_volume: float
 
     @property
     def words(self) -> str:
-        """That it is of this degree."""
-        return f"polynomials of degree {self.degree} fitted to neighbours"
+        """The form in words, for reports."""
+        return WORDS[self.name]
 
     @property
     def support(self) -> float:
-        """h."""
+        """Radius h within which particles contribute."""
         return self.kernel.support
 
-    def of(self, field: ParticleField) -> _AtAnyPoints:
-        """See Form."""
-        return _AtAnyPoints(
-            field, lambda receivers: field.fitted(self.kernel, self.degree, self.mean_volume, receivers))
+    def of(self, field: ParticleField) -> Reconstructed:
+        """Reconstruct the velocity of the particles of a field; collective."""
+        if self.name == "average":
+            return _Averaged(field, self.kernel)
+        if self.name == "kriging":
+            return Reconstructed(field, lambda points: self._kriged(field, points))
+        return Reconstructed(field, lambda points: self._fitted(field, points, DEGREES[self.name]))
 
+    def _fitted(self, field: ParticleField, points: Tensor, degree: int) -> tuple[Tensor, Tensor]:
+        return field.fitted(self.kernel, degree, self.mean_volume, points)
 
-@dataclass(frozen=True)
-class Kriging:
-    """The best linear estimate from neighbours, for the covariance of turbulence that has passed a Gaussian filter.
-
-    At points with too many neighbours, or with singular equations, `instead` is used, and the log says so.
-    """
-
-    covariance: Covariance
-    instead: LeastSquares
-    words = "kriging among neighbours"
-
-    @property
-    def support(self) -> float:
-        """h."""
-        return self.instead.support
-
-    def of(self, field: ParticleField) -> _AtAnyPoints:
-        """See Form."""
-        return _AtAnyPoints(field, lambda receivers: self._at(field, receivers))
-
-    def _at(self, field: ParticleField, receivers: Tensor) -> tuple[Tensor, Tensor]:
-        found = field.kriged(self.covariance, receivers)
-        failed = torch.nonzero(~(found[0].isfinite().all(1) & found[1].isfinite().all(2).all(1))).squeeze(1)
+    def _kriged(self, field: ParticleField, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Kriging; a quadratic fit where there are too many neighbours or the equations are singular."""
+        velocity, gradient = field.kriged(Covariance.of_filtered_turbulence(self.filter_width), points)
+        solved = velocity.isfinite().all(1) & gradient.isfinite().all(2).all(1)
+        failed = torch.nonzero(~solved).squeeze(1)
         if len(failed):
-            log.warning("kriging: of %d points %d have too many neighbours, or equations without a solution; there "
-                        "polynomials of second degree are fitted", len(receivers), len(failed))
-            for whole, part in zip(found, self.instead.of(field).at(receivers[failed])):
-                whole[failed] = part
-        return found
-
-
-class _AtAnyPoints:
-    """What needs no more than the particles around a point, wherever that lies on this rank."""
-
-    def __init__(self, field: ParticleField, at: Callable[[Tensor], tuple[Tensor, Tensor]]) -> None:
-        self._field, self.at = field, at
-
-    def velocity_on_grid(self) -> Tensor:
-        return self.at(self._field.points)[0]
-
-    def at_particles(self) -> tuple[Tensor, Tensor]:
-        return self.at(self._field.owned)
+            log.warning("kriging: %d of %d points have too many neighbours or singular equations; a quadratic fit "
+                        "replaces kriging there", len(failed), len(points))
+            velocity[failed], gradient[failed] = self._fitted(field, points[failed], 2)
+        return velocity, gradient
 
 
 def form_of(name: str, kernel: SmoothingKernel, filter_width: float, mean_volume: float) -> Form:
-    """The form that [kernel] form names: "average", "linear", "quadratic" or "kriging".
-
-    Parameters
-    ----------
-    kernel : the learned W. All forms use the particles within its support. Only averages accept negative weights.
-    filter_width : d of the filter that the velocities have passed. mean_volume : of a particle.
-    """
-    if name == "average":
-        return Average(kernel)
-    if name == "kriging":
-        return Kriging(Covariance.of_filtered_turbulence(filter_width), LeastSquares(kernel, 2, mean_volume))
-    return LeastSquares(kernel, DEGREES[name], mean_volume)
+    """Return the form that [kernel] form names; arguments as for `Form`."""
+    return Form(name, kernel, filter_width, mean_volume)

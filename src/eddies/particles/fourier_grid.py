@@ -1,6 +1,6 @@
-"""Fields on a grid in torch: the linear steps between particles, grid points and Fourier modes, each with its adjoint.
+"""Fields on a grid in torch: linear steps between particles, grid points and Fourier modes, each with its adjoint.
 
-Everything made of them is a formula that differentiates itself.
+Formulas composed of these steps are differentiated automatically.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from eddies.spectral.spectral_grid import SYMMETRIC, SpectralGrid
 
 
 class FourierGrid(ModeOperators):
-    """A periodic grid of one cell for each plane of the slabs, with the modes |k_i| <= `resolved`.
+    """A periodic grid with one cell for each plane of the slabs, and the modes |k_i| <= `resolved`.
 
-    Fields are real tensors (c, z_local, y, x), modes complex ones (c, kz, ky, kx) as in `SpectralGrid`; both are on the
-    host and of the precision of `dtype`, single or double. Values at positions are in double precision. Positions
-    (n, 3) lie in this rank's slab or at most `reach` outside, which is `margin` grid planes. All methods that change
-    between particles, fields and modes are collective, also on the way back of a gradient.
+    Fields are real tensors (c, z_local, y, x), modes complex ones (c, kz, ky, kx) as in `SpectralGrid`, on the host and
+    in the precision of `dtype`. Values at positions are in double precision. Positions (n, 3) lie in this rank's
+    slab or at most `reach` outside it, which is `margin` grid planes. Methods that change between particles, fields and
+    modes are collective, in the backward pass too.
     """
 
     def __init__(self, decomposition: SlabDecomposition, resolved: int, margin: int = 1,
@@ -38,13 +38,13 @@ class FourierGrid(ModeOperators):
         self.reach = margin * decomposition.spacing
         super().__init__([torch.from_numpy(axis) for axis in self.spectral.wavevector],
                          torch.from_numpy(self.spectral.wavenumber_squared), torch.stack)
-        #: |k|, in units of the smallest one
+        #: |k| in units of the smallest wavenumber
         self.shell = torch.from_numpy(np.sqrt(self.spectral.index_squared))
-        #: by which modes become those of spline coefficients
+        #: factor from modes of a field to modes of its spline coefficients
         self.prefilter = torch.from_numpy(self.spline.inverse)
-        #: how often a stored mode stands in the full sum
+        #: number of times that a stored mode counts in the full sum
         self.multiplicity = torch.from_numpy(self.spectral.multiplicity)
-        self._sphere = (self.shell <= resolved).to(dtype)  # products take half of the time of `where`
+        self._sphere = (self.shell <= resolved).to(dtype)  # a product is twice as fast as `where`
         self._transfers: dict[float, Tensor] = {}
 
     # ---- linear steps
@@ -54,42 +54,38 @@ class FourierGrid(ModeOperators):
         return _ToModes.apply(fields, self)
 
     def to_fields(self, modes: Tensor) -> Tensor:
-        """Fields of modes; of those with kx = 0 the part that belongs to a real field."""
+        """Fields of modes. Modes with kx = 0 contribute the part that belongs to a real field."""
         return _ToFields.apply(modes, self)
 
     def points(self, position: Tensor) -> Points:
-        """Positions at which fields are asked for more than once."""
+        """Positions (n, 3) on the grid."""
         return Points(self.spline, position)
 
-    def at(self, modes: Tensor, position: Tensor | Points) -> Tensor:
-        """Values (n, c) of modes at positions, by cubic splines; differentiable in both."""
-        points = self._as_points(position)
+    def at(self, modes: Tensor, points: Points) -> Tensor:
+        """Values (n, c) of modes at points, by cubic splines; differentiable in modes and positions."""
         return _Interpolated.apply(self.to_fields(modes * self.prefilter), points.position, points)
 
-    def spread(self, values: Tensor, position: Tensor | Points) -> Tensor:
-        """Modes (c, kz, ky, kx) of a sum of splines around positions with weights `values` (n, c); differentiable in
-        both. Up to the number of points and the multiplicity of modes the adjoint of `at`."""
-        points = self._as_points(position)
+    def spread(self, values: Tensor, points: Points) -> Tensor:
+        """Modes (c, kz, ky, kx) of a sum of splines around points with weights `values` (n, c); differentiable in both.
+
+        It is the adjoint of `at` except for the number of points and the multiplicity of modes.
+        """
         return self.to_modes(_Spread.apply(values, points.position, points)) * self.prefilter
 
-    def _as_points(self, position: Tensor | Points) -> Points:
-        return position if isinstance(position, Points) else self.points(position)
-
     def zeros(self, *leading: int) -> Tensor:
-        """Modes (*leading, kz, ky, kx) of nothing."""
+        """Zero modes (*leading, kz, ky, kx)."""
         return torch.zeros(*leading, *self.spectral.spectral_shape, dtype=self.dtype.to_complex())
 
     # ---- formulas on modes
 
     def filter_transfer(self, width: float) -> Tensor:
-        """`gaussian_transfer` G of each mode (kz, ky, kx), made once."""
+        """Transfer function G of the filter, `gaussian_transfer`, for each mode (kz, ky, kx)."""
         if width not in self._transfers:
             self._transfers[width] = torch.from_numpy(gaussian_transfer(self.spectral.wavenumber_squared, width))
         return self._transfers[width]
 
     def hidden_stress(self, stress: Tensor) -> Rates:
-        """What a stress tau that the filter hides does to the filtered flow, of (6, kz, ky, kx): its divergence and the
-        gradient of its pressure p_tau (`pressure_of`), which together are the force
+        """Force and pressure p_tau (`pressure_of`) of a stress tau (6, kz, ky, kx) that the filter hides. The force is
 
             -grad p_tau - div tau = -P[div tau],   P the projection on solenoidal fields."""
         divergence = self.stress_divergence(stress)
@@ -102,22 +98,24 @@ class FourierGrid(ModeOperators):
         return self.to_fields(modes).unflatten(0, (3, 3))
 
     def products(self, first: Tensor, second: Tensor) -> Tensor:
-        """Modes (6, kz, ky, kx) of a_i.b_j, symmetric in i and j, of fields (3, ..., z_local, y, x); what stands
-        between is summed over."""
+        """Modes (6, kz, ky, kx) of the symmetric products a_i b_j of fields (3, ..., z_local, y, x).
+
+        Axes between the component and the grid are summed over.
+        """
         fields = [first[i] * second[j] for i, j in SYMMETRIC]
         return self.to_modes(torch.stack([field.sum(0) if field.dim() > 3 else field for field in fields]))
 
     def squares(self, vector: Tensor) -> Tensor:
-        """Modes (6, kz, ky, kx), |k| <= `resolved`, of u_i u_j of a vector's modes."""
+        """Modes (6, kz, ky, kx), |k| <= `resolved`, of u_i u_j for a vector's modes."""
         return self.within(_Squares.apply(vector, self))
 
     def within(self, vector: Tensor) -> Tensor:
-        """The modes with |k| <= `resolved` of a vector."""
+        """The modes of a vector with |k| <= `resolved`; others are set to zero."""
         return vector * self._sphere
 
 
 class Points:
-    """Positions (n, 3) among the planes of a grid, and the splines around them, which are found once."""
+    """Positions (n, 3) among the planes of a grid, and the splines around them, which are computed once."""
 
     def __init__(self, spline: SplineInterpolation, position: Tensor) -> None:
         self.spline, self.position = spline, position
@@ -127,20 +125,20 @@ class Points:
         return self.spline.around(as_numpy(self.position))
 
     def at(self, parts: Sequence[np.ndarray]) -> Tensor:
-        """Values (n, c) of planes with those of the neighbours."""
+        """Values (n, c) of planes with ghost planes."""
         return torch.from_numpy(self._splines.at(parts)).to(self.position.device)
 
     def slope_along(self, parts: Sequence[np.ndarray], factors: Tensor) -> Tensor:
-        """Gradient (n, 3) with respect to the positions of sum_c factors_c f_c, the factors (n, c) held fixed."""
+        """Gradient (n, 3) of sum_c factors_c f_c with respect to the positions, the factors (n, c) held fixed."""
         return torch.from_numpy(self._splines.slope(parts, as_numpy(factors.double()))).to(self.position)
 
     def spread(self, values: Tensor) -> Tensor:
-        """Transpose of `at` on planes with ghosts: values (n, c) added to planes (c, z_local, y, x)."""
+        """Transpose of `at`: values (n, c) added to planes (c, z_local, y, x)."""
         return torch.from_numpy(self.spline.spread(as_numpy(values.double()), self._splines))
 
 
-# Modes with kx > 0 stand for two, so the transform back is the adjoint of the transform forth but for `multiplicity`
-# and the number of points.
+# Modes with kx > 0 count twice, so the backward transform is the adjoint of the forward transform except for
+# `multiplicity` and the number of points.
 
 
 class _ToModes(torch.autograd.Function):
@@ -170,8 +168,10 @@ class _ToFields(torch.autograd.Function):
 
 
 class _Squares(torch.autograd.Function):
-    """`FourierGrid.products` of a vector with itself, a few planes at a time: fields are not kept, so on the way back
-    they are made anew."""
+    """`FourierGrid.products` of a vector with itself, a few planes at a time.
+
+    Fields are not stored; the backward pass computes them again.
+    """
 
     @staticmethod
     def forward(ctx, modes: Tensor, grid: FourierGrid) -> Tensor:

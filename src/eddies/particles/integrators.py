@@ -15,9 +15,11 @@ from eddies.scene.integrators import SCHEMES, Scheme
 
 
 class Integrator:
-    """A time stepping scheme; `memory` is what it carries from one step to the next besides the particles and the
-    state of the dynamics, with rows as in the particles last returned; `restore` gives it back. Where the scheme is
-    dense the next step begins with the `rates` that somebody has asked for."""
+    """A time stepping scheme.
+
+    `memory` holds the rates that a step passes to the next one, with rows as in the particles last returned; `restore`
+    sets it again. In a dense scheme the next step reuses the `rates` between two steps.
+    """
 
     scheme: Scheme
 
@@ -26,48 +28,40 @@ class Integrator:
         self.restore(None, {})
 
     def restore(self, particles: ParticleSet | None, memory: dict[str, Tensor]) -> None:
-        """Go on from these very particles, to which `memory` belongs."""
+        """Continue from these particles, to which `memory` belongs."""
         self._last, self.memory = particles, memory
 
     def rates(self, particles: ParticleSet) -> tuple[ParticleSet, Rates]:
         """Particles between two steps, on the ranks of their slabs, and their rates; collective."""
         if particles is not self._last or not self.memory:
             particles, _ = self.dynamics.settle(particles)
-            rates = self.dynamics.rates_after(0.0, particles)
-            self.restore(particles, _remembered(rates))
+            self.restore(particles, _remembered(self.dynamics.rates_after(0.0, particles)))
         return particles, Rates(**self.memory)
 
     def step(self, particles: ParticleSet, time_step: float) -> ParticleSet:
-        """The particles one time step later; collective."""
+        """Return the particles one time step later; collective."""
         raise NotImplementedError
 
 
 class VelocityVerlet(Integrator):
     """Kick-drift-kick velocity Verlet of second order, one evaluation of the rates a step.
 
-    Rates may depend on velocity and density: they are evaluated at the velocity and density predicted for the
-    end of the step by an Euler step, v + dt a (Groot and Warren 1997, with lambda = 1), and serve the next
-    step's first half kick as well. A density with a rate is integrated by the trapezoidal rule; one that terms give
-    is left as last evaluated. A shift velocity is that of the step's start, of first order.
-
-    `memory` holds those rates. They are evaluated anew for any other particles than those last returned.
+    Rates may depend on velocity and density. They are evaluated at the values that an Euler step predicts for the end,
+    v + dt a (Groot and Warren 1997, lambda = 1), and also serve the next step's first half kick. A density with a rate
+    is integrated by the trapezoidal rule; a density that terms give is the last evaluated one. A shift velocity is that
+    at the start of the step, of first order.
     """
 
     scheme = SCHEMES["verlet"]
 
     def rates(self, particles: ParticleSet) -> tuple[ParticleSet, Rates]:
-        """Evaluated for themselves: those of the memory belong to the predicted velocity."""
-        if particles is not self._last:  # else they are where they belong, and the memory is theirs
+        """Particles between two steps and their rates, evaluated here: the memory belongs to a predicted velocity."""
+        if particles is not self._last:  # the last ones are on their ranks, and the memory is theirs
             particles, _ = self.dynamics.settle(particles)
         return particles, self.dynamics.rates(particles, time=self.dynamics.time)
 
     def step(self, particles: ParticleSet, time_step: float) -> ParticleSet:
-        """The particles one time step later; collective."""
-        if particles is self._last and self.memory:
-            start = Rates(**self.memory)
-        else:
-            particles, _ = self.dynamics.settle(particles)
-            start = self.dynamics.rates_after(0.0, particles)
+        particles, start = super().rates(particles)
         result, end = _kick_drift_kick(self.dynamics, particles, start, time_step)
         self.dynamics.time += time_step
         self.restore(result, _remembered(end))
@@ -75,19 +69,16 @@ class VelocityVerlet(Integrator):
 
 
 class CorrectedVerlet(Integrator):
-    """Velocity Verlet of which the rates at the end are evaluated again at the velocity and density that it has come
-    to, for the next step (Besold et al. 2000, DPD-VV).
+    """Velocity Verlet that evaluates the rates again at the final velocity and density (Besold et al. 2000, DPD-VV).
 
-    Both evaluations are at the same places, so that what depends on these alone, lists and weights of neighbours,
-    serves both. For rates that depend on velocity alone it is Heun's method of second order, stable up to twice the
-    step of velocity Verlet. A shift velocity is that of the step's start, of first order. `memory` holds the rates at
-    the particles last returned.
+    Both evaluations have the same positions and share neighbour lists and weights. For rates that depend on velocity
+    alone it is Heun's method of second order, stable up to twice the step of velocity Verlet. A shift velocity is that
+    at the start of the step, of first order.
     """
 
     scheme = SCHEMES["corrected-verlet"]
 
     def step(self, particles: ParticleSet, time_step: float) -> ParticleSet:
-        """The particles one time step later; collective."""
         particles, start = self.rates(particles)
         result, _ = _kick_drift_kick(self.dynamics, particles, start, time_step)
         end = self.dynamics.rates_after(time_step, result)
@@ -97,14 +88,11 @@ class CorrectedVerlet(Integrator):
 
 
 class RungeKutta(Integrator):
-    """An explicit Runge-Kutta scheme in which each stage goes from the step's start along the rates of the one before:
+    """An explicit Runge-Kutta scheme whose stages start from the step's start with the rates of the stage before:
 
         k_s = f(y + c_s dt k_(s-1)),    y + dt sum_s b_s k_s,
 
-    with c and b the nodes and weights of the scheme.
-
-    Particles change rank between stages. `memory` holds the rates at the particles last returned where `rates` was
-    asked for them.
+    with nodes c and weights b. Particles change rank between stages. `memory` holds rates only after a call of `rates`.
     """
 
     def __init__(self, dynamics: ParticleDynamics, scheme: Scheme) -> None:
@@ -125,18 +113,17 @@ class RungeKutta(Integrator):
         return end
 
     def _settled(self, stage: ParticleSet, *others: ParticleSet) -> list[ParticleSet]:
-        """A stage on the ranks of its slabs, and other columns of its particles beside it."""
+        """A stage on the ranks of its slabs, and the same particles at other stages beside it."""
         companions = {f"{number} {name}": column for number, other in enumerate(others)
                       for name, column in other.columns().items() if name != "id"}
         stage, moved = self.dynamics.settle(stage, companions)
-        found: list[dict[str, Tensor]] = [{"id": stage.id} for _ in others]
-        for place, column in moved.items():
-            number, name = place.split(" ", 1)
-            found[int(number)][name] = column
-        return [stage, *(ParticleSet(**columns) for columns in found)]
+        columns: list[dict[str, Tensor]] = [{"id": stage.id} for _ in others]
+        for label, column in moved.items():
+            number, name = label.split(" ", 1)
+            columns[int(number)][name] = column
+        return [stage, *(ParticleSet(**each) for each in columns)]
 
 
-REMEMBERED = (*BY_PARTICLE, "density")
 #: By the words of scenes.
 INTEGRATORS: dict[str, Callable[[ParticleDynamics], Integrator]] = {
     **{kind.scheme.name: kind for kind in (VelocityVerlet, CorrectedVerlet)},
@@ -146,7 +133,7 @@ INTEGRATORS: dict[str, Callable[[ParticleDynamics], Integrator]] = {
 
 def _kick_drift_kick(dynamics: ParticleDynamics, particles: ParticleSet, start: Rates,
                      time_step: float) -> tuple[ParticleSet, Rates]:
-    """Particles a step later, and the rates at their predicted velocity and density there; collective."""
+    """Particles a step later, and the rates at their predicted velocity and density; collective."""
     position = particles.position + time_step * (_pace(particles, start) + 0.5 * time_step * start.velocity_rate)
     predicted = replace(_kicked(particles, start, time_step), position=position)
     kicked = _kicked(particles, start, 0.5 * time_step)
@@ -157,13 +144,12 @@ def _kick_drift_kick(dynamics: ParticleDynamics, particles: ParticleSet, start: 
 
 
 def _remembered(rates: Rates) -> dict[str, Tensor]:
-    """Those that a later step may want, by name."""
-    found = {name: getattr(rates, name) for name in REMEMBERED}
-    return {name: rate for name, rate in found.items() if rate is not None}
+    """The rates that a later step may need, by name."""
+    return {name: getattr(rates, name) for name in (*BY_PARTICLE, "density") if getattr(rates, name) is not None}
 
 
 def _kicked(particles: ParticleSet, rates: Rates, time_step: float) -> ParticleSet:
-    """Velocity and, where it has a rate, density moved on by one Euler step; a density that terms give replaced."""
+    """Particles after an Euler step of velocity and density; a density that terms give replaces the old one."""
     density = particles.density
     if rates.density is not None:
         density = rates.density
@@ -173,10 +159,10 @@ def _kicked(particles: ParticleSet, rates: Rates, time_step: float) -> ParticleS
 
 
 def _advanced(particles: ParticleSet, stage: ParticleSet, rates: Rates, time_step: float) -> ParticleSet:
-    """All columns moved on by one Euler step with the velocity and the rates of a stage."""
+    """Particles after an Euler step of all columns, with the velocity and the rates of a stage."""
     return replace(_kicked(particles, rates, time_step), position=particles.position + time_step * _pace(stage, rates))
 
 
 def _pace(particles: ParticleSet, rates: Rates) -> Tensor:
-    """dx/dt."""
+    """dx/dt (n, 3)."""
     return particles.velocity if rates.shift_velocity is None else particles.velocity + rates.shift_velocity

@@ -1,4 +1,4 @@
-"""Regularised least squares for the solenoidal modes of a velocity that is known at points."""
+"""Regularised least squares for the solenoidal modes of a velocity known at points."""
 
 from __future__ import annotations
 
@@ -13,15 +13,20 @@ from eddies.kernels.modes import ModePasses
 from eddies.parallel.reduction import global_sum
 from eddies.particles.fourier_grid import FourierGrid, Points
 
-# How many times stronger the preconditioner holds the small scales back: their errors count most, as the filter is
-# undone, and the first iterations would make many of them.
+# Factor of the penalty in the preconditioner. It suppresses small scales in the first iterations, whose errors the
+# inverse of the filter amplifies most.
 SMOOTHING = 5.0
 
 
 @dataclass(frozen=True)
 class Solution:
-    """Modes (3, kz, ky, kx), their values at the points (n, 3), which the iterations come by, how many these were, and
-    the squared residual that is left."""
+    """Result of a solve.
+
+    Parameters
+    ----------
+    modes : (3, kz, ky, kx). at_points : their values (n, 3) at the points.
+    iterations : their number. left : remaining squared residual.
+    """
 
     modes: Tensor
     at_points: Tensor
@@ -30,24 +35,23 @@ class Solution:
 
 
 class LeastSquares:
-    """The equations  A u = P B^T v,  A = P B^T B + penalty,  of the minimum of
+    """The equations  A u = P B^T v,  A = P B^T B + penalty,  for the minimum of
 
         sum_i |v_i - u(x_i)|^2 + sum_k penalty_k |u(k)|^2
 
-    over solenoidal modes u (3, kz, ky, kx): B gives values at points, P projects on the solenoidal modes `inside`.
+    over solenoidal modes u (3, kz, ky, kx). B evaluates modes at points; P projects on the solenoidal modes `inside`.
 
     Parameters
     ----------
-    inside : (kz, ky, kx), which modes are solved for. penalty : likewise, real, 0 outside.
+    inside : (kz, ky, kx), the modes to be found. penalty : (kz, ky, kx), real, 0 outside.
     """
 
     def __init__(self, grid: FourierGrid, inside: Tensor, penalty: Tensor) -> None:
         self.grid, self.inside, self.penalty = grid, inside, penalty.to(grid.dtype)
         self._inside = inside.to(grid.dtype)
         scale = torch.where(inside, grid.prefilter * grid.spectral.cells**3, 0.0)
-        weights = (grid.spectral.wavevector, grid.spectral.multiplicity, grid.inverse_squared.numpy(), scale.numpy(),
-                   self.penalty.numpy())
-        self._passes = ModePasses(library(), *weights)
+        self._passes = ModePasses(library(), grid.spectral.wavevector, grid.spectral.multiplicity,
+                                  grid.inverse_squared.numpy(), scale.numpy(), self.penalty.numpy())
 
     def gathered(self, values: Tensor, points: Points) -> Tensor:
         """P B^T of values (n, 3) at points; collective, differentiable."""
@@ -57,19 +61,19 @@ class LeastSquares:
         """P B^T values - penalty modes; collective, differentiable."""
         if torch.is_grad_enabled():
             return self.gathered(values, points) - self.penalty * modes
-        given = self.grid.to_modes(points.spread(values))
-        return torch.from_numpy(self._passes.image(given.numpy(), -modes.numpy())[0])
+        spread = self.grid.to_modes(points.spread(values))
+        return torch.from_numpy(self._passes.image(spread.numpy(), -modes.numpy())[0])
 
     def projected(self, modes: Tensor) -> Tensor:
         """P of modes; differentiable."""
         return self.grid.solenoidal(modes) * self._inside
 
     def preconditioner(self, count: float) -> Tensor:
-        """1 / (N + 5 penalty), next to the inverse of A for N = `count` points; 0 outside."""
+        """1 / (N + 5 penalty), approximately the inverse of A for N = `count` points; 0 outside."""
         return torch.where(self.inside, 1 / (count + SMOOTHING * self.penalty), 0.0)
 
     def size(self, residual: Tensor, count: float) -> float:
-        """Square of a residual over all ranks, such that it is comparable to sum_i |v_i|^2."""
+        """Squared norm of a residual over all ranks, comparable to sum_i |v_i|^2; collective."""
         square = residual.real.square() + residual.imag.square()
         weighted = self.grid.multiplicity * self.preconditioner(count) * square
         return self._over_ranks(float(weighted.sum(dtype=torch.float64)))
@@ -77,10 +81,13 @@ class LeastSquares:
     @torch.no_grad()
     def solve(self, points: Points, right: Tensor, count: float, enough: float, iterations: int | None,
               most: int) -> Solution:
-        """Modes y with A y = `right` by preconditioned conjugate gradients, until the squared residual (`size`) is
-        `enough`, in `most` iterations, or in a given number of them."""
+        """Solve A y = `right` by preconditioned conjugate gradients; collective.
+
+        The iteration ends when the squared residual (`size`) is at most `enough`, or after `most` iterations. If
+        `iterations` is given, that many are taken instead.
+        """
         inverse, residual = self.preconditioner(count).numpy(), np.array(right.numpy(), order="C")
-        found, direction, passes = np.zeros_like(residual), inverse * residual, self._passes
+        modes, direction, passes = np.zeros_like(residual), inverse * residual, self._passes
         at_points = points.position.new_zeros((len(points.position), len(residual)), dtype=torch.float64)
         left, taken = self.size(right, count), 0
         while (left > enough and taken < most) if iterations is None else (taken < iterations and left > 0):
@@ -89,10 +96,10 @@ class LeastSquares:
             length = left / self._over_ranks(product)
             at_points += length * values
             before = left
-            left = self._over_ranks(passes.descend(length, inverse, direction, image, found, residual))
+            left = self._over_ranks(passes.descend(length, inverse, direction, image, modes, residual))
             passes.turn(left / before, inverse, residual, direction)
             taken += 1
-        return Solution(torch.from_numpy(found), at_points, taken, left)
+        return Solution(torch.from_numpy(modes), at_points, taken, left)
 
     def _over_ranks(self, value: float) -> float:
         return float(global_sum(self.grid.decomposition.comm, value))

@@ -1,4 +1,4 @@
-"""The particle model: a list of terms."""
+"""The particle model: a sum of terms."""
 
 from __future__ import annotations
 
@@ -19,62 +19,63 @@ from eddies.particles import terms as built_in
 from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.rates import BY_PARTICLE, Rates, total
-from eddies.particles.terms.forcing import Forcing
+from eddies.particles.terms.resolved_forces import Forcing
 from eddies.particles.terms.term import PairTerm, Term
 from eddies.scene.terms import TermError, TermSettings
 
 #: The classes behind the words of [model] terms: those in the modules of eddies.particles.terms.
 TERMS: dict[str, type[Term]] = {
     kind.Settings.word: kind
-    for found in iter_modules(built_in.__path__)
-    for kind in vars(import_module(f"{built_in.__name__}.{found.name}")).values()
+    for module in iter_modules(built_in.__path__)
+    for kind in vars(import_module(f"{built_in.__name__}.{module.name}")).values()
     if isinstance(kind, type) and issubclass(kind, Term) and kind.Settings.word}
-# The name of the forcing that is added to the terms of a model.
+# Name of the forcing among the terms of a model.
 FORCING = "injection"
+# The rates that a linear term stores.
+STORED = (*BY_PARTICLE, "density")
 
 
 class LagrangianModel(nn.Module):
-    """dv_i/dt, and d rho_i/dt where some term gives it, as the sum of terms.
+    """dv_i/dt, and d rho_i/dt if some term gives it, as the sum of terms.
+
+    Terms that do not read the density are evaluated first; the density that they give is the one that others read.
+    Inputs that no term reads are not computed. Raises TermError if a term reads the density and gives a part of it.
 
     Parameters
     ----------
-    terms : by name, in the order in which they are evaluated.
-    flow : what they were made for, and the units of their rates.
-
-    Terms that do not read the density come first; what they give of it is the density that the others see. What no term
-    reads is not built, and the density is not computed where nobody reads it. Raises TermError where a term both reads
-    the density and gives a part of it.
+    terms : by name, in the order of evaluation.
+    flow : the flow that they were made for, and the units of their rates.
     """
 
     def __init__(self, terms: Mapping[str, Term], flow: FlowUnits) -> None:
         super().__init__()
-        self.terms = cast(Mapping[str, Term], nn.ModuleDict(terms))  # which does not know the type of its modules
+        self.terms = cast(Mapping[str, Term], nn.ModuleDict(terms))  # nn.ModuleDict loses the type of its modules
         self.flow = flow
         for name, term in self.terms.items():
-            if "density" in term.reads and "density" in term.gives:
+            if "density" in term.settings.reads and "density" in term.settings.gives:
                 raise TermError(f'term "{name}": reads the density and gives a part of it; it can do only one of both')
 
     def forced(self, settings: TermSettings | None) -> LagrangianModel:
-        """The same terms, not copies of them, and the known forcing of a flow, if it has one."""
+        """Model of the same terms (not copies) and the known forcing of a flow, if it has one."""
         if settings is None:
             return self
         return LagrangianModel({**self.terms, FORCING: Forcing(settings, self.flow)}, self.flow)
 
     def share_parameters(self, other: LagrangianModel) -> None:
-        """Take the parameters of the same terms in the units of another flow for one's own: one set for both."""
+        """Use the parameters of a model of the same terms in the units of another flow: one set for both."""
         for name, parameter in other.named_parameters():
             module, _, own = name.rpartition(".")
             self.get_submodule(module).register_parameter(own, parameter)
 
     @property
     def reads(self) -> set[str]:
-        """What some term reads."""
-        return {name for term in self.terms.values() for name in term.reads}
+        """All inputs of the terms."""
+        return {name for term in self.terms.values() for name in term.settings.reads}
 
     @property
     def gives(self) -> set[str]:
-        """What some term contributes to."""
-        return {name for term in self.terms.values() for name in term.gives}
+        """All contributions of the terms."""
+        return {name for term in self.terms.values() for name in term.settings.gives}
 
     @property
     def reads_density(self) -> bool:
@@ -88,47 +89,47 @@ class LagrangianModel(nn.Module):
 
     @property
     def integrates_density(self) -> bool:
-        """Whether the density is a state of its own, as terms give its rate."""
+        """Whether the density is a state variable whose rate the terms give."""
         return "density_rate" in self.gives
 
     @property
     def regresses_density(self) -> bool:
-        """Whether a rate of density is learned from the rates of single moments."""
+        """Whether a density rate is learned from the rates at single moments."""
         return self.learns_density and not any(term.settings.learns_through_horizons for term in self._giving_rate)
 
     @property
     def learns_density(self) -> bool:
-        """Whether a rate of density has something to learn."""
+        """Whether a density rate has learned parameters."""
         return any(True for term in self._giving_rate for _ in term.parameters())
 
     @property
     def _giving_rate(self) -> list[Term]:
-        return [term for term in self.terms.values() if "density_rate" in term.gives]
+        return [term for term in self.terms.values() if "density_rate" in term.settings.gives]
 
     @property
     def networks(self) -> list[PairTerm]:
-        """The terms with a network of pairs, which can tell what it is given by `features`."""
+        """The terms with a network of pairs, which return its inputs by `features`."""
         return [term for term in self.terms.values() if isinstance(term, PairTerm) and hasattr(term, "features")]
 
     @property
     def learned_coefficients(self) -> dict[str, list[dict[str, Any]]]:
-        """What the terms have learned, by their names, ready for JSON; see `Coefficient`."""
+        """Learned coefficients by name of the term, ready for JSON; see `Coefficient`."""
         return {name: [asdict(each) for each in term.learned_coefficients] for name, term in self.terms.items()
                 if term.learned_coefficients}
 
     def rates(self, context: Context, kept: Mapping[str, LinearRates] | None = None) -> Rates:
-        """The sum of the terms: `acceleration` (k, 3), `density_rate` (k,) and what belongs to a shift if some term
-        gives it, and the `density` (n,) itself, not its deviation, if terms give it; beside the acceleration the
-        `force_modes` that are in it. Differentiable; collective.
+        """Sum of the terms; differentiable, collective.
 
-        `kept` stands for terms at these very particles: see `linear_rates`.
+        The result has `acceleration` (k, 3) with the `force_modes` in it, and `density_rate` (k,) and the shift if a
+        term gives them. A `density` that terms give is the whole density (n,), not its deviation. `kept` replaces terms
+        at these particles; see `linear_rates`.
         """
         kept, sums = kept or {}, []
         for stage in self._stages if self.density_is_given and context.density is None else [list(self.terms.items())]:
-            anew = [term for name, term in stage if name not in kept]
-            context.sum_pairs([term for term in anew if isinstance(term, PairTerm) and not _everywhere(term)])
-            found = [kept[name].at(context.rows) if name in kept else _evaluated(term, context) for name, term in stage]
-            sums.append(self._at_particles(total(found), context))
+            pair_terms = [term for name, term in stage if name not in kept and isinstance(term, PairTerm)]
+            context.sum_pairs([term for term in pair_terms if not _everywhere(term)])
+            rates = [kept[name].at(context.rows) if name in kept else _evaluated(term, context) for name, term in stage]
+            sums.append(self._at_particles(total(rates), context))
             deviation = sums[0].density
             if context.density is None and self.density_is_given and deviation is not None:
                 context.density = context.flow.scales.density_mean + deviation
@@ -140,27 +141,28 @@ class LagrangianModel(nn.Module):
 
     @torch.no_grad()
     def linear_rates(self, context: Context) -> dict[str, LinearRates]:
-        """What the single parameters do at given particles, by name of the terms that are linear in them and do not
-        read a density that others give: a training that looks at these particles again and again keeps it;
-        collective."""
+        """Effect of each parameter at given particles, by name of the linear terms; collective.
+
+        Terms that read a density given by others are left out. Training stores the result for particles that it
+        evaluates repeatedly.
+        """
         terms = self._stages[0] if self.density_is_given else self.terms.items()
         return {name: self._linear_rates(term, context) for name, term in terms if term.linear}
 
     @torch.no_grad()
     def require_linear(self, context: Context) -> None:
-        """Check terms that declare themselves linear in their parameters at other parameters than what is kept was
-        made with; raises TermError where one is not. Collective."""
+        """Raise TermError if a term that declares itself linear is not, at parameters other than the stored ones;
+        collective."""
         for name, kept in self.linear_rates(context).items():
-            term, sizes = self.terms[name], [parameter.shape for parameter in kept.parameters]
-            others = [torch.linspace(0.3, 1.9, shape.numel()).reshape(shape).to(parameter)
-                      for shape, parameter in zip(sizes, kept.parameters)]
-            named = dict(zip(dict(term.named_parameters()), others))
-            direct = self._at_particles(_required(functional_call(term, named, (context,)), term), context)
+            term = self.terms[name]
+            others = [torch.linspace(0.3, 1.9, parameter.numel()).reshape(parameter.shape).to(parameter)
+                      for parameter in kept.parameters]
+            direct = self._with_parameters(term, context, others)
             context.forget_sums(term)
             expected = replace(kept, parameters=others).at(None)
-            # As a whole: what all but cancels at a particle is rounding there.
-            wrong = [what for what in _GIVEN if getattr(direct, what) is not None and not (
-                (getattr(expected, what) - getattr(direct, what)).norm() <= 1e-3 * getattr(direct, what).norm())]
+            # Norms over all particles: at a single particle contributions may cancel to rounding.
+            wrong = [rate for rate in STORED if getattr(direct, rate) is not None and not (
+                (getattr(expected, rate) - getattr(direct, rate)).norm() <= 1e-3 * getattr(direct, rate).norm())]
             if any_rank(context.comm, bool(wrong)):
                 raise TermError(f'term "{name}": declares itself linear in its parameters, and is not; remove its '
                                 "linear = True")
@@ -168,20 +170,23 @@ class LagrangianModel(nn.Module):
     @property
     def _stages(self) -> list[list[tuple[str, Term]]]:
         """The terms that do not read the density, then those that do."""
-        named = list(self.terms.items())
-        return [[item for item in named if ("density" in item[1].reads) == reading] for reading in (False, True)]
+        stages: list[list[tuple[str, Term]]] = [[], []]
+        for name, term in self.terms.items():
+            stages["density" in term.settings.reads].append((name, term))
+        return stages
 
     def _at_particles(self, rates: Rates, context: Context) -> Rates:
-        """Rates of which what was given as modes is taken to the particles: the force less its mean over them, as it
-        keeps their momentum. It would have none in continuous space, and has one where particles sample the grid
-        unevenly."""
+        """Rates with their modes interpolated to the particles.
+
+        The mean of the force over the particles is subtracted, so their momentum is conserved. The mean vanishes in
+        continuous space, but not if particles sample the grid unevenly.
+        """
         pressure = rates.pressure_modes if self.density_is_given else None
         modes = [part for part in (rates.force_modes, None if pressure is None else pressure[None]) if part is not None]
-        local = replace(rates, pressure_modes=None)
+        parts = [replace(rates, pressure_modes=None)]
         if not modes:
-            return local
+            return parts[0]
         values = context.resolved.at_particles(torch.cat(modes)).to(context.particles.velocity)
-        parts = [local]
         if rates.force_modes is not None:
             parts.append(Rates(acceleration=context.without_mean(values[:, :3])).at(context.rows))
         if pressure is not None:
@@ -189,42 +194,49 @@ class LagrangianModel(nn.Module):
             parts.append(Rates(density=values[:, -1] * (scales.density_mean / scales.required("sound_speed") ** 2)))
         return total(parts)
 
+    def _with_parameters(self, term: Term, context: Context, values: Sequence[Tensor]) -> Rates:
+        """Rates of a term at the particles with other values of its parameters."""
+        context.forget_sums(term)
+        named = {name: value for (name, _), value in zip(term.named_parameters(), values)}
+        return self._at_particles(_checked(functional_call(term, named, (context,)), term), context)
+
     def _linear_rates(self, term: Term, context: Context) -> LinearRates:
-        parameters = dict(term.named_parameters())
+        parameters = list(term.parameters())
+        count = sum(parameter.numel() for parameter in parameters)
+        like = next(iter(parameters), context.particles.position)
 
         def at(values: Tensor) -> Rates:
-            split = values.split([parameter.numel() for parameter in parameters.values()])
-            named = {name: part.reshape(parameter.shape) for part, (name, parameter) in zip(split, parameters.items())}
-            context.forget_sums(term)
-            return self._at_particles(_required(functional_call(term, named, (context,)), term), context)
+            split = values.split([parameter.numel() for parameter in parameters])
+            return self._with_parameters(term, context, [part.reshape(parameter.shape)
+                                                         for part, parameter in zip(split, parameters)])
 
-        count = sum(parameter.numel() for parameter in parameters.values())
-        like = next(iter(parameters.values()), context.particles.position)
         origin = at(like.new_zeros(count))
         units = [at(unit) for unit in torch.eye(count, dtype=like.dtype, device=like.device)]
         context.forget_sums(term)
-        return LinearRates(origin, {name: torch.stack([getattr(unit, name) - getattr(origin, name) for unit in units])
-                                    for name in _GIVEN if units and getattr(origin, name) is not None},
-                           list(parameters.values()))
-
-
-_GIVEN = (*BY_PARTICLE, "density")
+        slopes = {name: torch.stack([getattr(unit, name) - getattr(origin, name) for unit in units])
+                  for name in STORED if units and getattr(origin, name) is not None}
+        return LinearRates(origin, slopes, parameters)
 
 
 @dataclass(frozen=True)
 class LinearRates:
-    """Rates of a term at given particles as a function of its parameters: `origin` where they are zero, and by name
-    what each of them adds, (parameters, n, ...)."""
+    """Rates of a term at given particles as a linear function of its parameters.
+
+    Parameters
+    ----------
+    origin : rates with all parameters zero.
+    slopes : contribution of each parameter, by name of the rate, (parameters, n, ...).
+    parameters : the parameters of the term.
+    """
 
     origin: Rates
     slopes: dict[str, Tensor]
     parameters: Sequence[Tensor]
 
     def at(self, rows: Tensor | None) -> Rates:
-        """The rates, acceleration and rate of density of some rows (k,) of the particles, or of all; differentiable
-        in the parameters."""
+        """The rates of all particles or of some rows (k,); differentiable in the parameters."""
         values = {}
-        for name in _GIVEN:
+        for name in STORED:
             value, slope = getattr(self.origin, name), self.slopes.get(name)
             if value is None:
                 continue
@@ -238,37 +250,37 @@ class LinearRates:
 
 
 def _everywhere(term: Term) -> bool:
-    """Whether a sum over pairs is for all particles, whichever are asked for: others see the density that it gives."""
-    return isinstance(term, PairTerm) and "density" in term.gives
+    """Whether a sum over pairs is needed at all particles, since others read the density that it gives."""
+    return isinstance(term, PairTerm) and "density" in term.settings.gives
 
 
 def _evaluated(term: Term, context: Context) -> Rates:
-    """A term's rates, those of the particles that are asked for."""
-    rates = _required(term(context.everywhere if _everywhere(term) else context), term)
+    """Rates of a term at the requested particles."""
+    rates = _checked(term(context.everywhere if _everywhere(term) else context), term)
     return rates if isinstance(term, PairTerm) else rates.at(context.rows)
 
 
-def _required(found: object, term: Term) -> Rates:
-    """What a term's forward returned; TermError unless these are Rates."""
-    if not isinstance(found, Rates):
-        raise TermError(f"{type(term).__name__}: forward returns a {type(found).__name__}; it must return Rates")
-    if "density" in term.gives and found.density is None and found.pressure_modes is None:
+def _checked(result: object, term: Term) -> Rates:
+    """The result of a term's forward; raises TermError unless it is Rates with the declared density."""
+    if not isinstance(result, Rates):
+        raise TermError(f"{type(term).__name__}: forward returns a {type(result).__name__}; it must return Rates")
+    if "density" in term.settings.gives and result.density is None and result.pressure_modes is None:
         raise TermError(f'{type(term).__name__}: declares that it gives "density", and returns none; take it out of '
                         "`gives` of its settings, or return density or pressure_modes")
-    return found
+    return result
 
 
 def build_model(settings: Mapping[str, TermSettings], paths: Iterable[str], flow: FlowUnits) -> LagrangianModel:
-    """A model with initial parameters, in double precision.
+    """Build a model with initial parameters, in double precision.
 
     Parameters
     ----------
-    settings : of each term, by the name that it goes by.
-    paths : the word or import path of each.
-    flow : what it is made for.
+    settings : of each term, by its name.
+    paths : the word or import path of each term.
+    flow : the flow that the model is made for.
 
-    Raises TermError where an import path does not lead to a Term, or it cannot be made; ImportPathError where it leads
-    nowhere.
+    Raises TermError if an import path does not lead to a Term or the term cannot be made, and ImportPathError if it
+    leads to nothing.
     """
     terms = {short_name(path): _build_term(path, settings[short_name(path)], flow) for path in paths}
     return LagrangianModel(terms, flow)
@@ -284,5 +296,5 @@ def _build_term(path: str, settings: TermSettings, flow: FlowUnits) -> Term:
         return kind(settings, flow).double()
     except UserError as error:
         raise TermError(f'term "{path}": {error}') from error
-    except Exception as error:  # of a class of the user's, anything
+    except Exception as error:  # a user's class may raise anything
         raise TermError(f'term "{path}": cannot be made: {type(error).__name__}: {error}') from error

@@ -1,4 +1,4 @@
-"""Particles at a moment by their ids, and between two moments."""
+"""All particles at a moment in the order of their ids, and interpolation between two moments."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from eddies.particles.rates import Rates
 
 @dataclass(frozen=True)
 class Moment:
-    """This rank's block of all particles in the order of their ids, wherever they are.
+    """This rank's block of all particles in the order of their ids, wherever the particles are.
 
     Parameters
     ----------
-    time : of the moment.
-    first : the id that the block begins with.
-    position, velocity, acceleration : (n, 3), the latter the velocity's rate of change.
-    density, density_rate : (n,), of particles that have a density, else None.
-    shift : (n, 3), of particles that move beside the fluid, with velocity + shift; else None.
+    time : time of the moment.
+    first : first id of the block.
+    position, velocity, acceleration : (n, 3); acceleration is the rate of change of the velocity.
+    density, density_rate : (n,), if particles have a density, else None.
+    shift : (n, 3), velocity of the particles relative to the fluid, if there is one, else None.
     """
 
     time: float
@@ -38,7 +38,7 @@ class Moment:
 
     @classmethod
     def of(cls, comm: Comm, total: int, time: float, particles: ParticleSet, rates: Rates) -> Moment:
-        """That of particles on any ranks, `total` in all; collective."""
+        """Moment of particles on any ranks, `total` in all; collective."""
         order = IdOrder(comm, as_numpy(particles.id), total)
         columns = {"position": particles.position, "velocity": particles.velocity, "acceleration": rates.velocity_rate,
                    "density": particles.density, "density_rate": rates.density_rate, "shift": rates.shift_velocity}
@@ -49,20 +49,22 @@ class Moment:
 
 
 def between(before: Moment, after: Moment, time: float, box: PeriodicBox) -> ParticleSet:
-    """The particles at a time between two moments, in blocks by id: polynomials of fifth degree for positions and of
-    third for velocities and densities (Hermite), which these and their rates at both ends determine. Their errors are
-    of sixth and of fourth order in the time between."""
+    """Interpolate the particles to a time between two moments, in blocks by id.
+
+    Hermite polynomials, of fifth degree for positions and of third for velocities and densities, match values and rates
+    at both ends. Their errors are of sixth and fourth order in the interval.
+    """
     step = after.time - before.time
     theta = (time - before.time) / step
     first, last, pull, last_pull = before.velocity, after.velocity, before.acceleration, after.acceleration
-    if before.shift is not None:  # whose rate is not known, but its change
+    if before.shift is not None:  # its rate is unknown; its mean rate over the interval replaces it
         first, last, turning = first + before.shift, last + after.shift, (after.shift - before.shift) / step
         pull, last_pull = pull + turning, last_pull + turning
     kick, drift = step * pull, step * first
-    # The nearest image is told of what the velocities leave open: particles may cross the box within a step.
+    # The velocities select the periodic image: particles may cross the box within a step.
     way = step * (first + last) / 2
     moved = way + box.displacement(torch.from_numpy(after.position - way), torch.from_numpy(before.position)).numpy()
-    # What remains at the end of the expansion about the first moment.
+    # Remainders at the end of the Taylor expansion about the first moment.
     jump, turn = step * (last - first) - step * kick, step * (step * last_pull - kick)
     miss = moved - drift - step * kick / 2
     position = before.position + theta * (drift + theta * (step * kick / 2 + theta * (
@@ -76,6 +78,6 @@ def between(before: Moment, after: Moment, time: float, box: PeriodicBox) -> Par
 
 
 def _cubic(first: np.ndarray, last: np.ndarray, rise: np.ndarray, fall: np.ndarray, theta: float) -> np.ndarray:
-    """Hermite's polynomial of third degree at 0 <= theta <= 1, of values and slopes at both ends."""
+    """Hermite's polynomial of third degree at 0 <= theta <= 1, from values and slopes at both ends."""
     jump, turn = last - first - rise, fall - rise
     return first + theta * (rise + theta * (3 * jump - turn + theta * (turn - 2 * jump)))

@@ -1,27 +1,27 @@
-"""Moment matrices of each particle's neighbourhood, by which differences of particles become derivatives."""
+"""Moment matrices of particles' neighbourhoods, which turn differences between particles into derivatives."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-# Rows of the six different entries of a symmetric 3 x 3 matrix: xx, xy, xz, yy, yz, zz.
+# Indices of the six entries of a symmetric 3 x 3 matrix: xx, xy, xz, yy, yz, zz.
 ENTRIES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 def weight(distance: Tensor, cutoff: float) -> Tensor:
-    """w = (1 - q^2)^2 of q = distance/cutoff: smooth, and zero with zero slope from q = 1 on."""
+    """w = (1 - q^2)^2 of q = distance/cutoff; zero with zero slope for q >= 1."""
     q = distance / cutoff
     return torch.clamp(1 - q * q, min=0) ** 2
 
 
 def expected_weight(neighbors: float) -> float:
-    """Sum of w over `neighbors` particles spread evenly within the cutoff: 3 int q^2 w dq = 8/35 of them."""
+    """Sum of w over `neighbors` evenly spread particles within the cutoff: 3 int q^2 w dq = 8/35 each."""
     return neighbors * 8 / 35
 
 
 def expected_moment(neighbors: float, cutoff: float) -> float:
-    """Diagonal entry of sum w x x^T for even neighbours: int q^4 w dq = 8/315 of cutoff^2 each."""
+    """Diagonal entry of sum w x x^T for evenly spread neighbours: int q^4 w dq = 8/315 of cutoff^2 each."""
     return neighbors * cutoff**2 * 8 / 315
 
 
@@ -31,18 +31,10 @@ def products(a: Tensor, b: Tensor) -> list[Tensor]:
 
 
 def invert_symmetric(matrix: Tensor) -> Tensor:
-    """Inverses of symmetric positive definite 3 x 3 matrices, as six entries (6, n) each, in closed form."""
+    """Inverses of symmetric positive definite 3 x 3 matrices, six entries (6, n), in closed form."""
     xx, xy, xz, yy, yz, zz = matrix
-    cofactors = torch.stack(
-        [
-            yy * zz - yz * yz,
-            xz * yz - xy * zz,
-            xy * yz - xz * yy,
-            xx * zz - xz * xz,
-            xy * xz - xx * yz,
-            xx * yy - xy * xy,
-        ]
-    )
+    cofactors = torch.stack([yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy, xx * zz - xz * xz,
+                             xy * xz - xx * yz, xx * yy - xy * xy])
     return cofactors / (xx * cofactors[0] + xy * cofactors[1] + xz * cofactors[2])
 
 

@@ -1,9 +1,10 @@
-"""What a rank sees around its particles: ghosts and the neighbour list, kept up to date."""
+"""Surroundings of a rank's particles: ghosts, the neighbour list and kriging weights, kept up to date."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -16,147 +17,168 @@ from eddies.parallel.reduction import any_rank, global_max
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.exchanges import exchange_ghost_positions, exchange_ghosts
 from eddies.particles.faults import find_unplaced
+from eddies.particles.kriging import Kriging
 from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.periodic_box import PeriodicBox
 
 
-@dataclass(frozen=True)
 class LocalParticles:
-    """The particles a rank sees at one moment: its own rows, then the ghosts.
+    """The particles that a rank sees at one moment, and quantities that depend on their positions alone.
 
-    Parameters
-    ----------
-    position : (s, 3); on several ranks z is not periodic here, and ghosts stand where they are seen from.
-    neighborhood : whose rows these are.
-    halo : for further columns, with `ghosts.exchange_ghosts`; another one whenever rows of ghosts change.
-    box : the box in which differences of these positions are taken.
+    Evaluations at the same positions share them. Everything is computed at first use, and collective.
     """
 
-    position: Tensor
-    neighborhood: Neighborhood
-    halo: HaloExchange
-    box: PeriodicBox
+    def __init__(self, owned: Tensor, neighborhood: Neighborhood) -> None:
+        self._owned, self.neighborhood = owned, neighborhood
+        self._state = self._state_of(owned)
+        self._kriging: Kriging | None = None
+
+    def fit(self, owned: Tensor) -> bool:
+        """Whether they belong to this unchanged tensor of owned positions, the present halo and list, and the present
+        recording of gradients. The answer is the same on all ranks."""
+        return self._owned is owned and self._state == self._state_of(owned)
+
+    def _state_of(self, owned: Tensor) -> tuple[int, int, bool]:
+        return owned._version, self.neighborhood.builds, torch.is_grad_enabled() and owned.requires_grad
+
+    @cached_property
+    def position(self) -> Tensor:
+        """Positions (s, 3) of the owned particles, then of the ghosts.
+
+        On several ranks z is not periodic here, and ghosts have the z at which the slab sees them.
+        """
+        # Stored component by component, which is faster for the gathering of pairs.
+        return self.neighborhood.with_ghosts(self._owned, exchange_ghost_positions).T.contiguous().T
+
+    @property
+    def box(self) -> PeriodicBox:
+        """The box in which differences of these positions are taken."""
+        return self.neighborhood.box
 
     @property
     def neighbors(self) -> NeighborList:
-        """The list of pairs of these rows."""
+        """The neighbour list of these rows."""
         return self.neighborhood.neighbors
+
+    def kriging(self, filter_width: float, dtype: torch.dtype) -> Kriging:
+        """Kriging among neighbours at all owned particles, for fields that have passed a filter of this width."""
+        if self._kriging is None:
+            position = self.position.detach()
+            pairs = self.neighbors.pairs(position[: len(self._owned)], position, dtype=dtype)
+            self._kriging = Kriging(pairs, len(position), self.neighborhood.cutoff, filter_width,
+                                    self.neighborhood.column)
+        return self._kriging
 
 
 class Neighborhood:
-    """Halo and neighbour list of the particles of a decomposition.
+    """Halo and neighbour list of the particles of a decomposition. All methods are collective.
 
     Parameters
     ----------
     decomposition : slabs.
     length : side of the periodic box.
-    cutoff : radius of the neighbour list, and how far a rank sees beyond its particles.
-    skin : extra radius. They hold until some particle of any rank has moved by half of it.
-
-    All methods are collective. Raises HaloError, on all ranks, when slabs are thinner than the halo.
+    cutoff : radius of the neighbour list. A rank sees as far beyond its particles.
+    skin : extra radius. Halo and list are valid until some particle of any rank has moved by half of it.
     """
 
     def __init__(self, decomposition: SlabDecomposition, length: float, cutoff: float, skin: float) -> None:
         self.decomposition, self.cutoff, self.skin = decomposition, cutoff, skin
         self.box = PeriodicBox(length, periodic_z=decomposition.size == 1)
         self._neighbors = NeighborList(self.box, cutoff, skin)
-        self._seen: Tensor | None = None
+        self._unlisted: Tensor | None = None
         self.builds = 0
         self.forget()
 
     def forget(self) -> None:
-        """Build anew at the next occasion."""
+        """Rebuild halo and list at the next update."""
         self._ids: Tensor | None = None
 
     def built_at(self, particles: ParticleSet) -> Tensor | None:
-        """Positions (n, 3) of these particles when they were built; None if that was for others. Sends nothing."""
+        """Positions (n, 3) of these particles at the last build; None if that was for others. Sends no message."""
         return self._built_at if particles.id is self._ids else None
 
     def outdated(self, particles: ParticleSet) -> bool:
-        """Whether, on any rank, these are other particles or one has moved by more than half the skin, or to a
-        position that is not a number."""
+        """Whether, on any rank, the particles are others or one has moved by more than half the skin or to NaN."""
         return any_rank(self.decomposition.comm, not self._moved(particles) <= self.skin / 2)
 
     def _moved(self, particles: ParticleSet) -> float:
-        """Largest distance that a particle of this rank has moved since the build; infinite for others."""
+        """Largest distance that a particle of this rank has moved since the build; infinite for other particles."""
         if particles.id is not self._ids:
             return math.inf
         moved = self.box.displacement(particles.position.detach(), self._built_at)
         return math.sqrt(float((moved * moved).sum(-1).max())) if len(moved) else 0.0
 
     def update(self, particles: ParticleSet) -> None:
-        """Make halo and list fit the particles.
+        """Rebuild halo and list if they are outdated. No particle changes rank.
 
-        No particle changes rank: where one has left its slab, the halo is wider by the farthest it strayed, and slabs
-        must be thicker by twice that: into one slab particles may stray from both sides, whose ranks do not see each
-        other. Raises HaloError, on all ranks, where slabs are too thin, a position is not finite, or a particle is
-        farther outside its slab than the box is long.
+        Where a particle has left its slab, the halo is wider by the largest distance outside. Slabs must be thicker by
+        twice that distance: two particles may enter a slab from both sides, and their ranks do not see each other.
+        Raises HaloError on all ranks if slabs are too thin, a position is not finite, or a particle is farther outside
+        its slab than the box is long.
         """
         if not self.outdated(particles):
             return
-        strayed = farthest_outside(self.decomposition, particles)
-        width = self.cutoff + self.skin + strayed
-        require_thick_slabs(self.decomposition, width + strayed)
+        outside = farthest_outside(self.decomposition, particles)
+        width = self.cutoff + self.skin + outside
+        require_thick_slabs(self.decomposition, width + outside)
         self.halo = HaloExchange(self.decomposition, as_numpy(particles.position), width)
         self._ids, self._built_at = particles.id, particles.position.detach().clone()
         self.builds += 1
         with torch.no_grad():
-            self._seen = self._with_ghosts(particles.position, exchange_ghost_positions)
+            self._unlisted = self.with_ghosts(particles.position, exchange_ghost_positions)
 
     @property
     def neighbors(self) -> NeighborList:
-        """The list of pairs, which is built where somebody asks for it."""
-        if self._seen is not None:
-            self._neighbors.build(self._seen[: len(self._built_at)], self._seen, exclude_self=True)
-            self._seen = None
+        """The list of pairs, built when it is first used."""
+        if self._unlisted is not None:
+            self._neighbors.build(self._unlisted[: len(self._built_at)], self._unlisted, exclude_self=True)
+            self._unlisted = None
         return self._neighbors
 
     def local(self, position: Tensor) -> LocalParticles:
-        """Positions (n, 3) of the owned particles with ghosts, as of now."""
-        # Stored component by component, as the gathering of pairs wants it.
-        position = self._with_ghosts(position, exchange_ghost_positions).T.contiguous().T
-        return LocalParticles(position, self, self.halo, self.box)
+        """The particles that this rank sees, with present positions (n, 3) of the owned ones."""
+        return LocalParticles(position, self)
 
     def column(self, owned: Tensor) -> Tensor:
-        """A column (n, ...) of owned particles followed by its ghost rows."""
-        return self._with_ghosts(owned, exchange_ghosts)
+        """Column (n, ...) of the owned particles, followed by its ghost rows."""
+        return self.with_ghosts(owned, exchange_ghosts)
 
-    def _with_ghosts(self, owned: Tensor, exchange) -> Tensor:
+    def with_ghosts(self, owned: Tensor, exchange: Callable[[HaloExchange, Tensor], Tensor]) -> Tensor:
+        """Column (n, ...) of the owned particles, followed by the ghost rows of an exchange."""
         return owned if self.decomposition.size == 1 else torch.cat([owned, exchange(self.halo, owned)])
 
 
 def farthest_outside(slab: SlabDecomposition, particles: ParticleSet) -> float:
-    """How far the particle farthest from its slab, of all ranks, is outside it; collective.
+    """Largest distance of a particle of any rank from its slab; collective.
 
-    Raises HaloError, on all ranks, where that is farther than the box is long, or a position is not finite.
+    Raises HaloError on all ranks if it exceeds the length of the box or a position is not finite.
     """
     position = particles.position.detach()
     z = position[:, 2]
     distance = torch.maximum(slab.lower - z, z - slab.upper).clamp_min(0)
-    if slab.size == 1:  # which has no outside
+    if slab.size == 1:  # one slab is the whole periodic box
         distance = torch.zeros_like(z)
-    # What is just at the upper face belongs to the next slab.
+    # A particle exactly at the upper face belongs to the next slab.
     distance = torch.where(z == slab.upper, torch.finfo(z.dtype).tiny, distance)
     distance = distance.where(torch.isfinite(position).all(1), torch.inf)
     farthest = float(global_max(slab.comm, float(distance.max()) if len(distance) else 0.0))
     if farthest > slab.length:
-        found = find_unplaced(particles, distance, PeriodicBox(slab.length), slab.comm.rank)
-        raise HaloError(f"within the step, {first_complaint(slab.comm, found)}")
+        complaint = find_unplaced(particles, distance, PeriodicBox(slab.length), slab.comm.rank)
+        raise HaloError(f"within the step, {first_complaint(slab.comm, complaint)}")
     return farthest
 
 
 def at_home(decomposition: SlabDecomposition, columns: dict[str, Tensor], reach: float) -> dict[str, Tensor]:
-    """All columns after each particle moved to the rank of its slab, ordered by place in cells of side `reach` and then
-    by id; collective.
+    """Move each particle to the rank of its slab and sort a rank's particles by cell, then by id; collective.
 
-    The order depends on nothing but ids and positions of a rank, and keeps neighbours close in memory.
+    Cells have the side `reach`, so neighbours are close in memory. The order depends on ids and positions alone.
     """
     device = columns["id"].device
     moved = migrate(decomposition, {name: as_numpy(column) for name, column in columns.items()})
     ids = moved["id"]
     numbers = int(ids.max(initial=0)) + 1
-    # Not so many that a cell and an id no longer fit one number, by which to sort is much faster than by four.
+    # Few enough cells for cell and id to fit one integer: one sort key is much faster than four.
     cells = max(min(int(decomposition.length / reach), int((2**63 / numbers) ** (1 / 3)) - 1), 1)
     x, y, z = np.minimum((moved["position"].T * (cells / decomposition.length)).astype(np.int64), cells - 1)
     order = np.argsort(((z * cells + y) * cells + x) * numbers + ids)

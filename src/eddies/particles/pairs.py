@@ -1,5 +1,5 @@
-"""Pairs of neighbouring particles, what they carry in the units of a model, and sums over each particle's neighbours:
-of values by torch, or by the compiled library."""
+"""Pairs of neighbouring particles in the units of a model, and sums over each particle's neighbours, by torch or by the
+compiled library."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from eddies.particles.periodic_box import safe_norm
 class Pairs:
     """Ordered pairs (i, j) of a receiver i and a sender j, sorted by receiver.
 
-    Columns of pairs are stored component by component: a (m, 3) column is the transpose of a contiguous (3,
-    m) array, several times faster for what is done to pairs.
+    Columns of pairs are stored component by component: a (m, 3) column is the transpose of a contiguous (3, m) array,
+    which is several times faster.
 
     Parameters
     ----------
-    receiver : int64 (m,), row of i among the local particles, or among the points that receive.
+    receiver : int64 (m,), row of i among the local particles or the receiving points.
     segment : int64 (m,), row of i in the output, in [0, count), not decreasing.
     sender : int64 (m,), row of j among the local particles (owned, then ghosts).
     displacement : (m, 3), x_i - x_j between nearest images.
@@ -45,8 +45,7 @@ class Pairs:
     @cached_property
     def offsets(self) -> Tensor:
         """First pair of each output row, and the number of pairs: int64 (count + 1,)."""
-        rows = torch.arange(self.count + 1, device=self.segment.device)
-        return torch.searchsorted(self.segment, rows)
+        return torch.searchsorted(self.segment, torch.arange(self.count + 1, device=self.segment.device))
 
     def at_receivers(self, column: Tensor) -> Tensor:
         """A particle column (n, ...) at the receiver of each pair: (m, ...)."""
@@ -57,31 +56,17 @@ class Pairs:
         return gather_rows(column, self.sender)
 
     def sum(self, values: Tensor) -> Tensor:
-        """Sum of pair values (m, ...) over the pairs of each output row: (count, ...); zero without pairs.
-
-        The order of summation is fixed, so the result is the same from run to run.
-        """
+        """Sum of pair values (m, ...) over the pairs of each output row: (count, ...). The order is fixed."""
         by_component = torch.atleast_2d(values.flatten(1).T if values.dim() > 1 else values).contiguous()
         sums = _SegmentSum.apply(by_component, self.offsets, self.segment)
         return sums.T.reshape(self.count, *values.shape[1:])
-
-    def add_to_both(self, values: Tensor, parity: Tensor, totals: Tensor) -> None:
-        """Add values (components, m) of pairs that stand once to totals (components, n) of the owned particles.
-
-        A value is added at the receiver and, times its `parity` (components,), 1 or -1, at the sender, unless that is
-        a ghost, whose owner has the pair as well. It works in place; the order is fixed, except on a GPU.
-        """
-        totals.index_add_(1, self.receiver, values)
-        home = torch.nonzero(self.sender < totals.shape[1]).squeeze(1)
-        totals.index_add_(1, self.sender.index_select(0, home), parity[:, None] * values.index_select(1, home))
 
 
 def gather_rows(column: Tensor, index: Tensor) -> Tensor:
     """column[index] for a column (n, ...): (m, ...), stored component by component."""
     if column.dim() == 1:
         return column.index_select(0, index)
-    components = column.flatten(1).unbind(1)
-    gathered = torch.stack([component.index_select(0, index) for component in components])
+    gathered = torch.stack([component.index_select(0, index) for component in column.flatten(1).unbind(1)])
     return gathered.T.reshape(len(index), *column.shape[1:])
 
 
@@ -97,27 +82,26 @@ class _SegmentSum(torch.autograd.Function):
         filled = np.flatnonzero(stops > starts)
         sums = values.new_zeros(len(values), len(starts))
         if len(filled):
-            # reduceat takes each sum up to the next start, so rows without pairs are left out of its starts.
+            # reduceat sums up to the next start, so the starts of rows without pairs are left out.
             sums.numpy()[:, filled] = np.add.reduceat(values.detach().numpy(), starts[filled], axis=1)
         return sums
 
     @staticmethod
     def backward(ctx, gradient: Tensor) -> tuple[Tensor, None, None]:
         (segment,) = ctx.saved_tensors
-        components = [component.index_select(0, segment) for component in gradient.unbind(0)]
-        return torch.stack(components), None, None
+        return torch.stack([component.index_select(0, segment) for component in gradient.unbind(0)]), None, None
 
 
 class ScaledPairs:
-    """Some pairs (i, j) with what they carry, computed where it is asked for first.
+    """Pairs (i, j) and their quantities in the units of a model, each computed at first use.
 
     Lengths are in units of the filter width d, velocities of v_rms, density fluctuations of rho_rms:
     x = (x_i - x_j)/d, v = (v_i - v_j)/v_rms, rho' = (rho - rho_0)/rho_rms.
 
     Parameters
     ----------
-    pairs : as listed, in the units of the simulation.
-    column : gives a column (s, ...), "velocity" or "density", of the particles that the pairs number, ghosts included.
+    pairs : in the units of the simulation.
+    column : returns a column (s, ...), "velocity" or "density", of the particles that the pairs number.
     flow : the units, and the radius of interaction.
     """
 
@@ -155,20 +139,19 @@ class ScaledPairs:
 
     @cached_property
     def approach(self) -> Tensor:
-        """x.v (m,), negative where particles approach each other."""
+        """x.v (m,), negative for approaching particles."""
         return (self.x * self.v).sum(0)
 
     @cached_property
     def weight(self) -> Tensor:
-        """w = (1 - q^2)^2 (m,), q the distance over the radius of interaction: rates are smooth where a neighbour
-        enters or leaves."""
+        """w = (1 - q^2)^2 (m,), q the distance over the radius of interaction."""
         return moments.weight(self.pairs.distance, self.flow.cutoff)
 
     def invariants(self, names: Sequence[str], symmetric: bool) -> Tensor:
-        """What a network is told of the pairs, (features, m), in the order of INPUTS of the settings.
+        """Inputs of a network for each pair, (features, m), in the order of INPUTS of the settings.
 
-        "density" makes two features: rho'_i and rho'_j, or, `symmetric`, rho'_i + rho'_j and (rho'_i - rho'_j)^2, which
-        are the same for (i, j) and (j, i) as all others are.
+        "density" gives two features: rho'_i and rho'_j, or, if `symmetric`, rho'_i + rho'_j and (rho'_i - rho'_j)^2,
+        which are equal for (i, j) and (j, i) as all others are.
         """
         features: list[Tensor] = []
         if "density" in names:
@@ -185,14 +168,15 @@ class ScaledPairs:
 
 @dataclass(frozen=True)
 class CompiledSum:
-    """What a term sums over pairs, as the library is told of it.
+    """A term's sum over pairs, as the compiled library takes it.
 
     Parameters
     ----------
-    kind : its name in the library (kernels/summands.hpp). numbers : that it takes there.
-    parameters : (p,), differentiable; none unless given.
-    scalars : columns (s,) of all particles that this rank sees, likewise.
-    reads_velocity : whether velocities matter.
+    kind : its name in the library (kernels/summands.hpp).
+    numbers : its constants there.
+    parameters : (p,), differentiable; none by default.
+    scalars : columns (s,) of all particles that this rank sees, differentiable.
+    reads_velocity : whether it depends on velocities.
     """
 
     kind: str
@@ -204,25 +188,25 @@ class CompiledSum:
 
 def compiled_sums(space: PairSpace, summands: Sequence[CompiledSum], parities: Sequence[Tensor], position: Tensor,
                   velocity: Tensor | None, wanted: np.ndarray, dtype: torch.dtype) -> tuple[Tensor, ...]:
-    """The sums (components, s) of each summand at the particles `wanted`, bool (s,), over those within the radius;
-    elsewhere they mean nothing. Differentiable.
+    """Sums (components, s) of each summand over the neighbours of the particles `wanted`, bool (s,); differentiable.
+
+    The values of other particles are undefined. Raises ValueError if a position is not finite.
 
     Parameters
     ----------
-    parities : of each summand, (components,), as those of pair terms.
-    position, velocity : (s, 3), of all particles that this rank sees; no velocity where no summand reads it.
-    dtype : of the arithmetic.
-
-    Raises ValueError where a position is not finite.
+    parities : of each summand, (components,); see PairTerm.
+    position, velocity : (s, 3), of all particles that this rank sees; velocity may be None if no summand reads it.
+    dtype : type of the arithmetic.
     """
     columns: list[Tensor] = []
     placed = []
     for summand, parity in zip(summands, parities, strict=True):
-        known = next((place for place in range(len(columns) - len(summand.scalars) + 1)
-                      if all(a is b for a, b in zip(columns[place:], summand.scalars))), len(columns))
-        if known == len(columns):
+        # Summands with the same columns share them.
+        shared = next((place for place in range(len(columns) - len(summand.scalars) + 1)
+                       if all(a is b for a, b in zip(columns[place:], summand.scalars))), len(columns))
+        if shared == len(columns):
             columns += summand.scalars
-        placed.append(Summand(summand.kind, summand.numbers, tuple(parity.tolist()), known))
+        placed.append(Summand(summand.kind, summand.numbers, tuple(parity.tolist()), shared))
     scalars = torch.stack(columns).double() if columns else position.new_zeros(0, len(position))
     velocity = torch.zeros_like(position) if velocity is None else velocity
     return _PairSums.apply(space, placed, wanted, dtype, position, velocity, scalars,
@@ -231,7 +215,7 @@ def compiled_sums(space: PairSpace, summands: Sequence[CompiledSum], parities: S
 
 
 class _PairSums(torch.autograd.Function):
-    """The sums; on the way back all pairs are evaluated anew."""
+    """The compiled sums. The backward pass evaluates all pairs again."""
 
     @staticmethod
     def forward(ctx, space: PairSpace, summands: list[Summand], wanted: np.ndarray, dtype: torch.dtype,
@@ -245,13 +229,12 @@ class _PairSums(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, *by_sums: Tensor) -> tuple[Tensor | None, ...]:
-        columns = any(ctx.needs_input_grad[4:7])
-        given = ctx.saved_tensors
-        by_parameters, by_columns = ctx.pairs.gradients(ctx.summands, list(map(_numbers, given[3:])),
-                                                        [by.numpy() for by in by_sums], columns)
-        found = [*(by_columns or (None, None, None)), *by_parameters]
+        inputs = ctx.saved_tensors
+        by_parameters, by_columns = ctx.pairs.gradients(ctx.summands, list(map(_numbers, inputs[3:])),
+                                                        [by.numpy() for by in by_sums], any(ctx.needs_input_grad[4:7]))
+        gradients = [*(by_columns or (None, None, None)), *by_parameters]
         return (None, None, None, None, *(None if by is None else torch.from_numpy(by).to(tensor)
-                                          for by, tensor in zip(found, given)))
+                                          for by, tensor in zip(gradients, inputs)))
 
 
 def _numbers(tensor: Tensor) -> np.ndarray:

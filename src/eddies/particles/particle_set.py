@@ -1,4 +1,4 @@
-"""The particles a rank owns."""
+"""The particles of a rank."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class ParticleSet:
-    """Columns of the particles owned by this rank, one row a particle; ghosts are never part of it.
+    """Columns of the particles that this rank owns, one row a particle, without ghosts.
 
     Parameters
     ----------
     id : int64 (n,), unique over all ranks.
-    position : (n, 3), x, y, z; in double precision.
+    position : (n, 3), x, y, z, in double precision.
     velocity : (n, 3).
-    density : (n,); None where nothing reads it.
+    density : (n,); None if no term reads it.
 
-    Raises ValueError if the columns differ in length or a shape is wrong.
+    Raises ValueError if a column has another shape.
     """
 
     id: Tensor
@@ -32,28 +32,27 @@ class ParticleSet:
         count = len(self.id)
         expected = {"id": (count,), "position": (count, 3), "velocity": (count, 3), "density": (count,)}
         for name, column in self.columns().items():
-            shape, needed = tuple(column.shape), expected[name]
-            if shape != needed:
-                raise ValueError(f"particle {name} of shape {shape}: {needed} is needed")
+            if tuple(column.shape) != expected[name]:
+                raise ValueError(f"particle {name} of shape {tuple(column.shape)}: must be {expected[name]}")
 
     def __len__(self) -> int:
         return len(self.id)
 
     def columns(self) -> dict[str, Tensor]:
-        """The columns that there are, by name."""
+        """The existing columns, by name."""
         return {name: column for name, column in vars(self).items() if column is not None}
 
     def to_numpy(self) -> dict[str, np.ndarray]:
-        """The same, detached, as arrays of the host."""
+        """The existing columns as arrays on the host, without gradients."""
         return {name: as_numpy(column) for name, column in self.columns().items()}
 
     @classmethod
     def from_numpy(cls, columns: dict[str, np.ndarray], device: torch.device | str = "cpu") -> ParticleSet:
-        """Inverse of `to_numpy`; columns that are no part of a particle set are left out."""
+        """Inverse of `to_numpy`; further columns are ignored."""
         return cls(**{field.name: torch.as_tensor(columns[field.name]).to(device) for field in fields(cls)
                       if field.name in columns})
 
 
 def as_numpy(tensor: Tensor) -> np.ndarray:
-    """The values of a tensor as an array of the host, without its history."""
+    """Values of a tensor as an array on the host, without gradients."""
     return tensor.detach().cpu().numpy()

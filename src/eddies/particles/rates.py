@@ -1,4 +1,4 @@
-"""What a term contributes to the rates of change of the particles."""
+"""Contributions of terms to the rates of change of the particles."""
 
 from __future__ import annotations
 
@@ -7,26 +7,25 @@ from dataclasses import dataclass, fields, replace
 
 from torch import Tensor
 
-
+# The rates with one row for each requested particle.
 BY_PARTICLE = ("acceleration", "density_rate", "shift_velocity", "shift_acceleration")
 
 
 @dataclass(frozen=True)
 class Rates:
-    """Contributions of a term, each optional; contributions of terms add up.
+    """Contributions of a term, each optional. Contributions of terms add up.
 
     Parameters
     ----------
-    acceleration : (n, 3) of the owned particles.
-    density_rate : (n,), the rate of change of their density.
-    density : (n,), a part of their density's deviation from the mean, where it is given and not integrated.
-    force_modes : Fourier modes (3, kz, ky, kx) of an acceleration as a field on the grid of the resolved velocity.
-    pressure_modes : (kz, ky, kx), those of a pressure p over the mean density, which adds p / c^2 to the density.
-    shift_velocity : (n, 3), of particles that move beside the fluid, dx/dt = v + shift_velocity.
-    shift_acceleration : (n, 3), what their velocity changes by for that: v is that of the fluid where they are. It adds
-        to the acceleration, which is that of the fluid and is compared with the truth.
+    acceleration : (n, 3), of the fluid at the owned particles.
+    density_rate : (n,), rate of change of their density.
+    density : (n,), part of the deviation of their density from the mean, if terms give the density instead of its rate.
+    force_modes : Fourier modes (3, kz, ky, kx) of an acceleration on the grid of the resolved velocity.
+    pressure_modes : modes (kz, ky, kx) of a pressure p over the mean density, which adds p / c^2 to the density.
+    shift_velocity : (n, 3), velocity of the particles relative to the fluid, dx/dt = v + shift_velocity.
+    shift_acceleration : (n, 3), change of the fluid velocity v at a particle due to the shift.
 
-    What terms give as modes is added up and taken to the particles once.
+    The sum of all modes is interpolated to the particles once.
     """
 
     acceleration: Tensor | None = None
@@ -39,12 +38,12 @@ class Rates:
 
     @property
     def velocity_rate(self) -> Tensor:
-        """dv/dt (n, 3) of the particles, where an acceleration is given: that of the fluid, and what a shift adds."""
+        """dv/dt (n, 3) of the particles: acceleration of the fluid and shift acceleration."""
         assert self.acceleration is not None
         return self.acceleration if self.shift_acceleration is None else self.acceleration + self.shift_acceleration
 
     def at(self, rows: Tensor | None) -> Rates:
-        """The same with what is of the particles, but the density, of some rows (k,) of them alone."""
+        """The same for some rows (k,) of the particles; the density stays that of all."""
         if rows is None:
             return self
         kept = {name: getattr(self, name)[rows] for name in BY_PARTICLE if getattr(self, name) is not None}
@@ -52,7 +51,7 @@ class Rates:
 
 
 def total(contributions: Iterable[Rates]) -> Rates:
-    """The sum of contributions; what none of them gives is None."""
+    """Sum of contributions; a rate that none of them has is None."""
     sums: dict[str, Tensor] = {}
     for each in contributions:
         for field in fields(Rates):

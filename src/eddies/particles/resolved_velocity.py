@@ -1,97 +1,188 @@
-"""The velocity that particles resolve: solenoidal modes found from theirs by regularised least squares."""
+"""The velocity that particles resolve: solenoidal modes from their velocities by regularised least squares."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from eddies.parallel.halo import HaloError
-from eddies.parallel.reduction import global_max, global_sum
+from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
-from eddies.particles.exchanges import mean_over_ranks
+from eddies.particles.exchanges import mean_over_ranks, sum_over_ranks
 from eddies.particles.flow_units import FlowUnits, resolved_wavenumber
-from eddies.particles.fourier_grid import FourierGrid
+from eddies.particles.fourier_grid import FourierGrid, Points
 from eddies.particles.least_squares import LeastSquares, Solution
+from eddies.particles.neighborhood import farthest_outside
 from eddies.particles.particle_set import ParticleSet, as_numpy
-from eddies.particles.resolved_flow import ResolvedFlow
 from eddies.spectral.mode_operators import gaussian_transfer
 
-# The exponent of the prior's power law, how it ends in the dissipation range (Pope 2000, Eq. 6.248), and how many
-# times the energy that it expects beyond the resolved modes is taken for noise. The latter measured in docs/closure.md.
+# Exponent of the prior's power law, the two constants of its dissipation range (Pope 2000, Eq. 6.248), and the factor
+# between the expected unresolved energy and the noise. The factor is measured in docs/closure.md.
 EXPONENT, DISSIPATION, DISSIPATION_ONSET, WEIGHT = 11 / 3, 5.2, 0.4, 100.0
-# Residuals, relative to the velocities, at which a solve ends: one that starts from nothing, and one that starts from
-# what is foreseen. The latter's is spread over all modes, the former's is left in those that are hardest to tell. At
-# twice the latter a forced flow ran away (docs/closure.md).
+# Final residuals relative to the velocities, of a solve that starts from zero and of one that starts from a prediction.
+# The latter residual is spread over all modes, the former stays in poorly determined ones. At twice the latter value a
+# forced flow diverged (docs/closure.md).
 TOLERANCE, TOLERANCE_FORESEEN = 2e-4, 1e-3
-# The same of the solve on the way back, relative to the gradient that it is given: makes gradients of a loss through
-# four frames wrong by 2e-3, in half of the iterations of 2e-4.
+# Final residual of the solve in the backward pass, relative to the incoming gradient. Gradients of a loss through four
+# frames then have an error of 2e-3, with half of the iterations of 2e-4.
 TOLERANCE_ADJOINT = 3e-3
 MOST_ITERATIONS = 300
 # Wavenumber shells in a band of the energy.
 BAND = 2
 
 
-class ResolvedVelocity:
-    """Makes a `ResolvedFlow` of particles: the solenoidal modes u(k), 0 < |k| <= k_c, that
-
-        minimise  sum_i |v_i - u(x_i)|^2  +  sum_k (sigma^2 / P_k) |u(k)|^2
-
-    as is done for measured particle tracks (Gesemann et al. 2016). The velocities v_i are relative to their mean over
-    all particles. P_k ~ k^(-11/3) f(k eta) G^2, f the end of the spectrum in the dissipation range and G the transfer
-    of the filter, is the energy expected of a mode, and sigma^2 `weight` times what this law has beyond k_c, which is
-    noise to the modes within; both in units of the velocities, so that their ratio is a number. As the filtered
-    velocity is smooth and solenoidal, modes beyond the particles' Nyquist wavenumber can be told.
-
-    Conjugate gradients, preconditioned by 1 / (N + 5 sigma^2/P_k), solve for the modes until the preconditioned
-    residual is `tolerance` of the velocities; or take a given number of `iterations`. Where the time of an evaluation
-    is given they start from what earlier ones foresee, see `foreseen`, and end at `tolerance_foreseen`; on the way back
-    at `tolerance_adjoint`.
-
-    Products of modes above a third of the number of cells alias; for fields known from particles that is far below the
-    error of the highest modes themselves.
+@dataclass(frozen=True)
+class ResolvedFlow:
+    """The resolved velocity at one moment.
 
     Parameters
     ----------
-    grid : where the velocity is resolved.
-    filter_width : d of the filter.
-    kolmogorov_length : eta of the flow; 0 where nothing ends its spectrum.
-    weight : of what is expected beyond k_c, taken for noise.
+    grid : grid of the modes.
+    velocity : modes (3, kz, ky, kx), solenoidal, |k| <= `grid.resolved`.
+    points : the owned particles on the grid.
+    relative_velocity : (n, 3), their velocity minus its mean over all particles.
+    filter_width : d of the filter that the particles' velocity has passed.
+    left_over : (n, 3), the result of `missing` if it is known.
+    iterations, residual : of the solve; the residual is relative to the velocities.
+    converged : whether the residual reached its tolerance.
+    """
 
-    Differentiable in the particles' positions and velocities: on the way back the same system is solved. All ranks call
-    it together. Raises HaloError, on all ranks, where a particle lies farther outside its slab than the grid reaches.
+    grid: FourierGrid
+    velocity: Tensor
+    points: Points
+    relative_velocity: Tensor
+    filter_width: float
+    left_over: Tensor | None = None
+    iterations: int = 0
+    residual: float = 0.0
+    converged: bool = True
+
+    def at_particles(self, modes: Tensor) -> Tensor:
+        """Values (n, c) of modes (c, kz, ky, kx) at the particles; collective, differentiable."""
+        return self.grid.at(modes, self.points)
+
+    def missing(self) -> Tensor:
+        """Unresolved part (n, 3) of the particles' velocities relative to their mean; collective."""
+        if self.left_over is not None:
+            return self.left_over
+        return self.relative_velocity - self.at_particles(self.velocity).to(self.relative_velocity)
+
+    @cached_property
+    def spectrum(self) -> Tensor:
+        """E(k) (k_c + 1,), the energy of the modes whose |k| rounds to k = 0, 1, ..., k_c, over all ranks.
+
+        The last shell holds only modes up to k_c; sum E = <u.u>/2 of the resolved velocity. Collective, differentiable.
+        """
+        grid = self.grid
+        energy = 0.5 * grid.multiplicity * (self.velocity.real.square() + self.velocity.imag.square()).sum(0)
+        shell = torch.round(grid.shell).long()
+        inside = shell <= grid.resolved
+        spectrum = energy.new_zeros(grid.resolved + 1, dtype=torch.float64)
+        return sum_over_ranks(grid.decomposition.comm, spectrum.index_add(0, shell[inside], energy[inside].double()))
+
+    @cached_property
+    def products(self) -> Tensor:
+        """Modes (6, kz, ky, kx) of u_i u_j; collective, differentiable."""
+        return self.grid.squares(self.velocity)
+
+    @cached_property
+    def convection(self) -> Tensor:
+        """Modes (3, kz, ky, kx) of d_j (u_i u_j); collective, differentiable."""
+        return self.grid.stress_divergence(self.products)
+
+    @property
+    def filter_transfer(self) -> Tensor:
+        """Transfer function G of the filter for each mode (kz, ky, kx)."""
+        return self.grid.filter_transfer(self.filter_width)
+
+    @cached_property
+    def unfiltered(self) -> Tensor:
+        """Modes (3, kz, ky, kx) of u* = u / G."""
+        return self.velocity * (1 / self.filter_transfer)  # a complex division is ten times slower
+
+    @cached_property
+    def rms(self) -> Tensor:
+        """Root mean square of a component of the resolved velocity; collective, differentiable."""
+        return self._rms_of(self.velocity, 0)
+
+    @cached_property
+    def smallest_rms(self) -> Tensor:
+        """Root mean square of a component of the smallest scales, the modes of u* with |k| > k_c/2."""
+        return self._rms_of(self.unfiltered, self.grid.resolved / 2)
+
+    def mean_square(self, modes: Tensor, above: float, below: float = math.inf) -> Tensor:
+        """Mean of u.u of a vector's modes with `above` < |k| < `below`, in units of the smallest wavenumber.
+
+        Collective, differentiable.
+        """
+        square = (modes.real.square() + modes.imag.square()).sum(0) * self.grid.multiplicity
+        inside = (self.grid.shell > above) & (self.grid.shell < below)
+        return sum_over_ranks(self.grid.decomposition.comm, torch.where(inside, square, 0.0).sum(dtype=torch.float64))
+
+    def _rms_of(self, modes: Tensor, above: float) -> Tensor:
+        # For a fluid at rest the derivative of the root is zero.
+        return (self.mean_square(modes, above) / 3).clamp_min(1e-300).sqrt()
+
+
+class ResolvedVelocity:
+    """Computes the `ResolvedFlow` of particles: the solenoidal modes u(k), 0 < |k| <= k_c, that
+
+        minimise  sum_i |v_i - u(x_i)|^2  +  sum_k (sigma^2 / P_k) |u(k)|^2
+
+    as for measured particle tracks (Gesemann et al. 2016). The velocities v_i are relative to their mean over all
+    particles. P_k ~ k^(-11/3) f(k eta) G^2 is the expected energy of a mode, f the dissipation range of the spectrum,
+    G the transfer function of the filter. sigma^2 is `weight` times the energy of this law beyond k_c, which is noise
+    for the modes within. Since the filtered velocity is smooth and solenoidal, modes beyond the particles' Nyquist
+    wavenumber are determined too.
+
+    Conjugate gradients, preconditioned by 1 / (N + 5 sigma^2/P_k), end when the preconditioned residual is `tolerance`
+    of the velocities, or after a given number of `iterations`. With the time of an evaluation they start from a
+    prediction (`foreseen`) and end at `tolerance_foreseen`; in the backward pass they end at `tolerance_adjoint`.
+
+    Products of modes above a third of the number of cells are aliased. For fields known at particles that error is far
+    below the error of the highest modes themselves.
+
+    Parameters
+    ----------
+    grid : grid of the modes.
+    filter_width : d of the filter.
+    kolmogorov_length : eta of the flow; 0 if its spectrum has no end.
+    weight : factor of the noise.
+
+    Differentiable in the particles' positions and velocities: the backward pass solves the same system. All methods are
+    collective. Raises HaloError on all ranks if a particle is farther outside its slab than the ghost planes reach.
     """
 
     tolerance, tolerance_foreseen, tolerance_adjoint = TOLERANCE, TOLERANCE_FORESEEN, TOLERANCE_ADJOINT
     most_iterations = MOST_ITERATIONS
     iterations: int | None = None
-    #: iterations and residual of the solves so far, and whether they converged, one after the other
+    #: iterations, residual and convergence of each solve so far
     solves: list[tuple[int, float, bool]]
-    #: modes that the last solve found; None before
+    #: modes of the last solve; None before the first
     found: Tensor | None = None
 
     def __init__(self, grid: FourierGrid, filter_width: float, kolmogorov_length: float = 0.0,
                  weight: float = WEIGHT) -> None:
         self.grid, self.filter_width = grid, filter_width
         inside = (grid.shell > 0) & (grid.shell <= grid.resolved)
-        self._moments: list[_Moment] = []
-        self.solves = []
-        #: rms u' of a component of the resolved velocity last remembered; 0 before
-        self.speed = 0.0
-        law, tail = _prior(grid, filter_width, kolmogorov_length, inside)
-        penalty = torch.where(inside, weight * tail / (3 * torch.where(inside, law, 1.0)), 0.0)
-        #: whose solution it is
+        energy, unresolved = _prior(grid, filter_width, kolmogorov_length, inside)
+        penalty = torch.where(inside, weight * unresolved / (3 * torch.where(inside, energy, 1.0)), 0.0)
         self.equations = LeastSquares(grid, inside, penalty)
+        self.forget()
 
     @classmethod
     def on_slabs(cls, decomposition: SlabDecomposition, flow: FlowUnits, margin: float = 0.0,
                  dtype: torch.dtype | None = None) -> ResolvedVelocity:
-        """On a grid of one cell for each plane of the slabs, for particles that lie at most `margin` outside them; in
-        double precision unless `dtype` is another."""
+        """On a grid with one cell for each plane of the slabs, in double precision by default.
+
+        Particles may be outside their slab by `margin` at most.
+        """
         scales = flow.scales
         highest = resolved_wavenumber(scales.spacing, scales.filter_width, scales.kolmogorov_length)
         shells = int(highest * decomposition.length / (2 * math.pi) + 1e-9)
@@ -101,9 +192,11 @@ class ResolvedVelocity:
         return cls(grid, scales.filter_width, scales.kolmogorov_length)
 
     def of(self, particles: ParticleSet, time: float | None = None, near: Tensor | None = None) -> ResolvedFlow:
-        """The resolved flow of particles; `time` tells what is foreseen of it. `near`: modes (3, kz, ky, kx) that are
-        known to be near it, without a time."""
-        self._require_reach(particles.position)
+        """The resolved flow of particles.
+
+        The solve starts from the prediction for `time`, from the modes `near` (3, kz, ky, kx), or from zero.
+        """
+        self._require_reach(particles)
         comm = self.grid.decomposition.comm
         mean = mean_over_ranks(comm, particles.velocity)
         relative, points = particles.velocity - mean, self.grid.points(particles.position)
@@ -118,39 +211,42 @@ class ResolvedVelocity:
         self.solves.append((flow.iterations, flow.residual, flow.converged))
         self.found = flow.velocity.detach()
         if torch.is_grad_enabled():
-            flow = replace(flow, left_over=None)  # which is without a gradient
+            flow = replace(flow, left_over=None)  # it has no gradient
             gradient = self._descent(flow, flow.missing())
             flow = replace(flow, velocity=_Solution.apply(gradient, flow.velocity, self._adjoint(flow)))
         return flow
 
     def band_energies(self, particles: ParticleSet, near: Tensor | None = None) -> Tensor:
-        """Mean kinetic energy <u.u>/2 of the resolved velocity by bands of `BAND` wavenumber shells, from shell 1 on:
-        (bands,), over all ranks; collective, differentiable. `near` as for `of`."""
+        """Mean kinetic energy <u.u>/2 in bands of `BAND` wavenumber shells from shell 1 on: (bands,), over all ranks.
+
+        `near` as in `of`. Collective, differentiable.
+        """
         spectrum = self.of(particles, near=near).spectrum[1:]
         return torch.nn.functional.pad(spectrum, (0, -len(spectrum) % BAND)).view(-1, BAND).sum(1)
 
-    # ---- from one evaluation to the next
+    # ---- predictions for the next evaluation
 
     @torch.no_grad()
     def remember(self, time: float, flow: ResolvedFlow, force: Tensor | None) -> None:
-        """Keep a flow and its rate of change for later evaluations to start from. `force` are the modes
-        (3, kz, ky, kx) of the particles' acceleration as a field: du/dt = P[force - div(uu)], P the solenoidal
-        projection, in the frame that moves with the particles' mean velocity."""
+        """Store a flow and its rate of change for later predictions.
+
+        `force` are the modes (3, kz, ky, kx) of the particles' acceleration. The rate is du/dt = P[force - div(uu)], P
+        the solenoidal projection, in the frame that moves with the particles' mean velocity.
+        """
         rate = self.equations.projected((0 if force is None else force.detach()) - flow.convection)
         self._moments = [moment for moment in self._moments if moment.time != time][-1:]
         self._moments.append(_Moment(time, flow.velocity.detach(), rate))
         self.speed = float(flow.rms)
 
     def foreseen(self, time: float, mean: np.ndarray, speed: float) -> Tensor | None:
-        """The modes at a time, extrapolated from the nearer of the last two evaluations at different times by the rates
-        of both (Adams and Bashforth), carried along by the mean velocity (3,) of the particles; None where nothing is
-        known.
+        """Predict the modes at a time; None without earlier evaluations.
 
-        Each is as large as it deserves. A flow of rms `speed` u' a component turns the phase of a mode by
-        theta = k u' dt in a time dt, and the forecast misses (5/12) theta^3 of it: 1.6 times the rms, where velocities
-        are normal. Modes that two or three u' would spoil count as unknown, 1 / (1 + (2 theta)^6), because one that is
-        wrong is worse than one that is missing: it is put right only where there are particles, and goes on growing
-        elsewhere.
+        The nearer of the last two evaluations at different times is extrapolated with the rates of both (Adams and
+        Bashforth). It moves with the mean velocity (3,) of the particles. Each mode is reduced by the expected error: a
+        flow with rms `speed` u' of a component turns the phase of a mode by theta = k u' dt in a time dt, and the
+        prediction misses (5/12) theta^3, or 1.6 times the rms for normally distributed velocities. The factor
+        1 / (1 + (2 theta)^6) removes modes that two or three u' would spoil. A wrong mode is worse than a missing one:
+        it is corrected only near particles and grows elsewhere.
         """
         if not self._moments:
             return None
@@ -163,12 +259,14 @@ class ResolvedVelocity:
         return worth * self._carried(near.velocity + step * rate, step, mean)
 
     def forget(self) -> None:
-        """Start the next solve from nothing."""
-        self._moments, self.solves, self.speed, self.found = [], [], 0.0, None
+        """Start the next solve from zero."""
+        self._moments: list[_Moment] = []
+        self.solves, self.found = [], None
+        #: rms u' of a component of the resolved velocity last remembered; 0 before
+        self.speed = 0.0
 
     def state_dict(self) -> dict[str, Tensor]:
-        """What later solves start from: times (m,), and modes (m, 2, 3, kz, ky_local, kx) of velocity and rate; and the
-        speed."""
+        """State for later solves: times (m,), modes (m, 2, 3, kz, ky_local, kx) of velocity and rate, and the speed."""
         modes = [torch.stack([moment.velocity, moment.rate]) for moment in self._moments]
         return {"times": torch.tensor([moment.time for moment in self._moments], dtype=torch.float64),
                 "modes": torch.stack(modes) if modes else self.grid.zeros(0, 2, 3),
@@ -188,65 +286,61 @@ class ResolvedVelocity:
     # ---- the solve
 
     def _solved(self, flow: ResolvedFlow, start: Tensor | None, count: float, square: float) -> ResolvedFlow:
-        """The flow with the modes that conjugate gradients find, of `count` particles with sum_i |v_i|^2 = `square`."""
+        """The flow with the modes of a solve, for `count` particles with sum_i |v_i|^2 = `square`."""
         if start is not None:
             flow = replace(flow, velocity=start)
         missing = flow.missing()
         right = self._descent(flow, missing)
         begin = self.equations.size(right, count)
         tolerance = self.tolerance if start is None else self.tolerance_foreseen
-        if begin > square and start is not None:  # worse than nothing is
+        if begin > square and start is not None:  # the prediction is worse than zero
             return self._solved(replace(flow, velocity=torch.zeros_like(start)), None, count, square)
         change = self._change(flow, right, count, tolerance**2 * square)
-        # What is not finite has not converged.
         return replace(flow, velocity=flow.velocity + change.modes, iterations=change.iterations,
                        left_over=missing - change.at_points.to(missing),
                        residual=math.sqrt(change.left / square) if square > 0 else 0.0,
+                       # false for NaN
                        converged=self.iterations is not None or change.left <= tolerance**2 * square)
 
     def _change(self, flow: ResolvedFlow, right: Tensor, count: float, enough: float) -> Solution:
         return self.equations.solve(flow.points, right, count, enough, self.iterations, self.most_iterations)
 
     def _descent(self, flow: ResolvedFlow, missing: Tensor) -> Tensor:
-        """Half the steepest descent of what is minimised, P B^T (v - B u) - (sigma^2/P_k) u, zero at its minimum, with
-        `missing` = v - B u."""
+        """Half the steepest descent, P B^T (v - B u) - (sigma^2/P_k) u, zero at the minimum; `missing` = v - B u."""
         return self.equations.descent(missing, flow.points, flow.velocity)
 
     def _adjoint(self, flow: ResolvedFlow) -> Callable[[Tensor], Tensor]:
-        """By the implicit function theorem: the gradient by modes of the minimum -> that by the descent there.
+        """Function from the gradient by modes of the minimum to the gradient by the descent there.
 
-        The descent d(u; x, v) is zero at the minimum and changes with u by -A, so that du = A^-1 dd. A is symmetric in
-        the inner product in which modes count by their multiplicity m, therefore its transpose is m A (1/m).
+        By the implicit function theorem: the descent d(u; x, v) vanishes at the minimum and changes with u by -A, so
+        du = A^-1 dd. A is symmetric in the inner product that weights modes by their multiplicity m; its transpose is
+        therefore m A (1/m).
         """
         grid, count = self.grid, float(global_sum(self.grid.decomposition.comm, len(flow.relative_velocity)))
 
         def solve(gradient: Tensor) -> Tensor:
-            # The part that belongs to a real field; what else there is has no effect on any value.
+            # Only the part that belongs to a real field affects any value.
             fields = grid.to_fields(gradient.resolve_conj() / grid.multiplicity)
             right = self.equations.projected(grid.to_modes(fields))
             enough = self.tolerance_adjoint**2 * self.equations.size(right, count)
-            found = self._change(flow, right, count, enough)
-            residual = self.tolerance_adjoint * math.sqrt(found.left / enough) if enough > 0 else 0.0
-            self.solves.append((found.iterations, residual,
-                                self.iterations is not None or found.left <= enough))
-            return grid.multiplicity * found.modes
+            change = self._change(flow, right, count, enough)
+            residual = self.tolerance_adjoint * math.sqrt(change.left / enough) if enough > 0 else 0.0
+            self.solves.append((change.iterations, residual,
+                                self.iterations is not None or change.left <= enough))
+            return grid.multiplicity * change.modes
 
         return solve
 
-    def _require_reach(self, position: Tensor) -> None:
-        slab, reach, position = self.grid.decomposition, self.grid.reach, position.detach()
-        z, lost = position[:, 2], not bool(torch.isfinite(position).all())
-        outside = slab.size > 1 and bool(((z < slab.lower - reach) | (z >= slab.upper + reach)).any())
-        if (worst := global_max(slab.comm, 2.0 * lost or 1.0 * outside)) == 2:
-            raise HaloError("the position of a particle is not finite: shorten the time step")
-        if worst == 1:
-            raise HaloError(f"a particle moves more than {reach:.3g} out of its slab before it can change rank, and "
-                            "the ghost planes reach no farther: shorten the time step or the skin")
+    def _require_reach(self, particles: ParticleSet) -> None:
+        reach = self.grid.reach
+        if farthest_outside(self.grid.decomposition, particles) >= reach:
+            raise HaloError(f"a particle is farther than {reach:.3g} outside its slab before it can change rank, "
+                            "beyond the ghost planes: shorten the time step or the skin")
 
 
 @dataclass(frozen=True)
 class _Moment:
-    """Modes of the resolved velocity at a time, and of its rate of change."""
+    """Modes of the resolved velocity and of its rate of change at a time."""
 
     time: float
     velocity: Tensor
@@ -254,7 +348,7 @@ class _Moment:
 
 
 class _Solution(torch.autograd.Function):
-    """The modes that make the descent zero, as a function of the descent at these very modes."""
+    """The modes at which the descent vanishes, as a function of the descent at these modes."""
 
     @staticmethod
     def forward(ctx, descent: Tensor, modes: Tensor, adjoint: Callable[[Tensor], Tensor]) -> Tensor:
@@ -267,14 +361,14 @@ class _Solution(torch.autograd.Function):
 
 
 def dissipation_range(wavenumber: np.ndarray) -> np.ndarray:
-    """f(k eta), by which spectra fall below the power law of the inertial range: exp(-5.2 ((k eta)^4 + 0.4^4)^(1/4) +
-    5.2 * 0.4) (Pope 2000, Eq. 6.248); 1 where `wavenumber`, k eta, is 0."""
+    """f(k eta) = exp(-5.2 ((k eta)^4 + 0.4^4)^(1/4) + 5.2 * 0.4), the factor of spectra in the dissipation range (Pope
+    2000, Eq. 6.248), as a function of `wavenumber`, k eta."""
     return np.exp(DISSIPATION * (DISSIPATION_ONSET - (wavenumber**4 + DISSIPATION_ONSET**4) ** 0.25))
 
 
 def _prior(grid: FourierGrid, filter_width: float, kolmogorov_length: float,
            inside: Tensor) -> tuple[Tensor, float]:
-    """Energy P_k of a component of each mode (kz, ky, kx), and the energy beyond, for <v.v> = 1."""
+    """Energy P_k of a component of each mode (kz, ky, kx), and the energy beyond k_c, for <v.v> = 1."""
     unit = 2 * math.pi / grid.decomposition.length
 
     def law(shell):

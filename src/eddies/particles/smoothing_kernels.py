@@ -1,8 +1,8 @@
-"""Smoothing kernels W(r) of compact support: SPH's own, tabulated ones, and the learned kernel after Eq. 7.
+"""Smoothing kernels W(r) of compact support: two kernels of SPH, tabulated ones, and the learned kernel of Eq. 7.
 
-Every kernel has unit integral over space, W in units of 1/length^3, is nowhere negative, and exactly zero for
-r >= support. The learned kernel in the published form alone may be negative, and its integral is one as nearly as the
-loss L_n makes it; it has the `mean_volume` L^3/N of a particle, V_j of Eq. 6, and its sums are not divided by anything.
+Every kernel has unit integral over space, with W in units of 1/length^3, is nowhere negative, and is exactly zero for
+r >= support. The published form of the learned kernel is the exception: it may be negative, and the loss L_n brings its
+integral only near one. It has a `mean_volume` L^3/N, V_j of Eq. 6, and its sums are not normalised.
 """
 
 from __future__ import annotations
@@ -17,16 +17,17 @@ from torch import Tensor, nn
 
 from eddies.particles.dense_network import DenseNetwork
 
-# Sharpness C of the paper's sigmoid (Eq. 7) with lengths in h, that of the public code; the text gives no number. Half
-# the value is lost at r = h, a tenth at r = 0.78 h.
+# Sharpness C of the sigmoid in Eq. 7, with lengths in h, as in the public code; the text gives no number. The sigmoid
+# is 1/2 at r = h and 0.9 at r = 0.78 h.
 SIGMOID_SHARPNESS = 10.0
-KNOTS = 129                  # of a table of the learned kernel
+# Knots of a table of the learned kernel.
+KNOTS = 129
 
 
 class SmoothingKernel(Protocol):
     """W(r) and dW/dr for distances of any shape, zero for r >= `support`.
 
-    With a `mean_volume` W may be negative, and <A> = V sum_j A_j W with V = L^3/N, Eq. 6 as published. Without one W is
+    With a `mean_volume` V = L^3/N, W may be negative, and <A> = V sum_j A_j W, Eq. 6 as published. Without one, W is
     nowhere negative, volumes are V_j = 1/sum_k W, and averages are normalised.
     """
 
@@ -35,8 +36,10 @@ class SmoothingKernel(Protocol):
 
     @property
     def pieces(self) -> Tensor:
-        """W(r) in each of equally long pieces of 0 <= r < support: the coefficients of u^0, u^1, ... for u = 1 ... 0
-        from a piece's begin to its end, (pieces, coefficients). Near the support, where u is small, they cancel least.
+        """W(r) in equally long pieces of 0 <= r < support, (pieces, coefficients).
+
+        The coefficients belong to u^0, u^1, ..., where u falls from 1 to 0 along a piece: near the support, where u is
+        small, they cancel least.
         """
 
     def value(self, distance: Tensor) -> Tensor: ...
@@ -55,18 +58,16 @@ class _Polynomial:
 
     @property
     def pieces(self) -> Tensor:
-        """See SmoothingKernel."""
+        """Coefficients of W; see SmoothingKernel."""
         return torch.tensor(self.shape_pieces, dtype=torch.float64) / self.support**3
 
     def value(self, distance: Tensor) -> Tensor:
-        """W(r) in 1/length^3, same shape as `distance`."""
-        q = torch.clamp(distance / self.support, max=1)
-        return self._shape(q) / self.support**3
+        """W(r) in 1/length^3, of the shape of `distance`."""
+        return self._shape(torch.clamp(distance / self.support, max=1)) / self.support**3
 
     def derivative(self, distance: Tensor) -> Tensor:
-        """dW/dr in 1/length^4, same shape as `distance`."""
-        q = torch.clamp(distance / self.support, max=1)
-        return self._slope(q) / self.support**4
+        """dW/dr in 1/length^4, of the shape of `distance`."""
+        return self._slope(torch.clamp(distance / self.support, max=1)) / self.support**4
 
 
 class CubicSpline(_Polynomial):
@@ -95,63 +96,61 @@ class WendlandC2(_Polynomial):
 
 
 def over_distance(slope: Tensor, distance: Tensor) -> Tensor:
-    """W'/r: the slope vanishes at r = 0, so that the quotient is 0 for coincident particles."""
+    """W'/r, which is 0 for coincident particles since the slope vanishes at r = 0."""
     return slope / distance.clamp(min=torch.finfo(distance.dtype).tiny)
 
 
 class HermiteKernel:
-    """Kernel tabulated on uniform knots q = r/h = 0 ... 1, cubic Hermite (C1) in between.
+    """Kernel tabulated at uniform knots q = r/h = 0 ... 1, with cubic Hermite polynomials (C1) between them.
 
     Parameters
     ----------
     support : h.
-    values, slopes : (knots,), the dimensionless W h^3 and d(W h^3)/dq; what is computed is differentiable in both.
-    mean_volume : see SmoothingKernel. Without one values are not negative, and slopes of more than three times the
-        value within a cell are lowered to that: a cubic between them would be negative somewhere.
+    values, slopes : (knots,), the dimensionless W h^3 and d(W h^3)/dq; all results are differentiable in both.
+    mean_volume : see SmoothingKernel. Without one, values must not be negative. Slopes above three times the value per
+        cell are then reduced to it, since a cubic would become negative between the knots.
     """
 
     def __init__(self, support: float, values: Tensor, slopes: Tensor, mean_volume: float | None = None) -> None:
-        if values.dim() != 1 or values.shape != slopes.shape or len(values) < 2:
-            raise ValueError(f"kernel table {(*values.shape,)}, {(*slopes.shape,)}: not two equal columns")
         self.support, self.values, self.cells, self.mean_volume = support, values, len(values) - 1, mean_volume
         steepest = 3 * self.cells * values
         self.slopes = torch.clamp(slopes, -steepest, steepest) if mean_volume is None else slopes
-        start, rise = values[:-1], values[1:] - values[:-1]
-        first, last = self.slopes[:-1] / self.cells, self.slopes[1:] / self.cells
-        self._coefficients = (start, first, 3 * rise - 2 * first - last, first + last - 2 * rise)
+        self._coefficients = self._cubics(values[:-1], values[1:], self.slopes[:-1], self.slopes[1:])
+
+    def _cubics(self, start: Tensor, end: Tensor, first: Tensor, last: Tensor) -> tuple[Tensor, ...]:
+        """Coefficients of cubics over the cells from values and slopes at both ends."""
+        rise, first, last = end - start, first / self.cells, last / self.cells
+        return start, first, 3 * rise - 2 * first - last, first + last - 2 * rise
 
     def value(self, distance: Tensor) -> Tensor:
-        """W(r) in 1/length^3, same shape as `distance`."""
+        """W(r) in 1/length^3, of the shape of `distance`."""
         inside, cell, t = self._locate(distance)
-        a, b, c, d = self._cubic(cell)
+        a, b, c, d = self._at(cell)
         value = a + t * (b + t * (c + t * d))
         if self.mean_volume is None:
-            value = torch.clamp(value, min=0)  # below zero by rounding alone
+            value = torch.clamp(value, min=0)  # rounding can give negative values
         return torch.where(inside, value, torch.zeros_like(value)) / self.support**3
 
     def derivative(self, distance: Tensor) -> Tensor:
-        """dW/dr in 1/length^4, same shape as `distance`."""
+        """dW/dr in 1/length^4, of the shape of `distance`."""
         inside, cell, t = self._locate(distance)
-        _, b, c, d = self._cubic(cell)
+        _, b, c, d = self._at(cell)
         slope = (b + t * (2 * c + t * (3 * d))) * self.cells
         return torch.where(inside, slope, torch.zeros_like(slope)) / self.support**4
 
     @property
     def pieces(self) -> Tensor:
-        """See SmoothingKernel."""
-        fall = self.values[:-1] - self.values[1:]
-        last, first = -self.slopes[:-1] / self.cells, -self.slopes[1:] / self.cells
-        cubics = self.values[1:], first, 3 * fall - 2 * first - last, first + last - 2 * fall
+        """Coefficients of W; see SmoothingKernel."""
+        cubics = self._cubics(self.values[1:], self.values[:-1], -self.slopes[1:], -self.slopes[:-1])
         return torch.stack(cubics, dim=1) / self.support**3
 
     @property
     def table(self) -> Tensor:
-        """Values and slopes (2 knots,), of which every W(r) is a linear function."""
+        """Values and slopes (2 knots,). Every W(r) is a linear function of them."""
         return torch.cat([self.values, self.slopes])
 
     def in_table(self, distance: Tensor) -> tuple[Tensor, Tensor]:
-        """The four entries of the table that each distance (m,) asks for, and the factors that make W(r) of them:
-        (4, m) each."""
+        """The four table entries at each distance (m,), and their factors in W(r): (4, m) each."""
         inside, cell, t = self._locate(distance)
         last = t * t * (3 - 2 * t)
         factors = torch.stack([1 - last, last, t * (1 - t) ** 2 / self.cells, t * t * (t - 1) / self.cells])
@@ -164,39 +163,36 @@ class HermiteKernel:
         cell = torch.clamp(position.detach().to(torch.int64), 0, self.cells - 1)
         return distance < self.support, cell, torch.clamp(position - cell, max=1)
 
-    def _cubic(self, cell: Tensor) -> list[Tensor]:
-        """The coefficients of the cubic in each cell."""
+    def _at(self, cell: Tensor) -> list[Tensor]:
+        """The coefficients of each cell."""
         flat = cell.flatten()
         return [coefficient.index_select(0, flat).reshape(cell.shape) for coefficient in self._coefficients]
 
 
 class KernelNetwork(nn.Module):
-    """The learned kernel: W(r) = alpha exp(NN(2 q^2 - 1)) g(q) with q = r/h, alpha from the unit integral, or, with a
+    """The learned kernel, with q = r/h: W(r) = alpha exp(NN(2 q^2 - 1)) g(q), alpha from the unit integral; or, with a
     `mean_volume`, W(r) = NN(q) g(q) / h^3, Eq. 7 as published.
 
     Parameters
     ----------
     support : h.
     hidden : widths of the tanh layers.
-    cutoff : "smooth": g = (1 - q^2)^2, exactly zero with zero slope at q = r/h = 1; or "sigmoid", the paper's
-        g = 1/(1 + exp(C (q - 1))), which is 1/2 at q = 1, so that the kernel ends there with a jump.
+    cutoff : "smooth": g = (1 - q^2)^2, zero with zero slope at q = 1; or "sigmoid", the paper's
+        g = 1/(1 + exp(C (q - 1))), which is 1/2 at q = 1, so the kernel ends with a jump.
     seed : of the initial weights.
     mean_volume : L^3/N of the published form, which may be negative; None: the positive form.
 
-    The alpha of the published form is part of the output layer, which the loss L_n of Eq. 11 brings to the unit
-    integral. Neither volumes 1/sum W nor normalised averages would do with it: they do not change with alpha, and their
-    denominators pass zero where weights of either sign cancel. With positive weights an average lies between the values
-    that it is taken of.
+    In the published form alpha is part of the output layer, which the loss L_n of Eq. 11 brings to the unit integral.
+    Volumes 1/sum W and normalised averages would fail with it: they do not depend on alpha, and their denominators
+    pass zero where weights of either sign cancel. With positive weights an average lies between the averaged values.
 
-    The positive form sees 2 q^2 - 1, so it is an even function of q: smooth at r = 0, with no slope there, as the
-    gradient of a reconstructed field needs. Its output layer starts small, so that W starts near g, a bell shape.
+    The positive form is an even function of q, smooth and without slope at r = 0, as the gradient of a reconstructed
+    field requires. Its output layer starts small, so W starts near the bell g.
     """
 
     def __init__(self, support: float, hidden: Sequence[int] = (20, 20, 20, 20), cutoff: str = "smooth", seed: int = 1,
                  mean_volume: float | None = None) -> None:
         super().__init__()
-        if cutoff not in ("smooth", "sigmoid"):
-            raise ValueError(f'kernel cutoff "{cutoff}": "smooth" or "sigmoid"')
         self.support, self.cutoff, self.mean_volume = support, cutoff, mean_volume
         self.network = DenseNetwork(1, hidden, 1, seed)
         if self.positive:
@@ -205,12 +201,12 @@ class KernelNetwork(nn.Module):
 
     @property
     def positive(self) -> bool:
-        """Whether W is nowhere negative: not in the published form."""
+        """Whether W is nowhere negative, unlike the published form."""
         return self.mean_volume is None
 
     @property
     def formula(self) -> str:
-        """What W is, in a word to be stored with the weights, which mean nothing in another one."""
+        """The formula of W, stored with the weights, which have no meaning in another one."""
         bell = "g" if self.cutoff == "smooth" else f"/ (1 + exp({SIGMOID_SHARPNESS:g} (q - 1)))"
         return f"{'exp(NN)' if self.positive else 'NN'} {bell}"
 
@@ -232,12 +228,11 @@ class KernelNetwork(nn.Module):
                              self.mean_volume)
 
     def integral(self, knots: int = KNOTS) -> Tensor:
-        """The integral over space before W is normalised, 1/alpha: what the loss of Eq. 11 brings near one."""
+        """Integral over space before normalisation, 1/alpha, which the loss of Eq. 11 brings near one."""
         return integral(self._unnormalised(knots))
 
     def table(self, knots: int = KNOTS) -> HermiteKernel:
-        """The kernel tabulated at `knots` points, with unit integral if it is positive; differentiable in the weights.
-        """
+        """The kernel tabulated at `knots` points, with unit integral if positive; differentiable in the weights."""
         kernel = self._unnormalised(knots)
         if not self.positive:
             return kernel
@@ -246,9 +241,9 @@ class KernelNetwork(nn.Module):
 
 
 def integral(kernel: SmoothingKernel) -> Tensor:
-    """Integral of a kernel over space, 4 pi int r^2 W dr, by Gauss-Legendre quadrature, 4 points a panel.
+    """Integral of a kernel over space, 4 pi int r^2 W dr, by Gauss-Legendre quadrature with 4 points a panel.
 
-    Exact for the kernels here, polynomials of degree 5 or less in each panel.
+    It is exact for the kernels here, polynomials of degree 5 or less in each panel.
     """
     tabulated = isinstance(kernel, HermiteKernel)
     values, panels = (kernel.values, kernel.cells) if tabulated else (torch.empty(0, dtype=torch.float64), 64)

@@ -1,10 +1,10 @@
-"""The report: figures, sections, the page."""
+"""The report: figures, sections and the page."""
 
 import contextlib
 import os
 import sys
 
-# Figures here need no backend, and a value of MPLBACKEND that is none would end the import of matplotlib.
+# The report needs no backend, and an unknown value of MPLBACKEND would end the import of matplotlib.
 if "matplotlib" not in sys.modules and (backend := os.environ.pop("MPLBACKEND", None)):
     try:
         import matplotlib

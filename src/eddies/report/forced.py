@@ -1,10 +1,8 @@
-"""The report's part on a forced rollout: its statistics beside those of the stationary state of the ground truth."""
+"""The section on a forced rollout: its statistics beside those of the stationary state of the ground truth."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from eddies.analysis.against_truth import EDGES, mean_energy
@@ -19,175 +17,101 @@ from eddies.report.page import Metric, Section
 from eddies.report.rollout import WITHOUT_KERNEL
 from eddies.spectral.mode_operators import gaussian_transfer
 
-
-@dataclass(frozen=True)
-class LateFrames:
-    """Energy <v.v>/2 and rms of a component of the acceleration of particles at frames over which they are averaged,
-    (m,) each, with the blocks of these frames, a turnover or more each."""
-
-    blocks: Blocks
-    energy: np.ndarray
-    acceleration_rms: np.ndarray
-
-    @classmethod
-    def of(cls, run: Frames, frames: np.ndarray, turnover: float) -> "LateFrames":
-        """Of frames of a trajectory."""
-        return cls(Blocks.of(run.times[frames] / turnover, 1.0),
-                   np.array([mean_energy(run, frame) for frame in frames]),
-                   np.array([np.std(run.read(frame, "acceleration")) for frame in frames]))
-
-    def averages(self, name: str, whose: str) -> dict[str, float]:
-        """Mean, named `whose`, and slope per turnover of "energy" or "acceleration_rms", each with its standard error,
-        and the standard deviation in time."""
-        samples = getattr(self, name)
-        mean, slope = self.blocks.mean(samples), self.blocks.trend(samples)
-        return {whose: mean.value, "standard error": mean.error, "trend per turnover": slope.value,
-                "error of the trend": slope.error, "deviation": float(samples.std())}
+SERIES = {"energy": "kinetic energy", "acceleration_rms": "rms of an acceleration component"}
 
 
-@dataclass(frozen=True)
-class ForcedStatistics:
-    """A forced rollout and the stationary flow that it should be like.
-
-    Parameters
-    ----------
-    times, energy : of the model, (frames,), <v.v>/2.
-    late : its frames in the second half, over which it is averaged; model : of these.
-    truth : of the true tracers at the same times, where they are forced too and last as long.
-    flow_energy : mean of the filtered flow's energy over its stationary span, by blocks too; flow_deviation : its
-        standard deviation in time.
-    wavenumber, flow_spectrum : the flow's mean filtered spectrum, (shells,). spectra : of the model, (m, shells), at
-        the times of `spectra_blocks`. cutoff : k_d, or the last of these shells.
-    velocity, acceleration : of the model's late frames, divided by the standard deviation of their frame.
-    flow_velocity, flow_acceleration : the same of the true tracers at the start, when they had just been forced.
-    flow_acceleration_rms : of one component, at the start.
-    qr_kl : divergence of the Q-R joint PDFs, each in units of its own enstrophy; None without a kernel.
-    """
-
-    times: np.ndarray
-    energy: np.ndarray
-    late: np.ndarray
-    model: LateFrames
-    truth: LateFrames | None
-    flow_energy: Estimate
-    flow_deviation: float
-    wavenumber: np.ndarray
-    flow_spectrum: np.ndarray
-    spectra_blocks: Blocks
-    spectra: np.ndarray
-    cutoff: float
-    velocity: np.ndarray
-    flow_velocity: np.ndarray
-    acceleration: np.ndarray
-    flow_acceleration: np.ndarray
-    flow_acceleration_rms: float
-    qr_kl: float | None
-
-    @classmethod
-    def of(cls, run: Rollout, span: StationarySpan) -> "ForcedStatistics":
-        """The statistics of a rollout with its truth; the frames before it broke, if it did.
-
-        Raises ValueError if there is no such frame.
-        """
-        frames = run.before_broken("model")
-        if not len(frames):
-            raise ValueError("the model has no finite frame")
-        times = run.model.times[frames]
-        late = frames[times >= times[-1] / 2]
-        shells = np.arange(span.spectra.shape[1])
-        transfer = gaussian_transfer(shells**2, run.filter_width) ** 2
-        flow_energy = span.spectra @ transfer
-        chosen = run.late_spectra()
-        spectra = np.array([run.spectra["model"][int(frame)] for frame in chosen])
-        known = min(spectra.shape[1], len(shells))
-        flow = {name: run.truth.read(0, name) for name in ("velocity", "acceleration")}
-        return cls(
-            times, np.array([mean_energy(run.model, frame) for frame in frames]), late,
-            LateFrames.of(run.model, late, run.turnover), _late_truth(run, times[-1]),
-            span.block_mean(flow_energy), span.average(flow_energy)[1],
-            shells[:known], (transfer * span.spectrum)[:known],
-            Blocks.of(run.model.times[chosen] / run.turnover, 1.0), spectra[:, :known],
-            min(np.pi / run.filter_width, known - 1.0),
-            np.concatenate([standardized(run.model.read(frame, "velocity")) for frame in late]),
-            standardized(flow["velocity"]),
-            np.concatenate([standardized(run.model.read(frame, "acceleration")) for frame in late]),
-            standardized(flow["acceleration"]), float(np.std(flow["acceleration"])),
-            None if run.reconstructions is None else invariant_divergence(
-                [run.reconstructions["model"][int(frame)].invariants for frame in late],
-                run.reconstructions["truth"][0].invariants))
-
-    @property
-    def spectrum(self) -> np.ndarray:
-        """The model's mean spectrum."""
-        return self.spectra_blocks.means(self.spectra).mean(axis=0)
-
-    @property
-    def spectrum_error(self) -> Estimate:
-        """Of the mean spectrum, not the mean of errors."""
-        return self.spectra_blocks.of_mean(
-            self.spectra, lambda mean: spectrum_error(mean, self.flow_spectrum, self.cutoff))
-
-    def divergence(self, column: str) -> float:
-        """Forward KL divergence of the standardised PDFs of "velocity" or "acceleration", flow to model."""
-        flow, model = (bin_probabilities(values, EDGES[column])
-                       for values in (getattr(self, f"flow_{column}"), getattr(self, column)))
-        return kl_divergence(flow, model)
-
-
-def _late_truth(run: Rollout, end: float) -> LateFrames | None:
-    """The true tracers in the second half of what ends at a time, if they are forced and last until then."""
-    reached = run.powers[1] > 0 and run.truth.times[-1] >= end * (1 - 1e-9)
-    return LateFrames.of(run.truth, second_half(run.truth.times, end), run.turnover) if reached else None
+def averages(run: Frames, frames: np.ndarray, turnover: float, whose: str) -> dict[str, dict[str, float]]:
+    """Return mean (named `whose`), slope per turnover, both with standard errors, and standard deviation of SERIES."""
+    blocks, found = Blocks.of(run.times[frames] / turnover, 1.0), {}
+    samples = {"energy": np.array([mean_energy(run, frame) for frame in frames]),
+               "acceleration_rms": np.array([np.std(run.read(frame, "acceleration")) for frame in frames])}
+    for name, values in samples.items():
+        mean, slope = blocks.mean(values), blocks.trend(values)
+        found[name] = {whose: mean.value, "standard error": mean.error, "trend per turnover": slope.value,
+                       "error of the trend": slope.error, "deviation": float(values.std())}
+    return found
 
 
 def invariant_divergence(model: Sequence[Invariants], flow: Invariants) -> float:
-    """Forward KL divergence of the joint PDFs of Q and R, of all frames of the model together, each in units of its own
-    <Q_w>."""
+    """Forward KL divergence of the joint PDFs of Q and R over all frames, each frame in units of its own <Q_w>."""
     true_plane, *planes = (found.normalized(found.scale) for found in (flow, *model))
     bins = InvariantBins.covering(*true_plane)
     return kl_divergence(bins.probabilities(*true_plane), bins.probabilities(*np.concatenate(planes, axis=1)))
 
 
 def section(run: Rollout, span: StationarySpan) -> Section:
-    """A forced rollout beside the stationary state of a ground truth whose filter width is known."""
-    title = "Forced rollout beside the stationary state"
-    try:
-        found, turnover = ForcedStatistics.of(run, span), run.turnover
-    except ValueError as error:
-        return Section("forced", title, notices=[f"It is not compared: {error}."])
-    energy, flow_energy, error = found.model.averages("energy", "model"), found.flow_energy, found.spectrum_error
-    begin, count = run.model.times[found.late[0]], len(found.model.blocks.members)
-    shown = Section(
-        "forced", title,
-        f"The model is forced with a power of {float(run.attributes['injection_rate']):.3g} a mass. Its averages, from "
-        f"{begin / turnover:.3g} to {found.times[-1] / turnover:.3g} T, beside those of the filtered flow over the "
-        f"{span.turnovers:.3g} turnovers in which it was stationary. Standard errors are those of blocks of a turnover "
-        f"or more, {count} of the model: frames closer than that are no independent samples. PDFs are compared with "
-        "those of the true tracers at the start, each in units of its own standard deviation.",
-        metrics=[
-            Metric("energy", "kinetic energy", {
-                **energy, "stationary flow": flow_energy.value, "its standard error": flow_energy.error,
-                "its deviation": found.flow_deviation}),
-            Metric("acceleration_rms", "rms of an acceleration component", {
-                **found.model.averages("acceleration_rms", "model"), "flow at the start": found.flow_acceleration_rms}),
-            Metric("spectrum_error", "error of the mean spectrum, rms of ln(E/E_filtered) over 1 ≤ k ≤ k_d",
-                   {"model": error.value, "standard error": error.error}),
-            Metric("velocity_kl", "KL divergence of the velocity PDF, standardised", found.divergence("velocity")),
-            Metric("acceleration_kl", "KL divergence of the acceleration PDF, standardised",
-                   found.divergence("acceleration")),
-            Metric("qr_kl", "KL divergence of the Q–R joint PDF, standardised", found.qr_kl, WITHOUT_KERNEL),
-        ])
-    if found.truth is not None:
-        shown.metrics += [Metric(f"true_{name}", f"the same of the true tracers at these times: {words}",
-                                 found.truth.averages(name, "true tracers"))
-                          for name, words in (("energy", "energy"), ("acceleration_rms", "acceleration"))]
+    """Return the section. Averages are those over the second half of the rollout, until the model broke."""
+    shown, turnover = Section("forced", "Forced rollout beside the stationary state"), run.turnover
+    frames = run.before_broken("model")
+    if not len(frames):
+        shown.notices.append("The rollout is not compared: the model has no finite frame.")
+        return shown
+    times = run.model.times[frames]
+    late = frames[times >= times[-1] / 2]
+    model = averages(run.model, late, turnover, "model")
+    flow, deviation = filtered_energy(run, span)
+    wavenumber, spectra, error = mean_spectra(run, span)
+    samples = {column: (standardized(run.truth.read(0, column)),
+                        np.concatenate([standardized(run.model.read(frame, column)) for frame in late]))
+               for column in ("velocity", "acceleration")}
+    divergence = {column: kl_divergence(*(bin_probabilities(values, EDGES[column]) for values in both))
+                  for column, both in samples.items()}
+    qr_kl = None if run.reconstructions is None else invariant_divergence(
+        [run.reconstructions["model"][int(frame)].invariants for frame in late],
+        run.reconstructions["truth"][0].invariants)
+    shown.text = (
+        f"The model is forced with a power of {run.powers[0]:.3g} per mass. Its averages from "
+        f"{run.model.times[late[0]] / turnover:.3g} to {times[-1] / turnover:.3g} T are compared with those of the "
+        f"filtered flow over {span.turnovers:.3g} turnovers of its stationary state. Standard errors are those of "
+        "blocks of a turnover or more, because closer frames are no independent samples. PDFs are compared with those "
+        "of the true tracers at the start, each in units of its own standard deviation.")
+    shown.metrics = [
+        Metric("energy", SERIES["energy"], {
+            **model["energy"], "stationary flow": flow.value, "its standard error": flow.error,
+            "its deviation": deviation}),
+        Metric("acceleration_rms", SERIES["acceleration_rms"], {
+            **model["acceleration_rms"], "flow at the start": float(np.std(run.truth.read(0, "acceleration")))}),
+        Metric("spectrum_error", "error of the mean spectrum, rms of ln(E/E_filtered) over 1 ≤ k ≤ k_d",
+               {"model": error.value, "standard error": error.error}),
+        Metric("velocity_kl", "KL divergence of the velocity PDF, standardised", divergence["velocity"]),
+        Metric("acceleration_kl", "KL divergence of the acceleration PDF, standardised", divergence["acceleration"]),
+        Metric("qr_kl", "KL divergence of the Q–R joint PDF, standardised", qr_kl, WITHOUT_KERNEL)]
+    if run.powers[1] > 0 and run.truth.times[-1] >= times[-1] * (1 - 1e-9):
+        truth = averages(run.truth, second_half(run.truth.times, times[-1]), turnover, "true tracers")
+        shown.metrics += [Metric(f"true_{name}", f"{words}, true tracers over the same time", truth[name])
+                          for name, words in SERIES.items()]
+    energy = np.array([mean_energy(run.model, frame) for frame in frames])
+    mean = Estimate(model["energy"]["model"], model["energy"]["standard error"])
     shown.add_figure(
-        "forced", "Forced rollout", forced_rollout(found, turnover, run.filter_wavenumber),
-        f"Energy of the model {_shown(found.model.blocks.mean(found.model.energy))}, of the stationary flow "
-        f"{_shown(flow_energy)} (± is the standard error; band: standard deviation in time). "
-        f"Rms of ln(E/E_filtered) of the mean spectra up to k_d (dotted): "
-        f"{_shown(error)}. KL of the acceleration PDF {found.divergence('acceleration'):.2g}.")
+        "forced", "Forced rollout",
+        forced_rollout((times / turnover, energy), (flow.value, deviation), (wavenumber, *spectra),
+                       run.filter_wavenumber, samples["acceleration"]),
+        f"Energy: model {_shown(mean)}, stationary flow {_shown(flow)} (± standard error; band: standard deviation in "
+        f"time). Rms of ln(E/E_filtered) of the mean spectra up to k_d (dotted): {_shown(error)}. KL divergence of the "
+        f"acceleration PDF: {divergence['acceleration']:.2g}.")
     return shown
+
+
+def _transfer(run: Rollout, span: StationarySpan) -> np.ndarray:
+    """Return the energy that the filter keeps, by shell."""
+    return gaussian_transfer(np.arange(span.spectra.shape[1]) ** 2, run.filter_width) ** 2
+
+
+def filtered_energy(run: Rollout, span: StationarySpan) -> tuple[Estimate, float]:
+    """Return the mean energy of the filtered flow over its stationary span, and its standard deviation in time."""
+    energy = span.spectra @ _transfer(run, span)
+    return span.block_mean(energy), span.average(energy)[1]
+
+
+def mean_spectra(run: Rollout, span: StationarySpan) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray], Estimate]:
+    """Return wavenumbers, mean spectra of filtered flow and model, and the error of the latter, (shells,) each."""
+    chosen = run.late_spectra()
+    spectra = np.array([run.spectra["model"][int(frame)] for frame in chosen])
+    known = min(spectra.shape[1], span.spectra.shape[1])
+    spectra, flow = spectra[:, :known], (_transfer(run, span) * span.spectrum)[:known]
+    cutoff, blocks = min(run.filter_wavenumber, known - 1.0), Blocks.of(run.model.times[chosen] / run.turnover, 1.0)
+    error = blocks.of_mean(spectra, lambda mean: spectrum_error(mean, flow, cutoff))
+    return np.arange(known), (flow, blocks.means(spectra).mean(axis=0)), error
 
 
 def _shown(found: Estimate) -> str:
@@ -195,35 +119,36 @@ def _shown(found: Estimate) -> str:
 
 
 @styled
-def forced_rollout(found: ForcedStatistics, turnover: float, cutoff: float) -> Figure:
-    """Energy over time, mean spectra and acceleration PDFs of the model and of the stationary flow."""
-    figure, axes = panels(1, 3, (3.7, 3.2))
-    energy, spectra, accelerations = axes.flat
-    mean, deviation = found.flow_energy.value, found.flow_deviation
+def forced_rollout(series: tuple[np.ndarray, np.ndarray], flow: tuple[float, float],
+                   spectra: tuple[np.ndarray, np.ndarray, np.ndarray], cutoff: float,
+                   accelerations: tuple[np.ndarray, np.ndarray]) -> Figure:
+    """Draw energy over time, mean spectra and acceleration PDFs of the model and of the stationary flow.
+
+    series: time / T and energy of the model. flow: mean and deviation of its energy. spectra: wavenumber, flow, model.
+    accelerations: flow and model, standardised.
+    """
+    figure, ((energy, spectrum, density),) = panels(1, 3, (3.7, 3.2))
+    mean, deviation = flow
     energy.axhspan(mean - deviation, mean + deviation, color=TRUTH, alpha=0.2, linewidth=0)
     energy.axhline(mean, color=TRUTH, label="stationary flow")
-    energy.plot(found.times / turnover, found.energy, color=MODEL, label="forced model")
+    energy.plot(*series, color=MODEL, label="forced model")
     energy.set(title="Kinetic energy", xlabel="$t/T$", ylabel=r"$\langle v\cdot v\rangle/2$",
-               ylim=(0, 1.15 * max(found.energy.max(), mean + deviation)))
+               ylim=(0, 1.15 * max(series[1].max(), mean + deviation)))
     energy.legend(loc="lower left")
-    _draw_spectra(spectra, found, cutoff)
+    k = spectra[0]
+    drawn = (k >= 1) & (k <= 2 * cutoff)
+    for values, colour in zip(spectra[1:], (TRUTH, MODEL)):
+        spectrum.loglog(k[drawn], values[drawn], color=colour, marker="o", markersize=3)
+    spectrum.axvline(cutoff, color=GUIDE, linestyle=":")
+    spectrum.set(title="Mean spectrum", xlabel="$k$", ylabel="$E(k)$")
+    number_wavenumbers(spectrum)
     edges = EDGES["acceleration"]
     middle = (edges[1:] + edges[:-1]) / 2
-    for values, colour, label in ((found.flow_acceleration, TRUTH, "true tracers at the start"),
-                                  (found.acceleration, MODEL, "forced model")):
-        density = pdf(values, edges)
-        accelerations.semilogy(middle[density > 0], density[density > 0], color=colour, label=label)
-    accelerations.plot(middle, gaussian(middle), color=GUIDE, linestyle="--", linewidth=1.1, label="Gaussian")
-    accelerations.set(title="Acceleration PDF", xlabel="$a$ / its standard deviation", ylim=(1e-6, 1))
-    accelerations.legend(loc="lower center")
-    letter(axes.flat)
+    for values, colour, label in zip(accelerations, (TRUTH, MODEL), ("true tracers at the start", "forced model")):
+        found = pdf(values, edges)
+        density.semilogy(middle[found > 0], found[found > 0], color=colour, label=label)
+    density.plot(middle, gaussian(middle), color=GUIDE, linestyle="--", linewidth=1.1, label="Gaussian")
+    density.set(title="Acceleration PDF", xlabel="$a$ / its standard deviation", ylim=(1e-6, 1))
+    density.legend(loc="lower center")
+    letter((energy, spectrum, density))
     return figure
-
-
-def _draw_spectra(axis: Axes, found: ForcedStatistics, cutoff: float) -> None:
-    shown = (found.wavenumber >= 1) & (found.wavenumber <= 2 * cutoff)
-    for energy, colour in ((found.flow_spectrum, TRUTH), (found.spectrum, MODEL)):
-        axis.loglog(found.wavenumber[shown], energy[shown], color=colour, marker="o", markersize=3)
-    axis.axvline(cutoff, color=GUIDE, linestyle=":")
-    axis.set(title="Mean spectrum", xlabel="$k$", ylabel="$E(k)$")
-    number_wavenumbers(axis)

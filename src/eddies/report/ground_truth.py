@@ -1,17 +1,18 @@
-"""Figures of the ground truth: the history of its statistics and its energy spectra."""
+"""The section on the ground truth: history of its statistics, energy spectra, fields."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from eddies.report.figures import (DNS, FILTERED, FOURTH, GUIDE, MODEL, POSITIVE, SECOND, SIGNED, TRUTH, colour_bar,
-                                   guide_power_law, largest, legend_below, letter, mark_time, number_wavenumbers,
-                                   panels, show_plane, styled)
+                                   guide_power_law, largest, legend_below, letter, mark_time, note,
+                                   number_wavenumbers, panels, show_plane, styled)
 from eddies.report.page import Metric, Section
 from eddies.spectral.mode_operators import gaussian_transfer
+
+Table = Mapping[str, np.ndarray]
 
 # Panels of the history: title, axis label, and the columns with their labels, colours and line styles.
 HISTORY = (
@@ -29,8 +30,7 @@ HISTORY = (
         ("skewness", "skewness", TRUTH, "-"),
         ("flatness", "flatness", MODEL, "--"))),
 )
-
-LOGARITHMIC, SMALLEST = ("Compressibility",), 1e-8  # below it is rounding, which would stretch the axis
+LOGARITHMIC, SMALLEST = "Compressibility", 1e-8  # smaller values are rounding errors and would stretch the axis
 METRICS = {
     "reynolds_lambda": "Taylor Reynolds number Re_λ", "kmax_eta": "resolution k_max η",
     "mach_turbulent": "turbulent Mach number M_t",
@@ -43,26 +43,60 @@ METRICS = {
 }
 
 
-@styled
-def statistics_history(statistics: Mapping[str, np.ndarray], release: float | None) -> Figure:
-    """Energy, dissipation, Re_lambda and further columns over time; `release` is when the tracers start, if
-    they do.
+def section(statistics: Table, spectra: Table, reference: Mapping[str, float], planes: Table,
+            field_name: str) -> Section:
+    """Return the section from the tables `statistics` and `spectra` and the attributes `reference`.
 
-    Columns (samples,); panels and lines without one finite number are left out.
+    Numbers are those at the release of the tracers, or at the end if there are no tracers. planes: "velocity" (u_x)
+    and "vorticity" (magnitude) [y, x] at z = pi of the last field called `field_name`. Times of spectra count from the
+    release of the tracers, times of statistics from the start.
     """
-    shown = [panel for panel in HISTORY if any(_known(statistics, line[0]) for line in panel[2])]
-    rows = -(-len(shown) // 3)
-    figure, axes = panels(rows, 3, (3.5, 2.6))
+    released, times = reference.get("released_at"), statistics["time"]
+    row = -1 if released is None else int(np.argmin(np.abs(times - released)))
+    at = {name: float(values[row]) for name, values in statistics.items()} | dict(reference)
+    when = "at the end" if released is None else "at the release of the tracers"
+    shown = Section(
+        "ground_truth", "Ground truth", f"Direct numerical simulation. Numbers {when}, t = {at['time']:.3g}.",
+        metrics=[Metric(key, label, at.get(key), "an incompressible fluid has none")
+                 for key, label in METRICS.items() if key in at or key == "mach_turbulent"],
+        main=("reynolds_lambda", "kmax_eta", "mach_turbulent"))
+    shown.add_figure(
+        "statistics", "History of the simulation", statistics_history(statistics, released),
+        f"From t = {times[0]:.3g} to {times[-1]:.3g}. Energy {when}: {at['energy']:.3g}; dissipation rate: "
+        f"{at['dissipation_rate']:.3g}.")
+    frame = -1 if released is None else int(np.argmin(np.abs(spectra["time"])))
+    energy, filtered = spectra["energy"][frame], spectra.get("filtered")
+    scales = {"dissipation_rate": float(statistics["dissipation_rate"][row]),
+              "kolmogorov_length": reference["kolmogorov_length"], "filter_width": reference.get("filter_width")}
+    caption = f"At t = {times[row]:.3g}; η = {scales['kolmogorov_length']:.3g}."
+    if filtered is not None:
+        filtered = filtered[frame]
+        caption += (f" The filter of width d = {scales['filter_width']:.3g} keeps {filtered.sum() / energy.sum():.1%} "
+                    "of the energy.")
+    shown.add_figure("spectra", "Energy spectrum of the ground truth",
+                     energy_spectra(spectra["wavenumber"], energy, filtered, scales), caption)
+    shown.add_figure("fields", "Velocity and vorticity", field_planes(**planes),
+                     f"Plane z = π of the last stored {field_name} field.")
+    return shown
+
+
+@styled
+def statistics_history(statistics: Table, release: float | None) -> Figure:
+    """Draw columns (samples,) over time and mark the release of the tracers; panels without finite values are left out.
+    """
+    known = {name for name, values in statistics.items() if np.isfinite(values).any()}
+    shown = [(title, label, [line for line in lines if line[0] in known]) for title, label, lines in HISTORY]
+    shown = [panel for panel in shown if panel[2]]
+    figure, axes = panels(-(-len(shown) // 3), 3, (3.5, 2.6))
     for axis, (title, label, lines) in zip(axes.flat, shown):
-        lines = [line for line in lines if _known(statistics, line[0])]
         for column, name, colour, style in lines:
             values = statistics[column]
-            if title in LOGARITHMIC:
+            if title == LOGARITHMIC:
                 values = np.where(values > SMALLEST, values, np.nan)
             axis.plot(statistics["time"], values, color=colour, linestyle=style, label=name)
         axis.set(title=title, xlabel=r"time $t$", ylabel=label)
         axis.margins(x=0.02, y=0.12)
-        if title in LOGARITHMIC:
+        if title == LOGARITHMIC:
             axis.set_yscale("log")
         if len(lines) > 1:
             legend_below(axis, len(lines))
@@ -75,16 +109,12 @@ def statistics_history(statistics: Mapping[str, np.ndarray], release: float | No
 
 
 @styled
-def spectra(
-    wavenumber: np.ndarray, energy: np.ndarray, filtered: np.ndarray | None,
-    scales: Mapping[str, float],
-) -> Figure:
-    """Energy spectrum at one time, the same compensated by eps^(-2/3) k^(5/3), and the transfer of the
-    filter.
+def energy_spectra(wavenumber: np.ndarray, energy: np.ndarray, filtered: np.ndarray | None,
+                   scales: Mapping[str, float]) -> Figure:
+    """Draw the energy spectrum at one time, the compensated spectrum eps^(-2/3) k^(5/3) E(k), and the filter.
 
-    Arrays (shells,); `filtered` None for a run without tracers. `scales`: dissipation_rate,
-    kolmogorov_length, and filter_width where there is a filter. Without viscosity, or with three
-    shells or fewer, nothing is compensated.
+    Arrays (shells,); `filtered` is None for a run without tracers. There is no compensated spectrum without viscosity
+    or with three shells or fewer.
     """
     inside = (wavenumber >= 1) & (energy > 1e-12 * energy.max())
     k, spectrum = wavenumber[inside], energy[inside]
@@ -102,25 +132,6 @@ def spectra(
     return figure
 
 
-@styled
-def field_planes(velocity: np.ndarray, vorticity: np.ndarray) -> Figure:
-    """u_x and the vorticity magnitude in a plane, both [y, x]."""
-    figure, axes = panels(1, 2, (3.9, 3.1))
-    limit = largest(velocity)
-    image = show_plane(axes[0, 0], velocity, (-limit, limit), SIGNED)
-    colour_bar(figure, image, axes[0, :1], "$u_x$")
-    image = show_plane(axes[0, 1], vorticity, (0, largest(vorticity)), POSITIVE)
-    colour_bar(figure, image, axes[0, 1:], r"$|\omega|$", extend="max")
-    for axis in axes.flat:
-        axis.set(xlabel="$x$", ylabel="$y$")
-    letter(axes.flat)
-    return figure
-
-
-def _known(statistics: Mapping[str, np.ndarray], column: str) -> bool:
-    return column in statistics and bool(np.isfinite(statistics[column]).any())
-
-
 def _energy_panel(axis: Axes, k: np.ndarray, energy: np.ndarray, filtered: np.ndarray | None) -> None:
     axis.loglog(k, energy, color=DNS, label="DNS", marker="o" if k.size < 8 else None)
     if filtered is not None:
@@ -136,8 +147,7 @@ def _compensated_panel(axis: Axes, k: np.ndarray, energy: np.ndarray, scales: Ma
     compensated = k ** (5 / 3) * energy / scales["dissipation_rate"] ** (2 / 3)
     axis.loglog(k * scales["kolmogorov_length"], compensated, color=DNS)
     axis.axhspan(1.5, 1.64, color=GUIDE, alpha=0.35, linewidth=0)
-    axis.annotate("1.5–1.64, high Re", (0.97, 1.64), xycoords=("axes fraction", "data"), xytext=(0, 2),
-                  textcoords="offset points", ha="right", fontsize=8.5, color="#5a5a5a")
+    note(axis, "1.5–1.64, high Re", (0.97, 1.64), ("axes fraction", "data"), (0, 2), ha="right", fontsize=8.5)
     axis.set(title="Compensated", xlabel=r"$k\,\eta$", ylabel=r"$\varepsilon^{-2/3}k^{5/3}E(k)$",
              ylim=(max(compensated.min() / 1.5, 1e-3), 2.5 * max(compensated.max(), 1.64)))
 
@@ -146,71 +156,21 @@ def _transfer_panel(axis: Axes, k: np.ndarray, ratio: np.ndarray, width: float) 
     axis.semilogx(k, gaussian_transfer(k**2, width) ** 2, color=FILTERED, label=r"$\exp(-k^2d^2/12)$")
     axis.semilogx(k, ratio, "o", color=TRUTH, markersize=4, markerfacecolor="none", label="measured")
     axis.axvline(np.pi / width, color=GUIDE, linestyle=":", linewidth=1)
-    axis.annotate(r"$k=\pi/d$", (np.pi / width, 0.02), xycoords=("data", "axes fraction"), xytext=(3, 2),
-                  textcoords="offset points", fontsize=8.5, color="#5a5a5a")
-    axis.set(title="Filter", xlabel="wavenumber $k$", ylabel="filtered energy / DNS energy",
-             ylim=(-0.03, 1.08))
+    note(axis, r"$k=\pi/d$", (np.pi / width, 0.02), ("data", "axes fraction"), (3, 2), fontsize=8.5)
+    axis.set(title="Filter", xlabel="wavenumber $k$", ylabel="filtered energy / DNS energy", ylim=(-0.03, 1.08))
     axis.legend(loc="upper right")
 
 
-@dataclass(frozen=True)
-class StoredFlow:
-    """The flow of a ground truth as stored: tables `statistics` and `spectra` (None without tracers), group
-    `reference`.
-
-    `planes` holds "velocity" (u_x) and "vorticity" (magnitude) [y, x] at z = pi of the last stored field,
-    whose name says which it is. Spectra count time from the release of the tracers, statistics from the
-    start.
-    """
-
-    statistics: Mapping[str, np.ndarray]
-    spectra: Mapping[str, np.ndarray]
-    reference: Mapping[str, float]
-    planes: Mapping[str, np.ndarray]
-    field_name: str
-
-    @property
-    def released_at(self) -> float | None:
-        """When the tracers start, None if there are none."""
-        return self.reference.get("released_at")
-
-    @property
-    def row(self) -> int:
-        """Row of the statistics that the numbers belong to: the release, or the end without tracers."""
-        if self.released_at is None:
-            return -1
-        return int(np.argmin(np.abs(self.statistics["time"] - self.released_at)))
-
-
-def section(flow: StoredFlow) -> Section:
-    """The ground truth: figures, and the numbers when the tracers start, or at the end without tracers."""
-    at = {name: float(values[flow.row]) for name, values in flow.statistics.items()} | dict(flow.reference)
-    when = "at the end" if flow.released_at is None else "when the tracers start"
-    metrics = [Metric(key, label, at.get(key), "an incompressible fluid has none")
-               for key, label in METRICS.items() if key in at or key == "mach_turbulent"]
-    text = f"Direct numerical simulation. Numbers {when}, t = {at['time']:.3g}."
-    shown = Section("ground_truth", "Ground truth", text, metrics=metrics,
-                    main=("reynolds_lambda", "kmax_eta", "mach_turbulent"))
-    first, last = flow.statistics["time"][[0, -1]]
-    shown.add_figure(
-        "statistics", "History of the simulation", statistics_history(flow.statistics, flow.released_at),
-        f"From t = {first:.3g} to {last:.3g}. {when.capitalize()} the energy is {at['energy']:.3g} and the "
-        f"dissipation rate {at['dissipation_rate']:.3g}.")
-    _add_spectra(shown, flow)
-    shown.add_figure("fields", "Velocity and vorticity", field_planes(**flow.planes),
-                     f"Plane z = π of the last stored {flow.field_name} field.")
-    return shown
-
-
-def _add_spectra(shown: Section, flow: StoredFlow) -> None:
-    frame = -1 if flow.released_at is None else int(np.argmin(np.abs(flow.spectra["time"])))
-    energy, filtered = flow.spectra["energy"][frame], flow.spectra.get("filtered")
-    scales = {"dissipation_rate": float(flow.statistics["dissipation_rate"][flow.row]),
-              "kolmogorov_length": flow.reference["kolmogorov_length"]}
-    caption = f"At t = {flow.statistics['time'][flow.row]:.3g}; η = {scales['kolmogorov_length']:.3g}."
-    if filtered is not None:
-        scales["filter_width"], filtered = flow.reference["filter_width"], filtered[frame]
-        kept = filtered.sum() / energy.sum()
-        caption += f" The filter of width d = {scales['filter_width']:.3g} keeps {kept:.1%} of the energy."
-    figure = spectra(flow.spectra["wavenumber"], energy, filtered, scales)
-    shown.add_figure("spectra", "Energy spectrum of the ground truth", figure, caption)
+@styled
+def field_planes(velocity: np.ndarray, vorticity: np.ndarray) -> Figure:
+    """Draw planes [y, x] of u_x and the vorticity magnitude."""
+    figure, axes = panels(1, 2, (3.9, 3.1))
+    limit = largest(velocity)
+    image = show_plane(axes[0, 0], velocity, (-limit, limit), SIGNED)
+    colour_bar(figure, image, axes[0, :1], "$u_x$")
+    image = show_plane(axes[0, 1], vorticity, (0, largest(vorticity)), POSITIVE)
+    colour_bar(figure, image, axes[0, 1:], r"$|\omega|$", extend="max")
+    for axis in axes.flat:
+        axis.set(xlabel="$x$", ylabel="$y$")
+    letter(axes.flat)
+    return figure

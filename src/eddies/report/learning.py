@@ -1,4 +1,4 @@
-"""Learning curves: losses, validation error, learning rate and gradient over the course of a training."""
+"""Learning curves: losses, validation error, learning rate and gradient over a training."""
 
 from collections.abc import Mapping
 
@@ -15,18 +15,19 @@ LOSSES = (
     ("acceleration_kl_loss", "acceleration KL", FOURTH), ("rollout_loss", "velocity over the horizon", THIRD),
     ("energy_loss", "energy over the horizon", "#56B4E9"), ("power_loss", "power", "#8c564b"),
 )
-# Single steps see a small batch: their mean over this share of a phase's steps is drawn over them.
-SMOOTHED = 0.04
+SMOOTHED = 0.04  # share of a phase's steps over which noisy curves are averaged
 
 
 @styled
 def curves(history: Mapping[str, np.ndarray]) -> Figure:
-    """The four curves over the steps of a training, each phase as wide as any other, also one that is not at its end;
-    dotted lines part them.
+    """Draw four curves over the steps of a training. All phases have the same width, with dotted lines between them.
 
-    history: columns (steps,); a loss that was not in use at a step is NaN there, one never used is absent.
+    history: columns (steps,). A loss that is not used in a step is NaN; a loss that is never used has no column.
     """
-    history = {**history, "place": _places(history["phase"])}
+    # Steps of the first phase are drawn in (0, 1], those of the second in (1, 2], and so on.
+    _, index, count = np.unique(history["phase"], return_inverse=True, return_counts=True)
+    before = np.cumsum(count) - count
+    history = {**history, "place": index + (np.arange(len(index)) - before[index] + 1) / count[index]}
     figure, axes = panels(2, 2, (4.6, 3.0), sharex=True)
     (losses, errors), (rates, gradients) = axes
     for name, label, colour in LOSSES:
@@ -47,20 +48,13 @@ def curves(history: Mapping[str, np.ndarray]) -> Figure:
     return figure
 
 
-def _places(phase: np.ndarray) -> np.ndarray:
-    """Where steps are drawn: those of the first phase in (0, 1], those of the second in (1, 2], and so on."""
-    _, index, count = np.unique(phase, return_inverse=True, return_counts=True)
-    before = np.cumsum(count) - count
-    return index + (np.arange(len(phase)) - before[index] + 1) / count[index]
-
-
 def _marker(steps: np.ndarray) -> str | None:
-    """A single step makes no line."""
+    """Return a marker for a single step, which makes no line."""
     return "." if np.count_nonzero(steps) == 1 else None
 
 
 def _mark_phases(axis: Axes, history: Mapping[str, np.ndarray]) -> None:
-    """Lines between the phases, and ticks that give steps and wall time."""
+    """Draw lines between the phases, and label ticks with steps and wall time."""
     phases = round(history["place"][-1])
     for end in range(1, phases):
         axis.axvline(end, color=GUIDE, linestyle=":", linewidth=1.0)
@@ -72,9 +66,8 @@ def _mark_phases(axis: Axes, history: Mapping[str, np.ndarray]) -> None:
 
 
 def _validation(axis: Axes, history: Mapping[str, np.ndarray]) -> None:
-    """Each phase has a measure of its own, so its points, from the one before its first step on, are joined with no
-    others; the least is circled."""
-    axis.set(title="Error on what is held out, its least circled", ylabel="validation error")
+    """Draw one line a phase, because each has its own measure, from the error before its first step; circle minima."""
+    axis.set(title="Validation error, minima circled", ylabel="validation error")
     missing, highest = np.full(len(history["step"]), np.nan), 0.0
     after, before = (history.get(name, missing) for name in ("validation_error", "start_error"))
     for index, number in enumerate(np.unique(history["phase"])):
@@ -91,7 +84,7 @@ def _validation(axis: Axes, history: Mapping[str, np.ndarray]) -> None:
 
 
 def _noisy(axis: Axes, history: Mapping[str, np.ndarray], name: str, colour: str, label: str | None) -> None:
-    """A curve of single steps, faint, under its running mean within each phase."""
+    """Draw a faint curve of single steps and, over it, its running mean within each phase."""
     values = history[name]
     for number in np.unique(history["phase"]):
         used = (values > 0) & (history["phase"] == number)

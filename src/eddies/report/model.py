@@ -1,16 +1,20 @@
-"""Figures of the trained model: a-priori errors and PDFs (the paper's Fig. 3) and its training."""
+"""The section on the model: a-priori errors and PDFs (the paper's Fig. 3), training, coefficients, other flows."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from eddies.analysis.pdfs import bin_edges, bin_probabilities, gaussian, kl_divergence, pdf, standardized
-from eddies.report.figures import DNS, FOURTH, GUIDE, MODEL, SECOND, TRUTH, legend_below, letter, panels, styled
+from eddies.analysis.pdfs import bin_edges, bin_probabilities, kl_divergence, standardized
+from eddies.report.figures import (DNS, FOURTH, GUIDE, MODEL, SECOND, draw_pdfs, legend_below, letter, note, panels,
+                                   plain_log_ticks, styled)
 from eddies.report.learning import curves
 from eddies.report.page import Metric, Section, shown
+
+Table = Mapping[str, np.ndarray]
 
 ERRORS = (  # column of the table, label, colour, line style, marker
     ("acceleration_error", "model", MODEL, "-", "o"),
@@ -22,136 +26,171 @@ EDGES = bin_edges(8, 65)  # of the PDFs, in standard deviations of the truth
 METRICS = {  # key in the report: column of the table, label
     "acceleration_error": ("acceleration_error", "acceleration error at the true state (a priori)"),
     "true_density_acceleration_error": (
-        "true_density_acceleration_error", "the same given the true density"),
+        "true_density_acceleration_error", "acceleration error given the true density"),
     "density_rate_error": ("density_rate_error", "density rate error at the true state"),
     "filtered_pressure_gradient_error": (
         "pressure_gradient_error", "acceleration error of the exact filtered pressure gradient"),
 }
-
 TRAINING = {
     "training_seconds": "wall seconds of the training, without reading and testing",
     "training_steps": "optimiser steps of the training, by phase",
-    "training_error": "error on what is held out, at the end of each phase",
+    "training_error": "validation error at the end of each phase",
 }
 
 
-@styled
-def a_priori(table: Mapping[str, np.ndarray], acceleration: Mapping[str, np.ndarray],
-             density_rate: Mapping[str, np.ndarray] | None) -> Figure:
-    """Errors over the delay after training, and PDFs of truth and prediction at the last frame.
+@dataclass(frozen=True)
+class FlowErrors:
+    """A-priori errors of a model on one flow: name of the flow, its M_t at the release of the tracers, the table."""
 
-    table: columns (frames,); acceleration: truth and predicted (m, 3); density_rate: the same (m,), or None.
+    name: str
+    mach: float | None
+    table: Table
+
+    def unseen(self, column: str) -> np.ndarray:
+        """Errors at the times after the training window."""
+        return self.table[column][self.table["delay"] > 0]
+
+
+def section(description: Mapping[str, Any], table: Table, acceleration: Table, density_rate: Table | None,
+            history: Table | None, source: str | None = None, others: Sequence[str] = ()) -> Section:
+    """Return the section with the errors at the last frame, from the tables of the product.
+
+    source: path of the run that the weights come from, if it is another one; the history is that of this run.
+    history: None if nothing was trained. others: the ground truths that the model was trained on, if they do not
+    include the one of this flow, or of the source.
     """
-    figure, axes = panels(1, 2 if density_rate is None else 3, (3.9, 3.5))
-    _errors_panel(axes[0, 0], table)
-    _pdf_panel(axes[0, 1], acceleration, "Acceleration", r"$a$")
-    if density_rate is not None:
-        _pdf_panel(axes[0, 2], density_rate, "Density rate", r"$\dot\rho$")
-    letter(axes.flat)
-    return figure
+    last = int(np.argmax(table["delay"]))
+    at = {name: float(values[last]) for name, values in table.items()}
+    terms = ", ".join(description["terms"])
+    metrics = [Metric(key, label, at.get(column), f"terms {terms} have none")
+               for key, (column, label) in METRICS.items()]
+    metrics.append(Metric("delay", "time of these errors after the training window", at["delay"]))
+    metrics += [*training_metrics(description), *coefficient_metrics(description)]
+    since, trained = "training window", ""
+    if source is not None:
+        since = "release of the tracers, or the training window"
+    if others:
+        whose = "this flow" if source is None else f"the flow of {source}, where its weights come from"
+        trained = f" Trained on {', '.join(others)}, and not on {whose}."
+        since = "release of the tracers" if source is None else since
+    part = Section("model", "Model", f"Terms: {terms}.{trained} A-priori test: the model sees the true particles of a "
+                   f"frame. Numbers are those of the last frame, {at['delay']:.3g} after the {since}.", metrics=metrics,
+                   main=("acceleration_error", "filtered_pressure_gradient_error"))
+    truth, predicted = acceleration["truth"], acceleration["predicted"]
+    divergence = kl_divergence(bin_probabilities(standardized(truth), EDGES),
+                               bin_probabilities(standardized(predicted, truth), EDGES))
+    beside = "without a model: 1"
+    if "pressure_gradient_error" in at:
+        beside = f"exact filtered pressure gradient alone: {at['pressure_gradient_error']:.3f}; {beside}"
+    part.add_figure(
+        "figure-3-a-priori", "A-priori errors and PDFs (the paper's Fig. 3)",
+        a_priori(table, acceleration, density_rate),
+        f"Acceleration error at the last frame: {at['acceleration_error']:.3f} ({beside}). KL divergence of the "
+        f"acceleration PDF: {divergence:.2g}. Grey: frames of the training window.")
+    if history is not None:
+        part.add_figure("model-training", "Training of the model", curves(history),
+                        f"{int(history['step'][-1]) + 1} steps" + (f", in {source}." if source else "."))
+    return part
 
 
-def _positive(values: np.ndarray) -> np.ndarray:
-    return np.where(np.asarray(values) > 0, values, np.nan)
-
-
-def _errors_panel(axis: Axes, table: Mapping[str, np.ndarray]) -> None:
-    delay = table["delay"]
-    axis.axhline(1, color=GUIDE, linestyle=":", linewidth=1.2, label="no model")
-    if delay.min() < 0:
-        axis.axvspan(delay.min() - 0.03 * np.ptp(delay), 0, color="#eeeeee", zorder=0)
-        axis.annotate("training", (delay.min(), 0.86), xycoords=("data", "axes fraction"), fontsize=9,
-                      color="#5a5a5a", va="top")
-    for column, label, colour, style, marker in ERRORS:
-        if column in table:
-            axis.plot(delay, table[column], color=colour, linestyle=style, marker=marker, markersize=4,
-                      label=label)
-    top = max(1.1, *(1.05 * table[column].max() for column, *_ in ERRORS if column in table))
-    seen = delay.min() < 0
-    axis.set(title="A-priori error", ylabel="normalised L2 error", ylim=(0, top),
-             xlabel="delay after the training window" if seen else "time after the release of the tracers")
-    legend_below(axis, 1)
-
-
-def _pdf_panel(axis: Axes, sample: Mapping[str, np.ndarray], title: str, symbol: str) -> None:
-    truth = sample["truth"]
-    edges = EDGES
-    centres = (edges[1:] + edges[:-1]) / 2
-    axis.semilogy(centres, gaussian(centres), color=GUIDE, linestyle=":", label="Gaussian")
-    axis.semilogy(centres, _positive(pdf(standardized(truth), edges)), color=TRUTH, label="truth")
-    axis.semilogy(centres, _positive(pdf(standardized(sample["predicted"], truth), edges)), color=MODEL,
-                  linestyle="none", marker="o", markersize=3.5, markerfacecolor="none", label="model")
-    smallest = 0.3 / truth.size / (edges[1] - edges[0])
-    axis.set(title=f"{title} PDF", xlabel=f"{symbol} / standard deviation of the truth", ylabel="PDF",
-             ylim=(smallest, 2))
-    legend_below(axis, 3)
-
-
-def _training(description: Mapping[str, Any]) -> list[Metric]:
-    """What the training cost, and the error on what is held out at the end of each phase."""
+def training_metrics(description: Mapping[str, Any]) -> list[Metric]:
+    """Return the cost of the training and the validation error at the end of each phase."""
     if "training" not in description:
         return [Metric(key, label, None, "not stored with these weights") for key, label in TRAINING.items()]
     phases = description["training"]
     values = {"training_seconds": float(sum(phase["seconds"] for phase in phases)),
               "training_steps": {phase["phase"]: phase["steps"] for phase in phases} or None,
               "training_error": {phase["phase"]: phase["error"] for phase in phases} or None}
-    return [Metric(key, label, values[key], "nothing is learned") for key, label in TRAINING.items()]
+    return [Metric(key, label, values[key], "the model has nothing to learn") for key, label in TRAINING.items()]
 
 
-def _coefficients(description: Mapping[str, Any]) -> list[Metric]:
-    """What each term has learned, as the terms declare it."""
+def coefficient_metrics(description: Mapping[str, Any]) -> list[Metric]:
+    """Return the learned coefficients that the terms declare."""
     return [Metric(f"{term} {each['name']}", f"{term}, {each['name']}: {each['meaning']}",
                    {key: each[key] for key in ("learned", "value", "unit", "meaning")}, written=_written(each))
             for term, found in description.get("coefficients", {}).items() for each in found]
 
 
 def _written(coefficient: Mapping[str, Any]) -> str:
-    """As it was learned and, where that is another number, its value in the units of the flow."""
+    """Write a coefficient as it was learned and, unless its unit is 1, in the units of the flow."""
     learned, value = (", ".join(map(shown, found if isinstance(found, list) else [found]))
                       for found in (coefficient["learned"], coefficient["value"]))
     return learned if coefficient["unit"] == "1" else f"{learned}, that is {value} {coefficient['unit']}"
 
 
-def section(description: Mapping[str, Any], table: Mapping[str, np.ndarray],
-            acceleration: Mapping[str, np.ndarray], density_rate: Mapping[str, np.ndarray] | None,
-            history: Mapping[str, np.ndarray] | None, source: str | None = None,
-            others: Sequence[str] = ()) -> Section:
-    """The model: a-priori figures and the errors at the last frame, from the tables.
-
-    `source` names the run that the weights come from, if it is another; the history is that run's, and None where
-    there was nothing to learn. `others` are ground truths that it was trained on, where that of this flow, or of the
-    source's, is none of them.
-    """
-    last = int(np.argmax(table["delay"]))
-    at = {name: float(values[last]) for name, values in table.items()}
-    terms = ", ".join(description["terms"])
-    missing = f"terms {terms} have none"
-    metrics = [Metric(key, label, at.get(column), missing) for key, (column, label) in METRICS.items()]
-    metrics.append(Metric("delay", "delay of these errors after what the model was trained on", at["delay"]))
-    metrics += [*_training(description), *_coefficients(description)]
-    since = "training window" if source is None else "release of the tracers, or the training window"
-    trained = ""
-    if others:
-        whose = "this flow" if source is None else f"the flow of {source}, where its weights come from"
-        trained = f" Trained on {', '.join(others)}, and on nothing of {whose}."
-    if others and source is None:
-        since = "release of the tracers"
-    text = (f"Terms: {terms}.{trained} A-priori: the model sees the true particles of a frame. Numbers are of the last "
-            f"frame, {at['delay']:.3g} after the {since}.")
-    part = Section("model", "Model", text, metrics=metrics,
-                   main=("acceleration_error", "filtered_pressure_gradient_error"))
-    truth, predicted = acceleration["truth"], acceleration["predicted"]
-    divergence = kl_divergence(bin_probabilities(standardized(truth), EDGES),
-                               bin_probabilities(standardized(predicted, truth), EDGES))
-    beside = ", that of no model 1"
-    if "pressure_gradient_error" in at:
-        beside = f"; that of the exact filtered pressure gradient alone is {at['pressure_gradient_error']:.3f}{beside}"
+def add_source(part: Section, this: FlowErrors, source: FlowErrors) -> None:
+    """Add errors over the Mach number for a model whose weights come from another flow, or a notice."""
+    if None in (this.mach, source.mach) or not len(source.unseen("acceleration_error")):
+        part.notices.append(f"{source.name} or this flow has no Mach number, or {source.name} stores no error after "
+                            "its training window. There is no figure over the Mach number. Train the model again, "
+                            "with a window below 1.")
+        return
+    part.metrics += [
+        Metric("mach_turbulent", "turbulent Mach number M_t", this.mach),
+        Metric("source_mach_turbulent", "M_t of the flow that the model was trained on", source.mach),
+        Metric("source_acceleration_error", "mean acceleration error in that flow, after the training window",
+               float(source.unseen("acceleration_error").mean())),
+        Metric("unseen_acceleration_error", "mean acceleration error in this flow",
+               float(this.unseen("acceleration_error").mean()))]
     part.add_figure(
-        "figure-3-a-priori", "A-priori errors and PDFs (the paper's Fig. 3)",
-        a_priori(table, acceleration, density_rate),
-        f"At the last frame the acceleration error is {at['acceleration_error']:.3f}{beside}. KL "
-        f"divergence of the acceleration PDF {divergence:.2g}. Grey: frames of the training window.")
-    if history is not None:
-        part.add_figure("model-training", "Training of the model", curves(history),
-                        f"{int(history['step'][-1]) + 1} steps" + (f", in {source}." if source else "."))
-    return part
+        "figure-3b-mach", "A-priori error over the Mach number (the paper's Fig. 3)", over_mach([this, source]),
+        f"Trained in {source.name} at M_t = {source.mach:.3f}. The model uses only the scales of this flow, which has "
+        f"M_t = {this.mach:.3f}. Points: mean over the unseen times of a flow; bars: smallest and largest.")
+
+
+@styled
+def a_priori(table: Table, acceleration: Table, density_rate: Table | None) -> Figure:
+    """Draw errors over the delay after training, and PDFs of truth and prediction at the last frame.
+
+    table: columns (frames,). acceleration: truth and predicted (m, 3). density_rate: the same (m,), or None.
+    """
+    figure, axes = panels(1, 2 if density_rate is None else 3, (3.9, 3.5))
+    _errors_panel(axes[0, 0], table)
+    for axis, sample, title, symbol in zip(axes[0, 1:], (acceleration, density_rate), ("Acceleration", "Density rate"),
+                                           (r"$a$", r"$\dot\rho$")):
+        draw_pdfs(axis, sample["truth"], sample["predicted"], EDGES)
+        axis.set(title=f"{title} PDF", xlabel=f"{symbol} / standard deviation of the truth", ylabel="PDF")
+        legend_below(axis, 3)
+    letter(axes.flat)
+    return figure
+
+
+def _errors_panel(axis: Axes, table: Table) -> None:
+    delay = table["delay"]
+    seen = delay.min() < 0
+    axis.axhline(1, color=GUIDE, linestyle=":", linewidth=1.2, label="no model")
+    if seen:
+        axis.axvspan(delay.min() - 0.03 * np.ptp(delay), 0, color="#eeeeee", zorder=0)
+        note(axis, "training", (delay.min(), 0.86), ("data", "axes fraction"), (0, 0), va="top")
+    drawn = [each for each in ERRORS if each[0] in table]
+    for column, label, colour, style, marker in drawn:
+        axis.plot(delay, table[column], color=colour, linestyle=style, marker=marker, markersize=4, label=label)
+    axis.set(title="A-priori error", ylabel="normalised L2 error",
+             ylim=(0, max(1.1, *(1.05 * table[column].max() for column, *_ in drawn))),
+             xlabel="delay after the training window" if seen else "time after the release of the tracers")
+    legend_below(axis, 1)
+
+
+@styled
+def over_mach(flows: Sequence[FlowErrors]) -> Figure:
+    """Draw the mean error over the unseen times of each flow, with bars from the smallest to the largest."""
+    figure, ((axis,),) = panels(1, 1, (5.2, 4.0))
+    flows = sorted(flows, key=lambda flow: flow.mach)
+    mach = np.array([flow.mach for flow in flows])
+    for (column, label, colour, *_), marker, apart in ((ERRORS[0], "o", 0.99), (ERRORS[-1], "s", 1.01)):
+        if any(column not in flow.table for flow in flows):
+            continue
+        errors = [flow.unseen(column) for flow in flows]
+        mean = np.array([each.mean() for each in errors])
+        spread = np.array([[each.mean() - each.min(), each.max() - each.mean()] for each in errors]).T
+        axis.errorbar(apart * mach, mean, spread, color=colour, marker=marker, markersize=5, capsize=3, linewidth=1.2,
+                      label=label)
+    axis.axhline(1, color=GUIDE, linestyle=":", linewidth=1.2)
+    note(axis, "no model", (1, 1), ("axes fraction", "data"), (-2, -11), ha="right")
+    for index, flow in enumerate(flows):
+        note(axis, flow.name, (flow.mach, 0.02 + 0.06 * index), ("data", "axes fraction"), (0, 0), ha="center")
+    axis.set(title="A-priori error", xlabel="turbulent Mach number $M_t$", ylabel="normalised L2, acceleration",
+             xscale="log", xlim=(0.7 * mach[0], mach[-1] / 0.7), ylim=(0, 1.1))
+    plain_log_ticks(axis.xaxis)
+    legend_below(axis, 2)
+    return figure

@@ -1,28 +1,25 @@
-"""Figures of a rollout and the true tracers: fields (the paper's Figs. 4-5), errors in time, PDFs of particles (Fig. 6)
-and the Q-R plane (Fig. 7)."""
+"""Figures of a rollout and the true tracers: planes, particle PDFs, spectra, errors over time, paths, disorder."""
 
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from eddies.analysis.against_truth import EDGES, InvariantStatistics, pdf_divergence
-from eddies.analysis.pdfs import gaussian, pdf, standardized
-from eddies.analysis.rollout import Pair
-from eddies.analysis.velocity_gradients import ConditionalVelocity, InvariantBins, vieillefosse_line
-from eddies.report.figures import (DNS, FOURTH, GUIDE, MODEL, POSITIVE, SIGNED, TRUTH, colour_bar, largest, letter,
-                                   panels, show_plane, styled)
+from eddies.analysis import disorder
+from eddies.analysis.against_truth import EDGES, pdf_divergence
+from eddies.analysis.lagrangian import PathStatistics
+from eddies.analysis.rollout import Pair, SpectraAt
+from eddies.report.figures import (DNS, FILTERED, FOURTH, GUIDE, MODEL, POSITIVE, SIGNED, TRUTH, colour_bar,
+                                   draw_pdfs, guide_power_law, largest, letter, note, number_wavenumbers, panels,
+                                   show_plane, styled)
 
-FEWEST = 8  # particles a cell needs before its conditional mean is drawn
 LINES = {"truth": {"label": "true tracers", "color": TRUTH},
          "model": {"label": "model", "color": MODEL, "linestyle": "--"}}
 
 
 @styled
 def velocity_planes(pairs: Sequence[Pair], turnover: float) -> Figure:
-    """u_x at z = pi over time: truth above, model below, one colour scale. Pairs of [y, x] planes."""
+    """Draw u_x in planes [y, x] over time, truth above and model below, with one colour scale."""
     figure, axes = panels(2, len(pairs), (2.7, 2.6), sharex=True, sharey=True)
     limit = largest(*(pair.truth for pair in pairs))
     for column, pair in zip(axes.T, pairs):
@@ -39,7 +36,7 @@ def velocity_planes(pairs: Sequence[Pair], turnover: float) -> Figure:
 
 @styled
 def vorticity_and_energy(vorticity: Pair, energy: Pair) -> Figure:
-    """Vorticity magnitude and kinetic energy in the plane z = pi: truth and model, one colour scale a row."""
+    """Draw planes [y, x] of vorticity magnitude and kinetic energy, truth and model, with one colour scale a row."""
     figure, axes = panels(2, 2, (3.2, 3.0), sharex=True, sharey=True)
     for row, pair, label in zip(axes, (vorticity, energy), (r"$|\omega|$", r"$\frac{1}{2}|u|^2$")):
         limit = largest(pair.truth)
@@ -58,8 +55,7 @@ def vorticity_and_energy(vorticity: Pair, energy: Pair) -> Figure:
 @styled
 def errors_over_time(model: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray],
                      errors: Mapping[str, np.ndarray], turnover: float) -> Figure:
-    """Energy, velocity error, PDF divergences and, where both have one, density rms over time; the model may outlast
-    the truth."""
+    """Draw energy, velocity error, PDF divergences and, if model and truth have one, density rms over time."""
     figure, axes = panels(2, 2, (4.6, 2.8))
     energy, error, divergence, density = axes.flat
     initial = truth["energy"][0]
@@ -92,15 +88,11 @@ def errors_over_time(model: Mapping[str, np.ndarray], truth: Mapping[str, np.nda
 
 @styled
 def particle_pdfs(pairs: Mapping[str, Sequence[Pair]], turnover: float) -> Figure:
-    """PDFs of all velocity components (above) and acceleration components (below) at several times.
-
-    pairs: "velocity" and "acceleration", each one Pair of (n, 3) a time; both are standardised by the truth.
-    """
-    rows = ("velocity", "acceleration")
+    """Draw PDFs of all components of "velocity" and "acceleration", given as a Pair of (n, 3) for each time."""
     figure, axes = panels(2, len(pairs["velocity"]), (3.3, 2.8), sharex="row", sharey="row")
-    for row, quantity in zip(axes, rows):
+    for row, quantity in zip(axes, ("velocity", "acceleration")):
         for axis, pair in zip(row, pairs[quantity]):
-            _pdf_panel(axis, pair, EDGES[quantity])
+            draw_pdfs(axis, pair.truth, pair.model, EDGES[quantity])
             divergence = pdf_divergence(pair, EDGES[quantity])
             axis.set_title(f"$t = {pair.time / turnover:.2f}\\,T$,  KL {divergence:.2g}")
             axis.set_xlabel(f"${quantity[0]}$ / standard deviation of the truth")
@@ -111,107 +103,94 @@ def particle_pdfs(pairs: Mapping[str, Sequence[Pair]], turnover: float) -> Figur
 
 
 @styled
-def invariant_plane(statistics: InvariantStatistics,
-                    flows: tuple[ConditionalVelocity, ConditionalVelocity] | None) -> Figure:
-    """Joint PDFs of (R, Q), truth and model, at the same levels; below, the mean (dR/dt, dQ/dt) on condition
-    of both, from the `flows` of model and truth.
+def energy_spectra(series: Sequence[SpectraAt], flow: Mapping[str, np.ndarray], start_time: float, turnover: float,
+                   filter_wavenumber: float) -> Figure:
+    """Draw spectra of model and true tracers over time with those of the DNS at the nearest time.
 
-    Arrows show the direction on the page; colour is the speed in the plane, one scale for both.
+    `flow` is a table with time (m,), wavenumber (k,), energy and filtered (m, k). The times of the model count from
+    start_time.
     """
-    rows = 1 if flows is None else 2
-    figure, axes = panels(rows, 2, (4.0, 3.5), sharex=True, sharey=True)
-    densities = [_smoothed(statistics.bins.density(cells)) for cells in (statistics.truth, statistics.model)]
-    levels = _levels(densities[0])
-    for axis, density, name in zip(axes[0], densities, ("true tracers", "model")):
-        filled = _joint_panel(axis, statistics.bins, density, levels)
-        axis.set_title(f"joint PDF, {name}")
-    bar = colour_bar(figure, filled, axes[0], "joint PDF", extend="neither")
-    bar.set_ticks(levels[::2], labels=[f"{level:.0e}" for level in levels[::2]])
-    if flows is not None:
-        _flow_row(figure, axes[1], flows[::-1], statistics.bins)
-    for axis in axes.flat:
-        _plane_axes(axis, statistics.bins)
-    for axis in axes[:, 0]:
-        axis.set_ylabel(r"$Q\,/\,\langle Q_w\rangle$")
-    for axis in axes[-1]:
-        axis.set_xlabel(r"$R\,/\,\langle Q_w\rangle^{3/2}$")
+    figure, axes = panels(1, len(series), (3.6, 3.5), sharex=True, sharey=True)
+    known = flow["wavenumber"] >= 1
+    for axis, at in zip(axes.flat, series):
+        nearest = int(np.argmin(np.abs(flow["time"] - (start_time + at.time))))
+        for column, line in (("energy", {"color": DNS, "label": "DNS"}),
+                             ("filtered", {"color": FILTERED, "linestyle": "--", "label": "filtered DNS"})):
+            axis.loglog(flow["wavenumber"][known], flow[column][nearest][known], linewidth=1.3, **line)
+        shells = at.wavenumber >= 1
+        axis.loglog(at.wavenumber[shells], at.truth[shells], color=TRUTH, label="true tracers")
+        axis.loglog(at.wavenumber[shells], at.model[shells], color=MODEL, linestyle="none", marker="o",
+                    markersize=4, markerfacecolor="none", label="model")
+        axis.axvline(filter_wavenumber, color=GUIDE, linestyle=":", linewidth=1)
+        note(axis, r"$\pi/d$", (filter_wavenumber, 0.01), ("data", "axes fraction"), (3, 1))
+        axis.set(title=f"$t = {at.time / turnover:.2f}\\,T$", xlabel="wavenumber $k$")
+        number_wavenumbers(axis)
+    peak, top = max(at.truth[1:].max() for at in series), 1.5 * series[0].wavenumber[-1]
+    guide_power_law(axes[0, 0], (2, min(10, 0.7 * top)), 2.2 * peak, -5 / 3, r"$k^{-5/3}$")
+    axes[0, 0].set(ylabel="$E(k)$", ylim=(1e-6 * peak, 6 * peak), xlim=(0.9, max(top, 2)))
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncol=4)
     letter(axes.flat)
     return figure
 
 
-def _pdf_panel(axis: Axes, pair: Pair, edges: np.ndarray) -> None:
-    centres = (edges[1:] + edges[:-1]) / 2
-    densities = (pdf(standardized(pair.truth), edges), pdf(standardized(pair.model, pair.truth), edges))
-    truth, model = (np.where(density > 0, density, np.nan) for density in densities)
-    axis.semilogy(centres, gaussian(centres), color=GUIDE, linestyle=":", label="Gaussian")
-    axis.semilogy(centres, truth, color=TRUTH, label="true tracers")
-    axis.semilogy(centres, model, color=MODEL, linestyle="none", marker="o", markersize=3.2,
-                  markerfacecolor="none", label="model")
-    axis.set_ylim(0.4 / pair.truth.size / (edges[1] - edges[0]), 2)
+@styled
+def path_statistics(model: PathStatistics, truth: PathStatistics, turnover: float) -> Figure:
+    """Draw correlations and increments of velocities, accelerations, and the spreading of pairs and tetrads."""
+    figure, axes = panels(3, 3, (3.5, 2.8))
+    (memory, structure, accelerations), (variance, flatness, pairs), (sizes, shapes, unused) = axes
+    for run, name in ((truth, "truth"), (model, "model")):
+        line, time, lags = LINES[name], run.times / turnover, run.lags / turnover
+        memory.plot(time, run.velocity_correlation, **line)
+        structure.loglog(lags, run.structure, marker="o", markersize=3, **line)
+        accelerations.plot(lags, run.acceleration_correlation, marker="o", markersize=3, **line)
+        variance.plot(time, run.acceleration_variance, **line)
+        flatness.semilogx(lags, run.flatness, marker="o", markersize=3, **line)
+        pairs.loglog(time[1:], run.pair_dispersion[1:], **line)
+        sizes.plot(time, run.tetrad_size, **line)
+        for eigenvalue in run.tetrad_shape.T:
+            shapes.plot(time, eigenvalue, **line)
+    memory.set(title="Velocity correlation", ylabel=r"$\rho_v(t)$")
+    structure.set(title="Structure function", ylabel=r"$\langle(\Delta_\tau v_i)^2\rangle$")
+    accelerations.set(title="Acceleration correlation", ylabel=r"$\rho_a(\tau)$")
+    accelerations.axhline(0, color=GUIDE, linewidth=0.8)
+    variance.set(title="Acceleration variance", ylabel=r"$\langle a_i^2\rangle$", ylim=(0, None))
+    flatness.set(title="Flatness of increments", ylabel=r"$\langle\Delta v^4\rangle/\langle\Delta v^2\rangle^2$")
+    flatness.axhline(3, color=GUIDE, linestyle=":")
+    pairs.set(title="Pair dispersion", ylabel=r"$\langle|r-r_0|^2\rangle/\langle r_0^2\rangle$")
+    sizes.set(title="Size of tetrads", ylabel=r"$\langle R^2\rangle/\langle R_0^2\rangle$", ylim=(0, None))
+    shapes.set(title="Shape of tetrads", ylabel=r"$\langle\lambda_i/R^2\rangle$", ylim=(0, 1))
+    shapes.axhline(1 / 3, color=GUIDE, linestyle=":")
+    for axis in (memory, variance, pairs, sizes, shapes):
+        axis.set_xlabel("time $t/T$")
+    for axis in (structure, accelerations, flatness):
+        axis.set_xlabel(r"lag $\tau/T$")
+    for axis in (structure, flatness, pairs):
+        number_wavenumbers(axis)
+    unused.axis("off")
+    unused.legend(*memory.get_legend_handles_labels(), loc="center")
+    letter(axes.flat[:-1])
+    return figure
 
 
-def _levels(density: np.ndarray) -> np.ndarray:
-    """Levels half a decade apart, from the peak of the truth down to what a single particle resolves."""
-    exponents = np.arange(np.floor(2 * np.log10(density.max())), 2 * np.log10(density[density > 0].min()), -1)
-    return 10.0 ** (exponents[:8][::-1] / 2)
+@styled
+def particle_disorder(distances: Mapping[str, np.ndarray], counts: Mapping[str, Mapping[str, np.ndarray]],
+                      turnover: float) -> Figure:
+    """Draw the PDF of nearest-neighbour distances and the variance of counts over time.
 
-
-def _joint_panel(axis: Axes, bins: InvariantBins, density: np.ndarray, levels: np.ndarray):
-    """Filled isolines of the inner cells: the outer ones also hold what lies beyond."""
-    inner = np.s_[1:-1]
-    third, second = _centres(bins.third)[inner], _centres(bins.second)[inner]
-    shown = np.maximum(density[inner, inner], 1e-3 * levels[0])  # an empty cell has no logarithm
-    filled = axis.contourf(third, second, shown, levels, cmap="YlGnBu", norm=LogNorm(levels[0], levels[-1]),
-                           extend="max")
-    axis.contour(third, second, shown, levels, colors="#303030", linewidths=0.7)
-    return filled
-
-
-def _flow_row(figure: Figure, row: Sequence[Axes], flows: Sequence[ConditionalVelocity], bins: InvariantBins) -> None:
-    speeds = [np.hypot(*flow.mean(FEWEST)) for flow in flows]
-    known = np.concatenate([speed[speed > 0] for speed in speeds])
-    norm = LogNorm(*np.quantile(known, (0.02, 0.98))) if known.size else None
-    for axis, flow, name in zip(row, flows, ("true tracers", "model")):
-        arrows = _arrows(axis, flow, norm, _limits(bins))
-        axis.set_title(f"mean motion, {name}")
-    colour_bar(figure, arrows, row, r"$|(dR/dt,\ dQ/dt)|$, normalised")
-
-
-def _arrows(axis: Axes, flow: ConditionalVelocity, norm: LogNorm | None, limits: tuple[float, float]):
-    """Arrows of one length in the cells that lie well inside the limits, so that the frame cuts none."""
-    third, second = _centres(flow.bins.third), _centres(flow.bins.second)
-    inside = np.ix_(np.abs(second) < 0.97 * limits[1], np.abs(third) < 0.97 * limits[0])
-    second_rate, third_rate = (rate[inside] for rate in flow.mean(FEWEST))
-    across, up = third_rate / np.ptp(flow.bins.third), second_rate / np.ptp(flow.bins.second)
-    length = np.hypot(across, up)
-    length[length == 0] = np.nan
-    return axis.quiver(third[inside[1][0]], second[inside[0][:, 0]], across / length, up / length,
-                       np.hypot(second_rate, third_rate), norm=norm, cmap="cividis", pivot="middle", scale=20,
-                       width=0.006, headwidth=4)
-
-
-def _plane_axes(axis: Axes, bins: InvariantBins) -> None:
-    third = np.linspace(bins.third[0], bins.third[-1], 401)
-    axis.plot(third, vieillefosse_line(third), color=MODEL, linewidth=1.3)
-    axis.axhline(0, color=GUIDE, linewidth=0.6, zorder=0)
-    axis.axvline(0, color=GUIDE, linewidth=0.6, zorder=0)
-    across, up = _limits(bins)
-    axis.set(xlim=(-across, across), ylim=(-up, up))
-
-
-def _limits(bins: InvariantBins) -> tuple[float, float]:
-    """Largest |R| and |Q| shown: the centres of the last cells but one."""
-    return float(_centres(bins.third)[-2]), float(_centres(bins.second)[-2])
-
-
-def _centres(edges: np.ndarray) -> np.ndarray:
-    return (edges[1:] + edges[:-1]) / 2
-
-
-def _smoothed(density: np.ndarray) -> np.ndarray:
-    """Binomial (1, 2, 1)/4 smoothing along both axes: only for drawing, the divergence uses the raw cells."""
-    for axis in (0, 1):
-        edge = [(1, 1) if a == axis else (0, 0) for a in (0, 1)]
-        padded = np.swapaxes(np.pad(density, edge, mode="edge"), 0, axis)
-        density = np.swapaxes((padded[:-2] + 2 * padded[1:-1] + padded[2:]) / 4, 0, axis)
-    return density
+    distances: probabilities (bins,) on disorder.DISTANCE_EDGES of "truth" and "model". counts: columns time and
+    count_variance of both.
+    """
+    figure, axes = panels(1, 2, (4.0, 3.1))
+    edges = disorder.DISTANCE_EDGES
+    fine, centres = np.linspace(edges[0], edges[-1], 300), (edges[1:] + edges[:-1]) / 2
+    nearest, variance = axes[0]
+    nearest.plot(fine, disorder.random_distance_density(fine), color=GUIDE, linestyle=":", label="random points")
+    for name, line in LINES.items():
+        nearest.plot(centres, distances[name] / np.diff(edges), **line)
+        variance.plot(counts[name]["time"] / turnover, counts[name]["count_variance"], **line)
+    nearest.set(title="Nearest neighbour", xlabel="distance / mean spacing", ylabel="PDF", ylim=(0, None))
+    nearest.legend()
+    variance.axhline(1, color=GUIDE, linestyle=":")
+    variance.set(title="Variance of counts", ylabel="relative to random points", xlabel="time $t/T$", ylim=(0, None))
+    letter(axes.flat)
+    return figure

@@ -1,4 +1,4 @@
-"""The report's part on the stationary state of forced turbulence: its averages beside those of the literature."""
+"""The section on the stationary state of forced turbulence: averages beside those of the literature."""
 
 from collections.abc import Mapping
 
@@ -17,7 +17,7 @@ HISTORY = (("dissipation_rate", r"dissipation", TRUTH, "-"), ("injection_rate", 
 
 @styled
 def stationary_state(statistics: Mapping[str, np.ndarray], span: StationarySpan) -> Figure:
-    """Energy and its rates over turnovers, components of the energy, and the mean compensated spectrum of a span.
+    """Draw energy and its rates over turnovers, components of the energy, and the compensated mean spectrum of a span.
 
     statistics: columns (samples,) of the whole run.
     """
@@ -44,7 +44,7 @@ def stationary_state(statistics: Mapping[str, np.ndarray], span: StationarySpan)
 
 
 def draw_compensated(axis: Axes, spans: Mapping[str | None, tuple[StationarySpan, str]]) -> None:
-    """Mean compensated spectra of spans, by label and with a colour each, and Kolmogorov's constant as a band."""
+    """Draw compensated mean spectra of spans, given with a colour by label, and a band for Kolmogorov's constant."""
     for label, (span, colour) in spans.items():
         k_eta, compensated = span.compensated_spectrum()
         axis.loglog(k_eta, compensated, color=colour, marker="o", markersize=3, label=label)
@@ -57,23 +57,23 @@ def draw_compensated(axis: Axes, spans: Mapping[str | None, tuple[StationarySpan
 
 
 def section(statistics: Mapping[str, np.ndarray], span: StationarySpan) -> Section:
-    """Averages over the stationary state, with the literature's values at the same Re_lambda."""
+    """Return the section: averages over the span and the literature's values at the same Re_lambda."""
     first, last = span.columns["time"][[0, -1]]
     shown = Section(
         "stationary", "Stationary turbulence",
-        f"Averages over {span.turnovers:.3g} large-eddy turnovers of the forced flow, t = {first:.3g} to {last:.3g}, "
-        "with the standard error of blocks of a turnover or more (frames closer than that are no independent samples) "
-        "and the standard deviation in time, and the literature's values at this Re_λ.",
+        f"Averages over {span.turnovers:.3g} large-eddy turnovers of the forced flow, t = {first:.3g} to {last:.3g}. "
+        "Standard errors are those of blocks of a turnover or more, because closer frames are no independent samples. "
+        "Deviations are standard deviations in time. Literature: values at this Re_λ.",
         metrics=[Metric(row.key, row.label, columns_of(row)) for row in comparison(span)])
     shown.add_figure(
         "stationary", "The stationary state", stationary_state(statistics, span),
-        f"Shaded: the span of the averages. Its energy balance closes to {abs(span.energy_imbalance):.1e} of the "
-        "dissipation. C: mean spectrum, each shell with the mean energy of its modes; band: Kolmogorov's constant.")
+        f"Shaded: the span of the averages. The energy balance closes to {abs(span.energy_imbalance):.1e} of the "
+        "dissipation. C: mean spectrum from the mean energy of the modes of each shell. Band: Kolmogorov's constant.")
     return shown
 
 
 def columns_of(row: Row) -> dict[str, float | str]:
-    """A row by the names of its columns; what it does not have is left out."""
+    """Return a row as values by column; missing values are left out."""
     columns = {"this run": row.value, "standard error": row.error, "deviation": row.deviation,
                "literature": row.literature, "source": row.source}
     return {name: value for name, value in columns.items() if value not in (None, "")}

@@ -1,19 +1,23 @@
-"""Error against run time of the variants of a scene: what nothing else beats, and all numbers in tables."""
+"""The section on all variants of a scene: error against run time, and a table of all numbers."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
+from matplotlib import patheffects
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
+from matplotlib.text import Text
+from matplotlib.transforms import Bbox
 
 from eddies.analysis.pareto import cheapest_grid, pareto_front, verdict
 from eddies.measures import DRAWN, MEASURES, SHOWN
-from eddies.report.figures import DNS, FILTERED, FOURTH, GUIDE, MODEL, SECOND, THIRD, TRUTH, letter, panels, styled
-from eddies.report.labels import fix_layout, place_labels
+from eddies.report.figures import (DNS, FILTERED, FOURTH, GUIDE, MODEL, SECOND, THIRD, TRUTH, letter, panels,
+                                   plain_log_ticks, styled)
 from eddies.report.page import Metric, Section
 
 Row = Mapping[str, Any]
@@ -21,19 +25,24 @@ Row = Mapping[str, Any]
 KEY = "variants"
 COST = "wall_seconds"
 LOOKS = list(zip((MODEL, TRUTH, SECOND, FOURTH, THIRD, DNS, FILTERED), "os^DvPX"))
-# Columns of the tables of the page: key in the rows, words. Measures come before them.
-COSTS = {"wall_seconds": "wall s per T", "wall_seconds_low": "lower quartile", "wall_seconds_high": "upper quartile",
+# Columns of the table after the measures: key in the rows, title.
+COSTS = {"end": "time of the end (T)", "stopped_at": "unstable at (T)",
+         "wall_seconds": "wall s per T", "wall_seconds_low": "lower quartile", "wall_seconds_high": "upper quartile",
          "core_seconds": "core s per T", "seconds_per_step": "s per step", "time_step": "time step",
          "ranks": "ranks", "weights": "learned numbers", "training_seconds": "training (s)",
          "training_steps": "training (steps)", "step_seconds": "finding the step (s)"}
-OF_TRAINING = ("training_seconds", "training_steps")
+LEGEND = ("Wall seconds per turnover T, with the quartiles of the time of a step as bars. Bars of errors are standard "
+          "deviations over realisations, if there are several. Dashed line: Pareto front, the variants that no other "
+          "one beats in both error and time. Crosses at the top: variants that became unstable, at the time given.")
+CAPTION = ("In the table, spectrum errors, energies and KL divergences (nats) are those at the end of the rollout, "
+           "for stable variants only. T is the eddy turnover time at the release of the tracers.")
 
 
 @dataclass(frozen=True)
 class ErrorAgainstTime:
-    """What is drawn: a row of numbers by key for every variant, None where there is none.
+    """A row of numbers by key for each variant, and the name of the variant (`subject`) that others are compared with.
 
-    subject: name of the variant that is looked at; every other one is a rival.
+    A missing number is None.
     """
 
     rows: Sequence[Row]
@@ -41,28 +50,32 @@ class ErrorAgainstTime:
 
     @property
     def drawn(self) -> list[str]:
-        """Those of the measures DRAWN that a row has; of rollouts shorter than T/2 the velocity error at their end."""
-        short = not self.finished("velocity_error_half")
-        wanted = ["velocity_error_end" if short and name == "velocity_error_half" else name for name in DRAWN]
-        return [name for name in wanted if self.finished(name)]
+        """The measures of DRAWN that a row has. For rollouts shorter than T/2 the velocity error is that at the end."""
+        replaced = {} if self.finished("velocity_error_half") else {"velocity_error_half": "velocity_error_end"}
+        return [name for name in (replaced.get(name, name) for name in DRAWN) if self.finished(name)]
 
     @property
     def looks(self) -> dict[str, tuple[str, str]]:
-        """Colour and marker of every kind of method, in order of appearance."""
+        """Colour and marker of each kind of method."""
         kinds = dict.fromkeys(row["kind"] for row in self.rows)
         return {kind: LOOKS[number % len(LOOKS)] for number, kind in enumerate(kinds)}
 
     @property
     def summary(self) -> list[str]:
-        """Where the subject is worth its cost, where it is not, and which grid, if there are any, would do; what became
-        unstable counts as without numbers."""
+        """Sentences: where the subject is worth its cost, and which coarse grid is as accurate.
+
+        A variant that became unstable counts as one without numbers.
+        """
         numbers = [row if is_stable(row) else {**row, **dict.fromkeys(self.drawn)} for row in self.rows]
         subject = next(row for row in numbers if row["name"] == self.subject)
         others = [row for row in numbers if row is not subject]
         sentences = verdict(subject, others, COST, {key: MEASURES[key] for key in self.drawn})
         grids = [row for row in others if row["on_grid"] and is_stable(row)]
         if grids and is_stable(subject):
-            sentences.append(cheapest_grid(subject, grids, COST, _times_of_errors(subject)))
+            end = f"{subject['end'] or 0:.2g} T"
+            times = {"velocity_error_half": "T/2"} | ({} if end == "0.5 T" else {"velocity_error_end": end})
+            known = {measure: words for measure, words in times.items() if subject[measure] is not None}
+            sentences.append(cheapest_grid(subject, grids, COST, known))
         return [sentence for sentence in sentences if sentence]
 
     def finished(self, measure: str) -> list[Row]:
@@ -74,41 +87,21 @@ class ErrorAgainstTime:
         return [row for row in self.rows if not is_stable(row) and row[COST] is not None]
 
 
-def _times_of_errors(row: Row) -> dict[str, str]:
-    """The times later than t_eta at which velocity errors are compared, T/2 and the end, in words by measure."""
-    end = f"{row['end'] or 0:.2g} T"
-    times = {"velocity_error_half": "T/2"} | ({} if end == "0.5 T" else {"velocity_error_end": end})
-    return {measure: words for measure, words in times.items() if row[measure] is not None}
-
-
 def is_stable(row: Row) -> bool:
-    """Whether the rollout came to its end."""
+    """Return whether the rollout reached its end."""
     return row["status"] == "complete"
 
 
 def section(table: ErrorAgainstTime, notes: Sequence[str] = ()) -> Section:
-    """The part of the page: what the subject is worth, the figure, a table of errors and costs.
-
-    notes: sentences that a reader has to know of the numbers.
-    """
-    shown = [key for key in SHOWN if any(row[key] is not None for row in table.rows)]
-    columns = {**{key: MEASURES[key] for key in shown}, "end": "time of the end (T)", "stopped_at": "unstable at (T)",
-               **COSTS}
-    metrics = [Metric(row["name"], row["label"], {words: _with_spread(row, key) for key, words in columns.items()})
+    """Return the section: summary, notes on the numbers, the figure, and the table of errors and costs."""
+    columns = {key: MEASURES[key] for key in SHOWN if any(row[key] is not None for row in table.rows)} | COSTS
+    metrics = [Metric(row["name"], row["label"], {title: _with_spread(row, key) for key, title in columns.items()})
                for row in table.rows]
-    unfinished = [_notice(row) for row in table.rows if not is_stable(row) or row[COST] is None]
-    part = Section(KEY, "Error against run time", " ".join([*table.summary, *notes, CAPTION]), notices=unfinished,
-                   metrics=metrics)
+    part = Section(KEY, "Error against run time", " ".join([*table.summary, *notes, CAPTION]), metrics=metrics,
+                   notices=[_notice(row) for row in table.rows if not is_stable(row) or row[COST] is None])
     if len(table.rows) > 1 and table.drawn:
         part.add_figure("error-against-run-time", "Error against run time", scatter(table, table.drawn), LEGEND)
     return part
-
-
-LEGEND = ("Wall seconds of a turnover T, with quartiles of the time of a step as bars; errors with their standard "
-          "deviation over realisations, if there are several. Line: what nothing else beats in both. Crosses at the "
-          "top: became unstable, at the time given.")
-CAPTION = ("In the table, spectrum, energy and KL divergences (nats) are those at the end of the rollout, of stable "
-           "variants alone; T is the eddy turnover time when the tracers start.")
 
 
 def _notice(row: Row) -> str:
@@ -118,9 +111,8 @@ def _notice(row: Row) -> str:
 
 
 def _with_spread(row: Row, column: str) -> Any:
-    """A number of a row, with its standard deviation over realisations where there are several; of a model whose
-    weights came without their cost, that it is not stored."""
-    if column in OF_TRAINING and row[column] is None and row["weights"] is not None:
+    """Return a number of a row, with its standard deviation over realisations if there is one."""
+    if column in ("training_seconds", "training_steps") and row[column] is None and row["weights"] is not None:
         return "not stored"
     spread = row.get(f"{column}_spread")
     return row[column] if spread is None else f"{row[column]:.3g} ± {spread:.2g}"
@@ -128,13 +120,14 @@ def _with_spread(row: Row, column: str) -> Any:
 
 @styled
 def scatter(table: ErrorAgainstTime, measures: Sequence[str]) -> Figure:
-    """Error against wall seconds a turnover, a panel for each measure."""
+    """Draw error against wall seconds per turnover, with one panel for each measure."""
     columns = min(len(measures), 2)
     size = (6.7, 5.0) if columns == 2 else (9.3, 6.0)
     figure, axes = panels(-(-len(measures) // columns), columns, size)
     for axis in axes.flat[len(measures):]:
         axis.remove()
-    for axis, measure in zip(axes.flat, measures):
+    used = list(zip(axes.flat, measures))
+    for axis, measure in used:
         _draw_panel(axis, table, measure)
     letter(axes.flat[:len(measures)])
     styles = [Line2D([], [], color=colour, marker=marker, linestyle="", label=kind)
@@ -143,9 +136,16 @@ def scatter(table: ErrorAgainstTime, measures: Sequence[str]) -> Figure:
         styles.append(Line2D([], [], color=DNS, marker="x", linestyle="", label="unstable, at this time"))
     styles.append(Line2D([], [], color=GUIDE, linestyle="--", label="Pareto front"))
     figure.legend(handles=styles, loc="outside lower center", ncols=min(len(styles), 5 if columns == 1 else 8))
-    fix_layout(figure)
-    for axis, measure in zip(axes.flat, measures):
-        _name_points(axis, table, measure)
+    FigureCanvasAgg(figure)
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")  # so that places in pixels stay the same
+    for axis, measure in used:
+        rows, stopped = table.finished(measure), table.stopped()
+        places = [(row[COST], row[measure]) for row in rows] + [(row[COST], _top(axis)) for row in stopped]
+        names = [row["label"] for row in rows] + [f"{row['label']} {row['stopped_at']:.2g} T" for row in stopped]
+        bold = [row["name"] == table.subject for row in [*rows, *stopped]]
+        if places:
+            name_points(axis, axis.transData.transform(places), names, bold)
     return figure
 
 
@@ -153,14 +153,13 @@ def _draw_panel(axis: Axes, table: ErrorAgainstTime, measure: str) -> None:
     rows, stopped = table.finished(measure), table.stopped()
     axis.set_xscale("log")
     axis.set_yscale("log")
-    _set_limits(axis, rows, stopped, measure)
+    _set_limits(axis, [row[COST] for row in [*rows, *stopped]], [row[measure] for row in rows])
     for row in rows:
         colour, marker = table.looks[row["kind"]]
         chosen = row["name"] == table.subject
         bars = [[row[COST] - row["wall_seconds_low"]], [row["wall_seconds_high"] - row[COST]]]
         spread = row.get(f"{measure}_spread") or 0.0
-        # On an axis of logarithms no bar reaches 0.
-        down = min(spread, 0.9 * row[measure])
+        down = min(spread, 0.9 * row[measure])  # a bar on a logarithmic axis does not reach 0
         axis.errorbar(row[COST], row[measure], [[down], [spread]], np.maximum(bars, 0), color=colour, marker=marker,
                       elinewidth=1, markersize=9 if chosen else 6, markeredgecolor=DNS if chosen else colour, zorder=4)
     for row in stopped:
@@ -173,35 +172,50 @@ def _draw_panel(axis: Axes, table: ErrorAgainstTime, measure: str) -> None:
 
 
 def in_symbols(words: str) -> str:
-    """Words with their symbols as formulas."""
+    """Write the symbols in a text as formulas."""
     return words.replace("t_η", r"$t_\eta$").replace("k_d", "$k_d$")
 
 
-def _set_limits(axis: Axes, rows: Sequence[Row], stopped: Sequence[Row], measure: str) -> None:
-    """Limits with room for names, and ticks that are numbers even where an axis is shorter than a decade."""
-    costs, errors = [row[COST] for row in [*rows, *stopped]], [row[measure] for row in rows]
-    # Above the highest error there is room for what became unstable.
+def _set_limits(axis: Axes, costs: Sequence[float], errors: Sequence[float]) -> None:
+    """Set limits with room for names and, at the top, for unstable variants; label ticks with plain numbers."""
     for values, limit, room, part in ((costs, axis.set_xlim, (0.16, 0.16), axis.xaxis),
                                       (errors, axis.set_ylim, (0.12, 0.2), axis.yaxis)):
         lowest, highest = (min(values), max(values)) if values else (0.1, 1.0)
         span = max(np.log10(highest / lowest), 0.3)
         limit(lowest * 10 ** (-room[0] * span), highest * 10 ** (room[1] * span))
-        part.set_major_locator(LogLocator(subs=(1, 2, 5) if span < 2.5 else (1,)))
-        part.set_major_formatter(StrMethodFormatter("{x:g}"))
-        part.set_minor_locator(NullLocator())
+        plain_log_ticks(part, subs=(1, 2, 5) if span < 2.5 else (1,))
 
 
 def _top(axis: Axes) -> float:
-    """The height at which what has no error is drawn, below the upper edge."""
+    """Return the height of unstable variants, below the upper edge."""
     low, high = np.log10(axis.get_ylim())
     return 10 ** (high - 0.03 * (high - low))
 
 
-def _name_points(axis: Axes, table: ErrorAgainstTime, measure: str) -> None:
-    rows, stopped = table.finished(measure), table.stopped()
-    places = [(row[COST], row[measure]) for row in rows] + [(row[COST], _top(axis)) for row in stopped]
-    if not places:
-        return
-    names = [row["label"] for row in rows] + [f"{row['label']} {row['stopped_at']:.2g} T" for row in stopped]
-    bold = [row["name"] == table.subject for row in [*rows, *stopped]]
-    place_labels(axis, axis.transData.transform(places), names, bold)
+def name_points(axis: Axes, points: np.ndarray, names: Sequence[str], bold: Sequence[bool]) -> list[Bbox]:
+    """Write a name beside each point (n, 2), in pixels, and return the boxes of the names, in pixels.
+
+    Each name takes the nearest height, to the right or left of its point, at which it covers no other name or point. A
+    thin line ties a name that is far away to its point. The layout of the figure must be fixed.
+    """
+    renderer, scale, boxes = axis.figure.canvas.get_renderer(), axis.figure.dpi / 72, []
+    taken = [Bbox([point - 5 * scale, point + 5 * scale]) for point in points]
+    heights = sorted(range(-150, 151, 3), key=abs)
+    for point, name, heavy in zip(points, names, bold):
+        line = {"arrowstyle": "-", "color": "#8a8a8a", "linewidth": 0.6, "shrinkA": 0, "shrinkB": 3}
+        text = axis.annotate(name, point, xycoords="figure pixels", xytext=(0, 0), textcoords="offset points",
+                             va="center", fontsize=8.5, fontweight="bold" if heavy else "normal", arrowprops=line,
+                             path_effects=[patheffects.withStroke(linewidth=2, foreground="white")], zorder=5,
+                             annotation_clip=False)
+        for height, (side, alignment) in product(heights, ((1, "left"), (-1, "right"))):
+            text.set(position=(side * (8 + abs(height) / 4), height), horizontalalignment=alignment)
+            text.update_positions(renderer)
+            box = Text.get_window_extent(text)  # that of the annotation includes the line
+            free = not any(box.overlaps(other) for other in taken)
+            if free and axis.bbox.x0 <= box.x0 and box.x1 <= axis.bbox.x1 and (
+                    axis.bbox.y0 <= box.y0 and box.y1 <= axis.bbox.y1):
+                break
+        text.arrow_patch.set_visible(abs(height) > 9)
+        taken.append(box)
+        boxes.append(box)
+    return boxes

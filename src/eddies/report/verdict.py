@@ -1,7 +1,7 @@
-"""What the report of a run says first: whether the numbers are good, in words and beside those of baselines.
+"""The verdict, the first section of a report: a mark for each main number, by fixed limits.
 
-All rules are those of this module. What moved the particles, a network or a grid, is judged alike: by limits of each
-measure or, where these are wider, by what samples of the truth itself show.
+All methods are judged alike. An error is compared with the limits of its measure or, where they are wider, with
+multiples of the error that samples of the truth itself have.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -12,28 +12,29 @@ from eddies.report.page import Metric, Section
 
 GOOD, FAIR, POOR = "good", "fair", "poor"
 KEY = "verdict"
-#: In this order the sections stand on the page; open are those that say how good the run is.
+#: Order of the sections on the page, and the sections that are not folded.
 ORDER = ("variants", KEY, "rollout", "forced", "step", "model", "kernel", "cost", "ground_truth", "stationary",
          "tracers")
 OPEN = ("variants", KEY, "rollout", "forced")
 
-#: Up to which part of the baseline's error an error is good, and fair; beyond them it is poor.
-BESIDE_NO_FORCE = BESIDE_GRADIENT = (0.2, 0.5)
-BESIDE_TEXTBOOK = (0.95, 1.05)  # better than kernels that need no training, or as good
-ENERGY = (0.03, 0.1)            # deviation from the truth's
+# Each pair is the largest error that is good and the largest that is fair.
+BESIDE_NO_FORCE = BESIDE_GRADIENT = (0.2, 0.5)  # times the error of the baseline
+BESIDE_TEXTBOOK = (0.95, 1.05)  # times the error of the better kernel that needs no training
+ENERGY = (0.03, 0.1)            # relative deviation from the truth
 SPECTRUM = (0.05, 0.2)          # rms of ln(E/E_filtered)
-DIVERGENCE = (0.002, 0.02)      # nats; of a normal distribution whose deviation is 4 % off, and 14 %
-FLOORS = (2.0, 5.0)             # times what samples of the truth itself show, where that is more
-ASKED_OF_IT = 0.1               # least error of no force with which there is something to judge
-BESIDE_IN_WORDS = {GOOD: "better than those that need no training", FAIR: "no better than those that need no training",
-                   POOR: "worse than those that need no training"}
-TEXTBOOK = {"cubic_spline": "cubic spline", "wendland": "Wendland"}
+DIVERGENCE = (0.002, 0.02)      # nats; normal distributions whose deviations differ by 4 % and 14 %
+FLOORS = (2.0, 5.0)             # times the error of samples of the truth itself
+LEAST_BASELINE = 0.1            # smallest error without any force for which velocities are judged
+KERNEL_WORDS = {GOOD: "better than", FAIR: "no improvement over", POOR: "worse than"}
+TEXTBOOK = {"cubic_spline": "cubic spline", "wendland": "Wendland kernel"}
 
 
 @dataclass(frozen=True)
 class Judged:
-    """A number with what it is judged by: an `error` that is good up to the first of two limits and fair up to the
-    second, which `within` has in words; `words` for the table, `short` for sentences, `beside` the baseline in words.
+    """A number and its mark.
+
+    `error` is compared with the two `limits`. `within` writes a limit for the table. `words` name the number in the
+    table, `short` names it in sentences. `beside` describes the baseline.
     """
 
     key: str
@@ -48,7 +49,7 @@ class Judged:
 
     @property
     def mark(self) -> str:
-        """good, fair or poor; or that there is nothing to judge."""
+        """good, fair, poor, or "not judged"."""
         if not self.judged:
             return "not judged"
         return GOOD if self.error <= self.limits[0] else FAIR if self.error <= self.limits[1] else POOR
@@ -62,8 +63,10 @@ class Judged:
 
 
 def arranged(sections: Sequence[Section], warned: bool) -> list[Section]:
-    """All sections in the order of the page, the verdict first where there is something to judge; `warned`: whether the
-    products of the run are such that the report warns of them."""
+    """Return the sections in the order of the page, with a verdict if there is something to judge.
+
+    warned: whether the report warns that products do not fit together.
+    """
     found = {each.key: each for each in sections}
     judgement = [section(found, warned)] if found.keys() & {"rollout", "model", "kernel"} else []
     ordered = sorted([*judgement, *sections], key=lambda each: ORDER.index(each.key))
@@ -73,43 +76,44 @@ def arranged(sections: Sequence[Section], warned: bool) -> list[Section]:
 
 
 def section(sections: Mapping[str, Section], warned: bool) -> Section:
-    """The verdict on a run from the numbers of its sections, by key."""
+    """Return the verdict on a run from the numbers of its sections, by key."""
     numbers = {key: {metric.key: metric.value for metric in each.metrics} for key, each in sections.items()}
     rollout, model, kernel = (numbers.get(key, {}) for key in ("rollout", "model", "kernel"))
     of_rollout, of_model, of_kernel = [*_rollout(rollout)], [*_model(model)], [*_kernel(kernel)]
     text = [*_on_rollout(rollout, of_rollout),
-            *(f"{each.short} {each.value:.2g} ({each.beside}): {each.mark}." for each in of_model),
-            *(f"{each.short} {BESIDE_IN_WORDS[each.mark]} ({each.value:.2g}; {each.beside})." for each in of_kernel)]
+            *(f"Model: {each.short} {each.value:.2g}, {each.mark} ({each.beside})." for each in of_model),
+            *(f"Learned kernel: {each.short} {each.value:.2g}, {KERNEL_WORDS[each.mark]} the "
+              f"{each.beside.replace(': ', ' (')})." for each in of_kernel)]
     if "forced" in sections:
-        text.append("A forced flow is another one after a turnover or two: what averages say stands in the section on "
-                    "the stationary state.")
+        text.append("A forced flow differs from its truth after one or two turnovers. The section on the stationary "
+                    "state compares its averages.")
     if warned:
-        text.append("The warnings above come first: these numbers may not belong together.")
+        text.append("Read the warnings above first: these numbers may not belong together.")
     return Section(KEY, "Verdict", " ".join(text), metrics=[each.metric for each in of_rollout + of_model + of_kernel])
 
 
 def _on_rollout(numbers: Mapping[str, Any], judged: Sequence[Judged]) -> Iterator[str]:
-    """Sentences on the rollout."""
+    """Yield sentences on the rollout."""
     if not numbers:
         yield "There is no rollout to judge."
         return
     if not numbers.get("stable"):
-        yield f"Poor: the rollout did not come to its end ({numbers.get('status')}). What is compared is from before."
+        yield f"Poor: the rollout did not reach its end ({numbers.get('status')}). Only earlier frames are compared."
     if numbers.get("two_flows"):
-        yield "The rollout is not judged by the true tracers: they are forced otherwise, and so in another flow."
+        yield ("The rollout is not judged by the true tracers: its forcing differs from theirs, so they are in two "
+               "different flows.")
         return
     if not judged:
-        yield "It cannot be compared with the truth."
+        yield "The rollout cannot be compared with the truth."
         return
     marked = {mark: [each.short for each in judged if each.mark == mark] for mark in (POOR, FAIR, GOOD)}
-    worst_first = [f"{mark} in {', '.join(those)}" for mark, those in marked.items() if those]
-    everything = "all that it is judged by: " if len(worst_first) == 1 else ""
-    yield f"The rollout is {'; '.join(worst_first)}.".replace(" in ", f" in {everything}", 1)
+    worst_first = [f"{mark} in {', '.join(names)}" for mark, names in marked.items() if names]
+    yield f"Rollout: {'; '.join(worst_first)}."
     if numbers["early_time"] < 0.5:
-        yield f"It is compared for {numbers['early_time']:.2g} turnovers alone, which asks little of it."
+        yield f"It is compared over only {numbers['early_time']:.2g} turnovers, which is an easy test."
     if not all(each.judged for each in judged):
-        yield (f"Even without any force its velocities would be off by less than {ASKED_OF_IT:g}: it is too short to "
-               "judge them.")
+        yield (f"Velocities are not judged: the rollout is so short that their error without any force is below "
+               f"{LEAST_BASELINE:g}.")
 
 
 def _rollout(numbers: Mapping[str, Any]) -> Iterator[Judged]:
@@ -119,7 +123,7 @@ def _rollout(numbers: Mapping[str, Any]) -> Iterator[Judged]:
     if error is not None and without:
         limits = (BESIDE_NO_FORCE[0] * without, BESIDE_NO_FORCE[1] * without)
         yield Judged("velocity", f"velocity error by particle after {numbers['early_time']:.2g} T", "velocities", error,
-                     error, limits, f"no force: {without:.2g}", judged=without >= ASKED_OF_IT)
+                     error, limits, f"no force: {without:.2g}", judged=without >= LEAST_BASELINE)
     ratio, without = numbers.get("energy_ratio"), numbers.get("energy_ratio_no_force")
     if ratio is not None:
         yield Judged("energy", "kinetic energy at the end, model / truth", "energy", ratio, abs(ratio - 1), ENERGY,
@@ -142,16 +146,15 @@ def _model(numbers: Mapping[str, Any]) -> Iterator[Judged]:
             baseline, beside = gradient, f"exact filtered pressure gradient: {gradient:.2g}"
         limits = (BESIDE_GRADIENT[0] * baseline, BESIDE_GRADIENT[1] * baseline)
         yield Judged("acceleration_error", "model: acceleration error at the true state",
-                     "At the true state the model's accelerations have an error of", error, error, limits, beside)
+                     "acceleration error at the true state", error, error, limits, beside)
 
 
 def _kernel(numbers: Mapping[str, Any]) -> Iterator[Judged]:
-    for what in ("velocity", "gradient"):
-        known = {key: numbers[f"{key}_{what}_error"] for key in TEXTBOOK if numbers.get(f"{key}_{what}_error")}
-        error = numbers.get(f"{what}_error")
+    for field in ("velocity", "gradient"):
+        known = {key: numbers[f"{key}_{field}_error"] for key in TEXTBOOK if numbers.get(f"{key}_{field}_error")}
+        error = numbers.get(f"{field}_error")
         if error is not None and known:
             best = min(known, key=lambda key: known[key])
             limits = (BESIDE_TEXTBOOK[0] * known[best], BESIDE_TEXTBOOK[1] * known[best])
-            yield Judged(f"kernel_{what}_error", f"kernel: error of the {what} field",
-                         f"In the {what} field the learned kernel is", error, error, limits,
-                         f"{TEXTBOOK[best]}: {known[best]:.2g}")
+            yield Judged(f"kernel_{field}_error", f"kernel: error of the {field} field", f"{field} error", error, error,
+                         limits, f"{TEXTBOOK[best]}: {known[best]:.2g}")

@@ -8,22 +8,20 @@ from __future__ import annotations
 
 import copy
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
 from eddies.scene.model import replace_terms
-from eddies.scene.reader import find_document, parse_document, read_text
-from eddies.scene.rules import quoted, shortened
+from eddies.scene.rules import nearest, quoted, shortened
 from eddies.scene.values import SceneError
 
 BUILT_IN = Path(__file__).parents[1] / "scenes"
 VARIANT = "variant"
-OF_FILES = ("base", "unset")  # keys that a file alone has
-# [section.sub.key], and the same in [variant.NAME].
-DEEPEST = 3
+OF_FILES = ("base", "unset")  # keys that only a file has
+DEEPEST = 3  # parts of a dotted key: [section.sub.key], and the same in [variant.NAME]
 
 Document = dict[str, Any]
 
@@ -36,21 +34,19 @@ class Layer:
     ----------
     values : new values by dotted key, such as "flow.cells"; an empty table makes an absent section.
     unset : dotted keys and sections that are removed before.
-    source : what begins a message about one of them.
     """
 
     values: Mapping[str, Any]
-    unset: Sequence[str] = field(default=())
-    source: str = ""
+    unset: Sequence[str] = ()
 
     @classmethod
     def of_table(cls, table: Mapping[str, Any]) -> Layer:
-        """The layer that a TOML table describes; its key `unset` lists what is removed."""
+        """Make the layer of a TOML table, whose key `unset` lists the removals."""
         unset = table.get("unset", [])
         if not (isinstance(unset, list) and all(isinstance(entry, str) and entry for entry in unset)):
             raise SceneError(f'unset = {shortened(quoted(unset))}: must be a list of keys or sections, such as '
                              '["training", "tracers.filter_width"]', "unset")
-        return cls(dict(dotted({key: value for key, value in table.items() if key != "unset"})), unset, "unset: ")
+        return cls(dict(dotted({key: value for key, value in table.items() if key != "unset"})), unset)
 
     @property
     def keys(self) -> frozenset[str]:
@@ -60,7 +56,7 @@ class Layer:
     def apply(self, document: Document) -> None:
         """Change the document in place.
 
-        Raises SceneError for a removal of what the document has not, and for a key below a value.
+        Raises SceneError for a removal of a key that the document lacks, and for a key below a value.
         """
         for removal in self.unset:
             self._remove(document, removal)
@@ -84,13 +80,13 @@ class Layer:
                 table = table[name]
             del table[last]
         except (KeyError, TypeError):
-            known = table if isinstance(table, dict) else document
-            raise SceneError(f"{self.source}{shortened(removal)}: there is no such key or section to remove; there "
-                             f"are: {', '.join(known) or 'none'}", removal) from None
+            valid = table if isinstance(table, dict) else document
+            raise SceneError(f"{shortened(removal)}: there is no such key or section to remove; there "
+                             f"are: {', '.join(valid) or 'none'}", removal) from None
 
 
 def dotted(table: Mapping[str, Any], within: str = "") -> Iterator[tuple[str, Any]]:
-    """All values of nested tables by dotted key; an empty table counts as a value."""
+    """Yield all values of nested tables by dotted key; an empty table counts as a value."""
     for name, value in table.items():
         key = f"{within}.{name}" if within else name
         if isinstance(value, dict) and value:
@@ -100,19 +96,19 @@ def dotted(table: Mapping[str, Any], within: str = "") -> Iterator[tuple[str, An
 
 
 def with_sections(key: str) -> Iterator[str]:
-    """A dotted key after the sections that hold it, the outermost first."""
+    """Yield the sections that hold a dotted key, the outermost first, then the key."""
     return accumulate(key.split("."), "{}.{}".format)
 
 
 def read_document(name_or_path: str, above: Sequence[Path] = ()) -> tuple[Path, Document]:
-    """The file of a scene, and its document over those of its bases; `above`: the files that it is a base of.
+    """Return the file of a scene, and its document over those of its bases; `above` are the files that it is a base of.
 
-    Variants of a scene replace those of its base. Raises SceneError: there is no such scene, a file is no TOML, or a
+    Variants of a scene replace those of its base. Raises SceneError if there is no such scene, a file is not TOML, or a
     scene is its own base.
     """
-    path = find_document(name_or_path, BUILT_IN, above[-1].parent if above else None)
+    path = _find(name_or_path, above[-1].parent if above else None)
     try:
-        document = parse_document(read_text(path))
+        document = _parse(path)
         base = document.pop("base", None)
         if base is None:
             if "unset" in document:
@@ -135,11 +131,43 @@ def read_document(name_or_path: str, above: Sequence[Path] = ()) -> tuple[Path, 
         raise SceneError(f"{path}: {error}", error.key) from None
 
 
-def command_line(overrides: Sequence[str], removals: Sequence[str]) -> Layer:
-    """The layer of `--set` and `--unset`. A value is read as TOML; what is not TOML, such as a bare word, is a
-    string.
+def _find(name_or_path: str, beside: Path | None) -> Path:
+    """The file of a built-in scene, or of a path, from the folder `beside` or else from the working directory."""
+    names = sorted(path.stem for path in BUILT_IN.glob("*.toml"))
+    if name_or_path in names:
+        return BUILT_IN / f"{name_or_path}.toml"
+    path = Path(name_or_path)
+    remedy = f"give the path of a TOML file, or one of {', '.join(names)}"
+    try:
+        for candidate in ((beside / path, path) if beside is not None else (path,)):
+            if candidate.is_file():
+                return candidate
+        is_directory = path.is_dir()
+    except OSError as error:
+        raise SceneError(f"{shortened(name_or_path)}: cannot be read: {error.strerror}; {remedy}") from None
+    if is_directory:
+        raise SceneError(f"{name_or_path}: is a directory, not a scene; give the path of a TOML file in it")
+    raise SceneError(f"{shortened(name_or_path)}: no such scene; {nearest(name_or_path, names)}{remedy}")
 
-    Raises SceneError for what is no "section.key=value".
+
+def _parse(path: Path) -> Document:
+    """The tables and keys of a TOML file; SceneError if it cannot be read, or with the line that is not TOML."""
+    try:
+        # Some editors begin a file with a mark of its encoding.
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except RecursionError:
+        raise SceneError("not TOML of a scene: its brackets are nested too deep; no value has more than two") from None
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise SceneError(f"cannot be read: {reason}; give the path of a scene, a TOML file") from None
+    except ValueError as error:  # of TOML, or of a number with thousands of digits
+        raise SceneError(f"not TOML: {error}; keys are written `key = value` under a [section]") from None
+
+
+def command_line(overrides: Sequence[str], removals: Sequence[str]) -> Layer:
+    """Make the layer of `--set` and `--unset`. A value is read as TOML, or else as a string without quotes.
+
+    Raises SceneError for an override that is not "section.key=value".
     """
     values = {}
     for override in overrides:
@@ -157,23 +185,33 @@ def command_line(overrides: Sequence[str], removals: Sequence[str]) -> Layer:
     return Layer(values, removals)
 
 
-def refuse_keys_of_variants(given: Layer, variants: Mapping[str, Layer]) -> None:
-    """Refuse a command line that sets or removes, for all variants, a key that a variant changes itself.
-
-    Raises SceneError with the option that reaches this variant.
-    """
-    for name, layer in variants.items():
-        for option, keys in (("--set", given.values), ("--unset", given.unset)):
-            for key in keys:
-                hit = any(f"{own}.".startswith(f"{key}.") for own in (*layer.values, *layer.unset))
-                if hit and not key.startswith(f"{VARIANT}."):
-                    raise SceneError(f'{option} {key}: the variant "{name}" changes this key itself; reach it by '
-                                     f"{option} {VARIANT}.{name}.{key}" + ("=..." if option == "--set" else ""))
-
-
 def _parsed(value: str) -> Any:
     try:
         parsed = tomllib.loads(f"value = {value}")
     except (ValueError, RecursionError):
         return value
     return parsed["value"] if len(parsed) == 1 else value
+
+
+def check_command_line(given: Layer, variants: Mapping[str, Layer], existing: Iterable[str]) -> None:
+    """Refuse a command line that changes a variant which is not among those `existing`, or, for all variants, a key
+    that one of them changes itself.
+
+    Raises SceneError with the option that reaches one variant.
+    """
+    for option, keys in (("--set", given.values), ("--unset", given.unset)):
+        for key in keys:
+            first, _, rest = key.partition(".")
+            if first == VARIANT and rest:
+                check_variant(rest.partition(".")[0], existing, key)
+            for name, layer in variants.items() if first != VARIANT else ():
+                if any(f"{own}.".startswith(f"{key}.") for own in (*layer.values, *layer.unset)):
+                    raise SceneError(f'{option} {key}: the variant "{name}" changes this key itself; reach it by '
+                                     f"{option} {VARIANT}.{name}.{key}" + ("=..." if option == "--set" else ""))
+
+
+def check_variant(name: str, variants: Iterable[str], where: str) -> None:
+    """Raise SceneError for a name that is not one of the variants; the error begins with `where`."""
+    if name not in variants:
+        raise SceneError(f'{where}: there is no variant "{name}"; {nearest(name, variants)}there are: '
+                         f"{', '.join(variants) or 'none'}")

@@ -4,34 +4,32 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from eddies.import_path import ImportPathError, is_path, load, short_name
-from eddies.scene.reader import read_section
 from eddies.scene.rules import nearest, quoted
 from eddies.scene.terms import DEFAULT_PRESET, GIVES, PRESETS, READS, TERMS, TermBase, TermSettings
-from eddies.scene.values import (KeyProblem, SceneError, Section, choice, import_paths, number, product_file,
-                                 sub_sections, text, texts)
+from eddies.scene.values import (SceneError, Section, choice, import_paths, number, product_file, read_section,
+                                 sections, text, texts)
 
-
-COME_ALONG = "eddies:"  # what [model] path begins with, for weights of the package
+COME_ALONG = "eddies:"  # the beginning of [model] path for weights of the package
 WEIGHTS = Path(__file__).parents[1] / "weights"
 
 
 def weights_that_come_along() -> list[str]:
-    """The trained weights of the package, as [model] path names them."""
+    """Return the names of the package's trained weights, for [model] path."""
     return sorted(f"{COME_ALONG}{path.stem}" for path in WEIGHTS.glob("*.h5"))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Model(Section):
-    """The terms whose sum moves the particles, each with its settings; a preset is a list of them that has a name.
+    """The terms whose sum moves the particles, each with its settings; a preset is a list of terms with a name.
 
-    Once made it holds all `terms`, their `settings` by NAME, and no preset. In a program settings are given as objects
-    or as dicts; a dict leaves the other keys as they are in the preset.
+    An object holds all `terms`, their `settings` by NAME, and no preset. A program gives settings as objects or as
+    dicts; keys that a dict lacks have the values of the preset.
     """
 
-    preset: str | None = choice(f"a list of terms that has a name; absent: {DEFAULT_PRESET}, if there are no terms",
+    preset: str | None = choice(f"a list of terms with a name; absent: {DEFAULT_PRESET}, if there are no terms",
                                 *PRESETS, default=None)
     terms: tuple[str, ...] | None = texts("what accelerates the particles and gives their density, each with the keys "
                                           "of [model.NAME]", *TERMS, default=None, paths=True)
@@ -39,50 +37,51 @@ class Model(Section):
                                      "pairs; absent: as in [kernel], or 60", default=None, at_least=8)
     path: str | None = text("run directory or model.h5 whose trained weights are used, or \"eddies:NAME\", those of a "
                             "built-in scene that come with the package; absent: they are trained", default=None)
-    settings: dict[str, TermSettings] = sub_sections()
+    settings: dict[str, TermSettings] = sections()
+    _holder: ClassVar[str] = "settings"
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.preset is not None and self.terms is not None:
-            raise SceneError(f"[model] preset = {quoted(self.preset)}: with terms = {quoted(self.terms)} the list is "
-                             "given twice; remove one of the two", "model.preset")
+            raise self.problem("preset", f"with terms = {quoted(self.terms)} the list is given twice; remove one of "
+                               "the two")
         if self.path is not None and self.path.startswith(COME_ALONG) and not self.weights_file.is_file():
-            raise KeyProblem("model", "path", f" = {quoted(self.path)}: must be a run directory, a model.h5, or one of "
-                             f"{', '.join(weights_that_come_along())}")
+            raise self.problem("path", "must be a run directory, a model.h5, or one of "
+                               f"{', '.join(weights_that_come_along())}")
         preset = PRESETS[self.preset or DEFAULT_PRESET] if self.terms is None else {}
         terms = self.terms if self.terms is not None else tuple(preset)
         named = {short_name(term): term for term in terms}
         if len(named) < len(terms) or not terms:
-            raise KeyProblem("model", "terms", f" = {quoted(terms)}: must be one or more terms, each once by its name "
-                             "(of an import path what follows the colon)")
+            raise self.problem("terms", "must be one or more terms, each once by its name, in an import path the part "
+                               "after the colon")
         for name in self.settings:
             if name not in named:
-                hint = f"{nearest(name, named)} ".lstrip()
-                raise SceneError(f"[model.{name}]: no such term; {hint}the terms are {', '.join(named)}; remove the "
-                                 "section, or add the term to the list", f"model.{name}")
+                raise SceneError(f"[model.{name}]: no such term; {nearest(name, named)}the terms are "
+                                 f"{', '.join(named)}; remove the section, or add the term to the list",
+                                 f"model.{name}")
         settings = {name: _settings(term, name, preset.get(name, {}), self.settings.get(name, {}))
                     for name, term in named.items()}
         for key, value in (("preset", None), ("terms", terms), ("settings", settings)):
             object.__setattr__(self, key, value)
         if self.neighbors is not None and "pairs" not in self.reads:
-            raise KeyProblem("model", "neighbors", f" = {self.neighbors:g}: none of the terms {quoted(terms)} reads "
-                             "pairs, so nothing has a radius of interaction; remove the key")
+            raise self.problem("neighbors", f"none of the terms {quoted(terms)} reads pairs, so nothing has a radius "
+                               "of interaction; remove the key")
 
     @property
     def weights_file(self) -> Path | None:
-        """The file of the weights, which `path` names; None without it."""
+        """The file of the weights that `path` names; None without it."""
         if self.path is None or not self.path.startswith(COME_ALONG):
             return None if self.path is None else product_file(self.path, "model.h5")
         return WEIGHTS / f"{self.path.removeprefix(COME_ALONG)}.h5"
 
     @property
     def reads(self) -> frozenset[str]:
-        """What the terms read, together."""
+        """The inputs of all terms together."""
         return frozenset(chain.from_iterable(settings.reads for settings in self.settings.values()))
 
     @property
     def gives(self) -> frozenset[str]:
-        """What the terms give, together."""
+        """The outputs of all terms together."""
         return frozenset(chain.from_iterable(settings.gives for settings in self.settings.values()))
 
     @property
@@ -92,14 +91,15 @@ class Model(Section):
 
     @property
     def foreign(self) -> tuple[str, ...]:
-        """The import paths that terms and networks are named by."""
-        parts = [(self, "model"), *((part, name) for name, part in self.settings.items())]
-        return tuple(dict.fromkeys(path for part, _ in parts for _, path in import_paths(part)))
+        """The import paths of the user's terms and networks, each once."""
+        return tuple(dict.fromkeys(path for part in (self, *self.settings.values()) for _, path in import_paths(part)))
 
 
 def replace_terms(table: dict[str, Any], keys: set[str]) -> None:
-    """Let preset go where terms were written over a [model] of a file, and terms where a preset was; with them the
-    file's settings of terms that there are no more. `keys` are those written over the file, "section.key"."""
+    """Make a new list of terms replace that of a [model] table below it, be one of them a preset or both.
+
+    `keys` are the keys "section.key" that were set. Settings of terms that are no longer in the list are removed.
+    """
     if ("model.preset" in keys) == ("model.terms" in keys):
         return
     written, other = ("preset", "terms") if "model.preset" in keys else ("terms", "preset")
@@ -113,10 +113,10 @@ def replace_terms(table: dict[str, Any], keys: set[str]) -> None:
 
 
 def settings_class(term: str) -> type[TermSettings]:
-    """The class of a term's settings: of a word of ours, or `Settings` of the class that an import path names.
+    """Return the class of a term's settings: of a word of ours, or `Settings` of a user's class.
 
-    Raises ImportPathError where the path leads nowhere; SceneError where it names no class of a term, or its Settings
-    are no settings.
+    Raises ImportPathError for a wrong import path; SceneError if it names no class of a term, or its Settings are not
+    settings.
     """
     if not is_path(term):
         return TERMS[term]
@@ -133,7 +133,7 @@ def settings_class(term: str) -> type[TermSettings]:
 
 def _settings(term: str, name: str, preset: Mapping[str, Any],
               given: TermSettings | Mapping[str, Any]) -> TermSettings:
-    """The settings of a term: as given, or made of the keys that are given over those of the preset."""
+    """The settings of a term: an object as given, or the given keys over those of the preset."""
     try:
         kind = settings_class(term)
     except (ImportPathError, SceneError) as error:

@@ -1,7 +1,7 @@
 """The sections of a scene, each a frozen dataclass whose fields declare their keys.
 
-A declaration gives what the key means, which values are allowed, and the default. Lengths are in units of the
-cube [0, 2 pi)^3, the mean density is 1, and times are in the unit that follows from lengths and velocities.
+Lengths are in units of the cube [0, 2 pi)^3, the mean density is 1, and the unit of time follows from lengths and
+velocities.
 """
 
 import math
@@ -10,16 +10,15 @@ from pathlib import Path
 
 from eddies.import_path import is_path, load
 from eddies.scene.integrators import SCHEMES, Scheme
-from eddies.scene.methods import METHODS, method_of
 from eddies.scene.rules import quoted
-from eddies.scene.values import (KeyProblem, Section, boolean, choice, integer, integers, named, number,
+from eddies.scene.values import (SceneError, Section, boolean, choice, integer, integers, named, number,
                                  product_file, section, text, texts)
 
 BOX_LENGTH = 2 * math.pi
 DEFAULT_WINDOW = 0.5
-# Along a side of the cube: of cells twice those of the largest direct simulations.
+# Cells along a side of the cube: twice those of the largest direct simulations.
 MOST_CELLS = 65536
-# Mean number of particles within a support or a radius of interaction, unless a scene says another: the paper's.
+# Mean number of particles within a support or a radius of interaction, as in the paper, unless a scene gives another.
 NEIGHBORS = 60.0
 
 
@@ -41,29 +40,19 @@ class Flow(Section):
 
 @dataclass(frozen=True)
 class InitialFlow:
-    """What is known of an initial flow before it is made.
+    """Properties of an initial flow that are known before it is made."""
 
-    Parameters
-    ----------
-    keys : of [initial] that it reads; all for a function of the user's.
-    rms, peak : root mean square of |u| and largest |u| + |v| + |w|, over the amplitude; None: unknown, or at rest.
-    wave : |k| of its modes over `wavenumber`; None: there are many.
-    turbulent : whether it is of many scales, with the spectrum's peak at `peak_wavenumber`.
-    sound : whether it is at rest but for sound.
-    steady : whether nothing in it is accelerated without viscosity.
-    """
-
-    keys: tuple[str, ...] = ("amplitude", "peak_wavenumber", "wavenumber", "path", "state")
-    rms: float | None = None
-    peak: float | None = None
-    wave: float | None = None
-    turbulent: bool = False
-    sound: bool = False
-    steady: bool = False
+    keys: tuple[str, ...] = ("amplitude", "peak_wavenumber", "wavenumber", "path", "state")  # of [initial], as it reads
+    rms: float | None = None  # root mean square of |u| over the amplitude; None: unknown, or at rest
+    peak: float | None = None  # largest |u| + |v| + |w| over the amplitude; None: unknown, or at rest
+    wave: float | None = None  # |k| of its modes over `wavenumber`; None: it has many
+    turbulent: bool = False  # it has many scales, with the spectrum's peak at `peak_wavenumber`
+    sound: bool = False  # it is at rest but for sound
+    steady: bool = False  # without viscosity nothing in it accelerates
 
     @property
     def from_file(self) -> bool:
-        """Whether a file holds it, which has to be named."""
+        """Whether it comes from a file."""
         return self.keys == ("path", "state")
 
 
@@ -82,18 +71,18 @@ class Initial(Section):
     """The velocity, and with a compressible fluid the density, at time 0."""
 
     kind: str = named("initial flow", *INITIAL_FLOWS, default="random")
-    amplitude: float = number("of velocity, random: rms of a component; sound-wave: of ln density",
-                              default=1.0, above=0)
+    amplitude: float = number("of the velocity, random: rms of a component; sound-wave: of ln density", default=1.0,
+                              above=0)
     peak_wavenumber: float = number("wavenumber of the spectrum's peak, random only", default=3.0, above=0)
     wavenumber: int = integer("waves in the cube; abc, shear-wave, sound-wave only", default=1, at_least=1)
-    path: str | None = text("the ground_truth.h5, JHTDB cutout or fluidsim state to start from, kind file only; its "
-                            "grid may be another", default=None)
-    state: int = integer("which of the states of the whole flow that the file holds, in time: fields/final, with "
-                         "tracers fields/unfiltered, of a cutout Velocity_####", default=0, at_least=0)
+    path: str | None = text("ground_truth.h5, JHTDB cutout or fluidsim state to start from, on any grid; file only",
+                            default=None)
+    state: int = integer("index in time of the state in this file: fields/final, with tracers fields/unfiltered, in a "
+                         "cutout Velocity_####", default=0, at_least=0)
 
     @property
     def flow(self) -> InitialFlow:
-        """What is known of the kind."""
+        """The properties of the kind."""
         return INITIAL_FLOWS.get(self.kind, InitialFlow())
 
 
@@ -117,7 +106,7 @@ class Time(Section):
 
     @property
     def explicit(self) -> bool:
-        """Whether the stepper has to resolve sound and viscosity."""
+        """Whether the step has to resolve sound and viscosity."""
         return self.stepper == "rk4"
 
 
@@ -126,7 +115,7 @@ class SpinUp(Section):
     """The time before tracers are released, in which forced turbulence becomes stationary."""
 
     turnovers: float = number("large-eddy turnovers", above=0)
-    stationary: float | None = number("of them, the last: averages of the stationary state are taken over these",
+    stationary: float | None = number("the last of these turnovers, over which the stationary state is averaged",
                                       default=None, above=0)
 
 
@@ -134,12 +123,11 @@ class SpinUp(Section):
 class Tracers(Section):
     """Particles that follow the filtered flow: the ground truth of learning.
 
-    Once made it holds the filter width in use.
+    An object holds the filter width in use.
     """
 
-    particles_per_side: int = integer("the number of particles is the cube of this", at_least=2,
-                                      at_most=MOST_CELLS)
-    placement: str = choice("where the particles start", "random", "lattice", default="random")
+    particles_per_side: int = integer("the number of particles is the cube of this", at_least=2, at_most=MOST_CELLS)
+    placement: str = choice("initial positions of the particles", "random", "lattice", default="random")
     filter_width: float = number("of the Gaussian filter, whose tails meet beyond half the cube; absent: twice the "
                                  "mean spacing, or half the cube where that is less",
                                  default=None, above=0, at_most=BOX_LENGTH / 2)
@@ -177,41 +165,39 @@ class Tracers(Section):
 
     @property
     def planes(self) -> int:
-        """Layers at which the particles' slabs are cut, cells of the grid on which their velocity is resolved: 1.75
-        particles_per_side rounded to even. Of modes up to 1.5 times their Nyquist wavenumber the shortest wave then has
-        2.3 cells, which cubic splines still follow."""
+        """Cells along each side of the grid of the resolved velocity, at whose planes the particles' slabs are cut.
+
+        1.75 particles_per_side rounded to even: the shortest resolved wave has 1.5 times the particles' Nyquist
+        wavenumber and 2.3 cells, which cubic splines can follow.
+        """
         return 2 * round(0.875 * self.particles_per_side)
 
 
-#: What a [kernel] has without a key, and in place of that with a preset.
+#: The values of absent keys of [kernel], and those that a preset has in their place.
 KERNEL_DEFAULTS = {"form": "kriging", "positive": True, "cutoff": "smooth", "normalization_weight": 0.0,
                    "learning_rate": 2e-3}
 KERNEL_PRESETS = {"paper": {"form": "average", "positive": False, "cutoff": "sigmoid", "normalization_weight": 1.0,
                             "learning_rate": 1e-3, "final_learning_rate": 1e-6}}
-# Of the learning rate at the start, at the end of a training that has none of its own.
+# The learning rate at the end of a training over that at the start, unless a scene gives another.
 FINAL_RATE = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
 class Kernel(Section):
-    """The smoothing kernel W, learned by reconstructing the filtered field from the particles, and how fields are
-    reconstructed.
+    """The smoothing kernel W, learned by reconstructing the filtered field, and the reconstruction of fields.
 
-    Once made it holds the values of all keys, and no preset.
+    An object holds the values of all keys, and no preset.
     """
 
-    preset: str | None = choice("values of other keys that have a name, under those that are given; paper: Eqs. 6 to "
-                                "11 as published", *KERNEL_PRESETS, default=None)
-    form: str | None = choice("how fields and gradients are reconstructed from particles: average: with weights W; "
-                              "linear, quadratic: polynomials fitted with W as weight; kriging: the best "
-                              "estimate for filtered turbulence; absent: kriging", "average", "linear", "quadratic",
-                              "kriging", default=None)
-    positive: bool | None = boolean("W = alpha exp(NN) g, of unit integral; false: NN g of Eq. 7, which may be "
-                                    "negative, and sums of Eq. 6, which nothing divides; absent: true", default=None)
-
+    preset: str | None = choice("a named set of values, below those that are given; paper: Eqs. 6 to 11 as published",
+                                *KERNEL_PRESETS, default=None)
+    form: str | None = choice("reconstruction of fields and gradients from particles: average: with weights W; linear, "
+                              "quadratic: polynomials fitted with W as weight; kriging: the best estimate for filtered "
+                              "turbulence; absent: kriging", "average", "linear", "quadratic", "kriging", default=None)
+    positive: bool | None = boolean("true: W = alpha exp(NN) g, of unit integral; false: NN g of Eq. 7, which may be "
+                                    "negative, and the sums of Eq. 6 without a divisor; absent: true", default=None)
     neighbors: float = number("mean number of particles within the support", default=NEIGHBORS, at_least=8)
-    hidden: tuple[int, ...] = integers("widths of the network's tanh layers", default=(20, 20, 20, 20),
-                                       at_least=1)
+    hidden: tuple[int, ...] = integers("widths of the network's tanh layers", default=(20, 20, 20, 20), at_least=1)
     cutoff: str | None = choice("factor g that ends the kernel at its support, where the sigmoid is 1/2; absent: "
                                 "smooth", "smooth", "sigmoid", default=None)
     gradient_weight: float = number("weight of the velocity gradient in the loss", default=1.0, at_least=0)
@@ -232,15 +218,15 @@ class Kernel(Section):
             object.__setattr__(self, "final_learning_rate", FINAL_RATE * self.learning_rate)
         object.__setattr__(self, "preset", None)
         if not self.positive and self.form != "average":
-            raise KeyProblem("kernel", "form", f' = "{self.form}": its weights must be positive, and positive = false '
-                             'lets W be negative; set form = "average", or positive = true')
+            raise self.problem("form", "its weights must be positive, and positive = false lets W be negative; set "
+                               'form = "average", or positive = true')
 
 
 @dataclass(frozen=True, kw_only=True)
 class Horizons(Section):
-    """Training through several steps of the simulation, after all others."""
+    """Training through several steps of the simulation, after all other training."""
 
-    frames: tuple[int, ...] = integers("through which the simulation is differentiated, one after the other",
+    frames: tuple[int, ...] = integers("numbers of frames through which the simulation is differentiated, in turn",
                                        default=(1, 2, 4, 8), at_least=1)
     steps: int = integer("optimiser steps through each number of frames", at_least=1)
     time_step: float | None = number("of the simulation; absent: the interval of frames", default=None, above=0)
@@ -250,18 +236,13 @@ class Horizons(Section):
 
     @property
     def scheme(self) -> Scheme:
-        """What the integrator does in a step."""
+        """The properties of the integrator."""
         return SCHEMES[self.integrator]
-
-    @classmethod
-    def section_name(cls) -> str:
-        """The name of this section within [training]."""
-        return "training.horizons"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Training(Section):
-    """How the force is fitted to the tracers: to trajectories, to all losses together, to what the simulation does."""
+    """The fit of the force to trajectories, then to all losses together, then through the simulation."""
 
     truths: tuple[str, ...] | None = texts("run directories or files of the ground truths that are used, each with its "
                                            "own scales; absent: the run's own", default=None)
@@ -270,26 +251,25 @@ class Training(Section):
     frames: int = integer("frames to draw from, in all, evenly shared by the ground truths", at_least=2)
     batch: int = integer("particles per step", at_least=1)
     steps: int = integer("optimiser steps; 0: parameters stay as they start", at_least=0)
-    patience: int | None = integer("steps without a smaller error on what is held out after which the steps on "
-                                   "trajectories end, and those on all losses; absent: all steps are taken",
-                                   default=None, at_least=1)
+    patience: int | None = integer("a phase, on trajectories or on all losses, ends after so many steps without a "
+                                   "smaller validation error; absent: all steps are taken", default=None, at_least=1)
     learning_rate: float = number("of the optimiser, at the start", default=5e-3, above=0)
     final_learning_rate: float = number("of the optimiser, at the end", default=1e-4, above=0)
     precision: str = choice("of the training", "float32", "float64", default="float32")
     field_weight: float = number("weight of the field loss beside the trajectory loss", default=0.0, at_least=0)
-    field_target: str = choice("what the field loss compares with; tracers: the kernel average of the true particles; "
-                               "flow: the filtered field that is stored one frame later, on frames that have one",
-                               "tracers", "flow", default="tracers")
+    field_target: str = choice("reference of the field loss; tracers: the kernel average of the true particles; flow: "
+                               "the filtered field stored one frame later, on frames that have one", "tracers", "flow",
+                               default="tracers")
     velocity_kl_weight: float = number("weight of the divergence of velocity PDFs", default=0.0, at_least=0)
     acceleration_kl_weight: float = number("the same for acceleration PDFs", default=0.0, at_least=0)
-    power_weight: float = number("weight of the loss of the power, of all steps: what the force does to the energy, "
-                                 "in units of u'^3 over the filter width", default=0.0, at_least=0)
+    power_weight: float = number("weight of the loss of the power, in all steps: the work of the force, in units of "
+                                 "u'^3 over the filter width", default=0.0, at_least=0)
     combined_steps: int = integer("steps at the end that use every loss", default=0, at_least=0)
     horizons: Horizons | None = section(Horizons, default=None)
 
     @property
     def wants_fields(self) -> bool:
-        """Whether each frame that is trained on needs a filtered field one frame later."""
+        """Whether each frame of the training needs a filtered field one frame later."""
         return self.field_target == "flow" and self.field_weight > 0
 
     @property
@@ -298,7 +278,23 @@ class Training(Section):
         return tuple(product_file(path, "ground_truth.h5") for path in self.truths or ())
 
 
-#: The step of a rollout that short rollouts find.
+@dataclass(frozen=True)
+class Method:
+    """Properties of a method that moves the particles of a rollout."""
+
+    needs: tuple[str, ...] = ()  # of NEEDS
+    title: str = "own method"  # in tables and figures
+    on_grid: bool = False  # a flow on a coarse grid moves the particles, as [eulerian] says
+
+
+METHODS = {
+    "learned": Method(needs=("model",), title="particle model"),
+    "none": Method(title="no force"),
+    "eulerian": Method(title="coarse grid", on_grid=True),
+}
+# A trained model; the density of the ground truth; neighbours within the radius of interaction.
+NEEDS = ("model", "density", "pairs")
+#: The value of [simulation] step that short rollouts replace by the step that they find.
 CONVERGED = "converged"
 
 
@@ -317,28 +313,27 @@ class Simulation(Section):
         "run directories or files of further ground truths, on each of which a step must have converged as well; "
         "absent: the realisations of the scene", default=None)
     turnovers: float = number("large-eddy turnovers to simulate", above=0)
-    start: float | None = number("as a fraction of the ground truth; absent: where the training window ends, or at the "
-                                 "first field of a ground truth that is not trained on", default=None, at_least=0,
-                                 below=1)
+    start: float | None = number("as a fraction of the ground truth; absent: the end of the training window, or the "
+                                 "first field of a ground truth without training", default=None, at_least=0, below=1)
     frame_interval: float = number("time between stored frames", above=0)
     skin: float = number("extra reach of the neighbour list, in supports", default=0.1, at_least=0, at_most=1)
     precision: str = choice("of the forces", "float32", "float64", default="float32")
-    injection: float | str = number("large-scale forcing power per mass; truth: as the ground truth was forced while "
-                                    "its tracers were followed; dissipation: as the flow loses", default="truth",
+    injection: float | str = number("large-scale forcing power per mass; truth: as in the ground truth while tracers "
+                                    "were followed; dissipation: as the flow loses", default="truth",
                                     words=("truth", "none", "dissipation"), above=0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.step_from is not None and self.step != CONVERGED:
-            raise KeyProblem("simulation", "step_from", f' = "{self.step_from}": step = {self.step:g} needs no other '
-                             f'run; set step = "{CONVERGED}", or remove step_from')
+            raise self.problem("step_from", f'step = {self.step:g} needs no other run; set step = "{CONVERGED}", or '
+                               "remove step_from")
         if self.confirmed_on and not self.finds_step:
-            raise KeyProblem("simulation", "confirmed_on", f" = {quoted(self.confirmed_on)}: no step is sought for "
-                             f'this rollout; set step = "{CONVERGED}" without step_from, or remove confirmed_on')
+            raise self.problem("confirmed_on", f'this rollout finds no step; set step = "{CONVERGED}" without '
+                               "step_from, or remove confirmed_on")
 
     @property
     def scheme(self) -> Scheme:
-        """What the integrator does in a step."""
+        """The properties of the integrator."""
         return SCHEMES[self.integrator or "rk3"]
 
     @property
@@ -348,12 +343,12 @@ class Simulation(Section):
 
     @property
     def longest_step(self) -> float:
-        """The longest time step as given, infinite where it is to be found."""
+        """The longest time step as given; infinite where short rollouts find it."""
         return math.inf if isinstance(self.step, str) else self.step
 
     @property
     def finds_step(self) -> bool:
-        """Whether the step is to be found for this rollout."""
+        """Whether short rollouts find the step."""
         return self.step == CONVERGED and self.step_from is None
 
     @property
@@ -362,35 +357,39 @@ class Simulation(Section):
         return tuple(product_file(path, "ground_truth.h5") for path in self.confirmed_on or ())
 
     @property
+    def _properties(self) -> Method:
+        """The properties of the method. A class of the user's, loaded only here, has `needs` as an attribute."""
+        if not is_path(self.method):
+            return METHODS[self.method]
+        needs = getattr(load(self.method), "needs", ())
+        if isinstance(needs, str) or not set(needs) <= set(NEEDS):
+            raise SceneError(f"[simulation] method: {quoted(self.method)}: needs = {quoted(needs)}: must be a tuple of "
+                             f"any of {', '.join(map(quoted, NEEDS))}")
+        return Method(tuple(needs), title=self.method.rpartition(":")[2])
+
+    @property
     def needs(self) -> tuple[str, ...]:
-        """What the method needs, of "model", "density" and "pairs"."""
-        return method_of(self.method).needs
+        """The needs of the method: any of "model", "density" and "pairs"."""
+        return self._properties.needs
 
     @property
     def title(self) -> str:
         """The method in tables and figures."""
-        return method_of(self.method).title
+        return self._properties.title
 
     @property
     def on_grid(self) -> bool:
         """Whether a flow on a coarse grid moves the particles."""
-        return method_of(self.method).on_grid
+        return self._properties.on_grid
 
 
 @dataclass(frozen=True)
 class Closure:
-    """A closure of a coarse grid.
+    """Properties of a closure of the coarse grid."""
 
-    Parameters
-    ----------
-    equations : that it is for.
-    constant : the key of [eulerian] with its constant; None: it has none.
-    learned : whether it takes the rates of damping that a model has learned.
-    """
-
-    equations: tuple[str, ...]
-    constant: str | None = None
-    learned: bool = False
+    equations: tuple[str, ...]  # that it closes
+    constant: str | None = None  # the key of [eulerian] with its constant; None: it has none
+    learned: bool = False  # it takes the rates of damping that a model has learned
 
 
 EQUATIONS = ("unfiltered", "filtered")
@@ -415,7 +414,7 @@ class Eulerian(Section):
                         default="incompressible")
     equations: str = choice("unfiltered: of the velocity, whose filtered part moves the particles; filtered: of the "
                             "filtered velocity", *EQUATIONS, default="unfiltered")
-    closure: str = choice("what stands for the scales that the grid, or the filter, leaves out; see Baselines",
+    closure: str = choice("model of the scales that the grid, or the filter, leaves out; see Baselines",
                           *CLOSURES, default="none")
     smagorinsky: float = number("C_s of closure smagorinsky, the eddy viscosity (C_s Delta)^2 (2 S:S)^(1/2)",
                                 default=0.17, above=0)
@@ -424,12 +423,12 @@ class Eulerian(Section):
         super().__post_init__()
         if self.equations not in self.form.equations:
             fitting = [name for name, closure in CLOSURES.items() if self.equations in closure.equations]
-            raise KeyProblem("eulerian", "closure", f' = "{self.closure}": with equations = "{self.equations}" it must '
-                             f"be one of {', '.join(fitting)}; change one of the two")
+            raise self.problem("closure", f'with equations = "{self.equations}" it must be one of '
+                               f"{', '.join(fitting)}; change one of the two")
 
     @property
     def form(self) -> Closure:
-        """What is known of the closure."""
+        """The properties of the closure."""
         return CLOSURES[self.closure]
 
     @property
@@ -438,7 +437,7 @@ class Eulerian(Section):
         return self.fluid == "compressible"
 
     def filter_passed(self, filter_width: float) -> float:
-        """Width of the filter that the velocity of the equations has passed: the particles' or 0."""
+        """Width of the filter on the velocity of the equations: that of the particles, or 0."""
         return filter_width if self.equations == "filtered" else 0.0
 
     def cells_for(self, filter_width: float) -> int:

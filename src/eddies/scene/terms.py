@@ -1,7 +1,6 @@
-"""What a scene can say of each term, what each reads, gives and asks of a step, and the lists of terms that go by a
-name: known without torch, so that a scene can be read and checked where no particle is computed.
+"""The settings of each term and its properties, without torch; and the presets, lists of terms with a name.
 
-A class of settings is a frozen dataclass whose fields declare their keys as those of a scene's sections do.
+A class of settings is a section of a scene: a frozen dataclass whose fields declare the keys of [model.NAME].
 """
 
 from __future__ import annotations
@@ -13,24 +12,23 @@ from typing import Any, ClassVar
 
 from eddies.errors import UserError
 from eddies.scene.integrators import Scheme
-from eddies.scene.values import KeyProblem, Section, boolean, choice, integer, integers, named, number, texts
+from eddies.scene.values import Section, boolean, choice, integer, integers, named, number, texts
 
 READS = ("pairs", "resolved", "density")
 GIVES = ("acceleration", "density", "density_rate", "shift_velocity")
-#: What a network can be told of a pair, in units of the flow: the densities of both, |x|, |v| and x.v.
+#: The inputs of a network of pairs, in units of the flow: the densities of both, |x|, |v| and x.v.
 INPUTS = ("density", "distance", "speed", "approach")
 BASES = ("corrected", "paper", "unit")
-# How much faster than its own rate what relaxes may be, as neighbours tell the noise of a particle with the wrong sign:
-# 3.6 to 4.0 among particles at random, and in turbulence. Two fifths more for what else makes noise grow: at 4.2 a flow
-# at M_t = 0.16 ran away after a turnover, at 5.5 one of 256^3 cells within steps.
+# The largest rate of relaxation over its nominal rate. The estimate from neighbours has the noise of a particle with
+# the wrong sign: 3.6 to 4.0 among random particles and in turbulence. Two fifths are a margin for other noise: with
+# 4.2 a flow at M_t = 0.16 diverged after a turnover, with 5.5 one of 256^3 cells after a few steps.
 NOISE_AMONG_NEIGHBORS = 5.6
 
 
 @dataclass(frozen=True, kw_only=True)
 class StepUnits:
-    """Of a rollout, what the longest step of a term may depend on: the radius of interaction, the filter width, the
-    sound speed (None: the flow has no sound), the rms of a component of the velocity (None: not foreseen), and the time
-    stepping scheme."""
+    """The numbers that limit the step of a rollout: the radius of interaction, the filter width, the sound speed (None:
+    the flow has no sound), the rms of a component of the velocity (None: unknown), and the time stepping scheme."""
 
     radius: float
     filter_width: float
@@ -40,31 +38,29 @@ class StepUnits:
 
 
 class TermError(UserError, ValueError):
-    """A term cannot be made of its settings, or does other than it declares: the text says which, and what to do."""
+    """A term cannot be made with its settings, or contradicts its declaration; the text gives term and remedy."""
 
 
 class TermBase:
-    """What every term derives from, so that one is known without torch: see eddies.Term."""
+    """Base of eddies.Term, by which a class of a term is recognised without torch."""
 
     Settings: type["TermSettings"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class TermSettings(Section):
-    """The keys of [model.NAME], and what a term that is set so declares.
+    """The keys of [model.NAME], and the properties of a term with these settings.
 
     Attributes
     ----------
-    word : what a scene names it by; empty of a class of the user's.
-    reads : of "pairs" (neighbours within the interaction radius, what they tell by kriging too), "resolved" (the
-        velocity that a grid resolves of the particles'), "density" (so that it is computed, stored, and wanted of the
-        ground truth). What no term reads is not built.
-    gives : of "acceleration", "density" (a part of it), "density_rate" and "shift_velocity".
-    learns_through_horizons : its parameters are trained through several steps of the simulation alone.
-    numbers_per_pair : how many numbers it keeps of each pair while it is evaluated, for an estimate of the memory.
+    word : its name in scenes; empty of a user's class.
+    reads : any of "pairs" (neighbours within the interaction radius, also for kriging), "resolved" (the velocity on a
+        grid) and "density" (computed, stored, and needed in the ground truth). Nothing else is built for it.
+    gives : any of "acceleration", "density" (a part of it), "density_rate" and "shift_velocity".
+    learns_through_horizons : only training through several steps of the simulation fits its parameters.
+    numbers_per_pair : so many numbers of each pair are held during an evaluation, for an estimate of the memory.
     damps_by : its parameter with rates of damping by wavenumber, which a coarse grid can take; empty: it has none.
-    too_long : what is wrong with a step beyond `longest_step`, and the remedy, of the term's {name}, the {longest} step
-        and the {integrator}.
+    too_long : error for a step beyond `longest_step`, with the term's {name}, the {longest} step and the {integrator}.
     """
 
     word: ClassVar[str] = ""
@@ -76,21 +72,21 @@ class TermSettings(Section):
     too_long: ClassVar[str] = ""
 
     def longest_step(self, units: StepUnits) -> float:
-        """The longest step of a rollout that the term allows; infinite where it sets none, or none is foreseen."""
+        """The longest step of a rollout that the term allows; infinite without a limit, or where it is unknown."""
         return math.inf
 
     @classmethod
     def section_name(cls) -> str:
-        """The class: a scene names the section by the term's place in its list, which is not known here."""
+        """The name of the class; only the scene knows that of the section."""
         return cls.__qualname__
 
 
 @dataclass(frozen=True, kw_only=True)
 class PairSum(TermSettings):
-    """How the values of pairs are weighted, and how their sum is scaled."""
+    """The weight of the values of pairs, and the scale of their sum."""
 
     window: str = choice("factor of a pair at the distance q, over the radius of interaction; smooth: (1 - q^2)^2; "
-                         "none: 1, so that a rate jumps where a neighbour enters or leaves", "smooth", "none",
+                         "none: 1, and a rate jumps where a neighbour enters or leaves", "smooth", "none",
                          default="smooth")
     scaling: str = choice("of the sum, by the expected number n of neighbours; number: 1/n; root: n^(-1/2)", "number",
                           "root", default="number")
@@ -108,8 +104,8 @@ class ForceSum(PairSum):
         super().__post_init__()
         if self.basis == "corrected" and (self.window, self.scaling) != ("smooth", "number"):
             key = "window" if self.window != "smooth" else "scaling"
-            raise KeyProblem(self.section_name(), key, f' = "{getattr(self, key)}": the moment matrix of basis = '
-                             '"corrected" takes the place of both window and scaling; set basis = "paper" or "unit"')
+            raise self.problem(key, 'the moment matrix of basis = "corrected" replaces both window and scaling; set '
+                               'basis = "paper" or "unit"')
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,17 +113,17 @@ class NetworkSettings(PairSum):
     """A network of the invariants of a pair."""
 
     hidden: tuple[int, ...] = integers("widths of the network's layers", default=(16, 16), at_least=1)
-    inputs: tuple[str, ...] = texts("what the network is told of a pair", *INPUTS, default=INPUTS)
+    inputs: tuple[str, ...] = texts("inputs of the network", *INPUTS, default=INPUTS)
     network: str = named("class of the network", "dense", default="dense")
 
     @property
     def reads(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Pairs, and with that input the density."""
+        """Pairs, and the density if it is an input."""
         return ("pairs", "density") if "density" in self.inputs else ("pairs",)
 
     @property
     def numbers_per_pair(self) -> int:  # type: ignore[override]
-        """The inputs, of which the density counts for both particles, what every layer gives, and a vector."""
+        """The inputs, with the density of both particles, the outputs of every layer, and a vector."""
         return len(self.inputs) + ("density" in self.inputs) + sum(self.hidden) + 3
 
 
@@ -143,9 +139,8 @@ class PairNetwork(ForceSum, NetworkSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.symmetry == "antisymmetric" and self.basis == "corrected":
-            raise KeyProblem(self.section_name(), "symmetry", f' = "{self.symmetry}": with basis = "{self.basis}" the '
-                             "forces of a pair are not opposite, as each particle has a moment matrix of its own; set "
-                             'basis = "paper", or symmetry = "none"')
+            raise self.problem("symmetry", 'with basis = "corrected" the forces of a pair are not opposite, as each '
+                               'particle has a moment matrix of its own; set basis = "paper", or symmetry = "none"')
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,8 +149,8 @@ class EddyViscosity(ForceSum):
 
     word = "eddy-viscosity"
 
-    form: str = choice("two-sided: of all pairs; monaghan: of approaching ones; bounded: of all, with tanh(x.v) for "
-                       "x.v", "two-sided", "monaghan", "bounded", default="two-sided")
+    form: str = choice("two-sided: all pairs; monaghan: approaching pairs; bounded: all, with tanh(x.v) for x.v",
+                       "two-sided", "monaghan", "bounded", default="two-sided")
     numbers_per_pair = 8
     reads = ("pairs",)
 
@@ -172,7 +167,7 @@ class DensityFlux(NetworkSettings):
 
     @property
     def reads(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Pairs, and the density where the network or the sign needs it."""
+        """Pairs, and the density if the network or the sign needs it."""
         return ("pairs", "density") if self.sign or "density" in self.inputs else ("pairs",)
 
 
@@ -188,7 +183,7 @@ class DensityDiffusion(PairSum):
 
 @dataclass(frozen=True, kw_only=True)
 class Pressure(TermSettings):
-    """The pressure of the resolved velocity: the density that belongs to it, and its force."""
+    """The pressure of the resolved velocity: its density, and its force."""
 
     word = "pressure"
     reads = ("resolved",)
@@ -197,7 +192,7 @@ class Pressure(TermSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class Stress(TermSettings):
-    """The stress that the filter hides, and its pressure."""
+    """The subfilter stress, and its pressure."""
 
     word = "stress"
 
@@ -227,7 +222,7 @@ class Damping(TermSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class Relaxation(TermSettings):
-    """Relaxation of the particles' velocity to what the grid resolves of it."""
+    """Relaxation of the particles' velocity to the resolved velocity."""
 
     word = "relaxation"
     reads = ("resolved",)
@@ -258,7 +253,7 @@ class Continuity(TermSettings):
 
     @property
     def learns_through_horizons(self) -> bool:  # type: ignore[override]
-        """Where there is something to learn."""
+        """Whether it has a parameter."""
         return self.diffusion > 0
 
 
@@ -287,7 +282,7 @@ class WCSPH(TermSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class TransportVelocity(TermSettings):
-    """Particles that a constant background pressure shifts to where there are fewer (Adami, Hu & Adams 2013)."""
+    """The shift of particles to sparser places by a constant background pressure (Adami, Hu & Adams 2013)."""
 
     word = "transport-velocity"
     numbers_per_pair = 16
@@ -298,16 +293,15 @@ class TransportVelocity(TermSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class FilteredEquations(TermSettings):
-    """The filtered equations of motion by derivatives that neighbours tell."""
+    """The filtered equations of motion with derivatives from neighbours, by kriging."""
 
     word = "filtered-equations"
 
-    sweeps: int = integer("of the pressure from neighbour to neighbour, each time that forces are asked for", default=8,
-                          at_least=1, at_most=32)
-    relaxation: float = number("rate, over 2 u'/d, at which velocities relax to what neighbours tell", default=1.0,
-                               at_least=0)
-    solenoidal: float = number("rate, over 2 u'/d, at which the pressure takes out a divergence", default=3.5,
-                               at_least=0)
+    sweeps: int = integer("iterations of the pressure among neighbours in each evaluation", default=8, at_least=1,
+                          at_most=32)
+    relaxation: float = number("rate, over 2 u'/d, at which a velocity relaxes to the estimate from its neighbours",
+                               default=1.0, at_least=0)
+    solenoidal: float = number("rate, over 2 u'/d, at which the pressure removes a divergence", default=3.5, at_least=0)
     density: float = number("rate, over 2 u'/d, at which the density follows the pressure", default=3.5, at_least=0)
 
     reads = ("pairs", "density")
@@ -316,38 +310,38 @@ class FilteredEquations(TermSettings):
                 "in steps of more than about {longest}; lower step to that")
 
     def longest_step(self, units: StepUnits) -> float:
-        """In which the noise of single particles relaxes as far as the scheme can take."""
+        """The step in which the noise of single particles relaxes as much as the scheme can follow."""
         if not units.velocity or not self.relaxation:
             return math.inf
         rate = NOISE_AMONG_NEIGHBORS * self.relaxation * 2 * units.velocity / units.filter_width
         return units.scheme.decay / rate
 
 
-#: The terms that a scene can name: the classes above that have a word.
+#: The terms that a scene can name: the classes above with a word.
 TERMS: dict[str, type[TermSettings]] = {kind.word: kind for kind in list(globals().values())
                                         if isinstance(kind, type) and issubclass(kind, TermSettings) and kind.word}
 
-# Near what training finds; the method's own values are tens of times the accelerations of turbulence.
+# Near the result of training; with the method's own values friction is tens of times the accelerations of turbulence.
 LITTLE_FRICTION = {"alpha": 0.05, "beta": 1.5}
 
 RESOLVED = ("pressure", "stress", "viscosity", "damping", "relaxation")
 
 
 def _published(basis: str, hidden: tuple[int, ...]) -> dict[str, Mapping[str, Any]]:
-    """Eq. 3: networks of force and density, and Pi of both. What the text leaves open is as in the public code."""
+    """Eq. 3: networks of force and density, and Pi of both; open choices of the text are those of the public code."""
     plain, network = {"window": "none", "scaling": "root"}, {"hidden": hidden}
     return {"pairs": {"basis": basis, **plain, **network},
             "eddy-viscosity": {"basis": basis, "form": "bounded", **plain},
             "density-flux": {"sign": True, **plain, **network}, "density-diffusion": plain}
 
 
-#: Of each preset the settings that differ from the terms' own, by term, in the order of the terms.
+#: The terms of each preset in their order, each with the settings that differ from its defaults.
 PRESETS: dict[str, dict[str, Mapping[str, Any]]] = {
     "paper": _published("paper", (20, 20, 20, 20)),
     "paper-code": _published("unit", (20, 100, 20)),
     "resolved": dict.fromkeys(RESOLVED, {}),
-    # The density there is that of the pressure, whose force is given: a network that is told of it learns no more, and
-    # costs twice as much, as pairs then are not opposite.
+    # The density is that of the pressure, whose force is there already. As an input of the network it adds nothing, and
+    # doubles the cost, as the forces of a pair are no longer opposite.
     "resolved + pairs": {**dict.fromkeys(RESOLVED, {}), "pairs": {"inputs": ("distance", "speed", "approach")}},
     "local": {"filtered-equations": {}, "eddy-viscosity": {}},
     "wcsph": {"continuity": {}, "wcsph": LITTLE_FRICTION},

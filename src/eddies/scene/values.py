@@ -1,31 +1,29 @@
-"""What a section of a scene is: a frozen dataclass whose fields declare their keys.
+"""Sections of a scene: frozen dataclasses whose fields declare their keys.
 
-Every key of a scene is declared once, beside the dataclass field that holds it, by one of the functions `number`,
-`integer`, `integers`, `boolean`, `choice`, `named`, `text`, `directory_name` and `texts`. The declaration
-carries a line on what the key means, which values it accepts, and its default; the reader, the error messages and the
-written scene all use that one declaration. It is applied where an object is made, from a TOML file or in a program.
+A field declares its key by one of the functions `number`, `integer`, `integers`, `boolean`, `choice`, `named`, `text`
+and `texts`: the meaning, the allowed values and the default. Errors, written scenes, the reference page and the JSON
+schema use this one declaration. It holds for objects made in a program as for those read from a TOML file.
 """
 
 import dataclasses
 import inspect
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import MISSING
 from pathlib import Path
 from typing import Any, ClassVar
 
 from eddies.errors import UserError
-from eddies.scene.rules import Boolean, Bounds, Choice, Integer, Integers, Name, Number, Text, Texts, quoted, shortened
+from eddies.scene.rules import Bounds, Rule, nearest, quoted, shortened
 
-
-# Of a key that may be left out, in place of its value: as if it were.
+# This value of an optional key leaves the key out.
 ABSENT = "none"
 
 
 class SceneError(UserError, ValueError):
-    """What the user asked for cannot be done: the text says what was given, what is allowed, and what to do.
+    """The user asks for something that cannot be done; the text gives the value, what is allowed, and a remedy.
 
-    `key` is the "section.key" at fault where there is one.
+    `key` is the "section.key" at fault, if there is one.
     """
 
     def __init__(self, message: str, key: str = ""):
@@ -34,113 +32,115 @@ class SceneError(UserError, ValueError):
 
 
 class KeyProblem(SceneError):
-    """What is wrong with one key of a section, known by the section's name."""
+    """A problem with one key of a section."""
 
     def __init__(self, section: str, key: str, problem: str):
         super().__init__(f"{place(key, section)}{problem}", f"{section}.{key}" if section else key)
         self.section, self._parts = section, (key, problem)
 
     def within(self, section: str) -> "KeyProblem":
-        """The same of a section of another name."""
+        """Return the same problem of a section with another name."""
         return KeyProblem(section, *self._parts)
 
 
 class Section:
-    """Base of the dataclasses of a scene: making one checks every value, and holds it in the form of its rule.
+    """Base of the dataclasses of a scene: making one checks every value and holds it in the form of its rule.
 
     Raises KeyProblem for a value that its declaration refuses.
 
     Attributes
     ----------
-    of_the_file : keys that a file may have beside those of the fields.
+    _holder : field that holds the section's own sections [section.NAME] by NAME; empty if it has none.
     """
 
-    of_the_file: ClassVar[tuple[str, ...]] = ()
+    _holder: ClassVar[str] = ""
+    __dataclass_fields__: ClassVar[dict[str, dataclasses.Field]]
 
     def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):  # type: ignore[arg-type]
-            value = getattr(self, field.name)
-            if isinstance(value, str) and value == ABSENT and field.default is None:
-                object.__setattr__(self, field.name, None)
-            elif not (value is None and field.default is None):
-                object.__setattr__(self, field.name, _accepted(type(self), field, value))
+        for field in dataclasses.fields(self):
+            object.__setattr__(self, field.name, self._accepted(field, getattr(self, field.name)))
 
     @classmethod
     def section_name(cls) -> str:
-        """The name of the section in errors: that of the class, as a scene writes it."""
+        """The name of the section in errors: that of the class in the spelling of scenes."""
         return re.sub(r"(?<!^)(?=[A-Z])", "_", cls.__name__).lower()
+
+    def problem(self, key: str, problem: str) -> KeyProblem:
+        """Return an error about a key, which begins with the key and its value."""
+        return KeyProblem(self.section_name(), key, f" = {shortened(quoted(getattr(self, key)))}: {problem}")
+
+    def _accepted(self, field: dataclasses.Field, value: Any) -> Any:
+        rule = rule_of(type(self), field)
+        if field.default is None and (value is None or isinstance(value, str) and value == ABSENT):
+            return None
+        if rule is not None:
+            try:
+                return rule.accept(value)
+            except ValueError as error:
+                allowed, hint = rule.allowed + _meaning(rule), f"; {error}" if str(error) else ""
+        elif field.metadata["section"] is None or isinstance(value, field.metadata["section"]):
+            return value
+        else:
+            allowed, hint = f"a {field.metadata['section'].__name__}", ""
+        raise self.problem(field.name, f"must be {allowed}{hint}")
 
 
 def number(about: str, default: Any = MISSING, words: tuple[str, ...] = (), **bounds: float) -> Any:
-    """Declare a dataclass field that holds a real number (or one of `words`)."""
-    return _declare(Number(about, Bounds(**bounds), words), default)
+    """Declare a dataclass field that holds a real number, or one of `words`."""
+    return _declare(Rule(float, about, Bounds(**bounds), words), default)
 
 
 def integer(about: str, default: Any = MISSING, **bounds: float) -> Any:
     """Declare a dataclass field that holds a whole number."""
-    return _declare(Integer(about, Bounds(**bounds)), default)
+    return _declare(Rule(int, about, Bounds(**bounds)), default)
 
 
 def integers(about: str, default: Any = MISSING, **bounds: float) -> Any:
     """Declare a dataclass field that holds a tuple of whole numbers."""
-    return _declare(Integers(about, Bounds(**bounds)), default)
+    return _declare(Rule(int, about, Bounds(**bounds), many=True), default)
 
 
 def boolean(about: str, default: Any = MISSING) -> Any:
     """Declare a dataclass field that holds True or False."""
-    return _declare(Boolean(about), default)
+    return _declare(Rule(bool, about), default)
 
 
 def choice(about: str, *words: str, default: Any = MISSING) -> Any:
     """Declare a dataclass field that holds one of `words`."""
-    return _declare(Choice(about, words), default)
+    return _declare(Rule(str, about, words=words), default)
 
 
 def named(about: str, *words: str, default: Any = MISSING) -> Any:
-    """Declare a dataclass field that holds one of `words`, or the import path "module:name" of something else."""
-    return _declare(Choice(about, words, paths=True), default)
+    """Declare a dataclass field that holds one of `words`, or the import path "module:name" of a user's own class."""
+    return _declare(Rule(str, about, words=words, paths=True), default)
 
 
 def text(about: str, default: Any = MISSING) -> Any:
     """Declare a dataclass field that holds a string."""
-    return _declare(Text(about), default)
-
-
-def directory_name(about: str, default: Any = MISSING) -> Any:
-    """Declare a dataclass field that holds the name of a directory."""
-    return _declare(Name(about), default)
+    return _declare(Rule(str, about), default)
 
 
 def texts(about: str, *words: str, default: Any = MISSING, paths: bool = False) -> Any:
-    """Declare a dataclass field that holds a tuple of strings, of `words` if any are given or, with `paths`, import
-    paths."""
-    return _declare(Texts(about, words, paths), default)
+    """Declare a dataclass field that holds a tuple of strings: of `words` if any are given, or import paths."""
+    return _declare(Rule(str, about, words=words, paths=paths, many=True), default)
 
 
 def section(kind: type, default: Any = MISSING) -> Any:
-    """Declare a dataclass field that holds a whole section, itself a dataclass `kind` (None: absent)."""
+    """Declare a dataclass field that holds a section of the class `kind`; None: absent."""
     return dataclasses.field(default=default, metadata={"section": kind})
 
 
-def sub_sections() -> Any:
-    """Declare a dataclass field that holds a dict of the section's own sections [section.NAME], by NAME.
+def sections() -> Any:
+    """Declare a dataclass field that holds a dict of sections, which its class checks itself."""
+    return dataclasses.field(default_factory=dict, metadata={"section": None})
 
-    The dataclass makes objects of their tables when it is made.
+
+def rule_of(kind: type, field: dataclasses.Field) -> Rule | None:
+    """Return the rule of a field: as declared, or that of its annotation; None for a field that holds sections.
+
+    Raises SceneError for a field with neither.
     """
-    return dataclasses.field(default_factory=dict, metadata={"sub_sections": True})
-
-
-def scenes() -> Any:
-    """Declare a dataclass field that holds a dict of whole scenes by name."""
-    return dataclasses.field(default_factory=dict, metadata={"scenes": True})
-
-
-def rule_of(kind: type, field: dataclasses.Field) -> Any:
-    """The rule of a field: as declared, or else that of its annotation; None for a field that holds sections.
-
-    Raises SceneError where there is neither.
-    """
-    if field.metadata.keys() & {"section", "sub_sections", "scenes"}:
+    if "section" in field.metadata:
         return None
     if "rule" in field.metadata:
         return field.metadata["rule"]
@@ -152,50 +152,111 @@ def rule_of(kind: type, field: dataclasses.Field) -> Any:
     return rule
 
 
-#: The rules of fields that a dataclass does not declare.
-ANNOTATIONS = {"float": Number(""), "int": Integer(""), "bool": Boolean(""), "str": Text(""),
-               "tuple[int, ...]": Integers("")}
+#: The rules of fields with an annotation but no declaration.
+ANNOTATIONS = {"float": Rule(float), "int": Rule(int), "bool": Rule(bool), "str": Rule(str),
+               "tuple[int, ...]": Rule(int, many=True)}
+
+
+def read_section(kind: type[Section], table: Any, name: str = "", others: Sequence[str] = ()) -> Any:
+    """Make a section of the class `kind` from a TOML table.
+
+    `name` is that of the section, empty for the whole document; `others` are keys that an error names beside those of
+    the class. Raises SceneError for an unknown key, a missing key, or a value that its declaration refuses.
+    """
+    if not isinstance(table, dict):
+        message = f"{name} = {shortened(quoted(table))}: must be a section; write [{name}] and its keys below"
+        raise SceneError(message, name)
+    fields = {field.name: field for field in dataclasses.fields(kind) if field.metadata.get("section", kind)}
+    values: dict[str, Any] = {}
+    for key, value in table.items():
+        if key in fields:
+            inner = fields[key].metadata.get("section")
+            values[key] = read_section(inner, value, f"{name}.{key}" if name else key) if inner else value
+        elif kind._holder and isinstance(value, dict):
+            values.setdefault(kind._holder, {})[key] = value
+        else:
+            raise _unknown_key(key, value, name, [*fields, *others])
+    for key, field in fields.items():
+        if key not in values and field.default is field.default_factory is MISSING:
+            raise _missing_key(kind, field, name)
+    try:
+        return kind(**values)
+    except KeyProblem as problem:
+        raise (problem.within(name) if problem.section == kind.section_name() else problem) from None
+
+
+def _unknown_key(key: str, value: Any, section: str, valid: Sequence[str]) -> SceneError:
+    is_section = isinstance(value, dict) and not section
+    problem = (f": no such {'section' if is_section else 'key'}; {nearest(key, valid, cutoff=0.5)}valid here: "
+               f"{', '.join(valid) or 'no key; remove it'}")
+    return SceneError(f"[{key}]{problem}", key) if is_section else KeyProblem(section, key, problem)
+
+
+def _missing_key(kind: type[Section], field: dataclasses.Field, section: str) -> SceneError:
+    rule = rule_of(kind, field)
+    if rule is None:
+        return SceneError(f"[{field.name}]: this section is missing; every scene needs it", field.name)
+    return KeyProblem(section, field.name, f": this key is missing{_meaning(rule)}; give it {rule.allowed}")
+
+
+def write_section(section: Section, name: str = "", all_keys: bool = False) -> list[str]:
+    """Return the lines `key = value  # meaning` of a section and of its own sections.
+
+    Absent keys and sections, and sections without keys, are left out. With `all_keys` comments list them.
+    """
+    lines, inner = [], []
+    for field in dataclasses.fields(section):
+        value, rule = getattr(section, field.name), rule_of(type(section), field)
+        own = f"{name}.{field.name}" if name else field.name
+        if rule is not None and (value is not None or all_keys):
+            lines.append(_line(field.name, rule, value))
+        elif rule is None and isinstance(value, Section):
+            inner += ["", f"[{own}]", *write_section(value, own, all_keys)]
+        elif rule is None and value is None and all_keys:
+            kind = field.metadata["section"]
+            inner += ["", f"# [{own}]  # {kind.__doc__.splitlines()[0]}"]
+            inner += [f"# {line.removeprefix('# ')}" for line in _declared_lines(kind)]
+        elif field.name == section._holder:
+            for key, part in value.items():
+                if written := write_section(part, all_keys=all_keys):
+                    inner += ["", f"[{name}.{key}]", *written]
+    return lines + inner
+
+
+def _declared_lines(kind: type[Section]) -> list[str]:
+    """The lines of the keys of an absent section, with their defaults."""
+    rules = [(field, rule_of(kind, field)) for field in dataclasses.fields(kind)]
+    return [_line(field.name, rule, None if field.default is MISSING else field.default) for field, rule in rules
+            if rule is not None]
+
+
+def _line(key: str, rule: Rule, value: Any) -> str:
+    given = f"# {key}: {rule.allowed}" if value is None else f"{key} = {quoted(value)}"
+    return f"{given}  # {rule.about}" if rule.about else given
 
 
 def import_paths(part: Section) -> Iterator[tuple[str, str]]:
-    """Each key of a section that may hold an import path, with the import paths that it holds."""
-    for field in dataclasses.fields(part):  # type: ignore[arg-type]
-        if getattr(rule_of(type(part), field), "paths", False):
-            value = getattr(part, field.name)
-            for name in (value,) if isinstance(value, str) else value or ():
-                if ":" in name:
-                    yield field.name, name
+    """Yield each key of a section that may hold import paths, with each import path that it holds."""
+    for field in dataclasses.fields(part):
+        rule, value = rule_of(type(part), field), getattr(part, field.name)
+        if rule is not None and rule.paths:
+            yield from ((field.name, path) for path in ((value,) if isinstance(value, str) else value or ())
+                        if ":" in path)
 
 
 def product_file(path: str, name: str) -> Path:
-    """The file of a product that a key names: the path itself where it ends in .h5, else NAME in that directory."""
+    """Return the file of a product that a key names: the path itself if it ends in .h5, else NAME in that directory."""
     return Path(path) if path.endswith(".h5") else Path(path) / name
 
 
 def place(key: str, section: str) -> str:
-    """A key in words."""
+    """Return the name of a key in errors."""
     return f"[{section}] {key}" if section else key
 
 
-def _accepted(kind: type[Section], field: dataclasses.Field, value: Any) -> Any:
-    """The value of a field as its rule holds it."""
-    def refusal(allowed: str, hint: str = "") -> KeyProblem:
-        return KeyProblem(kind.section_name(), field.name,
-                          f" = {shortened(quoted(value))}: must be {allowed}" + (f"; {hint}" if hint else ""))
-
-    if field.metadata.keys() & {"sub_sections", "scenes"}:
-        return value
-    if "section" in field.metadata:
-        if not isinstance(value, field.metadata["section"]):
-            raise refusal(f"a {field.metadata['section'].__name__}")
-        return value
-    rule = rule_of(kind, field)
-    try:
-        return rule.accept(value)
-    except ValueError as error:
-        about = f" ({rule.about})" if rule.about else ""
-        raise refusal(f"{rule.allowed}{about}", str(error)) from None
+def _meaning(rule: Rule) -> str:
+    return f" ({rule.about})" if rule.about else ""
 
 
-def _declare(rule: Any, default: Any) -> Any:
+def _declare(rule: Rule, default: Any) -> Any:
     return dataclasses.field(default=default, metadata={"rule": rule})

@@ -1,9 +1,7 @@
-"""Operators on modes of fields, for numpy arrays and torch tensors alike; those of tensors differentiate themselves.
+"""Operators on the modes of fields, for numpy arrays and torch tensors; autograd differentiates those of tensors.
 
 Modes are (..., kz, ky, kx). Vectors have the order x, y, z, symmetric matrices xx, yy, zz, xy, xz, yz.
 """
-
-from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -19,7 +17,8 @@ class ModeOperators:
 
     Parameters
     ----------
-    wavevector : kx, ky, kz, to broadcast over (kz, ky, kx). wavenumber_squared : k^2 (kz, ky, kx).
+    wavevector : kx, ky, kz, to broadcast over (kz, ky, kx).
+    wavenumber_squared : k^2 (kz, ky, kx).
     stack : numpy.stack or torch.stack.
     """
 
@@ -31,31 +30,33 @@ class ModeOperators:
         self.inverse_squared = (1 / (wavenumber_squared + mean)) * ~mean
 
     def along_wavevector(self, vector: Modes) -> Modes:
-        """k.u of a vector (3, kz, ky, kx): (kz, ky, kx)."""
+        """Return k.u (kz, ky, kx) of a vector (3, kz, ky, kx)."""
         kx, ky, kz = self.wavevector
         return kx * vector[0] + ky * vector[1] + kz * vector[2]
 
     def gradient(self, scalar: Modes) -> Modes:
-        """i k f of one component (kz, ky, kx): (3, kz, ky, kx)."""
+        """Return i k f (3, kz, ky, kx) of a scalar (kz, ky, kx)."""
         return self._stack([1j * k * scalar for k in self.wavevector])
 
     def divergence(self, vector: Modes) -> Modes:
-        """i k.u of a vector (3, kz, ky, kx): (kz, ky, kx)."""
+        """Return i k.u (kz, ky, kx) of a vector (3, kz, ky, kx)."""
         return 1j * self.along_wavevector(vector)
 
     def solenoidal(self, vector: Modes) -> Modes:
-        """u - k (k.u) / k^2, the projection of a vector (3, kz, ky, kx) on solenoidal fields."""
+        """Return u - k (k.u) / k^2, the projection of a vector (3, kz, ky, kx) on solenoidal fields."""
         along = self.along_wavevector(vector) * self.inverse_squared
         return self._stack([component - k * along for k, component in zip(self.wavevector, vector)])
 
     def stress_divergence(self, stress: Modes) -> Modes:
-        """d_j tau_ij of a symmetric matrix (6, kz, ky, kx): (3, kz, ky, kx)."""
+        """Return d_j tau_ij (3, kz, ky, kx) of a symmetric matrix (6, kz, ky, kx)."""
         xx, yy, zz, xy, xz, yz = stress
         return self._stack([self.divergence(row) for row in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))])
 
     def pressure_of(self, stress: Modes) -> Modes:
-        """p (kz, ky, kx) with  laplacian p = -d_i d_j tau_ij  and mean zero, of a symmetric matrix (6, kz, ky, kx):
-        div tau + grad p is solenoidal. Of tau = u u it is the kinematic pressure of an incompressible flow u."""
+        """Return p (kz, ky, kx) with mean zero and  laplacian p = -d_i d_j tau_ij  for a symmetric matrix (6, ...).
+
+        div tau + grad p is solenoidal. With tau = u u, p is the kinematic pressure of an incompressible flow u.
+        """
         kx, ky, kz = self.wavevector
         xx, yy, zz, xy, xz, yz = stress
         along = kx * kx * xx + ky * ky * yy + kz * kz * zz + 2 * (kx * ky * xy + kx * kz * xz + ky * kz * yz)
@@ -63,16 +64,20 @@ class ModeOperators:
 
 
 def rising(shell: Modes, highest: float, values: Modes) -> Modes:
-    """A function of |k| = `shell` that has `values` (n,) at n wavenumbers equally spaced up to the `highest`, is 0 at
-    0, linear between them and constant beyond: a learned damping rate."""
-    place, found, before = shell * (len(values) / highest), 0.0, 0.0
+    """Return a piecewise linear function of |k| = `shell`: a learned damping rate.
+
+    It is 0 at 0, has `values` (n,) at n wavenumbers equally spaced up to `highest`, and is constant beyond.
+    """
+    place, result, before = shell * (len(values) / highest), 0.0, 0.0
     for number, value in enumerate(values):
-        found = found + (value - before) * (place - number).clip(0, 1)
+        result = result + (value - before) * (place - number).clip(0, 1)
         before = value
-    return found
+    return result
 
 
 def gaussian_transfer(wavenumber_squared: np.ndarray | float, width: float) -> np.ndarray:
-    """exp(-k^2 d^2 / 24): Fourier transform of the Gaussian filter of width d, whose second moment is that of a box
-    filter of the same width (Pope 2000, Table 13.2)."""
+    """Return exp(-k^2 d^2 / 24), the Fourier transform of the Gaussian filter of width d.
+
+    Its second moment is that of a box filter of the same width (Pope 2000, Table 13.2).
+    """
     return np.exp(-np.asarray(wavenumber_squared) * width**2 / 24)

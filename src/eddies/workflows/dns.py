@@ -12,9 +12,9 @@ import numpy as np
 
 from eddies.clock import Clock, ProgressLine
 from eddies.flow.history import FlowHistory
+from eddies.io.checkpoint import Guard
 from eddies.io.fields import FieldWriter
 from eddies.io.frame_segments import FrameSegments
-from eddies.io.guard import Guard
 from eddies.io.hdf5 import File, create_product, write_attributes, write_table
 from eddies.parallel.communicator import Comm
 from eddies.parallel.stop import StopRequest
@@ -22,10 +22,11 @@ from eddies.pipeline import STAGES
 from eddies.scene.scene import Scene
 from eddies.scene.sections import SpinUp
 from eddies.time_stepping import STEPPERS
-from eddies.workflows.feasibility import check_span
 from eddies.workflows.ground_truth.flow_run import FlowRun, TracerRun, frame_layout
 from eddies.workflows.ground_truth.frame_counts import whole_frames
 from eddies.workflows.ground_truth.scene_flow import build_fluid, build_step_limit, initial_state
+from eddies.workflows.problems import check_span
+from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
 
 log = logging.getLogger("eddies")
 
@@ -42,7 +43,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     Raises Stopped, after a checkpoint, if `stop` requests it.
     """
     directory = Path(directory)
-    guard = Guard(comm, directory / STAGES["dns"].checkpoints, scene.fingerprint("dns"), stop)
+    guard = Guard(comm, directory / STAGES["dns"].checkpoints, stage_fingerprint(scene, "dns"), stop)
     saved, fluid = guard.checkpoints.newest(), build_fluid(scene, comm)
     state = initial_state(scene, fluid) if saved is None else None
     flow = FlowRun(fluid, state, STEPPERS[scene.time.stepper](fluid), build_step_limit(scene, fluid.grid),
@@ -51,7 +52,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     if saved is not None:
         flow.load_state_dict(saved)
         log.info("dns: continues from step %d, time %.4g", flow.clock.steps, flow.clock.time)
-    with create_product(comm, directory / STAGES["dns"].file, "ground_truth", scene.provenance("dns")) as file:
+    with create_product(comm, directory / STAGES["dns"].file, "ground_truth", stage_provenance(scene, "dns")) as file:
         if saved is None:
             flow.history.sample(flow.state, flow.clock)
         if flow.phase == "spin-up":

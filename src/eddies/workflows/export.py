@@ -1,4 +1,4 @@
-"""The fields and particles of a run in files for other programs, by series. Rank 0 does the work, the others wait."""
+"""Write the fields and particles of a run to files for other programs, a file for each series, on rank 0."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def run(run_directory: Path, output: Path, comm: Comm, layout: str = "vtkhdf") -
     with "lagrangebench" one of particles is the directory OUTPUT/PRODUCT-particles-NAME.
 
     Raises:
-        ProductError: on all ranks, if there is no such series, a product is damaged, or a file cannot be written.
+        ProductError: on all ranks; there is no such series, a product is damaged, or a file cannot be written.
     """
     alone = comm.Split(comm.rank)
     try:
@@ -69,14 +69,14 @@ def _ground_truth(run_directory: Path, alone: Comm) -> Iterator[tuple[Series, Pr
 
 @contextmanager
 def _rollout(run_directory: Path, alone: Comm) -> Iterator[tuple[Series, Provenance]]:
-    """Those of the rollout, as they are stored or made of it."""
+    """All series of the rollout, stored or computed."""
     from eddies.workflows.rollout.measured import open_rollout  # torch
     with open_rollout(run_directory, alone) as measured:
         yield measured.exported, measured.provenance
 
 
 def _write_vtkhdf(output: Path, case: str, group: str, series: Any, provenance: Provenance) -> bool:
-    """Write a series as a VTKHDF file; whether it has been written."""
+    """Write a series as a VTKHDF file; returns whether it was written."""
     path = output / f"{case}.vtkhdf"
     if group == "fields":
         write_images(path, series, BOX_LENGTH, provenance)
@@ -87,7 +87,7 @@ def _write_vtkhdf(output: Path, case: str, group: str, series: Any, provenance: 
 
 
 def _write_dataset(output: Path, case: str, group: str, series: Any, provenance: Provenance) -> bool:
-    """Write particles as a data set; whether that has been done."""
+    """Write particles as a data set; returns whether it was written."""
     if group == "fields":
         return False
     if problem := shortcoming(series):
@@ -98,7 +98,7 @@ def _write_dataset(output: Path, case: str, group: str, series: Any, provenance:
     return True
 
 
-# What writes a series in a layout, what of a run, and where that comes from.
+# By layout: the function that writes a series, the series that it can write, and the command that makes them.
 LAYOUTS = {"vtkhdf": (_write_vtkhdf, "fields or particles", "`eddies dns SCENE`"),
            "lagrangebench": (_write_dataset, "particles that make a data set",
                              "`eddies dns SCENE` with a scene that has [tracers]")}

@@ -37,6 +37,7 @@ from eddies.scene.integrators import MOST_COURANT, SCHEMES
 from eddies.scene.scene import BOX_LENGTH, Scene, SceneError, Simulation
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.rollout.method import METHODS, Method, Step, make_method
+from eddies.workflows.run_directory.fingerprints import stage_provenance
 
 log = logging.getLogger("eddies")
 
@@ -221,7 +222,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         found, half, difference = ladder[rung], ladder[rung + 1], ladder.difference(rung + 1)
         tables = {each.integrator: each.table() for each in ladders if each.trials}
     seconds = time.perf_counter() - began
-    with create_product(comm, directory / STAGES["find-step"].file, "step", scene.provenance("find-step")) as file:
+    provenance = stage_provenance(scene, "find-step")
+    with create_product(comm, directory / STAGES["find-step"].file, "step", provenance) as file:
         write_attributes(file.create_group("found"), {
             "integrator": found.step.integrator, "size": found.step.size, "seconds_per_turnover": found.seconds,
             "error": found.error, "error_with_half": half.error, "difference": difference,

@@ -10,7 +10,7 @@ import torch
 
 from eddies.clock import pace_in_words
 from eddies.io.frame_segments import FrameSegments
-from eddies.io.guard import Guard
+from eddies.io.checkpoint import Guard
 from eddies.io.hdf5 import create_product, open_product, read_attributes, write_attributes, write_table
 from eddies.parallel.communicator import Comm
 from eddies.parallel.slab import SlabDecomposition
@@ -24,6 +24,7 @@ from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.rollout.course import Course, frame_layout
 from eddies.workflows.rollout.method import Step, make_method
 from eddies.workflows.rollout.particle_run import forcing_of
+from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
 
 log = logging.getLogger("eddies")
 
@@ -36,7 +37,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     """
     directory, settings, device = Path(directory), scene.simulation, prepare_torch(scene.device, comm)
     slab = SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes)
-    guard = Guard(comm, directory / STAGES["simulate"].checkpoints, scene.fingerprint("simulate"), stop,
+    guard = Guard(comm, directory / STAGES["simulate"].checkpoints, stage_fingerprint(scene, "simulate"), stop,
                   " of the rollout")
     with open_product(comm, directory / STAGES["dns"].file, "ground_truth") as truth_file, torch.no_grad():
         truth = GroundTruth(truth_file, slab, device)
@@ -57,7 +58,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
             course = Course(method, segments, count, settings.frame_interval, guard, saved)
             outcome = course.run()
             with create_product(comm, directory / STAGES["simulate"].file, "rollout",
-                                scene.provenance("simulate")) as file:
+                                stage_provenance(scene, "simulate")) as file:
                 segments.assemble(file)
                 write_attributes(file.create_group("rollout"), {
                     **outcome, **method.description(), "method": settings.method,

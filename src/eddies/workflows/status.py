@@ -9,19 +9,17 @@ from pathlib import Path
 from eddies.clock import duration
 from eddies.errors import UserError
 from eddies.io.checkpoint import checkpoints_in
-from eddies.io.checksums import ATTRIBUTE
+from eddies.io.checksums import ATTRIBUTE, find_damage, open_to_read
 from eddies.io.errors import ProductError, make_again
 from eddies.io.hdf5 import in_files
 from eddies.io.provenance import product_provenance
-from eddies.io.reading import open_to_read
 from eddies.io.run_lock import find_lock
-from eddies.io.verification import find_damage
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm
 from eddies.pipeline import STAGES
 from eddies.scene.scene import SceneError, load_scene
 from eddies.workflows.foreseen.storage import in_units
-from eddies.workflows.rollout.truth_cache import KIND as TRUTH_MEASURES
+from eddies.workflows.run_directory.fingerprints import stage_fingerprint
 from eddies.workflows.run_directory.work import changed_settings, is_done, of_other_settings, stage_seconds
 from eddies.workflows.variants import Step, steps
 
@@ -50,8 +48,8 @@ def run(directory: Path, comm: Comm, verify: bool = False) -> None:
 
 
 def products_in(directory: Path) -> list[Path]:
-    """The products of all runs in a directory and the caches beside them, by name. A link to one is left out."""
-    names = [stage.file for stage in STAGES.values() if stage.product] + [f"{TRUTH_MEASURES}.h5"]
+    """The products of all runs in a directory, by name. A link to one of them is left out."""
+    names = [stage.file for stage in STAGES.values() if stage.product]
     found = sorted((path for name in names for path in directory.rglob(name)), key=Path.is_symlink, reverse=True)
     return sorted({path.resolve(): path for path in found}.values())
 
@@ -122,7 +120,7 @@ def stage_state(name: str, step: Step) -> str:
     if is_done(name, scene, step.directory):
         return f"complete, {in_units(product.stat().st_size)}"
     if checkpoints:
-        fits = scene.fingerprint(name) in [fingerprint for _, fingerprint in checkpoints]
+        fits = stage_fingerprint(scene, name) in [fingerprint for _, fingerprint in checkpoints]
         return f"stopped at step {checkpoints[-1][0]}, {'can continue' if fits else 'with other settings'}"
     if product.is_file():
         origin = product_provenance(product)

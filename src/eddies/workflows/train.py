@@ -6,10 +6,10 @@ import logging
 import time
 from pathlib import Path
 
-from eddies.io.guard import Guard
+from eddies.io.checkpoint import Guard
 from eddies.io.provenance import product_provenance
 from eddies.io.weights import save_weights
-from eddies.io.whole_files import write_files
+from eddies.io.new_files import write_files
 from eddies.learning.training import Training
 from eddies.parallel.communicator import Comm
 from eddies.parallel.stop import StopRequest
@@ -23,6 +23,7 @@ from eddies.workflows.learned.source import ModelDefinition
 from eddies.workflows.learned.training_data import model_for, training_data
 from eddies.workflows.learned.training_phases import feature_range, horizon_phases, one_step_phases, take_all_steps
 from eddies.workflows.learned.truths import open_truths
+from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
 
 log = logging.getLogger("eddies")
 
@@ -55,7 +56,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         own = next((each.model for each in data if each.truth is truth), None)
         # Where only other ground truths are trained on, no part of the run's own is seen.
         last = truth.last_frame_seen(settings.window if own is not None else 0.0)
-        guard = Guard(comm, directory / STAGES["train"].checkpoints, scene.fingerprint("train"), stop,
+        guard = Guard(comm, directory / STAGES["train"].checkpoints, stage_fingerprint(scene, "train"), stop,
                       " of the training")
         history, cost, curves = {}, [], None
         learns = next(model.parameters(), None) is not None
@@ -75,7 +76,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                                                            "coefficients": tested.learned_coefficients}
         of_named = {str(path): truth.reference.get("mach_turbulent")
                     for path, truth in zip(settings.truth_files, trained_on)}
-        provenance = {**scene.provenance("train"), "mach_turbulent": truth.reference.get("mach_turbulent"),
+        provenance = {**stage_provenance(scene, "train"), "mach_turbulent": truth.reference.get("mach_turbulent"),
                       "truths": {path: product_provenance(path).get("id") for path in of_named},
                       "mach_of_truths": of_named}
     weights = {name: tensor.cpu().numpy() for name, tensor in model.state_dict().items()}

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from eddies.io.guard import Guard
+from eddies.io.checkpoint import Guard
 from eddies.io.hdf5 import open_product
 from eddies.io.provenance import product_provenance
 from eddies.io.weights import load_tables, load_weights, save_weights
@@ -33,6 +33,7 @@ from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.workflows.ground_truth.frame_counts import KERNEL_FIELDS
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.learned.training_phases import take_all_steps
+from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
 
 log = logging.getLogger("eddies")
 
@@ -57,7 +58,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
         chosen = np.unique(np.linspace(0, len(seen) - 1, KERNEL_FIELDS).astype(int))
         samples = [load_sample(truth, index, support) for index in chosen]
         unseen, scales = load_sample(truth, len(truth.fields.times) - 1, support), truth.scales
-    guard = Guard(comm, directory / STAGES["train-kernel"].checkpoints, scene.fingerprint("train-kernel"), stop,
+    guard = Guard(comm, directory / STAGES["train-kernel"].checkpoints, stage_fingerprint(scene, "train-kernel"), stop,
                   " of the training")
     mean_volume = None if settings.positive else scene.tracers.spacing**3
     training = training_of(settings, support, mean_volume, scene.seed, samples)
@@ -73,7 +74,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                    "mean_volume": networks["learned"].mean_volume, "reconstruction": settings.form}
     weights = {name: tensor.numpy() for name, tensor in networks["learned"].state_dict().items()}
     save_weights(comm, directory / STAGES["train-kernel"].file, "kernel", description, weights,
-                 scene.provenance("train-kernel"), tables)
+                 stage_provenance(scene, "train-kernel"), tables)
     guard.checkpoints.remove()
     errors = tables["errors"]
     log.info("kernel: velocity error %.3f (cubic spline %.3f), gradient error %.3f (cubic spline %.3f)",

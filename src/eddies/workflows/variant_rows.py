@@ -1,4 +1,4 @@
-"""The numbers of the table of variants: a row for each, and the machine that they were measured on."""
+"""The rows of the table of variants, and the machine that the times were measured on."""
 
 from __future__ import annotations
 
@@ -6,59 +6,63 @@ import os
 import platform
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from eddies.analysis.accuracy import accuracy
+from eddies.cores import threads
 from eddies.io.hdf5 import open_product, read_attributes, read_table
 from eddies.io.provenance import environment, read_json
-from eddies.cores import threads
 from eddies.measures import MEASURES
 from eddies.parallel.communicator import Comm
 from eddies.pipeline import STAGES
 from eddies.scene.scene import Eulerian, Scene
 from eddies.scene.sections import CONVERGED
+from eddies.workflows.run_directory.fingerprints import stage_fingerprint
 from eddies.workflows.run_directory.work import FAILURE
 from eddies.workflows.variants import Place
 
+if TYPE_CHECKING:
+    from eddies.workflows.rollout.measured import MeasuredRollout  # needs torch
+
 COST = ("seconds_per_step", "time_step", "wall_seconds", "wall_seconds_low", "wall_seconds_high", "core_seconds",
         "ranks")
-# Of the search for the step: integrator and step ("etdrk4" and a Courant number on a grid), seconds of the search, and
-# errors of the short rollouts with it, half and twice of it.
+# The search for the step: integrator and step ("etdrk4" and a Courant number on a grid), its wall seconds, and errors
+# of short rollouts with the step, half of it and twice of it.
 SEARCH = ("step_integrator", "step_size", "step_seconds", "step_error", "step_error_half", "step_error_twice")
-# What comes before a rollout: learned numbers, their training, and the search for its step.
-BEFORE = ("weights", "training_seconds", "training_steps", *SEARCH)
-# Measured on gradients that the kernel makes of the particles, of the model and of the truth.
-THROUGH_KERNEL = ("qr_kl", "qr_kl_floor")
+BEFORE = ("weights", "training_seconds", "training_steps", *SEARCH)  # cost before the rollout
+THROUGH_KERNEL = ("qr_kl", "qr_kl_floor")  # measured on gradients that the smoothing kernel reconstructs
 COLUMNS = ("name", "label", "method", "kind", "on_grid", "status", "stopped_at", "realisations", *MEASURES, "end",
            *COST, *BEFORE, *(f"{measure}_spread" for measure in MEASURES), "settings")
 MODEL, ROLLOUT = STAGES["train"].file, STAGES["simulate"].file
 
 
-def row(scene: Scene, name: str, places: Sequence[Place], alone: Comm) -> dict[str, Any]:
-    """The row of a variant, or of a scene without any under its own name, by COLUMNS; None where there is no number.
+def row(scene: Scene, name: str, places: Sequence[Place], realised: Sequence[Mapping[str, Any]],
+        alone: Comm) -> dict[str, Any]:
+    """Return the row of a variant, or of a scene without variants, by COLUMNS; a missing number is None.
 
-    Times are in turnovers T of the flow, `wall_seconds` and `core_seconds` for one of them. One rank reads: `alone`.
+    realised: `numbers` of the rollouts in `places`, or nothing if one of them is missing. Times are in turnovers T,
+    `wall_seconds` and `core_seconds` are those of one turnover.
     """
     variant = scene.variant.get(name, scene)
     found: dict[str, Any] = dict.fromkeys(COLUMNS)
     found |= {"name": name, "label": variant.label or name, "method": variant.simulation.method,
               "kind": variant.simulation.title, "on_grid": variant.simulation.on_grid,
               "settings": "; ".join(scene.differences(variant)) if scene.variant else ""}
-    missing = [place.directory for place in places if not (place.directory / ROLLOUT).exists()]
-    if missing:
-        found |= {"status": why_not(missing[0])}
-    else:
-        found |= together([measured(place.directory, alone) for place in places])
+    if realised:
+        found |= together(realised)
         found |= before(places[0], alone)
         if has_own_kernel(scene, variant):
             found |= dict.fromkeys(THROUGH_KERNEL)
+    else:
+        found["status"] = why_not(next(place.directory for place in places
+                                       if not (place.directory / ROLLOUT).exists()))
     return {key: finite(value) for key, value in found.items()}
 
 
 def why_not(directory: Path) -> str:
-    """Why there is no rollout."""
+    """Return why there is no rollout."""
     for path in (directory / FAILURE, directory.parent / FAILURE):
         if path.is_file():
             return f"failed: {path.read_text(encoding='utf-8').strip()}"
@@ -66,8 +70,11 @@ def why_not(directory: Path) -> str:
 
 
 def together(realised: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """One row of those of several realisations: mean and, of several, standard deviation of the errors where all have
-    one; the median of the times with the widest quartiles; the first that came to no end, if any."""
+    """Combine the numbers of several realisations.
+
+    Errors become a mean and a standard deviation, if all realisations have them. Times become a median, with the widest
+    quartiles. The status is that of the first realisation that did not reach its end, if there is one.
+    """
     found: dict[str, Any] = {"realisations": len(realised), "status": "complete"}
     found |= next(({key: one[key] for key in ("status", "stopped_at")} for one in realised
                    if one["status"] != "complete"), {})
@@ -84,8 +91,7 @@ def together(realised: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def before(place: Place, alone: Comm) -> dict[str, Any]:
-    """Of BEFORE what there is: of the model, where the rollout has one, the training as it is stored with its weights,
-    whoever trained them; nothing of what is not stored."""
+    """Return the numbers of BEFORE that are stored with the weights of the model and with the step."""
     found: dict[str, Any] = {}
     path = place.directory / MODEL
     if place.scene.needs_model and path.exists():
@@ -95,64 +101,57 @@ def before(place: Place, alone: Comm) -> dict[str, Any]:
         if phases is not None:
             found["training_seconds"] = float(sum(phase["seconds"] for phase in phases))
             found["training_steps"] = sum(phase["steps"] for phase in phases)
-    step = place.scene.step_file or place.directory / STAGES["find-step"].file
-    if place.scene.simulation.step == CONVERGED and step.exists():
-        found |= searched(step, alone)
+    path = place.scene.step_file or place.directory / STAGES["find-step"].file
+    if place.scene.simulation.step == CONVERGED and path.exists():
+        with open_product(alone, path, "step") as file:
+            step = read_attributes(file, "found")
+            tried = read_table(file, f"trials/{step['integrator']}")
+        twice = tried["error"][np.isclose(tried["size"], 2 * step["size"])]
+        found |= zip(SEARCH, (step["integrator"], step["size"], step["seconds"], step["error"],
+                              step["error_with_half"], float(twice[0]) if len(twice) else None))
     return found
 
 
-def searched(path: Path, alone: Comm) -> dict[str, Any]:
-    """SEARCH as the file of a step has it; no error of twice the step where that was not tried, or went wrong."""
-    with open_product(alone, path, "step") as file:
-        step = read_attributes(file, "found")
-        tried = read_table(file, f"trials/{step['integrator']}")
-    twice = tried["error"][np.isclose(tried["size"], 2 * step["size"])]
-    return dict(zip(SEARCH, (step["integrator"], step["size"], step["seconds"], step["error"], step["error_with_half"],
-                             float(twice[0]) if len(twice) else None)))
-
-
 def has_own_kernel(scene: Scene, variant: Scene) -> bool:
-    """Whether a variant smooths with another kernel than the scene: what is measured through it does not compare."""
-    return len({each.fingerprint("train-kernel") for each in (scene.without_variants, variant)}) > 1
+    """Return whether the smoothing kernel of a variant differs from that of the scene, so that the numbers of
+    THROUGH_KERNEL cannot be compared."""
+    return len({stage_fingerprint(each, "train-kernel") for each in (scene.without_variants, variant)}) > 1
 
 
 def notes(scene: Scene) -> list[str]:
-    """What a reader has to know of the numbers: of how many flows they are, and what is special of single variants."""
+    """Return sentences that a reader must know about the numbers."""
     seeds, variants = scene.realisations, scene.variant or {scene.name: scene}
     found = [f"Mean and standard deviation over {len(seeds)} realisations, seeds {', '.join(map(str, seeds))}, that no "
              "training has seen." if seeds and len(seeds) > 1 else
-             "Of one realisation: a difference that is smaller than that between two flows is no difference."]
+             "Numbers of one realisation: a difference smaller than that between two flows means nothing."]
     own = [name for name, variant in variants.items() if has_own_kernel(scene, variant)]
-    blank = " and ".join(MEASURES[measure] for measure in THROUGH_KERNEL)
     if own:
-        found.append(f"{', '.join(own)}: no {blank}. These are measured on what the smoothing kernel makes of the "
-                     "particles; a kernel of other settings than the scene's shows another part of the flow.")
+        blank = " and ".join(MEASURES[measure] for measure in THROUGH_KERNEL)
+        found.append(f"{', '.join(own)}: no {blank}. These numbers need the smoothing kernel, and a kernel with other "
+                     "settings than the scene's shows another part of the flow.")
     grids = {name: (variant.eulerian or Eulerian()).cells_for(variant.tracers.filter_width)
              for name, variant in variants.items() if variant.simulation.on_grid}
     if grids:
         kept = ", ".join(f"{(cells - 1) // 3} in {name}" for name, cells in grids.items())
-        found.append(f"Of a grid the 2/3 rule leaves the wavenumbers |k_i| < cells/3, at most: {kept}; k_d = "
+        found.append(f"The 2/3 rule keeps the wavenumbers |k_i| < cells/3 of a grid, at most: {kept}; k_d = "
                      f"{np.pi / scene.tracers.filter_width:.3g}.")
     return found
 
 
-def measured(directory: Path, alone: Comm) -> dict[str, Any]:
-    """What the rollout of a run directory shows, and how long its steps took."""
-    from eddies.workflows.rollout.measured import open_rollout  # torch, which the report on other products does without
-    with open_rollout(directory, alone) as stored:
-        stored.measure(alone, whole=False)
-        rollout = stored.rollout
-        attributes, ranks = rollout.attributes, stored.provenance["ranks"]
-        found = {"status": rollout.status, "ranks": ranks, **accuracy(rollout),
-                 "stopped_at": None if rollout.status == "complete" else attributes["turnovers"]}
-    found["time_step"] = attributes.get("time_step")  # missing where the first step went wrong
+def numbers(stored: MeasuredRollout) -> dict[str, Any]:
+    """Return status, accuracy and cost of an open rollout."""
+    rollout, ranks = stored.rollout, stored.provenance["ranks"]
+    attributes = rollout.attributes
+    found = {"status": rollout.status, "ranks": ranks, **accuracy(rollout),
+             "stopped_at": None if rollout.status == "complete" else attributes["turnovers"],
+             "time_step": attributes.get("time_step")}  # missing if the first step failed
     if "seconds_per_step" in attributes:
         found |= step_costs(attributes, rollout.turnover, ranks)
     return found
 
 
 def step_costs(rollout: Mapping[str, Any], turnover: float, ranks: int) -> dict[str, float]:
-    """Seconds a step, and wall and core seconds a turnover with quartiles, from what a rollout has timed."""
+    """Return seconds per step, and wall seconds (with quartiles) and core seconds per turnover."""
     seconds, low, high = (rollout[f"seconds_per_step{end}"] for end in ("", "_low", "_high"))
     steps = turnover / rollout["time_step"]
     return {"seconds_per_step": seconds, "wall_seconds": seconds * steps, "wall_seconds_low": low * steps,
@@ -160,12 +159,12 @@ def step_costs(rollout: Mapping[str, Any], turnover: float, ranks: int) -> dict[
 
 
 def finite(value: Any) -> Any:
-    """The value, or None for a number that is none."""
+    """Return the value, or None for a float that is not finite."""
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def machine(device: str, ranks: int) -> dict[str, Any]:
-    """What the times depend on: processor, cores, ranks, threads, device, and the versions of all libraries."""
+    """Return what the times depend on: processor, cores, ranks, threads, device, versions of libraries."""
     if device == "cuda":
         import torch
         device = torch.cuda.get_device_name()
@@ -174,7 +173,7 @@ def machine(device: str, ranks: int) -> dict[str, Any]:
 
 
 def processor() -> str:
-    """Name of the processor as Linux gives it, or else its architecture."""
+    """Return the name of the processor from Linux, or else its architecture."""
     information = Path("/proc/cpuinfo")
     lines = information.read_text().splitlines() if information.exists() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]

@@ -20,6 +20,7 @@ from pathlib import Path
 
 from eddies.pipeline import STAGES
 from eddies.scene.scene import REALISATION, Scene, SceneError
+from eddies.workflows.run_directory.fingerprints import stage_fingerprint
 from eddies.workflows.run_directory.work import is_done
 
 # Stages whose products variants share if their settings agree.
@@ -113,7 +114,7 @@ def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[
     for name in chosen:
         own = scene.variant[name] if name else whole
         if seeds and own.simulation.finds_step and own.simulation.confirmed_on is None and (
-                own.fingerprint("dns") == whole.fingerprint("dns")):
+                stage_fingerprint(own, "dns") == stage_fingerprint(whole, "dns")):
             # A step must converge on all realisations, unless these are of another flow than the variant's.
             own = replace(own, simulation=replace(own.simulation, confirmed_on=tuple(map(str, realisations))))
         trained = ("train",) if not seeds or own.model is not None and own.model.path is None else ()
@@ -127,7 +128,7 @@ def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[
         own, where = place.scene, place.directory
         working, links = [], {}
         for stage in [stage for stage in STAGES if stage in own.stages and stage in MAKING]:
-            key = stage, own.fingerprint(stage)
+            key = stage, stage_fingerprint(own, stage)
             from_file = stage not in SHARED and own.model is not None and own.model.path is not None
             holder = None if from_file else made.get(key)
             if holder is not None and holder != where:

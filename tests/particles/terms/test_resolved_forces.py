@@ -1,9 +1,9 @@
-"""Pressure, hidden stress and viscosity of a filtered velocity of few modes against the exact ones, both forms of the
-stress.
+"""Forces of a resolved velocity of few modes against closed forms and against the exact filtered equations.
 
-What is expected is made of the unfiltered velocity by plain transforms, never of the terms' own formulas.
+The exact forces come from the unfiltered velocity by plain transforms, never from the terms' own formulas.
 """
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -11,39 +11,170 @@ import pytest
 import torch
 from mpi4py import MPI
 
-from eddies.flow.tracers import lattice_positions
+from eddies.flow.forcing import LinearForcing
+from eddies.flow.initial_fields import random_velocity as random_flow
+from eddies.flow.tracers import FilteredField, TracerParticles, lattice_positions, release
+from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.fourier_grid import FourierGrid
-from eddies.particles.model import LagrangianModel
 from eddies.particles.particle_set import ParticleSet
-from eddies.particles.resolved_flow import ResolvedFlow
-from tests.particles.configurations import CUTOFF, LENGTH, NEIGHBORS, SCALES, DensityReader, model
+from eddies.particles.resolved_velocity import ResolvedFlow
+from eddies.particles.terms.resolved_forces import RATES
+from eddies.scene.terms import TermError
+from eddies.spectral.spectral_grid import SpectralGrid
+from tests.particles.configurations import (
+    CUTOFF, LENGTH, NEIGHBORS, SCALES, DensityReader, alone, dynamics_of, given, model, of_terms, state,
+)
 from tests.validation.filtered_fields import CELLS, WAVE, Filtered, at, fields_of, modes_of, random_velocity
 
-pytestmark = pytest.mark.mpi(1)
-MODES, PLANES, COUNT, NU = random_velocity(4), 48, 400, 0.05
-
-
-def lagrangian(width, *words, form="gradient", spacing=SCALES.spacing):
-    """A model of these terms, and of one that reads a density."""
-    flow = FlowUnits(replace(SCALES, filter_width=width, spacing=spacing, viscosity=NU), CUTOFF, NEIGHBORS)
-    terms = model({word: dict(form=form) if word == "stress" else {} for word in words}, flow).terms
-    return LagrangianModel({**terms, "reader": DensityReader()}, flow)
+one_rank = pytest.mark.mpi(1)
+every_form = pytest.mark.parametrize("form", ["deconvolution", "gradient"])
+SIDE, RESOLVED = 18, 6
 
 
 class Known:
-    """In place of what resolves the particles' velocity: the modes that are there."""
+    """Replaces the solve for the resolved velocity by known modes."""
 
-    def __init__(self, field, width):
-        self.grid = FourierGrid(SlabDecomposition(MPI.COMM_SELF, LENGTH, PLANES), 10)
-        coarse = FourierGrid(SlabDecomposition(MPI.COMM_SELF, LENGTH, CELLS), 10)
-        self.modes, self.width = coarse.to_modes(torch.from_numpy(fields_of(field.velocity))), width
+    def __init__(self, grid, modes, width=SCALES.filter_width):
+        self.grid, self.modes, self.width = grid, modes, width
 
-    def of(self, particles, time):
-        points = self.grid.points(particles.position)
-        return ResolvedFlow(self.grid, self.modes, points, particles.velocity, self.width)
+    def of(self, particles, time=None):
+        relative = particles.velocity - particles.velocity.mean(0)
+        return ResolvedFlow(self.grid, self.modes, self.grid.points(particles.position), relative, self.width)
+
+
+def grid_on(cells, resolved):
+    return FourierGrid(SlabDecomposition(MPI.COMM_SELF, LENGTH, cells), resolved)
+
+
+def terms_of(words, flow, **settings):
+    """A model of these terms, and a term that reads the density."""
+    terms = model({word: settings.get(word, {}) for word in words}, flow).terms.values()
+    return of_terms(*terms, DensityReader(), flow=flow)
+
+
+# ---- closed forms, at the points of a grid, where splines are exact
+
+
+def points():
+    axis = torch.arange(SIDE, dtype=torch.float64) * (LENGTH / SIDE)
+    return torch.cartesian_prod(axis, axis, axis)
+
+
+@torch.no_grad()
+def evaluated(lagrangian, field, velocity=None, position=None):
+    """Rates of particles for a resolved velocity `field`, a function of x, y, z."""
+    grid, position = grid_on(SIDE, RESOLVED), points() if position is None else position
+    x, y, z = map(torch.from_numpy, grid.spectral.coordinates())
+    fields = torch.stack([each.expand(grid.spectral.physical_shape) for each in field(x, y, z)])
+    dynamics = dynamics_of(grid.decomposition, lagrangian, 0.1)
+    dynamics.resolution = Known(grid, grid.to_modes(fields))
+    velocity = torch.zeros_like(position) if velocity is None else velocity
+    return dynamics.rates(ParticleSet(torch.arange(len(position)), position, velocity))
+
+
+def waves(x, y, z):
+    """Wavenumber 2 in the first component, 5 = |(3, 0, 4)| in the second, 1 in the third."""
+    return torch.sin(2 * y), torch.cos(3 * x) * torch.cos(4 * z), torch.cos(y)
+
+
+def vortices(x, y, z):
+    return torch.sin(y), torch.sin(x), torch.zeros_like(x)
+
+
+UNITS = FlowUnits(SCALES, CUTOFF, NEIGHBORS)
+
+
+@one_rank
+def test_pressure_and_density_of_known_vortices(comm):
+    """u = (sin y, sin x, 0): lap p = -2 cos x cos y, so p = cos x cos y."""
+    x, y, _ = points().T
+    rates = evaluated(terms_of(["pressure"], UNITS), vortices)
+    force = torch.stack([torch.sin(x) * torch.cos(y), torch.cos(x) * torch.sin(y), 0 * x], dim=1)
+    assert torch.allclose(rates.acceleration, force, atol=1e-12)
+    expected = SCALES.density_mean * (1 + torch.cos(x) * torch.cos(y) / SCALES.sound_speed**2)
+    assert torch.allclose(rates.density, expected, atol=1e-14)
+    assert set(given(evaluated(model(pressure={}, stress={}), vortices))) == {"acceleration"}  # no unused density
+
+
+@one_rank
+@every_form
+def test_stress_of_two_waves_at_an_angle(comm, form):
+    """A filter exp(-k^2 d^2 / 24) hides exp(-p.q d^2/12) - 1 of the product of waves p and q, to leading order
+    -p.q d^2/12. The waves of u = (sin(x + y), -sin(x + y), sin x) give T = tau_zx = -tau_zy with cos y, the difference,
+    and cos(2x + y), the sum; p.q = -1 and 1. The force is d_y T - d_x T along z, without a pressure."""
+    x, y, _ = points().T
+    h = SCALES.filter_width**2 / 12
+    apart, together = (math.expm1(h), math.expm1(-h)) if form == "deconvolution" else (h, -h)
+    expected = -(apart * torch.sin(y) + together * torch.sin(2 * x + y)) / 2
+    rates = evaluated(terms_of(["stress"], UNITS, stress=dict(form=form)),
+                      lambda x, y, z: (torch.sin(x + y), -torch.sin(x + y), torch.sin(x)))
+    assert torch.allclose(rates.acceleration, torch.stack([0 * x, 0 * x, expected], dim=1), atol=1e-13)
+    assert (rates.density - SCALES.density_mean).abs().max() < 1e-15
+
+
+def damping_unit(square, wavenumber):
+    """k_c times the rms of a component of the one wave above k_c / 2, before the filter; its filtered mean square."""
+    return RESOLVED * math.sqrt(square * math.exp(wavenumber**2 * SCALES.filter_width**2 / 12) / 3)
+
+
+@one_rank
+def test_damping_and_viscosity_have_the_rate_of_each_wavenumber(comm):
+    lagrangian, nu = model(damping={}), SCALES.viscosity
+    with torch.no_grad():
+        lagrangian.terms["damping"].rates.copy_(torch.tensor([0.3, 1.1, 0.0, 0.0, 0.7, 0.0], dtype=torch.float64))
+    damped, viscous = (evaluated(each, waves).acceleration for each in (lagrangian, model(viscosity={})))
+    unit = damping_unit(square=1 / 4, wavenumber=5)
+    for component, (wave, rate, squared) in enumerate(zip(waves(*points().T), (1.1, 0.7, 0.3), (4, 25, 1))):
+        assert torch.allclose(damped[:, component], -unit * rate * wave, rtol=1e-12, atol=1e-11)
+        assert torch.allclose(viscous[:, component], -nu * squared * wave, atol=1e-12)
+
+
+@one_rank
+def test_damping_is_linear_between_its_rates_and_in_the_small_scales(comm):
+    def wave(x, y, z):  # |k| = sqrt(10)
+        return torch.zeros_like(x), torch.zeros_like(x), torch.cos(x) * torch.sin(3 * y)
+
+    force = evaluated(model(damping={}), wave).acceleration
+    share = 10**0.5 - 3
+    rate = float((1 - share) * RATES[2] + share * RATES[3]) * damping_unit(square=1 / 4, wavenumber=10**0.5)
+    assert torch.allclose(force[:, 2], -rate * wave(*points().T)[2], rtol=1e-12, atol=1e-12)
+
+    def damped(large, small):
+        return evaluated(model(damping={}), lambda x, y, z: (
+            large * torch.sin(y), small * torch.sin(5 * z), torch.cos(2 * x))).acceleration[:, 2]
+
+    assert torch.allclose(damped(1.0, 0.3), 3 * damped(7.0, 0.1), atol=1e-12) and damped(1.0, 0.3).abs().max() > 0.01
+    assert damped(1.0, 0.0).abs().max() < 1e-12  # no wave above half of the highest
+
+
+@one_rank
+def test_relaxation_removes_the_unresolved_velocity_and_conserves_momentum(comm):
+    """Among points of the grid, and among random particles, whose resolved velocity has a mean."""
+    generator = torch.Generator().manual_seed(1)
+    scattered = LENGTH * torch.rand((300, 3), dtype=torch.float64, generator=generator)
+    lagrangian = model(relaxation={})
+    with torch.no_grad():
+        lagrangian.terms["relaxation"].factor.fill_(1.5)
+    rate = 1.5 * 2 * math.sqrt((1 / 2 + 1 / 4 + 1 / 2) / 3) / SCALES.filter_width
+    for position, error in ((points(), 1e-12), (scattered, 0.1)):  # splines are not exact among scattered particles
+        missing = 0.1 * torch.randn(position.shape, dtype=torch.float64, generator=generator) + 0.3
+        force = evaluated(lagrangian, waves, torch.stack(waves(*position.T), dim=1) + missing, position).acceleration
+        assert torch.allclose(force, -rate * (missing - missing.mean(0)), atol=error)
+        assert force.sum(0).abs().max() < 1e-12 * force.abs().sum()
+
+
+# ---- the exact filtered equations
+
+MODES, PLANES, NU = random_velocity(4), 48, 0.05
+POSITION = LENGTH * np.random.default_rng(2).random((400, 3))
+ALL = ("pressure", "stress", "viscosity")
+
+
+def units(width, spacing=SCALES.spacing):
+    return FlowUnits(replace(SCALES, filter_width=width, spacing=spacing, viscosity=NU), CUTOFF, NEIGHBORS)
 
 
 def particles_in(field, position):
@@ -52,130 +183,110 @@ def particles_in(field, position):
 
 
 @torch.no_grad()
-def found(field, width, position, *words, form="gradient"):
-    """Acceleration and density by terms where the resolved velocity is exact."""
-    slab = SlabDecomposition(MPI.COMM_SELF, LENGTH, PLANES)
-    dynamics = ParticleDynamics(slab, lagrangian(width, *words, form=form), 0.1)
-    dynamics.resolution = Known(field, width)
-    rates = dynamics.rates(particles_in(field, position))
-    return rates.acceleration.numpy(), rates.density.numpy()
+def found(field, width, *words, form="gradient"):
+    """Acceleration, and pressure from the density, of terms with the exact resolved velocity."""
+    lagrangian, grid = terms_of(words, units(width), stress=dict(form=form)), grid_on(PLANES, 10)
+    dynamics = ParticleDynamics(grid.decomposition, lagrangian, 0.1)
+    dynamics.resolution = Known(grid, grid_on(CELLS, 10).to_modes(torch.from_numpy(fields_of(field.velocity))), width)
+    rates = dynamics.rates(particles_in(field, POSITION))
+    return rates.acceleration.numpy(), (rates.density.numpy() - 1)[:, None] * SCALES.sound_speed**2
 
 
 def error(values, exact):
-    """Relative error but for the mean, which the terms leave out of the force."""
+    """Relative error apart from the mean, which the terms subtract from the force."""
     difference = values - exact
     return np.linalg.norm(difference - difference.mean(0)) / np.linalg.norm(exact - exact.mean(0))
 
 
-def unprojected(field):
-    """-grad p of the resolved velocity and -div tau as it stands, without its pressure: the mistake."""
-    return field.force(NU, hidden=False) - field.stress_divergence()
+def wrong_forces(field):
+    """The force without the stress, and with a stress without its pressure."""
+    resolved = field.force(NU, hidden=False)
+    return resolved, resolved - field.stress_divergence()
 
 
-ALL = "pressure", "stress", "viscosity"
-
-
-def test_the_force_is_that_of_the_filtered_equations_to_the_fourth_power_of_the_width():
-    position = LENGTH * np.random.default_rng(2).random((COUNT, 3))
-    errors = {}
-    for width in (0.2, 0.4, 0.8):
-        field = Filtered(MODES, width)
-        exact = at(field.force(NU), position)
-        errors[width] = error(found(field, width, position, *ALL)[0], exact)
-        # Second order: without the stress, and with a stress whose pressure is left out.
-        for wrong in (field.force(NU, hidden=False), unprojected(field)):
-            assert error(at(wrong, position), exact) > 4 * errors[width]
-    # The gradient model's next order is d^4; at 0.2 the splines' error is of its size.
-    assert 12 < errors[0.8] / errors[0.4] < 20
-    assert errors[0.4] < 2e-3 and errors[0.2] < 3e-4
-
-
-def test_by_deconvolution_force_and_density_are_exact():
-    """All modes are known, so nothing but the splines' error is left, at any width."""
-    position, c = LENGTH * np.random.default_rng(2).random((COUNT, 3)), SCALES.sound_speed
+@one_rank
+def test_by_deconvolution_force_and_density_are_exact(comm):
+    """All modes are known, so only the splines' error is left, at any width."""
     for width in (0.4, 1.6):
         field = Filtered(MODES, width)
-        force, density = found(field, width, position, *ALL, form="deconvolution")
-        exact = at(field.force(NU), position)
-        assert error(force, exact) < 3e-4
-        pressure = at(field.pressure[None], position)[:, 0]
-        assert np.linalg.norm((density - 1) * c**2 - pressure) < 3e-4 * np.linalg.norm(pressure)
-        # Without the stress's pressure, and without the stress, it is another force.
-        for wrong in (unprojected(field), field.force(NU, hidden=False)):
-            assert error(at(wrong, position), exact) > 0.02
+        exact, pressure = at(field.force(NU), POSITION), at(field.pressure[None], POSITION)
+        force, by_density = found(field, width, *ALL, form="deconvolution")
+        assert error(force, exact) < 3e-4 and error(by_density, pressure) < 3e-4
+        assert all(error(at(wrong, POSITION), exact) > 0.02 for wrong in wrong_forces(field))
 
 
-def test_the_stress_of_the_terms_without_projection_is_another_force():
-    """The terms' own modes of div tau, not projected, differ from the exact force as much as no stress does."""
-    width, position = 0.4, LENGTH * np.random.default_rng(2).random((COUNT, 3))
-    field = Filtered(MODES, width)
-    known, exact = Known(field, width), at(field.force(), position)
-    grid = known.grid
-    slopes = grid.slopes(known.modes)
-    divergence = grid.stress_divergence(width**2 / 12 * grid.products(slopes, slopes))
-    pressure, both = (found(field, width, position, *words)[0] for words in (("pressure",), ("pressure", "stress")))
-    wrong = pressure - grid.at(divergence, torch.from_numpy(position)).numpy()
-    assert error(both, exact) < 2e-3 < 0.02 < error(wrong, exact)
-    without_its_pressure = at(field.force(hidden=False) - field.stress_divergence(), position)
-    assert error(wrong, exact) == pytest.approx(error(without_its_pressure, exact), rel=0.1)
-
-
-def test_the_density_has_the_pressure_of_the_stress():
-    position = LENGTH * np.random.default_rng(2).random((COUNT, 3))
-    errors, c = {}, SCALES.sound_speed
+@one_rank
+def test_the_gradient_model_is_exact_to_the_fourth_power_of_the_width(comm):
+    errors = {}
     for width in (0.4, 0.8):
         field = Filtered(MODES, width)
-        exact = at(field.pressure[None], position)[:, 0]
-        density = found(field, width, position, *ALL)[1]
-        errors[width] = np.linalg.norm((density - 1) * c**2 - exact) / np.linalg.norm(exact)
-        without = found(field, width, position, "pressure")[1]
-        assert np.linalg.norm((without - 1) * c**2 - exact) > 4 * errors[width] * np.linalg.norm(exact)
-    assert 12 < errors[0.8] / errors[0.4] < 20 and errors[0.4] < 2e-3
+        exact, pressure = at(field.force(NU), POSITION), at(field.pressure[None], POSITION)
+        force, by_density = found(field, width, *ALL)
+        errors[width] = np.array([error(force, exact), error(by_density, pressure)])
+        # Wrong forces, and the pressure without that of the stress, are of second order.
+        assert all(error(at(wrong, POSITION), exact) > 4 * errors[width][0] for wrong in wrong_forces(field))
+        assert error(found(field, width, "pressure")[1], pressure) > 4 * errors[width][1]
+    assert (errors[0.4] < 2e-3).all() and ((12 < errors[0.8] / errors[0.4]) & (errors[0.8] / errors[0.4] < 20)).all()
 
 
-def test_force_and_pressure_of_the_exact_stress_are_exact():
-    """-grad p_tau - div tau of the stress itself, to round-off."""
+def test_the_exact_force_satisfies_the_filtered_equations():
+    """-grad p - div tau is u.grad u minus the solenoidal part of div filtered(u u), for the filtered u."""
     field = Filtered(MODES, 0.8)
-    grid = FourierGrid(SlabDecomposition(MPI.COMM_SELF, LENGTH, CELLS), 10)
-    entries = field.stress[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-    hidden = grid.hidden_stress(grid.to_modes(torch.from_numpy(entries)))
-    expected = fields_of(-1j * WAVE * field.hidden_pressure - field.stress_divergence())
-    assert np.allclose(grid.to_fields(hidden.force_modes), expected, rtol=0, atol=1e-12 * np.abs(expected).max())
-    pressure = fields_of(field.hidden_pressure)
-    found = grid.to_fields(hidden.pressure_modes[None])[0]
-    assert np.allclose(found, pressure, rtol=0, atol=1e-12 * np.abs(pressure).max())
-    # Solenoidal: its work on a gradient is nothing.
-    assert np.abs((WAVE * modes_of(expected)).sum(0)).max() < 1e-13 * np.abs(expected).max()
-
-
-def test_the_filtered_equations_hold_for_what_is_called_exact():
-    """-grad p_bar - div tau is u_bar.grad u_bar less the solenoidal part of div filtered(u u): another way to it."""
-    field = Filtered(MODES, 0.8)
-    u_bar = fields_of(field.velocity)
+    u = fields_of(field.velocity)
     slopes = fields_of(1j * WAVE * field.velocity[:, None])
-    products = modes_of(field.stress + u_bar[:, None] * u_bar)
-    change = (1j * WAVE * products).sum(1)
-    squared = np.maximum((WAVE**2).sum(0), 1)
-    solenoidal = change - WAVE * (WAVE * change).sum(0) / squared
-    expected = np.einsum("j...,ij...->i...", u_bar, slopes) - fields_of(solenoidal)
+    change = (1j * WAVE * modes_of(field.stress + u[:, None] * u)).sum(1)
+    solenoidal = change - WAVE * (WAVE * change).sum(0) / np.maximum((WAVE**2).sum(0), 1)
+    expected = np.einsum("j...,ij...->i...", u, slopes) - fields_of(solenoidal)
     force = fields_of(field.force())
     assert np.allclose(force, expected, rtol=0, atol=1e-12 * np.abs(force).max())
-    position = LENGTH * np.arange(CELLS)[:5, None] / CELLS * [1, 0, 0]
-    assert np.allclose(at(field.force(), position), force[:, 0, 0, :5].T, atol=1e-12)
 
 
-def test_the_force_at_particles_that_resolve_their_velocity():
-    """Through the solve: 20^3 particles of wavenumbers up to 3."""
+@one_rank
+def test_the_force_at_particles_that_resolve_their_velocity(comm):
+    """Through the solve: 20^3 particles and wavenumbers up to 3."""
     side, width = 20, 0.8
     position = lattice_positions(3, side, 0, side**3, LENGTH)
     field = Filtered(MODES, width)
-    exact, slab = at(field.force(NU), position), SlabDecomposition(MPI.COMM_SELF, LENGTH, 34)
-    errors = {}
+    exact, slab, errors = at(field.force(NU), position), SlabDecomposition(comm, LENGTH, 34), {}
     with torch.no_grad():
         for form, words in (("deconvolution", ALL), ("gradient", ALL), ("none", ("pressure", "viscosity"))):
-            terms = lagrangian(width, *words, form=form, spacing=LENGTH / side)
-            rates = ParticleDynamics(slab, terms, 0.0).rates(particles_in(field, position))
+            lagrangian = terms_of(words, units(width, LENGTH / side), stress=dict(form=form))
+            rates = ParticleDynamics(slab, lagrangian, 0.0).rates(particles_in(field, position))
             errors[form] = error(rates.acceleration.numpy(), exact)
-    # The gradient model's next order alone is 0.023 of the force.
-    assert errors["deconvolution"] < 0.01 and errors["gradient"] < 0.03
-    assert min(errors["none"], error(at(unprojected(field), position), exact)) > 4 * errors["gradient"]
+    # The next order of the gradient model alone is 0.023 of the force.
+    assert errors["deconvolution"] < 0.01 and errors["gradient"] < 0.03 and errors["none"] > 0.1
+
+
+# ---- forcing
+
+
+def forcing(rate, wavenumber=2.0):
+    return dict(injection=dict(injection_rate=rate, wavenumber=wavenumber))
+
+
+@pytest.mark.mpi(1, 3)
+def test_the_forcing_is_that_of_the_direct_simulation_filtered(comm):
+    side, rate, wavenumber = 10, 0.37, 3.1
+    spacing = LENGTH / side
+    grid = SpectralGrid(SlabDecomposition(comm, LENGTH, 24))
+    velocity, force = random_flow(grid, 3, 1.0, 2.0), np.zeros((3, *grid.spectral_shape), complex)
+    LinearForcing(grid, rate, wavenumber).add(velocity, force)
+    field = FilteredField(grid, 2 * spacing, "quintic")
+    columns = TracerParticles(field, release(grid.decomposition, 5, side, "random"), velocity).columns
+    exact = torch.from_numpy(field.spline.at(field.velocity_coefficients(force), columns["position"]))
+    flow = FlowUnits(replace(SCALES, filter_width=2 * spacing, spacing=spacing), CUTOFF, NEIGHBORS)
+    dynamics = dynamics_of(grid.decomposition, model(forcing(rate, wavenumber), flow))
+    acceleration = dynamics.rates(ParticleSet.from_numpy(columns)).acceleration
+    error, product, square = global_sum(comm, np.array([
+        float((acceleration - exact).square().sum()), float((acceleration * exact).sum()),
+        float(exact.square().sum())]))
+    # The error of the resolved modes. The power of the filtered velocity instead would give 20 to 60 % more.
+    assert error < 0.03**2 * square and product / square == pytest.approx(1, abs=0.02)
+
+
+@one_rank
+def test_particles_at_rest_cannot_be_forced(comm):
+    slab, particles = alone(state(4)[0], torch.zeros(4, 3, dtype=torch.float64))
+    with pytest.raises(TermError, match="no energy"):
+        dynamics_of(slab, model(forcing(1.0))).rates(particles)
+    assert torch.equal(dynamics_of(slab, model(forcing(0.0))).rates(particles).acceleration, particles.velocity)

@@ -1,16 +1,20 @@
-"""Turbulence and steps that are known before a run: against closed forms, and against what runs do."""
+"""Estimates of a scene against closed forms, against runs, and against what is allocated."""
 
 import math
+import tracemalloc
 from dataclasses import replace
 
 import h5py
+import numpy as np
 import pytest
 
-from eddies.clock import ProgressLine
+from eddies.clock import Clock, ProgressLine
 from eddies.scene.scene import Time, load_scene
-from eddies.workflows.foreseen.numbers import expected_allowed_step, expected_step, expected_turbulence, rollout_of
-from eddies.workflows.foreseen.storage import rollout_bytes, trajectory_bytes
-from tests.small_scene import one_model
+from eddies.workflows.foreseen.numbers import expected_step, expected_turbulence, mach, rms_speed, rollout_of
+from eddies.workflows.foreseen.seconds import START, seconds
+from eddies.workflows.foreseen.storage import (FLOW_PROCESS, TORCH_PROCESS, flow_memory, memory, most_disk,
+                                               rollout_bytes, scratch, trajectory_bytes)
+from tests.small_scene import TINY, one_model
 
 SCENE = """
 [flow]
@@ -32,41 +36,40 @@ start = 0
 """
 
 
-def test_expected_turbulence_is_consistent():
+def test_expected_turbulence_agrees_with_the_definitions():
     turbulence = expected_turbulence(load_scene("hit-small"))
     eta, t_eta, nu = turbulence.kolmogorov_length, turbulence.kolmogorov_time, turbulence.viscosity
-    assert eta**2 / t_eta == pytest.approx(nu)
-    assert nu * (1 / t_eta) ** 2 == pytest.approx(turbulence.dissipation_rate)
+    assert eta**2 / t_eta == pytest.approx(nu) and nu / t_eta**2 == pytest.approx(turbulence.dissipation_rate)
     # Pope (2000), Eq. 6.64 with k = 3 u'^2 / 2: Re_lambda^2 = 15 u'^4 / (nu eps)
     assert turbulence.reynolds_lambda**2 == pytest.approx(15 * turbulence.velocity_rms**4 / (nu * 0.5))
+    decaying = expected_turbulence(load_scene("tracers-only"))
+    assert decaying.velocity_rms == 1.0 and decaying.turnover_time == pytest.approx(math.sqrt(2 * math.pi) / 3)
 
 
-def test_random_start_decays_from_its_own_scales():
-    turbulence = expected_turbulence(load_scene("tracers-only"))
-    assert turbulence.velocity_rms == 1.0
-    assert turbulence.turnover_time == pytest.approx(math.sqrt(2 * math.pi) / 3)
+@pytest.mark.parametrize("override, step, limit", [
+    ("time.max_step=0.001", 0.001, "max_step"), ("seed=1", 0.01, "courant"), ("time.step=0.004", 0.004, "step"),
+    ("time.stepper=rk4", 0.02 / 16, "courant")])
+def test_the_step_and_the_key_that_limits_it(override, step, limit):
+    assert expected_step(load_scene("hit-small", [override])) == (pytest.approx(step), limit)
 
 
-@pytest.mark.parametrize("overrides, step, limit", [
-    (["time.max_step=0.001"], 0.001, "max_step"),
-    ([], 0.01, "advection"),
-    (["time.stepper=rk4"], 0.02 / 16, "sound"),
-    (["time.step=0.004"], 0.004, "fixed"),
-])
-def test_what_limits_the_step(overrides, step, limit):
-    found, reason = expected_step(load_scene("hit-small", overrides))
-    assert found == pytest.approx(step) and limit in reason
-
-
-@pytest.mark.mpi(1)
-def test_expected_step_is_the_one_taken_at_the_start(comm):
-    from eddies.clock import Clock
+@pytest.mark.mpi(1, 2)
+def test_speeds_and_steps_are_those_of_the_flow_at_its_start(comm):
+    from eddies.flow.statistics import component_energies
     from eddies.workflows.ground_truth.scene_flow import build_fluid, build_step_limit, initial_state
-    for name in ("taylor-green", "abc"):
-        scene = replace(load_scene(name), time=Time(duration=1e9, max_step=1e3))
+    sound = ["flow.fluid=compressible", "flow.sound_speed=10", "flow.cells=16"]
+    for name, changes in (("taylor-green", []), ("abc", ["initial.wavenumber=2"]), ("shear-wave", []),
+                          ("tracers-only", ["tracers.particles_per_side=8"])):
+        scene = load_scene(name, [*sound, *changes])
         fluid = build_fluid(scene, comm)
-        taken = build_step_limit(scene, fluid.grid)(initial_state(scene, fluid), Clock())
-        assert expected_step(scene)[0] == pytest.approx(taken)
+        state = initial_state(scene, fluid)
+        energy = sum(component_energies(fluid.grid, state[:3]).values())
+        assert rms_speed(scene) == pytest.approx(np.sqrt(2 * energy), rel=1e-6)
+        assert mach(scene) == pytest.approx(np.sqrt(2 * energy) / 10, rel=1e-6)
+        if name in ("taylor-green", "abc"):
+            scene = replace(scene, time=Time(duration=1e9, max_step=1e3))
+            taken = build_step_limit(scene, fluid.grid)(state, Clock())
+            assert expected_step(scene)[0] == pytest.approx(taken)
 
 
 @pytest.fixture(scope="module")
@@ -82,10 +85,8 @@ def folder(comm, tmp_path_factory):
 @pytest.mark.mpi(1)
 @pytest.mark.parametrize("overrides", [
     [], ["simulation.step=0.3"], ["simulation.integrator=verlet", "simulation.step=0.02"],
-    ["simulation.integrator=rk2", "simulation.step=0.04", "simulation.frame_interval=0.02"],
-    ["simulation.integrator=rk4", "simulation.step=0.007"],
-    ["simulation.method=eulerian", "simulation.step=0.015"]])
-def test_a_rollout_takes_the_steps_that_are_expected(comm, folder, overrides, monkeypatch):
+    ["simulation.integrator=rk4", "simulation.step=0.007"], ["simulation.method=eulerian", "simulation.step=0.015"]])
+def test_runs_take_the_steps_and_bytes_that_are_expected(comm, folder, overrides, monkeypatch):
     from eddies.workflows import simulate
     shown = []
     monkeypatch.setattr(ProgressLine, "__call__", lambda self, done, step: shown.append((done, step)))
@@ -97,33 +98,76 @@ def test_a_rollout_takes_the_steps_that_are_expected(comm, folder, overrides, mo
     assert (rollout.steps, rollout.intervals) == (found["steps"], frames - 1)
     assert rollout.time_step == pytest.approx(found["time_step"])
     assert rollout.evaluations == found.get("evaluations", 0)
-    # Of files this small, a third is headers and words.
-    assert (folder / "rollout.h5").stat().st_size == pytest.approx(rollout_bytes(scene, rollout), rel=0.5)
-    # Progress is shown by time, so it is told after every step, and not only at frames.
+    with h5py.File(folder / "ground_truth.h5") as file:
+        frames = len(file["particles/tracers/time"])
+    # A third of files this small is headers and text.
+    for name, size in (("rollout", rollout_bytes(scene, rollout)), ("ground_truth", trajectory_bytes(scene, frames))):
+        assert (folder / f"{name}.h5").stat().st_size == pytest.approx(size, rel=0.5)
+    # The progress line is called after every step, not only at frames.
     assert [step for _, step in shown] == list(range(1, rollout.steps + 1))
     assert all(0 < done <= 1 for done, _ in shown)
 
 
-@pytest.mark.mpi(1)
-def test_frames_of_a_ground_truth_take_the_bytes_that_are_expected(folder):
-    scene = load_scene(folder / "short.toml")
-    with h5py.File(folder / "ground_truth.h5") as file:
-        frames = len(file["particles/tracers/time"])
-    assert (folder / "ground_truth.h5").stat().st_size == pytest.approx(trajectory_bytes(scene, frames), rel=0.5)
-
-
-def test_rollouts_of_methods_of_the_users_are_not_known(own):
-    own("own_method", "class Own:\n    has_density = needs = ()\n"
-                      "    advance = frame = status = series = description = 0\n")
-    for changes in (["simulation.method=own_method:Own"], ["flow.viscosity=0"]):
+def test_what_is_unknown_is_none(own):
+    own("own_flow", "class Own:\n    has_density = needs = ()\n"
+                    "    advance = frame = status = series = description = 0\n"
+                    "def swirl(grid, initial, seed): pass\n")
+    for changes in (["simulation.method=own_flow:Own"], ["flow.viscosity=0"]):
         assert rollout_of(one_model("hit-small", changes)) is None
     assert rollout_of(load_scene("taylor-green")) is None
+    assert seconds(load_scene("taylor-green", ["initial.kind=own_flow:swirl"]), "dns", 1) > 0  # a fixed step
+    assert seconds(load_scene("hit-small", ["initial.kind=own_flow:swirl", "flow.viscosity=0"]), "dns", 1) is None
 
 
-def test_particles_of_a_decaying_flow_may_take_longer_steps():
-    free, forced = (expected_allowed_step(one_model("hit-small", [f"simulation.injection={name}"]))
-                    for name in ("none", "dissipation"))
-    assert 1.1 * forced < free < 1.5 * forced
-    turbulence, interval = expected_turbulence(load_scene("hit-small")), 1e-4
-    lost = 1.5 * (turbulence.decayed(0.0)**2 - turbulence.decayed(interval)**2) / interval
-    assert lost == pytest.approx(turbulence.dissipation_rate, rel=1e-3)
+@pytest.mark.mpi(1, 2)
+@pytest.mark.parametrize("fluid", ["compressible", "incompressible"])
+def test_memory_of_a_step_is_as_expected(comm, fluid):
+    """Arrays that a state, its operators and buffers hold, as counted by the allocator."""
+    from eddies.time_stepping import ETDRK4
+    from eddies.workflows.ground_truth.scene_flow import build_fluid, build_step_limit, initial_state
+    changes = ["flow.cells=48", f"flow.fluid={fluid}", "initial.kind=taylor-green"]
+    scene = load_scene("taylor-green", changes + (["flow.sound_speed=10"] if fluid == "compressible" else []))
+    tracemalloc.start()
+    equation = build_fluid(scene, comm)
+    stepper, state = ETDRK4(equation), initial_state(scene, equation)
+    stepper(state, build_step_limit(scene, equation.grid)(state, Clock()))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    expected = flow_memory(scene, comm.size) - FLOW_PROCESS
+    assert 0.4 * expected < peak < 1.1 * expected
+
+
+def test_memory_falls_with_the_ranks_and_grows_with_the_frames():
+    scene = load_scene("hit-small")
+    for stage in ("dns", "train-kernel", "train", "find-step", "simulate"):
+        sizes = [memory(scene, stage, ranks) for ranks in (1, 2, 4, 12)]
+        assert sizes == sorted(sizes, reverse=True) and sizes[-1] > FLOW_PROCESS
+    few, many = (memory(load_scene("hit-small", [f"training.frames={frames}"]), "train", 1) - TORCH_PROCESS
+                 for frames in (16, 34))
+    assert many == pytest.approx(2 * few)
+
+
+def test_the_disk_of_the_worst_moment():
+    scene = load_scene("taylor-green", ["flow.cells=256"])
+    assert most_disk([(scene, "dns")]) > scratch(scene) > 256**3
+    scene = load_scene(TINY)
+    assert most_disk([(scene, "dns"), (scene, "simulate")] * 2) > 2 * most_disk([(scene, "simulate")])
+
+
+@pytest.mark.parametrize("stage, override", [
+    ("dns", "tracers.turnovers=9.6"), ("train-kernel", "kernel.steps=800"), ("train", "training.frames=64"),
+    ("train", "training.horizons.steps=10"), ("train", "model.preset=resolved + pairs"),
+    ("simulate", "simulation.step=0.01"), ("find-step", "model.preset=resolved + pairs"),
+    ("report", "simulation.turnovers=3")])
+def test_more_work_takes_longer_and_more_ranks_less(stage, override):
+    given = [] if stage == "find-step" else ["simulation.step=0.13"]
+    once, more = one_model("hit-small", given), one_model("hit-small", [*given, override])
+    assert seconds(more, stage, 1) > 1.05 * seconds(once, stage, 1)
+    assert START[stage] < seconds(more, stage, 2) < seconds(more, stage, 1)
+
+
+def test_times_of_large_and_of_shortened_stages():
+    """The paper's case takes most of a day on 256 ranks: docs/clusters.md."""
+    assert 6 < seconds(load_scene("hit-paper"), "dns", 256) / 3600 < 50
+    taken = one_model("hit-small", ["model.path=somewhere"])
+    assert START["train"] < seconds(taken, "train", 1) < 0.5 * seconds(one_model("hit-small"), "train", 1)

@@ -6,8 +6,8 @@ import pytest
 
 from eddies.errors import UserError
 from eddies.scene.scene import load_scene
-from eddies.workflows.foreseen.problems import refusals
 from eddies.workflows.ground_truth.scene_flow import build_fluid, initial_state
+from tests.small_scene import problems_of
 
 STORED, CELLS = 12, 16
 
@@ -129,7 +129,7 @@ def test_an_unfit_file_is_refused_by_check_and_run(comm, path):
         with pytest.raises(UserError, match=message) as error:
             start(comm, path)
         scene = load_scene("taylor-green", ["flow.cells=16", "initial.kind=file", f"initial.path={path}"])
-        line, = refusals(scene, comm)
+        (line,), _ = problems_of(scene, comm)
         assert line == str(error.value) and line.startswith(f"{path}: "), case
         comm.Barrier()
 

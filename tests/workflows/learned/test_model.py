@@ -17,6 +17,7 @@ from eddies.scene.scene import Model, SceneError, load_scene
 from eddies.scene.terms import PRESETS
 from eddies.workflows.learned.model import initial_model, load_form, load_kernel, load_model, take_from_first_rank
 from eddies.workflows.learned.source import ModelDefinition
+from eddies.workflows.run_directory.fingerprints import stage_provenance
 from eddies.workflows.train_kernel import keep_form
 from tests.small_scene import TINY
 
@@ -187,7 +188,7 @@ def test_another_form_of_reconstruction_keeps_weights_and_id(comm, tmp_path):
     identity, distance = product_provenance(path)["id"], torch.linspace(0, 0.8, 50)
     assert type(load_form(comm, path, SCALES)).__name__ == "Average"
     for form, kind in (("quadratic", "LeastSquares"), ("kriging", "Kriging"), ("kriging", "Kriging")):
-        keep_form(comm, path, form, load_scene(TINY, [f"kernel.form={form}"]).provenance("train-kernel"))
+        keep_form(comm, path, form, stage_provenance(load_scene(TINY, [f"kernel.form={form}"]), "train-kernel"))
         loaded = load_form(comm, path, SCALES)
         assert type(loaded).__name__ == kind and loaded.support == pytest.approx(0.7)
         assert product_provenance(path)["id"] == identity

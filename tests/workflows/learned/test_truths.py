@@ -3,7 +3,6 @@
 import json
 import shutil
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,10 +16,9 @@ from eddies.learning.losses import relative_error
 from eddies.parallel.reduction import global_sum
 from eddies.particles.model import FORCING
 from eddies.scene.scene import SceneError, load_scene
-from eddies.stages import Step, check_inputs, check_ranks
+from eddies.stages import Step, check_inputs
 from eddies.workflows import dns, train
-from eddies.workflows.foreseen.problems import warnings
-from eddies.workflows.foreseen.ranks import most_ranks
+from eddies.workflows.foreseen.ranks import most_ranks, rank_problems
 from eddies.workflows.ground_truth.frame_counts import rollout_start
 from eddies.workflows.ground_truth.truth import load_frame
 from eddies.workflows.learned import transfer
@@ -265,10 +263,6 @@ def test_unfit_truths_are_refused_before_any_work(comm, tmp_path):
             check_inputs(Step(scene, ("train",), own), comm)
 
 
-def on_ranks(size):
-    return SimpleNamespace(size=size)
-
-
 @pytest.mark.mpi(1)
 def test_another_truth_limits_the_number_of_ranks(comm, tmp_path):
     """It has 8 planes, the own one 14. Slabs must hold the radius of interaction, 2.5 planes, and the way of particles
@@ -282,15 +276,12 @@ def test_another_truth_limits_the_number_of_ranks(comm, tmp_path):
         alone = scene_of(tmp_path, "tracers.particles_per_side=8", f"model={model}")
         alone = replace(alone, training=replace(alone.training, horizons=None))
         scene = trained_on(alone, tmp_path / "nowhere", tmp_path / "other")
-        check_ranks(("train",), alone, on_ranks(3))
-        check_ranks(("train",), scene, on_ranks(most))
-        with pytest.raises(SceneError) as refusal:
-            check_ranks(("train",), scene, on_ranks(3))
-        assert f"({place}: {reason}" in str(refusal.value) and f"at most {most}" in str(refusal.value)
-        assert [f"at most {most}" in line for line in warnings(scene, 3) if "ranks" in line] == [True]
+        assert not [*rank_problems(alone, ("train",), 3), *rank_problems(scene, ("train",), most)]
+        problem, = rank_problems(scene, ("train",), 3)
+        assert f"({place}: {reason}" in problem and f"at most {most}" in problem
         # The own ground truth, and weights of another run, allow more ranks.
-        check_ranks(("dns",), scene, on_ranks(3))
-        check_ranks(("train",), replace(scene, model=replace(scene.model, path="runs/other")), on_ranks(3))
+        taken = replace(scene, model=replace(scene.model, path="runs/other"))
+        assert not [*rank_problems(scene, ("dns",), 3), *rank_problems(taken, ("train",), 3)]
 
     with changed(tmp_path / "other/ground_truth.h5") as file:
         file["reference"].attrs["velocity_rms"] = 30.0

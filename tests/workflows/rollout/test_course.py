@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from eddies.io.frame_segments import FrameSegments
-from eddies.io.guard import Guard
+from eddies.io.checkpoint import Guard
 from eddies.io.hdf5 import create_product, open_product
 from eddies.io.trajectories import Trajectory
 from eddies.particles.particle_set import ParticleSet

@@ -1,1 +1,1 @@
-"""The terms of a particle model, a file each. Nothing here is imported before a scene or a program names it."""
+"""Terms of the particle model. A scene or a program imports them by name."""

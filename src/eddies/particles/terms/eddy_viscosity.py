@@ -1,4 +1,4 @@
-"""The eddy viscosity between two particles: the term Pi of Eq. 3."""
+"""Eddy viscosity and density diffusion between two particles: the terms Pi of Eq. 3."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from eddies.particles.flow_units import FlowUnits
 from eddies.particles.pairs import CompiledSum, ScaledPairs
 from eddies.particles.rates import Rates
 from eddies.particles.terms.pair_basis import (
-    SMALL, acceleration, along_separation, separation_direction, told, window,
+    SMALL, acceleration, along_separation, compiled_switches, density_rate, separation_direction, window,
 )
 from eddies.particles.terms.term import Coefficient, PairTerm
 from eddies.scene import terms as declared
 
-# Softens the approach speed at small distances, in squared units of the reference length.
+# Softens quotients at small distances, in squared units of the filter width.
 SOFTENING = 0.1
-# In the order that the compiled library numbers them.
+# In the order of their numbers in the compiled library.
 FORMS = "two-sided", "monaghan", "bounded"
 
 
 class EddyViscosity(PairTerm):
-    """a_rms times the sum of w Pi b_1, weighted and scaled as that of the pair network, with
+    """a_rms times the sum of w Pi b_1, with weights and scaling as in the pair network, and
 
         Pi = -|a_1| mu + |a_2| mu^2,   mu = x.v / (|x|^2 + 0.1),
 
-    in the units of `ScaledPairs`. A positive Pi pushes apart. The form "two-sided" pushes receding pairs apart as well,
-    by its part mu^2. "bounded" has tanh(x.v) in place of x.v, as in the public code of the paper: the force of a fast
-    pair has a limit. "monaghan" acts on approaching pairs only (mu < 0), as in SPH. Both coefficients are learned.
+    in the units of `ScaledPairs`. A positive Pi repels. In the form "two-sided" the part mu^2 also repels receding
+    pairs. "bounded" replaces x.v by tanh(x.v), as the public code of the paper does: the force of a fast pair has a
+    limit. "monaghan" acts on approaching pairs only (mu < 0), as in SPH. Both coefficients are learned.
     """
 
     Settings = declared.EddyViscosity
@@ -42,37 +42,69 @@ class EddyViscosity(PairTerm):
 
     @property
     def learned_coefficients(self) -> list[Coefficient]:
-        """|a_1| and |a_2|; their values are those of an acceleration by mu in physical units, with b_1 as it is."""
         scales, (linear, quadratic) = self.flow.scales, self.coefficients.detach().abs()
         per_rate = scales.filter_width / scales.velocity
-        return [Coefficient.of("|a_1|", linear, "friction of a pair: acceleration by its rate of approach mu", "L/T",
+        return [Coefficient.of("|a_1|", linear, "friction of a pair: acceleration by its approach rate mu", "L/T",
                                scales.acceleration * per_rate),
                 Coefficient.of("|a_2|", quadratic, "repulsion of a pair: acceleration by mu^2", "L",
                                scales.acceleration * per_rate**2)]
 
-    def strength(self, distance: Tensor, approach: Tensor) -> Tensor:
-        """Pi (m,) from |x| (m,) and x.v (m,)."""
-        if self.settings.form == "bounded":
-            approach = torch.tanh(approach)
-        mu = approach / (distance * distance + SOFTENING)
-        if self.settings.form == "monaghan":
-            mu = torch.clamp(mu, max=0)
-        linear, quadratic = self.coefficients.abs()
-        return mu * (quadratic * mu - linear)
-
     def pair_values(self, pairs: ScaledPairs) -> Tensor:
         """w Pi b_1, (3, m)."""
-        return (window(pairs, self.settings) * self.strength(pairs.distance, pairs.approach)
-                ) * separation_direction(pairs, self.settings)
+        form, approach = self.settings.form, pairs.approach
+        mu = (torch.tanh(approach) if form == "bounded" else approach) / (pairs.distance**2 + SOFTENING)
+        if form == "monaghan":
+            mu = torch.clamp(mu, max=0)
+        linear, quadratic = self.coefficients.abs()
+        strength = window(pairs, self.settings) * mu * (quadratic * mu - linear)
+        return strength * separation_direction(pairs, self.settings)
 
     def compiled(self, context: Context) -> CompiledSum:
-        """The same for the compiled library."""
-        unit, weighted = told(self.settings)
-        # b_1 = x / (unit |x| + length)
-        length = SMALL if unit else 1.0
+        unit, weighted = compiled_switches(self.settings)
+        length = SMALL if unit else 1.0  # b_1 = x / (unit |x| + length)
         return CompiledSum("eddy-viscosity", (FORMS.index(self.settings.form), SOFTENING, weighted, unit, length),
                            self.coefficients.abs())
 
     def rates_of(self, sums: Tensor, context: Context) -> Rates:
-        """The acceleration."""
         return Rates(acceleration(along_separation(sums, self.settings, context), context))
+
+
+class DensityDiffusion(PairTerm):
+    """d rho_i/dt = -r_rms s sum_j w (|b_1| + |b_2| |q|) q with q = (rho'_i - rho'_j) / (|x|^2 + 0.1), in the units of
+    `ScaledPairs`, as in the public code of the paper.
+
+    r_rms is the rms of the density rate; w and s are window and scaling as in PairNetwork. One particle of a pair gains
+    what the other loses. Both coefficients are learned.
+    """
+
+    Settings = declared.DensityDiffusion
+    settings: declared.DensityDiffusion
+    parity, mutual = -torch.ones(1), True
+
+    def __init__(self, settings: declared.DensityDiffusion, flow: FlowUnits) -> None:
+        super().__init__(settings, flow)
+        self.coefficients = nn.Parameter(torch.full((2,), 0.1, dtype=torch.float64))
+
+    @property
+    def learned_coefficients(self) -> list[Coefficient]:
+        scales, (linear, quadratic) = self.flow.scales, self.coefficients.detach().abs()
+        rate = scales.required("density_rate")
+        per_difference = scales.filter_width**2 / scales.required("density")
+        return [Coefficient.of("|b_1|", linear, "diffusion of the density: its rate by the difference q of a pair",
+                               "L^2/T", rate * per_difference),
+                Coefficient.of("|b_2|", quadratic, "nonlinear diffusion of the density: its rate by |q| q",
+                               "L^7/(M T)", rate * per_difference**2)]
+
+    def pair_values(self, pairs: ScaledPairs) -> Tensor:
+        """-w (|b_1| + |b_2| |q|) q, (1, m)."""
+        own, other = pairs.densities
+        q = (own - other) / (pairs.distance**2 + SOFTENING)
+        linear, quadratic = self.coefficients.abs()
+        return -(window(pairs, self.settings) * (linear + quadratic * q.abs()) * q)[None]
+
+    def compiled(self, context: Context) -> CompiledSum:
+        return CompiledSum("density-diffusion", (SOFTENING, compiled_switches(self.settings)[1]),
+                           self.coefficients.abs(), (context.density_fluctuation,), reads_velocity=False)
+
+    def rates_of(self, sums: Tensor, context: Context) -> Rates:
+        return density_rate(sums, self.settings, context)

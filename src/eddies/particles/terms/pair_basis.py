@@ -1,4 +1,4 @@
-"""Weights, directions and scaling of sums over neighbours, and how networks of pairs are made."""
+"""Weights, directions and scaling of sums over neighbours, and the networks of pairs."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from eddies.particles.periodic_box import safe_norm
 from eddies.particles.rates import Rates
 from eddies.scene.terms import ForceSum, NetworkSettings, PairSum, TermError
 
-# Added to |x| and |v| where vectors are divided by their length, so that coincident particles have no direction.
+# Added to |x| and |v| in unit vectors, so that coincident particles have no direction.
 SMALL = 1e-6
 
 
 def window(pairs: ScaledPairs, settings: PairSum) -> Tensor:
-    """w (m,), the factor of each pair: (1 - q^2)^2, or 1 within the radius of interaction."""
+    """Factor w (m,) of each pair: (1 - q^2)^2, or 1 within the radius of interaction."""
     return pairs.weight if settings.window == "smooth" else (pairs.weight > 0).to(pairs.weight)
 
 
@@ -42,55 +42,58 @@ def scaled(sums: Tensor, settings: PairSum, context: Context) -> Tensor:
 
 
 def along_separation(sums: Tensor, settings: ForceSum, context: Context) -> Tensor:
-    """sum_j w f b_1 (3, k), scaled; in the basis "corrected" times the inverse of M_i = sum_j w x x^T, which makes a
-    derivative of the differences between irregular particles."""
+    """Sums sum_j w f b_1 (3, k), scaled.
+
+    In the basis "corrected" the factor is the inverse of M_i = sum_j w x x^T instead: differences between irregular
+    particles then give a derivative.
+    """
     if settings.basis == "corrected":
         return moments.apply_symmetric(context.moments.inverse, sums)
     return scaled(sums, settings, context)
 
 
 def along_velocity(sums: Tensor, settings: ForceSum, context: Context) -> Tensor:
-    """sum_j w f b_2 (3, k), scaled; in the basis "corrected" over sum_j w."""
+    """Sums sum_j w f b_2 (3, k), scaled; in the basis "corrected" divided by sum_j w."""
     return sums / context.moments.weight if settings.basis == "corrected" else scaled(sums, settings, context)
 
 
 def density_rate(sums: Tensor, settings: PairSum, context: Context) -> Rates:
-    """A dimensionless rate of density (1, k), scaled, in the units of the flow."""
+    """Dimensionless sums (1, k), scaled, as a density rate in the units of the flow."""
     rate = context.flow.scales.required("density_rate") * scaled(sums[0], settings, context)
     return Rates(density_rate=rate.to(context.particles.velocity.dtype))
 
 
-def told(settings: PairSum) -> tuple[float, float]:
-    """Two numbers for the compiled library: 1 for unit vectors, and 1 for weighted pairs; else 0."""
-    return getattr(settings, "basis", "") == "unit", settings.window == "smooth"
-
-
 def acceleration(scaled: Tensor, context: Context) -> Tensor:
-    """A dimensionless acceleration (3, k) in the units of the flow, (k, 3)."""
+    """Dimensionless acceleration (3, k) in the units of the flow, (k, 3)."""
     return (context.flow.scales.acceleration * scaled.T).to(context.particles.velocity.dtype)
 
 
-def compiled_network(network: nn.Module, settings: NetworkSettings, outputs: int, symmetric: bool,
-                     context: Context, sign: bool = False) -> CompiledSum | None:
-    """The sum of a term with a network for the compiled library; None for a network of a user's class.
+def compiled_switches(settings: PairSum) -> tuple[float, float]:
+    """Two numbers for the compiled library: 1 for unit vectors, else 0; and 1 for weighted pairs, else 0."""
+    return getattr(settings, "basis", "") == "unit", settings.window == "smooth"
 
-    The network has one or two `outputs`. `sign`: its output is multiplied by the sign of the density difference.
+
+def compiled_network(network: nn.Module, settings: NetworkSettings, outputs: int, symmetric: bool, context: Context,
+                     sign: bool = False) -> CompiledSum | None:
+    """Sum of a term with a network for the compiled library; None for a network of a user's class.
+
+    The network has one or two `outputs`. With `sign` the output is multiplied by the sign of the density difference.
     """
     if type(network) is not DenseNetwork:
         return None
     layers = list(zip(network.weights, network.biases))
     inputs = [name in settings.inputs for name in ("density", "distance", "speed", "approach")]
-    return CompiledSum("pair-network", (outputs, symmetric, *inputs, *told(settings), sign,
+    return CompiledSum("pair-network", (outputs, symmetric, *inputs, *compiled_switches(settings), sign,
                                         *(len(bias) for _, bias in layers[:-1])),
                        torch.cat([parameter.flatten() for layer in layers for parameter in layer]),
                        (context.density_fluctuation,) if inputs[0] or sign else ())
 
 
 def build_network(settings: NetworkSettings, outputs: int, seed: int) -> nn.Module:
-    """The network of a term's settings: from features (inputs, m) of pairs to outputs (outputs, m).
+    """Build the network of a term: from features (inputs, m) of pairs to outputs (outputs, m).
 
-    One of the user's own is made as Network(inputs, hidden, outputs, seed). Raises TermError if it cannot be, or is no
-    torch.nn.Module.
+    A network of the user is made as Network(inputs, hidden, outputs, seed). Raises TermError if that fails, or if the
+    class is no torch.nn.Module.
     """
     inputs = len(settings.inputs) + ("density" in settings.inputs)
     if not is_path(settings.network):

@@ -1,21 +1,20 @@
-"""What a scene amounts to before it is run: its turbulence, and the steps of its direct simulation and its rollout."""
+"""Estimates of a scene before it runs: its turbulence, and the steps of its direct simulation and of its rollout."""
 
 import math
 from dataclasses import dataclass
 
 from eddies.clock import ladder_step
 from eddies.particles.flow_units import allowed_step, resolved_wavenumber
-from eddies.scene.methods import METHODS
+from eddies.scene.sections import METHODS
 from eddies.scene.scene import BOX_LENGTH, Eulerian, Scene
 
 DISSIPATION_CONSTANT = 0.5   # C_eps = eps L / u'^3 of developed turbulence
-DECAY_EXPONENT = 1.2         # of the energy of turbulence that nothing forces (Saffman 1967)
-PEAK_SPEED = 7.0             # max(|u| + |v| + |w|) over u' in turbulence: four rms in each component at worst
+PEAK_SPEED = 7.0             # max(|u| + |v| + |w|) over u' in turbulence: at most four rms in each component
 
 
 @dataclass(frozen=True)
 class ExpectedTurbulence:
-    """Turbulence that a scene is expected to develop, from u' and eps; L from eps = C_eps u'^3 / L."""
+    """Expected turbulence of a scene, from u', eps and nu; the integral scale follows from eps = C_eps u'^3 / L."""
 
     velocity_rms: float
     dissipation_rate: float
@@ -41,23 +40,17 @@ class ExpectedTurbulence:
         """Re_lambda = u' lambda / nu with lambda = (15 nu u'^2 / eps)^(1/2)."""
         return self.velocity_rms**2 * math.sqrt(15 / (self.viscosity * self.dissipation_rate))
 
-    def decayed(self, time: float) -> float:
-        """u' a time after the forcing has ended: the energy E falls as (1 + eps t / (n E))^-n, n = DECAY_EXPONENT."""
-        energy = 1.5 * self.velocity_rms**2
-        lost = self.dissipation_rate * time / (DECAY_EXPONENT * energy)
-        return self.velocity_rms * (1 + lost) ** (-DECAY_EXPONENT / 2)
-
 
 def largest_wavenumber(scene: Scene) -> int:
-    """k_max kept by the 2/3 rule: the largest integer below cells / 3."""
+    """k_max of the 2/3 rule: the largest integer below cells / 3."""
     return (scene.flow.cells - 1) // 3
 
 
 def expected_turbulence(scene: Scene) -> ExpectedTurbulence | None:
-    """Turbulence kept up by the forcing, or decaying from a random start; None of other flows.
+    """Turbulence that the forcing sustains, or that decays from a random start; None for other flows.
 
-    The integral scale is sqrt(2 pi) / k with k of the forcing or of the initial peak, which is exact for the initial
-    spectrum and holds within some 10 % for forced turbulence.
+    The integral scale is sqrt(2 pi) / k, with k of the forcing or of the initial peak. This is exact for the initial
+    spectrum and holds within about 10 % for forced turbulence.
     """
     forcing, initial, viscosity = scene.forcing, scene.initial, scene.flow.viscosity
     if viscosity == 0:
@@ -73,7 +66,7 @@ def expected_turbulence(scene: Scene) -> ExpectedTurbulence | None:
 
 
 def peak_speed(scene: Scene) -> float | None:
-    """Expected largest |u| + |v| + |w|; None without forcing for a flow from a file or of the user's."""
+    """Expected maximum of |u| + |v| + |w|; None for a flow from a file or of the user's without forcing."""
     initial, turbulence = scene.initial, expected_turbulence(scene)
     if turbulence or initial.flow.turbulent:
         return PEAK_SPEED * (turbulence.velocity_rms if turbulence else initial.amplitude)
@@ -83,8 +76,7 @@ def peak_speed(scene: Scene) -> float | None:
 
 
 def rms_speed(scene: Scene) -> float | None:
-    """Expected root mean square of the velocity, of all its components; None without forcing for a flow from a file or
-    of the user's, and where sound is all that moves."""
+    """Expected rms of the velocity vector; None where `peak_speed` is None, and for a pure sound wave."""
     initial, turbulence = scene.initial, expected_turbulence(scene)
     if turbulence:
         return math.sqrt(3) * turbulence.velocity_rms
@@ -92,7 +84,7 @@ def rms_speed(scene: Scene) -> float | None:
 
 
 def mach(scene: Scene) -> float | None:
-    """The expected turbulent Mach number; None without sound."""
+    """Expected turbulent Mach number; None without sound."""
     speed = rms_speed(scene)
     return speed / scene.flow.sound_speed if speed is not None and scene.flow.sound_speed else None
 
@@ -100,45 +92,38 @@ def mach(scene: Scene) -> float | None:
 # ---- the direct simulation
 
 
-def explicit_sound(scene: Scene) -> float:
-    """sqrt(3) c where the stepper must resolve sound, else 0."""
-    return math.sqrt(3) * scene.flow.sound_speed if scene.time.explicit and scene.flow.sound_speed else 0.0
-
-
 def courant_bound(scene: Scene) -> float | None:
-    """The longest step of the direct simulation by its Courant number; None where the speed is not known."""
-    speed = peak_speed(scene)
+    """Longest step that the Courant number allows; None where the speed is unknown. An explicit stepper resolves
+    sound."""
+    speed, sound = peak_speed(scene), scene.flow.sound_speed if scene.time.explicit else None
     return None if speed is None else (
-        scene.time.courant * BOX_LENGTH / scene.flow.cells / (speed + explicit_sound(scene)))
+        scene.time.courant * BOX_LENGTH / scene.flow.cells / (speed + math.sqrt(3) * (sound or 0.0)))
 
 
 def expected_step(scene: Scene) -> tuple[float, str] | None:
-    """The time step of the direct simulation and what limits it; None where the speed is not known."""
+    """Time step of the direct simulation and the key of [time] that limits it; None where the speed is unknown."""
     settings, bound = scene.time, courant_bound(scene)
     if settings.step is not None:
-        return settings.step, "fixed by [time] step"
+        return settings.step, "step"
     if bound is None:
         return None
-    if bound >= settings.max_step:
-        return settings.max_step, "limited by [time] max_step"
-    limit = "sound, which rk4 must resolve" if explicit_sound(scene) > peak_speed(scene) else "advection"
-    return ladder_step(settings.max_step, bound), f"limited by {limit}: at most {bound:.3g}"
+    return ladder_step(settings.max_step, bound), "max_step" if bound >= settings.max_step else "courant"
 
 
 def time_of(scene: Scene, turnovers: float) -> float | None:
-    """Physical time of so many turnovers; None where the turnover time is not known."""
+    """Physical time of a number of turnovers; None where the turnover time is unknown."""
     turbulence = expected_turbulence(scene)
     return turbulence and turnovers * turbulence.turnover_time
 
 
 def run_time(scene: Scene) -> float | None:
-    """Physical time that the direct simulation covers; None where the turnover time is not known."""
+    """Physical time that the direct simulation covers; None where the turnover time is unknown."""
     parts = [time_of(scene, part.turnovers) for part in (scene.spin_up, scene.tracers) if part]
     return None if None in parts else sum(parts) + (scene.time.duration or 0.0)
 
 
 def tracer_intervals(scene: Scene) -> int | None:
-    """Frame intervals through which tracers are followed, 0 without tracers; None where that is not known."""
+    """Number of frame intervals of the tracers, 0 without tracers; None where the turnover time is unknown."""
     if scene.tracers is None:
         return 0
     span = time_of(scene, scene.tracers.turnovers)
@@ -146,8 +131,8 @@ def tracer_intervals(scene: Scene) -> int | None:
 
 
 def flow_steps(scene: Scene) -> int | None:
-    """Steps of the direct simulation, with tracers equal ones within each frame interval; None where they are not
-    known."""
+    """Number of steps of the direct simulation; None where it is unknown. With tracers, each frame interval is divided
+    into equal steps."""
     expected, span, intervals = expected_step(scene), run_time(scene), tracer_intervals(scene)
     if expected is None or not span:
         return None
@@ -164,8 +149,8 @@ def flow_steps(scene: Scene) -> int | None:
 
 @dataclass(frozen=True)
 class Rollout:
-    """A rollout of so many frame intervals: the longest step taken, how many steps, and the evaluations of the
-    particles' rates that they need (0 on a coarse grid)."""
+    """Number of frame intervals of a rollout, its longest step, its number of steps, and how often it evaluates the
+    rates of the particles (0 on a coarse grid)."""
 
     turnover_time: float
     intervals: int
@@ -175,15 +160,17 @@ class Rollout:
 
 
 def rollout_of(scene: Scene, turnover_time: float | None = None) -> Rollout | None:
-    """The rollout of a scene in a flow of the expected turnover time, or of a given one; None without a rollout, where
-    the turnover time is not known, or where what moves the particles is the user's."""
+    """Rollout of a scene in a flow of the expected turnover time, or of a given one.
+
+    Returns None without a rollout, where the turnover time is unknown, and for a method of the user's.
+    """
     settings, turbulence = scene.simulation, expected_turbulence(scene)
     if settings is None or settings.method not in METHODS or turbulence is None and turnover_time is None:
         return None
     turnover_time = turnover_time or turbulence.turnover_time
     intervals = math.ceil(settings.turnovers * turnover_time / settings.frame_interval - 1e-9)
     step, interval = rollout_step(scene), settings.frame_interval
-    if settings.on_grid or not settings.scheme.dense:  # whole steps between two frames
+    if settings.on_grid or not settings.scheme.dense:  # a whole number of steps between two frames
         within = math.ceil(interval / step - 1e-9)
         step, steps = interval / within, intervals * within
     else:
@@ -193,8 +180,8 @@ def rollout_of(scene: Scene, turnover_time: float | None = None) -> Rollout | No
 
 
 def rollout_step(scene: Scene) -> float:
-    """The time step of the particles: the scene's, or where that is less what their resolved velocity can follow, or
-    the Courant number on a coarse grid allows. Where it is still to be found, at most a frame interval is expected."""
+    """Time step of the particles: the scene's, unless the resolved velocity or the Courant number of a coarse grid
+    demands a shorter one. A step that is still to be found counts as one frame interval at most."""
     settings, allowed = scene.simulation, None
     if settings.on_grid:
         cells, speed = (scene.eulerian or Eulerian()).cells_for(scene.tracers.filter_width), peak_speed(scene)
@@ -206,7 +193,7 @@ def rollout_step(scene: Scene) -> float:
 
 
 def resolved_shells(scene: Scene) -> int:
-    """Highest wavenumber, along each axis, of the velocity that the particles resolve."""
+    """Largest wavenumber along each axis of the resolved velocity of the particles."""
     tracers, turbulence = scene.tracers, expected_turbulence(scene)
     highest = resolved_wavenumber(tracers.spacing, tracers.filter_width,
                                   turbulence.kolmogorov_length if turbulence else 0.0)
@@ -214,14 +201,7 @@ def resolved_shells(scene: Scene) -> int:
 
 
 def expected_allowed_step(scene: Scene) -> float | None:
-    """The longest time step that particles with a resolved velocity can take in the expected turbulence, in the middle
-    of their rollout where it decays; None where it is not known."""
-    settings, turbulence = scene.simulation, expected_turbulence(scene)
-    if turbulence is None:
-        return None
-    speed = turbulence.velocity_rms
-    if not scene.injects:
-        start = scene.seen_in(scene.directory) if settings.start is None else settings.start
-        turnovers = start * scene.tracers.turnovers + settings.turnovers / 2
-        speed = turbulence.decayed(turnovers * turbulence.turnover_time)
-    return allowed_step(settings.scheme.angle, resolved_shells(scene), speed)
+    """Longest time step of particles with a resolved velocity, at the speed at which the tracers start; None where that
+    is unknown."""
+    turbulence = expected_turbulence(scene)
+    return turbulence and allowed_step(scene.simulation.scheme.angle, resolved_shells(scene), turbulence.velocity_rms)

@@ -1,4 +1,4 @@
-"""The wall time of a stage, for batch requests: right within a factor of three; `eddies check --time` measures instead.
+"""Wall time of a stage by a formula, for batch requests: within a factor of three. `eddies check --time` measures.
 
     seconds = START + (transforms x TRANSFORM + pairs x (PAIR + weights x WEIGHT)) / ranks
             + calls x (CALL + ROUNDS x (ranks - 1) x MESSAGE)
@@ -7,44 +7,44 @@
 from itertools import pairwise
 
 from eddies.flow.navier_stokes import FLUIDS, CompressibleFluid
-from eddies.scene.scene import BOX_LENGTH, Eulerian, Model, Scene
+from eddies.scene.scene import BOX_LENGTH, Eulerian, Scene
 from eddies.scene.terms import NetworkSettings
 from eddies.time_stepping import ETDRK4, STEPPERS
 from eddies.workflows.foreseen.numbers import flow_steps, rollout_of
 from eddies.workflows.foreseen.storage import training_steps
 from eddies.workflows.ground_truth.frame_counts import KERNEL_FIELDS, TESTED_FRAMES
 
-# Seconds, measured on one and two cores of an AMD EPYC with AVX-512, with `tiny`, `hit-small` and `hit-coarse`: of a
-# transform of a grid point (1 + cells / CACHED times that where planes outgrow the caches), a pair of particles in a
-# sum, a weight of a network for a pair, an evaluation or iteration without its work, a message; of an idle stage.
+# Seconds on one and two cores of an AMD EPYC with AVX-512 (`tiny`, `hit-small`, `hit-coarse`): a transform of a grid
+# point (1 + cells / CACHED times that where planes outgrow the caches), a pair, a weight of a network for a pair, an
+# evaluation or iteration without its work, a message; a stage without work.
 TRANSFORM, CACHED, PAIR, WEIGHT, CALL, MESSAGE, ROUNDS = 4e-9, 550, 2.5e-8, 6e-11, 2.5e-4, 2e-6, 4
-# What a pair costs in each form of reconstruction, of 60 neighbours, in that of averages.
-FORM_PAIRS = {"average": 1, "linear": 5, "quadratic": 8, "kriging": 27}
 START = {"dns": 0.4, "train-kernel": 0.7, "train": 1.0, "find-step": 0.5, "simulate": 0.3, "report": 2.3}
-SEARCH = 2                   # turnovers of the short rollouts that find a step, of the longest step
-COLD, ITERATION = 25, 12     # iterations of a solve from nothing; transforms of a point in one, with its splines
-GRADIENT = 4                 # an evaluation with its gradient, and a step of the optimiser, over an evaluation
+FORM_PAIRS = {"average": 1, "linear": 5, "quadratic": 8, "kriging": 27}  # cost of a neighbour, in averages
+SEARCH, CONFIRM = 2, 0.75    # turnovers of rollouts that a search takes, and each further ground truth of it
+COLD, ITERATION = 25, 12     # iterations of a solve without a first guess; transforms of a point in each
+GRADIENT = 4                 # an evaluation with its gradient, over an evaluation
 
 
 def seconds(scene: Scene, stage: str, ranks: int) -> float | None:
-    """Wall time of a stage on so many ranks; None where the number of its steps is not known."""
+    """Wall time of a stage; None where the number of its steps is unknown."""
     tracers, kernel, model, rollout = scene.tracers, scene.kernel, scene.model, rollout_of(scene)
-    transforms = pairs = calls = solves = 0.0
+    transforms = pairs = calls = solves = weights = 0.0
     neighbors = scene.neighbors if model and "pairs" in model.reads else 0.0
     if stage == "dns":
         if (steps := flow_steps(scene)) is None:
             return None
-        calls = steps * STEPPERS[scene.time.stepper].evaluations
-        cells, fluid = scene.flow.cells, FLUIDS.get(scene.flow.fluid, CompressibleFluid)
+        calls, cells = steps * STEPPERS[scene.time.stepper].evaluations, scene.flow.cells
+        fluid = FLUIDS.get(scene.flow.fluid, CompressibleFluid)
         transforms = calls * fluid.transforms * cells**3 * (1 + cells / CACHED)
     elif stage == "train-kernel":  # twice
         calls = 2 * kernel.steps * GRADIENT
         pairs = kernel.neighbors * (kernel.steps * tracers.particles + 2 * KERNEL_FIELDS * tracers.cells**3)
     elif stage == "train":
         training, solves = scene.training if model.path is None else None, TESTED_FRAMES
+        calls = GRADIENT * training_steps(scene)
         if training:
             solves, pairs = solves + training.frames + 1, GRADIENT * training.steps * training.batch * neighbors
-            if training.field_weight > 0:  # of the particles in and around a cube of a quarter of the box
+            if training.field_weight > 0:  # in a cube of a quarter of the box, and around it
                 width = min(1 / 4 + 2 * scene.kernel_support / BOX_LENGTH, 1)
                 pairs += GRADIENT * training.combined_steps * tracers.particles * width**3 * kernel.neighbors
             if horizons := training.horizons:
@@ -52,17 +52,14 @@ def seconds(scene: Scene, stage: str, ranks: int) -> float | None:
                 evaluations = horizons.steps * sum(horizons.frames) * substeps * horizons.scheme.evaluations
                 solves += 2 * evaluations
                 pairs += GRADIENT * evaluations * tracers.particles * neighbors / 2
-        calls = GRADIENT * training_steps(scene)
-    elif stage == "find-step":
-        whole = seconds(scene, "simulate", ranks)
-        return whole and START[stage] + SEARCH / scene.simulation.turnovers * (whole - START["simulate"])
-    elif stage == "simulate":
+    elif stage in ("find-step", "simulate"):
         if rollout is None:
             return None
         calls, pairs = rollout.evaluations, rollout.evaluations * tracers.particles * neighbors / 2
         if scene.simulation.on_grid:
-            eulerian, calls = scene.eulerian or Eulerian(), rollout.steps * ETDRK4.evaluations
-            transforms = calls * CompressibleFluid.transforms * eulerian.cells_for(tracers.filter_width) ** 3
+            cells, calls = (scene.eulerian or Eulerian()).cells_for(tracers.filter_width), rollout.steps
+            calls *= ETDRK4.evaluations
+            transforms = calls * CompressibleFluid.transforms * cells**3
         elif "model" in scene.simulation.needs:
             solves = rollout.evaluations * scene.simulation.scheme.iterations / COLD
     elif rollout and kernel:       # a report reconstructs model and truth at particles and grid points
@@ -71,13 +68,12 @@ def seconds(scene: Scene, stage: str, ranks: int) -> float | None:
     if solves and scene.resolves:
         calls += solves * COLD
         transforms += solves * COLD * ITERATION * tracers.planes**3
-    learned = _weights(model) if stage in ("train", "simulate") and model else 0
-    work = (transforms * TRANSFORM + pairs * (PAIR + learned * WEIGHT)) / ranks
-    return START[stage] + work + calls * (CALL + ROUNDS * (ranks - 1) * MESSAGE)
-
-
-def _weights(model: Model) -> int:
-    """How many weights the networks of pairs have, about: those between their inputs and hidden layers."""
-    layers = [(len(settings.inputs), *settings.hidden) for settings in model.settings.values()
-              if isinstance(settings, NetworkSettings)]
-    return sum(first * second for widths in layers for first, second in pairwise(widths))
+    if stage in ("train", "find-step", "simulate") and model:
+        layers = [(len(term.inputs), *term.hidden) for term in model.settings.values()
+                  if isinstance(term, NetworkSettings)]
+        weights = sum(first * second for widths in layers for first, second in pairwise(widths))
+    whole = (transforms * TRANSFORM + pairs * (PAIR + weights * WEIGHT)) / ranks
+    whole += calls * (CALL + ROUNDS * (ranks - 1) * MESSAGE)
+    if stage == "find-step":
+        whole *= (SEARCH + CONFIRM * len(scene.simulation.confirming_files)) / scene.simulation.turnovers
+    return START[stage] + whole

@@ -1,49 +1,49 @@
-"""Memory of a rank and disk that the stages of a scene need, in bytes; constants measured on `tiny` to `hit` on 1 and 2
-ranks, and on thin slabs of 1024^3 cells."""
+"""Memory of a rank and disk that the stages of a scene need, in bytes. The constants were measured with `tiny` to `hit`
+on one and two ranks, and with thin slabs of 1024^3 cells."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
+from eddies.cores import threads
 from eddies.flow.history import EVERY
 from eddies.io.checkpoint import KEPT
-from eddies.cores import threads
 from eddies.scene.scene import Scene
 from eddies.spectral.fourier_passes import BLOCK_BYTES
 from eddies.workflows.foreseen.numbers import Rollout, flow_steps, largest_wavenumber, rollout_of, tracer_intervals
 from eddies.workflows.ground_truth.frame_counts import (KERNEL_FIELDS, TESTED_PARTICLES, whole_cells,
                                                         whole_frames)
 
-# Memory of a process before any field, without and with torch, and of a report with its figures.
+# A process before any field, without and with torch; a report with its figures.
 FLOW_PROCESS, TORCH_PROCESS, REPORT_PROCESS = 100e6, 285e6, 280e6
-# Of a cell of the direct simulation in float64, and of the block of planes that is worked on in real arrays of a pair
-# of planes, by whether the fluid is compressible; of a tracer.
+# Direct simulation: a cell in float64, and the arrays of two planes that are worked on, by whether the fluid is
+# compressible; a tracer.
 CELL_BYTES, BLOCK_ARRAYS, TRACER_BYTES = {True: 320, False: 220}, {True: 64, False: 32}, 300
-# Of a particle in an evaluation of the model, of a point of its grid, of a listed neighbour, and of a neighbour of a
-# grid point while the kernel is trained; of a particle in the table of a field that the kernel is trained on.
+# Evaluation of a model: a particle, a point of its grid, a listed neighbour. Training of the kernel: a neighbour of a
+# grid point, a particle in the table of a field.
 PARTICLE_BYTES, POINT_BYTES, NEIGHBOR_BYTES, GRADIENT_BYTES, TABLE_BYTES = 800, 160, 8, 200, 1100
-PRODUCT_BYTES, FIGURE_BYTES = 45_000, 0.6e6  # of a product beside what grows, and of a figure in the report
-FIGURES = {"dns": 4, "train-kernel": 3, "train": 2, "simulate": 8}
-SAMPLE_COLUMNS = 25          # numbers in a sample of the statistics of a flow, beside the spectrum
+# Disk: a product without its frames, a report, a row of the statistics without the spectrum.
+PRODUCT_BYTES, REPORT_BYTES, SAMPLE_BYTES = 45_000, 10e6, 200
 
 
 def memory(scene: Scene, stage: str, ranks: int) -> float:
-    """Memory of the rank that needs most in a stage."""
+    """Memory of the rank that needs most."""
     if stage in ("dns", "report"):
         return flow_memory(scene, ranks) if stage == "dns" else REPORT_PROCESS
     tracers, kernel, training = scene.tracers, scene.kernel, scene.training
     own, planes = tracers.particles / ranks, tracers.planes
     if stage == "train-kernel":
         points = tracers.cells**3 / ranks
-        lists = (KERNEL_FIELDS * NEIGHBOR_BYTES * points + GRADIENT_BYTES * min(kernel.points, points))
+        lists = KERNEL_FIELDS * NEIGHBOR_BYTES * points + GRADIENT_BYTES * min(kernel.points, points)
         return TORCH_PROCESS + KERNEL_FIELDS * TABLE_BYTES * own + lists * kernel.neighbors
     skin, evaluation = scene.simulation.skin if scene.simulation else 0.0, PARTICLE_BYTES * own
-    if scene.resolves or stage == "simulate":
+    if scene.resolves or stage != "train":
         evaluation += POINT_BYTES * planes**2 * math.ceil(planes / ranks)
     if scene.model and "pairs" in scene.model.reads:
         ghosts = tracers.particles * scene.interaction_radius * (1 + skin) / math.pi if ranks > 1 else 0.0
         evaluation += PARTICLE_BYTES * ghosts + NEIGHBOR_BYTES * scene.neighbors * (1 + skin) ** 3 * own
-    if stage == "simulate":
+    if stage != "train":
         coarse = CELL_BYTES[True] * planes**3 / ranks if scene.simulation.on_grid else 0.0
         return TORCH_PROCESS + evaluation + coarse
     if training and training.field_weight > 0:
@@ -62,47 +62,49 @@ def flow_memory(scene: Scene, ranks: int) -> float:
 
 
 def disk(scene: Scene, stage: str) -> float | None:
-    """What a stage leaves in the run directory; None where the number of its frames is not known."""
-    rollout = rollout_of(scene)
+    """Size of what a stage leaves in the run directory; None where the number of its frames is unknown."""
     if stage == "dns":
         intervals, steps = tracer_intervals(scene), flow_steps(scene) or 0
         shells = math.ceil(math.sqrt(3) * largest_wavenumber(scene)) + 1
-        statistics = 8 * (SAMPLE_COLUMNS + shells) * (steps // EVERY)
+        statistics = (SAMPLE_BYTES + 8 * shells) * (steps // EVERY)
         if scene.tracers is None:
             return statistics + 4 * fields(scene) * scene.flow.cells**3
         return None if intervals is None else statistics + trajectory_bytes(scene, intervals + 1)
-    if stage == "train-kernel":  # mostly the planes of five reconstructions, velocity and gradient
+    if stage == "train-kernel":  # planes of five reconstructions, velocity and gradient
         return PRODUCT_BYTES + 80 * scene.tracers.cells**2 + 64 * scene.kernel.steps
-    if stage == "train":         # mostly samples of rates and the history
+    if stage == "train":         # samples of rates, and the history
         return PRODUCT_BYTES + 48 * min(scene.tracers.particles, TESTED_PARTICLES) + 100 * training_steps(scene)
-    if stage == "find-step":
-        return PRODUCT_BYTES
     if stage == "simulate":
+        rollout = rollout_of(scene)
         return rollout and rollout_bytes(scene, rollout)
-    return FIGURE_BYTES * sum(FIGURES.get(name, 0) for name in scene.stages)
+    return PRODUCT_BYTES if stage == "find-step" else REPORT_BYTES
 
 
 def scratch(scene: Scene) -> float:
-    """What a direct simulation keeps until it ends: frames, and checkpoints with the one being written."""
+    """Disk that a direct simulation needs until it ends: frames, and checkpoints with the one that is written."""
     k_max, intervals = largest_wavenumber(scene), tracer_intervals(scene) or 0
     state = fields(scene) * (2 * k_max + 1) ** 2 * (k_max + 1) * 2 * real_bytes(scene)
     return (KEPT + 1) * state + (trajectory_bytes(scene, intervals) if scene.tracers else 0)
 
 
-def most_disk(scene: Scene) -> float:
-    """The disk that the stages, one after the other, need at the worst moment."""
-    return max(sum(disk(scene, stage) or 0.0 for stage in scene.stages), (disk(scene, "dns") or 0.0) + scratch(scene))
+def most_disk(work: Iterable[tuple[Scene, str]]) -> float:
+    """The disk that stages of scenes, one after the other, need at the worst moment."""
+    left = most = 0.0
+    for scene, stage in work:
+        left += disk(scene, stage) or 0.0
+        most = max(most, left + (scratch(scene) if stage == "dns" else 0.0))
+    return most
 
 
 def trajectory_bytes(scene: Scene, frames: int) -> int:
-    """Of so many frames of tracers (place, velocity, images of the box and density) and of filtered fields."""
+    """Size of frames of tracers (position, velocity, images of the box and density) and of filtered fields."""
     tracers, whole = scene.tracers, whole_cells(largest_wavenumber(scene)) ** 3 * len(whole_frames(scene, frames))
     points = tracers.cells**3 * math.ceil(frames / tracers.field_every) + whole
     return frames * tracers.particles * (2 * 24 + 6 + 8 * scene.flow.compressible) + 4 * fields(scene) * points
 
 
 def rollout_bytes(scene: Scene, rollout: Rollout) -> float:
-    """Of rollout.h5: frames of the model (place, velocity, acceleration and images of the box)."""
+    """Size of rollout.h5: frames of the model (position, velocity, acceleration and images of the box)."""
     return (rollout.intervals + 1) * 42 * scene.tracers.particles
 
 
@@ -119,11 +121,11 @@ def fields(scene: Scene) -> int:
 
 
 def real_bytes(scene: Scene) -> int:
-    """Bytes of a real number of the grid of the direct simulation."""
+    """Bytes of a real number on the grid of the direct simulation."""
     return 4 if scene.flow.precision == "float32" else 8
 
 
 def in_units(size: float) -> str:
-    """Bytes as text."""
+    """Bytes as text, such as "1.2 GB"."""
     unit, name = next(((unit, name) for unit, name in ((1e9, "GB"), (1e6, "MB")) if size >= unit), (1e3, "kB"))
     return f"{size / unit:.3g} {name}" if name == "GB" else f"{size / unit:.0f} {name}"

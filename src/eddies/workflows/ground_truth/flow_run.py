@@ -16,10 +16,8 @@ from eddies.flow.navier_stokes import Fluid
 from eddies.flow.stability import StabilityWatch
 from eddies.flow.statistics import energy_spectrum
 from eddies.flow.tracers import FilteredField, TracerParticles, release
-from eddies.io.checkpoint import Checkpoint
-from eddies.io.contiguous import Block
+from eddies.io.checkpoint import Block, Checkpoint, Guard
 from eddies.io.frame_segments import FieldLayout, FrameLayout, FrameSegments
-from eddies.io.guard import Guard
 from eddies.io.hdf5 import File, write_table
 from eddies.parallel.migration import IdOrder, id_block, migrate
 from eddies.parallel.slab import SlabDecomposition

@@ -1,6 +1,7 @@
-"""Whether the frames of a ground truth are enough for what a scene makes of them: counting alone, known before a run.
+"""Which frames of a ground truth the stages use, and whether they are enough.
 
-`frames` is the number of frames, `at_fields` are those at whose time a filtered field is stored.
+`frames` is the number of frames, `at_fields` are the frames at whose time a filtered field is stored, and `seen` is the
+fraction of the ground truth that the model is trained on.
 """
 
 from __future__ import annotations
@@ -10,15 +11,13 @@ from collections.abc import Sequence
 
 from eddies.scene.scene import Scene, SceneError, Training
 
-# The share of the training window, at its end, that is held out for validation; no less than the longest horizon.
-HELD_OUT = 0.1
-# Filtered fields that the kernel is trained on; frames of the a-priori test, and particles of which it keeps the rates.
-KERNEL_FIELDS, TESTED_FRAMES, TESTED_PARTICLES = 4, 9, 20_000
+HELD_OUT = 0.1               # share of the training window that validates, at its end; at least the longest horizon
+KERNEL_FIELDS = 4            # filtered fields that the kernel is trained on
+TESTED_FRAMES, TESTED_PARTICLES = 9, 20_000  # of the a-priori test, which stores the rates of the particles
 
 
 def check_frames(stages: Sequence[str], scene: Scene, seen: float, frames: int) -> None:
-    """Refuse a scene of which one of these stages finds too few frames; `seen` is the fraction that the model is
-    trained on."""
+    """Raise SceneError where one of the stages finds too few frames."""
     at_fields = range(0, frames, scene.tracers.field_every)
     if "train" in stages:
         if scene.model.path is None and seen > 0:
@@ -29,15 +28,13 @@ def check_frames(stages: Sequence[str], scene: Scene, seen: float, frames: int) 
 
 
 def last_seen(window: float, frames: int) -> int:
-    """The last frame of the training window, a fraction of the ground truth."""
+    """The last frame of the training window, which is a fraction of the ground truth."""
     return max(int(window * (frames - 1)), 1)
 
 
 def last_trained_on(settings: Training, frames: int) -> int:
-    """The last frame that a model is trained on: those behind it in the window are for validation.
-
-    Raises SceneError where too few are left.
-    """
+    """The last frame that a model is trained on; the later frames of the window validate. Raises SceneError where too
+    few remain."""
     last = last_seen(settings.window, frames)
     longest = max(settings.horizons.frames) if settings.horizons else 0
     held_out = max(math.ceil(HELD_OUT * last), longest, 2)  # rates need a frame on both sides
@@ -50,12 +47,8 @@ def last_trained_on(settings: Training, frames: int) -> int:
 
 
 def trained_frames(settings: Training, frames: int, at_fields: Sequence[int]) -> tuple[list[int], int]:
-    """The frames that can be trained on, and the last of those held out: all up to `last_trained_on` and the last but
-    one of the window; of them, where the field loss compares with the flow, those with a filtered field one frame
-    later.
-
-    Raises SceneError where too few are left.
-    """
+    """The frames that are trained on, and the last frame that validates. A field loss that compares with the flow needs
+    a filtered field one frame later. Raises SceneError where too few remain."""
     learned, last = last_trained_on(settings, frames), last_seen(settings.window, frames)
     fields = set(at_fields)
     usable = [frame for frame in range(1, last) if not settings.wants_fields or frame + 1 in fields]
@@ -68,7 +61,7 @@ def trained_frames(settings: Training, frames: int, at_fields: Sequence[int]) ->
 
 
 def between_frames(frames: int, at_fields: Sequence[int]) -> list[int]:
-    """The frames at times of filtered fields that have frames on both sides. Raises SceneError if there is none."""
+    """The frames with a filtered field and with frames on both sides; raises SceneError without any."""
     usable = [frame for frame in at_fields if 0 < frame < frames - 1]
     if not usable:
         raise SceneError("[tracers] field_every: no filtered field is stored between the first and the last frame; "
@@ -77,11 +70,8 @@ def between_frames(frames: int, at_fields: Sequence[int]) -> list[int]:
 
 
 def rollout_start(scene: Scene, seen: float, frames: int, at_fields: Sequence[int]) -> int:
-    """The first frame with a filtered field at or after the moment that the scene asks for, or else after what the
-    model has `seen`, a fraction of them.
-
-    Raises SceneError if none follows that leaves a frame of the ground truth to compare with.
-    """
+    """The first frame with a filtered field at or after the start that the scene asks for, or after the part that the
+    model was trained on. Raises SceneError without a later frame to compare with."""
     wanted = _frame_at(scene.simulation.start, seen, frames)
     last = frames - 2 - round(scene.simulation.frame_interval / scene.tracers.frame_interval)
     usable = [frame for frame in at_fields if wanted <= frame <= last]
@@ -93,20 +83,18 @@ def rollout_start(scene: Scene, seen: float, frames: int, at_fields: Sequence[in
 
 
 def whole_frames(scene: Scene, frames: int) -> set[int]:
-    """The frames at which the unfiltered state is stored, for coarse grids to start from: with filtered fields, where
-    its rollouts start, and where they start earliest."""
+    """The frames at which the unfiltered state is stored for coarse grids: where rollouts start, and the earliest frame
+    from which rollouts start where the model is not trained on this ground truth."""
     fractions = () if scene.simulation is None else (0.0, scene.simulation.start)
-    # Where nothing of it is trained on, rollouts start earliest.
     every, seen = scene.tracers.field_every, scene.training.window if scene.training else 0.0
     return {math.ceil(_frame_at(fraction, seen, frames) / every) * every for fraction in fractions}
 
 
 def whole_cells(cutoff: int) -> int:
-    """Cells along each side, an even number, of the smallest grid that holds all modes of a flow up to a wavenumber."""
+    """Cells along a side, an even number, of the smallest grid that holds all modes up to a wavenumber."""
     return 2 * cutoff + 2
 
 
 def _frame_at(fraction: float | None, seen: float, frames: int) -> int:
-    """The frame, not the first, at a fraction of the ground truth; the end of what is trained on, another fraction, for
-    None."""
+    """The frame at a fraction of the ground truth, at least 1; for None the end of the part that is seen."""
     return max(last_seen(seen, frames) if fraction is None else int(fraction * (frames - 1)), 1)

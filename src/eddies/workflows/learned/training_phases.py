@@ -13,7 +13,7 @@ from typing import TypeVar
 import numpy as np
 
 from eddies.clock import ProgressLine
-from eddies.io.guard import Guard
+from eddies.io.checkpoint import Guard
 from eddies.learning.optimization import Adam
 from eddies.learning.training import Phase, Training, TrainingDiverged
 from eddies.parallel.halo import HaloError

@@ -21,6 +21,7 @@ from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.learned.a_priori import evaluate, evaluation_frames
 from eddies.workflows.learned.model import with_weights
 from eddies.workflows.learned.source import ModelDefinition, ModelSource, read_source
+from eddies.workflows.run_directory.fingerprints import stage_provenance
 
 log = logging.getLogger("eddies")
 
@@ -46,7 +47,7 @@ def run(scene: Scene, comm: Comm, directory: Path) -> None:
     if "training" in source.description:
         description["training"] = source.description["training"]
     origin, own_errors = trained_on(source, scene.model.path)
-    provenance = {**scene.provenance("train"), "mach_turbulent": mach, "source": origin}
+    provenance = {**stage_provenance(scene, "train"), "mach_turbulent": mach, "source": origin}
     kept = source.tables | ({"source_a_priori": own_errors} if own_errors else {})
     save_weights(comm, directory / STAGES["train"].file, "model", description, source.weights, provenance,
                  kept | tables)

@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 
 from eddies.clock import WARM_UP_STEPS, Clock, ProgressLine
-from eddies.io.checkpoint import Checkpoint
+from eddies.io.checkpoint import Checkpoint, Guard
 from eddies.io.frame_segments import FrameLayout, FrameSegments
-from eddies.io.guard import Guard
 from eddies.parallel.migration import IdOrder, wrap
 from eddies.parallel.reduction import global_sum
 from eddies.particles.particle_set import as_numpy

@@ -18,8 +18,7 @@ from eddies.flow.navier_stokes import FLUIDS, Fluid
 from eddies.flow.stability import quadratic_energy
 from eddies.flow.subgrid import Closure, DynamicStress, EddyDamping, SpectralViscosity, StressModel
 from eddies.flow.tracers import FilteredField, TracerParticles
-from eddies.io.checkpoint import Checkpoint
-from eddies.io.contiguous import Block
+from eddies.io.checkpoint import Block, Checkpoint
 from eddies.io.weights import load_weights
 from eddies.parallel.migration import migrate
 from eddies.parallel.slab import SlabDecomposition

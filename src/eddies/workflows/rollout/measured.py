@@ -1,4 +1,4 @@
-"""The rollout of a run directory and its truth as all have them who read them: what is stored, and what is measured."""
+"""The rollout of a run directory and the true tracers beside it, and everything that is measured of both."""
 
 from __future__ import annotations
 
@@ -24,21 +24,24 @@ from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.learned.model import load_form
 from eddies.workflows.rollout.particle_measures import (GRADIENT, FieldsOfParticles, ParticleSpectra,
                                                         ReconstructedFields, WithGradients)
-from eddies.workflows.rollout.truth_cache import TruthCache
 
 log = logging.getLogger("eddies")
 
 Task = tuple[str, str, int]  # "spectra" or "reconstructions", "model" or "truth", frame
+#: Measures of true tracers by ground truth, kernel, quantity and frame. The rank that measured one holds its value, the
+#: others hold None.
+TruthMeasures = dict[tuple[Path, Path | None, str, int], Any]
 
 
 class TrueParticles:
-    """The true tracers at the times of a rollout, as its own particles are stored: in single precision, with their
-    acceleration, which is the centred difference along the trajectories, and images counted from the first frame.
+    """The true tracers at the times of a rollout, in single precision like the particles of the rollout.
+
+    The acceleration is the centred difference of the velocity along trajectories. Images count from the first frame.
 
     Parameters
     ----------
-    tracers : of the ground truth, frame by frame.
-    start_time : of the rollout. times : of its frames, of which those are left that the tracers have, (m,).
+    tracers : of the ground truth.
+    start_time : of the rollout. times : of its frames, (m,). Frames that the tracers do not have are left out.
     """
 
     def __init__(self, tracers: Trajectory, start_time: float, times: np.ndarray) -> None:
@@ -51,7 +54,7 @@ class TrueParticles:
         self.columns = (*tracers.columns, "acceleration")
 
     def read(self, frame: int, column: str, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Rows start to stop of a column, in order of id. ProductError where one is not finite."""
+        """Read rows start to stop of a column, in order of id. ProductError if a value is not finite."""
         tracers, at = self._tracers, int(self.frames[frame])
         if column == "acceleration":
             before, after = (tracers.read(at + step, "velocity", start, stop) for step in (-1, 1))
@@ -62,19 +65,9 @@ class TrueParticles:
         return values.astype(np.float32)
 
 
-class NoParticles:
-    """The truth of a rollout without its ground truth: no frame."""
-
-    times, columns = np.zeros(0), ()
-
-    def read(self, frame: int, column: str, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Nothing."""
-        raise IndexError(f"frame {frame} of none")
-
-
 @dataclass(frozen=True)
 class Made:
-    """What is made of each frame, under one name."""
+    """A series with one column, computed frame by frame."""
 
     times: np.ndarray
     column: str
@@ -82,16 +75,20 @@ class Made:
 
     @property
     def columns(self) -> tuple[str]:
-        """The name."""
+        """The name of the column."""
         return (self.column,)
 
     def read(self, frame: int, column: str) -> np.ndarray:
-        """That of a frame."""
+        """Compute a frame."""
         return self.make(frame)
 
 
+#: The true tracers of a rollout without a ground truth.
+NOTHING = Made(np.zeros(0), "velocity", lambda frame: np.zeros((0, 3)))
+
+
 class OnDemand(dict):
-    """By frame, what a function gives of it; it is asked once."""
+    """Values of a function by frame, each computed once, when it is first used."""
 
     def __init__(self, measure: Callable[[int], Any]) -> None:
         super().__init__()
@@ -103,31 +100,31 @@ class OnDemand(dict):
 
 
 class MeasuredRollout:
-    """An open rollout, for one rank. What is asked of `rollout` is measured then, and once; `measure` does so before,
-    with the help of other ranks and of what an earlier run has measured of the truth.
+    """An open rollout of one rank. Measures are made once, when first used, or before by all ranks with `measure`.
 
     Parameters
     ----------
-    rollout : what is compared. provenance : of its product.
-    fields : as they are reconstructed. solver : of spectra. cache : of the truth. None without a kernel or a ground
-        truth.
+    rollout : the rollout and its truth. provenance : of its product.
+    directory : the run directory.
+    fields, solver : make reconstructions and spectra of particles. None without a kernel, or a ground truth.
+    stationary : whether the ground truth has a stationary state.
     """
 
-    def __init__(self, rollout: Rollout, provenance: Mapping[str, Any], fields: FieldsOfParticles | None = None,
-                 solver: ParticleSpectra | None = None, cache: TruthCache | None = None) -> None:
-        self.rollout, self.provenance = rollout, provenance
-        self.fields, self._solver, self._cache = fields, solver, cache
+    def __init__(self, rollout: Rollout, provenance: Mapping[str, Any], directory: Path,
+                 fields: FieldsOfParticles | None = None, solver: ParticleSpectra | None = None,
+                 stationary: bool = False) -> None:
+        self.rollout, self.provenance, self._directory = rollout, provenance, directory
+        self.fields, self._solver, self._stationary = fields, solver, stationary
 
     @property
     def particles(self) -> dict[str, Any]:
-        """Of "model" and "truth", as far as they are there."""
+        """The particles of "model" and "truth" that have a frame."""
         return {name: run for name, run in (("model", self.rollout.model), ("truth", self.rollout.truth))
                 if len(run.times)}
 
     @property
     def exported(self) -> dict[str, dict[str, Any]]:
-        """Series of "fields" and "particles" by these names, the latter with velocity gradients, where there is a
-        kernel."""
+        """Series of "fields" and "particles" by name; with a kernel, particles have velocity gradients."""
         fields, runs = self.fields, self.particles
         if fields is None:
             return {"fields": {}, "particles": runs}
@@ -136,7 +133,7 @@ class MeasuredRollout:
 
     @property
     def groups(self) -> dict[str, Any]:
-        """What programs can read of the rollout beside what it has stored, by names as of groups of a product."""
+        """Series that `open_run` offers beside the stored ones, named like groups of a product."""
         found: dict[str, Any] = {f"particles/{name}": run for name, run in self.particles.items() if name != "model"}
         for name, run in self.particles.items():
             if self._solver is not None:
@@ -147,33 +144,33 @@ class MeasuredRollout:
                                                   lambda frame, run=run: self.fields.gradients(run, frame))
         return found
 
-    def measure(self, comm: Comm, root: int = 0, whole: bool = True, late: bool = False) -> None:
-        """Measure what the report shows, `late` spectra of a forced rollout among it, or without `whole` what
-        `accuracy` needs, each rank a share of the frames; rank `root` has it then. All ranks call it, each with this
-        rollout open. ProductError on all ranks where one of them cannot read a frame."""
+    def measure(self, comm: Comm, root: int = 0, whole: bool = True, known: TruthMeasures | None = None) -> None:
+        """Measure a share of the frames on each rank and collect everything on rank `root`; all ranks call it.
+
+        whole: measure what the page shows, otherwise only what `accuracy` needs. known: measures of true tracers from
+        earlier calls, which are used and added to. ProductError on all ranks if one of them cannot read a frame.
+        """
         if self._solver is None:
             return
+        known = {} if known is None else known
         prepare_torch("cpu", comm)
-        tasks = on_all_ranks(comm, lambda: self._tasks(whole, late), ProductError)
-        known = self._cache.read() if comm.rank == root else {}
-        at = [self._place(task) for task in tasks]
-        left = comm.bcast([task for task, place in zip(tasks, at) if place not in known], root)
-        own = on_all_ranks(comm, lambda: {task: self._measured(task) for task in left[comm.rank::comm.size]},
-                           ProductError)
-        gathered = comm.gather(own, root)
+        tasks = on_all_ranks(comm, lambda: self._tasks(whole), ProductError)
+        new = [task for task in tasks if self._key(task) not in known]
+        own = on_all_ranks(comm, lambda: {(quantity, of, frame): getattr(self.rollout, quantity)[of][frame]
+                                          for quantity, of, frame in new[comm.rank::comm.size]}, ProductError)
+        for task in new:
+            if task[1] == "truth":
+                known[self._key(task)] = own.get(task)
+        own |= {task: known[self._key(task)] for task in tasks if known.get(self._key(task)) is not None}
+        for part in comm.gather(own, root) or []:
+            for (quantity, of, frame), value in part.items():
+                getattr(self.rollout, quantity)[of][frame] = value
         complaints = [words for some in comm.allgather(self._solver.complaints) for words in some]
         if complaints and comm.rank == 0:
-            log.info("report: %s", complaints[0] + (", as may others" if complaints[1:] else ""))
-        if comm.rank == root:
-            found = {task: value for some in gathered for task, value in some.items()}
-            for task, place in zip(tasks, at):
-                self._keep(task, found[task] if task in found else known[place])
-            fresh = {self._place(task): value for task, value in found.items() if task[1] == "truth"}
-            if fresh:
-                self._cache.write(known | fresh)
+            log.info("report: %s", complaints[0] + (f" ({len(complaints)} such solves)" if complaints[1:] else ""))
 
-    def _tasks(self, whole: bool, late: bool) -> list[Task]:
-        """What is to be measured; nothing where nothing is compared."""
+    def _tasks(self, whole: bool) -> list[Task]:
+        """List the measures to make; empty if nothing is compared."""
         run = self.rollout
         try:
             common = run.common
@@ -183,39 +180,35 @@ class MeasuredRollout:
         shown = run.shown_spectra() if whole else np.intersect1d(run.spectral(), last)
         frames = {"model": common.model, "truth": common.truth}
         tasks = [("spectra", of, int(frame)) for of in frames for frame in frames[of][shown]]
-        if late:
+        if whole and run.forced and self._stationary:
             tasks += [("spectra", "model", int(frame)) for frame in run.late_spectra()]
         if self.fields is not None:
             tasks += [("reconstructions", of, int(frame)) for of in frames
                       for frame in (run.before_broken(of) if whole else frames[of][-1:])]
         return list(dict.fromkeys(tasks))
 
-    def _place(self, task: Task) -> tuple[str, int] | None:
-        """Where the cache has a measure of the truth; None of the model."""
+    def _key(self, task: Task) -> Any:
+        """Return the key of a measure in TruthMeasures; a measure of the model is the task itself, which is in none."""
         quantity, of, frame = task
-        return (quantity, int(self.rollout.truth.frames[frame])) if of == "truth" else None
-
-    def _measured(self, task: Task) -> Any:
-        quantity, of, frame = task
-        return getattr(self.rollout, quantity)[of][frame]
-
-    def _keep(self, task: Task, value: Any) -> None:
-        quantity, of, frame = task
-        getattr(self.rollout, quantity)[of][frame] = value
+        if of == "model":
+            return task
+        kernel = (self._directory / "kernel.h5").resolve() if quantity == "reconstructions" else None
+        return (self._directory / "ground_truth.h5").resolve(), kernel, quantity, int(self.rollout.truth.frames[frame])
 
 
 @contextmanager
 def open_together(directory: Path, comm: Comm, alone: Comm) -> Iterator[MeasuredRollout]:
-    """The rollout of a run directory for each rank of `comm`, by communicators of their own; all ranks call it, and all
-    raise the ProductError of one."""
+    """Open the rollout of a run directory on each rank; all ranks call it, and all raise the ProductError of one."""
     with ExitStack() as files:
         yield on_all_ranks(comm, lambda: files.enter_context(open_rollout(directory, alone)), ProductError)
 
 
 @contextmanager
 def open_rollout(directory: Path, alone: Comm) -> Iterator[MeasuredRollout]:
-    """The rollout of a run directory, for one rank, with the truth of the ground truth there and measured with the
-    kernel there, if there are any. ProductError where one of them cannot be read."""
+    """Open the rollout of a run directory on one rank, with its ground truth and kernel if they are there.
+
+    Raises ProductError if one of them cannot be read.
+    """
     with ExitStack() as files:
         def opened(kind: str) -> Any:
             return files.enter_context(open_product(alone, directory / f"{kind}.h5", kind))
@@ -232,8 +225,8 @@ def open_rollout(directory: Path, alone: Comm) -> Iterator[MeasuredRollout]:
             "outside_training": read_table(file, "outside_training")["share"] if "outside_training" in file else None,
             "closure": read_table(file, "closure") if "closure" in file else None}
         if truth_file is None:
-            yield MeasuredRollout(Rollout(attributes, model, NoParticles(), model.length, {}, {}, {}, None, **tables,
-                                          without_truth=missing), provenance)
+            yield MeasuredRollout(Rollout(attributes, model, NOTHING, model.length, {}, {}, {}, None, **tables,
+                                          without_truth=missing), provenance, directory)
             return
         ground = GroundTruth(truth_file, SlabDecomposition(alone, model.length, 1))
         truth = TrueParticles(ground.trajectory, attributes["start_time"], model.times)
@@ -250,5 +243,4 @@ def open_rollout(directory: Path, alone: Comm) -> Iterator[MeasuredRollout]:
             for name, run in both.items()}
         rollout = Rollout(attributes, model, truth, model.length, read_table(truth_file, "spectra"), ground.reference,
                           spectra, reconstructions, **tables, reconstructed_by=fields.form.words if fields else "")
-        cache = TruthCache(directory / "ground_truth.h5", kernel if fields else None, alone)
-        yield MeasuredRollout(rollout, provenance, fields, solver, cache)
+        yield MeasuredRollout(rollout, provenance, directory, fields, solver, "stationary" in truth_file)

@@ -1,4 +1,4 @@
-"""What one rank measures of particles at one moment, whatever moves them: reconstructed fields, and spectra."""
+"""Fields and spectra that one rank makes of particles at one time."""
 
 from __future__ import annotations
 
@@ -18,17 +18,16 @@ from eddies.particles.particle_field import ParticleField
 from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.particles.resolved_velocity import ResolvedVelocity
 
-# Where particles have gathered and left voids a solve takes more, and gains little by most: see ParticleSpectra.
-MOST_ITERATIONS = 100
+MOST_ITERATIONS = 100  # of a solve for a spectrum, see ParticleSpectra
 GRADIENT = "velocity_gradient"
 
 
 class FieldsOfParticles:
-    """What a form of reconstruction makes of particles, frame by frame; what was made last is kept.
+    """Fields that a form of reconstruction makes of particles. The result of the last call is kept.
 
     Parameters
     ----------
-    form : of the reconstruction. slab : of one rank, with a plane for each cell of the grid, whose point i lies at
+    form : of the reconstruction. slab : of one rank, with a plane for each cell of the grid. Grid point i is at
         i L / cells.
     """
 
@@ -38,27 +37,27 @@ class FieldsOfParticles:
 
     def gradients(self, particles: Frames, frame: int) -> np.ndarray:
         """Velocity gradients (n, 3, 3) [component, direction] at the particles."""
-        return self._kept("gradients", particles, frame, lambda made: as_numpy(made.at_particles()[1]))
+        return self._kept(("gradients", id(particles), frame),
+                          lambda: as_numpy(self._made(particles, frame).at_particles()[1]))
 
     def velocity(self, particles: Frames, frame: int) -> np.ndarray:
         """The velocity (3, z, y, x) on the grid."""
-        return self._kept("velocity", particles, frame, lambda made: self._by_component(made.velocity_on_grid(), 3))
+        return self._kept(("velocity", id(particles), frame),
+                          lambda: self._by_component(self._made(particles, frame).velocity_on_grid(), 3))
 
     def plane(self, particles: Frames, frame: int) -> tuple[np.ndarray, np.ndarray]:
-        """Velocity (3, y, x) and magnitude of the vorticity (y, x) at the grid's points in the plane z = pi."""
+        """Velocity (3, y, x) and magnitude of the vorticity (y, x) at the grid points in the plane z = pi."""
         axis = torch.arange(self.slab.planes, dtype=torch.float64) * self.slab.spacing
         y, x = torch.meshgrid(axis, axis, indexing="ij")
         middle = torch.full_like(x, self.slab.planes // 2 * self.slab.spacing)
         velocity, gradient = self._made(particles, frame).at(torch.stack([x, y, middle], -1).reshape(-1, 3))
-        antisymmetric = gradient - gradient.transpose(1, 2)  # its norm is that of the vorticity times sqrt(2)
+        antisymmetric = gradient - gradient.transpose(1, 2)  # its norm is sqrt(2) times that of the vorticity
         vorticity = antisymmetric.square().sum((1, 2)).div(2).sqrt()
         return self._by_component(velocity, 2), as_numpy(vorticity).reshape([self.slab.planes] * 2)
 
-    def _kept(self, what: str, particles: Frames, frame: int,
-              make: Callable[[Reconstructed], np.ndarray]) -> np.ndarray:
-        asked = what, id(particles), frame
-        if self._last[0] != asked:
-            self._last = asked, make(self._made(particles, frame))
+    def _kept(self, key: Any, make: Callable[[], np.ndarray]) -> np.ndarray:
+        if self._last[0] != key:
+            self._last = key, make()
         return self._last[1]
 
     @torch.no_grad()
@@ -71,21 +70,21 @@ class FieldsOfParticles:
 
 
 class WithGradients:
-    """Particles with a column more, `velocity_gradient`: dv_i/dx_j as it is reconstructed."""
+    """Particles with one more column, the reconstructed `velocity_gradient` dv_i/dx_j."""
 
     def __init__(self, particles: Any, fields: FieldsOfParticles) -> None:
         self._particles, self._fields, self.times = particles, fields, particles.times
         self.total, self.length, self.columns = particles.total, particles.length, (*particles.columns, GRADIENT)
 
     def read(self, frame: int, column: str, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Rows start to stop of a column, in order of id."""
+        """Read rows start to stop of a column, in order of id."""
         if column == GRADIENT:
             return self._fields.gradients(self._particles, frame)[start:stop]
         return self._particles.read(frame, column, start, stop)
 
 
 class ReconstructedFields:
-    """The velocity that is reconstructed from particles on a grid, as a series of fields."""
+    """A series of fields: the velocity that is reconstructed from particles on a grid."""
 
     variables = columns = ("velocity",)
 
@@ -94,23 +93,21 @@ class ReconstructedFields:
         self.cells = fields.slab.planes
 
     def read(self, index: int, variable: str, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Planes start to stop, (3, stop - start, y, x)."""
+        """Read planes start to stop, (3, stop - start, y, x)."""
         return self._fields.velocity(self._particles, index)[:, start:stop]
 
 
 class ParticleSpectra:
-    """Energy spectra of particles, whatever moves them: of the modes that least squares find in their velocities.
+    """Energy spectra of particles: of the modes that a least-squares fit finds in their velocities.
 
-    They are those of the resolved velocity of the closure, with the same wavenumbers for all methods: no kernel
-    attenuates them, and what they miss at a wavenumber they miss of model and truth alike. Every solve starts from
-    nothing; in single precision, as frames are stored.
+    These are the modes of the closure's resolved velocity, with the same wavenumbers for all methods. No kernel
+    attenuates them, and they miss the same part of model and truth. Every solve starts from 0, in single precision,
+    in which frames are stored.
 
-    Particles that nothing keeps apart, as those without a force, gather and leave voids. What lives in the voids is
-    told by the prior alone, which is far weaker than particles are: the equations get eigenvalues of either size, and
-    conjugate gradients take longer. Without a force for T/2 it is 167 iterations in `hit` and 121 in `hit-coarse`
-    instead of 44; 111 and 95 at the same positions with velocities of a smooth field, 43 and 45 with such at random
-    ones. What follows the first 100 changes ln E(k) by 0.07 at most, of spectra with twice the energy of the true ones
-    by then: so a solve ends there, and `complaints` say so.
+    Particles without a force between them cluster and leave voids, where only the weak prior determines the modes.
+    The equations become stiff: without a force for T/2 a solve takes 167 iterations in `hit` and 121 in `hit-coarse`
+    instead of 44. Iterations after the first 100 change ln E(k) by 0.07 at most, while such spectra have twice the
+    energy of the true ones. A solve therefore ends after 100 iterations, and is listed in `complaints`.
 
     Parameters
     ----------
@@ -130,14 +127,14 @@ class ParticleSpectra:
         return found
 
     def of(self, particles: Frames, frame: int, whose: str) -> np.ndarray:
-        """E(k) of the shells 0, 1, ... all of whose modes are resolved, two at least; `whose` is for complaints."""
+        """E(k) of the shells 0, 1, ... whose modes are all resolved, at least two. `whose` names the particles."""
         position, velocity = (particles.read(frame, name).astype(float) for name in ("position", "velocity"))
         with torch.no_grad():
             flow = self._resolution.of(ParticleSet.from_numpy(
                 {"id": np.arange(len(position)), "position": position, "velocity": velocity}))
         if not flow.converged:
             self.complaints.append(
-                f"at time {particles.times[frame]:.3g} particles of the {whose} have gathered and left voids: the "
+                f"at time {particles.times[frame]:.3g} particles of the {whose} have clustered and left voids: the "
                 f"solve for their spectrum did not converge in {flow.iterations} iterations and left "
                 f"{flow.residual:.1e}")
         return as_numpy(flow.spectrum[:max(self._resolution.grid.resolved, 2)]).astype(float)

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from eddies.io.checkpoint import Checkpoint
-from eddies.io.contiguous import Block
+from eddies.io.checkpoint import Block, Checkpoint
 from eddies.parallel.communicator import Comm
 from eddies.parallel.migration import migrate
 from eddies.parallel.reduction import global_sum

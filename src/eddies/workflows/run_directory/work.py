@@ -1,5 +1,5 @@
-"""What of the stages of a scene is in a run directory: what fits the scene's settings is kept or gone on with, what
-does not would be lost to new work."""
+"""The work that a run directory holds. Work that fits the scene's settings is kept or continued; other work would be
+replaced."""
 
 from __future__ import annotations
 
@@ -13,46 +13,36 @@ from typing import Any
 from eddies.clock import duration
 from eddies.errors import UserError
 from eddies.io.checkpoint import checkpoints_in
-from eddies.io.errors import ProductError
+from eddies.io.checksums import open_to_read
+from eddies.io.errors import ProductError, unreadable
 from eddies.io.provenance import product_provenance
-from eddies.io.reading import cannot_be_read, open_to_read, why_unreadable
 from eddies.pipeline import STAGES, Stage
 from eddies.scene.rules import quoted
 from eddies.scene.scene import Scene
+from eddies.workflows.run_directory.fingerprints import stage_fingerprint
 
 SECONDS = "stage_seconds.json"
-FAILURE = "failure.txt"  # why a variant failed
-MOST_CHANGES = 3  # that a refusal lists
+FAILURE = "failure.txt"  # the error of a failed variant
+MOST_CHANGES = 3  # in the message of a refusal
 
 
 class WorkAtStake(UserError):
-    """A command would replace work that somebody may still want."""
+    """A command would replace work of other settings."""
 
 
 @dataclass(frozen=True)
 class Work:
-    """What stages find in a run directory.
-
-    Parameters
-    ----------
-    directory : the run directory.
-    done : the stages whose product is complete and was made with the same settings.
-    begun : the stages that go on from a checkpoint.
-    useless : the stages whose checkpoints are of no use: left behind by a run that came to its end, or of other
-        settings and to be replaced.
-    lost : what they would replace, with what it cost, in words.
-    changes : which settings differ from those that this was made with, in words.
-    """
+    """The work that stages find in a run directory."""
 
     directory: Path
-    done: frozenset[str]
-    begun: frozenset[str]
-    useless: frozenset[str]
-    lost: tuple[str, ...]
-    changes: tuple[str, ...]
+    done: frozenset[str]  # stages whose product is complete and was made with the same settings
+    begun: frozenset[str]  # stages that continue from a checkpoint
+    useless: frozenset[str]  # stages whose checkpoints are left over from a complete run, or belong to other settings
+    lost: tuple[str, ...]  # the files that the stages would replace, with their cost
+    changes: tuple[str, ...]  # the settings that differ from those of the lost files
 
     def refuse_to_lose(self) -> None:
-        """Raise WorkAtStake, which names it, if anything would be replaced."""
+        """Raise WorkAtStake if anything would be replaced."""
         if self.lost:
             raise WorkAtStake(f"{self.directory}: holds work of {of_other_settings(self.changes)} that would be "
                               f"replaced: {', '.join(self.lost)}; add --overwrite to replace it, or choose another "
@@ -60,25 +50,25 @@ class Work:
 
 
 def find_work(stages: Sequence[str], scene: Scene, directory: Path) -> Work:
-    """What stages of a scene find in a run directory. One rank calls it, the directory being locked.
+    """The work that stages of a scene find in a locked run directory; on one rank.
 
-    Raises ProductError where the system does not let a product be read: it may be sound.
+    Raises ProductError if the system refuses to read a product, which may be sound.
     """
     done, begun, useless, lost, changes = set(), set(), set(), [], {}
     seconds = stage_seconds(directory)
     for stage in [STAGES[name] for name in stages if STAGES[name].product is not None]:
-        product = directory / stage.file
+        product, settings = directory / stage.file, stage_fingerprint(scene, stage.name)
         checkpoints = checkpoints_in(directory / stage.checkpoints) if stage.checkpoints else []
-        of_others = checkpoints and scene.fingerprint(stage.name) not in [fingerprint for _, fingerprint in checkpoints]
+        of_others = checkpoints and settings not in [fingerprint for _, fingerprint in checkpoints]
         origin = product_provenance(product)
-        if _fits(origin, stage.name, scene):
+        if origin.get("fingerprint") == settings:
             done.add(stage.name)
-            if not of_others:  # those may be gone on with by whoever wants to replace the product
+            if not of_others:  # a scene with those settings may still continue from them
                 useless.add(stage.name)
             continue
         if product.is_file() and not product.is_symlink():
             if not origin:
-                _refuse_unreadable(product)
+                _check_readable(product)
             lost.append(stage.file + _cost(origin, seconds.get(stage.name)))
             changes |= dict.fromkeys(changed_settings(stage, origin.get("scene"), scene.to_toml()))
         if checkpoints and not of_others:
@@ -90,14 +80,14 @@ def find_work(stages: Sequence[str], scene: Scene, directory: Path) -> Work:
 
 
 def is_done(stage: str, scene: Scene, directory: Path) -> bool:
-    """Whether the product of a stage is complete and was made with the same settings. One rank calls it."""
-    return STAGES[stage].product is not None and _fits(
-        product_provenance(directory / STAGES[stage].file), stage, scene)
+    """Whether the product of a stage is complete and was made with the same settings; on one rank."""
+    if STAGES[stage].product is None:
+        return False
+    return product_provenance(directory / STAGES[stage].file).get("fingerprint") == stage_fingerprint(scene, stage)
 
 
 def stage_seconds(directory: Path) -> dict[str, float]:
-    """Wall time of each stage as earlier runs noted it; a file that is missing or damaged holds nothing worth an
-    error."""
+    """Wall time of each stage in earlier runs; empty if the file is missing or damaged."""
     try:
         return read_stage_seconds(directory)
     except (OSError, ProductError):
@@ -105,7 +95,7 @@ def stage_seconds(directory: Path) -> dict[str, float]:
 
 
 def read_stage_seconds(directory: Path) -> dict[str, float]:
-    """The same; ProductError where the file is damaged."""
+    """The same; ProductError if the file is damaged."""
     path = directory / SECONDS
     if not path.exists():
         return {}
@@ -116,8 +106,8 @@ def read_stage_seconds(directory: Path) -> dict[str, float]:
 
 
 def changed_settings(stage: Stage, then: str | None, now: str | None) -> list[str]:
-    """The settings that the product of a stage depends on and that differ between the texts of two scenes, each with
-    both values; none where a text is missing or damaged."""
+    """The settings of a stage's product that differ between the texts of two scenes, each with both values; empty if a
+    text is missing or damaged."""
     stages = [STAGES[name] for name in (*stage.depends_on, stage.name)]
     try:
         before, after = (dict(leaves(tomllib.loads(text or ""))) for text in (then, now))
@@ -131,24 +121,20 @@ def changed_settings(stage: Stage, then: str | None, now: str | None) -> list[st
 
 
 def of_other_settings(changes: Sequence[str]) -> str:
-    """That settings have changed, and the first of those that did, in words."""
+    """"other settings", with the first of the changes."""
     listed = [*changes[:MOST_CHANGES], *(["..."] if changes[MOST_CHANGES:] else [])]
     return "other settings" + (f" ({', '.join(listed)})" if listed else "")
 
 
-def _refuse_unreadable(product: Path) -> None:
-    """Raise ProductError where the system does not let a product be read, which may be sound."""
+def _check_readable(product: Path) -> None:
+    """Raise ProductError if the system refuses to read a product; a damaged content is no error here."""
     try:
         open_to_read(product).close()
     except OSError as error:
-        if reason := why_unreadable(error):
-            raise ProductError(cannot_be_read(product, reason)) from None
-    except ProductError:  # of its content
+        if problem := unreadable(product, error):
+            raise problem from None
+    except ProductError:
         return
-
-
-def _fits(origin: Mapping[str, Any], stage: str, scene: Scene) -> bool:
-    return origin.get("fingerprint") == scene.fingerprint(stage)
 
 
 def _cost(origin: Mapping[str, Any], seconds: float | None) -> str:
@@ -162,7 +148,7 @@ def _value(settings: Mapping[tuple[str, ...], Any], key: tuple[str, ...]) -> str
 
 
 def leaves(table: Mapping[str, Any], within: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """All values of nested tables, each with the keys that lead to it."""
+    """All values of nested tables, each with its keys."""
     for key, value in table.items():
         if isinstance(value, dict):
             yield from leaves(value, (*within, key))

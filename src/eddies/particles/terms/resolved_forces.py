@@ -1,0 +1,152 @@
+"""Forces from the resolved velocity: pressure, viscosity, hidden stress, damping, relaxation and forcing."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from eddies.particles.context import Context
+from eddies.particles.flow_units import FlowUnits
+from eddies.particles.rates import Rates
+from eddies.particles.resolved_velocity import ResolvedFlow
+from eddies.particles.terms.term import Coefficient, Term
+from eddies.scene import terms as declared
+from eddies.spectral.mode_operators import rising
+
+# Initial damping rates D, proportional to k^2 like those of a small viscosity.
+RATES = 0.1 * (torch.arange(1, 7, dtype=torch.float64) / 6) ** 2
+
+
+class Pressure(Term):
+    """-grad p with  laplacian p = -d_i d_j (u_i u_j)  for the resolved velocity u.
+
+    The density rho_0 (1 + p / c^2) follows the pressure; there is no density equation and no sound.
+    """
+
+    Settings = declared.Pressure
+    linear = True
+
+    def forward(self, context: Context) -> Rates:
+        grid = context.resolved.grid
+        pressure = grid.pressure_of(context.resolved.products)
+        return Rates(force_modes=-grid.gradient(pressure), pressure_modes=pressure)
+
+
+class Viscosity(Term):
+    """nu laplacian u for the resolved velocity u and the viscosity nu of the flow."""
+
+    Settings = declared.Viscosity
+    linear = True
+
+    def forward(self, context: Context) -> Rates:
+        grid, velocity = context.resolved.grid, context.resolved.velocity
+        return Rates(force_modes=-context.flow.scales.viscosity * grid.wavenumber_squared * velocity)
+
+
+class Stress(Term):
+    """-P[div tau], P the projection on solenoidal fields, for the stress tau that the filter hides:
+
+        tau = G(u* u*) - u u,          u* = u / G                                     form "deconvolution"
+        tau = (d^2/12) grad u grad u^T                                                form "gradient"
+
+    u is the resolved velocity, G the transfer function of the filter and d its width. The first form is exact except
+    for unresolved modes (Stolz and Adams 1999). The second is the leading term of its expansion in d (Leonard 1975;
+    Clark et al. 1979). The pressure of the stress contributes to the density. There is no learned parameter.
+    """
+
+    Settings = declared.Stress
+    settings: declared.Stress
+    linear = True
+
+    def forward(self, context: Context) -> Rates:
+        flow = context.resolved
+        stress = _deconvolved(flow) if self.settings.form == "deconvolution" else _gradient(flow)
+        return flow.grid.hidden_stress(stress)
+
+
+def _deconvolved(flow: ResolvedFlow) -> Tensor:
+    """Modes (6, kz, ky, kx) of G(u* u*) - u u."""
+    return flow.filter_transfer * flow.grid.squares(flow.unfiltered) - flow.products
+
+
+def _gradient(flow: ResolvedFlow) -> Tensor:
+    """Modes (6, kz, ky, kx) of (d^2/12) d_k u_i d_k u_j."""
+    slopes = flow.grid.slopes(flow.velocity)
+    return flow.filter_width**2 / 12 * flow.grid.within(flow.grid.products(slopes, slopes))
+
+
+class Damping(Term):
+    """-D(k) u for the modes of the resolved velocity u: a spectral eddy viscosity (Kraichnan 1976).
+
+    D is k_c u_c times six learned values at wavenumbers equally spaced up to the highest resolved one, k_c. It is
+    linear between them, with D(0) = 0. u_c is the present rms of a component of the smallest resolved scales, the modes
+    of the unfiltered velocity above k_c/2: the energy transfer to unresolved scales depends on them.
+    """
+
+    Settings = declared.Damping
+    linear = True
+
+    def __init__(self, settings: declared.Damping, flow: FlowUnits) -> None:
+        super().__init__(settings, flow)
+        self.rates = nn.Parameter(RATES.clone())
+
+    @property
+    def learned_coefficients(self) -> list[Coefficient]:
+        return [Coefficient.of("D/(k_c u_c)", self.rates, "damping rates at k/k_c = 1/6, 2/6, ..., 1; u_c is the rms "
+                               "of the smallest resolved scales")]
+
+    def forward(self, context: Context) -> Rates:
+        flow = context.resolved
+        highest = 2 * math.pi / context.decomposition.length * flow.grid.resolved
+        rates = rising(flow.grid.shell, flow.grid.resolved, self.rates.double().cpu()).to(flow.grid.dtype)
+        return Rates(force_modes=-highest * flow.smallest_rms * rates * flow.velocity)
+
+
+class Relaxation(Term):
+    """-C (v - u): each particle's velocity v relaxes to the resolved velocity u.
+
+    The mean of v - u over the particles is subtracted, so the momentum is conserved. C is a learned factor times
+    2 u_rms/d with the present u_rms of u.
+    """
+
+    Settings = declared.Relaxation
+    linear = True
+
+    def __init__(self, settings: declared.Relaxation, flow: FlowUnits) -> None:
+        super().__init__(settings, flow)
+        self.factor = nn.Parameter(torch.ones((), dtype=torch.float64))
+
+    @property
+    def learned_coefficients(self) -> list[Coefficient]:
+        return [Coefficient.of("C d/(2 u_rms)", self.factor, "relaxation rate of a velocity to the resolved one")]
+
+    def forward(self, context: Context) -> Rates:
+        flow = context.resolved
+        missing = context.without_mean(flow.missing())
+        rate = (2 * flow.rms / flow.filter_width).to(missing) * self.factor.to(missing)
+        return Rates(acceleration=-rate * missing)
+
+
+class Forcing(Term):
+    """f(k) = A u(k) over 0 < |k| < k_f with A = P / sum |u*(k)|^2: linear forcing of the large scales (Lundgren 2003).
+
+    The flow is forced by A u*, with u* = u / G its velocity before the filter (`flow/forcing.py`), and the power P is
+    the `injection_rate` of that flow. The filtered flow receives less, A sum |u(k)|^2. Each evaluation sets A.
+    """
+
+    Settings = declared.Forcing
+    settings: declared.Forcing
+    linear = True
+
+    def forward(self, context: Context) -> Rates:
+        """Modes of the force. Raises TermError if the forced modes have no energy."""
+        flow, below = context.resolved, self.settings.wavenumber
+        square = flow.mean_square(flow.unfiltered, 0, below)
+        if square == 0 and self.settings.injection_rate > 0:
+            raise declared.TermError("injection: the particles have no energy at the forced wavenumbers; leave the "
+                                     "forcing out, or raise its wavenumber to scales at which they move")
+        amplitude = self.settings.injection_rate / square if square > 0 else 0.0
+        shell = flow.grid.shell
+        return Rates(force_modes=amplitude * torch.where((shell > 0) & (shell < below), flow.velocity, 0))

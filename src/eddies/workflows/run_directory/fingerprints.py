@@ -1,0 +1,79 @@
+"""The dependence of products on the scene: fingerprints, and the provenance that a product keeps."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from eddies.import_path import origins
+from eddies.pipeline import STAGES
+from eddies.scene.parts import FOREIGN_IN
+from eddies.scene.scene import Scene
+
+
+def stage_fingerprint(scene: Scene, stage: str) -> str:
+    """Return the SHA-256 of the inputs of a stage's product.
+
+    It covers the settings of the stage and of the scene's earlier stages, the content of the files that the flow, the
+    weights and the step come from, the source of the user's classes, and the fingerprints of other ground truths.
+    """
+    training, simulation = scene.training, scene.simulation
+    settings: dict[str, Any] = asdict(scene) | {
+        "window": scene.window, "start": _digest(scene.initial.path),
+        "weights": _digest(scene.model.weights_file if scene.model else None),
+        "truths": _fingerprints(training.truth_files if training else ()), "found_step": _digest(scene.step_file),
+        "confirming": _fingerprints(simulation.confirming_files if simulation else ())}
+    # The content of these files counts, not their paths.
+    if settings["weights"] is not None:
+        del settings["model"]["path"]
+    if settings["found_step"] is not None:
+        del settings["simulation"]["step_from"]
+    if simulation is not None:
+        del settings["simulation"]["confirmed_on"]
+    settings |= {f"own_{name}": origins(scene.foreign_in(name)) for name in FOREIGN_IN}
+    of_these = {*STAGES[stage].depends_on, stage} & {*scene.stages}
+    read = [[key, _without(settings[key], key, each.but)]
+            for each in STAGES.values() if each.name in of_these for key in each.reads]
+    return hashlib.sha256(json.dumps(read).encode()).hexdigest()
+
+
+def stage_provenance(scene: Scene, stage: str) -> dict[str, Any]:
+    """Return what the product of a stage keeps of the scene: its text, the stage's fingerprint, the kinds of the
+    products that it is made from and, if the scene names any, the origins of the user's classes."""
+    foreign = {"foreign": origins(scene.foreign)} if scene.foreign else {}
+    return {"scene": scene.to_toml(), "fingerprint": stage_fingerprint(scene, stage),
+            "made_from": [each.product for each in scene.inputs(stage)], **foreign}
+
+
+def _without(value: Any, section: str, keys: Sequence[str]) -> Any:
+    """The values of a section without some keys "section.key"; any other value as it is."""
+    if not isinstance(value, dict):
+        return value
+    return {key: each for key, each in value.items() if f"{section}.{key}" not in keys}
+
+
+def _fingerprints(paths: Sequence[Path]) -> list[str | None]:
+    """The fingerprints of ground truths, whose files may be too large to digest; None for a missing one."""
+    if not paths:
+        return []
+    from eddies.io.provenance import product_fingerprint  # h5py and mpi4py, only here
+    return [product_fingerprint(path) for path in paths]
+
+
+def _digest(path: str | Path | None) -> str | None:
+    """The SHA-256 of a file's content; None if there is no such file."""
+    if path is None or not Path(path).is_file():
+        return None
+    state = Path(path).stat()
+    return _digest_of_version(path, state.st_size, state.st_mtime_ns)
+
+
+@lru_cache(maxsize=4)  # the file may be large, and a run asks several times
+def _digest_of_version(path: str | Path, size: int, modified: int) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,277 @@
+"""Problems that are known before any work: each where it is due, with its key, its value and a remedy that helps; and
+what only the flow tells."""
+
+import dataclasses
+import logging
+import re
+
+import pytest
+
+from eddies.scene.scene import SceneError, builtin_scenes, load_scene
+from eddies.workflows.foreseen.storage import memory
+from eddies.workflows.problems import Context, memory_of_node, problems, refuse
+from tests.bad_scenes import INFEASIBLE
+from tests.changed_product import changed
+from tests.small_scene import TINY, one_model, problems_of
+from tests.workflows.synthetic_run import write_ground_truth
+
+
+def eddies(*arguments):
+    """Exit code of a command."""
+    from eddies.cli import main
+    return main([str(argument) for argument in arguments])
+
+
+# ---- warnings
+
+
+@pytest.fixture
+def warned(comm):
+    """A function that gives the warnings of a scene with changes."""
+    return lambda *overrides, scene=TINY: problems_of(load_scene(scene, list(overrides)), comm)[1]
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("name", [name for name, _ in builtin_scenes()])
+def test_built_in_scenes_have_no_problem_but_missing_runs(comm, name):
+    refused, warnings = problems_of(load_scene(name), comm)
+    others = [line for line in warnings if "of memory here" not in line and "of disk" not in line]
+    assert all("no such file" in line for line in refused) and all("path" in line or "train" in line for line in others)
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("given, words, remedy", [
+    ("flow.viscosity=0.05", "k_max eta is about 0.88", "flow.viscosity={viscosity to}"),
+    ("flow.viscosity=0.05", "[flow] cells = 24", "flow.cells={raise cells to}"),
+    ("flow.cells=120", "k_max eta is about 5.6", "flow.cells={lower cells to}"),
+    ("flow.sound_speed=4", "Mach number is about 0.47: above 0.3", "flow.sound_speed={raise sound_speed to}"),
+    ("flow.sound_speed=1.5", "supersonic", "flow.sound_speed={raise sound_speed to}"),
+    ("time.step=0.06", "unstable by advection, step x k_max x max(|u| + |v| + |w|) = 3.17, stable up to 2.83",
+     "time.step=0.05"),
+    ("time.courant=2.5", "[time] courant = 2.5: is unstable by advection", None),
+    ("tracers.filter_width=2", "passes wavenumbers up to 1.6", "tracers.filter_width={lower it to}"),
+    ("tracers.filter_width=0.1", "narrower than a cell", "tracers.filter_width={raise it to}"),
+    ("simulation.turnovers=5", "ends 0.3 turnovers after its start", "simulation.turnovers={lower it to}"),
+    ("simulation.turnovers=5", "[simulation] turnovers = 5", "tracers.turnovers={raise .tracers. turnovers to}"),
+    ("simulation.start=0.9", "[simulation] turnovers = 0.3: the ground truth ends 0.06 turnovers", None),
+])
+def test_a_warning_names_key_and_value_and_its_remedy_helps(warned, given, words, remedy):
+    changes = [given, "time.max_step=1"] if "courant" in given else [given]
+    line, = warned(*changes)
+    assert words in line and "\n" not in line
+    assert re.match(r"\[\w+\] \w+ = [\d.e-]+: ", line)
+    if remedy:
+        key, value = remedy.split("=")
+        if value.startswith("{"):
+            value = re.search(value[1:-1] + r" ([\d.e-]*\d)", line).group(1)
+        assert warned(*changes, f"{key}={float(value) if 'cells' not in key else int(value)}") == []
+
+
+@pytest.mark.mpi(1)
+def test_viscosity_that_leaves_no_turbulence(warned):
+    for viscosity, words in ((2, "below 5"), (60, "laminar")):
+        line, = (line for line in warned(f"flow.viscosity={viscosity}") if "Re_lambda is" in line)
+        remedy = re.search(r"lower viscosity to ([\d.]+)", line).group(1)
+        assert words in line
+        assert not any("Re_lambda is" in line for line in warned(f"flow.viscosity={0.99 * float(remedy):.3g}"))
+
+
+@pytest.mark.mpi(1)
+def test_explicit_steps_have_the_limits_of_sound_and_viscosity_too(comm, warned):
+    line, = warned("time.stepper=rk4", "time.step=0.05")
+    assert "[time] step = 0.05: is unstable by sound" in line and 'stepper = "etdrk4"' in line
+    free = load_scene("taylor-green", ["time.stepper=rk4", "flow.viscosity=1", "flow.cells=32"])
+    free = dataclasses.replace(free, time=dataclasses.replace(free.time, step=None, max_step=0.05))
+    (line,), = problems_of(free, comm)[1:]
+    assert "[time] max_step = 0.05: is unstable by viscosity, step x 3 viscosity k_max^2 = 15" in line
+
+
+@pytest.mark.mpi(1)
+def test_steps_that_are_too_long_for_a_forced_rollout_or_for_a_term(comm, warned):
+    """Runs of `hit` with C_r = 2 end in noise with velocity Verlet and steps of 0.05."""
+    forced = ["simulation.injection=dissipation", "simulation.step=0.3", "simulation.frame_interval=0.3"]
+    line, = warned(*forced)
+    step = re.search(r"of about ([\d.]+)", line).group(1)
+    assert line.startswith("[simulation] step = 0.3") and warned(*forced, f"simulation.step={step}") == []
+    changes = ["model.preset=local", "model.filtered-equations.relaxation=2"]
+    for integrator, step, expected in (("verlet", 0.05, True), ("rk3", 0.04, False)):
+        given = [*changes, f"simulation.integrator={integrator}", f"simulation.step={step}"]
+        lines = problems_of(one_model("hit", given), comm)[1]
+        assert any("relaxes so fast" in line for line in lines) is expected
+    sound = ["model.preset=wcsph", "training.horizons.steps=5"]
+    line, = (line for line in warned(*sound) if "sound" in line)
+    scene = load_scene(TINY, sound)
+    # Monaghan (1992), with an alpha of 0.05.
+    longest = 0.4 * scene.interaction_radius / 2 / (scene.flow.sound_speed * 1.03)
+    assert float(line.partition("at most ")[2].split()[0]) == pytest.approx(longest, rel=0.1)
+    assert warned(*sound, "simulation.step=0.001") == []
+
+
+@pytest.mark.mpi(1)
+def test_terms_and_weights_that_nothing_trains(warned, tmp_path):
+    lines = warned("model.preset=transport-velocity")
+    assert any('"transport-velocity" is trained through horizons alone' in line for line in lines)
+    assert warned("model.preset=transport-velocity", "training.horizons.steps=5", "simulation.step=0.001") == []
+    line, = warned(f"model.path={tmp_path}")
+    assert f"there is no {tmp_path / 'model.h5'} yet" in line
+
+
+@pytest.mark.mpi(1)
+def test_a_warning_names_the_variants_that_it_concerns(comm):
+    scene = load_scene("tiny", ["variant.paper.simulation.step=0.3", "variant.no-force.simulation.step=0.3",
+                                "simulation.injection=dissipation", "simulation.frame_interval=0.3"])
+    assert [line.partition(":")[0] for line in problems_of(scene, comm)[1] if "0.3: the particles" in line] == [
+        "variant paper"]
+    line, = (line for line in problems_of(load_scene("tiny", ["simulation.turnovers=5"]), comm)[1])
+    assert line.startswith("variant paper, resolved, local, grid-16, grid-20, no-force: [simulation] turnovers = 5")
+
+
+@pytest.mark.mpi(1)
+def test_weights_that_the_same_job_makes_are_not_read(comm, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    scene = load_scene("tiny", ["realisations=[2]"])
+    assert problems_of(scene, comm) == ([], [])
+    (tmp_path / "runs/tiny/paper").mkdir(parents=True)
+    (tmp_path / "runs/tiny/paper/model.h5").write_text("of other settings")
+    assert problems_of(scene, comm) == ([], [])
+
+
+@pytest.mark.mpi(1, 2)
+def test_a_machine_that_is_too_small(comm, tmp_path):
+    scene = load_scene(TINY)
+    fits = Context(comm, scene.stages, tmp_path, memory=memory_of_node(), free_disk=1e9)
+    assert problems(scene, fits) == []
+    size = memory(scene, "dns", comm.size)
+    small, = problems(scene, dataclasses.replace(fits, stages=["dns"], memory=(comm.size - 0.5) * size))
+    full, = problems(scene, dataclasses.replace(fits, free_disk=1e6))
+    assert "of memory here" in small.text and "of disk" in full.text and not small.fatal and not full.fatal
+
+
+@pytest.mark.mpi(1)
+def test_a_run_logs_the_warnings_of_its_stages_when_it_starts(comm, tmp_path, monkeypatch, caplog):
+    from eddies.parallel.stop import StopRequest
+    from eddies.stages import run_stages
+    from eddies.workflows import dns
+    monkeypatch.setattr(dns, "run", lambda *given: None)
+    scene = load_scene(TINY, ["flow.sound_speed=4", "model.preset=transport-velocity"])
+    with caplog.at_level(logging.WARNING, logger="eddies"):
+        run_stages(["dns"], scene, comm, tmp_path, StopRequest(comm))
+    shown = [record.getMessage() for record in caplog.records]
+    assert len(shown) == 1 and "sound_speed" in shown[0] and len(problems_of(scene, comm)[1]) > 1
+
+
+# ---- what is refused
+
+
+@pytest.mark.mpi(1)
+@pytest.mark.parametrize("override, message", INFEASIBLE, ids=[override for override, _ in INFEASIBLE])
+def test_what_cannot_end_is_refused_before_it_begins(comm, tmp_path, monkeypatch, capfd, override, message):
+    monkeypatch.chdir(tmp_path)
+    for command in ("check", "run"):
+        assert eddies(command, TINY, "--set", override) == 2
+        output, errors = capfd.readouterr()
+        assert errors.startswith("eddies: error: tiny: ") and errors.count("\n") == 1 and message in errors
+        assert (output == "") == (command == "run") and list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.mpi(2)
+def test_a_refusal_is_written_once(comm, tmp_path, capfd):
+    assert eddies("run", TINY, "--set", "time.step=1e-12", "--output", tmp_path / "run") == 2
+    errors = capfd.readouterr().err
+    assert errors.count("\n") == (comm.rank == 0) and not (tmp_path / "run").exists()
+
+
+@pytest.mark.mpi(1)
+def test_only_the_stages_that_are_asked_for_are_refused(comm, tmp_path):
+    scene = load_scene(TINY, ["simulation.step=1e-12", "tracers.turnovers=0.01"])
+    for stages, text in ((["dns", "train-kernel"], None), (["dns", "train"], "window"), (["train"], None),
+                         (["simulate"], "step = 1e-12")):
+        try:
+            refuse(scene, Context(comm, stages, tmp_path))
+            assert text is None
+        except SceneError as error:
+            assert text is not None and text in str(error)
+
+
+@pytest.mark.mpi(1)
+def test_a_gpu_that_is_not_there(comm, tmp_path, monkeypatch, capfd):
+    import torch
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.chdir(tmp_path)
+    assert eddies("run", TINY, "--set", "device=cuda") == 2
+    assert capfd.readouterr().err == (
+        'eddies: error: device = "cuda": torch finds no GPU here; set device = "cpu"\n')
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.mpi(1, 2)
+def test_files_that_do_not_fit(comm, tmp_path):
+    path = comm.bcast(str(tmp_path))
+    (line,), _ = problems_of(load_scene("taylor-green", ["initial.kind=file", f"initial.path={path}/start.h5"]), comm)
+    assert f"{path}/start.h5" in line
+    if comm.rank == 0:
+        (tmp_path / "model.h5").write_text("nothing")
+    comm.Barrier()
+    (line,), _ = problems_of(load_scene("hit-mt008", [f"model.path={path}"], ["variant"]), comm)
+    assert f"{path}/model.h5" in line
+
+
+# ---- what only the flow tells
+
+
+@pytest.mark.mpi(1, 2)
+@pytest.mark.parametrize("overrides, message", [
+    (["initial.amplitude=1e-15"], "[time] max_step = 0.05: "),
+    (["initial.kind=tests.workflows.test_problems:at_rest"], "at rest"),
+    (["tracers.turnovers=1e13"], "[time] courant = "),
+    (["tracers.frame_interval=1e-11"], "[tracers] frame_interval = 1e-11: "),
+    (["spin_up.turnovers=1e10"], "[time] max_step = 0.05: "),
+], ids=lambda value: value[0] if isinstance(value, list) else "")
+def test_a_flow_of_unknown_turnover_time_is_refused_once_it_is_there(comm, tmp_path, capfd, overrides, message):
+    options = [word for each in ("flow.viscosity=0", "flow.cells=16", "tracers.particles_per_side=4", *overrides)
+               for word in ("--set", each)]
+    assert eddies("dns", "tracers-only", *options, "--output", tmp_path) == 2
+    errors = capfd.readouterr().err
+    assert comm.rank > 0 or errors.startswith("eddies: error: tracers-only: ") and errors.count("\n") == 1
+    assert comm.rank > 0 or message in errors
+    comm.Barrier()
+    assert not (tmp_path / "ground_truth.h5").exists()
+
+
+@pytest.mark.mpi(1)
+def test_a_run_of_given_time_has_a_limit_of_steps(comm, tmp_path, capfd):
+    fast = ["--set", "initial.kind=tests.workflows.test_problems:fast", "--set", "time.duration=1e9", "--unset",
+            "time.step"]
+    assert eddies("dns", "abc", *fast, "--output", tmp_path) == 2
+    assert "[time] courant = " in (errors := capfd.readouterr().err) and "for a time of 1e+09, and 1e+09" in errors
+
+
+def fast(grid, initial, seed):
+    """A flow of the user's with an unknown speed."""
+    from eddies.flow.initial_fields import INITIAL_FLOWS
+    return 1e4 * INITIAL_FLOWS["random"](grid, initial, seed)
+
+
+def at_rest(grid, initial, seed):
+    """A flow of the user's that does not move."""
+    return 0 * fast(grid, initial, seed)
+
+
+@pytest.mark.mpi(1, 2)
+def test_a_ground_truth_with_too_few_frames_or_without_motion(comm, tmp_path):
+    from eddies.workflows.problems import check_ground_truth
+    scene = load_scene(TINY, ["tracers.field_every=5"])
+    write_ground_truth(comm, tmp_path, frames=30)
+    check_ground_truth(["train", "simulate"], scene, comm, tmp_path)
+    with pytest.raises(SceneError, match="after frame 14 of 30 no filtered field is followed"):
+        coarse = dataclasses.replace(scene.simulation, frame_interval=0.5)
+        check_ground_truth(["simulate"], dataclasses.replace(scene, simulation=coarse), comm, tmp_path)
+    for group, value, stages, message in (("eddy_turnover_time", 1e12, ["simulate"], "3.8e.12 steps of 0.08"),
+                                          ("acceleration_rms", 0.0, ["train"], "scale acceleration = 0.0: must be")):
+        comm.Barrier()
+        if comm.rank == 0:
+            with changed(tmp_path / "ground_truth.h5") as file:
+                file["reference"].attrs[group] = value
+        comm.Barrier()
+        with pytest.raises(SceneError, match=message):
+            check_ground_truth(stages, scene, comm, tmp_path)
