@@ -15,8 +15,7 @@ pytest_plugins = ["mpi_tools.pytest_mpi"]
 
 @pytest.fixture(autouse=True)
 def fresh_logger():
-    """Each test begins with the package's logger as imported: a command configures it, and module-scoped fixtures run
-    commands before any function-scoped fixture is set up."""
+    """Reset the logger of the package before each test, because commands configure it."""
     logger = logging.getLogger("eddies")
     logger.handlers, logger.propagate = [], True
     logger.setLevel(logging.NOTSET)
@@ -24,14 +23,14 @@ def fresh_logger():
 
 @pytest.fixture
 def undrawn(monkeypatch):
-    """Figures are made but not drawn: that is most of a report's time."""
+    """Make figures but do not draw them, which takes most of the time of a report."""
     from eddies.report import figures
     monkeypatch.setattr(figures, "png", lambda figure: b"\x89PNG\r\n\x1a\n" + bytes(16))
 
 
 @pytest.fixture
 def no_figures(monkeypatch, undrawn):
-    """Figures are not even made, which is most of the rest: for tests of a report's numbers and words."""
+    """Do not even make figures, for tests of the numbers and words of a report."""
     from matplotlib.figure import Figure
     # All are imported first: one that is imported later would keep what it takes from another as it is now.
     modules = [importlib.import_module(found.name)
@@ -44,29 +43,28 @@ def no_figures(monkeypatch, undrawn):
 
 @pytest.fixture
 def quick_solves(monkeypatch):
-    """Three iterations in each solve for the resolved velocity, where it does not matter what is learned of it."""
+    """Three iterations in each solve for the resolved velocity, for tests in which its accuracy does not matter."""
     from eddies.particles.resolved_velocity import ResolvedVelocity
     monkeypatch.setattr(ResolvedVelocity, "iterations", 3)
 
 
 @pytest.fixture
 def quick_spectra(monkeypatch):
-    """Three iterations for each spectrum of particles, where nobody looks at them."""
+    """Three iterations for each spectrum of particles, for tests in which its accuracy does not matter."""
     from eddies.workflows.rollout import particle_measures
     monkeypatch.setattr(particle_measures, "MOST_ITERATIONS", 3)
 
 
 @pytest.fixture
 def own(tmp_path, monkeypatch):
-    """A function that writes a module of a user's, NAME and text, into tmp_path, where modules are found as long as the
-    test lasts."""
+    """A function that writes a module of a user into tmp_path, which is on the import path during the test."""
     monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path)])
     written = []
 
     def write(name, text):
         path, new = tmp_path / f"{name}.py", tmp_path / f"{name}-{os.getpid()}"
         new.write_text(text)
-        new.replace(path)  # other ranks, which write the same, never read a part of it
+        new.replace(path)  # other ranks write the same file, and must not read a part of it
         importlib.invalidate_caches()
         written.append(name)
         return path

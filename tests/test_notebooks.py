@@ -1,5 +1,4 @@
-"""The notebooks of the documentation: each runs from its first cell to its last, on a smaller scene, and finds what
-it says."""
+"""The notebooks of the documentation run from first to last cell, on smaller scenes, and find what they claim."""
 
 import base64
 import json
@@ -14,11 +13,10 @@ from eddies.analysis.pareto import pareto_front
 from mpi_tools.launch import mpi_environment
 
 NOTEBOOKS = Path(__file__).parents[1] / "docs" / "notebooks"
-NAMES = [path.stem for path in sorted(NOTEBOOKS.glob("*.ipynb"))]
 SMALLER = ["spin_up.turnovers=0.3", "tracers.particles_per_side=8", "tracers.field_cells=12",
            "tracers.turnovers=0.3", "kernel.steps=4", "kernel.points=50"]
 TRAINED_LESS = ["training.steps=8", "training.combined_steps=2", "training.frames=2", "training.batch=64"]
-# As quick_spectra and undrawn, but in the notebook's process. Of the figures that of PDFs is shown.
+# Like the fixtures quick_spectra and undrawn, in the process of the notebook. Only the figure of PDFs is drawn.
 QUICK = """
 from eddies.report import figures
 from eddies.workflows.rollout import particle_measures
@@ -31,14 +29,14 @@ figures.png = lambda figure: png(figure) if "KL" in figure.axes[0].get_title("le
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Where they run: what one has made the next finds."""
+    """The common working directory of the notebooks."""
     return tmp_path_factory.mktemp("notebooks")
 
 
 @pytest.fixture
 def execute(folder, monkeypatch):
-    """A function that runs a notebook in a process of its own; gives its cells, by id, and the value of an expression
-    at its end."""
+    """A function that runs a notebook in its own process. It returns the cells by id, and the value of an expression at
+    the end."""
     for name, value in {**mpi_environment(1), "JUPYTER_DATA_DIR": folder, "JUPYTER_RUNTIME_DIR": folder,
                         "IPYTHONDIR": folder}.items():
         monkeypatch.setenv(name, str(value))
@@ -57,17 +55,18 @@ def execute(folder, monkeypatch):
 
 
 def figures(cells):
-    """The images that cells show, by id, as bytes."""
+    """The images of the cells by id, as bytes."""
     return {name: base64.b64decode(output.data["image/png"]) for name, cell in cells.items()
             for output in cell.get("outputs", ()) if "image/png" in output.get("data", {})}
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_a_notebook_is_kept_without_what_it_shows(name):
-    notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
-    nbformat.validate(notebook)
-    assert all(not cell.outputs and cell.execution_count is None for cell in notebook.cells if cell.cell_type == "code")
-    assert set(notebook.metadata) == {"kernelspec", "language_info"}
+def test_notebooks_are_kept_without_output():
+    for path in NOTEBOOKS.glob("*.ipynb"):
+        notebook = nbformat.read(path, as_version=4)
+        nbformat.validate(notebook)
+        code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+        assert all(not cell.outputs and cell.execution_count is None for cell in code), path
+        assert set(notebook.metadata) == {"kernelspec", "language_info"}, path
 
 
 def test_a_first_run(execute, folder):
@@ -87,7 +86,7 @@ def test_a_term_of_ones_own(execute, folder):
     error = {name: row["acceleration"] for name, row in table.items()}
     assert error["deconvolution"] < error["smagorinsky"] != error["none"] < 1
     assert all(0.8 < row["energy"] < 1.2 for row in table.values())
-    # It is the class of the example.
+    # The notebook has the class of the example.
     example = (NOTEBOOKS.parent / "examples" / "own_term.py").read_text(encoding="utf-8")
     of_the_class = example[example.index("@dataclass"):example.index("\n\nif __name__")].strip()
     assert of_the_class in (folder / "own_term.py").read_text(encoding="utf-8")

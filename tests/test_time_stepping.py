@@ -53,14 +53,3 @@ def test_order_four(stepper, steps):
             state = step(state, 1.0 / count)
         errors.append(np.abs(state - equation.exact(start, 1.0)).max())
     assert np.log2(errors[0] / errors[1]) > 3.8 and np.log2(errors[1] / errors[2]) > 3.8
-
-
-def test_operators_are_prepared_once_for_each_step_size():
-    equation = Oscillator()
-    prepared = []
-    original = equation.linear_function
-    equation.linear_function = lambda f, step: prepared.append(step) or original(f, step)
-    stepper, state = ETDRK4(equation), np.ones(3, complex)
-    for step in (0.1, 0.05, 0.1, 0.05):
-        state = stepper(state, step)
-    assert prepared == [0.1] * 6 + [0.05] * 6

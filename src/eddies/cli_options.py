@@ -1,4 +1,4 @@
-"""The command line: sub-commands, their options, and examples of each."""
+"""The command line: sub-commands with options and examples."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import eddies
 from eddies.errors import UserError
 from eddies.pipeline import STAGES
 
-# What `--help` of a command ends with.
+# Examples at the end of `--help` of a command.
 EXAMPLES = {
     "run": ("eddies run hit-small", "mpirun -n 2 eddies run mine.toml --set training.steps=200 --output runs/second"),
     "dns": ("eddies dns hit-small --set seed=2 --output runs/hit-small-seed-2",),
@@ -31,7 +31,7 @@ EXAMPLES = {
 
 
 def parse_arguments(arguments: list[str] | None, rank: int) -> argparse.Namespace:
-    """The options of the command line; help and usage errors are printed by rank 0 alone."""
+    """The options of the command line. Only rank 0 prints help and usage errors."""
     with contextlib.ExitStack() as stack:
         if rank > 0:
             silence = stack.enter_context(open(os.devnull, "w"))
@@ -41,7 +41,7 @@ def parse_arguments(arguments: list[str] | None, rank: int) -> argparse.Namespac
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """Sub-commands and their options."""
+    """The parser with all sub-commands."""
     parser = argparse.ArgumentParser(prog="eddies", description=eddies.__doc__,
                                      epilog="EDDIES_LOG = debug (as --verbose), info, outcome (as --quiet) or warning "
                                             "sets what is logged.")
@@ -52,7 +52,7 @@ def build_parser() -> argparse.ArgumentParser:
         command = add_command(commands, name, about)
         add_scene_options(command)
         if name in ("run", "train", "find-step", "simulate"):
-            add_variants(command, "work on this variant of the scene alone; repeatable")
+            add_variants(command, "run only this variant of the scene; repeatable")
         add_job_options(command, "run directory (default: runs/NAME)")
     report = add_command(commands, "report", STAGES["report"].about)
     add_run(report, "run")
@@ -71,15 +71,15 @@ def build_parser() -> argparse.ArgumentParser:
     add_variants(check, "check this variant in place of the scene; repeatable")
     how = check.add_mutually_exclusive_group()
     how.add_argument("--json", action="store_true", help="the numbers as JSON, for programs")
-    how.add_argument("--time", action="store_true", help="run a few steps of each stage, and say how long it will take")
+    how.add_argument("--time", action="store_true", help="run a few steps of each stage, and estimate its time")
     scenes = add_command(commands, "scenes", "the built-in scenes, a line each; or one with all settings")
     scenes.add_argument("scene", nargs="?", metavar="SCENE", help="print this scene with all keys, also absent ones")
     scenes.add_argument("--schema", action="store_true", help="print the JSON schema of scenes, for editors")
-    status = add_command(commands, "status", "what stands in run directories: stages, checkpoints, jobs, sizes")
+    status = add_command(commands, "status", "the state of run directories: stages, checkpoints, jobs, sizes")
     status.add_argument("directory", nargs="?", type=directory, default=Path("runs"), metavar="DIR",
                         help="a run directory, or one of several (default: runs)")
     status.add_argument("--verify", action="store_true", help="compare all bytes of the products with their checksums")
-    diff = add_command(commands, "diff", "what differs between two runs: settings and numbers")
+    diff = add_command(commands, "diff", "the differences between two runs: settings and numbers")
     add_run(diff, "one")
     add_run(diff, "other", nargs="?")
     add_variants(diff, "of both runs; or, given twice, of one run")
@@ -94,19 +94,18 @@ def add_command(commands: argparse._SubParsersAction, name: str, about: str) -> 
 
 
 def add_run(parser: argparse.ArgumentParser, name: str, nargs: str | None = None) -> None:
-    """A run directory."""
+    """Add a run directory."""
     parser.add_argument(name, type=directory, metavar="RUN", nargs=nargs, help="a run directory, such as runs/tiny")
 
 
 class OptionError(UserError):
-    """An option of the command line that cannot be meant."""
+    """An option of the command line is invalid."""
 
 
 def directory(text: str) -> Path:
-    """A directory of the command line, there or not."""
+    """A directory of the command line, which may not exist yet."""
     if not text:
-        raise OptionError("an empty text is no directory, and would mean the one that you are in; give its name (. for "
-                          "the one that you are in)")
+        raise OptionError("an empty text is no directory; give the name of one, or . for the working directory")
     try:
         Path(text).exists()
     except OSError as error:
@@ -115,15 +114,15 @@ def directory(text: str) -> Path:
 
 
 def positive(text: str) -> float:
-    """A number of the command line that is larger than zero."""
+    """A positive number of the command line."""
     value = float(text)
     if not value > 0:
-        raise argparse.ArgumentTypeError(f"{text}: a number larger than 0 is expected")
+        raise argparse.ArgumentTypeError(f"{text}: must be larger than 0")
     return value
 
 
 def add_scene_options(parser: argparse.ArgumentParser) -> None:
-    """The scene and changes to it."""
+    """Add the scene and changes to it."""
     parser.add_argument("scene", metavar="SCENE", help="name of a built-in scene, or path of a TOML file")
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", dest="overrides",
                         help="change a key of the scene; repeatable")
@@ -132,28 +131,28 @@ def add_scene_options(parser: argparse.ArgumentParser) -> None:
 
 
 def add_variants(parser: argparse.ArgumentParser, about: str) -> None:
-    """Variants of a scene by name."""
+    """Add the choice of variants by name."""
     parser.add_argument("--variant", action="append", default=[], metavar="NAME", dest="variants", help=about)
 
 
 def add_job_options(parser: argparse.ArgumentParser, output: str) -> None:
-    """Options of commands that run for long: where the products go, what they may replace, and when to stop."""
+    """Add options of long commands: output, replacement of work, and limits of time."""
     parser.add_argument("--output", type=directory, metavar="DIR", help=output)
-    parser.add_argument("--overwrite", action="store_true", help="replace products and checkpoints of other settings; "
-                        "else they are named, and nothing is touched. What fits is kept, or gone on with")
+    parser.add_argument("--overwrite", action="store_true", help="replace products and checkpoints of other settings, "
+                        "which are otherwise an error. Work of the same settings is kept and continued")
     parser.add_argument("--take-over", action="store_true",
-                        help="end another job in the same directory, or one that only seems to be there")
+                        help="end another job in the same directory, or remove the lock of a job that has died")
     parser.add_argument("--checkpoint-minutes", type=positive, default=10.0, metavar="M",
                         help="wall time between two checkpoints (default: 10)")
     parser.add_argument("--max-minutes", type=positive, default=math.inf, metavar="M",
-                        help="stop after M minutes of wall time, with exit code 75; the same command goes on")
+                        help="stop after M minutes of wall time, with exit code 75; the same command continues")
     add_log_options(parser)
 
 
 def add_log_options(parser: argparse.ArgumentParser) -> None:
-    """How much is said meanwhile."""
+    """Add the amount of log lines."""
     how_much = parser.add_mutually_exclusive_group()
     how_much.add_argument("--quiet", action="store_const", const="outcome", dest="log",
-                          help="say only what is wrong, and at the end what was made and where")
+                          help="log only warnings, and at the end the product and its place")
     how_much.add_argument("--verbose", action="store_const", const="debug", dest="log",
-                          help="a line for every step, and what frames, checkpoints and parts of the report took")
+                          help="log each step, and the time of frames, checkpoints and parts of the report")

@@ -1,6 +1,5 @@
-"""The base of errors that are the user's to mend."""
+"""The base of errors that the user can correct."""
 
 
 class UserError(Exception):
-    """The text tells what is wrong and what to do: a command that ends with it shows no traceback, and its exit code
-    is 2."""
+    """The text names the mistake and the remedy. A command that ends with it prints one line; exit code 2."""

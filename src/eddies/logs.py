@@ -1,5 +1,5 @@
-"""Log lines of a parallel run: rank 0 reports, the other ranks only warn and say which rank they are. And the streams
-on which all that a command says goes out."""
+"""Log lines of a parallel run, and the output streams of a command. Rank 0 logs all lines; other ranks log only
+warnings, with their rank."""
 
 import logging
 import os
@@ -11,17 +11,13 @@ from typing import Any
 
 from eddies.scene.scene import SceneError
 
-OUTCOME = (logging.INFO + logging.WARNING) // 2  # of the line in which a command says what it has made, and where
+OUTCOME = (logging.INFO + logging.WARNING) // 2  # level of the line about the final product
 LEVELS = {"debug": logging.DEBUG, "info": logging.INFO, "outcome": OUTCOME, "warning": logging.WARNING}
 
 
 def configure_logging(rank: int, level: str | None = None) -> None:
-    """Send the logger "eddies" to standard output; `level` = debug, info, outcome or warning is rank 0's, by default
-    that of the variable EDDIES_LOG.
-
-    Raises:
-        SceneError: EDDIES_LOG is none of these.
-    """
+    """Send the logger "eddies" to standard output. `level` is that of rank 0: debug, info, outcome or warning, by
+    default the value of EDDIES_LOG. Raises SceneError if EDDIES_LOG has another value."""
     name = level or os.environ.get("EDDIES_LOG", "info")
     if name not in LEVELS:
         raise SceneError(f"EDDIES_LOG = {name}: must be one of {', '.join(LEVELS)}")
@@ -33,12 +29,15 @@ def configure_logging(rank: int, level: str | None = None) -> None:
 
 
 class Output:
-    """Standard output of a command: it takes any text, what its encoding lacks as "\\u2264", and a line that cannot be
-    written, as on a full disk, is no reason to end a run, but for its end to tell. Making one puts it in place."""
+    """Replaces standard output while a command runs.
+
+    Characters that the encoding lacks are written as "\\u2264". A line that cannot be written, as on a full disk, does
+    not end the run; `end` reports it.
+    """
 
     def __init__(self) -> None:
         for name in ("stdout", "stderr"):
-            if getattr(sys, name) is None:  # closed: the next file that is opened must not take its place
+            if getattr(sys, name) is None:  # closed: otherwise the next open file gets its number
                 setattr(sys, name, open(os.devnull, "w"))
             if hasattr(getattr(sys, name), "reconfigure"):
                 getattr(sys, name).reconfigure(errors="backslashreplace")
@@ -49,21 +48,21 @@ class Output:
         return getattr(self._stream, name)
 
     def write(self, text: str) -> int:
-        """Write a text; an error is kept for `end`."""
+        """Write a text. `end` reports an error."""
         self._try(lambda: self._stream.write(text))
         return len(text)
 
     def flush(self) -> None:
-        """Write out what is held back; an error is kept for `end`."""
+        """Flush the stream. `end` reports an error."""
         self._try(self._stream.flush)
 
     def end(self) -> str | None:
-        """Put the stream back; what kept text from being written, in words, or None."""
+        """Restore the stream. Returns None, or a message if some text could not be written."""
         self.flush()
         sys.stdout = self._stream
         if not self._refusal:
             return None
-        os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())  # what is still held back is lost
+        os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())  # discards buffered text
         return f"cannot write to standard output: {self._refusal}; make room, or send it elsewhere"
 
     def _try(self, action: Callable[[], Any]) -> None:
@@ -74,8 +73,10 @@ class Output:
 
 
 def show_warnings() -> None:
-    """Show warnings of libraries in a line each, without the source of who warns; not what mpi4py suspects of the
-    launcher, as parallel/connection.py knows it."""
+    """Show each warning of a library in one line, without source code.
+
+    The warning of mpi4py about the launcher is left out, because parallel/connection.py checks the launcher.
+    """
     def show(message, category, filename, lineno, file=None, line=None) -> None:
         sys.stderr.write(f"eddies: warning: {' '.join(str(message).split())} ({Path(filename).name}, line {lineno})\n")
 
@@ -84,7 +85,7 @@ def show_warnings() -> None:
 
 
 class _RankFormatter(logging.Formatter):
-    """Rank 0's messages as they are, "rank 3: " before those of others; warnings and errors are so named."""
+    """Puts "rank 3: " before messages of ranks other than 0, and the level before warnings and errors."""
 
     def __init__(self, rank: int) -> None:
         super().__init__()

@@ -1,6 +1,6 @@
-"""The measures by which rollouts are compared with the truth: names and words, in the order of tables and figures."""
+"""The measures that compare rollouts with the truth: key and title, in the order of tables and figures."""
 
-#: The best value is 0; that of ratios and of the variance of counts is 1.
+#: The best value is 0, except 1 for ratios and for the variance of counts.
 MEASURES = {
     "velocity_error_early": "velocity error at t_η",
     "velocity_error_half": "velocity error at T/2",
@@ -29,7 +29,7 @@ MEASURES = {
     "count_variance": "variance of counts, over random points",
     "count_variance_floor": "variance of counts of the true tracers",
 }
-#: Those that the table of variants shows, and of them those that are drawn.
+#: Measures that are drawn, and measures in the table of variants.
 DRAWN = ("velocity_error_early", "velocity_error_half", "spectrum_error", "acceleration_kl")
 SHOWN = ("velocity_error_early", "velocity_error_half", "velocity_error_end", "spectrum_error", "energy_ratio",
          "velocity_kl", "velocity_kl_floor", "acceleration_kl", "acceleration_kl_floor", "qr_kl", "qr_kl_floor",

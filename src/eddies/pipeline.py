@@ -1,24 +1,23 @@
-"""The stages of a scene: what each is about, what it makes, and from what. Whoever asks for the shape of the pipeline
-reads it here."""
+"""The stages of a scene: the product of each, and what it depends on."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class Stage:
-    """A stage of the pipeline; as a command, `eddies NAME SCENE` runs it alone.
+    """A stage of the pipeline, and the command `eddies NAME SCENE` that runs it alone.
 
     Parameters
     ----------
-    name : of the stage and its command.
-    about : what it makes, for the help.
-    section : of a scene, without which there is nothing to do; None: it works with what there is.
-    product : kind of the file that it makes, PRODUCT.h5 in the run directory; None: no such file.
-    reads : what of a scene its product depends on beside the stages before it: sections and properties, see
-        workflows/run_directory/fingerprints.py.
-    depends_on : all stages that its product depends on, those of its inputs included, of those that a scene has.
-    checkpoints : the directory within the run directory where its checkpoints lie; None: it makes none.
-    but : "section.key", of the sections that it reads what its product does not depend on.
+    name : name of the stage and of its command.
+    about : its result, for the help.
+    section : the section of a scene that asks for it; None if it is always run.
+    product : kind of its product PRODUCT.h5 in the run directory; None without one.
+    reads : sections and properties of a scene on which its product depends, besides those of the stages before it (see
+        workflows/run_directory/fingerprints.py).
+    depends_on : all stages on which its product depends, if the scene has them.
+    checkpoints : directory of its checkpoints in the run directory; None without checkpoints.
+    but : keys "section.key" of those sections on which its product does not depend.
     """
 
     name: str
@@ -32,7 +31,7 @@ class Stage:
 
     @property
     def file(self) -> str:
-        """Name of the product's file."""
+        """File name of the product."""
         return f"{self.product}.h5"
 
 
@@ -54,10 +53,5 @@ STAGES = {stage.name: stage for stage in (
     Stage("report", "figures, one page and metrics.json of a run directory", None, None,
           (), ("dns", "train-kernel", "train", "find-step", "simulate"), None),
 )}
-#: The stage that makes a kind of product.
+#: The stage that makes each kind of product.
 MAKER_OF = {stage.product: stage for stage in STAGES.values() if stage.product is not None}
-
-
-def after(name: str) -> list[Stage]:
-    """The stages that start from the product of one, in order."""
-    return [stage for stage in STAGES.values() if name in stage.depends_on]

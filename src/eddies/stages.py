@@ -1,4 +1,4 @@
-"""Runs the stages of a scene in a run directory, skips what is done, and keeps how long each took."""
+"""Runs the stages of a scene in a run directory, skips those that are done, and records their wall times."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ from eddies.logs import OUTCOME
 from eddies.parallel.communicator import Comm, warn_of_few_processors
 from eddies.parallel.connection import all_arrive
 from eddies.parallel.stop import Stopped, StopRequest
-from eddies.pipeline import STAGES, Stage
+from eddies.pipeline import STAGES
 from eddies.scene.scene import Scene, SceneError
 from eddies.workflows.foreseen.storage import in_units
 from eddies.workflows.learned.source import read_source
 from eddies.workflows.problems import Context, check_ground_truth, memory_of_node, refuse
-from eddies.workflows.run_directory.fingerprints import stage_fingerprint
+from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
 from eddies.workflows.run_directory.work import FAILURE, SECONDS, Work, find_work, is_done, stage_seconds
-from eddies.workflows.variants import Step, check_unseen, link, steps
+from eddies.workflows.variants import Step, check_unseen, steps
 
 log = logging.getLogger("eddies")
 
-# Where the functions are that do the stages, each as run(scene, comm, directory, stop); imported once it is their turn.
+# The functions of the stages, each run(scene, comm, directory, stop). A module is imported when its stage runs.
 RUN = {"dns": "eddies.workflows.dns:run", "train-kernel": "eddies.workflows.train_kernel:run",
        "train": "eddies.workflows.train:run", "find-step": "eddies.workflows.find_step:run",
        "simulate": "eddies.workflows.simulate:run",
@@ -44,28 +44,27 @@ RUN = {"dns": "eddies.workflows.dns:run", "train-kernel": "eddies.workflows.trai
 
 
 class VariantsFailed(UserError):
-    """Some variants of a scene did not come to their end."""
+    """Some variants of a scene failed."""
 
 
 def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path, stop: StopRequest,
                overwrite: bool = False, take_over: bool = False, variants: Sequence[str] = ()) -> None:
-    """Run stages of a scene, of all its variants or of those named, all ranks together.
+    """Run stages of a scene, for all its variants or those named; all ranks call it.
 
-    Stages whose product is complete and was made with the same settings are skipped; one with a checkpoint of the same
-    settings goes on from it. Work of other settings is replaced with `overwrite` alone. The wall time of each stage is
-    recorded in stage_seconds.json. Meanwhile no other job works in the directory; one that seems to is ended with
-    `take_over`. A variant that fails does not keep the others from their end.
+    A stage is skipped if its product is complete and was made with the same settings. It continues from a checkpoint of
+    the same settings. Work of other settings is replaced only with `overwrite`. The wall time of each stage is recorded
+    in stage_seconds.json. A lock keeps other jobs out of the directory; `take_over` ends the job that holds it. The
+    failure of a variant does not stop the others.
 
     Raises:
-        Stopped: `stop` found a reason to; the running stage has kept what the next run needs.
-        SceneError: a file STOP asks the job to end before it begins, the scene lacks a section that a stage is about,
-            cannot be cut into as many slabs as there are ranks, makes a file too large for rank 0 to write for all, or
-            differs from that of a product the stages start from.
+        Stopped: `stop` requested it; the running stage has kept what the next run needs.
+        SceneError: a file STOP is present at the start, or the scene lacks a section, cannot use as many ranks, makes
+            too large a file for rank 0 to write, or differs from the scene of an input.
         RunInUse, RunTakenOver: another job works in the directory, or has taken it over.
         WorkAtStake: work of other settings would be replaced.
         WriteError: the directory cannot be written.
-        ProductError: a stage that is not among `stages` has not left the product that they start from.
-        VariantsFailed: variants failed; what the others made is there.
+        ProductError: an input is missing that `stages` do not make.
+        VariantsFailed: variants failed; the products of the others are complete.
     """
     settings = [scene.to_toml(), *(stage_fingerprint(scene, stage) for stage in scene.stages), str(directory), *stages,
                 *variants]
@@ -83,20 +82,23 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
     warnings = refuse(scene, Context(comm, stages, directory, variants, memory_of_node()))
     if take_over:
         for step in planned:
-            look_at_work(step, comm, overwrite)  # a command that is refused ends no other job
+            look_at_work(step, comm, overwrite)  # a command that is refused must not end another job
     else:
         refuse_if_held(comm, directory)
-    check_made(planned, comm)
-    check_stop_file(comm, directory)
+    making = {(stage, step.directory) for step in planned for stage in step.stages}
+    for step in planned:
+        check_inputs(step, comm, making)
+    if on_first_rank(comm, lambda: os.path.exists(directory / "STOP")):  # ends a chain of jobs that queues itself again
+        raise SceneError(f"{directory / 'STOP'}: asks the job to stop before it begins; remove the file to go on")
     with working_in(comm, directory, stop, take_over):
         for step in planned:
             look_at_work(step, comm, overwrite)
-        prepare_directory(scene, comm, directory)
+        prepare_directory(scene.to_toml(), comm, directory)
         for warning in warnings if comm.rank == 0 else ():
             log.warning(warning)
         failures = run_steps(planned, comm, directory, stop, overwrite, take_over)
         if reported:
-            run_stage(STAGES["report"], scene, comm, directory, stop, False, variants=variants)
+            run_stage("report", scene, comm, directory, stop, False, variants=variants)
     if failures:
         raise VariantsFailed(f"{scene.name}: variants failed: " + "; ".join(
             f"{name} ({failure})" for name, failure in failures.items()))
@@ -104,23 +106,22 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
 
 def run_steps(planned: Sequence[Step], comm: Comm, directory: Path, stop: StopRequest, overwrite: bool,
               take_over: bool) -> dict[str, str]:
-    """Run the steps of a run directory, which is held, one after the other; returns why variants failed, by name."""
+    """Run the steps of a run directory whose lock is held. Returns the errors of failed variants by name."""
     failures: dict[str, str] = {}
-    errors = comm.Dup()  # ranks that do not know of a failure may wait for a message on the other one
+    errors = comm.Dup()  # other ranks may wait in `comm` for a message when one rank fails
     for number, step in enumerate(planned, 1):
         if step.variant in failures:
             continue
         if len(planned) > 1:
             log.info("%s, %d of %d: %s", step.directory, number, len(planned), ", ".join(step.stages))
-        if step.directory == directory:
-            holding: AbstractContextManager[None] = nullcontext()
-        else:
+        holding: AbstractContextManager[None] = nullcontext()
+        if step.directory != directory:
             holding = working_in(comm, step.directory, stop, take_over)
         try:
             with holding:
-                in_files(comm, step.directory, lambda: link(step))
+                in_files(comm, step.directory, step.link)
                 if step.directory != directory:
-                    prepare_directory(step.scene, comm, step.directory)
+                    prepare_directory(step.scene.to_toml(), comm, step.directory)
                 run_step(step, comm, stop, overwrite)
         except (WriteError, RunInUse, RunTakenOver):  # these concern all variants
             raise
@@ -136,79 +137,68 @@ def run_steps(planned: Sequence[Step], comm: Comm, directory: Path, stop: StopRe
 
 
 def run_step(step: Step, comm: Comm, stop: StopRequest, overwrite: bool) -> None:
-    """Run the stages of a step that are not done, in its directory, which is held."""
-    if step.links:  # else checked before any step
+    """Run the stages of a step that are not done, in its directory, whose lock is held."""
+    scene, directory = step.scene, step.directory
+    if step.links:  # other inputs were checked before any step
         check_inputs(step, comm)
     work = look_at_work(step, comm, overwrite)
     if has_single_writer(comm):
-        log.info("rank 0 writes for all, up to %s a file: this h5py is built without MPI", in_units(LARGEST_BYTES))
-    if step.scene.foreign:
-        log.info("%s: uses classes that are not of this package: %s", step.scene.name, ", ".join(step.scene.foreign))
-    known = False  # that the ground truth is what the other stages need
-    for stage in [STAGES[name] for name in step.stages]:
-        if stage.name in work.useless:
-            remove_checkpoints(stage, comm, step.directory)
-        if stage.name in work.done:
-            log.info("%s: skipped, %s is complete and made with the same settings", stage.name, stage.file)
-            if stage.name == "train-kernel":
-                from eddies.workflows.train_kernel import keep_form  # torch, only here
-                keep_form(step.scene, comm, step.directory)
+        log.info("rank 0 writes for all, up to %s a file, because this h5py has no MPI", in_units(LARGEST_BYTES))
+    if scene.foreign:
+        log.info("%s: uses classes that are not of this package: %s", scene.name, ", ".join(scene.foreign))
+    checked = False  # whether the ground truth was checked for the stages that need it
+    for number, name in enumerate(step.stages):
+        stage = STAGES[name]
+        if name in work.useless and stage.checkpoints is not None:
+            CheckpointDirectory(comm, directory / stage.checkpoints, "").remove()
+        if name in work.done:
+            log.info("%s: skipped, %s is complete and made with the same settings", name, stage.file)
+            if name == "train-kernel" and scene.kernel is not None:
+                from eddies.workflows.train_kernel import keep_form  # imports torch
+                keep_form(comm, directory / stage.file, scene.kernel.form, stage_provenance(scene, name))
             continue
-        if "dns" in stage.depends_on and not known:
-            rest, known = step.stages[step.stages.index(stage.name):], True
-            check_ground_truth(rest, step.scene, comm, step.directory)
-        run_stage(stage, step.scene, comm, step.directory, stop, stage.name in work.begun)
+        if "dns" in stage.depends_on and not checked:
+            check_ground_truth(step.stages[number:], scene, comm, directory)
+            checked = True
+        run_stage(name, scene, comm, directory, stop, name in work.begun)
 
 
 def look_at_work(step: Step, comm: Comm, overwrite: bool) -> Work:
-    """What a step finds in its directory; WorkAtStake where it would replace it and may not `overwrite`."""
+    """Examine the directory of a step. Raises WorkAtStake if work would be replaced without `overwrite`."""
     work = in_files(comm, step.directory, lambda: find_work([*step.links, *step.stages], step.scene, step.directory))
     if not overwrite:
         work.refuse_to_lose()
     return work
 
 
-def check_made(planned: Sequence[Step], comm: Comm) -> None:
-    """Refuse steps that start from a product which neither they make nor an earlier job has made."""
-    making = {(stage, step.directory) for step in planned for stage in step.stages}
-    for step in planned:
-        check_inputs(step, comm, making)
-
-
 @contextmanager
 def working_in(comm: Comm, directory: Path, stop: StopRequest, take_over: bool) -> Iterator[None]:
-    """Hold a directory, so that no other job works there, and end with the next look of `stop` if one takes it over."""
+    """Hold the lock of a directory. If another job takes it over, the next call of `stop` ends this job."""
     with lock_directory(comm, directory, take_over) as loss, stop.watching(loss):
         yield
 
 
-def run_stage(stage: Stage, scene: Scene, comm: Comm, directory: Path, stop: StopRequest, begun: bool,
+def run_stage(name: str, scene: Scene, comm: Comm, directory: Path, stop: StopRequest, begun: bool,
               **more: Sequence[str]) -> None:
-    """Run one stage, and record its wall time, also when it is stopped: if it was `begun` before, that is added.
+    """Run one stage and record its wall time, also if it is stopped. If it had `begun` before, times are added.
     `more` are further arguments of the stage."""
-    log.info("%s: starts on %d %s", stage.name, comm.size, "rank" if comm.size == 1 else "ranks")
+    log.info("%s: starts on %d %s", name, comm.size, "rank" if comm.size == 1 else "ranks")
     start = time.perf_counter()
-    module, _, function = RUN[stage.name].partition(":")
+    module, _, function = RUN[name].partition(":")
     run = getattr(import_module(module), function)
     stop.check()
     try:
         run(scene, comm, directory, stop, **more)
         comm.Barrier()
     except Stopped:
-        record_seconds(stage.name, time.perf_counter() - start, comm, directory, begun)
+        record_seconds(name, time.perf_counter() - start, comm, directory, begun)
         raise
-    seconds = record_seconds(stage.name, time.perf_counter() - start, comm, directory, begun)
-    log.info("%s: took %s", stage.name, duration(seconds))
-
-
-def remove_checkpoints(stage: Stage, comm: Comm, directory: Path) -> None:
-    """Remove the checkpoints of a stage, if it makes any."""
-    if stage.checkpoints is not None:
-        CheckpointDirectory(comm, directory / stage.checkpoints, "").remove()
+    seconds = record_seconds(name, time.perf_counter() - start, comm, directory, begun)
+    log.info("%s: took %s", name, duration(seconds))
 
 
 def check_sections(stages: Sequence[str], scene: Scene) -> None:
-    """Refuse stages that the scene lacks."""
+    """Raise SceneError if a scene lacks the section of a stage."""
     for stage in stages:
         if stage not in scene.stages:
             if stage == "train" and scene.model is not None and scene.simulation is not None:
@@ -218,9 +208,9 @@ def check_sections(stages: Sequence[str], scene: Scene) -> None:
 
 
 def check_inputs(step: Step, comm: Comm, making: Collection[tuple[str, Path]] = ()) -> None:
-    """Refuse stages that the scene of a step lacks, and inputs that are missing, of other settings or of another form.
+    """Raise SceneError or ProductError if an input of a step is missing, unfit or of other settings.
 
-    `making` names the inputs that the same job makes first, by stage and directory. They are not checked.
+    Inputs in `making`, by stage and directory, are not checked, because the same job makes them first.
     """
     stages, scene = step.stages, step.scene
     check_sections(stages, scene)
@@ -228,7 +218,7 @@ def check_inputs(step: Step, comm: Comm, making: Collection[tuple[str, Path]] = 
     if weights is not None and ("train", weights.parent) not in making:
         read_source(scene, comm)
     if "train" in stages and scene.training is not None and scene.training.truths is not None:
-        from eddies.workflows.learned.truths import truth_problems  # torch, only here
+        from eddies.workflows.learned.truths import truth_problems  # imports torch
         for problem in truth_problems(scene, comm, step.holder("dns")):
             raise SceneError(f"{scene.name}: {problem}")
     for needed in scene.inputs(stages[0]):
@@ -243,33 +233,26 @@ def check_inputs(step: Step, comm: Comm, making: Collection[tuple[str, Path]] = 
                              "of then")
 
 
-def check_stop_file(comm: Comm, directory: Path) -> None:
-    """Refuse to start where a file STOP lies: put there between two jobs, it ends a chain that queues itself again."""
-    if on_first_rank(comm, lambda: os.path.exists(directory / "STOP")):
-        raise SceneError(f"{directory / 'STOP'}: asks the job to stop before it begins; remove the file to go on")
-
-
-def prepare_directory(scene: Scene, comm: Comm, directory: Path) -> None:
-    """Write the scene as used into the run directory, and remove what jobs that were killed left unfinished there; if
-    rank 0 cannot, all ranks raise."""
+def prepare_directory(scene: str, comm: Comm, directory: Path) -> None:
+    """Write the text of the scene into a run directory and remove unfinished files of killed jobs; collective."""
     def write() -> None:
         for leftover in directory.glob("*.partial"):
             leftover.unlink()
         (directory / FAILURE).unlink(missing_ok=True)
-        write_files({directory / "scene.toml": scene.to_toml()})
+        write_files({directory / "scene.toml": scene})
 
     in_files(comm, directory, write)
 
 
 def record_seconds(stage: str, seconds: float, comm: Comm, directory: Path, begun: bool) -> float:
-    """Keep the wall time of a stage in stage_seconds.json, which holds that of each, and give it: of all its runs, as
-    far as they were not killed, if it was `begun` before."""
+    """Record the wall time of a stage in stage_seconds.json and return it. If the stage had `begun` before, the time of
+    its earlier runs is added, as far as they were not killed."""
     path = directory / SECONDS
 
     def record() -> float:
-        known = stage_seconds(directory)
-        whole = seconds + (known.get(stage, 0.0) if begun else 0.0)
-        write_files({path: json.dumps({**known, stage: round(whole, 3)}, indent=2) + "\n"})
+        recorded = stage_seconds(directory)
+        whole = seconds + (recorded.get(stage, 0.0) if begun else 0.0)
+        write_files({path: json.dumps({**recorded, stage: round(whole, 3)}, indent=2) + "\n"})
         return whole
 
     return in_files(comm, path, record)

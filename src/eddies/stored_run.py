@@ -1,4 +1,4 @@
-"""A run directory as programs and notebooks read it: products, numbers and figures."""
+"""Access to a run directory from programs and notebooks: products, numbers and figures."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TRAJECTORIES = {"tracers": "ground_truth/particles/tracers", "model": "rollout/p
                 "truth": "rollout/particles/truth"}
 FIELDS = {"filtered": "ground_truth/fields/filtered", "unfiltered": "ground_truth/fields/unfiltered",
           "final": "ground_truth/fields/final", "model": "rollout/fields/model", "truth": "rollout/fields/truth"}
-#: What is not stored, but made of the rollout and its truth when it is asked for.
+#: Groups that are not stored, but computed from the rollout and its truth on access.
 MADE = tuple(f"rollout/{group}" for group in ("particles/truth", "gradients/model", "gradients/truth", "fields/model",
                                               "fields/truth", "spectra_of_model", "spectra_of_truth"))
 SPECTRA = {"flow": ("ground_truth/spectra", "energy"), "filtered": ("ground_truth/spectra", "filtered"),
@@ -26,10 +26,10 @@ SPECTRA = {"flow": ("ground_truth/spectra", "energy"), "filtered": ("ground_trut
 
 
 class StoredRun:
-    """What a run has left in its directory; nothing is read before it is asked for.
+    """The content of a run directory, read on access.
 
-    Groups of arrays are xarray Datasets with coordinates and units, whose values are read from the file when they are
-    used, or, where xarray is not installed, dictionaries of numpy arrays. What is missing is told by a UserError.
+    Groups of arrays are xarray Datasets with coordinates and units, whose values are read when they are used. Without
+    xarray they are dictionaries of numpy arrays. Access to something that is missing raises UserError.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -40,12 +40,12 @@ class StoredRun:
 
     @property
     def products(self) -> tuple[str, ...]:
-        """Names of the products that there are: "ground_truth", "kernel", "model", "rollout"."""
+        """Names of the existing products, such as "ground_truth", "kernel", "model", "rollout"."""
         return tuple(name for name, file in self._files.items() if (self.path / file).is_file())
 
     @property
     def groups(self) -> list[str]:
-        """All that `run[...]` gives, such as "rollout/particles/model"."""
+        """Names for `run[...]`, such as "rollout/particles/model"."""
         from eddies.io.datasets import groups_in, opened
         found = []
         for product in self.products:
@@ -62,7 +62,7 @@ class StoredRun:
         return self._made(group) if name in MADE else open_group(self.path / self._files[product], group)
 
     def _made(self, group: str) -> Any:
-        """What is made of the rollout, read or measured frame by frame."""
+        """A group that is computed from the rollout, frame by frame."""
         from mpi4py import MPI
 
         from eddies.io.datasets import MadeArray, made_group
@@ -74,8 +74,8 @@ class StoredRun:
 
         with open_rollout(self.path, MPI.COMM_SELF) as measured:
             if group not in measured.groups:
-                raise UserError(f"{self.path}: no {group} can be made of rollout.h5 without its ground_truth.h5, or "
-                                "kernel.h5 for fields and gradients")
+                raise UserError(f"{self.path}: {group} needs rollout.h5 with its ground_truth.h5, and kernel.h5 for "
+                                "fields and gradients")
             times = measured.groups[group].times
             samples = {column: measured.groups[group].read(0, column) for column in measured.groups[group].columns}
         arrays = {"time": MadeArray.of(f"{group}/time", times)}
@@ -91,27 +91,26 @@ class StoredRun:
 
     @cached_property
     def scene(self) -> Scene:
-        """The scene as it was run."""
+        """The scene that was run."""
         return load_scene(self.path / "scene.toml")
 
     def variant(self, name: str) -> StoredRun:
-        """The run of a variant: its model and rollout, with realisations those of the first one."""
+        """The run of a variant; if the scene has realisations, that of the first."""
         return StoredRun(variant_directory(self.path, name))
 
     @property
     def metrics(self) -> dict[str, Any]:
-        """The numbers of the report, by section."""
+        """The numbers of the report by section."""
         path = self.path / "report" / "metrics.json"
         if not path.is_file():
             raise UserError(f"{path}: no such file; run `eddies report {self.path}` first")
         return json.loads(path.read_text())
 
     def trajectories(self, ids: Any = None, of: str = "model", unwrapped: bool = False) -> Any:
-        """Position, velocity and what else is stored of particles, all or those with these ids: of the "model" or the
-        "truth" of the rollout, or of the "tracers" of the ground truth.
+        """Position, velocity and other columns of all particles or those with these ids.
 
-        Positions that are unwrapped go on beyond the cube, from where they are in the first frame; between frames a
-        particle must move by less than half an edge.
+        `of` is "model" or "truth" for the rollout, or "tracers" for the ground truth. Positions that are `unwrapped`
+        are continuous beyond the periodic cube.
         """
         found = self[chosen(TRAJECTORIES, of)]
         if isinstance(found, dict):  # without xarray
@@ -122,8 +121,7 @@ class StoredRun:
             found = found.sel(particle=ids)
         if unwrapped:
             if "image" not in found:
-                raise UserError(f"{self.path}: its particles have no image, as those of eddies 0.2 and before; make "
-                                "them again")
+                raise UserError(f"{self.path}: its particles have no image, as before eddies 0.3; make them again")
             position = found["position"]
             path = np.asarray(position) + 2 * np.pi * np.asarray(found["image"])
             if isinstance(found, dict):
@@ -132,20 +130,25 @@ class StoredRun:
         return found
 
     def field(self, name: str = "velocity", time: float | None = None, of: str = "filtered") -> Any:
-        """A field on its grid, (component, z, y, x), at the stored time next to the one given, or the last: of the
-        "filtered" or "unfiltered" flow, of the "final" one of a run without tracers, or what the kernel makes of the
-        particles of the "model" or of the "truth"."""
+        """A field on its grid, (component, z, y, x), at the stored time nearest to `time`, or the last.
+
+        `of` is "filtered" or "unfiltered" for the flow, "final" for a run without tracers, or "model" or "truth" for
+        the field that the kernel reconstructs from the particles.
+        """
         return at_time(self[chosen(FIELDS, of)], name, time)
 
     def spectrum(self, of: str = "model", time: float | None = None) -> Any:
-        """Energy of each wavenumber at a time, likewise: of the "flow", of what is "filtered" of it, or what least
-        squares find in the velocities of the particles of the "model" or of the "truth"."""
+        """Energy spectrum at the stored time nearest to `time`, or the last.
+
+        `of` is "flow" or "filtered", or "model" or "truth" for the spectrum of a least-squares fit to the velocities of
+        the particles.
+        """
         group, column = chosen(SPECTRA, of)
         return at_time(self[group], column, time)
 
     @cached_property
     def figures(self) -> dict[str, Any]:
-        """All figures of the report, by name, as matplotlib figures that can be changed and saved."""
+        """All figures of the report by name, as matplotlib figures."""
         from mpi4py import MPI
 
         from eddies.workflows.report import sections_of
@@ -161,12 +164,12 @@ class StoredRun:
 
 
 def open_run(path: str | Path) -> StoredRun:
-    """A run directory, for programs and notebooks."""
+    """Open a run directory."""
     return StoredRun(path)
 
 
 def variant_directory(path: Path, name: str) -> Path:
-    """The directory of a variant in a run directory; SceneError where the scene has no such variant."""
+    """The directory of a variant in a run directory. Raises SceneError if the scene has no such variant."""
     from eddies.workflows.variants import rollouts
     scene = load_scene(path / "scene.toml")
     scene.check_variants([name])
@@ -174,14 +177,14 @@ def variant_directory(path: Path, name: str) -> Path:
 
 
 def chosen(table: dict[str, Any], of: str) -> Any:
-    """What a name stands for; UserError with those that there are."""
+    """The entry of a name. Raises UserError, with the valid names, for another name."""
     if of not in table:
         raise UserError(f'of = "{of}": must be one of {", ".join(table)}')
     return table[of]
 
 
 def at_time(found: Any, name: str, time: float | None) -> Any:
-    """A variable at the stored time next to the one given, or the last."""
+    """A variable at the stored time nearest to `time`, or the last."""
     if isinstance(found, dict):  # without xarray
         return found[name][-1 if time is None else int(np.argmin(np.abs(found["time"] - time)))]
     return found[name].isel(time=-1) if time is None else found[name].sel(time=time, method="nearest")

@@ -1,8 +1,8 @@
 """Time steppers for du/dt = L u + N(u): exponential time differencing and explicit Runge-Kutta.
 
-A stepper knows an equation only through four things: `nonlinear(state)` is N, `linear(state)` is L u,
-`linear_function(f, step)` is the operator f(step L), and `combine((operator, state), ...)` the sum of such operators
-applied to states. Results and states add like arrays.
+A stepper uses four methods of an equation: `nonlinear(state)` is N, `linear(state)` is L u, `linear_function(f, step)`
+is the operator f(step L), and `combine((operator, state), ...)` is the sum of such operators applied to states. States
+add like arrays.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ ScalarFunction = Callable[[np.ndarray], np.ndarray]
 
 
 class Equation(Protocol):
-    """What a stepper needs to know of du/dt = L u + N(u)."""
+    """The methods of an equation that a stepper uses."""
 
     def nonlinear(self, state: np.ndarray) -> np.ndarray: ...
 
@@ -74,7 +74,7 @@ def divided_difference(function: ScalarFunction, first: np.ndarray, second: np.n
 class ETDRK4:
     """Fourth-order exponential time differencing (Cox and Matthews 2002, Eqs. 26-29): L exact, N by Runge-Kutta.
 
-    The operators f(step L) are kept for every step size met, so steps should come from a ladder.
+    The operators f(step L) are kept for each step size, so the number of different step sizes should be small.
     """
 
     evaluations = 4

@@ -41,7 +41,7 @@ def test_job_is_stopped_queued_again_and_goes_on(slurm, tmp_path):
     assert (known["JobState"], known["Restarts"]) == ("COMPLETED", "1"), output
     before, after = output.split("stopped by SIGUSR1; the same command goes on from ")
     reached = int(re.match(r"step (\d+)\n", after)[1])
-    assert "dns: starts on 2 ranks" in before and f"dns: goes on from step {reached}, " in after
+    assert "dns: starts on 2 ranks" in before and f"dns: continues from step {reached}, " in after
     assert [int(step) for step in re.findall(r"dns  step (\d+) ", after)] == list(range(reached + 1, STEPS + 1))
     with h5py.File(run / "ground_truth.h5") as file:
         time, energy = file["statistics/time"][:], file["statistics/energy"][:]

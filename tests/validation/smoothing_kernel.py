@@ -17,8 +17,8 @@ from mpi4py import MPI
 
 from eddies.io.hdf5 import open_product
 from eddies.kernels.library import library
-from eddies.kernels.moving_least_squares import fitted as fitted_by
 from eddies.kernels.neighbors import Box
+from eddies.kernels.reconstruction import fitted as fitted_by
 from eddies.kernels.reconstruction import told_kernel
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.neighbor_list import NeighborList
@@ -49,7 +49,7 @@ class Field:
             truth = GroundTruth(file, slab)
             last = len(truth.fields.times) - 1
             self.sample = load_sample(truth, last, self.support)
-            columns = truth.block(truth.frame_of_field(last), ("position", "velocity"))
+            columns = truth.block(truth.at_fields[last], ("position", "velocity"))
             self.position, self.velocity = (torch.from_numpy(columns[name]) for name in ("position", "velocity"))
         chosen = np.random.default_rng(seed).choice(slab.planes**3, min(POINTS, slab.planes**3), replace=False)
         self.rows = torch.from_numpy(np.sort(chosen))

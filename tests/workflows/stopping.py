@@ -4,7 +4,7 @@ from eddies.parallel.stop import StopRequest
 
 
 class StopAtStep(StopRequest):
-    """Stops a job after so many looks; with `every_step` a checkpoint is due at each."""
+    """Stops a job after a number of calls; with `every_step` a checkpoint is due at each call."""
 
     def __init__(self, comm, steps=10**9, every_step=False):
         super().__init__(comm)

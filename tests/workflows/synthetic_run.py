@@ -1,4 +1,4 @@
-"""Products of a made-up run: random smooth fields and particles in the layout that the stages write."""
+"""Products of a synthetic run: random smooth fields and particles in the layout of the stages."""
 
 import numpy as np
 
@@ -61,8 +61,8 @@ def provenance(*made_from, seed=1, forcing=""):
 
 def write_ground_truth(comm, directory, tracers=True, cells=16, frames=0, stationary=False, density=True, seed=1,
                        forced=False, total=600):
-    """With `frames` of the tracers, of which 13 are at the times of the rollout, and with a span over which the
-    stationary state is averaged; without `density` as of an incompressible fluid."""
+    """Write ground_truth.h5. Its frames of tracers include the times of the rollout if `frames` is 13. A `stationary`
+    flow has a span for averages. A flow without `density` is incompressible."""
     flow, origin = RandomFlow(seed), provenance(seed=seed, forcing='[forcing]\nwavenumber = 2.0\n' * stationary)
     with create_product(comm, directory / "ground_truth.h5", "ground_truth", origin) as file:
         time = np.linspace(0, 4, 81)
@@ -90,7 +90,7 @@ def write_ground_truth(comm, directory, tracers=True, cells=16, frames=0, statio
 
 
 def write_tracers(file, frames, density, total):
-    """Frames of tracers until the last of the spectra, which are at their places when the rollout starts."""
+    """Write frames of tracers, which are at `places` at the start of the rollout."""
     shapes = {"position": (3,), "velocity": (3,)} | ({"density": ()} if density else {})
     flow, start = PerturbedFlow(0.0), places(total)
     writer = TrajectoryWriter(file, "tracers", total, LENGTH, shapes, np.float64, images=True)
@@ -99,7 +99,7 @@ def write_tracers(file, frames, density, total):
 
 
 def places(total):
-    """Of particles when the rollout starts."""
+    """Positions of particles at the start of the rollout."""
     return np.random.default_rng(5).uniform(0, LENGTH, (total, 3))
 
 
@@ -139,7 +139,7 @@ def write_kernel(comm, directory, cells=32, seed=1):
 
 
 def write_model(comm, directory, terms=("pressure", "pairs"), source=None):
-    """With weights of another run, where `source` says which and at which Mach number."""
+    """Write model.h5; `source` names another run from which its weights come."""
     rng = np.random.default_rng(3)
     step, delay = np.arange(0, 300, 10), np.linspace(-0.6, 0.6, 13)
     decay = np.exp(-step / 80)
@@ -186,8 +186,7 @@ class PerturbedFlow:
 
 def write_rollout(comm, directory, status="complete", total=600, frames=9, broken=None, injection_rate=0.0,
                   truth_injection_rate=0.0, density=True):
-    """The tracers of the ground truth end three frames before the model. Velocities of the model's frame `broken` are
-    NaN."""
+    """Write rollout.h5. The tracers of the truth end three frames earlier. Velocities of frame `broken` are NaN."""
     shapes = {"position": (3,), "velocity": (3,), "acceleration": (3,)} | ({"density": ()} if density else {})
     times = 0.1 * np.arange(frames)
     attributes = {"status": status, "start_time": START, "time_step": 0.02, "integrator": "verlet",
@@ -212,7 +211,7 @@ def write_rollout(comm, directory, status="complete", total=600, frames=9, broke
 
 
 def write_run(comm, directory, truth=None, **rollout):
-    """All four products; `truth` holds arguments of the first, the others are those of the rollout."""
+    """Write all four products; `truth` has arguments for the ground truth, the others are for the rollout."""
     directory.mkdir(parents=True, exist_ok=True)
     same = {name: rollout[name] for name in ("total", "density") if name in rollout}
     write_ground_truth(comm, directory, **{"frames": 13, **same, **(truth or {})})

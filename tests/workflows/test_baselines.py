@@ -1,4 +1,4 @@
-"""What a rollout does without a learned force: of particles left alone, of WCSPH, and of a coarse Eulerian flow."""
+"""Rollouts without a learned force: free particles, WCSPH, and a coarse Eulerian flow."""
 
 import logging
 import shutil
@@ -8,15 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from eddies.io.hdf5 import open_product
-from eddies.io.weights import save_weights
-from eddies.parallel.slab import SlabDecomposition
-from eddies.particles.smoothing_kernels import KernelNetwork
 from eddies.report.rollout import moved_by
 from eddies.scene.scene import BOX_LENGTH, SceneError, load_scene
 from eddies.workflows.rollout.measured import open_rollout
-from eddies.workflows.run_directory.fingerprints import stage_fingerprint
 from tests.small_scene import TINY
+from tests.workflows.small_rollout import write_kernel
 
 pytestmark = pytest.mark.usefixtures("quick_spectra")
 
@@ -48,8 +44,7 @@ SMOOTHED = ['model.terms=["continuity", "wcsph"]', "training.steps=0", "training
 
 @pytest.fixture(scope="module")
 def made(comm):
-    """A directory with the scene, its ground truth, and a kernel with the weights that training starts from; the same
-    on all ranks."""
+    """A directory with the scene, its ground truth and an untrained kernel; the same on all ranks."""
     from eddies.workflows import dns
 
     folder = Path(comm.bcast(tempfile.mkdtemp() if comm.rank == 0 else None))
@@ -58,11 +53,7 @@ def made(comm):
     comm.Barrier()
     scene = load_scene(folder / "baseline.toml")
     dns.run(scene, comm, folder)
-    network = KernelNetwork(scene.kernel_support, [4])
-    description = {"form": network.formula, "support": network.support, "hidden": [4], "cutoff": "smooth"}
-    weights = {name: tensor.numpy() for name, tensor in network.state_dict().items()}
-    provenance = {"scene": SCENE, "fingerprint": stage_fingerprint(scene, "train-kernel")}
-    save_weights(comm, folder / "kernel.h5", "kernel", description, weights, provenance)
+    write_kernel(comm, folder, scene)
     comm.Barrier()
     yield folder
     comm.Barrier()
@@ -72,7 +63,7 @@ def made(comm):
 
 @pytest.fixture
 def folder(comm, made, tmp_path):
-    """A run directory of a test's own with these."""
+    """A new run directory with links to these."""
     if comm.rank == 0:
         for path in made.iterdir():
             (tmp_path / path.name).symlink_to(path)
@@ -116,18 +107,6 @@ def test_particles_without_a_force_keep_their_velocity(comm, folder):
     comm.Barrier()
 
 
-@pytest.mark.mpi(1)
-def test_without_a_force_there_is_no_list_and_no_halo(comm, folder):
-    from eddies.workflows.ground_truth.truth import GroundTruth
-    from eddies.workflows.rollout.particle_run import BallisticRun
-
-    with open_product(comm, folder / "ground_truth.h5", "ground_truth") as file:
-        truth = GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, 8))
-        run = BallisticRun(load_scene(folder / "baseline.toml"), truth, 1, folder, "cpu")
-    dynamics = run.dynamics
-    assert dynamics.neighborhood is None and dynamics.resolution is None and not dynamics.model.terms
-
-
 @pytest.mark.mpi(1, 2)
 def test_an_untrained_model_of_smoothed_particles_keeps_momentum_and_integrates_its_density(comm, folder):
     from eddies.io.weights import load_weights
@@ -151,16 +130,16 @@ def test_an_untrained_model_of_smoothed_particles_keeps_momentum_and_integrates_
 
 
 def velocity_error(columns, frame):
-    """Of all particles together, relative to the truth."""
+    """Velocity error of all particles, relative to the truth."""
     model, truth = (columns[name]["velocity"][frame] for name in ("model", "truth"))
     return np.linalg.norm(model - truth) / np.linalg.norm(truth)
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(1)
 @pytest.mark.parametrize("fluid, error", [("compressible", 3e-6), ("incompressible", 3e-2)])
 def test_a_grid_of_the_resolution_of_the_truth_is_the_truth(comm, folder, fluid, error):
-    """With the same equations, precision and steps but for what single precision has lost of the state; without sound
-    to the order of M_t^2."""
+    """Equations, precision and steps are the same, except that the state is stored in single precision. Without sound
+    the difference is of the order of M_t^2."""
     simulate(comm, folder, "simulation.method=eulerian", "eulerian.cells=16", f"eulerian.fluid={fluid}",
              "simulation.precision=float64")
     if comm.rank == 0:
@@ -177,9 +156,8 @@ def test_a_grid_of_the_resolution_of_the_truth_is_the_truth(comm, folder, fluid,
     comm.Barrier()
 
 
-@pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("equations, closure", [
-    ("unfiltered", "none"), ("unfiltered", "dynamic-smagorinsky"), ("filtered", "dynamic-mixed")])
+@pytest.mark.mpi(2)
+@pytest.mark.parametrize("equations, closure", [("unfiltered", "dynamic-smagorinsky"), ("filtered", "dynamic-mixed")])
 def test_particles_follow_the_coarse_flow(comm, folder, equations, closure):
     from mpi4py import MPI
 
@@ -197,17 +175,16 @@ def test_particles_follow_the_coarse_flow(comm, folder, equations, closure):
         change = (model["velocity"][2:] - model["velocity"][:-2]) / (times[2:] - times[:-2])[:, None, None]
         difference = np.linalg.norm(change - model["acceleration"][1:-1]) / np.linalg.norm(change)
         assert difference < 0.05
-        if comm.size > 1:
-            simulate(MPI.COMM_SELF, folder, *form)
-            alone = read(folder)[2]["model"]
-            # Computed and stored in single precision.
-            assert np.abs(alone["acceleration"] - model["acceleration"]).max() < 1e-4
-            assert np.abs(alone["position"] - model["position"]).max() < 1e-5
+        simulate(MPI.COMM_SELF, folder, *form)
+        alone = read(folder)[2]["model"]
+        # Computed and stored in single precision.
+        assert np.abs(alone["acceleration"] - model["acceleration"]).max() < 1e-4
+        assert np.abs(alone["position"] - model["position"]).max() < 1e-5
     comm.Barrier()
 
 
 @pytest.mark.mpi(1)
-def test_closures_and_forcing_do_to_the_energy_what_they_are_for(comm, folder):
+def test_closures_dissipate_and_forcing_injects(comm, folder):
     ends = {}
     for name, more in {"none": [], "smagorinsky": ["eulerian.closure=smagorinsky"],
                        "spectral": ["eulerian.closure=spectral"], "forced": ["simulation.injection=1.0"],
@@ -218,35 +195,28 @@ def test_closures_and_forcing_do_to_the_energy_what_they_are_for(comm, folder):
         ends[name] = energy(columns["model"])[-1] / energy(columns["truth"])[-1]
         ends[name, "error"] = velocity_error(columns, -1)
     assert ends["smagorinsky"] < 0.99 * ends["none"] and ends["spectral"] < 0.999 * ends["none"]
-    # All modes below |k| = 2 are resolved; of the power there the filter leaves exp(-k^2 d^2/12), 0.54 to 0.81.
+    # All modes below |k| = 2 are resolved. The filter leaves exp(-k^2 d^2/12) of the power there, 0.54 to 0.81.
     power = (ends["forced"] - ends["none"]) * energy(columns["truth"])[-1]
     assert 0.5 * times[-1] < power < 0.85 * times[-1]
-    # To know of what the filter hides helps.
+    # The gradient model recovers a part of the filtered stress.
     assert ends["gradient", "error"] < 0.9 * ends["filtered", "error"]
 
 
 @pytest.mark.mpi(1)
-def test_a_coarse_flow_that_is_unstable_ends_the_rollout_in_words(comm, folder, caplog):
+def test_an_unstable_coarse_flow_ends_the_rollout(comm, folder, caplog):
     caplog.set_level(logging.INFO)
     simulate(comm, folder, *COARSE, "eulerian.closure=smagorinsky", "eulerian.smagorinsky=500")
     attributes, _, columns = read(folder)
     assert all(np.isfinite(value) for value in attributes.values() if not isinstance(value, str))
-    assert "seconds_per_step" not in attributes and caplog.text.endswith("too few steps to time one\n")
+    assert "seconds_per_step" not in attributes and "too few steps to time one" in caplog.text
     assert attributes["status"].startswith("stopped: step") and "coarse flow is unstable" in attributes["status"]
     assert len(columns["model"]["velocity"]) >= 1
 
 
-@pytest.mark.mpi(1, 2)
-def test_a_start_at_which_the_whole_flow_is_not_stored_is_refused(comm, folder):
-    with pytest.raises(SceneError, match=r"starts at 0.154 of the ground truth, which holds .* flow at 0.0769;"):
+@pytest.mark.mpi(2)
+def test_a_start_without_the_stored_flow_is_refused(comm, folder):
+    with pytest.raises(SceneError, match="starts at 0.154 of the ground truth, .* at 0.0769;"):
         simulate(comm, folder, *COARSE, "simulation.start=0.2", "simulation.turnovers=0.1")
-
-
-def test_seconds_of_a_step_are_a_median_with_quartiles():
-    from eddies.workflows.rollout.course import quartiles
-    found = quartiles([1.0, 2.0, 3.0, 4.0, 5.0])
-    assert found == {"seconds_per_step": 3.0, "seconds_per_step_low": 2.0, "seconds_per_step_high": 4.0}
-    assert quartiles([]) == {}
 
 
 @pytest.mark.parametrize("overrides, limit", [

@@ -1,4 +1,4 @@
-"""A direct simulation that is stopped and goes on is the one that was never stopped."""
+"""A direct simulation that is stopped and continued equals the one that was never stopped."""
 
 import hashlib
 import shutil
@@ -22,13 +22,13 @@ SPLIT = ["flow.cells=12", "tracers.particles_per_side=5", "tracers.field_cells=8
          "simulation.frame_interval=0.06", "tracers.field_every=2", "time.max_step=0.025", "kernel.neighbors=20",
          "training.batch=9"]
 STEPS = 20
-# Of both parts the first steps and the last, and the whole interval between two frames.
-SPLITS = (0, 1, 7, 8, 9, 10, 11, 12, 19)
+# The first and last steps of both parts, and a step between two frames.
+SPLITS = (0, 7, 8, 10, 19)
 
 
 @pytest.fixture
 def last(monkeypatch):
-    """The run and its tracers that the guard saw last."""
+    """The run and the guard of the last step."""
     seen = SimpleNamespace()
 
     class SeeingGuard(dns.Guard):
@@ -41,7 +41,7 @@ def last(monkeypatch):
 
 
 def fingerprint(last):
-    """SHA-256 of state, clock, history, and tracers by id; of this rank's part."""
+    """SHA-256 of this rank's part of state, clock, history, and tracers by id."""
     run, tracers = last.run, last.run.tracers.tracers.columns
     order = np.argsort(tracers["id"])
     rows = [[value for name, value in sorted(row.items()) if name != "seconds_per_step"] for row in run.history.rows]
@@ -52,7 +52,7 @@ def fingerprint(last):
 
 
 def product(comm, path):
-    """All numbers of a ground truth that another run must repeat."""
+    """All numbers of a ground truth, except times of the run."""
     with open_product(comm, path / "ground_truth.h5", "ground_truth") as file:
         trajectory = Trajectory(file, "tracers")
         tables = {f"{table}/{name}": values for table in ("statistics", "spectra", "spectra_of_statistics")
@@ -95,25 +95,24 @@ def test_a_split_of_a_run_is_the_whole_run(comm, tmp_path, last, monkeypatch):
 
 
 @pytest.mark.mpi(1)
-def test_forcing_that_stays_on_stays_on_over_a_restart(comm, tmp_path, last):
+def test_forcing_stays_on_over_a_restart(comm, tmp_path, last):
     scene, found = load_scene(TINY, [*SPLIT, "tracers.forced=true"]), {}
-    for name, steps in (("whole", []), ("split", [14])):  # within the time of the tracers
-        directory = tmp_path / name
-        directory.mkdir()
-        for step in steps:
+    for name, steps in (("whole", 10**9), ("split", 14)):  # within the time of the tracers
+        (tmp_path / name).mkdir()
+        if steps < STEPS:
             with pytest.raises(Stopped):
-                dns.run(scene, comm, directory, StopAtStep(comm, step))
-        dns.run(scene, comm, directory, StopAtStep(comm))
-        found[name] = product(comm, directory)
+                dns.run(scene, comm, tmp_path / name, StopAtStep(comm, steps))
+        dns.run(scene, comm, tmp_path / name)
+        found[name] = product(comm, tmp_path / name)
     assert all(np.array_equal(found["split"][name], values) for name, values in found["whole"].items())
     assert len(found["whole"]["whole"]) == 1 and last.run.fluid.forcing is not None
 
 
-@pytest.mark.mpi(1, 2)
-def test_a_stopped_run_goes_on_and_leaves_nothing_else(comm, tmp_path, last):
+@pytest.mark.mpi(2)
+def test_a_stopped_run_continues_and_leaves_nothing_else(comm, tmp_path, last):
     scene = load_scene(TINY, SPLIT)
     for _ in range(2):  # in spin-up, then with tracers: the second stop is the resumed run's
-        with pytest.raises(Stopped, match="command goes on from step"):
+        with pytest.raises(Stopped, match="from step"):
             dns.run(scene, comm, tmp_path, StopAtStep(comm, 7))
     comm.Barrier()
     assert not (tmp_path / "ground_truth.h5").exists() and not (tmp_path / "ground_truth.h5.partial").exists()
@@ -129,11 +128,11 @@ def test_a_checkpoint_of_other_settings_is_not_used(comm, tmp_path, last, caplog
         dns.run(load_scene(TINY, SPLIT), comm, tmp_path, StopAtStep(comm, 5))
     with caplog.at_level("WARNING", "eddies"), pytest.raises(Stopped, match="from step 2"):
         dns.run(load_scene(TINY, [*SPLIT, "seed=5"]), comm, tmp_path, StopAtStep(comm, 2))
-    assert "step-00000005: was made with other settings; this checkpoint is not used" in caplog.text
+    assert "step-00000005" in caplog.text and "other settings" in caplog.text
 
 
 @pytest.mark.mpi(1)
-def test_a_run_without_tracers_goes_on(comm, tmp_path, last):
+def test_a_run_without_tracers_continues(comm, tmp_path, last):
     scene = load_scene("taylor-green", ["flow.cells=12", "time.duration=0.2", "time.step=0.02"])
     for split in (0, 4):
         with pytest.raises(Stopped):
@@ -143,7 +142,7 @@ def test_a_run_without_tracers_goes_on(comm, tmp_path, last):
 
 
 @pytest.mark.mpi(3)
-@pytest.mark.parametrize("before, after", [(1, 2), (2, 3), (3, 1)])
+@pytest.mark.parametrize("before, after", [(2, 3), (3, 1)])
 def test_another_number_of_ranks(comm, tmp_path, last, before, after):
     # Stopped at step 10, within a frame interval; 20 more follow.
     scene, run = load_scene(TINY, [*SPLIT, "tracers.turnovers=0.36"]), tmp_path / "run"

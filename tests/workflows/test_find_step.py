@@ -1,4 +1,4 @@
-"""The step that is found for a rollout against errors that are known, and what a rollout makes of it."""
+"""The step that is found for a rollout, compared with known errors, and its use by the rollout."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -10,9 +10,9 @@ from eddies.io.hdf5 import open_product, read_attributes, read_table
 from eddies.scene.scene import SceneError
 from eddies.workflows import find_step, simulate
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint
-from tests.workflows.rollout.test_particle_run import prepared, with_method
+from tests.workflows.small_rollout import prepared, with_method
 
-# Velocities are wrong by a constant and by what is of first order in the step.
+# The error of the velocity is a constant plus a part of first order in the step.
 OWN_METHOD = """
 import torch
 
@@ -76,41 +76,32 @@ def velocities(comm, directory, *frames):
         return [value[frame].astype(np.float64) for frame in frames]
 
 
+def found_step(comm, scene, directory):
+    find_step.run(scene, comm, directory)
+    with open_product(comm, directory / "step.h5", "step") as file:
+        return read_attributes(file, "found"), read_table(file, "trials/rk2")
+
+
 @pytest.mark.mpi(1, 2)
 def test_the_step_is_the_longest_whose_half_changes_little_of_the_error(comm, tmp_path, own):
-    """Of a method whose error is a + b h: halving the step changes b h / 2."""
+    """The error of the method is a + b h, so that halving the step changes b h / 2. In a weaker flow the same error is
+    a larger share, and the step must converge there too."""
     own("first_order", OWN_METHOD.format(slope=3.0))
-    scene = searched(prepared(comm, tmp_path), "first_order:FirstOrder")
-    find_step.run(scene, comm, tmp_path)
-    with open_product(comm, tmp_path / "step.h5", "step") as file:
-        found, trials = read_attributes(file, "found"), read_table(file, "trials/rk2")
+    scene, weaker = searched(prepared(comm, tmp_path), "first_order:FirstOrder"), tmp_path / "weaker"
+    prepared(comm, weaker, overrides=["initial.amplitude=0.2"])
+    found, trials = found_step(comm, scene, tmp_path)
     sizes, errors, rms = sizes_and_errors(comm, scene, tmp_path, found["turnovers"], 3.0)
-    wanted = first_converged(sizes, errors, rms, 3.0)
-    assert found["size"] == pytest.approx(wanted) and found["integrator"] == "rk2"
+    assert found["size"] == pytest.approx(first_converged(sizes, errors, rms, 3.0)) and found["integrator"] == "rk2"
+    assert found["confirmed_on"] == 0
     assert trials["size"] == pytest.approx(sizes[:len(trials["size"])])
     assert trials["error"] == pytest.approx(errors[:len(trials["size"])], rel=1e-6)
     assert trials["difference"][1:] == pytest.approx(3.0 * trials["size"][1:] / rms, rel=1e-5)
 
-
-@pytest.mark.mpi(1, 2)
-def test_a_step_has_to_converge_on_the_other_ground_truths_too(comm, tmp_path, own):
-    """In a weaker flow the same error of the method is a larger share."""
-    own("of_first_order", OWN_METHOD.format(slope=3.0))
-    scene = searched(prepared(comm, tmp_path), "of_first_order:FirstOrder")
-    weaker = tmp_path / "weaker"
-    prepared(comm, weaker, overrides=["initial.amplitude=0.2"])
-    with_it = replace(scene, simulation=replace(scene.simulation, confirmed_on=(str(weaker),)))
-    assert stage_fingerprint(with_it, "find-step") != stage_fingerprint(scene, "find-step")
-    found = {}
-    for name, each in (("alone", scene), ("confirmed", with_it)):
-        find_step.run(each, comm, tmp_path)
-        with open_product(comm, tmp_path / "step.h5", "step") as file:
-            found[name] = read_attributes(file, "found")
-    span = found["alone"]["turnovers"]
-    both = [first_converged(*sizes_and_errors(comm, scene, where, span, 3.0), 3.0) for where in (tmp_path, weaker)]
-    assert found["alone"]["size"] == pytest.approx(both[0]) and found["alone"]["confirmed_on"] == 0
-    assert both[1] < both[0]
-    assert found["confirmed"]["size"] < found["alone"]["size"] and found["confirmed"]["confirmed_on"] == 1
+    both = replace(scene, simulation=replace(scene.simulation, confirmed_on=(str(weaker),)))
+    assert stage_fingerprint(both, "find-step") != stage_fingerprint(scene, "find-step")
+    confirmed, _ = found_step(comm, both, tmp_path)
+    least = first_converged(*sizes_and_errors(comm, scene, weaker, found["turnovers"], 3.0), 3.0)
+    assert least < found["size"] and confirmed["size"] < found["size"] and confirmed["confirmed_on"] == 1
 
 
 @pytest.mark.mpi(1)
@@ -118,43 +109,41 @@ def test_a_ground_truth_of_other_particles_confirms_nothing(comm, tmp_path):
     scene = searched(prepared(comm, tmp_path))
     prepared(comm, tmp_path / "more", side=7)
     other = replace(scene, simulation=replace(scene.simulation, confirmed_on=(str(tmp_path / "more"),)))
-    with pytest.raises(SceneError, match=r"confirmed_on: .*ground_truth.h5 holds 343 particles, not 216"):
+    with pytest.raises(SceneError, match="confirmed_on: .*ground_truth.h5 holds 343 particles, not 216"):
         find_step.run(other, comm, tmp_path)
+
+
+def ladder(comm, integrator, evaluations, seconds, error):
+    """Rollouts whose velocity is 1 + error(h), with an error of 0.3, so that ends within 0.06 have converged."""
+    stretch = object.__new__(find_step.Stretch)
+    stretch.truth, stretch.end = SimpleNamespace(decomposition=SimpleNamespace(comm=comm)), np.ones((4, 3))
+
+    def tried(stretch, step):
+        return find_step.Trial(step, seconds / step.size, np.full((4, 3), 1 + error(step.size)), 0.3)
+
+    return find_step.Ladder(tried, [stretch], integrator, 0.32, evaluations)
 
 
 @pytest.mark.mpi(1)
 def test_other_integrators_are_tried_where_they_may_be_cheaper(comm):
-    """Velocities of 1 + b h^p with an error of 0.3, so that ends within 0.06 have converged: of first order up to
-    h = 0.01, of fourth order at less cost up to 0.08, and another that is given up at once."""
-    def ladder(name, evaluations, error):
-        def made(step):
-            return find_step.Trial(step, evaluations / step.size, np.full((4, 3), 1 + error(step.size)), 0.3)
-        return find_step._Ladder(made, name, 0.32, evaluations)
-
-    search = object.__new__(find_step._Search)
-    search.comm, search.start, search._others = comm, SimpleNamespace(end=np.ones((4, 3))), []
-    search.ladders = [ladder("first", 1, lambda h: 10 * h), ladder("worse", 2, lambda h: 30 * h),
-                      ladder("fourth", 4, lambda h: 200 * h**4)]
-    found, rung = search.cheapest()
-    tried = {ladder.integrator: [trial.step.size for trial in ladder.trials.values()] for ladder in search.ladders}
+    """Of first order, converged up to h = 0.01; of fourth order, converged at less cost up to 0.08; and another, which
+    is given up at once."""
+    ladders = [ladder(comm, "first", 1, 1, lambda h: 10 * h), ladder(comm, "worse", 2, 2, lambda h: 30 * h),
+               ladder(comm, "fourth", 4, 4, lambda h: 200 * h**4)]
+    found, rung = find_step.cheapest(ladders)
+    tried = {ladder.integrator: [trial.step.size for trial in ladder.trials.values()] for ladder in ladders}
     assert tried == {"first": pytest.approx([0.32 / 2**rung for rung in range(7)]), "worse": [0.02],
                      "fourth": [0.04, 0.08, 0.16]}
     assert found.integrator == "fourth" and found[rung].step.size == 0.08
-    assert search.difference(found, rung + 1) == pytest.approx(200 * (0.08**4 - 0.04**4))
-    assert np.isnan(search.difference(found, rung - 1)) and search.table(found)["size"] == [0.16, 0.08, 0.04]
+    assert found.difference(rung + 1) == pytest.approx(200 * (0.08**4 - 0.04**4))
+    assert np.isnan(found.difference(rung - 1)) and found.table()["size"] == [0.16, 0.08, 0.04]
 
 
 @pytest.mark.mpi(1)
 def test_an_integrator_of_cheap_evaluations_is_tried_with_shorter_steps(comm):
-    """The second has converged at 0.01, which needs twice the evaluations of the first at 0.01 in half of the time."""
-    def ladder(name, evaluations, seconds, error):
-        return find_step._Ladder(lambda step: find_step.Trial(
-            step, seconds / step.size, np.full((4, 3), 1 + error * step.size), 0.3), name, 0.32, evaluations)
-
-    search = object.__new__(find_step._Search)
-    search.comm, search.start, search._others = comm, SimpleNamespace(end=np.ones((4, 3))), []
-    search.ladders = [ladder("first", 1, 1.0, 10.0), ladder("cheap", 2, 0.4, 9.0)]
-    found, rung = search.cheapest()
+    """The second converges at 0.01, which needs twice the evaluations of the first at 0.01 in half of the time."""
+    found, rung = find_step.cheapest([ladder(comm, "first", 1, 1.0, lambda h: 10 * h),
+                                      ladder(comm, "cheap", 2, 0.4, lambda h: 9 * h)])
     assert found.integrator == "cheap" and found[rung].step.size == 0.01
 
 
@@ -173,9 +162,9 @@ def test_a_rollout_takes_the_step_that_was_found(comm, tmp_path):
 
 
 @pytest.mark.mpi(1)
-def test_where_none_converges_a_number_is_asked_for(comm, tmp_path, own):
+def test_without_a_converged_step_a_number_is_asked_for(comm, tmp_path, own):
     own("never_converges", OWN_METHOD.format(slope=1e9))
     scene = searched(prepared(comm, tmp_path), "never_converges:FirstOrder")
-    with pytest.raises(SceneError, match=r"step = \"converged\": none has converged down to .*; give a number"):
+    with pytest.raises(SceneError, match='step = "converged": no step down to'):
         find_step.run(scene, comm, tmp_path)
     assert not (tmp_path / "step.h5").exists()

@@ -1,4 +1,4 @@
-"""A rollout that is stopped and goes on is the one that was never stopped."""
+"""A rollout that is stopped and continued equals the one that was never stopped."""
 
 import shutil
 import tempfile
@@ -10,32 +10,28 @@ import numpy as np
 import pytest
 
 from eddies.io.checkpoint import Checkpoint
-from eddies.io.hdf5 import open_product
-from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import Stopped
 from eddies.scene.scene import BOX_LENGTH, Eulerian, Model, load_scene
 from eddies.workflows import dns, simulate
-from eddies.workflows.ground_truth.truth import GroundTruth
-from tests.workflows.rollout.test_particle_run import OWN_METHOD, prepared, with_method, write_model
+from tests.workflows.small_rollout import OWN_METHOD, prepared, scales_of, with_method, write_model
 from tests.workflows.stopping import StopAtStep
 
 pytestmark = pytest.mark.usefixtures("quick_spectra")
 
 MODELS = {
     "default": Model(preset="resolved + pairs"),
-    "told densities": Model(preset="resolved + pairs", settings={"pairs": {
+    "density inputs": Model(preset="resolved + pairs", settings={"pairs": {
         "inputs": ("density", "distance", "speed", "approach")}}),
     "own density": Model(terms=("pairs", "density-flux", "continuity"), settings={"continuity": {"diffusion": 0.1}}),
     "local": Model(preset="local"),
 }
-# Of all networks; of each two densities, if any.
-FEATURES = {"default": 3, "told densities": 5, "own density": 10, "local": 0}
+# Number of inputs of all networks.
+FEATURES = {"default": 3, "density inputs": 5, "own density": 10, "local": 0}
 DENSITY = {"step": 0.015, "turnovers": 0.06}
-# Frames at every 0.04: between steps that may go beyond them, or at the ends of steps.
+# Frames are 0.04 apart. Steps of 0.03 go beyond them; with other integrators frames are at the ends of steps.
 CASES = {
     "default": ("default", "learned", {"step": 0.03, "skin": 0.3}),
-    "told densities": ("told densities", "learned", {"step": 0.03, "skin": 0.3}),
-    "told densities, forced, Verlet": ("told densities", "learned", {
+    "density inputs, forced, Verlet": ("density inputs", "learned", {
         "step": 0.02, "injection": "dissipation", "integrator": "verlet", "skin": 0.3}),
     "own density": ("own density", "learned", {**DENSITY, "precision": "float64"}),
     "own density, forced, Verlet": ("own density", "learned", {
@@ -52,8 +48,7 @@ def products(comm):
     """A directory with a ground truth, a kernel, and each of the models; the same on all ranks, and its scene."""
     folder = Path(comm.bcast(tempfile.mkdtemp() if comm.rank == 0 else None))
     scene = prepared(comm, folder / "run", side=9, overrides=["tracers.field_cells=12"])  # enough for three slabs
-    with open_product(comm, folder / "run" / "ground_truth.h5", "ground_truth") as file:
-        scales = GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, 9)).scales
+    scales = scales_of(comm, folder / "run", 9)
     for name, model in MODELS.items():
         if comm.rank == 0:
             (folder / name).mkdir()
@@ -132,6 +127,7 @@ def go_on_from(comm, scene, directory, saved, step):
     simulate.run(scene, comm, directory)
 
 
+@pytest.mark.usefixtures("quick_solves")
 @pytest.mark.mpi(1)
 @pytest.mark.parametrize("name", CASES)
 def test_every_split_of_a_rollout_is_the_whole_rollout(comm, case_of, monkeypatch, name):
@@ -139,21 +135,14 @@ def test_every_split_of_a_rollout_is_the_whole_rollout(comm, case_of, monkeypatc
 
 
 @pytest.mark.usefixtures("quick_solves")
-@pytest.mark.mpi(2)
-@pytest.mark.parametrize("name", ["default", "told densities, forced, Verlet", "own density", "eulerian"])
-def test_splits_on_two_ranks(comm, case_of, monkeypatch, name):
-    check_splits(comm, *case_of(name), monkeypatch, each=2)
-
-
-@pytest.mark.usefixtures("quick_solves")
-@pytest.mark.mpi(3)
-@pytest.mark.parametrize("name", ["default", "own density", "eulerian, forced"])
-def test_splits_on_three_ranks(comm, case_of, monkeypatch, name):
-    check_splits(comm, *case_of(name), monkeypatch, each=3)
+@pytest.mark.mpi(2, 3)
+@pytest.mark.parametrize("name", ["density inputs, forced, Verlet", "own density", "eulerian, forced"])
+def test_splits_on_several_ranks(comm, case_of, monkeypatch, name):
+    check_splits(comm, *case_of(name), monkeypatch, each=comm.size)
 
 
 def check_splits(comm, scene, directory, monkeypatch, each=1):
-    """Go on from each, or each second, ... of these: the first step, the second, one after a frame, the last."""
+    """Continue from each, or each second, ... of these: the first step, the second, one after a frame, the last."""
     simulate.run(scene, comm, directory)
     whole = product(comm, directory)
     assert whole["status"] == "complete" and len(whole["frames at steps"]) >= 2
@@ -168,9 +157,9 @@ def check_splits(comm, scene, directory, monkeypatch, each=1):
     assert not (directory / "checkpoints-rollout").exists()
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_a_list_that_was_built_before_is_kept(comm, case_of, monkeypatch):
-    """Not built where the particles are now: sums over pairs would be taken in another order."""
+    """A list that is built at the present positions would change the order of sums over pairs."""
     scene, directory = case_of("own density")
     saved = each_step_saved(comm, scene, directory, monkeypatch)
     states = [Checkpoint(path, {}) for path in sorted(saved.glob("step-*"))]
@@ -180,11 +169,11 @@ def test_a_list_that_was_built_before_is_kept(comm, case_of, monkeypatch):
 
 
 @pytest.mark.mpi(1, 2)
-def test_a_stopped_rollout_goes_on_and_leaves_nothing_else(comm, case_of):
+def test_a_stopped_rollout_continues_and_leaves_nothing_else(comm, case_of):
     scene, directory = case_of("default")
     names = {path.name for path in directory.iterdir()}
     for number in (1, 2):
-        with pytest.raises(Stopped, match=f"command goes on from step {number} of the rollout"):
+        with pytest.raises(Stopped, match=f"from step {number} of the rollout"):
             simulate.run(scene, comm, directory, StopAtStep(comm, 1))
     comm.Barrier()
     assert {path.name for path in directory.iterdir()} == names | {"checkpoints-rollout"}
@@ -221,14 +210,14 @@ def test_another_number_of_ranks_goes_on_to_rounding(comm, case_of, name, before
 
 
 @pytest.mark.mpi(1, 2)
-def test_a_method_that_tells_no_state_begins_anew(comm, products, tmp_path, own):
+def test_a_method_without_a_state_begins_again(comm, products, tmp_path, own):
     if comm.rank == 0:
         own("own_restarting", OWN_METHOD)
         for name in ("ground_truth.h5", "kernel.h5"):
             (tmp_path / name).symlink_to(products[0] / "run" / name)
     comm.Barrier()
     scene = with_method(products[1], "own_restarting:Swept")
-    with pytest.raises(Stopped, match="goes on after the last finished stage"):
+    with pytest.raises(Stopped, match="after the last finished stage"):
         simulate.run(scene, comm, tmp_path, StopAtStep(comm, 1))
     simulate.run(scene, comm, tmp_path)
     assert product(comm, tmp_path)["status"] == "complete"
@@ -265,7 +254,7 @@ start = 0.3
 
 @pytest.mark.mpi(3)
 def test_a_few_particles_go_on(comm, tmp_path, monkeypatch):
-    """Of these eight one rank has a single one."""
+    """One rank has a single one of these eight particles."""
     if comm.rank == 0:
         (tmp_path / "own.toml").write_text(FEW)
     comm.Barrier()

@@ -26,7 +26,7 @@ def write_scene(directory, *changes):
 
 
 @pytest.mark.mpi(1)
-def test_what_there_is_of_every_stage_is_told(comm, tmp_path, capfd):
+def test_the_state_of_every_stage(comm, tmp_path, capfd):
     scene = write_scene(tmp_path / "one")
     checkpoints = CheckpointDirectory(comm, tmp_path / "one/checkpoints-train", stage_fingerprint(scene, "train"))
     checkpoints.write(40, {"weights": np.ones(3)})
@@ -43,36 +43,34 @@ def test_what_there_is_of_every_stage_is_told(comm, tmp_path, capfd):
     lines = {line.split()[0]: line for line in second.splitlines()[1:]}
     assert "complete" in lines["dns"] and "1 min 15 s" in lines["dns"]
     assert "made with other settings (kernel.steps = 7, now 100)" in lines["train-kernel"]
-    assert lines["train"].endswith("stopped at step 40, goes on") and lines["simulate"].endswith("to do")
+    assert "stopped at step 40, can continue" in lines["train"] and lines["simulate"].endswith("to do")
     (tmp_path / "one/scene.toml").write_text("[flow]\n")
     assert "[flow]" in next(status_lines(tmp_path / "one"))
 
 
-@pytest.mark.mpi(1)
-def test_a_directory_without_a_run_is_told(tmp_path):
-    with pytest.raises(UserError, match="holds no run; make one with `eddies run SCENE`"):
+def test_a_directory_without_a_run_is_an_error(tmp_path):
+    with pytest.raises(UserError, match="holds no run"):
         list(status_lines(tmp_path / "nowhere"))
 
 
-@pytest.mark.mpi(1)
 def test_settings_and_numbers_that_differ(tmp_path):
     one, other = tmp_path / "one", tmp_path / "other"
     write_scene(one)
     write_scene(other, "training.steps=90", "simulation.step=0.05")
-    told = "\n".join(diff_lines(one, other))
-    assert "no numbers to compare: `eddies report" in told and "flow.cells" not in told
-    assert ["training.steps", "60", "90"] in [line.split() for line in told.splitlines()]
+    lines = [line.split() for line in diff_lines(one, other)]
+    assert "`eddies" in lines[-1] and ["training.steps", "60", "90"] in lines
+    assert not any("flow.cells" in line for line in lines)
     for path, error in ((one, 0.2), (other, 0.1)):
         (path / "report").mkdir()
         numbers = {"warnings": [], "rollout": {"error": error, "same": 1.0}}
         (path / "report/metrics.json").write_text(json.dumps(numbers))
     lines = [line.split() for line in diff_lines(one, other)]
     assert ["rollout.error", "0.2", "0.1", "0.5"] in lines and not any("rollout.same" in line for line in lines)
-    assert list(diff_lines(one, one)) == ["no setting differs", "", "no number differs"]
+    assert diff_lines(one, one) == ["no setting differs", "", "no number differs"]
 
 
 @pytest.mark.mpi(1)
-def test_variants_of_one_run_are_told_apart(comm, tmp_path, capfd):
+def test_variants_of_one_run_are_compared(comm, tmp_path, capfd):
     (tmp_path / "scene.toml").write_text(f'base = "{TINY}"\n[variant.a]\n[variant.b]\nsimulation.step = 0.05\n')
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
@@ -81,7 +79,7 @@ def test_variants_of_one_run_are_told_apart(comm, tmp_path, capfd):
     assert main(["diff", str(tmp_path), "--variant", "a", "--variant", "b"]) == 0
     assert ["simulation.step", "0.08", "0.05"] in [line.split() for line in capfd.readouterr().out.splitlines()]
     assert main(["diff", str(tmp_path)]) == 2
-    assert "give two runs, or one run and --variant twice" in capfd.readouterr().err
+    assert "give two runs" in capfd.readouterr().err
     assert main(["status", str(tmp_path)]) == 0
     lines = [line.split() for line in capfd.readouterr().out.splitlines()]
     assert ["b:", "simulate", "to", "do"] in lines and ["dns", "to", "do"] in lines and len(lines) == 7
@@ -93,8 +91,8 @@ def test_variants_of_one_run_are_told_apart(comm, tmp_path, capfd):
 
 
 @pytest.mark.mpi(1, 2)
-def test_products_that_are_not_as_written_are_told(comm, tmp_path, capfd):
-    """Those of a variant too; a link to a product is no other one, and one of before there were checksums is none."""
+def test_damaged_products_are_found(comm, tmp_path, capfd):
+    """Also of variants. A link is not another product, and a product of an older version has no checksums."""
     if comm.rank == 0:
         alone = comm.Create_group(comm.group.Incl([0]))
         write_scene(tmp_path)
@@ -107,14 +105,14 @@ def test_products_that_are_not_as_written_are_told(comm, tmp_path, capfd):
         write_rollout(alone, tmp_path / "a")
     comm.Barrier()
 
-    def told(code):
+    def verified(code):
         assert run_cli("status", tmp_path, "--verify") == code
         output, errors = capfd.readouterr()
         return [line for line in output.splitlines() if line.startswith(f"{tmp_path}/")], errors
 
     rest = [f"{tmp_path / 'ground_truth.h5'}: as written",
             f"{tmp_path / 'kernel.h5'}: holds no checksums, made by an earlier version"]
-    lines, _ = told(0)
+    lines, _ = verified(0)
     assert lines == ([f"{tmp_path / 'a/rollout.h5'}: as written", *rest] if comm.rank == 0 else [])
     comm.Barrier()
     if comm.rank == 0:
@@ -124,11 +122,11 @@ def test_products_that_are_not_as_written_are_told(comm, tmp_path, capfd):
             file.seek(place + 5000)
             file.write(b"other bytes")
     comm.Barrier()
-    lines, errors = told(2)
+    lines, errors = verified(2)
     if comm.rank == 0:
         assert lines[0].startswith(f"{tmp_path / 'a/rollout.h5'}: particles/model/velocity/value, frame 4")
-        assert lines[0].endswith("not what was written, the file is damaged; remove it and run `eddies simulate` again")
-        assert lines[1:] == rest and errors == f"eddies: error: {tmp_path}: 1 of 3 products are damaged\n"
+        assert "damaged" in lines[0] and "`eddies simulate`" in lines[0]
+        assert lines[1:] == rest and "1 of 3 products are damaged" in errors
     for command in ("report", "export"):
         assert run_cli(command, tmp_path / "a") == 2
         errors = capfd.readouterr().err

@@ -1,5 +1,5 @@
-"""What the training of the main job, the scene `hit-small` with the paper's system, does on several ranks: it evaluates
-pairs of networks, among them pairs with ghosts, and sums the gradients of the networks. All three are counted."""
+"""Training of the published system in the scene `hit-small` on several ranks: evaluated pairs, also those with ghosts,
+and sums of network gradients over the ranks are counted."""
 
 import numpy as np
 import pytest

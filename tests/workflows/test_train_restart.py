@@ -1,4 +1,4 @@
-"""A training that is stopped and goes on is the one that was never stopped."""
+"""A training that is stopped and continued equals the one that was never stopped."""
 
 import sys
 from dataclasses import replace
@@ -19,8 +19,8 @@ from eddies.workflows.run_directory.work import stage_seconds
 from tests.small_scene import TINY
 from tests.workflows.stopping import StopAtStep
 
-# Ten frame intervals, all of them for training: six steps on single frames, two of them with every loss; and then, or
-# not, two of each horizon.
+# Ten frame intervals, all for training. Six steps on single frames, two of them with all losses; then, if there are
+# horizons, two of each.
 SHORT = ["flow.cells=12", "tracers.particles_per_side=6", "tracers.field_cells=8", "spin_up.turnovers=0.01",
          "tracers.turnovers=0.14", "tracers.frame_interval=0.02", "tracers.field_every=3", "kernel.neighbors=20",
          "kernel.steps=2", "kernel.points=20", "model.pairs.hidden=[4]", "training.window=1", "training.frames=2",
@@ -28,7 +28,7 @@ SHORT = ["flow.cells=12", "tracers.particles_per_side=6", "tracers.field_cells=8
 THROUGH_HORIZONS = [*SHORT, "training.horizons.steps=2", "training.horizons.frames=[1,2]"]
 
 
-# What is learned does not matter here, but that it is the same.
+# Only equality matters here, not the quality of the model.
 pytestmark = pytest.mark.usefixtures("quick_solves", "no_figures")
 
 
@@ -73,7 +73,7 @@ def test_a_stopped_training_is_the_one_never_stopped(comm, tmp_path):
         (tmp_path / "learning.png").unlink()
     # Before the first step, within the first phase, between two phases, and between two horizons.
     for before, step in pairwise((0, 0, 3, 6, 8)):
-        with pytest.raises(Stopped, match=f"command goes on from step {step} of the training"):
+        with pytest.raises(Stopped, match=f"from step {step} of the training"):
             train.run(scene, comm, tmp_path, StopAtStep(comm, step - before))
     train.run(scene, comm, tmp_path)
     parts = trained(comm, tmp_path)
@@ -86,14 +86,14 @@ def test_a_stopped_training_is_the_one_never_stopped(comm, tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"ground_truth.h5", "kernel.h5", "model.h5", "learning.png"}
 
 
-@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.mpi(1, 3)
 def test_a_stopped_training_of_the_kernel_is_the_one_never_stopped(comm, tmp_path):
     scene = prepared(comm, tmp_path, [*SHORT, "tracers.particles_per_side=9", "kernel.steps=3"])
     whole = datasets(comm, tmp_path / "kernel.h5")
     assert len(whole["history/loss_learned"]) == len(whole["history/loss_learned_no_gradient"]) == 3
     # Before the first step, within a form of the kernel, between the two, and before the last step.
     for before, step in pairwise((0, 0, 1, 3, 5)):
-        with pytest.raises(Stopped, match=f"command goes on from step {step} of the training"):
+        with pytest.raises(Stopped, match=f"from step {step} of the training"):
             train_kernel.run(scene, comm, tmp_path, StopAtStep(comm, step - before))
     train_kernel.run(scene, comm, tmp_path)
     parts = datasets(comm, tmp_path / "kernel.h5")
@@ -105,35 +105,35 @@ def test_a_stopped_training_of_the_kernel_is_the_one_never_stopped(comm, tmp_pat
 
 
 @pytest.mark.mpi(1)
-def test_a_kernel_that_diverges_is_told_with_the_remedy(comm, tmp_path):
+def test_a_kernel_that_diverges_is_an_error_with_the_remedy(comm, tmp_path):
     scene = prepared(comm, tmp_path, SHORT)
     wild = replace(scene, kernel=replace(scene.kernel, learning_rate=1e15, steps=4))
-    with pytest.raises(SceneError, match=r"\[kernel\] step . of the training \(learned\): .*; lower learning_rate"):
+    with pytest.raises(SceneError, match=r"\[kernel\] step .*learned.*lower learning_rate"):
         train_kernel.run(wild, comm, tmp_path)
 
 
 @pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("fault", ["a directory is in its place", "nonsense as backend", "no matplotlib",
-                                   "matplotlib that ends the program"])
-def test_a_training_is_not_lost_to_a_picture(comm, tmp_path, monkeypatch, caplog, fault):
+def test_a_training_is_not_lost_to_a_picture(comm, tmp_path, monkeypatch, caplog):
     scene = prepared(comm, tmp_path)
-    if fault.startswith("a directory") and comm.rank == 0:
-        (tmp_path / "learning.png").mkdir()
-    elif fault.startswith("nonsense"):
-        monkeypatch.setattr("eddies.report.figures.png", lambda figure: matplotlib.use("nonsense"))
-    elif fault.startswith("matplotlib"):
-        monkeypatch.setattr("eddies.report.figures.png", sys.exit)
-    elif fault.startswith("no"):
-        monkeypatch.setitem(sys.modules, "eddies.report.learning", None)
     monkeypatch.setattr(train, "DRAWING_SECONDS", -1.0)  # draw after each step, too
-    train.run(scene, comm, tmp_path)
-    told = [record.getMessage() for record in caplog.records if "learning.png cannot be drawn (" in record.getMessage()]
-    assert len(told) == (comm.rank == 0)
-    assert trained(comm, tmp_path)
+    for fault in ("backend", "exit", "no matplotlib", "directory"):
+        with monkeypatch.context() as patch:
+            if fault == "directory":
+                (tmp_path / "learning.png").mkdir(exist_ok=True)
+            elif fault == "no matplotlib":
+                patch.setitem(sys.modules, "eddies.report.learning", None)
+            else:
+                png = sys.exit if fault == "exit" else lambda figure: matplotlib.use("nonsense")
+                patch.setattr("eddies.report.figures.png", png)
+            caplog.clear()
+            train.run(scene, comm, tmp_path)
+        warnings = [record for record in caplog.records if "cannot draw" in record.getMessage()]
+        assert len(warnings) == (comm.rank == 0), fault
+        assert trained(comm, tmp_path)
 
 
 @pytest.mark.mpi(2)
-def test_a_training_goes_on_from_products_of_the_settings_that_it_began_with(comm, tmp_path):
+def test_a_training_continues_with_inputs_of_the_same_settings(comm, tmp_path):
     scene = prepared(comm, tmp_path, SHORT)
 
     def stopped(looks, step, names=("train",)):
@@ -147,7 +147,7 @@ def test_a_training_goes_on_from_products_of_the_settings_that_it_began_with(com
     assert stage_seconds(tmp_path)["train"] > first > 0
     if comm.rank == 0:
         (tmp_path / "kernel.h5").unlink()
-    # The kernel is trained in two forms of two steps each; made with the same settings, it is the one of before.
+    # The two forms of the kernel are trained again, two steps each, with the same settings and the same result.
     stopped(1 + 2 * 2 + 2, 4, names=("train-kernel", "train"))
     stages.run_stages(["train"], scene, comm, tmp_path, StopRequest(comm))
     leftover = tmp_path / "checkpoints-train"
@@ -160,12 +160,10 @@ def test_a_training_goes_on_from_products_of_the_settings_that_it_began_with(com
     assert not leftover.exists()
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_a_window_too_short_for_its_horizons_is_refused(comm, tmp_path):
     prepared(comm, tmp_path)
     scene = load_scene(TINY, [*SHORT, "training.horizons.steps=1", "training.horizons.frames=[1,5]"])
-    with pytest.raises(SceneError, match=r"\[training\] window = 1: holds 10 frames of the ground truth, too few with "
-                                         "5 held out for validation and horizons of 5; raise it or .* frame_interval "
-                                         r"or \[training.horizons\] frames"):
+    with pytest.raises(SceneError, match=r"\[training\] window = 1: holds 10 frames .* 5 held out .* horizons of 5"):
         train.run(scene, comm, tmp_path)
     assert not list(tmp_path.glob("model.h5*"))

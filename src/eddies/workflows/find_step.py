@@ -1,15 +1,15 @@
-"""The cheapest time step of a rollout that has converged, found by short rollouts on the ground truth.
+"""Find the cheapest time step of a rollout that has converged, by short rollouts on the ground truth.
 
-Every method goes by the same rule. Steps of each integrator differ by factors of two. Two rollouts are compared, one
-with the step and one with half of it. The difference of their final velocities (rms) is taken as the error that the
-step adds. The step has converged if this raises the error by less than 2 %, or is less than 1e-4 of the velocity.
-Independent errors add as squares, so the difference may be a fifth of the error. A step must also converge on every
-further ground truth that the scene names. Coarse grids have Courant numbers in place of steps. The cheapest step that
-has converged is taken.
+The rule is the same for every method. The steps of an integrator differ by factors of two. A step is compared with half
+of it: the difference d of the final velocities (rms) is taken as the error that the step adds to the error e of the
+rollout. Independent errors add as squares. The step has converged if e^2 + d^2 is below (1.02 e)^2, which allows d to
+be a fifth of e, or if d is less than 1e-4 of the velocity. A step must also converge on all ground truths in
+[simulation] confirmed_on. For coarse grids the step is a Courant number. The cheapest converged step is stored.
 
-The steps of the first integrator are halved until one has converged. Those of the others are doubled, from the shortest
-one that needs no more evaluations than the best so far, for as long as they end within the tolerance of where that ends
-with half its step. An integrator whose shortest such step ends farther away is given up: longer ones end farther still.
+The steps of the first integrator are halved until one has converged. The search with each other integrator starts at
+the shortest step that needs no more evaluations than the best step so far. It doubles the step while the final velocity
+stays within the tolerance of the most accurate rollout with the best integrator. It ends at once if its shortest step
+is already farther away, because longer steps are less accurate.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -35,19 +34,19 @@ from eddies.parallel.stop import StopRequest
 from eddies.particles.devices import prepare_torch
 from eddies.pipeline import STAGES
 from eddies.scene.integrators import MOST_COURANT, SCHEMES
-from eddies.scene.scene import BOX_LENGTH, Scene, SceneError
+from eddies.scene.scene import BOX_LENGTH, Scene, SceneError, Simulation
 from eddies.workflows.ground_truth.truth import GroundTruth
-from eddies.workflows.rollout.method_of_step import METHODS, Step, method_of_step
+from eddies.workflows.rollout.method import METHODS, Method, Step, make_method
 from eddies.workflows.run_directory.fingerprints import stage_provenance
 
 log = logging.getLogger("eddies")
 
 TURNOVERS = 0.25  # of a short rollout
-# The share of the error that a step may add, and the share of the velocity that it may change in any case.
+# Largest share of the error that a step may add, and relative change of the velocity that is always allowed.
 OF_ERROR, OF_VELOCITY = 0.02, 1e-4
-# How often a step is halved at most.
+# Largest number of halvings of a step.
 HALVINGS = 12
-# Another integrator takes the place of the best one if it needs less than this share of its time: times are uncertain.
+# Another integrator replaces the best one if it needs less than this share of its time. Measured times vary.
 CHEAPER = 0.9
 
 
@@ -57,9 +56,10 @@ class Trial:
 
     Parameters
     ----------
-    step : its step. seconds : of a turnover, without storing.
-    velocity : at the end, in order of id; None where it went wrong.
-    error : rms of that velocity less the true one, over that of the true one; nan without an end.
+    step : its step.
+    seconds : wall time of a turnover, without storing.
+    velocity : the final velocity in order of id; None if the rollout failed.
+    error : rms of the final velocity minus the true one, relative to the true one; nan if the rollout failed.
     """
 
     step: Step
@@ -73,68 +73,53 @@ class Trial:
         return max(math.sqrt((1 + OF_ERROR) ** 2 - 1) * self.error, OF_VELOCITY)
 
 
-def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | None = None) -> None:
-    """Find the step of a scene's rollout and write step.h5.
+class Stretch:
+    """The part of a ground truth that short rollouts cover, in whole frame intervals of the rollout.
 
-    Raises SceneError where no step has converged.
-    """
-    device, directory, began = prepare_torch(scene.device, comm), Path(directory), time.perf_counter()
-    slab = SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes)
-    paths = [directory / STAGES["dns"].file, *scene.simulation.confirming_files]
-    with ExitStack() as files, torch.no_grad():
-        truths = [GroundTruth(files.enter_context(open_product(comm, path, "ground_truth")), slab) for path in paths]
-        for path, truth in zip(paths, truths):
-            if truth.total != truths[0].total:
-                raise SceneError(f"{scene.name}: [simulation] confirmed_on: {path} holds {truth.total} particles, not "
-                                 f"{truths[0].total}; name a run with as many")
-        search = _Search(scene, truths, directory, device, stop or StopRequest(comm))
-        ladder, rung = search.cheapest()
-        found, half, difference = ladder[rung], ladder[rung + 1], search.difference(ladder, rung + 1)
-        tables = {ladder.integrator: search.table(ladder) for ladder in search.ladders if ladder.trials}
-    seconds = time.perf_counter() - began
-    with create_product(comm, directory / "step.h5", "step", stage_provenance(scene, "find-step")) as file:
-        write_attributes(file.create_group("found"), {
-            "integrator": found.step.integrator, "size": found.step.size, "seconds_per_turnover": found.seconds,
-            "error": found.error, "error_with_half": half.error, "difference": difference,
-            "tolerance": half.tolerance, "seconds": seconds, "confirmed_on": len(truths) - 1,
-            "turnovers": search.span / search.turnover})
-        for name, table in tables.items():
-            write_table(file, f"trials/{name}", table)
-    log.info("find-step: %s, %s %.4g, %.3g s a turnover; halving it changes %.4f of an error of %.4f",
-             found.step.integrator, "Courant number" if scene.simulation.on_grid else "step", found.step.size,
-             found.seconds, difference, half.error)
-
-
-class _Start:
-    """The part of a ground truth that short rollouts go through: from the first frame at which the whole flow is
-    stored, or from the second frame, in whole frame intervals of the rollout."""
-
-    def __init__(self, truth: GroundTruth, scene: Scene) -> None:
-        self.truth, self.turnover = truth, float(truth.reference["eddy_turnover_time"])
-        whole = [int(np.argmin(np.abs(truth.times - at))) for at in truth.states.times]
-        self.frame = min((frame for frame in whole if frame > 0), default=1)
-        interval = scene.simulation.frame_interval
-        frames = round(interval / scene.tracers.frame_interval)
-        most = (len(truth.times) - 1 - self.frame) // frames
-        count = min(max(round(TURNOVERS * self.turnover / interval), 1), most)
-        self.stops = np.arange(1, count + 1) * interval
-        self.end = truth.block(self.frame + count * frames, ("velocity",))["velocity"]
-
-
-class _Ladder:
-    """Short rollouts with an integrator, made when they are asked for: rung 0 has the longest step, each other one half
-    of that before.
+    It starts at the first frame that has the unfiltered flow, or else at the second frame.
 
     Parameters
     ----------
-    make : what makes a rollout with a step.
-    evaluations : of the rates in a step.
-    trials : those that have been made, by rung.
+    interval, every : the frame interval of the rollout, in units of time and in frames of the ground truth.
     """
 
-    def __init__(self, make: Callable[[Step], Trial], integrator: str, first: float, evaluations: int) -> None:
-        self._make, self.integrator, self._first, self.evaluations = make, integrator, first, evaluations
-        self.trials: dict[int, Trial] = {}
+    def __init__(self, truth: GroundTruth, interval: float, every: int) -> None:
+        self.truth, self.turnover = truth, float(truth.reference["eddy_turnover_time"])
+        whole = [int(np.argmin(np.abs(truth.times - at))) for at in truth.states.times]
+        self.frame = min((frame for frame in whole if frame > 0), default=1)
+        most = (len(truth.times) - 1 - self.frame) // every
+        count = min(max(round(TURNOVERS * self.turnover / interval), 1), most)
+        self.stops = np.arange(1, count + 1) * interval
+        self.end = truth.block(self.frame + count * every, ("velocity",))["velocity"]
+
+    def distance(self, one: Trial | None, other: Trial | None) -> float:
+        """Distance of the final velocities of two trials; nan if one is missing or failed. Collective."""
+        if one is None or other is None or one.velocity is None or other.velocity is None:
+            return np.nan
+        return self.error(one.velocity, other.velocity)
+
+    def error(self, one: np.ndarray, other: np.ndarray) -> float:
+        """Rms of the difference of two final velocities, relative to that of the true final velocity; collective."""
+        sums = np.array([np.sum((one.astype(np.float64) - other) ** 2), np.sum(self.end.astype(np.float64) ** 2)])
+        square, size = global_sum(self.truth.decomposition.comm, sums)
+        return float(np.sqrt(square / size))
+
+
+class Ladder:
+    """Short rollouts with one integrator. Rung 0 has the longest step, and each rung half the step of the one before.
+
+    Parameters
+    ----------
+    tried : makes the rollout with a step on a stretch; called for a rung when it is first needed.
+    stretches : of all ground truths. The search is on the first; a step must converge on the others too.
+    integrator, first, evaluations : name, longest step, and evaluations of the rates in a step.
+    """
+
+    def __init__(self, tried: Callable[[Stretch, Step], Trial], stretches: Sequence[Stretch], integrator: str,
+                 first: float, evaluations: int) -> None:
+        self._tried, self._stretches, self.integrator = tried, stretches, integrator
+        self._first, self.evaluations = first, evaluations
+        self.trials: dict[int, Trial] = {}  # by rung
 
     def step(self, rung: int) -> Step:
         """The step of a rung."""
@@ -142,118 +127,143 @@ class _Ladder:
 
     def __getitem__(self, rung: int) -> Trial:
         if rung not in self.trials:
-            self.trials[rung] = self._make(self.step(rung))
+            self.trials[rung] = self._tried(self._stretches[0], self.step(rung))
         return self.trials[rung]
 
+    def distance(self, one: Trial | None, other: Trial | None) -> float:
+        """Distance of the final velocities of two trials on the first stretch; nan if one is missing or failed."""
+        return self._stretches[0].distance(one, other)
 
-class _Search:
-    """Short rollouts of a scene on ground truths, of which the first is searched."""
+    def difference(self, rung: int) -> float:
+        """Distance of the rollout on a rung from that with twice the step; nan without one of them."""
+        return self.distance(self.trials.get(rung), self.trials.get(rung - 1))
 
-    def __init__(self, scene: Scene, truths: Sequence[GroundTruth], directory: Path, device: torch.device,
-                 stop: StopRequest) -> None:
-        self.scene, self.directory, self.device, self.stop = scene, directory, device, stop
-        self.comm = truths[0].decomposition.comm
-        self.start, *self._others = (_Start(truth, scene) for truth in truths)
-        self.span, self.turnover = float(self.start.stops[-1]), self.start.turnover
-        self.ladders = [_Ladder(partial(self._try, self.start), *rungs) for rungs in self._integrators()]
-
-    def cheapest(self) -> tuple[_Ladder, int]:
-        """The rung with the cheapest step that has converged, and its ladder."""
-        best: tuple[_Ladder, int] | None = None
-        for ladder in self.ladders:
-            if best is None:
-                rung = next((rung for rung in range(HALVINGS) if self._converged(ladder, rung)), None)
-            else:
-                rung = self._cheaper(ladder, *best)
-            best = best if rung is None else (ladder, rung)
-        if best is None:
-            smallest = min(trial.step.size for ladder in self.ladders for trial in ladder.trials.values())
-            raise SceneError(f'{self.scene.name}: [simulation] step = "converged": none has converged down to '
-                             f"{smallest:.2g}; give a number")
-        return best
-
-    def difference(self, ladder: _Ladder, rung: int) -> float:
-        """Rms of the velocity at the end less that with twice the step, over that of the true one; nan where one of
-        them was not tried or has no end."""
-        return self._distance(ladder.trials.get(rung), ladder.trials.get(rung - 1), self.start)
-
-    def table(self, ladder: _Ladder) -> dict[str, list[float]]:
-        """The trials of a ladder, the longest step first."""
-        rungs = sorted(ladder.trials)
-        trials = [ladder.trials[rung] for rung in rungs]
+    def table(self) -> dict[str, list[float]]:
+        """The trials, the longest step first."""
+        rungs = sorted(self.trials)
+        trials = [self.trials[rung] for rung in rungs]
         return {"size": [trial.step.size for trial in trials],
                 "seconds_per_turnover": [trial.seconds for trial in trials],
                 "error": [trial.error for trial in trials],
-                "difference": [self.difference(ladder, rung) for rung in rungs]}
+                "difference": [self.difference(rung) for rung in rungs]}
 
-    def _cheaper(self, ladder: _Ladder, best: _Ladder, of_best: int) -> int | None:
-        """The longest step of a ladder that has converged, if it costs less than the best one so far."""
-        most = best.evaluations / best.step(of_best).size
-        shortest = max((rung for rung in range(HALVINGS) if ladder.evaluations / ladder.step(rung).size <= most),
-                       default=-1)
-        most_seconds = CHEAPER * best[of_best].seconds
-        # Evaluations differ in cost: of a corrected Verlet step, or where a solve starts from a good guess.
-        while 0 <= shortest < HALVINGS and 2 * ladder[shortest].seconds < most_seconds:
-            shortest += 1
-        rung, right = shortest, best[of_best + 1]
-        while rung >= 0 and self._distance(ladder[rung], right, self.start) <= right.tolerance:
-            rung -= 1
-        return next((rung for rung in range(rung + 1, shortest + 1)
-                     if ladder[rung].seconds < most_seconds and self._converged(ladder, rung)), None)
-
-    def _converged(self, ladder: _Ladder, rung: int) -> bool:
+    def converged(self, rung: int) -> bool:
         """Whether a step has converged on all ground truths."""
-        whole, half = ladder[rung], ladder[rung + 1]
-        if not self._distance(whole, half, self.start) < half.tolerance:
+        whole, half = self[rung], self[rung + 1]
+        if not self.distance(whole, half) < half.tolerance:
             return False
-        for number, start in enumerate(self._others, 1):
-            coarser, finer = self._try(start, whole.step), self._try(start, half.step)
-            if not self._distance(coarser, finer, start) < finer.tolerance:
-                log.info("find-step: %s %.4g has not converged on ground truth %d of %d", whole.step.integrator,
-                         whole.step.size, number, len(self._others))
+        for number, stretch in enumerate(self._stretches[1:], 1):
+            coarser, finer = (self._tried(stretch, trial.step) for trial in (whole, half))
+            if not stretch.distance(coarser, finer) < finer.tolerance:
+                log.info("find-step: %s %.4g has not converged on ground truth %d of %d", self.integrator,
+                         whole.step.size, number, len(self._stretches) - 1)
                 return False
         return True
 
-    def _integrators(self) -> Iterator[tuple[str, float, int]]:
-        """Those that are searched, each with its first step and its evaluations in a step."""
-        settings = self.scene.simulation
-        if settings.on_grid:
-            yield "etdrk4", MOST_COURANT, 4
-            return
-        # A method of the user's steps in its own way, whatever the integrator.
-        for name in settings.schemes if settings.method in METHODS else settings.schemes[:1]:
-            scheme = SCHEMES[name]
-            yield name, self.span if scheme.dense else self.scene.simulation.frame_interval, scheme.evaluations
 
-    def _try(self, start: _Start, step: Step) -> Trial:
-        """A short rollout with a step."""
-        method = method_of_step(self.scene, step, start.truth, start.frame, self.directory, self.device)
-        method.frame(0.0)  # the rates with which the first step begins
-        began, number, complaint = time.perf_counter(), 0, None
-        for until in start.stops:
-            while complaint is None and method.time < until - 1e-9 * start.stops[0]:
-                self.stop.check()
-                number += 1
-                complaint = method.advance(until, number)
-        seconds = self.comm.bcast((time.perf_counter() - began) * start.turnover / max(method.time, 1e-300))
-        if complaint is not None:
-            log.info("find-step: %s %.4g: %s", step.integrator, step.size, complaint)
-            return Trial(step, seconds)
-        particles, _ = method.frame(float(start.stops[-1]))
-        columns = particles.to_numpy()
-        velocity = IdOrder(self.comm, columns["id"], start.truth.total).apply(columns["velocity"])
-        error = self._rms(velocity, start.end, start)
-        log.info("find-step: %s %.4g: error %.4f, %.3g s a turnover", step.integrator, step.size, error, seconds)
-        return Trial(step, seconds, velocity, error)
+def cheapest(ladders: Sequence[Ladder]) -> tuple[Ladder, int] | None:
+    """The ladder and the rung of the cheapest converged step; None if no step converges."""
+    best: tuple[Ladder, int] | None = None
+    for ladder in ladders:
+        if best is None:
+            rung = next((rung for rung in range(HALVINGS) if ladder.converged(rung)), None)
+        else:
+            rung = cheaper(ladder, *best)
+        best = best if rung is None else (ladder, rung)
+    return best
 
-    def _distance(self, one: Trial | None, other: Trial | None, start: _Start) -> float:
-        """Between the ends of two trials, over the rms of the true velocity; nan without one of them."""
-        if one is None or other is None or one.velocity is None or other.velocity is None:
-            return np.nan
-        return self._rms(one.velocity, other.velocity, start)
 
-    def _rms(self, one: np.ndarray, other: np.ndarray, start: _Start) -> float:
-        """Rms of the difference of two velocities, over that of the true one at the end."""
-        sums = np.array([np.sum((one.astype(np.float64) - other) ** 2), np.sum(start.end.astype(np.float64) ** 2)])
-        square, size = global_sum(self.comm, sums)
-        return float(np.sqrt(square / size))
+def cheaper(ladder: Ladder, best: Ladder, of_best: int) -> int | None:
+    """The longest converged step of a ladder, if it costs less than the best step so far."""
+    most = best.evaluations / best.step(of_best).size
+    shortest = max((rung for rung in range(HALVINGS) if ladder.evaluations / ladder.step(rung).size <= most),
+                   default=-1)
+    most_seconds = CHEAPER * best[of_best].seconds
+    # The cost of an evaluation varies: a corrected Verlet step, or a solve that starts from a good guess, is cheap.
+    while 0 <= shortest < HALVINGS and 2 * ladder[shortest].seconds < most_seconds:
+        shortest += 1
+    rung, right = shortest, best[of_best + 1]
+    while rung >= 0 and ladder.distance(ladder[rung], right) <= right.tolerance:
+        rung -= 1
+    return next((rung for rung in range(rung + 1, shortest + 1)
+                 if ladder[rung].seconds < most_seconds and ladder.converged(rung)), None)
+
+
+def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | None = None) -> None:
+    """Find the step of a scene's rollout and write step.h5.
+
+    Raises SceneError if no step converges.
+    """
+    directory, settings, began = Path(directory), scene.simulation, time.perf_counter()
+    slab, device = SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes), prepare_torch(scene.device, comm)
+    paths = [directory / STAGES["dns"].file, *settings.confirming_files]
+    stop = stop or StopRequest(comm)
+
+    def tried(stretch: Stretch, step: Step) -> Trial:
+        return short_rollout(make_method(scene, step, stretch.truth, stretch.frame, directory), step, stretch, stop)
+
+    with ExitStack() as files, torch.no_grad():
+        opened = [files.enter_context(open_product(comm, path, "ground_truth")) for path in paths]
+        truths = [GroundTruth(file, slab, device) for file in opened]
+        for path, truth in zip(paths, truths):
+            if truth.total != truths[0].total:
+                raise SceneError(f"{scene.name}: [simulation] confirmed_on: {path} holds {truth.total} particles, not "
+                                 f"{truths[0].total}; name a run with as many")
+        every = round(settings.frame_interval / scene.tracers.frame_interval)
+        stretches = [Stretch(truth, settings.frame_interval, every) for truth in truths]
+        span = float(stretches[0].stops[-1])
+        ladders = [Ladder(tried, stretches, *integrator) for integrator in integrators(settings, span)]
+        best = cheapest(ladders)
+        if best is None:
+            smallest = min(trial.step.size for ladder in ladders for trial in ladder.trials.values())
+            raise SceneError(f'{scene.name}: [simulation] step = "converged": no step down to {smallest:.2g} has '
+                             "converged; give a number")
+        ladder, rung = best
+        found, half, difference = ladder[rung], ladder[rung + 1], ladder.difference(rung + 1)
+        tables = {each.integrator: each.table() for each in ladders if each.trials}
+    seconds = time.perf_counter() - began
+    provenance = stage_provenance(scene, "find-step")
+    with create_product(comm, directory / STAGES["find-step"].file, "step", provenance) as file:
+        write_attributes(file.create_group("found"), {
+            "integrator": found.step.integrator, "size": found.step.size, "seconds_per_turnover": found.seconds,
+            "error": found.error, "error_with_half": half.error, "difference": difference,
+            "tolerance": half.tolerance, "seconds": seconds, "confirmed_on": len(truths) - 1,
+            "turnovers": span / stretches[0].turnover})
+        for name, table in tables.items():
+            write_table(file, f"trials/{name}", table)
+    log.info("find-step: %s, %s %.4g, %.3g s a turnover; half of it changes the velocity by %.4f; error %.4f",
+             found.step.integrator, "Courant number" if settings.on_grid else "step", found.step.size, found.seconds,
+             difference, half.error)
+
+
+def integrators(settings: Simulation, span: float) -> Iterator[tuple[str, float, int]]:
+    """The integrators to search, each with its longest step in a time `span` and its evaluations in a step."""
+    if settings.on_grid:
+        yield "etdrk4", MOST_COURANT, 4
+        return
+    # A method of the user ignores the integrator.
+    for name in settings.schemes if settings.method in METHODS else settings.schemes[:1]:
+        scheme = SCHEMES[name]
+        yield name, span if scheme.dense else settings.frame_interval, scheme.evaluations
+
+
+def short_rollout(method: Method, step: Step, stretch: Stretch, stop: StopRequest) -> Trial:
+    """Advance a method with a step through a stretch of the ground truth; collective. Raises Stopped on request."""
+    comm, total = stretch.truth.decomposition.comm, stretch.truth.total
+    method.frame(0.0)  # the rates at the start, which the first step uses
+    began, number, complaint = time.perf_counter(), 0, None
+    for until in stretch.stops:
+        while complaint is None and method.time < until - 1e-9 * stretch.stops[0]:
+            stop.check()
+            number += 1
+            complaint = method.advance(until, number)
+    seconds = comm.bcast((time.perf_counter() - began) * stretch.turnover / max(method.time, 1e-300))
+    if complaint is not None:
+        log.info("find-step: %s %.4g: %s", step.integrator, step.size, complaint)
+        return Trial(step, seconds)
+    particles, _ = method.frame(float(stretch.stops[-1]))
+    columns = particles.to_numpy()
+    velocity = IdOrder(comm, columns["id"], total).apply(columns["velocity"])
+    error = stretch.error(velocity, stretch.end)
+    log.info("find-step: %s %.4g: error %.4f, %.3g s a turnover", step.integrator, step.size, error, seconds)
+    return Trial(step, seconds, velocity, error)

@@ -1,9 +1,9 @@
-"""What stands in run directories, for people: stages, what they were made with, checkpoints, jobs and sizes."""
+"""The state of run directories for a person: stages, their settings, checkpoints, jobs and sizes."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 from eddies.clock import duration
@@ -16,8 +16,8 @@ from eddies.io.provenance import product_provenance
 from eddies.io.run_lock import find_lock
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm
-from eddies.pipeline import STAGES, Stage
-from eddies.scene.scene import Scene, SceneError, load_scene
+from eddies.pipeline import STAGES
+from eddies.scene.scene import SceneError, load_scene
 from eddies.workflows.foreseen.storage import in_units
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint
 from eddies.workflows.run_directory.work import changed_settings, is_done, of_other_settings, stage_seconds
@@ -27,8 +27,11 @@ SCENE, PAGE = "scene.toml", Path("report") / "index.html"
 
 
 def run(directory: Path, comm: Comm, verify: bool = False) -> None:
-    """Print a line for every stage of the runs in a directory, or of the run that it is; all ranks call it. `verify`:
-    also one for every product, all of whose bytes the ranks compare with its checksums; UserError where some differ."""
+    """Print a line for each stage of a run, or of all runs in a directory; all ranks call it.
+
+    With `verify` the ranks also compare all bytes of the products with their checksums, and print a line for each
+    product. Raises UserError if one is damaged.
+    """
     for line in in_files(comm, directory, lambda: list(status_lines(directory))):
         _print(comm, line)
     if not verify:
@@ -45,14 +48,14 @@ def run(directory: Path, comm: Comm, verify: bool = False) -> None:
 
 
 def products_in(directory: Path) -> list[Path]:
-    """The products of all runs in a directory, in order of their names; of links only those that lead elsewhere."""
+    """The products of all runs in a directory, by name. A link to one of them is left out."""
     names = [stage.file for stage in STAGES.values() if stage.product]
     found = sorted((path for name in names for path in directory.rglob(name)), key=Path.is_symlink, reverse=True)
     return sorted({path.resolve(): path for path in found}.values())
 
 
 def before_checksums(path: Path) -> bool:
-    """Whether a product is of a version that made no checksums."""
+    """Whether a product was written by a version without checksums."""
     try:
         with open_to_read(path) as file:
             return ATTRIBUTE not in file.attrs
@@ -67,8 +70,9 @@ def _print(comm: Comm, line: str) -> None:
 
 
 def status_lines(directory: Path) -> Iterator[str]:
-    """Those of all runs, in order of their names; UserError where there is none."""
-    found = [directory] if is_run(directory) else sorted(path.parent for path in directory.glob(f"**/{SCENE}"))
+    """The lines of all runs in a directory, by name. Raises UserError if it holds no run."""
+    is_run = (directory / SCENE).is_file() or any((directory / stage.file).is_file() for stage in STAGES.values())
+    found = [directory] if is_run else sorted(path.parent for path in directory.glob(f"**/{SCENE}"))
     if not found:
         raise UserError(f"{directory}: holds no run; make one with `eddies run SCENE`, or give the directory of one")
     inner: set[Path] = set()
@@ -77,13 +81,8 @@ def status_lines(directory: Path) -> Iterator[str]:
             yield from run_lines(path, inner)
 
 
-def is_run(directory: Path) -> bool:
-    """Whether stages have worked here."""
-    return (directory / SCENE).is_file() or any((directory / stage.file).is_file() for stage in STAGES.values())
-
-
 def run_lines(directory: Path, inner: set[Path]) -> Iterator[str]:
-    """Its name, size and job, then its stages, those of variants in their directories, which are added to `inner`."""
+    """Name, size and job of a run, then its stages. The directories of its variants are added to `inner`."""
     files = [path for path in directory.rglob("*") if path.is_file() and not path.is_symlink()]
     size, held = in_units(sum(path.stat().st_size for path in files)), find_lock(directory)
     job = "" if held is None else f", {held.holder}{', without a sign of life' if held.stale else ''}"
@@ -95,38 +94,37 @@ def run_lines(directory: Path, inner: set[Path]) -> Iterator[str]:
     yield f"{directory}  {size}{job}: {scene.title}"
     planned = steps(scene, tuple(STAGES), directory)
     inner |= {step.directory for step in planned}
-    found = [(step, name) for step in planned for name in step.stages if name in step.scene.stages]
-    titles = [name if step.directory == directory else f"{step.directory.relative_to(directory)}: {name}"
-              for step, name in found]
-    width = max(map(len, [*titles, "train-kernel"]))
-    for title, (step, name) in zip(titles, found):
-        seconds, state = stage_seconds(step.directory), stage_state(STAGES[name], step.scene, step.directory)
-        took = duration(seconds[name]) if name in seconds else ""
-        yield f"  {title:{width}}  {took:>12}  {state}".rstrip()
-    took = duration(seconds["report"]) if "report" in (seconds := stage_seconds(directory)) else ""
-    yield f"  {'report':{width}}  {took:>12}  {page_state(directory, planned)}"
+    rows = []
+    for step in planned:
+        seconds, prefix = stage_seconds(step.directory), ""
+        if step.directory != directory:
+            prefix = f"{step.directory.relative_to(directory)}: "
+        rows += [(prefix + name, seconds.get(name), stage_state(name, step))
+                 for name in step.stages if name in step.scene.stages]
+    page, products = directory / PAGE, [step.directory / STAGES[name].file for step in planned for name in step.stages]
+    state = "to do"
+    if page.is_file():
+        old = any(path.stat().st_mtime > page.stat().st_mtime for path in products if path.is_file())
+        state = f"older than the products: `eddies report {directory}`" if old else f"complete, {page}"
+    rows.append(("report", stage_seconds(directory).get("report"), state))
+    width = max(len(title) for title, *_ in [*rows, ("train-kernel",)])
+    for title, seconds, state in rows:
+        yield f"  {title:{width}}  {'' if seconds is None else duration(seconds):>12}  {state}".rstrip()
 
 
-def stage_state(stage: Stage, scene: Scene, directory: Path) -> str:
-    """What there is of a stage, in words."""
-    product, found = directory / stage.file, checkpoints_in(directory / stage.checkpoints) if stage.checkpoints else []
-    if is_done(stage.name, scene, directory):
+def stage_state(name: str, step: Step) -> str:
+    """The state of a stage of a step in words."""
+    stage, scene = STAGES[name], step.scene
+    product = step.directory / stage.file
+    checkpoints = checkpoints_in(step.directory / stage.checkpoints) if stage.checkpoints else []
+    if is_done(name, scene, step.directory):
         return f"complete, {in_units(product.stat().st_size)}"
-    if found:
-        fits = stage_fingerprint(scene, stage.name) in [fingerprint for _, fingerprint in found]
-        return f"stopped at step {found[-1][0]}, {'goes on' if fits else 'with other settings'}"
+    if checkpoints:
+        fits = stage_fingerprint(scene, name) in [fingerprint for _, fingerprint in checkpoints]
+        return f"stopped at step {checkpoints[-1][0]}, {'can continue' if fits else 'with other settings'}"
     if product.is_file():
         origin = product_provenance(product)
-        return "made with " + of_other_settings(changed_settings(stage, origin.get("scene"), scene.to_toml())) if (
-            origin) else "damaged, unfinished or of another version"
+        if not origin:
+            return "damaged, unfinished or of another version"
+        return "made with " + of_other_settings(changed_settings(stage, origin.get("scene"), scene.to_toml()))
     return "to do"
-
-
-def page_state(directory: Path, planned: Sequence[Step]) -> str:
-    """The state of the report: to do, older than a product of these steps, or complete."""
-    page = directory / PAGE
-    if not page.is_file():
-        return "to do"
-    products = [step.directory / STAGES[stage].file for step in planned for stage in step.stages]
-    old = any(path.stat().st_mtime > page.stat().st_mtime for path in products if path.is_file())
-    return f"older than the products: `eddies report {directory}`" if old else f"complete, {page}"

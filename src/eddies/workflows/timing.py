@@ -28,9 +28,11 @@ from eddies.workflows import dns, find_step, report, simulate, train, train_kern
 from eddies.workflows.foreseen.numbers import expected_step, flow_steps, rollout_of
 from eddies.workflows.ground_truth.frame_counts import TESTED_FRAMES
 from eddies.workflows.learned.model import load_kernel
+from eddies.workflows.learned.source import ModelDefinition
+from eddies.workflows.learned.training_data import training_data
 from eddies.workflows.learned.training_phases import horizon_phases, one_step_phases
-from eddies.workflows.learned.truths import open_truths, training_data
-from eddies.workflows.variants import link, steps
+from eddies.workflows.learned.truths import open_truths
+from eddies.workflows.variants import steps
 
 log = logging.getLogger("eddies")
 
@@ -74,7 +76,7 @@ def measure_stages(scene: Scene, directory: Path, stop: StepTimes) -> None:
         few = shortened(scene, product_attributes(directory / STAGES["dns"].file, "reference")["eddy_turnover_time"])
     for step in steps(few, scene.stages_of_all, directory):
         whole = scene.variant[step.variant] if step.variant else scene.without_variants
-        in_files(comm, step.directory, lambda: link(step))
+        in_files(comm, step.directory, step.link)
         for stage in step.stages:
             name = f"{step.variant}: {stage}" if step.variant else stage
             if step.variant not in failed and not measured(name, stage, step.scene, whole, step.directory, stop):
@@ -135,13 +137,14 @@ def rest_of_training(seconds: float, few: Scene, whole: Scene, directory: Path,
     if whole.model.path is not None:
         return seconds, 0.0, 0
     comm, stepping, number = stop.comm, 0.0, 0
-    with open_truths(few, comm, directory) as (_, trained_on):
+    with open_truths(directory / STAGES["dns"].file, few.training.truth_files, few.tracers, comm,
+                     prepare_torch(whole.device, comm)) as (_, trained_on):
         kernel = load_kernel(comm, directory / STAGES["train-kernel"].file) if few.training.field_weight > 0 else None
-        data = training_data(few, trained_on, prepare_torch(whole.device, comm))
+        data = training_data(ModelDefinition.of(few), few.training, trained_on)
         parameters = list(data[0].model.parameters())
         frames = elapsed(comm, lambda: [each.frames for each in data]) / few.training.frames
         seconds += frames * (whole.training.frames - few.training.frames + TESTED_FRAMES)
-        for phase in [*one_step_phases(few, data, kernel), *horizon_phases(few, data)] if parameters else ():
+        for phase in [*one_step_phases(data, kernel), *horizon_phases(data)] if parameters else ():
             stop.check()
             optimizer = Adam(comm, parameters, phase.steps, *phase.rates)
             step = min(elapsed(comm, lambda: phase.take(optimizer, index))

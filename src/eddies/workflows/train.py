@@ -1,4 +1,4 @@
-"""The particle model: trained on tracers of the training window, then tested a priori at other times."""
+"""Train the particle model on tracers of the training window, then test it a priori at other times."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 
 from eddies.io.checkpoint import Guard
+from eddies.io.provenance import product_provenance
 from eddies.io.weights import save_weights
 from eddies.io.new_files import write_files
 from eddies.learning.training import Training
@@ -18,11 +19,10 @@ from eddies.scene.scene import Scene
 from eddies.workflows.learned import transfer
 from eddies.workflows.learned.a_priori import evaluate, evaluation_frames
 from eddies.workflows.learned.model import load_kernel
-from eddies.workflows.learned.source import describe
-from eddies.workflows.learned.steps import take_all_steps
-from eddies.workflows.learned.training_data import model_of
-from eddies.workflows.learned.training_phases import feature_range, horizon_phases, one_step_phases
-from eddies.workflows.learned.truths import open_truths, training_data, truth_ids
+from eddies.workflows.learned.source import ModelDefinition
+from eddies.workflows.learned.training_data import model_for, training_data
+from eddies.workflows.learned.training_phases import feature_range, horizon_phases, one_step_phases, take_all_steps
+from eddies.workflows.learned.truths import open_truths
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
 
 log = logging.getLogger("eddies")
@@ -32,71 +32,74 @@ DRAWING_SECONDS = 30.0
 
 
 def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | None = None) -> None:
-    """Train the model of a scene and write model.h5: weights, learning history, a-priori tests, and the range of
-    what its networks were given.
+    """Train the model of a scene and write model.h5: weights, learning history, a-priori tests and feature range.
 
-    With [model] path its weights are taken instead. A training that is stopped goes on from a checkpoint.
+    With [model] path the weights of another run are used, without training. A stopped training continues from its
+    newest checkpoint.
     """
+    directory = Path(directory)
     if scene.model.path is not None:
         transfer.run(scene, comm, directory)
         return
-    device, directory = prepare_torch(scene.device, comm), Path(directory)
-    with open_truths(scene, comm, directory) as (truth, trained_on):
-        # Only the field loss averages with it.
-        kernel = load_kernel(comm, directory / "kernel.h5", device) if scene.training.field_weight > 0 else None
-        data, tests = training_data(scene, trained_on, device), evaluation_frames(truth)
-        model = data[0].model
+    definition, settings, device = ModelDefinition.of(scene), scene.training, prepare_torch(scene.device, comm)
+    own_file = directory / STAGES["dns"].file
+    with open_truths(own_file, settings.truth_files, scene.tracers, comm, device) as (truth, trained_on):
+        # Only the field loss averages with the kernel.
+        kernel_file = directory / STAGES["train-kernel"].file
+        kernel = load_kernel(comm, kernel_file, truth.device) if settings.field_weight > 0 else None
+        data, tests = training_data(definition, settings, trained_on), evaluation_frames(truth)
+        model, dtype = data[0].model, data[0].dtype
         for each in data:
             log.info("train: frames up to %d of the times up to %.3g of %.3g, %d held out; %d weights", each.learned,
                      each.truth.times[each.last], each.truth.times[-1], each.last - each.learned,
                      sum(p.numel() for p in model.parameters()))
         own = next((each.model for each in data if each.truth is truth), None)
-        # Nothing of the run's own ground truth is seen where others are trained on.
-        last = truth.last_frame_seen(scene.training.window if own is not None else 0.0)
+        # Where only other ground truths are trained on, no part of the run's own is seen.
+        last = truth.last_frame_seen(settings.window if own is not None else 0.0)
         guard = Guard(comm, directory / STAGES["train"].checkpoints, stage_fingerprint(scene, "train"), stop,
                       " of the training")
         history, cost, curves = {}, [], None
-        phases = []
-        if next(model.parameters(), None) is not None:
-            phases = [*one_step_phases(scene, data, kernel), *horizon_phases(scene, data)]
+        learns = next(model.parameters(), None) is not None
+        phases = [*one_step_phases(data, kernel), *horizon_phases(data)] if learns else []
         if not phases:
-            log.info("train: the terms have no parameters, or [training] no steps: nothing is learned")
+            log.info("train: nothing to learn, because the terms have no parameters or [training] has no steps")
         else:
             training, curves = Training(comm, model, phases), LearningCurves(comm, directory / "learning.png")
             take_all_steps(training, guard, "train", "training", "lower learning_rate here or in [training.horizons], "
                            "or shorten time_step there", curves)
             history, cost = {"history": training.columns()}, training.cost
-        tested = model_of(scene, truth, device, model) if own is None else own
-        tables = history | evaluate(truth, tested, tests, last, data[0].dtype, device)
+        tested = model_for(definition, truth, dtype, model) if own is None else own
+        tables = history | evaluate(truth, tested, tests, last, dtype)
         if model.networks:
             tables["feature_range"] = vars(feature_range(data))
-        mach = truth.reference.get("mach_turbulent")
-        description = describe(scene, truth.scales) | {"training": cost, "coefficients": tested.learned_coefficients}
-        mach_of_truths = {str(path): each.reference.get("mach_turbulent")
-                          for path, each in zip(scene.training.truth_files, trained_on)}
+        description = definition.describe(truth.scales) | {"training": cost,
+                                                           "coefficients": tested.learned_coefficients}
+        of_named = {str(path): truth.reference.get("mach_turbulent")
+                    for path, truth in zip(settings.truth_files, trained_on)}
+        provenance = {**stage_provenance(scene, "train"), "mach_turbulent": truth.reference.get("mach_turbulent"),
+                      "truths": {path: product_provenance(path).get("id") for path in of_named},
+                      "mach_of_truths": of_named}
     weights = {name: tensor.cpu().numpy() for name, tensor in model.state_dict().items()}
-    save_weights(comm, directory / "model.h5", "model", description, weights,
-                 {**stage_provenance(scene, "train"), "mach_turbulent": mach, "truths": truth_ids(scene),
-                  "mach_of_truths": mach_of_truths}, tables)
+    save_weights(comm, directory / STAGES["train"].file, "model", description, weights, provenance, tables)
     guard.checkpoints.remove()
-    if curves is not None:  # after the product, which no picture may cost
+    if curves is not None:  # after the product, which a picture must not put at risk
         curves.draw(training)
     errors = tables["a_priori"]
     beside = (f" (exact filtered pressure gradient {errors['pressure_gradient_error'][-1]:.3f})"
               if "pressure_gradient_error" in errors else "")
-    since = "training window" if own is not None else "release of tracers that were not trained on"
+    since = "training window" if own is not None else "release of the tracers, none of which were trained on"
     log.info("model: acceleration error %.3f at a time %.3g after the %s%s", errors["acceleration_error"][-1],
              errors["delay"][-1], since, beside)
 
 
 class LearningCurves:
-    """Draws the history of a training to a file now and then, on rank 0. A picture that fails is a warning, once."""
+    """Draws the history of a training to a file now and then, on rank 0. A failure is logged once as a warning."""
 
     def __init__(self, comm: Comm, path: Path) -> None:
         self.comm, self.path, self._drawn, self._failed = comm, path, time.monotonic(), False
 
     def __call__(self, training: Training) -> None:
-        """Draw if it is time."""
+        """Draw if the last drawing is old."""
         if time.monotonic() - self._drawn > DRAWING_SECONDS:
             self.draw(training)
 
@@ -109,7 +112,7 @@ class LearningCurves:
             from eddies.report import figures  # matplotlib takes a while to start
             from eddies.report.learning import curves
             write_files({self.path: figures.png(curves(training.columns()))})
-        except (Exception, SystemExit) as error:  # of matplotlib, its settings, the disk: no reason to lose a training
+        except (Exception, SystemExit) as error:  # from matplotlib, its settings or the disk: the training continues
             self._failed = True
-            log.warning("train: %s cannot be drawn (%s: %s); the training goes on without it", self.path,
+            log.warning("train: cannot draw %s (%s: %s); the training continues without it", self.path,
                         type(error).__name__, error)

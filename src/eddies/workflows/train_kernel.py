@@ -1,9 +1,11 @@
-"""Smoothing kernel: trained on the filtered fields, with and without their gradients, and compared with SPH's."""
+"""Train the smoothing kernel on filtered fields, with and without their gradients, and compare it with SPH kernels."""
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,40 +28,40 @@ from eddies.particles.forms import DEGREES, form_of
 from eddies.particles.particle_field import ParticleField
 from eddies.particles.smoothing_kernels import CubicSpline, KernelNetwork, SmoothingKernel, WendlandC2, integral
 from eddies.pipeline import STAGES
-from eddies.scene.scene import BOX_LENGTH, Scene
+from eddies.scene.scene import BOX_LENGTH, Kernel, Scene
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.workflows.ground_truth.frame_counts import KERNEL_FIELDS
 from eddies.workflows.ground_truth.truth import GroundTruth
-from eddies.workflows.learned.steps import take_all_steps
+from eddies.workflows.learned.training_phases import take_all_steps
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
 
 log = logging.getLogger("eddies")
 
-# Of those that a step has.
+# Losses of a step that are stored.
 LOSSES = "loss", "velocity", "gradient", "normalization"
-# Forms of reconstruction, beside averages, whose errors are measured with the learned kernel.
+# Forms of reconstruction, besides averages, whose errors are measured with the learned kernel.
 OTHER_FORMS = *DEGREES, "kriging"
 
 
 def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | None = None) -> None:
     """Train the kernel of a scene on fields of the training window and write kernel.h5.
 
-    The kernel without the gradient loss (the paper's Fig. 1) is trained as well. Errors are those at the last field.
-    A training that is stopped goes on from a checkpoint.
+    A second kernel is trained without the gradient loss (Fig. 1). Errors are measured on the last field. A stopped
+    training continues from its newest checkpoint.
     """
     prepare_torch("cpu", comm)
     settings, directory = scene.kernel, Path(directory)
-    slab = SlabDecomposition(comm, BOX_LENGTH, scene.tracers.cells)
     support = scene.kernel_support
-    with open_product(comm, directory / "ground_truth.h5", "ground_truth") as file:
-        truth = GroundTruth(file, slab)
+    with open_product(comm, directory / STAGES["dns"].file, "ground_truth") as file:
+        truth = GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, scene.tracers.cells))
         seen = np.flatnonzero(truth.fields.times <= scene.window * truth.times[-1])
         chosen = np.unique(np.linspace(0, len(seen) - 1, KERNEL_FIELDS).astype(int))
         samples = [load_sample(truth, index, support) for index in chosen]
         unseen, scales = load_sample(truth, len(truth.fields.times) - 1, support), truth.scales
     guard = Guard(comm, directory / STAGES["train-kernel"].checkpoints, stage_fingerprint(scene, "train-kernel"), stop,
                   " of the training")
-    training = training_of(scene, samples)
+    mean_volume = None if settings.positive else scene.tracers.spacing**3
+    training = training_of(settings, support, mean_volume, scene.seed, samples)
     take_all_steps(training, guard, "kernel", "kernel", "lower learning_rate")
     networks, history = training.model, losses_of(training)
     with torch.no_grad():
@@ -71,8 +73,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                    "hidden": list(settings.hidden), "cutoff": settings.cutoff,
                    "mean_volume": networks["learned"].mean_volume, "reconstruction": settings.form}
     weights = {name: tensor.numpy() for name, tensor in networks["learned"].state_dict().items()}
-    save_weights(comm, directory / "kernel.h5", "kernel", description, weights, stage_provenance(scene, "train-kernel"),
-                 tables)
+    save_weights(comm, directory / STAGES["train-kernel"].file, "kernel", description, weights,
+                 stage_provenance(scene, "train-kernel"), tables)
     guard.checkpoints.remove()
     errors = tables["errors"]
     log.info("kernel: velocity error %.3f (cubic spline %.3f), gradient error %.3f (cubic spline %.3f)",
@@ -83,47 +85,49 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                  errors[f"velocity_error_{settings.form}"], errors[f"gradient_error_{settings.form}"])
 
 
-def keep_form(scene: Scene, comm: Comm, directory: Path) -> None:
-    """Write the form of a scene into a kernel.h5 that is trained and holds another one; its weights, what was measured
-    with it, and its id stay. All ranks call it."""
-    path, form = directory / "kernel.h5", scene.kernel.form
+def keep_form(comm: Comm, path: Path, form: str | None, provenance: Mapping[str, Any]) -> None:
+    """Write a form of reconstruction into a trained kernel file that names another one; all ranks call it.
+
+    Weights, tables and the id of the file do not change.
+    """
     description, weights = load_weights(comm, path, "kernel")
     if description.get("reconstruction", "average") != form:
-        origin = {**stage_provenance(scene, "train-kernel"), "id": product_provenance(path).get("id")}
+        origin = {**provenance, "id": product_provenance(path).get("id")}
         save_weights(comm, path, "kernel", {**description, "reconstruction": form}, weights, origin, load_tables(path))
-        log.info('train-kernel: %s says now form = "%s"', path, form)
+        log.info('train-kernel: %s now has form = "%s"', path, form)
 
 
 def load_sample(truth: GroundTruth, index: int, support: float) -> KernelSample:
-    """A filtered field with its exact gradient, and the particles at that time."""
+    """A filtered field with its exact gradient, and the particles at its time."""
     slab = truth.decomposition
     velocity = truth.field(index, "velocity")
     grid = SpectralGrid(slab, cutoff=(slab.planes - 1) // 2)
     derivatives = np.stack([grid.backward(grid.gradient(component)) for component in grid.forward(velocity)])
-    # Without the density, which an incompressible ground truth has not.
-    columns = migrate(slab, truth.block(truth.frame_of_field(index), ("position", "velocity")))
+    columns = migrate(slab, truth.block(truth.at_fields[index], ("position", "velocity")))
     by_point = [torch.from_numpy(np.ascontiguousarray(np.moveaxis(values.reshape(*values.shape[:-3], -1), -1, 0)))
                 for values in (velocity, derivatives)]
     position, own_velocity = (torch.from_numpy(columns[name]) for name in ("position", "velocity"))
     return KernelSample(ParticleField(slab, support, position, own_velocity), *by_point)
 
 
-def training_of(scene: Scene, samples: list[KernelSample]) -> Training:
-    """The training of both forms of the kernel, by name, one after the other."""
-    settings, support, dtype = scene.kernel, scene.kernel_support, samples[0].particles.dtype
-    rates = (settings.learning_rate, settings.final_learning_rate)
+def training_of(settings: Kernel, support: float, mean_volume: float | None, seed: int,
+                samples: list[KernelSample]) -> Training:
+    """The training of the kernel with the gradient loss, then without it.
+
+    `mean_volume` is that of a particle, for a kernel that may be negative; None for a positive kernel.
+    """
+    dtype, rates = samples[0].particles.dtype, (settings.learning_rate, settings.final_learning_rate)
     networks, phases = nn.ModuleDict(), []
     for name, gradient_weight in (("learned", settings.gradient_weight), ("learned_no_gradient", 0.0)):
-        networks[name] = KernelNetwork(support, settings.hidden, settings.cutoff, scene.seed,
-                                       None if settings.positive else scene.tracers.spacing**3).to(dtype)
+        networks[name] = KernelNetwork(support, settings.hidden, settings.cutoff, seed, mean_volume).to(dtype)
         weights = KernelLossWeights(gradient_weight, settings.normalization_weight)
-        trainer = KernelTrainer(networks[name], samples, weights, settings.points, scene.seed)
+        trainer = KernelTrainer(networks[name], samples, weights, settings.points, seed)
         phases.append(Phase(name, np.ones(settings.steps), rates, trainer.step))
     return Training(samples[0].decomposition.comm, networks, phases)
 
 
 def losses_of(training: Training) -> dict[str, np.ndarray]:
-    """Steps of a phase, and the losses of each, LOSS_PHASE."""
+    """Columns `step`, and `LOSS_PHASE` for each loss of each phase."""
     columns = training.columns()
     table = {"step": np.arange(training.phases[0].steps)}
     for number, phase in enumerate(training.phases):
@@ -133,7 +137,7 @@ def losses_of(training: Training) -> dict[str, np.ndarray]:
 
 
 def shapes(kernels: dict[str, SmoothingKernel], support: float) -> dict[str, np.ndarray]:
-    """W and dW/dr over r/h, made dimensionless with h."""
+    """W h^3 and dW/dr h^4 over r/h."""
     r = torch.linspace(0, support, 201)
     table = {"r_over_h": (r / support).numpy()}
     for name, kernel in kernels.items():
@@ -143,7 +147,7 @@ def shapes(kernels: dict[str, SmoothingKernel], support: float) -> dict[str, np.
 
 
 def compare(kernels: dict[str, SmoothingKernel], sample: KernelSample) -> dict[str, dict[str, np.ndarray]]:
-    """Errors of every kernel on a field, and the plane z = pi of u_x and du_x/dx; collective."""
+    """Errors of each kernel on a field, and the plane z = pi of u_x and du_x/dx; collective."""
     errors, slices = {}, {}
     slab = sample.decomposition
     slices["truth_velocity"] = _middle_plane(slab, sample.field[:, 0])
@@ -159,7 +163,7 @@ def compare(kernels: dict[str, SmoothingKernel], sample: KernelSample) -> dict[s
 
 
 def errors_of_forms(kernel: SmoothingKernel, sample: KernelSample, scales: ReferenceScales) -> dict[str, float]:
-    """Errors on a field of the forms other than averages, with a kernel that may be their weight; collective."""
+    """Errors on a field of the forms of reconstruction other than averages; collective."""
     errors = {}
     for name in OTHER_FORMS if kernel.mean_volume is None else ():
         made = form_of(name, kernel, scales.filter_width, scales.spacing**3).of(sample.particles)
@@ -169,7 +173,7 @@ def errors_of_forms(kernel: SmoothingKernel, sample: KernelSample, scales: Refer
 
 
 def _middle_plane(slab: SlabDecomposition, values: torch.Tensor) -> np.ndarray:
-    """The plane z = pi of a scalar (m,) at all grid points, [y, x], on every rank."""
+    """The plane z = pi, [y, x], of a scalar (m,) on the grid points of this rank; equal on all ranks."""
     n, middle = slab.planes, slab.planes // 2
     plane = np.zeros((n, n))
     if slab.start <= middle < slab.stop:

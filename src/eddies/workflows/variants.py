@@ -1,14 +1,14 @@
-"""The steps of a run: which stages of which scene work in which directory, for a scene with variants and realisations.
+"""The steps of a run: which stages work for which scene in which directory.
 
-A scene without variants has one step, in the run directory. Otherwise the run directory holds
+A scene without variants and realisations has one step, in the run directory. Otherwise the run directory holds
 
     ground_truth.h5, kernel.h5            of the scene, made once
-    realisation-SEED/                     the same of further ground truths, which no training sees
+    realisation-SEED/                     the same for further ground truths, which no training sees
     VARIANT/                              model and rollout of a variant
-    VARIANT/realisation-SEED/             its rollouts, where there are realisations
-    report/                               one page about all of them
+    VARIANT/realisation-SEED/             its rollouts, one for each realisation
+    report/                               one page about all variants
 
-Every directory is a run directory of its own: what is made elsewhere with the same settings is linked there.
+Each directory is a complete run directory: products that are made elsewhere with the same settings are linked into it.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from eddies.scene.scene import REALISATION, Scene, SceneError
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint
 from eddies.workflows.run_directory.work import is_done
 
-# The stages whose products all variants share where their settings agree.
+# Stages whose products variants share if their settings agree.
 SHARED = ("dns", "train-kernel")
-# The stages that make a product.
+# Stages that make a product.
 MAKING = tuple(stage.name for stage in STAGES.values() if stage.product is not None)
 
 
@@ -35,9 +35,11 @@ class Step:
 
     Parameters
     ----------
-    scene : without variants. stages : in order, all that make a product. directory : where they work.
-    variant : the variant's name; None for what all variants share.
-    links : the directory that holds the product of a stage, by stage, for products that are made elsewhere.
+    scene : the scene, without variants.
+    stages : the stages, in order. All make a product.
+    directory : where they work.
+    variant : name of the variant; None for what all variants share.
+    links : for products that are made elsewhere, the directory of each by stage.
     """
 
     scene: Scene
@@ -47,57 +49,92 @@ class Step:
     links: Mapping[str, Path] = field(default_factory=dict)
 
     def holder(self, stage: str) -> Path:
-        """The directory that holds the product of a stage, or will hold it."""
+        """The directory of the product of a stage, whether or not the product exists yet."""
         return self.links.get(stage, self.directory)
+
+    def link(self) -> None:
+        """Make the directory, and in it relative links to the products of other directories. One rank calls it.
+
+        A product of the step's own settings is kept; another one is replaced.
+        """
+        self.directory.mkdir(parents=True, exist_ok=True)
+        for stage, holder in self.links.items():
+            path, product = self.directory / STAGES[stage].file, holder / STAGES[stage].file
+            if path.is_symlink() or not is_done(stage, self.scene, self.directory):
+                path.unlink(missing_ok=True)
+                if product.exists():
+                    path.symlink_to(os.path.relpath(product.resolve(), self.directory.resolve()))
 
 
 @dataclass(frozen=True)
 class Place:
-    """A rollout of a variant: its scene, and the run directory in which all that it needs is found."""
+    """A rollout of a variant: its scene, and the run directory with all products that it needs."""
 
     scene: Scene
     directory: Path
 
 
 def rollouts(scene: Scene, directory: Path) -> dict[str, list[Place]]:
-    """Those of each variant, one or one for each realisation; of a scene without variants under its name."""
-    return {name or scene.name: [Place(*where) for where in _rollouts_of(scene, name, directory)]
-            for name in scene.variant or (None,)}
+    """The rollouts of each variant, one for each realisation. A scene without variants counts as one variant."""
+    return {name or scene.name: rollouts_of(scene, name, directory) for name in scene.variant or (None,)}
+
+
+def rollouts_of(scene: Scene, name: str | None, directory: Path) -> list[Place]:
+    """The rollouts of one variant, or for None of a scene without variants."""
+    own, where = scene.variant[name] if name else scene.without_variants, directory / (name or "")
+    if scene.realisations is None:
+        return [Place(own, where)]
+    model = own.model if "train" in own.stages else None
+    if model is not None and model.path is None:
+        model = replace(model, path=str(where))
+    step_from = str(where) if own.simulation.finds_step else own.simulation.step_from
+    simulation = replace(own.simulation, start=0.0, step_from=step_from, confirmed_on=None)
+    return [Place(replace(own, seed=seed, model=model, training=None, simulation=simulation),
+                  where / f"{REALISATION}{seed}") for seed in scene.realisations]
 
 
 def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[str] = ()) -> list[Step]:
-    """What is to be done for some stages of a scene, of all variants or of those named, in order.
+    """The steps for some stages of a scene, for all variants or those named, in order.
 
-    Rollouts go round by round over the variants, so that a machine that is slow for a while is slow for all of them.
-    What is made with weights that are taken over is never shared: their file may be made in an earlier step.
+    Rollouts take turns between the variants, so that a slow phase of the machine slows all of them. Products that use
+    trained weights of a file are never shared, because an earlier step may replace the file.
     """
     if not scene.variant and not scene.realisations:
         making = tuple(stage for stage in stages if stage in MAKING)
         return [Step(scene, making, directory)] if making else []
-    seeds = scene.realisations or ()
-    planned = [(None, scene.without_variants, directory, SHARED)]
-    planned += [(None, _truth_of(scene, seed), directory / f"{REALISATION}{seed}", SHARED) for seed in seeds]
+    whole, seeds = scene.without_variants, scene.realisations or ()
+    realisations = tuple(directory / f"{REALISATION}{seed}" for seed in seeds)
+    planned = [(None, Place(whole, directory), SHARED)]
+    for seed, place in zip(seeds, realisations):
+        # A ground truth for rollouts from its beginning; no model is needed here.
+        simulation = whole.simulation and replace(whole.simulation, method="none", start=0.0, confirmed_on=None)
+        truth = replace(whole, seed=seed, model=None, training=None, eulerian=None, simulation=simulation)
+        planned.append((None, Place(truth, place), SHARED))
     chosen: Sequence[str | None] = [*names] or [*scene.variant] or [None]
     for name in chosen:
-        own = _confirmed(scene, scene.variant[name] if name else scene.without_variants, directory)
+        own = scene.variant[name] if name else whole
+        if seeds and own.simulation.finds_step and own.simulation.confirmed_on is None and (
+                stage_fingerprint(own, "dns") == stage_fingerprint(whole, "dns")):
+            # A step must converge on all realisations, unless these are of another flow than the variant's.
+            own = replace(own, simulation=replace(own.simulation, confirmed_on=tuple(map(str, realisations))))
         trained = ("train",) if not seeds or own.model is not None and own.model.path is None else ()
-        planned.append((name, own, _directory_of(name, directory), (*SHARED, *trained, "find-step")))
-    by_variant = [_rollouts_of(scene, name, directory) for name in chosen]
-    for together in zip(*by_variant):
-        planned += [(name, own, where, (*SHARED, *(("train",) if seeds else ()), "simulate"))
-                    for name, (own, where) in zip(chosen, together)]
+        planned.append((name, Place(own, directory / (name or "")), (*SHARED, *trained, "find-step")))
+    for together in zip(*(rollouts_of(scene, name, directory) for name in chosen)):
+        planned += [(name, place, (*SHARED, *(("train",) if seeds else ()), "simulate"))
+                    for name, place in zip(chosen, together)]
     found: list[Step] = []
     made: dict[tuple[str, str], Path] = {}
-    for name, own, where, possible in planned:
+    for name, place, possible in planned:
+        own, where = place.scene, place.directory
         working, links = [], {}
         for stage in [stage for stage in STAGES if stage in own.stages and stage in MAKING]:
             key = stage, stage_fingerprint(own, stage)
-            taken_over = stage not in SHARED and own.model is not None and own.model.path is not None
-            holder = None if taken_over else made.get(key)
+            from_file = stage not in SHARED and own.model is not None and own.model.path is not None
+            holder = None if from_file else made.get(key)
             if holder is not None and holder != where:
                 links[stage] = holder
                 if seeds and stage == "train" and stage in possible and stage in stages:
-                    working.append(stage)  # finds the link; rollouts on realisations take the model over from here
+                    working.append(stage)  # finds the link; rollouts on realisations take their weights from here
             elif stage in possible and holder is None:
                 made[key] = where
                 working += [stage] if stage in stages else []
@@ -107,7 +144,7 @@ def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[
 
 
 def check_unseen(scene: Scene, directory: Path) -> None:
-    """Refuse realisations that a variant is trained on; SceneError."""
+    """Raise SceneError if a variant is trained on one of the realisations."""
     for name, variant in (scene.variant or {scene.name: scene}).items():
         trained_on = [path.resolve() for path in variant.training.truth_files] if variant.training else []
         for seed in scene.realisations or ():
@@ -115,51 +152,3 @@ def check_unseen(scene: Scene, directory: Path) -> None:
             if path.resolve() in trained_on:
                 raise SceneError(f"{name}: is trained on {path}, by [training] truths; leave {seed} out of "
                                  "realisations")
-
-
-def link(step: Step) -> None:
-    """Make the directory of a step, and in it relative links to products that are made elsewhere. One rank does this.
-
-    A product of the step's own settings that lies there is kept; another one is replaced.
-    """
-    step.directory.mkdir(parents=True, exist_ok=True)
-    for stage, holder in step.links.items():
-        path, product = step.directory / STAGES[stage].file, holder / STAGES[stage].file
-        if path.is_symlink() or not is_done(stage, step.scene, step.directory):
-            path.unlink(missing_ok=True)
-            if product.exists():
-                path.symlink_to(os.path.relpath(product.resolve(), step.directory.resolve()))
-
-
-def _directory_of(name: str | None, directory: Path) -> Path:
-    return directory / name if name else directory
-
-
-def _rollouts_of(scene: Scene, name: str | None, directory: Path) -> list[tuple[Scene, Path]]:
-    """Scene and directory of each rollout of a variant."""
-    own, where = scene.variant[name] if name else scene.without_variants, _directory_of(name, directory)
-    if scene.realisations is None:
-        return [(own, where)]
-    model = own.model if "train" in own.stages else None
-    if model is not None and model.path is None:
-        model = replace(model, path=str(where))
-    found = str(where) if own.simulation.finds_step else own.simulation.step_from
-    simulation = replace(own.simulation, start=0.0, step_from=found, confirmed_on=None)
-    return [(replace(own, seed=seed, model=model, training=None, simulation=simulation),
-             where / f"{REALISATION}{seed}") for seed in scene.realisations]
-
-
-def _confirmed(scene: Scene, own: Scene, directory: Path) -> Scene:
-    """The scene of a variant, the step of which is to converge on all realisations of the whole scene; as it is where
-    these are of another flow."""
-    asked = scene.realisations and own.simulation.finds_step and own.simulation.confirmed_on is None
-    if not asked or stage_fingerprint(own, "dns") != stage_fingerprint(scene.without_variants, "dns"):
-        return own
-    named = tuple(str(directory / f"{REALISATION}{seed}") for seed in scene.realisations)
-    return replace(own, simulation=replace(own.simulation, confirmed_on=named))
-
-
-def _truth_of(scene: Scene, seed: int) -> Scene:
-    """The scene of a further ground truth: with a rollout that needs no model, from its beginning."""
-    simulation = scene.simulation and replace(scene.simulation, method="none", start=0.0, confirmed_on=None)
-    return replace(scene.without_variants, seed=seed, model=None, training=None, eulerian=None, simulation=simulation)

@@ -1,4 +1,4 @@
-"""Flows that start from velocities of other codes, in files as those codes write them."""
+"""Flows that start from velocities in files of other codes."""
 
 import h5py
 import numpy as np
@@ -13,7 +13,7 @@ STORED, CELLS = 12, 16
 
 
 def flow(x, y, z):
-    """A solenoidal velocity (3, z, y, x), of which no component or direction is like another."""
+    """A solenoidal velocity (3, z, y, x) whose components and directions all differ."""
     u = np.cos(z) + 0.5 * np.sin(2 * y)
     v = np.sin(3 * x) + 0.3 * np.cos(z) + 0.1
     w = 0.7 * np.sin(x) - 0.2 * np.cos(2 * y)
@@ -21,7 +21,7 @@ def flow(x, y, z):
 
 
 def stored_velocity(cells=STORED, factor=1.0):
-    """That flow on the points of a file, with a part that is no flow of an incompressible fluid."""
+    """The flow on the points of a file, plus a part with divergence."""
     z, y, x = np.meshgrid(*[2 * np.pi * np.arange(cells) / cells] * 3, indexing="ij")
     velocity = factor * flow(x, y, z)
     velocity[0] += 0.4 * np.sin(x)
@@ -68,15 +68,15 @@ def start(comm, path, *overrides):
 
 @pytest.fixture
 def path(comm, tmp_path):
-    """The same on all ranks."""
+    """A path that is the same on all ranks."""
     return comm.bcast(str(tmp_path / "start.h5"))
 
 
 @pytest.mark.mpi(1, 2)
 @pytest.mark.parametrize("layout, tolerance", [("cutout", 1e-6), ("fluidsim", 1e-14)])
 def test_the_flow_of_the_file_is_the_flow_of_the_scene(comm, path, layout, tolerance):
-    """On another grid, in coordinates of the scene whatever the edge of the box there, and without what is not
-    solenoidal; cutouts are in single precision."""
+    """On another grid, for any edge of the box, and without the part that has a divergence. Cutouts are in single
+    precision."""
     if comm.rank == 0:
         write = {"cutout": lambda: write_cutout(path, [stored_velocity()]),
                  "fluidsim": lambda: write_fluidsim(path, stored_velocity())}
@@ -91,7 +91,7 @@ def test_the_flow_of_the_file_is_the_flow_of_the_scene(comm, path, layout, toler
     assert np.abs(state[3] - balanced).max(initial=0) < 1e-14 < np.abs(balanced).max(initial=1)
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_state_picks_a_time_of_a_cutout(comm, path):
     if comm.rank == 0:
         write_cutout(path, [stored_velocity(factor=number) for number in (1, 2, 3)])
@@ -99,7 +99,7 @@ def test_state_picks_a_time_of_a_cutout(comm, path):
         fluid, velocity = start(comm, path, f"initial.state={state}")
         expected = (state + 1) * flow(*fluid.grid.coordinates())
         assert np.abs(fluid.grid.backward(velocity) - expected).max(initial=0) < 1e-5
-    with pytest.raises(UserError, match="holds 3 states of the whole flow, number 0 to 2"):
+    with pytest.raises(UserError, match="holds 3 states"):
         start(comm, path, "initial.state=3")
 
 
@@ -110,40 +110,36 @@ UNEVEN = np.float32(2 * np.pi * np.arange(STORED) / STORED) + np.float32(0.1) * 
 
 
 REFUSED = {
-    "a part": (lambda path: write_cutout(path, [stored_velocity()], points=PART),
-               "xcoor goes from 0 to 0.0674952 in 12 points: no whole periodic cube of edge 2 pi"),
+    "a part": (lambda path: write_cutout(path, [stored_velocity()], points=PART), "xcoor goes from 0 to 0.0674952"),
     "uneven": (lambda path: write_cutout(path, [stored_velocity()], points=UNEVEN), "no whole periodic cube"),
-    "nowhere": (lambda path: write_cutout(path, [stored_velocity()], coordinates=("xcoor", "ycoor")),
-                "holds no zcoor with the 12 points"),
+    "nowhere": (lambda path: write_cutout(path, [stored_velocity()], coordinates=("xcoor", "ycoor")), "no zcoor"),
     "flat": (lambda path: write_cutout(path, [stored_velocity()[:, :8]]), r"Velocity_0009: .* shape \(8, 12, 12, 3\)"),
     "scalar": (lambda path: write_cutout(path, [stored_velocity()[:1]]), r"Velocity_0009: .* shape \(12, 12, 12, 1\)"),
-    "no cube": (lambda path: write_fluidsim(path, stored_velocity(), (4.0, 4.0, 8.0)),
-                "the box has the edges 4, 4, 8; take a cube"),
-    "no edges": (lambda path: write_fluidsim(path, stored_velocity(), ("four",) * 3),
-                 "info_simul/params/oper has no numbers Lx"),
-    "unknown": (lambda path: write_fluidsim(path, stored_velocity()[:2]),
-                "no velocity in a layout that is known: .*state_phys"),
+    "no cube": (lambda path: write_fluidsim(path, stored_velocity(), (4.0, 4.0, 8.0)), "edges 4, 4, 8"),
+    "no edges": (lambda path: write_fluidsim(path, stored_velocity(), ("four",) * 3), "no numbers Lx"),
+    "unknown": (lambda path: write_fluidsim(path, stored_velocity()[:2]), "state_phys"),
 }
 
 
-@pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("write, told", REFUSED.values(), ids=REFUSED)
-def test_a_file_that_is_no_start_is_told_before_and_refused(comm, path, write, told):
-    if comm.rank == 0:
-        write(path)
-    with pytest.raises(UserError, match=told) as error:
-        start(comm, path)
-    scene = load_scene("taylor-green", ["flow.cells=16", "initial.kind=file", f"initial.path={path}"])
-    (line,), _ = problems_of(scene, comm)
-    assert line == str(error.value) and line.startswith(f"{path}: ")
+@pytest.mark.mpi(2)
+def test_an_unfit_file_is_refused_by_check_and_run(comm, path):
+    for case, (write, message) in REFUSED.items():
+        if comm.rank == 0:
+            write(path)
+        with pytest.raises(UserError, match=message) as error:
+            start(comm, path)
+        scene = load_scene("taylor-green", ["flow.cells=16", "initial.kind=file", f"initial.path={path}"])
+        (line,), _ = problems_of(scene, comm)
+        assert line == str(error.value) and line.startswith(f"{path}: "), case
+        comm.Barrier()
 
 
-@pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("write, place", [(lambda path: write_cutout(path, [BROKEN]), "Velocity_0009"),
-                                          (lambda path: write_fluidsim(path, BROKEN), "state_phys/vy")],
-                         ids=["cutout", "fluidsim"])
-def test_values_that_are_not_finite_are_refused_on_all_ranks(comm, path, write, place):
-    if comm.rank == 0:
-        write(path)
-    with pytest.raises(UserError, match=f"{place}: holds values that are not finite"):
-        start(comm, path)
+@pytest.mark.mpi(2)
+def test_values_that_are_not_finite_are_refused_on_all_ranks(comm, path):
+    for write, place in ((lambda: write_cutout(path, [BROKEN]), "Velocity_0009"),
+                         (lambda: write_fluidsim(path, BROKEN), "state_phys/vy")):
+        if comm.rank == 0:
+            write()
+        with pytest.raises(UserError, match=f"{place}: .*not finite"):
+            start(comm, path)
+        comm.Barrier()

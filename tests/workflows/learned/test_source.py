@@ -14,10 +14,10 @@ from eddies.scene.rules import quoted
 from eddies.scene.scene import Model, SceneError, load_scene
 from eddies.stages import Step, check_inputs
 from eddies.workflows.learned.model import with_weights
-from eddies.workflows.learned.source import describe, differences, read_source
+from eddies.workflows.learned.source import ModelDefinition, read_source
 from tests.small_scene import TINY, one_model
 
-# Of the scene tiny: filter width two spacings, whatever their number.
+# The filter width is two spacings, as in the scene tiny.
 SCALES = ReferenceScales(filter_width=0.5, spacing=0.25, velocity=1.0, acceleration=2.0, density_mean=1.0,
                          viscosity=0.01)
 OWN_TERM = """
@@ -41,7 +41,7 @@ def scene(*overrides):
 
 
 def described(*overrides):
-    return json.loads(json.dumps(describe(scene(*overrides), SCALES)))
+    return json.loads(json.dumps(ModelDefinition.of(scene(*overrides)).describe(SCALES)))
 
 
 def write_source(comm, directory, description=None):
@@ -60,70 +60,56 @@ def test_a_run_directory_or_its_file_gives_description_weights_and_tables(comm, 
         assert np.array_equal(source.weights["bias"], np.arange(3.0)) and set(source.tables) == {"a_priori"}
 
 
+INPUTS = '["density", "distance", "speed", "approach"]'
+
+
 @pytest.mark.mpi(1)
-@pytest.mark.parametrize("override, message", [
-    ("model.pairs.hidden=[8, 9]", "[model.pairs] hidden = [8, 9], but {} was trained with [8, 8]; set it to that"),
-    ("model.pairs.basis=paper", '[model.pairs] basis = "paper", but {} was trained with "corrected"'),
-    ('model.pairs.inputs=["distance"]', '[model.pairs] inputs = ["distance"], but {} was trained with ["distance", '
-                                        '"speed", "approach"]; set it to that'),
-    ("model.pairs.network=own_networks:Net", '[model.pairs] network = "own_networks:Net", but {} was trained with '
-                                             '"dense"'),
-    ("model.neighbors=50", "[model] neighbors = 50.0, but {} was trained with 56.0"),
-    ("tracers.filter_width=0.9", "[tracers] filter_width = 0.9, but {} was trained with 1.04719755"),
-])
-def test_another_form_is_refused_with_both_values(comm, tmp_path, own, override, message):
+@pytest.mark.parametrize("key, here, there", [
+    ("model.pairs.hidden", "[8, 9]", "[8, 8]"),
+    ("model.pairs.basis", '"paper"', '"corrected"'),
+    ("model.pairs.inputs", INPUTS, '["distance", "speed", "approach"]'),
+    ("model.pairs.network", '"own_networks:Net"', '"dense"'),
+    ("model.neighbors", "50.0", "56.0"),
+    ("tracers.filter_width", "0.9", "1.04719755")])
+def test_a_model_of_another_form_is_refused_with_both_values(comm, tmp_path, own, key, here, there):
     own("own_networks", "from torch import nn\nclass Net(nn.Module):\n    def forward(self, features): pass\n")
     write_source(comm, tmp_path)
     with pytest.raises(SceneError) as error:
-        read_source(scene(f"model.path={tmp_path}", override), comm)
-    assert message.format(tmp_path / "model.h5") in str(error.value)
+        read_source(scene(f"model.path={tmp_path}", f"{key}={here}"), comm)
+    section, _, name = key.rpartition(".")
+    for part in (f"[{section}] {name} = {here}", str(tmp_path / "model.h5"), there):
+        assert part in str(error.value)
 
 
 @pytest.mark.mpi(1)
-def test_a_network_that_was_told_the_densities_is_read_by_a_scene_that_says_so(comm, tmp_path):
-    """As that of the preset was once; the preset alone does not read it."""
-    told = 'model.pairs.inputs=["density", "distance", "speed", "approach"]'
-    write_source(comm, tmp_path, described(told))
-    with pytest.raises(SceneError) as error:
-        read_source(scene(f"model.path={tmp_path}"), comm)
-    assert (f'[model.pairs] inputs = ["distance", "speed", "approach"], but {tmp_path}/model.h5 was trained with '
-            '["density", "distance", "speed", "approach"]; set it to that') in str(error.value)
-    assert read_source(scene(f"model.path={tmp_path}", told), comm).description == described(told)
-
-
-@pytest.mark.mpi(1)
-@pytest.mark.parametrize("terms", [("pressure", "pairs"),
-                                   ("pairs", "pressure", "stress", "damping", "relaxation")])
+@pytest.mark.parametrize("terms", [("pressure", "pairs"), ("pairs", "pressure", "stress", "damping", "relaxation")])
 def test_other_terms_are_refused_with_both_lists(comm, tmp_path, terms):
-    """Also in another order, in which sums are rounded otherwise."""
+    """Another order too, because it changes the rounding of sums."""
     write_source(comm, tmp_path)
     with pytest.raises(SceneError) as error:
         read_source(scene_with(tmp_path, *terms), comm)
-    trained = '["pressure", "stress", "viscosity", "damping", "relaxation", "pairs"]'
-    expected = f"tiny: [model] terms = {quoted(terms)}, but {tmp_path}/model.h5 was trained with {trained}"
-    assert expected in str(error.value)
+    for part in (f"[model] terms = {quoted(terms)}", '["pressure", "stress", "viscosity", "damping", "relaxation", "p'):
+        assert part in str(error.value)
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_missing_weights_are_refused_before_any_work_on_all_ranks(comm, tmp_path):
     wanted = scene(f"model.path={tmp_path}")
-    with pytest.raises(ProductError, match=r"tiny: \[model\] path = .*model.h5: no such file; run `eddies train"):
+    with pytest.raises(ProductError, match=r"\[model\] path = .*model.h5: no such file; run `eddies train"):
         check_inputs(Step(wanted, wanted.stages, tmp_path), comm)
     check_inputs(Step(wanted, ("dns",), tmp_path), comm)
 
 
 @pytest.mark.mpi(1, 2)
 def test_a_file_never_has_a_class_imported(comm, tmp_path, own):
-    """The scene that is run must name it again, and one error says so."""
+    """The scene must name the class again, and one error says so."""
     if comm.rank == 0:
         own("own_source", OWN_TERM)
     comm.Barrier()
     terms = {"pressure": {"force": True}, "own_source:Drag": {}}
     write_source(comm, tmp_path, {"terms": terms, "scales": SCALES.to_dict(), "neighbors": 56.0})
-    with pytest.raises(SceneError) as error:
+    with pytest.raises(SceneError, match=r'terms = \["pressure"\], .* \["pressure", "own_source:Drag"\]'):
         read_source(scene_with(tmp_path, "pressure"), comm)
-    assert (f'tiny: [model] terms = ["pressure"], but {tmp_path}/model.h5 was trained with ["pressure", '
-            '"own_source:Drag"]; set it to that') in str(error.value)
     assert "own_source" not in sys.modules and not (tmp_path / "imported").exists()
     comm.Barrier()
     if comm.rank == 0:  # whose path leads to the module
@@ -135,21 +121,19 @@ def test_a_file_never_has_a_class_imported(comm, tmp_path, own):
 @pytest.mark.parametrize("name, base", [("hit", "hit"), ("hit-coarse", "hit-coarse"), ("hit-local", "hit"),
                                         ("hit-small", "hit-small")])
 def test_weights_of_the_first_version_are_read(comm, name, base):
-    """Of a term's keys that there are no more, with the values at which they are fixed now."""
+    """Keys of terms that no longer exist have the values at which they are now fixed."""
     changes = ["model.preset=local"] if name == "hit-local" else []
     found = one_model(base, [*changes, f"model.path=eddies:{name}"])
     source = read_source(found, comm)
     scales = ReferenceScales(**source.description["scales"])
-    model = with_weights(found, comm, source.description, source.weights, source.path, scales)
+    model = with_weights(ModelDefinition.of(found), comm, source.description, source.weights, source.path, scales)
     assert {key: value.shape for key, value in source.weights.items()} == {
         key: tuple(value.shape) for key, value in model.state_dict().items()}
 
 
 def test_a_former_key_with_another_value_is_another_model():
-    resolved = load_scene(TINY, ["model.preset=resolved"])
-    scales = replace(SCALES, filter_width=resolved.tracers.filter_width, spacing=resolved.tracers.spacing)
-    description = json.loads(json.dumps(describe(resolved, scales)))
-    assert list(differences(resolved, description)) == []
-    for force, found in ((True, []), (False, [("[model.pressure] force", "true", "false")])):
+    resolved = ModelDefinition.of(load_scene(TINY, ["model.preset=resolved"]))
+    description = json.loads(json.dumps(resolved.describe(SCALES)))
+    for force, differences in ((True, []), (False, [("[model.pressure] force", "true", "false")])):
         description["terms"]["pressure"] = {"force": force}
-        assert [(key, *rest) for key, *rest in differences(resolved, description)] == found
+        assert list(resolved.differences(description)) == differences

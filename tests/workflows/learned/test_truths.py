@@ -19,13 +19,14 @@ from eddies.scene.scene import SceneError, load_scene
 from eddies.stages import Step, check_inputs
 from eddies.workflows import dns, train
 from eddies.workflows.foreseen.ranks import most_ranks, rank_problems
+from eddies.workflows.ground_truth.frame_counts import rollout_start
 from eddies.workflows.ground_truth.truth import load_frame
 from eddies.workflows.learned import transfer
-from eddies.workflows.learned.training_data import model_of
-from eddies.workflows.learned.truths import open_truths, training_data, truth_problems
+from eddies.workflows.learned.source import ModelDefinition
+from eddies.workflows.learned.training_data import model_for, training_data
+from eddies.workflows.learned.truths import open_truths, truth_problems
 from eddies.workflows.rollout.eulerian_run import EulerianRun
-from eddies.workflows.rollout.particle_run import injection
-from eddies.workflows.simulate import start_frame
+from eddies.workflows.rollout.particle_run import forcing_of
 from tests.changed_product import changed
 
 CPU = torch.device("cpu")
@@ -71,7 +72,7 @@ def scene_of(directory, *overrides):
 
 
 def made(comm, directory, *overrides, runs=("own",)):
-    """A scene, with the ground truths of some run directories in `directory`, of a seed each."""
+    """A scene, and ground truths in run directories below `directory`, each with its own seed."""
     if comm.rank == 0:
         (directory / "own.toml").write_text(SCENE)
     comm.Barrier()
@@ -81,6 +82,10 @@ def made(comm, directory, *overrides, runs=("own",)):
         comm.Barrier()
         dns.run(scene_of(directory, *overrides, f"seed={seed}"), comm, directory / name)
     return scene_of(directory, *overrides)
+
+
+def opened(scene, comm, directory):
+    return open_truths(directory / "ground_truth.h5", scene.training.truth_files, scene.tracers, comm, CPU)
 
 
 def trained_on(scene, *directories):
@@ -96,7 +101,7 @@ def weights_and_errors(scene, comm, directory):
 
 
 def copied(source, target):
-    """The ground truth of a run in another run directory."""
+    """Copy the ground truth of a run into another run directory."""
     target.mkdir()
     return shutil.copy(source / "ground_truth.h5", target)
 
@@ -113,12 +118,12 @@ def test_training_on_two_flows_takes_the_same_steps_on_any_number_of_ranks(comm,
             assert np.abs(weights[name] - tensor).max() < 1e-9 * np.abs(tensor).max()
         for name in ("loss", "validation_error"):
             assert np.allclose(tables["history"][name], expected_tables["history"][name], rtol=1e-9, equal_nan=True)
-        # They take turns: neighbouring losses are of different flows, and each phase is measured on both.
+        # The flows take turns, and each phase is validated on both.
         assert len(tables["history"]["loss"]) == 6 + 2
 
 
 @pytest.mark.mpi(1)
-def test_the_own_ground_truth_named_is_that_of_a_scene_that_names_none(comm, tmp_path, quick_solves):
+def test_naming_the_own_ground_truth_changes_nothing(comm, tmp_path, quick_solves):
     scene = made(comm, tmp_path, "tracers.forced=true")
     found = [weights_and_errors(each, comm, tmp_path / "own")
              for each in (scene, trained_on(scene, tmp_path / "own" / "ground_truth.h5"))]
@@ -130,7 +135,7 @@ def test_the_own_ground_truth_named_is_that_of_a_scene_that_names_none(comm, tmp
 
 
 def twice_as_fast(source, target):
-    """The same flow in another unit of time, half as long."""
+    """The same flow in a unit of time that is twice as long."""
     powers = {"velocity_rms": 1, "acceleration_rms": 2, "sound_speed": 1, "viscosity": 1, "density_rate_rms": 1}
     with changed(copied(source, target)) as file:
         file.attrs["provenance"] = json.dumps(json.loads(file.attrs["provenance"]) | {"id": "another"})
@@ -138,13 +143,13 @@ def twice_as_fast(source, target):
         for name, power in powers.items():
             reference[name] *= 2.0**power
         tracers["velocity/value"][...] *= 2
-        tracers["position/time"][...] /= 2  # which all columns share
+        tracers["position/time"][...] /= 2  # shared by all columns
         file["fields/filtered/velocity"][...] *= 2
 
 
 @pytest.mark.mpi(1)
 def test_the_same_is_learned_of_the_same_flow_in_other_units(comm, tmp_path):
-    """Each flow is seen in its own scales; then nothing of the run's own is trained on."""
+    """A model sees each flow in the scales of that flow."""
     scene = made(comm, tmp_path, "training.steps=4", "training.combined_steps=0", "training.acceleration_kl_weight=0",
                  "simulation.start=0.1")
     scene = replace(scene, training=replace(scene.training, horizons=None, window=1.0))
@@ -156,44 +161,47 @@ def test_the_same_is_learned_of_the_same_flow_in_other_units(comm, tmp_path):
         assert np.allclose(weights[name], tensor, rtol=1e-9)
     assert np.allclose(unseen["history"]["loss"], seen["history"]["loss"], rtol=1e-9)
     assert np.allclose(unseen["a_priori"]["acceleration_error"], seen["a_priori"]["acceleration_error"], rtol=1e-9)
-    # Weights that are taken over say where they were trained, not where they lay.
+    # Weights of another run keep the name of the flow of their training.
     transfer.run(replace(scene, model=replace(scene.model, path=str(own))), comm, tmp_path / "fast")
     source = product_provenance(tmp_path / "fast/model.h5")["source"]
     (truth, mach), = source["truths"].items()
     assert truth == str(tmp_path / "fast/ground_truth.h5") and source["path"] == str(own)
     assert mach == product_attributes(truth, "reference")["mach_turbulent"] > 0
-    # The delay is that since the end of what was seen: here all, or nothing.
+    # The filtered pressure gradient is a part of the acceleration, a small one in so viscous a flow.
+    assert 0 < seen["a_priori"]["pressure_gradient_error"].max() < 1
+    # The delay is that since the end of the training window, here the whole flow or nothing of it.
     assert seen["a_priori"]["delay"].max() < 0 < unseen["a_priori"]["delay"].min()
 
 
-@pytest.mark.mpi(1, 2)
-def test_a_forced_truth_is_matched_with_its_forcing_alone(comm, tmp_path):
-    """By the known forces, none of which is learned; each flow with the power of its own file."""
+@pytest.mark.mpi(2)
+def test_a_forced_truth_is_matched_only_with_its_forcing(comm, tmp_path):
+    """Known forces, none of which is learned, match the truth if the forcing has the power in its file."""
     scene = made(comm, tmp_path, "tracers.forced=true", "tracers.particles_per_side=10",
                  'model.terms=["pressure", "stress", "viscosity"]')
-    with open_truths(scene, comm, tmp_path / "own") as (truth, _):
+    with opened(scene, comm, tmp_path / "own") as (truth, _):
         assert (truth.forcing.injection_rate, truth.forcing.wavenumber) == (1.0, 2.0)
-        forced = model_of(scene, truth, CPU)
+        models = [model_for(ModelDefinition.of(scene), truth, torch.float64)]
         truth.forcing = None
-        frames = [load_frame(truth, 4, model, torch.float64, CPU) for model in (forced, model_of(scene, truth, CPU))]
+        models.append(model_for(ModelDefinition.of(scene), truth, torch.float64))
+        frames = [load_frame(truth, 4, model, torch.float64) for model in models]
         force = frames[0].kept[FORCING].at(None).acceleration
         missed = [frame.errors()["acceleration"] for frame in frames]
         with_it, without = (relative_error(comm, error, force) for error in missed)
         share = global_sum(comm, float((-missed[1] * force).sum())) / global_sum(comm, float(force.square().sum()))
-    # What else is missed is the same with the force and without: it is a third of it, and has nothing to do with it.
+    # The rest of the error is a third of the force and uncorrelated with it.
     assert with_it < 0.4 * without and share == pytest.approx(1, abs=0.02)
 
 
 @pytest.mark.mpi(1)
-def test_every_flow_is_trained_on_with_the_forcing_of_its_own_and_one_set_of_parameters(comm, tmp_path):
+def test_flows_have_their_own_forcing_and_share_the_parameters(comm, tmp_path):
     free = made(comm, tmp_path)
     forced = scene_of(tmp_path, "tracers.forced=true", "forcing.injection_rate=0.7", "seed=4")
     (tmp_path / "forced").mkdir()
     dns.run(forced, comm, tmp_path / "forced")
     scene = trained_on(free, tmp_path / "own", tmp_path / "forced")
-    with open_truths(scene, comm, tmp_path / "own") as (own, truths):
+    with opened(scene, comm, tmp_path / "own") as (own, truths):
         assert truths[0] is own
-        first, second = training_data(scene, truths, CPU)
+        first, second = training_data(ModelDefinition.of(scene), scene.training, truths)
         assert FORCING not in first.model.terms
         assert second.model.terms[FORCING].settings.injection_rate == 0.7
         assert first.model.flow.scales == truths[0].scales != second.model.flow.scales == truths[1].scales
@@ -202,66 +210,63 @@ def test_every_flow_is_trained_on_with_the_forcing_of_its_own_and_one_set_of_par
 
 
 @pytest.mark.mpi(1)
-def test_a_rollout_is_forced_as_its_truth_was_and_starts_after_what_was_seen(comm, tmp_path):
+def test_a_rollout_is_forced_like_its_truth_and_starts_after_the_training_window(comm, tmp_path):
     scene = made(comm, tmp_path, "tracers.forced=true")
     other = tmp_path / "other"
     copied(tmp_path / "own", other)
-    with open_truths(scene, comm, tmp_path / "own") as (truth, _):
-        for word, rate in (("truth", 1.0), ("none", None), ("dissipation", truth.reference["dissipation_rate"]),
-                           (0.3, 0.3)):
-            found = injection(replace(scene, simulation=replace(scene.simulation, injection=word)), truth)
-            assert (found and found.injection_rate) == rate
+    with opened(scene, comm, tmp_path / "own") as (truth, _):
+        for power, rate in (("truth", 1.0), ("none", None), ("dissipation", truth.reference["dissipation_rate"]),
+                            (0.3, 0.3)):
+            forcing = forcing_of(power, scene.forcing, truth)
+            assert (forcing and forcing.injection_rate) == rate
         ends = truth.last_frame_seen(scene.training.window)
         coarse = EulerianRun(scene, truth, ends, tmp_path, CPU)
         assert coarse.fluid.forcing.injection_rate == 1.0 and coarse.fluid.forcing.wavenumber == 2.0
-        # Every frame has a field; at the first there are no rates.
-        assert start_frame(scene, truth, tmp_path / "own") == ends > 2
-        assert start_frame(trained_on(scene, other), truth, tmp_path / "own") == 1
+        # Each frame has a field. The first frame has no rates.
+        for each, start in ((scene, ends), (trained_on(scene, other), 1)):
+            seen = each.seen_in(tmp_path / "own")
+            assert rollout_start(each, seen, len(truth.times), truth.at_fields) == start
+        assert ends > 2
 
 
 REFUSED = {
-    "no such file": ([], "nowhere", "nowhere/ground_truth.h5: no such file; run `eddies dns SCENE` first"),
-    "twice": ([], "own", "is named before; name each ground truth once"),
-    "another filter": (["tracers.filter_width=1.2"], "other",
-                       "its filter is 1.14591559 mean spacings wide, and [tracers] filter_width = 2.0943951 is 2; "),
+    "no such file": ([], "nowhere", "nowhere/ground_truth.h5: no such file"),
+    "twice": ([], "own", "is named twice"),
+    "another filter": (["tracers.filter_width=1.2"], "other", "its filter is 1.14591559 mean spacings wide"),
     "no density": (["flow.fluid=incompressible", "flow.sound_speed=none", 'model.terms=["pressure"]'], "other",
-                   "holds no density, which the terms of [model] read; give one of a compressible flow"),
-    "other frames": (["tracers.frame_interval=0.01"], "other",
-                     "its frames are 0.01 apart, and [training.horizons] counts frames of [tracers] frame_interval"),
-    "fewer particles": (["tracers.particles_per_side=4", "training.batch=9"], "other",
-                        "holds 64 particles, fewer than [training] batch = 100; lower batch"),
-    "too short": (["tracers.turnovers=0.01"], "other", "[training] window = 0.5: holds 1 frames of the ground truth"),
-    "no tracers": (["tracers", "model", "training", "simulation"], "other", "holds no tracers to learn from; give the"),
+                   "holds no density"),
+    "other frames": (["tracers.frame_interval=0.01"], "other", "its frames are 0.01 apart"),
+    "fewer particles": (["tracers.particles_per_side=4", "training.batch=9"], "other", "holds 64 particles"),
+    "too short": (["tracers.turnovers=0.01"], "other", "[training] window = 0.5: holds 1 frames"),
+    "no tracers": (None, "other", "holds no tracers"),
 }
 
 
 @pytest.mark.mpi(1)
-@pytest.mark.parametrize("overrides, name, message", REFUSED.values(), ids=REFUSED)
-def test_truths_that_do_not_fit_are_refused_before_any_work(comm, tmp_path, overrides, name, message):
-    read_density = 'model={preset = "paper"}' if "no density" in message else "seed=1"
-    scene = trained_on(made(comm, tmp_path, read_density, runs=()), tmp_path / "own", tmp_path / name)
-    other = scene_of(tmp_path)
-    if overrides[:1] == ["tracers"]:
-        other = replace(other, **dict.fromkeys(overrides), spin_up=None, time=replace(other.time, duration=0.01))
-    elif overrides:
-        other = scene_of(tmp_path, *overrides)
-    if name == "other":
-        if comm.rank == 0:
-            (tmp_path / "other").mkdir()
-        comm.Barrier()
-        dns.run(replace(other, spin_up=None, forcing=None), comm, tmp_path / "other")
-    problems = truth_problems(scene, comm, tmp_path / "own")
-    assert len(problems) == 1 and message in problems[0]
-    assert problems[0].startswith(f'[training] truths: "{tmp_path / name}": ')
-    # The own ground truth, which is named too, is made by the run itself.
-    with pytest.raises(SceneError, match=r"own: \[training\] truths: "):
-        check_inputs(Step(scene, ("train",), tmp_path / "own"), comm)
+def test_unfit_truths_are_refused_before_any_work(comm, tmp_path):
+    made(comm, tmp_path, runs=())
+    for case, (overrides, name, message) in REFUSED.items():
+        own, other = tmp_path / case / "own", tmp_path / case / name
+        if name == "other":
+            other.mkdir(parents=True)
+            scene = scene_of(tmp_path, *(overrides or ()))
+            if overrides is None:
+                scene = replace(scene, tracers=None, model=None, training=None, simulation=None,
+                                time=replace(scene.time, duration=0.01))
+            dns.run(replace(scene, spin_up=None, forcing=None), comm, other)
+        read_density = ['model={preset = "paper"}'] if case == "no density" else []
+        scene = trained_on(scene_of(tmp_path, *read_density), own, other)
+        (problem,) = truth_problems(scene, comm, own)
+        assert problem.startswith(f'[training] truths: "{other}"') and message in problem
+        # The run itself makes its own ground truth, which is named too.
+        with pytest.raises(SceneError, match=r"own: \[training\] truths: "):
+            check_inputs(Step(scene, ("train",), own), comm)
 
 
 @pytest.mark.mpi(1)
-def test_more_ranks_than_another_truth_can_be_cut_for_are_refused_before_any_work(comm, tmp_path):
-    """Into 8 layers, of which the own has 14; no thinner than a radius of 2.5 of them, nor than what particles stray in
-    the training through horizons, at the speed that they have there."""
+def test_another_truth_limits_the_number_of_ranks(comm, tmp_path):
+    """It has 8 planes, the own one 14. Slabs must hold the radius of interaction, 2.5 planes, and the way of particles
+    within the horizons."""
     other = made(comm, tmp_path, "tracers.particles_per_side=4", "training.batch=60", runs=("other",))
     assert other.tracers.planes == 8
     place = f'[training] truths: "{tmp_path / "other"}"'
@@ -273,8 +278,8 @@ def test_more_ranks_than_another_truth_can_be_cut_for_are_refused_before_any_wor
         scene = trained_on(alone, tmp_path / "nowhere", tmp_path / "other")
         assert not [*rank_problems(alone, ("train",), 3), *rank_problems(scene, ("train",), most)]
         problem, = rank_problems(scene, ("train",), 3)
-        assert f"3 ranks are more than the {most} that it can use ({place}: {reason}); start at most {most}" in problem
-        # The ground truth of the run is made by as many as it can be cut for, and weights are taken by as many.
+        assert f"({place}: {reason}" in problem and f"at most {most}" in problem
+        # The own ground truth, and weights of another run, allow more ranks.
         taken = replace(scene, model=replace(scene.model, path="runs/other"))
         assert not [*rank_problems(scene, ("dns",), 3), *rank_problems(taken, ("train",), 3)]
 

@@ -1,9 +1,9 @@
-"""A flow on its way through time, and tracers in it, with all that goes on from a checkpoint."""
+"""The direct simulation in time, alone or with tracers whose frames are stored, and its state for checkpoints."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,23 +14,26 @@ from eddies.flow.courant import CourantLimit, FixedStep
 from eddies.flow.history import FlowHistory
 from eddies.flow.navier_stokes import Fluid
 from eddies.flow.stability import StabilityWatch
+from eddies.flow.statistics import energy_spectrum
 from eddies.flow.tracers import FilteredField, TracerParticles, release
 from eddies.io.checkpoint import Block, Checkpoint, Guard
-from eddies.io.frame_segments import FrameSegments
+from eddies.io.frame_segments import FieldLayout, FrameLayout, FrameSegments
+from eddies.io.hdf5 import File, write_table
 from eddies.parallel.migration import IdOrder, id_block, migrate
+from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.flow_units import MEAN_DENSITY, measured_scales
-from eddies.scene.scene import Scene
-from eddies.workflows.ground_truth.frame_counts import whole_frames
-from eddies.workflows.ground_truth.tracer_frames import TracerFrames
+from eddies.scene.scene import BOX_LENGTH, Tracers
+from eddies.spectral.spectral_grid import SpectralGrid, regrid
+from eddies.workflows.ground_truth.frame_counts import whole_cells
 
 
 @dataclass
 class FlowRun:
-    """A fluid with its state, the steps that it takes, its clock and its history.
+    """A fluid and its state, the time stepper, the clock and the history.
 
-    `guard` looks on before each step; after it `watch` ends a run that became unstable. `phase` is where it is on its
-    way: in the "spin-up", at the "start" of what follows, in the "run" of a given time, or with "tracers", of
-    which then `tracers` is the run.
+    `guard` is called before each step; after it `watch` ends a run that has become unstable. `phase` is "spin-up",
+    "start" (of what follows), "run" for a given time, or "tracers", in which `tracers` is set. `max_step` limits the
+    steps with tracers, in addition to `step_limit`.
     """
 
     fluid: Fluid
@@ -42,6 +45,7 @@ class FlowRun:
     clock: Clock = field(default_factory=Clock)
     phase: str = "start"
     tracers: TracerRun | None = None
+    max_step: float = np.inf
     watch: StabilityWatch = field(init=False)
 
     def __post_init__(self) -> None:
@@ -52,22 +56,16 @@ class FlowRun:
         """Steps taken so far."""
         return self.clock.steps
 
-    def begin_tracers(self, tracers: TracerRun, forced: bool) -> None:
-        """Be in the phase in which tracers are followed: unless it stays `forced`, nothing forces the flow from here
-        on."""
-        self.phase, self.tracers = "tracers", tracers
-        if not forced:
-            self.fluid.forcing = None
-
     def advance(self, observers: Sequence[Callable], step_limit: Callable | None = None) -> None:
-        """Take steps, of another limit if one is given, until the clock ends; every observer sees every step.
+        """Take steps until the clock ends, and call each observer after each step. A given `step_limit` replaces that
+        of the run.
 
-        Raises FlowDiverged at the step that was unstable.
+        Raises FlowDiverged at an unstable step.
         """
         while self.clock.running:
             self.guard(self, self.tracers.segments if self.tracers else None)
             step = (step_limit or self.step_limit)(self.state, self.clock)
-            with np.errstate(over="ignore", invalid="ignore"):  # the watch says it better
+            with np.errstate(over="ignore", invalid="ignore"):  # the watch reports it
                 state = self.stepper(self.state, step)
                 self.clock.tick(step)
                 self.watch(self.state, state, step, self.clock)
@@ -76,7 +74,7 @@ class FlowRun:
                 observer(self.state, self.clock)
 
     def state_dict(self) -> dict[str, Any]:
-        """All that goes on, for a checkpoint; with that of the tracers, if there are any."""
+        """The state for a checkpoint, with that of the tracers."""
         grid = self.fluid.grid
         modes = Block(self.state, int(grid.column_starts[grid.decomposition.rank]), grid.modes, axis=2)
         return {"phase": self.phase, "modes": modes, "clock": self.clock.state_dict(),
@@ -84,7 +82,7 @@ class FlowRun:
                 **self.history.state_dict(), **(self.tracers.state_dict() if self.tracers else {})}
 
     def load_state_dict(self, saved: Checkpoint) -> None:
-        """Go on from a checkpoint, made on any number of ranks; tracers take what is theirs themselves."""
+        """Continue from a checkpoint, made on any number of ranks. Tracers read their part themselves."""
         grid = self.fluid.grid
         starts, rank = grid.column_starts, grid.decomposition.rank
         self.phase, self.state = saved["phase"], saved.read("modes", starts[rank], starts[rank + 1], axis=2)
@@ -95,36 +93,50 @@ class FlowRun:
 
 
 class TracerRun:
-    """Releases tracers into a flow, its forcing off unless [tracers] forced, or takes them from a checkpoint, and
-    follows them.
+    """Releases tracers into a flow, or takes them from a checkpoint, and follows them to the end.
 
-    `released` is the sample of the flow at the release. Within a frame interval all steps are equal: the longest
-    allowed ones that divide it, so that frames are equally spaced.
+    Within a frame interval all steps are equal: the longest allowed steps that divide it, so that frames are equally
+    spaced. `released` is the sample of the flow at the release.
+
+    Parameters
+    ----------
+    flow : its forcing ends at the release unless [tracers] forced.
+    segments : the files for the frames.
+    settings, seed : [tracers], and the seed of random places.
+    whole : gives, for a number of frames, those (with filtered fields) at which the unfiltered flow is stored.
+    saved : the checkpoint, or None.
     """
 
-    def __init__(self, scene: Scene, flow: FlowRun, segments: FrameSegments, saved: Checkpoint | None) -> None:
-        self.scene, self.flow, self.segments, self.settings = scene, flow, segments, scene.tracers
-        flow.begin_tracers(self, self.settings.forced)
-        field = FilteredField(flow.fluid.grid, self.settings.filter_width, self.settings.interpolation)
-        self.comm = flow.fluid.grid.decomposition.comm
+    def __init__(self, flow: FlowRun, segments: FrameSegments, settings: Tracers, seed: int,
+                 whole: Callable[[int], Collection[int]], saved: Checkpoint | None) -> None:
+        self.flow, self.segments, self.settings = flow, segments, settings
+        flow.phase, flow.tracers = "tracers", self
+        if not settings.forced:
+            flow.fluid.forcing = None
+        field = FilteredField(flow.fluid.grid, settings.filter_width, settings.interpolation)
+        slab = flow.fluid.grid.decomposition
+        self.comm = slab.comm
         if saved is None:
             self.released, self.released_at = flow.history.sample(flow.state, flow.clock), flow.clock.time
             self.interval, self.step, self.first_step = 0, 0.0, flow.clock.steps
-            slab = flow.fluid.grid.decomposition
-            columns = release(slab, scene.seed, self.settings.particles_per_side, self.settings.placement)
-            self.tracers = TracerParticles(field, columns, flow.state)
-            self.frames = self._new_frames()
-            self.frames.store(flow.state, flow.clock)
+            columns = release(slab, seed, settings.particles_per_side, settings.placement)
         else:
             self.released, self.released_at = saved["released"], saved["released_at"]
             self.interval, self.step, self.first_step = saved["interval"], saved["step"], saved["first_step"]
-            self.tracers = TracerParticles(field, self._saved_columns(saved), flow.state)
-            self.frames = self._new_frames()
-            self.frames.load_state_dict(saved)
+            start, stop = id_block(self.comm, settings.particles)
+            block = {name: saved.read(name, start, stop) for name in ("position", "velocity")}
+            columns = migrate(slab, {"id": np.arange(start, stop, dtype=np.int64), **block})
+        self.tracers = TracerParticles(field, columns, flow.state)
+        self.coarse, self.whole = self._grid_of(settings.cells), whole(self.intervals + 1)
+        names = "time", "energy", "filtered"
+        self.spectra = {name: [] if saved is None else list(saved[f"spectra_{name}"]) for name in names}
+        self.stored = 0 if saved is None else saved["frames"]
+        if saved is None:
+            self._store()
 
     @property
     def intervals(self) -> int:
-        """Number of frame intervals, at least the one that the rates of the release are measured over."""
+        """Number of frame intervals; at least one, over which the rates at the release are measured."""
         duration = self.settings.turnovers * self.released["eddy_turnover_time"]
         return max(int(np.ceil(duration / self.settings.frame_interval - 1e-9)), 1)
 
@@ -142,49 +154,84 @@ class TracerRun:
         flow.history.sample(flow.state, flow.clock)
 
     def scales(self) -> dict[str, float]:
-        """Scales of the filtered flow at the release, with the rates between the first two frames: what the same flow
-        does later does not change them."""
+        """Scales of the filtered flow at the release. Rates are differences between the first two frames, so that the
+        scales do not depend on the rest of the run."""
         (start, first), (end, second) = self.segments.first_frames("tracers", 2)
-        return {"released_at": self.released_at, "sound_speed": self.scene.flow.sound_speed or np.inf,
+        return {"released_at": self.released_at, "sound_speed": self.flow.fluid.sound_speed,
                 "filter_width": self.settings.filter_width, "spacing": self.settings.spacing,
                 "density_mean": MEAN_DENSITY, **measured_scales(self.comm, first, second, end - start)}
 
     def state_dict(self) -> dict[str, Any]:
-        """What a checkpoint keeps beside the flow and the files of `segments`."""
+        """The state for a checkpoint, besides the flow and the files of `segments`."""
         order = IdOrder(self.comm, self.tracers.columns["id"], self.settings.particles)
         columns = {name: Block(order.apply(self.tracers.columns[name]), order.start, self.settings.particles)
                    for name in ("position", "velocity")}
         return {"released": self.released, "released_at": self.released_at, "interval": self.interval,
-                "step": self.step, "first_step": self.first_step, **self.frames.state_dict(), **columns}
+                "step": self.step, "first_step": self.first_step, "frames": self.stored,
+                **{f"spectra_{name}": np.array(rows) for name, rows in self.spectra.items()}, **columns}
 
-    def _new_frames(self) -> TracerFrames:
-        return TracerFrames(self.segments, self.tracers, self.settings, self.released_at,
-                            self.flow.fluid.compressible, whole_frames(self.scene, self.intervals + 1))
+    def write_spectra(self, file: File) -> None:
+        """Write the table of unfiltered and filtered energy spectra."""
+        wavenumber = np.arange(len(self.spectra["energy"][0]))
+        columns = {name: np.array(rows) for name, rows in self.spectra.items()}
+        write_table(file, "spectra", {"wavenumber": wavenumber, **columns})
 
     def _longest_step(self) -> float:
         interval = self.settings.frame_interval
-        longest = min(self.flow.step_limit.bound(self.flow.state, self.flow.clock), self.scene.time.max_step)
+        longest = min(self.flow.step_limit.bound(self.flow.state, self.flow.clock), self.flow.max_step)
         return interval / int(np.ceil(interval / longest - 1e-9))
 
     @property
     def _done(self) -> float:
         return (self.flow.clock.time - self.released_at) / (self.intervals * self.settings.frame_interval)
 
-    @property
-    def _steps(self) -> int:
-        return self.flow.clock.steps - self.first_step
-
     def _finish_interval(self, progress: ProgressLine) -> None:
         flow, step = self.flow, self.step
         flow.advance([flow.history, lambda state, _: self.tracers.advance(state, step),
-                      lambda *_: progress(self._done, self._steps)], FixedStep(step))
+                      lambda *_: progress(self._done, flow.clock.steps - self.first_step)], FixedStep(step))
         began = time.perf_counter()
         with progress.storing():
-            self.frames.store(flow.state, flow.clock)
+            self._store()
         flow.history.leave_out(time.perf_counter() - began)
 
-    def _saved_columns(self, saved: Checkpoint) -> dict[str, np.ndarray]:
-        """Each saved tracer on the rank whose slab holds it."""
-        start, stop = id_block(self.comm, self.settings.particles)
-        columns = {name: saved.read(name, start, stop) for name in ("position", "velocity")}
-        return migrate(self.flow.fluid.grid.decomposition, {"id": np.arange(start, stop, dtype=np.int64), **columns})
+    def _store(self) -> None:
+        """Store a frame, with filtered fields and spectra every `field_every` frames. Times count from the release."""
+        state, clock, columns = self.flow.state, self.flow.clock, self.tracers.columns
+        compressible, time_since = self.flow.fluid.compressible, clock.time - self.released_at
+        order = IdOrder(self.comm, columns["id"], self.settings.particles)
+        frame = {name: order.apply(columns[name]) for name in ("position", "velocity")}
+        if compressible:
+            frame["density"] = order.apply(self.tracers.density(state))
+        self.segments.open(clock.steps)
+        self.segments.trajectories["tracers"].append(clock.steps, time_since, order.start, frame)
+        if self.stored % self.settings.field_every == 0:
+            field, grid = self.tracers.field, self.coarse
+            velocity = field.transfer * state[:3]
+            modes = {"velocity": velocity} | ({"density": field.density_modes(state)} if compressible else {})
+            planes = {name: grid.backward(regrid(field.grid, grid, part)) for name, part in modes.items()}
+            self.segments.fields["filtered"].append(time_since, grid.decomposition.start, planes)
+            for name, value in (("time", time_since), ("energy", energy_spectrum(field.grid, state[:3])[1]),
+                                ("filtered", energy_spectrum(field.grid, velocity)[1])):
+                self.spectra[name].append(value)
+            if self.stored in self.whole:
+                # Velocity and density on the smallest grid that holds all their modes.
+                grid = self._grid_of(whole_cells(field.grid.cutoff))
+                values = grid.backward(regrid(field.grid, grid, state))
+                planes = {"velocity": values[:3]} | ({"density": np.exp(values[3:])} if compressible else {})
+                self.segments.fields["unfiltered"].append(time_since, grid.decomposition.start, planes)
+        self.stored += 1
+
+    def _grid_of(self, cells: int) -> SpectralGrid:
+        """A grid of so many cells, with all modes of the flow that it can hold."""
+        fine = self.flow.fluid.grid
+        slab = SlabDecomposition(self.comm, fine.decomposition.length, cells)
+        return SpectralGrid(slab, fine.precision, min(fine.cutoff, (cells - 1) // 2))
+
+
+def frame_layout(settings: Tracers, compressible: bool, cutoff: int) -> FrameLayout:
+    """The datasets of the ground truth; `cutoff` is the largest wavenumber of the unfiltered flow."""
+    columns, variables = {"position": (3,), "velocity": (3,)}, {"velocity": 3}
+    if compressible:
+        columns, variables = columns | {"density": ()}, variables | {"density": 1}
+    return FrameLayout(settings.particles, BOX_LENGTH, {"tracers": columns}, np.float64, {
+        "filtered": FieldLayout(settings.cells, variables), "unfiltered": FieldLayout(whole_cells(cutoff), variables)})

@@ -1,4 +1,4 @@
-"""The flow of a scene as it is built: the fluid on its grid, how its step is chosen, and the state at time 0."""
+"""Build the flow of a scene: the fluid on its grid, the choice of its time step, and its initial state."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ log = logging.getLogger("eddies")
 
 
 def build_fluid(scene: Scene, comm: Comm) -> Fluid:
-    """The fluid of a scene on its grid, with its forcing if it has one."""
+    """The fluid of a scene on its grid, with its forcing."""
     flow = scene.flow
     grid = SpectralGrid(SlabDecomposition(comm, BOX_LENGTH, flow.cells), flow.precision)
     forcing = None
@@ -37,7 +37,7 @@ def build_fluid(scene: Scene, comm: Comm) -> Fluid:
 
 
 def build_step_limit(scene: Scene, grid: SpectralGrid) -> CourantLimit | FixedStep:
-    """How the step of a scene is chosen: fixed, or by the Courant number, with sound for the explicit stepper only."""
+    """The choice of the time step: fixed, or by the Courant number, with sound for the explicit stepper only."""
     time = scene.time
     if time.step is not None:
         return FixedStep(time.step)
@@ -46,12 +46,14 @@ def build_step_limit(scene: Scene, grid: SpectralGrid) -> CourantLimit | FixedSt
 
 
 def initial_state(scene: Scene, fluid: Fluid) -> np.ndarray:
-    """The state at time 0: velocity, and for a compressible fluid s = ln(rho / rho_0)."""
+    """The modes of the initial state: velocity, and for a compressible fluid s = ln(rho / rho_0)."""
     initial, grid = scene.initial, fluid.grid
     if initial.flow.from_file:
-        return _state_from_file(scene, fluid)
-    velocity = _own_velocity(scene, grid) if is_path(initial.kind) else INITIAL_FLOWS[initial.kind](
-        grid, initial, scene.seed)
+        return _state_from_file(initial, fluid)
+    if is_path(initial.kind):
+        velocity = _velocity_of_user(initial, scene.seed, grid)
+    else:
+        velocity = INITIAL_FLOWS[initial.kind](grid, initial, scene.seed)
     if not fluid.compressible:
         return velocity
     if initial.flow.sound:
@@ -61,22 +63,22 @@ def initial_state(scene: Scene, fluid: Fluid) -> np.ndarray:
     return np.concatenate([velocity, density[None]])
 
 
-def _own_velocity(scene: Scene, grid: SpectralGrid) -> np.ndarray:
-    """What the user's function of an initial flow returns, its solenoidal part; SceneError where it is no velocity."""
-    initial, shape = scene.initial, (3, *grid.spectral_shape)
-    velocity = load(initial.kind)(grid, initial, scene.seed)
+def _velocity_of_user(initial: Initial, seed: int, grid: SpectralGrid) -> np.ndarray:
+    """The solenoidal part of the velocity that a function of the user returns. Raises SceneError for a wrong shape."""
+    shape = (3, *grid.spectral_shape)
+    velocity = load(initial.kind)(grid, initial, seed)
     if not isinstance(velocity, np.ndarray) or velocity.shape != shape:
-        found = f"an array {velocity.shape}" if isinstance(velocity, np.ndarray) else f"a {type(velocity).__name__}"
-        raise SceneError(f'[initial] kind = "{initial.kind}": returned {found}; must be the modes (3, kz, ky, kx) = '
+        returned = f"an array {velocity.shape}" if isinstance(velocity, np.ndarray) else f"a {type(velocity).__name__}"
+        raise SceneError(f'[initial] kind = "{initial.kind}": returned {returned}; must be the modes (3, kz, ky, kx) = '
                          f"{shape} of the velocity on this rank, such as grid.forward(velocity) gives")
     return grid.solenoidal(velocity.astype(grid.complex))
 
 
 @contextmanager
 def stored_states(initial: Initial, comm: Comm) -> Iterator[StoredStates | VelocityCubes]:
-    """The states of the whole flow in the file that a scene starts from; all ranks call it.
+    """Open the unfiltered flow states in the file that a scene starts from; all ranks call it.
 
-    Raises SceneError where there is no state of the number that the scene names, ProductError where there is none.
+    Raises SceneError if [initial] state is too large, ProductError if the file has no state.
     """
     with open_states(comm, initial.path) as states:
         if initial.state >= len(states):
@@ -85,8 +87,8 @@ def stored_states(initial: Initial, comm: Comm) -> Iterator[StoredStates | Veloc
         yield states
 
 
-def _state_from_file(scene: Scene, fluid: Fluid) -> np.ndarray:
-    grid, initial = fluid.grid, scene.initial
+def _state_from_file(initial: Initial, fluid: Fluid) -> np.ndarray:
+    grid = fluid.grid
     comm, length = grid.decomposition.comm, grid.decomposition.length
     with stored_states(initial, comm) as fields:
         whole = SpectralGrid(SlabDecomposition(comm, length, fields.cells), grid.precision, (fields.cells - 1) // 2)
@@ -99,14 +101,14 @@ def _state_from_file(scene: Scene, fluid: Fluid) -> np.ndarray:
     if "density" in stored:
         density = regrid(whole, grid, whole.forward(np.log(stored["density"])))
         if stored_speed not in (None, fluid.sound_speed):
-            # With the density as it is the pressure would be another, and what does not balance the velocity is sound.
+            # The same density would mean another pressure, and the part out of balance with the velocity is sound.
             density *= (stored_speed / fluid.sound_speed) ** 2
             if comm.rank == 0:
-                log.info("dns: starts from a flow with the speed of sound %g: fluctuations of ln(density) are taken "
-                         "times %.3g, so that the pressure stays", stored_speed,
+                log.info("dns: the file holds a flow with the speed of sound %g: fluctuations of ln(density) are "
+                         "multiplied by %.3g, which keeps the pressure", stored_speed,
                          (stored_speed / fluid.sound_speed) ** 2)
         return np.concatenate([velocity, density])
-    # A velocity of a compressible flow, in single precision, or of every second point alone, is not solenoidal.
+    # The velocity of a compressible flow, in single precision or on fewer points, is not exactly solenoidal.
     velocity = grid.solenoidal(velocity)
     if not fluid.compressible:
         return velocity

@@ -1,4 +1,4 @@
-"""The ground truth as training and simulation read it: frames of particles on their slabs, fields, scales."""
+"""Read the ground truth for training and simulation: frames of particles on slabs, fields and scales."""
 
 from __future__ import annotations
 
@@ -33,30 +33,32 @@ Result = TypeVar("Result")
 
 
 class GroundTruth:
-    """An open ground_truth.h5, read by all ranks; particles arrive on the slabs of `decomposition`.
+    """An open ground_truth.h5 that all ranks read. A particle is on the rank whose slab of `decomposition` holds it.
+    Frames for training and models go to `device`.
 
-    Where the fluid is incompressible no density is stored: then `has_density` is false and the columns of the density
-    are left out. All ranks raise ProductError where what one of them reads is not finite.
+    For an incompressible fluid no density is stored: `has_density` is false and columns of the density are missing.
+    All ranks raise ProductError if one of them reads a value that is not finite.
     """
 
-    def __init__(self, file: File, decomposition: SlabDecomposition) -> None:
-        self.decomposition, self._file = decomposition, file
+    def __init__(self, file: File, decomposition: SlabDecomposition,
+                 device: torch.device = torch.device("cpu")) -> None:
+        self.decomposition, self.device, self._file = decomposition, device, file
         self.trajectory, self.fields = Trajectory(file, "tracers"), FieldSeries(file, "filtered")
         self.times, self.total = self.trajectory.times, self.trajectory.total
         self.reference = read_attributes(file, "reference")
-        #: that stayed on while the tracers were followed; None if nothing forced the flow then
+        #: the forcing after the release of the tracers, None without one
         self.forcing = Forcing(**read_attributes(file, "forcing")) if "forcing" in file else None
         self.has_density = "density" in self.trajectory.columns
         self._evolving = ("velocity", "density") if self.has_density else ("velocity",)
 
     @cached_property
     def states(self) -> FieldSeries:
-        """The unfiltered flow, at the few times at which it is stored."""
+        """The unfiltered flow at the few times at which it is stored."""
         return FieldSeries(self._file, "unfiltered")
 
     @property
     def scales(self) -> ReferenceScales:
-        """Reference scales of the flow when the particles are released; those of the density None without one."""
+        """Reference scales of the flow at the release of the tracers. Those of a density are None without a density."""
         r = self.reference
         density = ({"density": r["density_rms"], "density_rate": r["density_rate_rms"],
                     "sound_speed": r["sound_speed"]} if self.has_density else {})
@@ -66,13 +68,13 @@ class GroundTruth:
             kolmogorov_length=r["kolmogorov_length"], **density)
 
     def particles(self, frame: int) -> dict[str, np.ndarray]:
-        """id, position, velocity and, where there is one, density of this rank's particles at a frame."""
+        """id, position, velocity and, if stored, density of this rank's particles at a frame."""
         return migrate(self.decomposition, self.block(frame))
 
     def particles_with_rates(self, frame: int) -> dict[str, np.ndarray]:
-        """The same with `acceleration` (n, 3) and `density_rate` (n,): centred differences along the trajectories.
+        """The same with `acceleration` (n, 3) and `density_rate` (n,), by centred differences along trajectories.
 
-        Not for the first and the last frame.
+        Raises ValueError for the first and the last frame.
         """
         if not 0 < frame < len(self.times) - 1:
             raise ValueError(f"frame {frame} of {len(self.times)} has no frames on both sides")
@@ -84,8 +86,8 @@ class GroundTruth:
         return migrate(self.decomposition, columns)
 
     def window(self, frame: int, length: int) -> dict[str, np.ndarray]:
-        """`particles` of a frame, and what is true of them in the frames that follow: `position_later` and
-        `velocity_later` (n, length, 3), `density_later` (n, length)."""
+        """`particles` of a frame, with their values in the next frames: `position_later` and `velocity_later`
+        (n, length, 3), `density_later` (n, length)."""
         columns = self.block(frame)
         later = [self.block(frame + number) for number in range(1, length + 1)]
         for name in ("position", *self._evolving):
@@ -93,26 +95,21 @@ class GroundTruth:
         return migrate(self.decomposition, columns)
 
     def field(self, index: int, variable: str, slab: SlabDecomposition | None = None) -> np.ndarray:
-        """This rank's planes of a filtered field, or those of another slab, (components, z_local, y, x), in double
-        precision."""
+        """The planes of a slab (default: that of the particles) of a filtered field, (components, z_local, y, x), in
+        double precision."""
         return self._planes(self.fields, index, variable, slab or self.decomposition)
 
     def state(self, index: int, variable: str, slab: SlabDecomposition) -> np.ndarray:
-        """A slab's planes of a field of the unfiltered flow, likewise."""
+        """The same of a field of the unfiltered flow."""
         return self._planes(self.states, index, variable, slab)
-
-    def frame_of_field(self, index: int) -> int:
-        """The frame taken at the time of a field."""
-        return int(np.argmin(np.abs(self.times - self.fields.times[index])))
 
     @cached_property
     def at_fields(self) -> list[int]:
-        """The frames at whose time a filtered field is stored."""
-        return [self.frame_of_field(index) for index in range(len(self.fields))]
+        """The frames at the times of the filtered fields."""
+        return [int(np.argmin(np.abs(self.times - time))) for time in self.fields.times]
 
     def field_at(self, frame: int, points: torch.Tensor) -> np.ndarray:
-        """The filtered velocity (m, 3) that is stored at the time of a frame, at the `grid_points` (m, 3) that this
-        rank's slab has of its grid."""
+        """The stored filtered velocity (m, 3) at the time of a frame, at the `grid_points` (m, 3) of this rank."""
         cells, index = self.fields.cells, self.at_fields.index(frame)
         planes = len(points) // cells**2
         first = round(float(points[0, 2]) * cells / self.decomposition.length) if planes else 0
@@ -120,11 +117,11 @@ class GroundTruth:
         return field.reshape(3, -1).T.astype(np.float64)
 
     def last_frame_seen(self, window: float) -> int:
-        """The last frame of the training window, a fraction of the ground truth; 0 where nothing of it was seen."""
+        """The last frame of the training window, a fraction of the ground truth; 0 without a window."""
         return last_seen(window, len(self.times)) if window > 0 else 0
 
     def block(self, frame: int, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
-        """Columns of this rank's ids at a frame: those named, or all."""
+        """The named columns, or all, of this rank's block of ids at a frame."""
         start, stop = id_block(self.decomposition.comm, self.total)
         names = ("position", *self._evolving) if names is None else names
         columns = self._together(lambda: {name: self.trajectory.read(frame, name, start, stop) for name in names})
@@ -134,34 +131,37 @@ class GroundTruth:
         return self._together(lambda: series.read(index, variable, slab.start, slab.stop)).astype(np.float64)
 
     def _together(self, read: Callable[[], Result]) -> Result:
-        """What is read on this rank; what is wrong with the file on any is raised by all."""
+        """Read on this rank; all ranks raise the ProductError of one."""
         return on_all_ranks(self.decomposition.comm, read, ProductError)
 
 
-def load_frame(truth: GroundTruth, index: int, model: LagrangianModel, dtype: torch.dtype, device: torch.device,
+def load_frame(truth: GroundTruth, index: int, model: LagrangianModel, dtype: torch.dtype,
                with_field: bool = False) -> TrainingFrame:
-    """A frame with its true rates, and `with_field` with the filtered field one frame later; its particles carry the
-    true density where the model integrates it."""
+    """A frame with its true rates, and `with_field` also the filtered field one frame later; collective.
+
+    The particles have the true density if the model integrates the density.
+    """
     columns = truth.particles_with_rates(int(index))
-    rates = {name: torch.from_numpy(columns[name]).to(device, dtype)
+    rates = {name: torch.from_numpy(columns[name]).to(truth.device, dtype)
              for name in ("acceleration", "density_rate") if name in columns}
     dynamics = ParticleDynamics(truth.decomposition, model, skin=0.0, dtype=dtype)
-    later = _field_after(truth, int(index), dtype, device) if with_field else None
-    frame = TrainingFrame(dynamics, particles_for(model, columns, device), rates["acceleration"],
+    later = _field_after(truth, int(index), dtype) if with_field else None
+    frame = TrainingFrame(dynamics, particles_for(model, columns, truth.device), rates["acceleration"],
                           rates.get("density_rate"), later)
     solves = [] if dynamics.resolution is None else dynamics.resolution.solves
     for iterations, residual, converged in solves:
         if not converged and truth.decomposition.comm.rank == 0:
-            log.warning("frame %d: the solve for the resolved velocity did not converge in %d iterations and left %.1e",
+            log.warning("frame %d: a solve for the resolved velocity did not converge in %d iterations, residual %.1e",
                         index, iterations, residual)
     return frame
 
 
-def _field_after(truth: GroundTruth, frame: int, dtype: torch.dtype, device: torch.device) -> FieldLater:
-    """The filtered field one frame after a frame, and where the particles of that frame are then."""
-    slab, columns = truth.decomposition, truth.window(frame, 1)  # rows as in `particles_with_rates`
+def _field_after(truth: GroundTruth, frame: int, dtype: torch.dtype) -> FieldLater:
+    """The filtered field one frame after a frame, and the positions of the particles at that time."""
+    slab, device = truth.decomposition, truth.device
+    columns = truth.window(frame, 1)  # rows as in `particles_with_rates`
     position, later = (torch.from_numpy(columns[name]) for name in ("position", "position_later"))
-    # Positions are stored within the box; here they go on from where the particles are.
+    # Stored positions are wrapped into the box; these continue from the positions of the frame.
     moved = position + PeriodicBox(slab.length).displacement(later[:, 0], position)
     points = grid_points(slab, truth.fields.cells)
     field = torch.from_numpy(truth.field_at(frame + 1, points))
@@ -171,6 +171,6 @@ def _field_after(truth: GroundTruth, frame: int, dtype: torch.dtype, device: tor
 
 
 def particles_for(model: LagrangianModel, columns: dict[str, np.ndarray], device: torch.device) -> ParticleSet:
-    """The true particles as a model sets them going: with their density where it integrates that."""
+    """The true particles as a start for a model; with their density only if the model integrates it."""
     particles = ParticleSet.from_numpy(columns, device)
     return particles if model.integrates_density else replace(particles, density=None)

@@ -1,4 +1,4 @@
-"""A-priori tests of a trained model: its rates against the truth's at times it was not trained on (Fig. 3)."""
+"""A-priori tests of a trained model: its rates compared with the truth at times outside the training (Fig. 3)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import torch
 from eddies.clock import ProgressLine
 from eddies.learning.force_training import TrainingFrame
 from eddies.learning.losses import relative_error
-from eddies.parallel.communicator import Comm
 from eddies.parallel.migration import IdOrder, migrate
 from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition
@@ -22,30 +21,28 @@ from eddies.workflows.ground_truth.truth import GroundTruth, load_frame, particl
 
 
 def evaluation_frames(truth: GroundTruth) -> np.ndarray:
-    """Frames at times of filtered fields, evenly spread over the ground truth, with frames on both sides.
+    """Frames with a filtered field, evenly spread over the ground truth, that have a frame before and after.
 
-    Raises SceneError if there is none.
+    Raises SceneError if the ground truth has no such frame.
     """
-    at_fields = [truth.frame_of_field(index) for index in range(len(truth.fields.times))]
-    usable = np.array(between_frames(len(truth.times), at_fields))
+    usable = np.array(between_frames(len(truth.times), truth.at_fields))
     return usable[np.unique(np.linspace(0, len(usable) - 1, TESTED_FRAMES).astype(int))]
 
 
 @torch.no_grad()
-def evaluate(truth: GroundTruth, model: LagrangianModel, frames: np.ndarray, last_seen: int, dtype: torch.dtype,
-             device: torch.device) -> dict[str, dict[str, np.ndarray]]:
-    """Normalised L2 errors over time delay, and samples of true and predicted rates at the last frame; collective.
+def evaluate(truth: GroundTruth, model: LagrangianModel, frames: np.ndarray, last_seen: int,
+             dtype: torch.dtype) -> dict[str, dict[str, np.ndarray]]:
+    """Normalised L2 errors over the delay since `last_seen`, and samples of rates at the last frame; collective.
 
-    `acceleration_error` is that of the model as it runs: with the density that its terms give.
-    `density_rate_error` is that of the learned rate, or of the rate at which a given density changes.
-    `true_density_acceleration_error` is that with the true density, `pressure_gradient_error` that of
-    -c^2 grad ln(rho) of the filtered field, with the forcing of a flow that stays forced, without any model, of a
-    truth that has a density.
+    `acceleration_error`: the model as in a rollout, with the density that its terms give.
+    `true_density_acceleration_error`: the model with the true density.
+    `density_rate_error`: the learned rate of the density, or the rate of change of the density that terms give.
+    `pressure_gradient_error`: no model, but -c^2 grad ln(rho) of the filtered field, plus the forcing if it stays on.
     """
     rows, comm = [], truth.decomposition.comm
-    progress = ProgressLine("train", lambda: "of the a-priori test", unit="frame")
+    progress = ProgressLine("train", lambda: "in the a-priori test", unit="frame")
     for index in frames:
-        frame = load_frame(truth, index, model, dtype, device)
+        frame = load_frame(truth, index, model, dtype)
         errors = frame.errors()
         row = {"delay": truth.times[index] - truth.times[last_seen],
                "acceleration_error": relative_error(comm, errors["acceleration"], frame.acceleration)}
@@ -55,10 +52,10 @@ def evaluate(truth: GroundTruth, model: LagrangianModel, frames: np.ndarray, las
                 exact = exact + frame.kept[FORCING].at(None).acceleration
             row["pressure_gradient_error"] = relative_error(comm, exact - frame.acceleration, frame.acceleration)
         if model.density_is_given:
-            true = torch.from_numpy(truth.particles(int(index))["density"]).to(device)
+            true = torch.from_numpy(truth.particles(int(index))["density"]).to(truth.device)
             given = frame.errors(density=true)["acceleration"]
             row["true_density_acceleration_error"] = relative_error(comm, given, frame.acceleration)
-            row["density_rate_error"] = _given_rate_error(truth, frame.dynamics, int(index), device)
+            row["density_rate_error"] = _given_rate_error(truth, frame.dynamics, int(index))
         if "density_rate" in errors:
             row["density_rate_error"] = relative_error(comm, errors["density_rate"], frame.density_rate)
         rows.append(row)
@@ -70,28 +67,23 @@ def evaluate(truth: GroundTruth, model: LagrangianModel, frames: np.ndarray, las
     return tables
 
 
-def _given_rate_error(truth: GroundTruth, dynamics: ParticleDynamics, index: int, device: torch.device) -> float:
-    """Error of the rate of the density that terms give, along the true trajectories, by centred differences."""
+def _given_rate_error(truth: GroundTruth, dynamics: ParticleDynamics, index: int) -> float:
+    """Error of the rate of change of the density that terms give, by centred differences along true trajectories."""
     comm, total = truth.decomposition.comm, truth.total
 
     def density(frame: int) -> np.ndarray:
-        particles = particles_for(dynamics.model, truth.particles(frame), device)
-        found = dynamics.rates(particles).density
-        return _by_id(comm, total, {"id": as_numpy(particles.id), "density": as_numpy(found)}, "density")
+        particles = particles_for(dynamics.model, truth.particles(frame), truth.device)
+        return IdOrder(comm, as_numpy(particles.id), total).apply(as_numpy(dynamics.rates(particles).density))
 
     rate = (density(index + 1) - density(index - 1)) / (truth.times[index + 1] - truth.times[index - 1])
-    exact = _by_id(comm, total, truth.particles_with_rates(index), "density_rate")
+    columns = truth.particles_with_rates(index)
+    exact = IdOrder(comm, columns["id"], total).apply(columns["density_rate"])
     return relative_error(comm, torch.from_numpy(rate - exact), torch.from_numpy(exact))
-
-
-def _by_id(comm: Comm, total: int, columns: dict[str, np.ndarray], name: str) -> np.ndarray:
-    """This rank's block of a column in the order of particle ids."""
-    return IdOrder(comm, columns["id"], total).apply(columns[name])
 
 
 def _pressure_force(truth: GroundTruth, index: int, particles: ParticleSet) -> torch.Tensor:
     """-c^2 grad ln(rho) of the filtered field at the particles (n, 3)."""
-    at = int(np.argmin(np.abs(truth.fields.times - truth.times[index])))
+    at = truth.at_fields.index(index)
     slab = SlabDecomposition(truth.decomposition.comm, truth.decomposition.length, truth.fields.cells)
     grid = SpectralGrid(slab, cutoff=(slab.planes - 1) // 2)
     planes = truth.field(at, "density", slab)
@@ -99,7 +91,7 @@ def _pressure_force(truth: GroundTruth, index: int, particles: ParticleSet) -> t
     spline = SplineInterpolation(grid, "quintic")
     columns = migrate(slab, {name: as_numpy(getattr(particles, name)) for name in ("id", "position")})
     values = spline.at(spline.coefficients(force), columns["position"])
-    # The fields' slabs may differ from the particles': values go back to the particles' owners by id.
+    # The slabs of the fields may differ from those of the particles, so values return to their particles by id.
     order = IdOrder(slab.comm, columns["id"], truth.total)
     back = migrate(truth.decomposition, {"id": np.arange(order.start, order.stop), "value": order.apply(values),
                                          "position": order.apply(columns["position"])})
@@ -110,7 +102,7 @@ def _pressure_force(truth: GroundTruth, index: int, particles: ParticleSet) -> t
 
 def _sample(truth: GroundTruth, frame: TrainingFrame, exact: torch.Tensor,
             error: torch.Tensor) -> dict[str, np.ndarray]:
-    """True and predicted rates of the particles with the lowest ids, on every rank."""
+    """True and predicted rates of the particles with the lowest ids, equal on all ranks."""
     columns = {"truth": as_numpy(exact), "predicted": as_numpy(exact + error)}
     ids, sampled = as_numpy(frame.particles.id), min(TESTED_PARTICLES, truth.total)
     chosen = ids < sampled

@@ -1,5 +1,4 @@
-"""What is stored of a model beside its weights, how a scene differs from it, and the trained weights of another run
-with it; known without torch."""
+"""What defines a model, what is stored of it beside its weights, and trained weights of another run. Needs no torch."""
 
 from __future__ import annotations
 
@@ -17,51 +16,76 @@ from eddies.io.hdf5 import ProductError, open_product
 from eddies.io.provenance import read_provenance
 from eddies.io.weights import load_tables, load_weights
 from eddies.parallel.communicator import Comm
-from eddies.particles.flow_units import ReferenceScales
+from eddies.particles.flow_units import FlowUnits, ReferenceScales
 from eddies.scene.rules import quoted
-from eddies.scene.scene import Scene, SceneError
+from eddies.scene.scene import Model, Scene, SceneError, Tracers
 
-# Keys of terms in version 1.0, with the values at which they are fixed now.
+# Keys that terms had in version 1.0, with the values at which they are now fixed.
 FORMER = {"force": True, "kernel": "cubic-spline", "background": 0.25}
 
 
-def describe(scene: Scene, scales: ReferenceScales) -> dict[str, Any]:
-    """What is stored with the weights of a scene's model, ready for JSON: the terms with their settings, and the
-    flow."""
-    settings = {term: asdict(scene.model.settings[short_name(term)]) for term in scene.model.terms}
-    neighbors = {"neighbors": scene.neighbors} if "pairs" in scene.model.reads else {}
-    return {"terms": settings, "scales": scales.to_dict(), **neighbors}
+@dataclass(frozen=True)
+class ModelDefinition:
+    """The parts of a scene that define a model. With the scales of a flow they give the model for that flow.
 
-
-def differences(scene: Scene, description: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
-    """Keys in which a scene differs from the description of a trained model, with both values, as TOML.
-
-    Classes are compared by their names: none is imported because a file names it.
+    Parameters
+    ----------
+    model : [model], the terms and their settings; None if the scene has none.
+    tracers : [tracers], particles and filter.
+    neighbors : mean number of particles within the radius of interaction.
+    seed : seed of the initial parameters.
     """
-    trained_terms = description["terms"]
-    if list(scene.model.terms) != list(trained_terms):
-        yield "[model] terms", quoted(scene.model.terms), quoted(list(trained_terms))
-        return
-    for term, trained in trained_terms.items():
-        name, settings = short_name(term), scene.model.settings[short_name(term)]
-        wanted = json.loads(json.dumps(asdict(settings)))
-        # A model that was trained before there was a key has its default.
-        then = {field.name: field.default for field in fields(settings) if field.default is not MISSING}
-        then = json.loads(json.dumps(then)) | trained
-        for key in wanted.keys() | then.keys():
-            if (value := wanted.get(key, FORMER.get(key))) != then.get(key):
-                yield f"[model.{name}] {key}", quoted(value), quoted(then.get(key))
-    if "pairs" in scene.model.reads and scene.neighbors != description["neighbors"]:
-        yield "[model] neighbors", quoted(scene.neighbors), quoted(description["neighbors"])
-    scales, tracers = description["scales"], scene.tracers
-    width = scales["filter_width"] / scales["spacing"] * tracers.spacing
-    if not math.isclose(tracers.filter_width, width, rel_tol=1e-6):
-        yield "[tracers] filter_width", f"{tracers.filter_width:.9g}", f"{width:.9g}"
+
+    model: Model
+    tracers: Tracers
+    neighbors: float
+    seed: int
+
+    @classmethod
+    def of(cls, scene: Scene) -> ModelDefinition:
+        """The definition in a scene."""
+        return cls(scene.model, scene.tracers, scene.neighbors, scene.seed)
+
+    def units(self, scales: ReferenceScales) -> FlowUnits:
+        """Units of a flow with these scales. The radius of interaction is proportional to the mean particle spacing."""
+        radius = self.tracers.radius_of(self.neighbors) * (scales.spacing / self.tracers.spacing)
+        return FlowUnits(scales, radius, self.neighbors, self.seed)
+
+    def describe(self, scales: ReferenceScales) -> dict[str, Any]:
+        """The description that is stored with the weights, ready for JSON: terms with settings, and scales."""
+        settings = {term: asdict(self.model.settings[short_name(term)]) for term in self.model.terms}
+        neighbors = {"neighbors": self.neighbors} if "pairs" in self.model.reads else {}
+        return {"terms": settings, "scales": scales.to_dict(), **neighbors}
+
+    def differences(self, description: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
+        """Keys in which this definition differs from a stored description: key, value here, value there, as TOML.
+
+        Classes are compared by name, so that no class is imported because a file names it.
+        """
+        trained_terms = description["terms"]
+        if list(self.model.terms) != list(trained_terms):
+            yield "[model] terms", quoted(self.model.terms), quoted(list(trained_terms))
+            return
+        for term, trained in trained_terms.items():
+            name, settings = short_name(term), self.model.settings[short_name(term)]
+            wanted = json.loads(json.dumps(asdict(settings)))
+            # A description that is older than a key means the default of the key.
+            stored = {field.name: field.default for field in fields(settings) if field.default is not MISSING}
+            stored = json.loads(json.dumps(stored)) | trained
+            for key in wanted.keys() | stored.keys():
+                if (value := wanted.get(key, FORMER.get(key))) != stored.get(key):
+                    yield f"[model.{name}] {key}", quoted(value), quoted(stored.get(key))
+        if "pairs" in self.model.reads and self.neighbors != description["neighbors"]:
+            yield "[model] neighbors", quoted(self.neighbors), quoted(description["neighbors"])
+        scales = description["scales"]
+        width = scales["filter_width"] / scales["spacing"] * self.tracers.spacing
+        if not math.isclose(self.tracers.filter_width, width, rel_tol=1e-6):
+            yield "[tracers] filter_width", f"{self.tracers.filter_width:.9g}", f"{width:.9g}"
 
 
 @dataclass(frozen=True)
 class ModelSource:
-    """What a model.h5 holds: description, weights and tables by name, and where it comes from."""
+    """Content of a model.h5: description, weights and tables by name, and provenance."""
 
     path: Path
     description: dict[str, Any]
@@ -71,11 +95,11 @@ class ModelSource:
 
 
 def read_source(scene: Scene, comm: Comm) -> ModelSource:
-    """The trained model that [model] path names; all ranks call it.
+    """Read the trained model that [model] path names; all ranks call it.
 
     Raises:
-        ProductError: there is none, or it is damaged.
-        SceneError: it has another form, or other neighbourhoods in units of the filter width, than the scene's.
+        ProductError: the file is missing or damaged.
+        SceneError: the model has other terms, settings, neighbours or filter width in spacings than the scene.
     """
     path = scene.model.weights_file
     try:
@@ -84,7 +108,7 @@ def read_source(scene: Scene, comm: Comm) -> ModelSource:
             provenance = read_provenance(file)
     except ProductError as error:
         raise ProductError(f"{scene.name}: [model] path = {quoted(scene.model.path)}: {error}") from None
-    for key, wanted, trained in differences(scene, description):
+    for key, wanted, trained in ModelDefinition.of(scene).differences(description):
         raise SceneError(f"{scene.name}: {key} = {wanted}, but {path} was trained with {trained}; set it to "
                          "that, or give another [model] path")
     return ModelSource(path, description, weights, load_tables(path), provenance)

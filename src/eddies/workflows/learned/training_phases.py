@@ -1,33 +1,43 @@
-"""The phases of a scene's training, on one ground truth or several: they take turns, a step each, and an error on what
-is held out is the mean of theirs."""
+"""The phases of a training, and the loop over its steps.
+
+Several ground truths take turns, one step each, and a validation error is the mean over them.
+"""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from statistics import fmean
 from typing import TypeVar
 
 import numpy as np
 
+from eddies.clock import ProgressLine
+from eddies.io.checkpoint import Guard
 from eddies.learning.optimization import Adam
-from eddies.learning.training import Phase
+from eddies.learning.training import Phase, Training, TrainingDiverged
+from eddies.parallel.halo import HaloError
 from eddies.particles.feature_range import FeatureRange, pair_features
 from eddies.particles.smoothing_kernels import SmoothingKernel
-from eddies.scene.scene import Scene
-from eddies.workflows.learned.training_data import COMBINED_DRAWS, VALIDATION_PARTICLES, TrainingData
+from eddies.scene.scene import SceneError
+from eddies.workflows.learned.training_data import TrainingData
 
-# How many validations a phase has.
+log = logging.getLogger("eddies")
+
+# Particles for the validation error of the acceleration, and cubes or batches for that of all losses.
+VALIDATION_PARTICLES, COMBINED_DRAWS = 8192, 8
+# Number of validations in a phase.
 VALIDATIONS, HORIZON_VALIDATIONS = 25, 4
-# How many validations at least before the patience of a phase is at its end.
+# Least number of validations within the patience of a phase.
 LOOKS = 4
 
 Trainer = TypeVar("Trainer")
 
 
-def one_step_phases(scene: Scene, data: Sequence[TrainingData], kernel: SmoothingKernel | None) -> list[Phase]:
-    """Steps on the rates of single frames: on trajectories, then on all losses, as far as the scene has them."""
-    settings = scene.training
-    if scene.model.foreign:
+def one_step_phases(data: Sequence[TrainingData], kernel: SmoothingKernel | None) -> list[Phase]:
+    """Phases on the rates of single frames: the trajectory loss alone, then all losses."""
+    settings = data[0].settings
+    if data[0].definition.model.foreign:
         first = data[0].frames[0]
         data[0].model.require_linear(first.dynamics.context(first.particles))
     trainers = [each.force_trainer(kernel) for each in data]
@@ -37,13 +47,11 @@ def one_step_phases(scene: Scene, data: Sequence[TrainingData], kernel: Smoothin
     between = settings.learning_rate * fall ** (alone / max(settings.steps, 1))
 
     def phase(name: str, steps: int, rates: tuple[float, float], take, error) -> Phase:
-        # Work in evaluations of the force of a particle.
+        # The unit of work is one evaluation of the force on one particle.
         work = np.array([float(_at_turn(trainers, step).batch) for step in range(steps)])
+        every = max(min(steps // VALIDATIONS, (settings.patience or steps) // LOOKS), 1)
         return Phase(name, work, rates, lambda optimizer, step: take(_at_turn(trainers, step), optimizer, step),
-                     _mean(error, trainers, held_out), every(steps), settings.patience)
-
-    def every(steps: int) -> int:
-        return max(min(steps // VALIDATIONS, (settings.patience or steps) // LOOKS), 1)
+                     _mean(error, trainers, held_out), every, settings.patience)
 
     phases = [phase("one step", alone, (settings.learning_rate, between),
                     lambda trainer, optimizer, step: trainer.trajectory_step(optimizer, step),
@@ -54,14 +62,14 @@ def one_step_phases(scene: Scene, data: Sequence[TrainingData], kernel: Smoothin
     return [phase for phase in phases if phase.steps]
 
 
-def horizon_phases(scene: Scene, data: Sequence[TrainingData]) -> list[Phase]:
-    """Steps through windows of frames, one phase for each horizon of the scene."""
-    settings = scene.training.horizons
+def horizon_phases(data: Sequence[TrainingData]) -> list[Phase]:
+    """Phases on windows of frames, one for each horizon in [training.horizons]."""
+    settings = data[0].settings.horizons
     if settings is None:
         return []
     trainers, held_out = zip(*(each.rollout_trainer() for each in data))
     longest = max(settings.frames)
-    rates = settings.learning_rate, scene.training.final_learning_rate
+    rates = settings.learning_rate, data[0].settings.final_learning_rate
     every = max(settings.steps // HORIZON_VALIDATIONS, 1)
 
     def phase(number: int, horizon: int) -> Phase:
@@ -70,10 +78,10 @@ def horizon_phases(scene: Scene, data: Sequence[TrainingData]) -> list[Phase]:
         def take(optimizer: Adam, step: int) -> dict[str, float]:
             return _at_turn(trainers, first + step).step(optimizer, first + step, horizon)
 
-        # Each step through a window is evaluated, evaluated again on the way back, and differentiated.
+        # Each step through a window is evaluated, evaluated again in the backward pass, and differentiated.
         at_turn = [_at_turn(trainers, first + step) for step in range(settings.steps)]
         work = np.array([3.0 * trainer.steps_per_frame * horizon * trainer.total for trainer in at_turn])
-        # All horizons are measured by the longest: a shorter one is a way to it.
+        # The error at the longest horizon validates all phases, because the last one is to minimise it.
         error = _mean(lambda trainer, window: trainer.validation_error(window, longest), trainers, held_out)
         return Phase(f"horizon {horizon}", work, rates, take, error, every)
 
@@ -81,9 +89,9 @@ def horizon_phases(scene: Scene, data: Sequence[TrainingData]) -> list[Phase]:
 
 
 def feature_range(data: Sequence[TrainingData]) -> FeatureRange:
-    """The range of what the networks are given by all pairs of the frames that are trained on; collective.
+    """The range of the network inputs over all pairs in the training frames; collective.
 
-    Where the simulation leads within the horizons is left out, as it is not the truth.
+    States that the model reaches within the horizons are left out, because they are not the truth.
     """
     blocks = (block for each in data for frame in each.frames
               for block in pair_features(frame.dynamics, frame.seen()))
@@ -96,3 +104,36 @@ def _at_turn(trainers: Sequence[Trainer], step: int) -> Trainer:
 
 def _mean(error: Callable, trainers: Sequence, held_out: Sequence) -> Callable[[], float]:
     return lambda: fmean([error(trainer, moment) for trainer, moment in zip(trainers, held_out)])
+
+
+def take_all_steps(training: Training, guard: Guard, stage: str, section: str, remedy: str,
+                   after_each: Callable[[Training], None] = lambda training: None) -> None:
+    """Run a training to its end, from its newest checkpoint if one exists. Log lines begin with `stage`.
+
+    Raises Stopped after a checkpoint if a stop is requested. Raises SceneError, which names the `section` and the
+    `remedy`, if the training diverges.
+    """
+    saved = guard.checkpoints.newest()
+    if saved is not None:
+        training.load_state_dict(saved)
+        log.info("%s: continues from step %d", stage, training.steps)
+
+    def describe() -> str:
+        last = training.history[-1]
+        errors = [row["validation_error"] for row in training.history if "validation_error" in row]
+        shown = f"  validation error {errors[-1]:.3f}" if errors else ""
+        return f"{training.phase.name}  loss {last['loss']:.4f}{shown}"
+
+    progress = ProgressLine(stage, describe, done=training.done)
+    while training.running:
+        guard(training)
+        phase = training.number
+        try:
+            training.step()
+        except (TrainingDiverged, HaloError) as error:
+            raise SceneError(f"[{section}] {error}; {remedy}") from None
+        if training.running:
+            progress(training.done, training.steps)
+        if training.number != phase:
+            progress.renew()
+        after_each(training)

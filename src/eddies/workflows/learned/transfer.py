@@ -1,4 +1,4 @@
-"""A model trained on another flow: its weights with the scales of this flow, tested a priori."""
+"""Use of a model on another flow than that of its training: the weights of the source with the scales of this flow."""
 
 from __future__ import annotations
 
@@ -15,56 +15,58 @@ from eddies.io.weights import save_weights
 from eddies.parallel.communicator import Comm
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.devices import prepare_torch
+from eddies.pipeline import STAGES
 from eddies.scene.scene import BOX_LENGTH, Scene
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.learned.a_priori import evaluate, evaluation_frames
 from eddies.workflows.learned.model import with_weights
-from eddies.workflows.learned.source import ModelSource, describe, read_source
+from eddies.workflows.learned.source import ModelDefinition, ModelSource, read_source
 from eddies.workflows.run_directory.fingerprints import stage_provenance
 
 log = logging.getLogger("eddies")
 
 
-def run(scene: Scene, comm: Comm, directory: str | Path) -> None:
-    """Write model.h5 with the weights that [model] path names, instead of training; all ranks call it.
+def run(scene: Scene, comm: Comm, directory: Path) -> None:
+    """Write model.h5 with the weights that [model] path names, without training; all ranks call it.
 
-    Terms work in units of the flow (Eq. 4), so only the scales and the support are this flow's. The tables are
-    the source's, but for the a-priori tests: those of this flow, beside `source_a_priori`, those of the flow on which
-    the weights were trained, if the source tested them there. The cost of training is what the source has stored.
+    Terms work in units of the flow (Eq. 4), so only the scales and the radius of interaction are those of this flow.
+    Tables are copied from the source, except the a-priori tests, which are repeated on this flow. The tests on the flow
+    of the training are kept as `source_a_priori` if the source has them. The cost of training is that of the source.
     """
-    device, source = prepare_torch(scene.device, comm), read_source(scene, comm)
-    slab = SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes)
-    with open_product(comm, Path(directory) / "ground_truth.h5", "ground_truth") as file:
-        truth = GroundTruth(file, slab)
-        model = with_weights(scene, comm, source.description, source.weights, source.path, truth.scales).to(device)
+    source, definition = read_source(scene, comm), ModelDefinition.of(scene)
+    slab, device = SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes), prepare_torch(scene.device, comm)
+    with open_product(comm, directory / STAGES["dns"].file, "ground_truth") as file:
+        truth = GroundTruth(file, slab, device)
+        model = with_weights(definition, comm, source.description, source.weights, source.path, truth.scales).to(device)
         model = model.forced(truth.forcing)
         dtype = next((parameter.dtype for parameter in model.parameters()), torch.float64)
-        last = truth.last_frame_seen(scene.seen_in(Path(directory)))
-        tables = evaluate(truth, model, evaluation_frames(truth), last, dtype, device)
+        last = truth.last_frame_seen(scene.seen_in(directory))
+        tables = evaluate(truth, model, evaluation_frames(truth), last, dtype)
         mach = truth.reference.get("mach_turbulent")
-        description = describe(scene, truth.scales) | {"coefficients": model.learned_coefficients}
+        description = definition.describe(truth.scales) | {"coefficients": model.learned_coefficients}
     if "training" in source.description:
         description["training"] = source.description["training"]
-    origin, own_errors = trained_on(scene, source)
+    origin, own_errors = trained_on(source, scene.model.path)
     provenance = {**stage_provenance(scene, "train"), "mach_turbulent": mach, "source": origin}
     kept = source.tables | ({"source_a_priori": own_errors} if own_errors else {})
-    save_weights(comm, Path(directory) / "model.h5", "model", description, source.weights, provenance, kept | tables)
+    save_weights(comm, directory / STAGES["train"].file, "model", description, source.weights, provenance,
+                 kept | tables)
     errors, beside = tables["a_priori"], []
     if "pressure_gradient_error" in errors:
         beside.append(f"exact filtered pressure gradient {errors['pressure_gradient_error'][-1]:.3f}")
-    beside.append(f"on its own flow {own_errors['acceleration_error'][-1]:.3f}" if own_errors else
+    beside.append(f"on the flow of its training {own_errors['acceleration_error'][-1]:.3f}" if own_errors else
                   f"trained on {', '.join(origin['truths'])}")
     log.info("model: weights of %s; acceleration error %.3f (%s)", source.path, errors["acceleration_error"][-1],
              "; ".join(beside))
 
 
-def trained_on(scene: Scene, source: ModelSource) -> tuple[dict[str, Any], dict[str, np.ndarray] | None]:
-    """Path and Mach number of the run where weights were trained, and errors there; not of one that took them.
+def trained_on(source: ModelSource, path: str) -> tuple[dict[str, Any], dict[str, np.ndarray] | None]:
+    """The run in which the weights of a source were trained, and the a-priori errors on the flow of that run.
 
-    Where that run trained on ground truths of others alone, its own flow was none of them: then these by path with
-    their Mach numbers, as `truths`, in place of its own, and no errors.
+    The run is `path`, with its Mach number, unless the source itself took its weights from another run. If it was
+    trained on ground truths of other runs only, these are given as `truths` with their Mach numbers, and no errors.
     """
-    origin, path = source.provenance, scene.model.path
+    origin = source.provenance
     if "source" in origin:
         return origin["source"], source.tables.get("source_a_priori")
     if others_trained_on(origin):

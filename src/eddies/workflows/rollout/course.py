@@ -1,4 +1,4 @@
-"""The course of a rollout: steps and frames, and what a checkpoint must hold of them."""
+"""The loop over steps and frames of a rollout, with its checkpoints."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ log = logging.getLogger("eddies")
 
 
 def frame_layout(total: int, length: float, density: bool) -> FrameLayout:
-    """What a rollout stores of so many particles in a box: with their `density`, where they have one."""
+    """The datasets of a rollout with `total` particles in a box of edge `length`."""
     columns = {"position": (3,), "velocity": (3,), "acceleration": (3,)} | ({"density": ()} if density else {})
     return FrameLayout(total, length, {"model": columns}, np.float32, {})
 
 
 class Course:
-    """A method on its way through `count` frame intervals of a length, from the start or from a checkpoint.
+    """Runs a method through `count` frame intervals, from the start or from a checkpoint.
 
-    `segments` take the frames. `guard` looks on before each step. A method that cannot tell its state makes no
+    Frames are written into `segments`. `guard` is called before each step. A method without `state_dict` makes no
     checkpoints.
     """
 
@@ -43,7 +43,7 @@ class Course:
         if saved is not None:
             self._load(saved)
             method.load_state_dict(saved)
-            log.info("rollout: goes on from step %d, time %.4g", self.steps, self.clock.time)
+            log.info("rollout: continues from step %d, time %.4g", self.steps, self.clock.time)
         self.progress = ProgressLine("rollout", self._describe, done=self.clock.time / self.clock.end)
 
     @property
@@ -52,10 +52,10 @@ class Course:
         return self.clock.steps
 
     def run(self) -> dict[str, float | str]:
-        """Advance to the last frame, or until the state is at fault.
+        """Advance to the last frame, or until the state is faulty.
 
-        Returns status, time, steps and, where there are any, their mean length, the share of the wall time since the
-        start or the last restart that storing frames took, and the seconds of those steps that were timed.
+        Returns status, time and number of steps. After at least one step also `time_step` (mean length) and
+        `storing_share` (part of the wall time that storing took), and quartiles of the seconds of timed steps.
         """
         complaint: str | None = None
         if not self.times:
@@ -63,7 +63,10 @@ class Course:
         while complaint is None and (number := len(self.times)) <= self.count:
             until = number * self.interval
             while complaint is None and self.method.time < until - 1e-9 * self.interval:
-                self._look()
+                if hasattr(self.method, "state_dict"):
+                    self.guard(self, self.segments)
+                else:
+                    self.guard.stop.check()
                 complaint = self._step(until)
                 self.progress(min(self.clock.time / self.clock.end, 1.0), self.steps)
             if complaint is None:
@@ -76,25 +79,18 @@ class Course:
                 "steps": self.steps, **step, **quartiles(self.seconds)}
 
     def state_dict(self) -> dict[str, Any]:
-        """All that goes on, for a checkpoint, beside the files of the frames."""
+        """The state for a checkpoint, besides the files of the frames."""
         return {"rollout": {"clock": self.clock.state_dict(), "energy": self.energy, "ranks": self.comm.size,
                             "seconds": self.seconds, "times": self.times},
                 **self.method.state_dict()}
 
     def _load(self, saved: Checkpoint) -> None:
-        """Take what is no part of the method from a checkpoint."""
-        known = saved["rollout"]
-        self.clock.load_state_dict(known["clock"])
-        self.times, self.energy = known["times"], known["energy"]
-        if known["ranks"] == self.comm.size:  # else they are no measure of the steps of this run
-            self.seconds = known["seconds"]
-
-    def _look(self) -> None:
-        """Let the guard look on; without a state to keep, only whether the run is to stop."""
-        if hasattr(self.method, "state_dict"):
-            self.guard(self, self.segments)
-        else:
-            self.guard.stop.check()
+        """Restore all but the state of the method."""
+        state = saved["rollout"]
+        self.clock.load_state_dict(state["clock"])
+        self.times, self.energy = state["times"], state["energy"]
+        if state["ranks"] == self.comm.size:  # times of another number of ranks are not comparable
+            self.seconds = state["seconds"]
 
     def _step(self, until: float) -> str | None:
         began, before = time.perf_counter(), self.method.time
@@ -107,9 +103,9 @@ class Course:
         return complaint
 
     def _store(self, at: float) -> None:
-        """Store the frame of a time, and take down the mean kinetic energy <v.v>/2 of its particles."""
+        """Store the frame at a time, and keep the mean kinetic energy <v.v>/2 of its particles."""
         layout = self.segments.layout
-        # The first step begins with the forces of the first frame; what others take is taken for the frame alone.
+        # The first step uses the forces of the first frame. Later frames evaluate forces for storing only.
         with self.progress.storing() if self.times else nullcontext():
             particles, acceleration = self.method.frame(at)
         with self.progress.storing():
@@ -128,7 +124,7 @@ class Course:
 
 
 def quartiles(seconds: Sequence[float]) -> dict[str, float]:
-    """Median and quartiles of the seconds of steps; nothing without any."""
+    """Median and quartiles of the seconds of steps; empty without timed steps."""
     if not seconds:
         return {}
     low, median, high = np.quantile(seconds, (0.25, 0.5, 0.75))

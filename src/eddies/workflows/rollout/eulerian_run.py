@@ -1,4 +1,4 @@
-"""Eulerian large-eddy simulation on a coarse grid, with particles that follow its filtered velocity."""
+"""Rollouts by Eulerian large-eddy simulation on a coarse grid. Particles follow its filtered velocity."""
 
 from __future__ import annotations
 
@@ -20,27 +20,27 @@ from eddies.flow.subgrid import Closure, DynamicStress, EddyDamping, SpectralVis
 from eddies.flow.tracers import FilteredField, TracerParticles
 from eddies.io.checkpoint import Block, Checkpoint
 from eddies.io.weights import load_weights
-from eddies.parallel.communicator import Comm
 from eddies.parallel.migration import migrate
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.particle_set import ParticleSet
+from eddies.pipeline import STAGES
 from eddies.scene.scene import Eulerian, Scene, SceneError
 from eddies.spectral.mode_operators import gaussian_transfer
 from eddies.spectral.spectral_grid import SpectralGrid, regrid
 from eddies.time_stepping import ETDRK4
 from eddies.workflows.ground_truth.truth import GroundTruth
-from eddies.workflows.rollout.particle_run import injection
-from eddies.workflows.rollout.saved_rows import restored_rows, saved_rows
+from eddies.workflows.rollout.particle_run import forcing_of
+from eddies.workflows.rollout.saved_particles import restored_rows, saved_rows
 
-# Runaway is a flow with this many times the energy of its start.
+# A flow is unstable if its energy exceeds that of its start by this factor.
 RUNAWAY_ENERGY = 100.0
 
 
 class EulerianRun:
-    """A fluid on a coarse grid, with a closure or without one, from a frame of the truth on.
+    """A fluid on a coarse grid, with or without a closure, that starts at a frame of the truth.
 
-    It starts from those modes of the unfiltered velocity that the grid keeps, or, where its equations are those of the
-    filtered velocity, from the filter of them. The true particles follow the filtered velocity in either case.
+    It starts from the modes of the unfiltered velocity that the grid holds. Equations for the filtered velocity start
+    from these modes after the filter. The particles follow the filtered velocity in both cases.
     """
 
     def __init__(self, scene: Scene, truth: GroundTruth, start: int, directory: Path, device: torch.device) -> None:
@@ -48,10 +48,15 @@ class EulerianRun:
         comm, length, width = truth.decomposition.comm, truth.decomposition.length, truth.scales.filter_width
         cells = self.settings.cells_for(width)
         grid = SpectralGrid(SlabDecomposition(comm, length, cells), scene.simulation.precision)
-        # What is left for the filter to do to the fluid's velocity, and what it has done to it.
+        # Width of the filter that the velocity of the fluid has passed, and of the filter for the particles.
         filter_passed = self.settings.filter_passed(width)
         filter_left = 0.0 if filter_passed else width
-        self.fluid = coarse_fluid(scene, truth, grid, filter_passed, directory)
+        forcing = None
+        if (forced := forcing_of(scene.simulation.injection, scene.forcing, truth)) is not None:
+            forcing = LinearForcing(grid, forced.injection_rate, forced.wavenumber, filter_passed)
+        sound_speed = scene.flow.sound_speed if self.settings.compressible else math.inf
+        closure = closure_of(self.settings, grid, filter_passed, directory, scene.model and scene.model.damping)
+        self.fluid = FLUIDS[self.settings.fluid](grid, scene.flow.viscosity, sound_speed, forcing, closure=closure)
         self.stepper, self.clock = ETDRK4(self.fluid), Clock()
         self.step_limit = CourantLimit(grid, scene.time.courant, math.inf)
         self.state = initial_state(truth, self.fluid, filter_passed, start)
@@ -64,7 +69,7 @@ class EulerianRun:
 
     @property
     def has_density(self) -> bool:
-        """Whether the particles of its frames have a density."""
+        """Whether the particles of a frame have a density."""
         return self.fluid.compressible
 
     @property
@@ -73,19 +78,21 @@ class EulerianRun:
         return self.clock.time
 
     def advance(self, until: float, number: int) -> str | None:
-        """Take one of the equal steps to a time, as many as the Courant number of the flow now asks for, and none
-        longer than that of the scene; what is wrong with the state after it, on all ranks, or None."""
+        """Take one of the equal steps to a time. Returns None, or on all ranks what is wrong with the new state.
+
+        The Courant number of the present flow and [simulation] step limit the step.
+        """
         left = until - self.time
         longest = min(self.step_limit.bound(self.state, self.clock), self.longest_step)
         step = left / math.ceil(left / longest - 1e-9)
         began = time.perf_counter()
-        with np.errstate(over="ignore", invalid="ignore"):  # said in words below
+        with np.errstate(over="ignore", invalid="ignore"):  # reported below
             if self.fluid.closure is not None:
                 self.fluid.closure.begin_step(self.state[:3])
             self.state = self.stepper(self.state, step)
             energy = quadratic_energy(self.fluid, self.state)
         self.flow_seconds.append(time.perf_counter() - began)
-        # Written so that what is not finite fails.
+        # A NaN fails this condition too.
         if not energy <= self.largest_energy:
             return (f"step {number}: the coarse flow is unstable, its energy is {energy:.3g} and more than "
                     f"{RUNAWAY_ENERGY:g} times that of the start; lower [time] courant or [simulation] step")
@@ -94,13 +101,11 @@ class EulerianRun:
         return None
 
     def frame(self, time: float) -> tuple[ParticleSet, torch.Tensor]:
-        """The particles, with the density of a compressible fluid, and their acceleration."""
-        density = {"density": self.tracers.density(self.state)} if self.has_density else {}
-        return ParticleSet.from_numpy(self.tracers.columns | density), torch.from_numpy(self._acceleration())
+        """The particles, with the density of a compressible fluid, and their acceleration (n, 3).
 
-    def _acceleration(self) -> np.ndarray:
-        """du/dt + v.grad u (n, 3) of the filtered velocity u at the particles: the rate of change of their velocity,
-        exact but for the splines."""
+        The acceleration is du/dt + v.grad u of the filtered velocity u at the particles, exact except for the splines.
+        """
+        density = {"density": self.tracers.density(self.state)} if self.has_density else {}
         fluid, transfer = self.fluid, self.tracers.field.transfer
         velocity = transfer * self.state[:3]
         if fluid.closure is not None:
@@ -110,25 +115,25 @@ class EulerianRun:
         spline = self.tracers.field.spline
         values = spline.at(spline.coefficients(np.concatenate([change, *gradients])), self.tracers.columns["position"])
         along = np.einsum("nij,nj->ni", values[:, 3:].reshape(-1, 3, 3), self.tracers.columns["velocity"])
-        return values[:, :3] + along
+        return ParticleSet.from_numpy(self.tracers.columns | density), torch.from_numpy(values[:, :3] + along)
 
     def status(self) -> str:
-        """Nothing."""
+        """Empty."""
         return ""
 
     def series(self) -> dict[str, dict[str, list[float]]]:
-        """None."""
+        """Empty."""
         return {}
 
     def state_dict(self) -> dict[str, Any]:
-        """All that goes on, for a checkpoint; collective."""
+        """The state for a checkpoint; collective."""
         grid = self.fluid.grid
         modes = Block(self.state, int(grid.column_starts[grid.decomposition.rank]), grid.modes, axis=2)
         return {"modes": modes, "clock": self.clock.state_dict(), "flow_seconds": self.flow_seconds,
                 **saved_rows(grid.decomposition.comm, self.tracers.columns)}
 
     def load_state_dict(self, saved: Checkpoint) -> None:
-        """Inverse of `state_dict`, bit for bit on the same number of ranks; collective."""
+        """Inverse of `state_dict`, exact on the same number of ranks; collective."""
         grid = self.fluid.grid
         starts, rank = grid.column_starts, grid.decomposition.rank
         self.state = saved.read("modes", int(starts[rank]), int(starts[rank + 1]), axis=2)
@@ -138,8 +143,7 @@ class EulerianRun:
         self.tracers = TracerParticles(self.tracers.field, columns, self.state)
 
     def description(self) -> dict[str, float | str]:
-        """Grid and model; where there were steps, `flow_seconds_per_step` (median) is the flow's share of one, without
-        the particles."""
+        """Grid, fluid and closure; after a step also `flow_seconds_per_step`, the median time without particles."""
         grid = self.fluid.grid
         seconds = {"flow_seconds_per_step": float(np.median(self.flow_seconds))} if self.flow_seconds else {}
         key = self.settings.form.constant
@@ -149,56 +153,44 @@ class EulerianRun:
                 "closure": self.settings.closure + constant, **seconds}
 
 
-def coarse_fluid(scene: Scene, truth: GroundTruth, grid: SpectralGrid, filter_passed: float,
-                 directory: Path) -> Fluid:
-    """The fluid of a coarse grid, whose velocity has passed a filter of some width or 0, with the forcing of the
-    scene's particles and the closure of the scales that the grid or the filter leaves out."""
-    settings, forcing = scene.eulerian or Eulerian(), None
-    if (forced := injection(scene, truth)) is not None:
-        forcing = LinearForcing(grid, forced.injection_rate, forced.wavenumber, filter_passed)
-    sound_speed = scene.flow.sound_speed if settings.compressible else math.inf
-    closure = closure_of(settings, grid, filter_passed, directory, scene.model and scene.model.damping)
-    return FLUIDS[settings.fluid](grid, scene.flow.viscosity, sound_speed, forcing, closure=closure)
-
-
 def closure_of(settings: Eulerian, grid: SpectralGrid, filter_width: float, directory: Path,
                damping: str | None) -> Closure | None:
-    """The closure of the filtered equations, or, without a filter width, of the velocity that the grid cuts off at its
-    highest wavenumber k_c; Delta is d, or pi/k_c. What is learned is read from model.h5 in the directory, where it is
-    the parameter `damping` of a term."""
+    """The closure of equations for a velocity that has passed a filter, or with `filter_width` = 0 the sharp cut-off of
+    the grid at its highest wavenumber k_c. The length Delta is then pi/k_c.
+
+    A learned closure takes the parameter `damping` of the terms in the model.h5 of the directory.
+    """
+    def learned() -> Closure:
+        _, weights = load_weights(grid.decomposition.comm, directory / STAGES["train"].file, "model")
+        return EddyDamping(grid, weights[f"terms.{damping}"])
+
     width = filter_width or math.pi / grid.cutoff
     made = {
         "none": lambda: None,
         "smagorinsky": lambda: StressModel(grid, mixing_length=settings.smagorinsky * width),
         "dynamic-smagorinsky": lambda: DynamicStress(grid, filter_width),
         "spectral": lambda: SpectralViscosity(grid),
-        "learned": lambda: EddyDamping(grid, learned_rates(grid.decomposition.comm, directory, damping)),
+        "learned": learned,
         "gradient": lambda: StressModel(grid, filter_width=filter_width),
         "dynamic-mixed": lambda: DynamicStress(grid, filter_width, with_gradient=True),
     }
     return made[settings.closure]()
 
 
-def learned_rates(comm: Comm, directory: Path, damping: str | None) -> np.ndarray:
-    """The rates of eddy damping that a model has learned."""
-    _, weights = load_weights(comm, directory / "model.h5", "model")
-    return weights[f"terms.{damping}"]
-
-
 def initial_state(truth: GroundTruth, fluid: Fluid, filter_passed: float, frame: int) -> np.ndarray:
-    """The modes that a fluid's grid keeps of the flow at a frame, its velocity passed through a filter; the density
-    as it was, or in balance with a filtered velocity.
+    """The modes of the true flow at a frame that the grid of a fluid holds, after a filter of the velocity.
 
-    Raises SceneError where the ground truth does not have the whole flow at that frame.
+    The density is that of the frame, or in balance with a filtered velocity. Raises SceneError if the unfiltered flow
+    is not stored at that frame.
     """
     grid, series = fluid.grid, truth.states
     at = [index for index, time in enumerate(series.times) if abs(time - truth.times[frame]) < 1e-9]
     if not at:
-        known = ", ".join(f"{time / truth.times[-1]:.3g}" for time in series.times) or "nowhere"
+        stored = ", ".join(f"{time / truth.times[-1]:.3g}" for time in series.times) or "no time"
         raise SceneError(
             f'[simulation] method = "eulerian": the rollout starts at {truth.times[frame] / truth.times[-1]:.3g} of the'
-            f" ground truth, which holds the unfiltered flow at {known}; start there ([simulation] start), or make the "
-            "ground truth again for this start")
+            f" ground truth, which holds the unfiltered flow at {stored}; start there ([simulation] start), or make "
+            "the ground truth again for this start")
     slab = SlabDecomposition(grid.decomposition.comm, grid.decomposition.length, series.cells)
     whole = SpectralGrid(slab, grid.precision, (series.cells - 1) // 2)
 

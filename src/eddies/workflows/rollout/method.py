@@ -1,45 +1,82 @@
-"""What moves the particles of a rollout."""
+"""What moves the particles of a rollout: the interface, the methods of the package, and how a scene chooses one."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Protocol
 
 import torch
 
+from eddies.import_path import is_path, load
 from eddies.io.checkpoint import Checkpoint
 from eddies.particles.particle_set import ParticleSet
+from eddies.scene.scene import Scene
+from eddies.workflows.ground_truth.truth import GroundTruth
+from eddies.workflows.rollout.eulerian_run import EulerianRun
+from eddies.workflows.rollout.particle_run import BallisticRun, LearnedRun, ParticleRun
 
 
 class Method(Protocol):
-    """What moves the particles of a rollout, made as Class(scene, truth, start, directory, device) where `start` is the
-    frame of the ground truth that it starts from. All methods are collective.
+    """Moves the particles of a rollout. Made as Class(scene, truth, start, directory, device), where `start` is the
+    frame of the ground truth at which the rollout starts. All methods are collective.
 
-    `state_dict` and `load_state_dict` may be missing: a rollout that is stopped then begins anew.
+    `state_dict` and `load_state_dict` may be missing: a stopped rollout then starts again from the beginning.
     """
 
-    has_density: bool  # of the particles of its frames
+    has_density: bool  # whether the particles of a frame have a density
 
-    time: float  # of its particles, since the start
+    time: float  # of the particles, since the start
 
     def advance(self, until: float, number: int) -> str | None:
-        """Take a step, the `number`-th of the run, that ends at a time or before it, or beyond it where `frame` can
-        look back; what is wrong with the state after it, on all ranks, or None."""
+        """Take one step, the `number`-th, towards the time `until`. The step may pass that time if `frame` can
+        interpolate. Returns None, or on all ranks what is wrong with the new state."""
 
     def frame(self, time: float) -> tuple[ParticleSet, torch.Tensor]:
-        """The particles at a time that the last step reached, in any order, and their acceleration (n, 3)."""
+        """The particles at a time within the last step, in any order, and their acceleration (n, 3)."""
 
     def status(self) -> str:
-        """What the progress line shows of it beside time and energy."""
+        """Text for the progress line, after time and energy."""
 
     def series(self) -> dict[str, dict[str, list[float]]]:
-        """Tables for the product, with a value in each column for each call of `frame`."""
+        """Tables for the product; each column has one value for each call of `frame`."""
 
     def description(self) -> dict[str, float | str]:
-        """The settings of what moves the particles, for the attributes of the product."""
+        """Settings of the method, for the attributes of the product."""
 
     def state_dict(self) -> dict[str, Any]:
-        """All that goes on after the frames of the steps so far, as `CheckpointDirectory.write` takes it; no name
-        begins with "rollout"."""
+        """The state after the frames so far, as `CheckpointDirectory.write` takes it. No name begins with "rollout"."""
 
     def load_state_dict(self, saved: Checkpoint) -> None:
-        """Go on from a checkpoint, made on any number of ranks; on the same number bit for bit."""
+        """Continue from a checkpoint, made on any number of ranks; on the same number exactly."""
+
+
+#: The classes behind the words of [simulation] method.
+METHODS: dict[str, Callable[..., Method]] = {"learned": LearnedRun, "none": BallisticRun, "eulerian": EulerianRun}
+
+
+@dataclass(frozen=True)
+class Step:
+    """Integrator and longest time step of a rollout; for a coarse grid "etdrk4" and the Courant number."""
+
+    integrator: str
+    size: float
+
+
+def make_method(scene: Scene, step: Step | None, truth: GroundTruth, start: int, directory: Path) -> Method:
+    """The method of a scene, starting at a frame of the truth. A given `step` replaces that of the scene; collective.
+
+    With a given step the limit that the resolved velocity sets to steps is ignored.
+    """
+    settings = scene.simulation
+    if step is not None and settings.on_grid:
+        scene = replace(scene, time=replace(scene.time, courant=step.size))
+    elif step is not None:
+        given = replace(settings, integrator=step.integrator, step=step.size, step_from=None, confirmed_on=None)
+        scene = replace(scene, simulation=given)
+    kind = load(settings.method) if is_path(settings.method) else METHODS[settings.method]
+    method = kind(scene, truth, start, directory, truth.device)
+    if step is not None and isinstance(method, ParticleRun):
+        method.limited = False
+    return method

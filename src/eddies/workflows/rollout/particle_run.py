@@ -1,4 +1,4 @@
-"""Particles moved by the terms of a model, or by none."""
+"""Rollouts of particles that are moved by a model, or by no force."""
 
 from __future__ import annotations
 
@@ -11,48 +11,52 @@ import numpy as np
 import torch
 
 from eddies.io.checkpoint import Checkpoint
+from eddies.io.hdf5 import open_product, read_table
 from eddies.parallel.broadcast import first_complaint
 from eddies.parallel.halo import HaloError
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.faults import Limits, find_fault
 from eddies.particles.feature_range import FeatureRange, pair_features
-from eddies.particles.flow_units import FlowUnits, allowed_step
+from eddies.particles.flow_units import allowed_step
 from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.model import LagrangianModel
 from eddies.particles.moment import Moment, between
 from eddies.particles.particle_set import ParticleSet
+from eddies.pipeline import STAGES
+from eddies.scene.scene import Forcing as ForcingSection
 from eddies.scene.scene import Scene
 from eddies.scene.terms import Forcing
 from eddies.workflows.ground_truth.truth import GroundTruth, particles_for
-from eddies.workflows.learned.model import load_feature_range, load_model
-from eddies.workflows.rollout.particle_state import particle_state, restored_particles
+from eddies.workflows.learned.model import load_model
+from eddies.workflows.learned.source import ModelDefinition
+from eddies.workflows.rollout.saved_particles import particle_state, restored_particles
 
 log = logging.getLogger("eddies")
 
-# A state is runaway, not turbulence, when a particle is this many times faster, or its density this many times
-# farther from the mean, than the rms of the truth.
+# A state is faulty if a particle is this many times faster, or its density deviates this many times more from the mean,
+# than the rms of the truth.
 RUNAWAY_SPEED, RUNAWAY_DENSITY = 30.0, 300.0
-# What is stored of the solves for the resolved velocity.
+# Columns that are stored about the solves for the resolved velocity.
 SOLVES = "solves", "iterations", "most_iterations", "residual", "not_converged"
 
 
 class ParticleRun:
     """The particles of a frame of the ground truth, moved by a model.
 
-    Its units are the scales of the flow at the release of the tracers, as in training. A subclass says which model it
-    is (`build`), and how far a particle's density may deviate from the mean in a sound state (`largest_deviation`).
+    The units are the scales of the flow at the release of the tracers, as in training. A subclass makes the model
+    (`build`) and may limit the deviation of the density from the mean (`largest_deviation`).
     """
 
     largest_deviation = np.inf
     seen: FeatureRange | None = None
-    #: whether steps are limited to what the resolved velocity can follow; not where the step was found by rollouts
+    #: whether the resolved velocity limits the step; false if the step was found by rollouts
     limited = True
 
     def __init__(self, scene: Scene, truth: GroundTruth, start: int, directory: Path, device: torch.device) -> None:
+        definition, forcing = ModelDefinition.of(scene), forcing_of(scene.simulation.injection, scene.forcing, truth)
         self.settings, self.comm, self.scales = scene.simulation, truth.decomposition.comm, truth.scales
-        self.flow = FlowUnits(self.scales, scene.interaction_radius, scene.neighbors, scene.seed)
-        dtype = getattr(torch, self.settings.precision)
-        self.model = self.build(scene, directory).forced(injection(scene, truth)).to(dtype=dtype, device=device)
+        self.flow, dtype = definition.units(self.scales), getattr(torch, self.settings.precision)
+        self.model = self.build(definition, directory).forced(forcing).to(dtype=dtype, device=device)
         self.dynamics = ParticleDynamics(truth.decomposition, self.model, self.settings.skin * self.flow.cutoff, dtype)
         self.integrator = INTEGRATORS[self.settings.scheme.name](self.dynamics)
         self.particles, self.total = particles_for(self.model, truth.particles(start), device), truth.total
@@ -61,13 +65,13 @@ class ParticleRun:
         self._shares_outside: list[float] = []
         self._solves: dict[str, list[float]] = {name: [] for name in SOLVES}
 
-    def build(self, scene: Scene, directory: Path) -> LagrangianModel:
-        """The model, without forcing; collective."""
+    def build(self, definition: ModelDefinition, directory: Path) -> LagrangianModel:
+        """The model without forcing; collective."""
         raise NotImplementedError
 
     @property
     def has_density(self) -> bool:
-        """Whether the particles of its frames have a density."""
+        """Whether the particles of a frame have a density."""
         return self.model.reads_density
 
     @property
@@ -76,10 +80,10 @@ class ParticleRun:
         return self.dynamics.time
 
     def advance(self, until: float, number: int) -> str | None:
-        """Take a step towards a time; what is wrong with the state after it, on all ranks, or None.
+        """Take one step towards a time. Returns None, or on all ranks what is wrong with the new state.
 
-        Steps are as long as the scene has them, or as the flow allows where that is less. Those of a scheme that can
-        tell what was between them may go beyond that time; those of others end there.
+        The step is that of the scene, or shorter if the flow demands it. A scheme with dense output may step beyond
+        that time; steps of other schemes end there.
         """
         step, left = min(self.settings.longest_step, self._allowed_step()), until - self.time
         if not self.integrator.scheme.dense:
@@ -91,12 +95,12 @@ class ParticleRun:
             complaint = first_complaint(self.comm, fault)
             if complaint is None and self.integrator.scheme.dense:
                 complaint = self._complaint_of_rates(number)
-        except HaloError as error:  # on all ranks alike: particles outrun the halo
+        except HaloError as error:  # raised on all ranks: particles are faster than the halo allows
             return f"step {number}: {error}"
         return complaint
 
     def _allowed_step(self) -> float:
-        """The longest step in which the resolved velocity, if there is one, can follow the flow as it is now."""
+        """The longest step that the resolved velocity allows in the present flow; infinite without one."""
         resolution = self.dynamics.resolution
         if resolution is None or not self.limited:
             return np.inf
@@ -104,21 +108,20 @@ class ParticleRun:
         return allowed_step(self.integrator.scheme.angle, highest, resolution.speed)
 
     def _complaint_of_rates(self, number: int) -> str | None:
-        """What is wrong with the rates at the end of a step, which a frame asks for and the next step begins with."""
+        """What is wrong with the rates at the end of a step. The next frame and the next step use these rates."""
         self.particles, rates = self.integrator.rates(self.particles)
         wrong = self.particles.id[~torch.isfinite(rates.acceleration).all(1)].tolist()
         return first_complaint(self.comm, f"step {number}, rank {self.comm.rank}, particle {wrong[0]}: its "
                                           "acceleration is not finite" if wrong else None)
 
     def frame(self, time: float) -> tuple[ParticleSet, torch.Tensor]:
-        """The particles at a time that the last step reached, with the density that terms give if they do, and their
-        acceleration."""
+        """The particles at a time within the last step, with the density that terms give, and their acceleration."""
         if self._before is None:
             self.particles, rates = self.integrator.rates(self.particles)
             particles = self.particles
         else:
-            found = between(self._before, self._now(), time, self.dynamics.box)
-            particles, _ = self.dynamics.settle(particles_for(self.model, found.to_numpy(), self.particles.id.device))
+            columns = between(self._before, self._now(), time, self.dynamics.box).to_numpy()
+            particles, _ = self.dynamics.settle(particles_for(self.model, columns, self.particles.id.device))
             rates = self.dynamics.rates(particles, time=time)
         if rates.density is not None:
             particles = replace(particles, density=rates.density)
@@ -128,82 +131,87 @@ class ParticleRun:
         return particles, rates.acceleration
 
     def _now(self) -> Moment:
-        """The particles with their acceleration, which the next step does not evaluate again; collective."""
+        """The particles with their rates, which the next step uses again; collective."""
         self.particles, rates = self.integrator.rates(self.particles)
         return Moment.of(self.comm, self.total, self.time, self.particles, rates)
 
     def _count_solves(self) -> None:
-        """Take down what the closure's solves took since the last frame."""
+        """Record the effort of the solves for the resolved velocity since the last frame."""
         if self.dynamics.resolution is None:
             return
         solves, self.dynamics.resolution.solves = self.dynamics.resolution.solves, []
         iterations, residuals, converged = (np.array(column) for column in zip(*solves or [(0, 0.0, True)]))
         failed = int((~converged).sum())
-        found = len(solves), iterations.sum(), iterations.max(), residuals.max(), failed
-        for name, value in zip(SOLVES, found):
+        for name, value in zip(SOLVES, (len(solves), iterations.sum(), iterations.max(), residuals.max(), failed)):
             self._solves[name].append(float(value))
-        # Said once; the report counts them.
+        # Logged once; the report gives the number.
         if 0 < failed == sum(self._solves["not_converged"]) and self.comm.rank == 0:
-            log.warning("rollout: %d of %d solves for the resolved velocity did not converge in %d iterations, the "
-                        "worst left a residual of %.1e; the report counts later ones too", failed, len(solves),
+            log.warning("rollout: %d of %d solves for the resolved velocity did not converge in %d iterations; the "
+                        "largest residual is %.1e. The report gives the total number", failed, len(solves),
                         max(iterations), residuals.max())
 
     def status(self) -> str:
-        """Iterations of a solve for the resolved velocity, for the progress line: the last mean between two frames."""
+        """Mean iterations of a solve for the resolved velocity between the last two frames, for the progress line."""
         means = [iterations / count for count, iterations in zip(self._solves["solves"], self._solves["iterations"])
                  if count]
         return f"  iterations {means[-1]:.1f}" if means else ""
 
     def series(self) -> dict[str, dict[str, list[float]]]:
-        """`outside_training`: the share of pairs that give the networks inputs outside the range of their training;
-        `closure`: the solves for the resolved velocity since the frame before, all and most of their iterations, the
-        largest residual, and how many did not converge."""
-        found = {} if self.seen is None else {"outside_training": {"share": self._shares_outside}}
-        return found if self.dynamics.resolution is None else {**found, "closure": self._solves}
+        """Tables over the frames.
+
+        `outside_training`: share of pairs whose network inputs are outside the range of the training.
+        `closure`: since the last frame the number of solves for the resolved velocity, their iterations in total and at
+        most, the largest residual, and the number of solves that did not converge.
+        """
+        tables = {} if self.seen is None else {"outside_training": {"share": self._shares_outside}}
+        return tables if self.dynamics.resolution is None else {**tables, "closure": self._solves}
 
     def state_dict(self) -> dict[str, Any]:
-        """All that goes on, for a checkpoint between the frames of one step and the next step; collective."""
+        """The state for a checkpoint, after the frames of one step and before the next step; collective."""
         return {**particle_state(self.particles, self.integrator), "series": {
             "outside_training": self._shares_outside, "closure": self._solves}}
 
     def load_state_dict(self, saved: Checkpoint) -> None:
-        """Inverse of `state_dict`, bit for bit on the same number of ranks; collective."""
+        """Inverse of `state_dict`, exact on the same number of ranks; collective."""
         self.particles = restored_particles(saved, self.integrator, self.particles.id.device)
         self._shares_outside, self._solves = (saved["series"][name] for name in ("outside_training", "closure"))
 
     def description(self) -> dict[str, float | str]:
-        """Integrator, terms, whether they integrate a density, and how often rates were evaluated for the steps."""
+        """Integrator, terms, whether they integrate a density, and the number of evaluations of the rates."""
         return {"integrator": self.settings.scheme.name, "terms": ", ".join(self.model.terms) or "none",
                 "integrates_density": self.model.integrates_density, "evaluations": self.dynamics.evaluations}
 
 
 class LearnedRun(ParticleRun):
-    """Moved by the trained model of the run directory."""
+    """Particles moved by the trained model of the run directory."""
 
-    def build(self, scene: Scene, directory: Path) -> LagrangianModel:
-        path = directory / "model.h5"
-        model = load_model(scene, self.comm, path, self.scales)
+    def build(self, definition: ModelDefinition, directory: Path) -> LagrangianModel:
+        path = directory / STAGES["train"].file
+        model = load_model(definition, self.comm, path, self.scales)
         if model.integrates_density and self.scales.density is not None:
             self.largest_deviation = RUNAWAY_DENSITY * self.scales.density
         if model.networks:
-            self.seen = load_feature_range(self.comm, path)
+            with open_product(self.comm, path, "model") as file:
+                self.seen = FeatureRange(**read_table(file, "feature_range"))
         return model
 
 
 class BallisticRun(ParticleRun):
-    """Not moved by anything: particles keep their velocity. Neither neighbour list nor messages."""
+    """Particles without forces, which keep their velocity. There is no neighbour list and no message."""
 
-    def build(self, scene: Scene, directory: Path) -> LagrangianModel:
+    def build(self, definition: ModelDefinition, directory: Path) -> LagrangianModel:
         return LagrangianModel({}, self.flow)
 
 
-def injection(scene: Scene, truth: GroundTruth) -> Forcing | None:
-    """The forcing of a rollout: that of the ground truth; or at a power per mass as given, or the dissipation rate of
-    the ground truth, at the wavenumbers of [forcing]; or none."""
-    power = scene.simulation.injection
+def forcing_of(power: str | float, section: ForcingSection | None, truth: GroundTruth) -> Forcing | None:
+    """The forcing of a rollout, None without one.
+
+    `power` is [simulation] injection: "truth" means the forcing of the ground truth, "dissipation" its dissipation
+    rate, a number the power per mass. The last two act at the wavenumbers of `section`, which is [forcing].
+    """
     if power == "truth":
         return truth.forcing
     if power == "none":
         return None
     return Forcing(injection_rate=truth.reference["dissipation_rate"] if power == "dissipation" else power,
-                   wavenumber=scene.forcing.wavenumber if scene.forcing else 2.0)
+                   wavenumber=section.wavenumber if section else 2.0)

@@ -1,0 +1,86 @@
+"""Particles in checkpoints. Each rank gets back its own rows in the same order, so that sums over them are equal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+
+from eddies.io.checkpoint import Block, Checkpoint
+from eddies.parallel.communicator import Comm
+from eddies.parallel.migration import migrate
+from eddies.parallel.reduction import global_sum
+from eddies.parallel.slab import SlabDecomposition, block_starts
+from eddies.particles.integrators import Integrator
+from eddies.particles.particle_set import ParticleSet, as_numpy
+
+MEMORY, BUILT_AT = "memory ", "built at"
+MODES_AXIS = 4  # ky, the axis along which ranks share the modes (moments, 2, 3, kz, ky, kx) of the resolved velocity
+
+
+def saved_rows(comm: Comm, columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Columns (n, ...), among them `id` and `position`, for a checkpoint; the rows of the ranks follow each other.
+    Collective."""
+    rows = np.zeros(comm.size, np.int64)
+    rows[comm.rank] = len(columns["id"])
+    rows = global_sum(comm, rows)
+    first, total = int(rows[:comm.rank].sum()), int(rows.sum())
+    return {"columns": list(columns), "rows_of_ranks": rows,
+            **{f"particles {name}": Block(column, first, total) for name, column in columns.items()}}
+
+
+def restored_rows(slab: SlabDecomposition, saved: Checkpoint) -> tuple[dict[str, np.ndarray], bool]:
+    """The columns of this rank, and whether they are exactly the rows that it saved. On another number of ranks the
+    columns are those of the particles in its slab. Collective."""
+    rows = saved["rows_of_ranks"]
+    same = len(rows) == slab.size
+    starts = np.concatenate([[0], np.cumsum(rows)]) if same else block_starts(int(rows.sum()), slab.size)
+    block = int(starts[slab.rank]), int(starts[slab.rank + 1])
+    columns = {name: saved.read(f"particles {name}", *block) for name in saved["columns"]}
+    return (columns if same else migrate(slab, columns)), same
+
+
+def particle_state(particles: ParticleSet, integrator: Integrator) -> dict[str, Any]:
+    """The state of particles for a checkpoint: the particles that the integrator returned last, the rates that it
+    keeps, the positions at which the neighbour list was built, and start values of the next solves. Collective."""
+    dynamics = integrator.dynamics
+    columns = particles.to_numpy() | {MEMORY + name: as_numpy(rate) for name, rate in integrator.memory.items()}
+    built_at = dynamics.built_at(particles)
+    if built_at is not None:
+        columns[BUILT_AT] = as_numpy(built_at)
+    state = {"time": dynamics.time, "evaluations": dynamics.evaluations,
+             **saved_rows(dynamics.decomposition.comm, columns)}
+    if dynamics.resolution is not None:
+        values, grid = dynamics.resolution.state_dict(), dynamics.resolution.grid
+        modes = Block(as_numpy(values["modes"]), int(grid.spectral.column_starts[dynamics.decomposition.rank]),
+                      grid.spectral.modes, MODES_AXIS)
+        solves = [(int(iterations), float(residual), bool(converged))
+                  for iterations, residual, converged in dynamics.resolution.solves]
+        state |= {"closure": {"times": values["times"].tolist(), "speed": float(values["speed"]), "solves": solves},
+                  "modes": modes}
+    return state
+
+
+def restored_particles(saved: Checkpoint, integrator: Integrator, device: torch.device) -> ParticleSet:
+    """Inverse of `particle_state`, exact on the same number of ranks. On another number the particles move to their
+    slabs, and the neighbour list is built again. Collective."""
+    dynamics = integrator.dynamics
+    slab, state = dynamics.decomposition, {"time": torch.tensor(saved["time"], dtype=torch.float64)}
+    if dynamics.resolution is not None:
+        starts, closure = dynamics.resolution.grid.spectral.column_starts, saved["closure"]
+        modes = saved.read("modes", int(starts[slab.rank]), int(starts[slab.rank + 1]), MODES_AXIS)
+        state |= {"modes": torch.from_numpy(modes), "times": torch.tensor(closure["times"], dtype=torch.float64),
+                  "speed": torch.tensor(closure["speed"], dtype=torch.float64)}
+        dynamics.resolution.solves = [tuple(solve) for solve in closure["solves"]]
+    dynamics.load_state_dict(state)
+    dynamics.evaluations = saved["evaluations"]
+    columns, same = restored_rows(slab, saved)
+    particles = ParticleSet.from_numpy(columns, device)
+    if same and BUILT_AT in columns:
+        dynamics.rebuild(particles, torch.from_numpy(columns[BUILT_AT]).to(device))
+    memory = {name.removeprefix(MEMORY): torch.from_numpy(column).to(device) for name, column in columns.items()
+              if name.startswith(MEMORY)}
+    integrator.restore(particles if memory else None, memory)
+    return particles
