@@ -86,6 +86,7 @@ def test_which_checkpoints_are_used(comm, tmp_path, caplog, monkeypatch):
     assert CheckpointDirectory(comm, directory.path, "others").newest() is None
     assert comm.rank > 0 or "step-00000001: was made with other settings" in caplog.text
     assert list(directory.path.iterdir()) == []
+    comm.Barrier()
     monkeypatch.setattr("eddies.io.checkpoint.FORMAT", 1)
     directory = fill(comm, tmp_path, [1])
     monkeypatch.undo()

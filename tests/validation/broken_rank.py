@@ -26,7 +26,7 @@ PLACES = {
     "halo": (eddies.parallel.halo.PlaneHalo, "forward", 2),
     "reduction": (eddies.parallel.reduction, "_reduce", 60),
     "product": (eddies.io.hdf5, "frame_bytes", 15),  # before a collective write: the second frame
-    "checkpoint": (eddies.io.checkpoint, "own_part", 6),  # before a collective write: the second checkpoint
+    "checkpoint": (eddies.io.checkpoint, "own_part", 45),  # before a collective write: the second checkpoint, half written
 }
 
 TINY = Path(__file__).parents[1] / "tiny.toml"
