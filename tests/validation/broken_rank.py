@@ -26,7 +26,7 @@ PLACES = {
     "halo": (eddies.parallel.halo.PlaneHalo, "forward", 2),
     "reduction": (eddies.parallel.reduction, "_reduce", 60),
     "product": (eddies.io.hdf5, "frame_bytes", 15),  # before a collective write: the second frame
-    "checkpoint": (eddies.io.checkpoint, "own_part", 45),  # before a collective write: the second checkpoint, half written
+    "checkpoint": (eddies.io.checkpoint, "own_part", 45),  # half of the second checkpoint is written
 }
 
 TINY = Path(__file__).parents[1] / "tiny.toml"
