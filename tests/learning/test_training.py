@@ -47,7 +47,7 @@ def numbers(training):
 
 
 @pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("best, patience", [(None, None), (2, None), (2, 2)],
+@pytest.mark.parametrize("best, patience", [(None, None), (2, None), (2, 3)],
                          ids=["best at the end", "best after two steps", "of little patience"])
 def test_a_training_restored_at_any_step_is_bitwise_the_one_never_stopped(comm, best, patience):
     def begun():
