@@ -29,7 +29,7 @@ BATCH = ("sbatch", "qsub", "bsub", "flux")
 
 
 def text_of(page):
-    """What a page says; of a notebook its words, not its code."""
+    """The text of a page; for a notebook its text without code."""
     text = page.read_text(encoding="utf-8")
     if page.suffix != ".ipynb":
         return text

@@ -155,8 +155,8 @@ def test_a_dynamic_coefficient_is_found_where_the_hidden_stress_is_the_models(
 
 @pytest.mark.mpi(2)
 def test_spectral_viscosity_drains_what_an_inertial_range_brings(comm):
-    """With E = 1.4 eps^(2/3) k^(-5/3) up to the cut-off it dissipates eps, but for the sum over shells instead of an
-    integral. A resolved flow, without energy at the cut-off, loses nothing."""
+    """With E = 1.4 eps^(2/3) k^(-5/3) up to the cut-off it dissipates eps; the sum over shells replaces an integral. A
+    resolved flow, without energy at the cut-off, loses nothing."""
     grid, dissipation = make_grid(comm, 48), 0.7
     velocity = initial_fields.random_velocity(grid, 5, 1.0, 6.0)
     k, energy = energy_spectrum(grid, velocity)

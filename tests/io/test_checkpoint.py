@@ -70,7 +70,8 @@ def test_the_newest_three_are_kept(comm, tmp_path):
 
 @pytest.mark.mpi(1, 2)
 def test_which_checkpoints_are_used(comm, tmp_path, caplog, monkeypatch):
-    """Those of other kernels with a warning; leftovers, other settings and other versions not, and they are removed."""
+    """Checkpoints of other kernels are used with a warning. Leftovers, and those of other settings and versions, are
+    removed."""
     directory = fill(comm, tmp_path, [1])
     if comm.rank == 0:
         (directory.path / "step-00000002.partial").mkdir()

@@ -85,7 +85,7 @@ def test_missing_and_wrong_kind(comm, tmp_path):
 @pytest.mark.parametrize("kind, remedy", [("ground_truth", "remove it and run `eddies dns` again"),
                                           ("frames", "make it again")])
 def test_another_format_is_refused(comm, tmp_path, kind, remedy, number):
-    """Of a later version, and of eddies 0.1.0, which stored none."""
+    """A later version stores another number, and eddies 0.1.0 stored none."""
     path = write(comm, tmp_path / "a.h5", kind)
     assert product_fingerprint(path) == "abc"
     comm.Barrier()

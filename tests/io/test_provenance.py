@@ -1,4 +1,4 @@
-"""What a product says of itself: its id, and those of the products that it was made from."""
+"""Provenance of a product: its id, and the ids of the products that it was made from."""
 
 import json
 

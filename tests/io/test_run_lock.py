@@ -67,7 +67,7 @@ def test_a_job_holds_its_directory_and_leaves_nothing(comm, tmp_path):
                                                  (0, 400, False)])
 def test_a_job_elsewhere_counts_for_five_minutes_after_its_last_sign(comm, tmp_path, elsewhere, monkeypatch, silent,
                                                                      ahead, free):
-    """By the clock of the file system, also if that of the machine is ahead."""
+    """The clock of the file system counts, also if the clock of the machine is ahead."""
     put(tmp_path, elsewhere, silent)
     clock = time.time
     monkeypatch.setattr(time, "time", lambda: clock() + ahead)
@@ -82,7 +82,7 @@ def test_a_job_elsewhere_counts_for_five_minutes_after_its_last_sign(comm, tmp_p
 
 @pytest.mark.mpi(1)
 def test_a_machine_knows_which_of_its_processes_live(comm, tmp_path, monkeypatch):
-    """Whatever the signs of life say. A process number may belong to another process later."""
+    """A living process holds the lock without recent signs of life. Its number may belong to another process later."""
     process = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
     job = replace(Holder.this_job(), job="another", pid=process.pid, born=run_lock._born(process.pid))
     put(tmp_path, job, silent=3600)

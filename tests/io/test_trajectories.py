@@ -16,7 +16,7 @@ def values(frame, column):
 
 
 def write(comm, path, dtype=np.float32, starts=None):
-    """By ranks with blocks that begin at `starts`, about equal ones by default."""
+    """Write a trajectory; the blocks of ranks begin at `starts`, by default they are about equal."""
     starts = np.linspace(0, TOTAL, comm.size + 1).astype(int) if starts is None else starts
     start, stop = starts[comm.rank], starts[comm.rank + 1]
     with create_product(comm, path, "ground_truth", {}) as file:

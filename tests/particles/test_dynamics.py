@@ -20,7 +20,7 @@ from tests.particles.configurations import (
 )
 
 SKIN = 0.2
-# Of each solve for the resolved velocity, equal on any number of ranks.
+# Iterations of each solve for the resolved velocity, equal on any number of ranks.
 ITERATIONS = 8
 every_model = pytest.mark.parametrize("terms", MODELS.values(), ids=MODELS)
 

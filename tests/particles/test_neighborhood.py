@@ -21,7 +21,7 @@ def particles_at(comm, heights):
 @pytest.mark.mpi(2, 3)
 @pytest.mark.parametrize("strayed, refused", [(0.29, False), (0.35, True)])
 def test_particles_that_enter_a_slab_from_both_sides_must_not_meet(comm, strayed, refused):
-    """Their ranks do not see each other. At 0.35 they would be within the cutoff, but form no pair."""
+    """The ranks of two such particles do not exchange them. At 0.35 they are within the cutoff, but form no pair."""
     slab = SlabDecomposition(comm, LENGTH, 24)
     cutoff = LENGTH / comm.size - 0.6
     heights = [slab.upper + strayed] if comm.rank == 0 else []

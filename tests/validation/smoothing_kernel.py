@@ -1,4 +1,4 @@
-"""What an average over neighbours can tell of a filtered field at best, and moving least squares of as many. A script.
+"""Best possible averages over neighbours, and moving least squares with as many, of a filtered field. A script.
 
     python tests/validation/smoothing_kernel.py RUN [RUN ...] [--neighbors 60] [--steps 60]
 

@@ -34,7 +34,7 @@ COLOURS = {("etdrk4", ANY): TRUTH, ("etdrk4", PERCENT): SECOND, ("rk4", ANY): MO
 
 
 def amplification(stepper, z, w):
-    """What one step multiplies u by, for u' = L u + i a u with z = step L and w = step a of equal shape."""
+    """Amplification of u in a step, for u' = L u + i a u with z = step L and w = step a of equal shape."""
     z, w = np.asarray(z, complex), 1j * np.asarray(w)
     if stepper == "rk4":
         return sum((z + w) ** n / factorial for n, factorial in enumerate((1, 1, 2, 6, 24)))
@@ -65,7 +65,7 @@ def measured_growth(comm, stepper, advection, viscosity=0.0, sound=0.0):
     fluid = CompressibleFluid(grid, 0.0, sound / k) if sound else IncompressibleFluid(grid, viscosity / k**2)
 
     def amplitudes(state):
-        """Of what does not mix: sound to the right and to the left, or the transverse velocity."""
+        """Amplitudes of the eigenmodes: sound to the right and to the left, or the transverse velocity."""
         u, v, s = (state[i, 0, 0, k] if here else 0j for i in (0, 1, -1))
         c = sound / k
         return np.abs(global_sum(comm, [u + c * s, u - c * s] if sound else [v]))

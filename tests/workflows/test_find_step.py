@@ -70,7 +70,7 @@ def first_converged(sizes, errors, rms, slope):
 
 
 def velocities(comm, directory, *frames):
-    """Of all true particles at some frames, in double precision."""
+    """True velocities of all particles at some frames, in double precision."""
     with open_product(comm, directory / "ground_truth.h5", "ground_truth") as file:
         value = file["particles/tracers/velocity/value"]
         return [value[frame].astype(np.float64) for frame in frames]
@@ -126,8 +126,8 @@ def ladder(comm, integrator, evaluations, seconds, error):
 
 @pytest.mark.mpi(1)
 def test_other_integrators_are_tried_where_they_may_be_cheaper(comm):
-    """Of first order, converged up to h = 0.01; of fourth order, converged at less cost up to 0.08; and another, which
-    is given up at once."""
+    """The first-order scheme converges up to h = 0.01, the fourth-order one up to 0.08 at less cost. The third is given
+    up at once."""
     ladders = [ladder(comm, "first", 1, 1, lambda h: 10 * h), ladder(comm, "worse", 2, 2, lambda h: 30 * h),
                ladder(comm, "fourth", 4, 4, lambda h: 200 * h**4)]
     found, rung = find_step.cheapest(ladders)

@@ -20,8 +20,8 @@ from eddies.io.errors import ProductError
 from eddies.kernels.library import in_use
 from eddies.pipeline import MAKER_OF
 
-# Of the products of this version; no other is read. 1, of eddies 0.1, is not stored in the file. Since 2 the scales are
-# those at the release, and a model is a list of terms. Since 3 the filter width has its own name.
+# The format of products; other formats are not read. Format 1 (eddies 0.1) is not stored in the file. Since 2 the
+# scales are those at the release, and a model is a list of terms. Since 3 the filter width has its own name.
 FORMAT = 3
 LIBRARIES = ("numpy", "mpi4py", "h5py", "pyfftw", "torch")
 

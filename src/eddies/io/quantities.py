@@ -37,7 +37,7 @@ class Quantity(NamedTuple):
 
 PARTICLES, FIELD, ROW = "time particle", "time component z y x", "row"
 POINTS = "at the points i edge / cells of the periodic cube, i = 0, 1, ..."
-# By path in the file; the first match counts.
+# Quantities by path in the file; the first match counts.
 QUANTITIES = {
     "particles/*/id": Quantity("1", "particle", "of the particle in each row of every frame"),
     "particles/*/step": Quantity("1", "time", "number of the time step"),

@@ -47,7 +47,7 @@ class InitialFlow:
     peak: float | None = None  # largest |u| + |v| + |w| over the amplitude; None: unknown, or at rest
     wave: float | None = None  # |k| of its modes over `wavenumber`; None: it has many
     turbulent: bool = False  # it has many scales, with the spectrum's peak at `peak_wavenumber`
-    sound: bool = False  # it is at rest but for sound
+    sound: bool = False  # at rest except for sound waves
     steady: bool = False  # without viscosity nothing in it accelerates
 
     @property

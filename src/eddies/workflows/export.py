@@ -98,7 +98,7 @@ def _write_dataset(output: Path, case: str, group: str, series: Any, provenance:
     return True
 
 
-# By layout: the function that writes a series, the series that it can write, and the command that makes them.
+# Layouts: the function that writes a series, the series that it can write, and the command that makes them.
 LAYOUTS = {"vtkhdf": (_write_vtkhdf, "fields or particles", "`eddies dns SCENE`"),
            "lagrangebench": (_write_dataset, "particles that make a data set",
                              "`eddies dns SCENE` with a scene that has [tracers]")}

@@ -43,7 +43,7 @@ LATER, TURBULENT = 3.0, 20.0
 
 @dataclass(frozen=True)
 class Context:
-    """What a scene is compared with.
+    """Ranks, machine and run directory, with which a scene is compared.
 
     Parameters
     ----------

@@ -78,7 +78,7 @@ def test_ranks_for_horizons_are_those_that_the_grid_and_the_particles_accept(com
 def test_ghost_planes_limit_the_ranks():
     fields = {planes: most_ranks(load_scene(TINY, [f"tracers.field_cells={planes}"])) for planes in (11, 12)}
     assert [limits["ghost planes of the filtered fields"] for limits in fields.values()] == [2, 3]
-    # Of 20 planes two serve the splines, and further ones the particles that moved by half the skin.
+    # A slab needs two ghost planes for the splines, and more for particles that moved by half the skin.
     assert fields[12]["ghost planes of the resolved velocity"] == 20 // 3
     for overrides, ghosts in ((["simulation.step=0.2"], 3), (["simulation.skin=1"], 4)):
         assert most_ranks(load_scene(TINY, overrides))["ghost planes of the resolved velocity"] == 20 // ghosts

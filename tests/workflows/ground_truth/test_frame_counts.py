@@ -31,7 +31,7 @@ def test_frames_that_validate_are_not_trained_on(window, horizons, held_out):
 
 
 def test_the_field_loss_uses_frames_with_a_field_one_frame_later():
-    """Of 101 frames half are the window, 5 of these validate; rates need a frame on both sides."""
+    """The window is half of 101 frames, and 5 of its frames are for validation. Rates need a frame on both sides."""
     training = replace(load_scene("hit-small").training, window=0.5)
     assert trained_frames(training, FRAMES, range(0, FRAMES, 5)) == ([*range(1, 46)], 49)
     flow = replace(training, field_target="flow")

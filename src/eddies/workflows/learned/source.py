@@ -1,4 +1,4 @@
-"""What defines a model, what is stored of it beside its weights, and trained weights of another run. Needs no torch."""
+"""The definition of a model, its stored description, and trained weights of another run. Needs no torch."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What moves the particles of a rollout: the interface, the methods of the package, and how a scene chooses one."""
+"""Methods that move the particles of a rollout: the interface, the methods of the package, and their choice."""
 
 from __future__ import annotations
 

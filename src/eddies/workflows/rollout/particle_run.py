@@ -108,7 +108,7 @@ class ParticleRun:
         return allowed_step(self.integrator.scheme.angle, highest, resolution.speed)
 
     def _complaint_of_rates(self, number: int) -> str | None:
-        """What is wrong with the rates at the end of a step. The next frame and the next step use these rates."""
+        """Return a complaint if a rate at the end of a step is not finite. The next frame and step use these rates."""
         self.particles, rates = self.integrator.rates(self.particles)
         wrong = self.particles.id[~torch.isfinite(rates.acceleration).all(1)].tolist()
         return first_complaint(self.comm, f"step {number}, rank {self.comm.rank}, particle {wrong[0]}: its "
