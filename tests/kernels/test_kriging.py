@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from eddies.kernels.kriging import MOST_NEIGHBORS, kriging_weights, told
+from eddies.kernels.kriging import MOST_NEIGHBORS, kriging_weights, weighted_sums
 from eddies.particles.kriging import NOISE, Covariance
 from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.periodic_box import PeriodicBox
@@ -85,7 +85,7 @@ def test_weighted_sums(library, rows, dtype):
     field = random.standard_normal((40, 2)).astype(dtype)
     own, others = (list(random.standard_normal((rows, size)).astype(dtype)) for size in (9, len(senders)))
     others[-1][offsets[4] : offsets[5]] = np.nan
-    found = told(library, offsets, senders, own, others, field)
+    found = weighted_sums(library, offsets, senders, own, others, field)
     assert found.shape == (9, 2, rows) and found.dtype == dtype
     for row in range(rows):
         expected = own[row][:, None].astype(float) * field[:9]
@@ -103,4 +103,4 @@ def test_arrays_of_another_kind_are_refused(library):
                     {"senders": np.array([1, 2], np.int32)}, {"own": [np.zeros(3)]}, {"weights": [np.zeros(3)]},
                     {"offsets": np.array([0, 3])}):
         with pytest.raises(ValueError, match="needed"):
-            told(library, **arrays | changed)
+            weighted_sums(library, **arrays | changed)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from eddies.kernels.pairs import CompiledPairs, PairSpace, Summand, kinds
-from eddies.kernels.reconstruction import told_kernel
+from eddies.kernels.reconstruction import kernel_numbers
 from eddies.particles import context
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.model import TERMS as BUILT_IN
@@ -169,7 +169,7 @@ def test_tanh_of_a_network(library, dtype, error):
 
 
 def summand_of(kernel):
-    return Summand("kernel-sum", told_kernel(kernel.support, kernel.pieces.numpy()), (1.0,))
+    return Summand("kernel-sum", kernel_numbers(kernel.support, kernel.pieces.numpy()), (1.0,))
 
 
 def kernel_sums(library, position, kernel=CubicSpline(CUTOFF), **options):

@@ -7,7 +7,7 @@ import torch
 from eddies.flow.tracers import release
 from eddies.parallel.reduction import global_max
 from eddies.parallel.slab import SlabDecomposition
-from eddies.particles.forms import DEGREES, form_of
+from eddies.particles.forms import DEGREES, Form
 from eddies.particles.kriging import Covariance
 from eddies.particles.particle_field import RIDGE, ParticleField
 from eddies.particles.smoothing_kernels import CubicSpline, HermiteKernel, WendlandC2
@@ -23,7 +23,7 @@ SIGNED = torch.tensor([2.0, 1.0, -0.4, 0.2], dtype=torch.float64)
 
 
 def form(name, kernel=None):
-    return form_of(name, kernel or WendlandC2(SUPPORT), 2 * SPACING, SPACING**3)
+    return Form(name, kernel or WendlandC2(SUPPORT), 2 * SPACING, SPACING**3)
 
 
 def field_of(comm, velocity, placement="random", move=lambda x: x, dtype=torch.float64):

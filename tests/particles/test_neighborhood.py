@@ -26,7 +26,7 @@ def test_particles_that_enter_a_slab_from_both_sides_must_not_meet(comm, strayed
     cutoff = LENGTH / comm.size - 0.6
     heights = [slab.upper + strayed] if comm.rank == 0 else []
     heights += [slab.lower - strayed] if comm.rank == 2 % comm.size else []
-    neighborhood = Neighborhood(slab, LENGTH, cutoff, 0.0)
+    neighborhood = Neighborhood(slab, cutoff, 0.0)
     assert (LENGTH / comm.size - 2 * strayed < cutoff) == refused
     if refused:
         with pytest.raises(HaloError):
@@ -42,7 +42,7 @@ def test_all_ranks_name_a_particle_far_from_its_slab(comm, z, complaint):
     slab = SlabDecomposition(comm, LENGTH, 24)
     below = z if comm.size > 1 else z - LENGTH
     heights = [slab.upper - 0.1, below if comm.rank == comm.size - 1 else slab.lower]
-    neighborhood, particles = Neighborhood(slab, LENGTH, 1.0, 0.0), particles_at(comm, heights)
+    neighborhood, particles = Neighborhood(slab, 1.0, 0.0), particles_at(comm, heights)
     if comm.size == 1 and math.isfinite(z):
         neighborhood.update(particles)
         return

@@ -19,7 +19,7 @@ from eddies.io.hdf5 import open_product
 from eddies.kernels.library import library
 from eddies.kernels.neighbors import Box
 from eddies.kernels.reconstruction import fitted as fitted_by
-from eddies.kernels.reconstruction import told_kernel
+from eddies.kernels.reconstruction import kernel_numbers
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.particle_field import grid_points
@@ -111,7 +111,7 @@ def fitted(points, position, velocity, support, degree):
     neighbors, weights = NeighborList(PeriodicBox(BOX_LENGTH), support, 0.0), WendlandC2(support)
     neighbors.build(points, position, exclude_self=False)
     values = torch.from_numpy(fitted_by(
-        library(), Box(BOX_LENGTH, True), degree, told_kernel(support, weights.pieces.numpy()),
+        library(), Box(BOX_LENGTH, True), degree, kernel_numbers(support, weights.pieces.numpy()),
         BOX_LENGTH**3 / len(position), LEAST_WEIGHT, neighbors.offsets.numpy(), neighbors.senders.numpy(),
         points.numpy(), position.numpy(), velocity.numpy()))
     return values[:, 0], values[:, 1:].transpose(1, 2)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from eddies.kernels.pairs import CompiledPairs, Summand
-from eddies.kernels.reconstruction import told_kernel
+from eddies.kernels.reconstruction import kernel_numbers
 from eddies.learning import optimization
 from eddies.particles import pairs
 from eddies.scene.scene import load_scene
@@ -38,7 +38,7 @@ def test_training_evaluates_pairs_with_ghosts_and_sums_gradients(comm, tmp_path,
         def gradients(self, summands, parameters, by_sums, columns):
             space, position, wanted = self.given
             # A kernel that is 1 within the radius counts them.
-            one = Summand("kernel-sum", told_kernel(space.radius, np.ones((1, 1))), (1.0,))
+            one = Summand("kernel-sum", kernel_numbers(space.radius, np.ones((1, 1))), (1.0,))
             found = self.sums([one], [np.empty(0)])[0]
             evaluated.append(([each.kind for each in summands], space, position, wanted, float(found[0, wanted].sum())))
             return super().gradients(summands, parameters, by_sums, columns)

@@ -33,7 +33,7 @@ class Blocks:
 
     @classmethod
     def of(cls, times: np.ndarray, shortest: float) -> "Blocks":
-        """As many blocks as are at least `shortest` long, without empty ones; one if the times span less than two."""
+        """The largest number of blocks that are at least `shortest` long, or one block; empty blocks are left out."""
         span = float(times[-1] - times[0])
         count = max(min(int(span / shortest + 1e-9), len(times)), 1)
         block = ((times - times[0]) * (count / max(span, 1e-300)) + 1e-9).astype(int).clip(max=count - 1)

@@ -5,6 +5,7 @@ u' is the rms of a velocity component, L the integral scale, eps the dissipation
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -131,7 +132,7 @@ class StationarySpan:
         """Slope of the regression line of the energy over its mean, per turnover."""
         return self._blocks.trend(self.columns["energy"] / self.mean("energy"))
 
-    @property
+    @cached_property
     def _blocks(self) -> Blocks:
         return Blocks.of(self.columns["turnovers"], 1.0)
 

@@ -1,5 +1,5 @@
-// What is copied around the one-dimensional transforms of a slab: each function reads and writes the memory once.
-// spectral/copies.py is the definition. Complex numbers are real and imaginary part, one after the other.
+// Copies around the one-dimensional transforms of a slab; each function reads and writes the memory once.
+// tests/kernels/test_copies.py compares them with numpy. Complex numbers are real and imaginary part, one after the other.
 
 #include <cstdint>
 #include <vector>

@@ -1,5 +1,5 @@
 // Pointwise formulas of the direct numerical simulation: each reads and writes the memory once.
-// tests/kernels/reference_formulas.py has the definitions. Complex numbers are real and imaginary part.
+// tests/kernels/test_flow.py compares them with numpy. Complex numbers are real and imaginary part.
 
 #include <algorithm>
 #include <cstdint>

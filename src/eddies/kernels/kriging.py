@@ -19,7 +19,7 @@ class _Kriging(ctypes.Structure):
                 + members(ADDRESS, "amplitudes own weights"))
 
 
-class _Told(ctypes.Structure):
+class _Sums(ctypes.Structure):
     _fields_ = members(INT, "receivers rows columns") + members(ADDRESS, "offsets senders own weights field result")
 
 
@@ -52,8 +52,8 @@ def kriging_weights(library: ctypes.CDLL, offsets: np.ndarray, displacement: np.
     return own, weights
 
 
-def told(library: ctypes.CDLL, offsets: np.ndarray, senders: np.ndarray, own: Sequence[np.ndarray] | None,
-         weights: Sequence[np.ndarray], field: np.ndarray) -> np.ndarray:
+def weighted_sums(library: ctypes.CDLL, offsets: np.ndarray, senders: np.ndarray, own: Sequence[np.ndarray] | None,
+                  weights: Sequence[np.ndarray], field: np.ndarray) -> np.ndarray:
     """own_i f_i + sum_j weights_ij f_j, (n, c, rows), for one, three, four or ten rows of weights.
 
     Parameters
@@ -76,7 +76,7 @@ def told(library: ctypes.CDLL, offsets: np.ndarray, senders: np.ndarray, own: Se
         require(row, senders.shape, dtype)
     result = np.empty((receivers, field.shape[1], rows), dtype)
     of_own, of_weights = (np.array([address(row) for row in some], np.uint64) for some in (own, weights))
-    given = _Told(receivers, rows, field.shape[1], address(offsets), address(senders),
+    given = _Sums(receivers, rows, field.shape[1], address(offsets), address(senders),
                   address(of_own) if sited else None, *map(address, (of_weights, field, result)))
     getattr(library, f"told_{dtype}")(ctypes.byref(given))
     return result

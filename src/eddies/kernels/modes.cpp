@@ -1,5 +1,5 @@
 // Passes over the Fourier modes of a vector field, for conjugate gradients on solenoidal ones: each reads and writes
-// the memory once; particles/least_squares.py has them as formulas. Sums are made in double precision plane by plane,
+// the memory once; kernels/modes.py documents them. Sums are made in double precision plane by plane,
 // and these summed in order, so that nothing depends on the number of threads.
 
 #include <cstdint>

@@ -1,5 +1,5 @@
 // Moving least squares: at each receiver the polynomial of first or second degree that fits what particles around it
-// carry best, with a smoothing kernel as weight; eddies/particles/reconstruction.py has the definition.
+// carry best, with a smoothing kernel as weight; `ParticleField.fitted` in particles/particle_field.py has the equation.
 
 #include <algorithm>
 #include <cmath>
@@ -10,7 +10,7 @@
 extern "C" {
 
 // Receivers and the particles listed near them in compressed rows, some of which may be beyond the kernel's support;
-// kernels/moving_least_squares.py has the same structure.
+// kernels/reconstruction.py has the same structure.
 struct Fit {
     std::int64_t receivers, periodic_z;
     double length, volume, ridge;     // edge of the box; mean volume of a particle; see the definition

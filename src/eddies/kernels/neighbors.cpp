@@ -17,8 +17,8 @@ struct Search {
     std::int64_t* offsets;      // (receivers + 1), where the senders of each begin
 };
 
-// Those pairs of a list that are within a radius now, and for receivers that are senders, if `once`, the first of both
-// orders of each alone. `rows` (count) are the receivers asked for. Outputs are given in the second of two calls.
+// The pairs of a list that are within a radius now, for the receivers `rows` (count). Outputs are given in the second of
+// two calls.
 struct Listed {
     std::int64_t count;
     const std::int64_t *rows, *offsets, *sender;
@@ -26,7 +26,6 @@ struct Listed {
     double length;
     std::int64_t periodic_z;
     double radius;
-    std::int64_t once;
     std::int64_t* first;        // (count + 1), where the pairs of each row begin
     std::int64_t *receiver, *segment, *found;
     void *displacement, *distance;  // (3, pairs) and (pairs)
@@ -92,7 +91,6 @@ inline void each_pair(const Listed& list, std::int64_t row, const Visit& visit) 
     const double limit = list.radius * list.radius;
     for (std::int64_t at = list.offsets[i]; at < list.offsets[i + 1]; ++at) {
         const std::int64_t j = list.sender[at];
-        if (list.once && j < i) continue;
         const Between found = between(list, list.receivers + 3 * i, list.positions + 3 * j);
         if (found.square < limit) visit(i, j, found);
     }

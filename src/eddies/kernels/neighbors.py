@@ -27,7 +27,7 @@ class _Search(ctypes.Structure):
 class _Listed(ctypes.Structure):
     _fields_ = (members(INT, "count") + members(ADDRESS, "rows offsets sender receivers positions")
                 + members(NUMBER, "length") + members(INT, "periodic_z") + members(NUMBER, "radius")
-                + members(INT, "once") + members(ADDRESS, "first receiver segment found displacement distance"))
+                + members(ADDRESS, "first receiver segment found displacement distance"))
 
 
 def neighbors_within(library: ctypes.CDLL, box: Box, radius: float, receivers: np.ndarray, senders: np.ndarray,
@@ -48,17 +48,15 @@ def neighbors_within(library: ctypes.CDLL, box: Box, radius: float, receivers: n
 
 
 def pairs_within(library: ctypes.CDLL, box: Box, radius: float, receivers: np.ndarray, senders: np.ndarray,
-                 offsets: np.ndarray, listed: np.ndarray, rows: np.ndarray, once: bool,
-                 kind: np.dtype) -> tuple[np.ndarray, ...]:
+                 offsets: np.ndarray, listed: np.ndarray, rows: np.ndarray, kind: np.dtype) -> tuple[np.ndarray, ...]:
     """The pairs of a list that are within a radius now, for the receivers `rows` (k,).
 
     Returns the rows of receiver, output and sender (m,), displacements to the nearest image (3, m), and distances (m,).
-    With `once` only one of the two orders of a pair is returned.
     """
     receivers, senders = (np.ascontiguousarray(points, np.float64) for points in (receivers, senders))
     rows, first = np.ascontiguousarray(rows, np.int64), np.empty(len(rows) + 1, np.int64)
     given = _Listed(len(rows), *map(address, (rows, offsets, listed, receivers, senders)), box.length,
-                    box.periodic_z, radius, once, address(first))
+                    box.periodic_z, radius, address(first))
     library.neighbors_count(ctypes.byref(given))
     indices, count = np.empty((3, first[-1]), np.int64), first[-1]
     displacement, distance = np.empty((3, count), kind), np.empty(count, kind)

@@ -34,7 +34,7 @@ class _Fit(ctypes.Structure):
                 + members(ADDRESS, "offsets senders receiver position value kernel found"))
 
 
-def told_kernel(support: float, pieces: np.ndarray, signed: bool = False) -> tuple[float, ...]:
+def kernel_numbers(support: float, pieces: np.ndarray, signed: bool = False) -> tuple[float, ...]:
     """A smoothing kernel W as numbers for the library.
 
     Parameters
@@ -46,23 +46,23 @@ def told_kernel(support: float, pieces: np.ndarray, signed: bool = False) -> tup
     return support, -np.inf if signed else 0.0, *map(float, pieces.shape), *map(float, pieces.ravel())
 
 
-def sums_on_grid(library: ctypes.CDLL, grid: GridPlanes, told: tuple[float, ...], position: np.ndarray,
+def sums_on_grid(library: ctypes.CDLL, grid: GridPlanes, numbers: tuple[float, ...], position: np.ndarray,
                  columns: np.ndarray) -> np.ndarray:
     """sum_j c_j W(x - x_j) of columns c (n, 4) of particles (n, 3) at the points of the planes, (points, 4).
 
-    `told` is W as `told_kernel` returns it. The result has the precision of the columns.
+    `numbers` are W as `kernel_numbers` returns it. The result has the precision of the columns.
     """
     position, columns = np.ascontiguousarray(position, np.float64), np.ascontiguousarray(columns)
     if columns.shape != (len(position), 4):
         raise ValueError(f"columns {columns.shape} of {len(position)} particles: four are needed")
-    sums, kernel = np.empty((grid.planes * grid.cells**2, 4), columns.dtype), np.array(told)
-    given = _Reconstruction(len(position), grid.cells, grid.first, grid.planes, grid.periodic_z, grid.spacing, told[0],
-                            *map(address, (position, kernel, columns, sums)))
+    sums, kernel = np.empty((grid.planes * grid.cells**2, 4), columns.dtype), np.array(numbers)
+    given = _Reconstruction(len(position), grid.cells, grid.first, grid.planes, grid.periodic_z, grid.spacing,
+                            numbers[0], *map(address, (position, kernel, columns, sums)))
     getattr(library, f"reconstruction_sums_{columns.dtype}")(ctypes.byref(given))
     return sums
 
 
-def fitted(library: ctypes.CDLL, box: Box, degree: int, told: tuple[float, ...], volume: float, ridge: float,
+def fitted(library: ctypes.CDLL, box: Box, degree: int, numbers: tuple[float, ...], volume: float, ridge: float,
            offsets: np.ndarray, senders: np.ndarray, receivers: np.ndarray, positions: np.ndarray,
            values: np.ndarray) -> np.ndarray:
     """Moving least squares: values and their derivatives along x, y and z, (n, 4, 3), of the best polynomials.
@@ -71,13 +71,13 @@ def fitted(library: ctypes.CDLL, box: Box, degree: int, told: tuple[float, ...],
 
     Parameters
     ----------
-    degree : of the polynomials, 1 or 2. told : the weight W as `told_kernel` returns it.
+    degree : of the polynomials, 1 or 2. numbers : the weight W as `kernel_numbers` returns it.
     volume : mean volume of a particle. ridge : see the definition.
     offsets, senders : int64 (n + 1,) and (m,), the particles listed near each receiver; some may be too far.
     receivers (n, 3), positions and values (s, 3), in double precision.
     """
-    kernel = np.array(told)
-    offsets, senders = (np.ascontiguousarray(numbers, np.int64) for numbers in (offsets, senders))
+    kernel = np.array(numbers)
+    offsets, senders = (np.ascontiguousarray(rows, np.int64) for rows in (offsets, senders))
     receivers, positions, values = (np.ascontiguousarray(a, np.float64) for a in (receivers, positions, values))
     found = np.empty((len(receivers), 4, 3))
     given = _Fit(len(receivers), box.periodic_z, box.length, volume, ridge,

@@ -1,4 +1,4 @@
-// Tensor-product B-splines between points and the planes of a periodic grid; spectral/splines.py is the definition.
+// Tensor-product B-splines between points and the planes of a periodic grid; tests/kernels/reference_splines.py is a reference.
 //
 // Points are put in order of place once, into bins. What the splines around the points of a bin reach is copied to a
 // tile that fits a core's first cache, in which the components of a grid point are neighbours, and spread points are

@@ -29,7 +29,7 @@ HISTOGRAM_BINS, HISTOGRAM_REACH = 41, 5.0
 
 @dataclass(frozen=True)
 class LossWeights:
-    """Weights over that of the trajectory loss: of the other losses of Eq. 15, and of the power, which is not in it."""
+    """Weights of the other losses; that of the trajectory loss is 1. The power loss is not part of Eq. 15."""
 
     field: float = 0.0
     velocity_kl: float = 0.0
@@ -132,7 +132,7 @@ class TrainingFrame:
             around, averaged = self.dynamics.neighborhood, self.averaged
             # The model's list serves if it reaches as far and belongs to the same positions.
             if around is None or around.cutoff < kernel.support * (1 - 1e-9) or self.later is not None:
-                around = Neighborhood(self.decomposition, self.decomposition.length, kernel.support, 0.0)
+                around = Neighborhood(self.decomposition, kernel.support, 0.0)
                 around.update(averaged)
             position = around.local(averaged.position).position
             pairs = around.neighbors.pairs(position[: len(self.particles)], position, dtype=self.acceleration.dtype)
@@ -277,10 +277,10 @@ class ForceTrainer:
         Without a field the error is <a - a_true> at the true positions: both velocities one step ahead are averaged by
         the kernel. The kernel's own error is far larger than the change in a step, and the force cannot correct it.
 
-        With a filtered field u one frame later, the error is (<v> - u) / span. Here v = v_before + span a is the
-        model's velocity after a midpoint step from the frame before to the frame after, span its length. As a is
-        compared with centred differences, v is the true velocity then plus span (a - a_true). The positions after such
-        a step do not depend on a: they are the true ones. So this error is the one without a field plus the kernel's
+        With a filtered field u one frame later, the error is (<v> - u) / span. v = v_before + span a is the model's
+        velocity after a midpoint step of length span, from the frame before to the frame after. True accelerations are
+        centred differences, so v is the true velocity at its end plus span (a - a_true). The positions at its end do
+        not depend on a: they are the true ones. This error is therefore the one without a field, plus the kernel's
         error for the true particles over span.
         """
         within, later, points = frame.within(self.kernel), frame.later, self._points[inside]

@@ -71,5 +71,5 @@ class Adam:
 
 def shared_values(comm: Comm, shares: Mapping[str, Tensor]) -> dict[str, float]:
     """The global losses by name: sums of the shares of all ranks, in one message."""
-    own = torch.stack([share.detach().double() for share in shares.values()])
-    return dict(zip(shares, global_sum(comm, own.cpu().numpy()).tolist()))
+    own = np.array([float(share.detach()) for share in shares.values()])  # they may be on different devices
+    return dict(zip(shares, global_sum(comm, own).tolist()))

@@ -105,8 +105,8 @@ class RolloutTrainer:
 
     def _energy_share(self, window: TrainingWindow, frame: int, particles: ParticleSet) -> Tensor:
         """This rank's equal part of the squared error of the energies by bands."""
-        # The solve starts from zero, as for the truth: a forecast would leave its traces in the energies. On the way
-        # back it starts from its own solution, so that it takes no iteration.
+        # The solve starts from zero, as for the truth: a prediction would change the energies. In the backward
+        # pass it starts from its own solution and takes no iteration.
         near: Tensor | None = None
 
         def energies_of(position: Tensor, velocity: Tensor) -> Tensor:

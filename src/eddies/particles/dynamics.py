@@ -46,7 +46,7 @@ class ParticleDynamics:
         if "resolved" in model.reads:
             self.resolution = ResolvedVelocity.on_slabs(decomposition, model.flow, skin / 2 + drift, dtype)
         if "pairs" in model.reads:
-            self.neighborhood = Neighborhood(decomposition, decomposition.length, model.flow.cutoff, skin)
+            self.neighborhood = Neighborhood(decomposition, model.flow.cutoff, skin)
 
     def forget(self) -> None:
         """Rebuild halo and list at the next evaluation.

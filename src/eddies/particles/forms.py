@@ -102,8 +102,3 @@ class Form:
                         "replaces kriging there", len(failed), len(points))
             velocity[failed], gradient[failed] = self._fitted(field, points[failed], 2)
         return velocity, gradient
-
-
-def form_of(name: str, kernel: SmoothingKernel, filter_width: float, mean_volume: float) -> Form:
-    """Return the form that [kernel] form names; arguments as for `Form`."""
-    return Form(name, kernel, filter_width, mean_volume)

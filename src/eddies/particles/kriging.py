@@ -57,8 +57,8 @@ def interpolated(pairs: Pairs, support: float, covariance: Covariance, sender_va
     """
     _, weights = kriging_weights(pairs, support, covariance, sited=False)
     values = sender_values.to(pairs.displacement.dtype).contiguous()
-    sums = torch.from_numpy(compiled.told(library(), pairs.offsets.numpy(), pairs.sender.numpy(), None,
-                                          weights[UP_TO_FIRST], values.numpy()))
+    sums = torch.from_numpy(compiled.weighted_sums(library(), pairs.offsets.numpy(), pairs.sender.numpy(), None,
+                                                   weights[UP_TO_FIRST], values.numpy()))
     return sums[..., OWN], sums[..., FIRST]
 
 
@@ -143,8 +143,8 @@ class Kriging:
             rows = [own_row[:, None] * seen[: len(own_row)] + self._matrix(row) @ seen
                     for own_row, row in zip(own, others)]
             return torch.stack(rows, -1).to(field.device)
-        rows = compiled.told(library(), self._offsets.numpy(), self._senders.numpy(), own.numpy(),
-                             [row.numpy() for row in others], seen.detach().contiguous().numpy())
+        rows = compiled.weighted_sums(library(), self._offsets.numpy(), self._senders.numpy(), own.numpy(),
+                                      [row.numpy() for row in others], seen.detach().contiguous().numpy())
         return torch.from_numpy(rows).to(field.device)
 
     def _matrix(self, values: Tensor) -> Tensor:

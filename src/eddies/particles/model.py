@@ -160,7 +160,7 @@ class LagrangianModel(nn.Module):
             direct = self._with_parameters(term, context, others)
             context.forget_sums(term)
             expected = replace(kept, parameters=others).at(None)
-            # Norms over all particles: at a single particle contributions may cancel to rounding.
+            # Norms over this rank's particles: at a single particle contributions may cancel to rounding.
             wrong = [rate for rate in STORED if getattr(direct, rate) is not None and not (
                 (getattr(expected, rate) - getattr(direct, rate)).norm() <= 1e-3 * getattr(direct, rate).norm())]
             if any_rank(context.comm, bool(wrong)):

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from eddies.kernels.library import library
-from eddies.kernels.neighbors import Box, neighbors_within, pairs_within
+from eddies.kernels.neighbors import neighbors_within, pairs_within
 from eddies.particles.devices import kernels_serve
 from eddies.particles.pairs import Pairs, gather_rows
 from eddies.particles.particle_set import as_numpy
@@ -36,7 +36,6 @@ class NeighborList:
             raise ValueError(f"cutoff {cutoff:.6g} and skin {skin:.6g}: the cutoff must be positive, and their sum "
                              f"less than half the box, {box.length / 2:.6g}")
         self.box, self.cutoff, self.skin = box, cutoff, skin
-        self._space = Box(box.length, box.periodic_z)
 
     def build(self, receivers: Tensor, senders: Tensor, exclude_self: bool) -> None:
         """List the pairs of receivers (n, 3) and senders (s, 3).
@@ -48,7 +47,7 @@ class NeighborList:
             raise ValueError("neighbour list: a position is not finite")
         # Slightly too large: `pairs` decides for both orders of a pair alike whether it lies within the cutoff.
         reach = (self.cutoff + self.skin) * (1 + 1e-9)
-        columns = neighbors_within(library(), self._space, reach, as_numpy(receivers), as_numpy(senders), exclude_self)
+        columns = neighbors_within(library(), self.box, reach, as_numpy(receivers), as_numpy(senders), exclude_self)
         self.offsets, self.senders = (torch.from_numpy(column).to(receivers.device) for column in columns)
 
     def blocks(self, together: int) -> Iterator[slice]:
@@ -93,8 +92,8 @@ class NeighborList:
 
     def _compiled_pairs(self, receivers: Tensor, senders: Tensor, numbers: Tensor, dtype: torch.dtype) -> Pairs:
         kind = np.dtype(str(dtype).removeprefix("torch."))
-        columns = pairs_within(library(), self._space, self.cutoff, as_numpy(receivers), as_numpy(senders),
-                               self.offsets.numpy(), self.senders.numpy(), numbers.numpy(), False, kind)
+        columns = pairs_within(library(), self.box, self.cutoff, as_numpy(receivers), as_numpy(senders),
+                               self.offsets.numpy(), self.senders.numpy(), numbers.numpy(), kind)
         receiver, segment, sender, displacement, distance = map(torch.from_numpy, columns)
         return Pairs(receiver, segment, sender, displacement.T, distance, len(numbers))
 

@@ -77,14 +77,13 @@ class Neighborhood:
     Parameters
     ----------
     decomposition : slabs.
-    length : side of the periodic box.
     cutoff : radius of the neighbour list. A rank sees as far beyond its particles.
     skin : extra radius. Halo and list are valid until some particle of any rank has moved by half of it.
     """
 
-    def __init__(self, decomposition: SlabDecomposition, length: float, cutoff: float, skin: float) -> None:
+    def __init__(self, decomposition: SlabDecomposition, cutoff: float, skin: float) -> None:
         self.decomposition, self.cutoff, self.skin = decomposition, cutoff, skin
-        self.box = PeriodicBox(length, periodic_z=decomposition.size == 1)
+        self.box = PeriodicBox(decomposition.length, periodic_z=decomposition.size == 1)
         self._neighbors = NeighborList(self.box, cutoff, skin)
         self._unlisted: Tensor | None = None
         self.builds = 0

@@ -9,9 +9,8 @@ import torch
 from torch import Tensor
 
 from eddies.kernels.library import library
-from eddies.kernels.neighbors import Box
 from eddies.kernels.pairs import PairSpace
-from eddies.kernels.reconstruction import GridPlanes, fitted, sums_on_grid, told_kernel
+from eddies.kernels.reconstruction import GridPlanes, fitted, sums_on_grid, kernel_numbers
 from eddies.parallel.halo import HaloExchange
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.exchanges import exchange_ghost_positions, exchange_ghosts
@@ -48,6 +47,7 @@ class ParticleField:
     def __init__(self, decomposition: SlabDecomposition, support: float, position: Tensor, velocity: Tensor,
                  dtype: torch.dtype = torch.float32) -> None:
         self.decomposition, self.dtype, self.owned, self.support = decomposition, dtype, position, support
+        self._box = PeriodicBox(decomposition.length, periodic_z=decomposition.size == 1)
         self.halo = HaloExchange(decomposition, as_numpy(position), support)
         self._position = torch.cat([position, exchange_ghost_positions(self.halo, position)])
         self._velocity = self._with_ghosts(velocity).to(dtype)
@@ -104,7 +104,7 @@ class ParticleField:
         """Average velocity (m, 3) at all of this rank's grid points; cheaper than with its gradient."""
         slab = self.decomposition
         weighted = volume.unsqueeze(1) * torch.cat([torch.ones_like(volume).unsqueeze(1), self._velocity], dim=1)
-        planes = GridPlanes(slab.planes, slab.spacing, slab.start, slab.count, slab.size == 1)
+        planes = GridPlanes(slab.planes, slab.spacing, slab.start, slab.count, self._box.periodic_z)
         sums = torch.from_numpy(sums_on_grid(library(), planes, _for_library(kernel), self._position.numpy(),
                                              weighted.numpy()))
         return sums[:, 1:] * normalisation(kernel, sums[:, :1])
@@ -122,8 +122,8 @@ class ParticleField:
         neighbours are few, distant or badly placed, the ridge dominates and leaves the average with the weight W. The
         result is zero where no particle lies within the support.
         """
-        neighbors, slab = self._neighbors_of(receivers), self.decomposition
-        values = fitted(library(), Box(slab.length, slab.size == 1), degree, _for_library(kernel), mean_volume, RIDGE,
+        neighbors = self._neighbors_of(receivers)
+        values = fitted(library(), self._box, degree, _for_library(kernel), mean_volume, RIDGE,
                         neighbors.offsets.numpy(), neighbors.senders.numpy(), receivers.numpy(),
                         self._position.numpy(), self._velocity.numpy())
         result = torch.from_numpy(values).to(self.dtype)
@@ -141,7 +141,7 @@ class ParticleField:
     def _sums(self, kernel: SmoothingKernel, kind: str, components: int, position: Tensor, count: int,
               scalars: tuple[Tensor, ...] = ()) -> Tensor:
         """Sums over the particles within the support, (components, count), at the first `count` positions."""
-        space = PairSpace(self.decomposition.length, self.decomposition.size == 1, kernel.support, 1.0, 1.0, False)
+        space = PairSpace(self._box.length, self._box.periodic_z, kernel.support, 1.0, 1.0, False)
         summand = CompiledSum(kind, _for_library(kernel), scalars=scalars, reads_velocity=False)
         sums, = compiled_sums(space, [summand], [torch.ones(components)], position, None,
                               np.arange(len(position)) < count, self.dtype)
@@ -158,8 +158,7 @@ class ParticleField:
         return self._neighbors_of(self.points)
 
     def _neighbors_of(self, receivers: Tensor) -> NeighborList:
-        box = PeriodicBox(self.decomposition.length, periodic_z=self.decomposition.size == 1)
-        neighbors = NeighborList(box, self.support, 0.0)
+        neighbors = NeighborList(self._box, self.support, 0.0)
         neighbors.build(receivers, self._position, exclude_self=False)
         return neighbors
 
@@ -175,7 +174,7 @@ def grid_points(slab: SlabDecomposition, cells: int) -> Tensor:
 
 def _for_library(kernel: SmoothingKernel) -> tuple[float, ...]:
     """The kernel as the numbers that the compiled library takes."""
-    return told_kernel(kernel.support, kernel.pieces.numpy(), kernel.mean_volume is not None)
+    return kernel_numbers(kernel.support, kernel.pieces.numpy(), kernel.mean_volume is not None)
 
 
 def _table_sums(kernel: HermiteKernel, pairs: Pairs) -> Tensor:

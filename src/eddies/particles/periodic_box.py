@@ -7,15 +7,16 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from eddies.kernels.neighbors import Box
+
 
 @dataclass(frozen=True)
-class PeriodicBox:
+class PeriodicBox(Box):
     """Cube of side `length`, periodic in x and y, and in z unless `periodic_z` is False.
 
     With several ranks z is an ordinary coordinate in a slab: the ghosts arrive with the z at which the slab sees them.
     """
 
-    length: float
     periodic_z: bool = True
 
     def nearest_image(self, difference: Tensor, axis: int) -> Tensor:

@@ -242,11 +242,11 @@ class ResolvedVelocity:
         """Predict the modes at a time; None without earlier evaluations.
 
         The nearer of the last two evaluations at different times is extrapolated with the rates of both (Adams and
-        Bashforth). It moves with the mean velocity (3,) of the particles. Each mode is reduced by the expected error: a
-        flow with rms `speed` u' of a component turns the phase of a mode by theta = k u' dt in a time dt, and the
-        prediction misses (5/12) theta^3, or 1.6 times the rms for normally distributed velocities. The factor
-        1 / (1 + (2 theta)^6) removes modes that two or three u' would spoil. A wrong mode is worse than a missing one:
-        it is corrected only near particles and grows elsewhere.
+        Bashforth). It moves with the mean velocity (3,) of the particles. Each mode is reduced by its expected
+        error. In a time dt a flow with rms `speed` u' of a component turns the phase of a mode by theta = k u' dt. The
+        prediction then misses (5/12) theta^3, or 1.6 times the rms for normally distributed velocities. The factor
+        1 / (1 + (2 theta)^6) removes modes that velocities of two or three u' would spoil. A wrong mode is
+        worse than a missing one: it is corrected only near particles and grows elsewhere.
         """
         if not self._moments:
             return None
@@ -312,9 +312,9 @@ class ResolvedVelocity:
     def _adjoint(self, flow: ResolvedFlow) -> Callable[[Tensor], Tensor]:
         """Function from the gradient by modes of the minimum to the gradient by the descent there.
 
-        By the implicit function theorem: the descent d(u; x, v) vanishes at the minimum and changes with u by -A, so
-        du = A^-1 dd. A is symmetric in the inner product that weights modes by their multiplicity m; its transpose is
-        therefore m A (1/m).
+        It follows from the implicit function theorem. The descent d(u; x, v) vanishes at the minimum and changes with u
+        by -A, so du = A^-1 dd. A is symmetric in the inner product that weights modes by their multiplicity m. Its
+        transpose is therefore m A (1/m).
         """
         grid, count = self.grid, float(global_sum(self.grid.decomposition.comm, len(flow.relative_velocity)))
 
@@ -360,10 +360,10 @@ class _Solution(torch.autograd.Function):
         return ctx.adjoint(gradient), None, None
 
 
-def dissipation_range(wavenumber: np.ndarray) -> np.ndarray:
-    """f(k eta) = exp(-5.2 ((k eta)^4 + 0.4^4)^(1/4) + 5.2 * 0.4), the factor of spectra in the dissipation range (Pope
-    2000, Eq. 6.248), as a function of `wavenumber`, k eta."""
-    return np.exp(DISSIPATION * (DISSIPATION_ONSET - (wavenumber**4 + DISSIPATION_ONSET**4) ** 0.25))
+def dissipation_range(k_eta: np.ndarray) -> np.ndarray:
+    """Factor of spectra in the dissipation range, exp(-5.2 ((k eta)^4 + 0.4^4)^(1/4) + 5.2 * 0.4) (Pope 2000, Eq.
+    6.248)."""
+    return np.exp(DISSIPATION * (DISSIPATION_ONSET - (k_eta**4 + DISSIPATION_ONSET**4) ** 0.25))
 
 
 def _prior(grid: FourierGrid, filter_width: float, kolmogorov_length: float,

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from eddies.analysis.lagrangian import evenly
 from eddies.io.checkpoint import Guard
 from eddies.io.hdf5 import open_product
 from eddies.io.provenance import product_provenance
@@ -24,7 +25,7 @@ from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import StopRequest
 from eddies.particles.devices import prepare_torch
 from eddies.particles.flow_units import ReferenceScales
-from eddies.particles.forms import DEGREES, form_of
+from eddies.particles.forms import DEGREES, Form
 from eddies.particles.particle_field import ParticleField
 from eddies.particles.smoothing_kernels import CubicSpline, KernelNetwork, SmoothingKernel, WendlandC2, integral
 from eddies.pipeline import STAGES
@@ -55,7 +56,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     with open_product(comm, directory / STAGES["dns"].file, "ground_truth") as file:
         truth = GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, scene.tracers.cells))
         seen = np.flatnonzero(truth.fields.times <= scene.window * truth.times[-1])
-        chosen = np.unique(np.linspace(0, len(seen) - 1, KERNEL_FIELDS).astype(int))
+        chosen = evenly(len(seen), KERNEL_FIELDS)
         samples = [load_sample(truth, index, support) for index in chosen]
         unseen, scales = load_sample(truth, len(truth.fields.times) - 1, support), truth.scales
     guard = Guard(comm, directory / STAGES["train-kernel"].checkpoints, stage_fingerprint(scene, "train-kernel"), stop,
@@ -166,7 +167,7 @@ def errors_of_forms(kernel: SmoothingKernel, sample: KernelSample, scales: Refer
     """Errors on a field of the forms of reconstruction other than averages; collective."""
     errors = {}
     for name in OTHER_FORMS if kernel.mean_volume is None else ():
-        made = form_of(name, kernel, scales.filter_width, scales.spacing**3).of(sample.particles)
+        made = Form(name, kernel, scales.filter_width, scales.spacing**3).of(sample.particles)
         errors[f"velocity_error_{name}"], errors[f"gradient_error_{name}"] = sample.errors_of(
             *made.at(sample.particles.points))
     return errors

@@ -5,7 +5,7 @@ import pytest
 
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.flow_units import ReferenceScales
-from eddies.particles.forms import form_of
+from eddies.particles.forms import Form
 from eddies.particles.smoothing_kernels import CubicSpline
 from eddies.workflows.rollout.particle_measures import (FieldsOfParticles, ParticleSpectra, ReconstructedFields,
                                                         WithGradients)
@@ -86,7 +86,7 @@ def test_averages_of_a_linear_flow_are_that_flow_away_from_its_jump(comm):
         def __init__(self):
             self.position, self.velocity = place, (place - LENGTH / 2) @ rotation.T
 
-    form = form_of("average", CubicSpline(2.2 * SPACING), 2 * SPACING, SPACING**3)
+    form = Form("average", CubicSpline(2.2 * SPACING), 2 * SPACING, SPACING**3)
     averages = FieldsOfParticles(form, SlabDecomposition(comm, LENGTH, SIDE))
     particles, fields = WithGradients(Rotating(), averages), ReconstructedFields(Rotating(), averages)
     assert particles.columns == ("position", "velocity", "velocity_gradient") and fields.cells == SIDE

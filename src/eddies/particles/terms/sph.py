@@ -156,8 +156,8 @@ class TransportVelocity(_SPHTerm):
 
     p_b delta_t is learned in units of rho_0 c h; its magnitude counts, since particles gather if it is negative. The
     initial value 1/4 is that of the paper: pressure c^2 rho_0 and step h/(4c), for any step here. The paper has the
-    divergence of the stress v w instead of (w.grad) v. That conserves momentum, but its term v div w changes the
-    velocity of random particles more than if they were not shifted.
+    divergence of the stress v w instead of (w.grad) v. That conserves momentum. Its term v div w, however,
+    changes the velocity of random particles more than if they were not shifted.
     """
 
     Settings = declared.TransportVelocity

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from eddies.analysis.lagrangian import evenly
 from eddies.clock import ProgressLine
 from eddies.learning.force_training import TrainingFrame
 from eddies.learning.losses import relative_error
@@ -26,7 +27,7 @@ def evaluation_frames(truth: GroundTruth) -> np.ndarray:
     Raises SceneError if the ground truth has no such frame.
     """
     usable = np.array(between_frames(len(truth.times), truth.at_fields))
-    return usable[np.unique(np.linspace(0, len(usable) - 1, TESTED_FRAMES).astype(int))]
+    return usable[evenly(len(usable), TESTED_FRAMES)]
 
 
 @torch.no_grad()

@@ -19,7 +19,7 @@ from eddies.parallel.broadcast import first_complaint, share_text
 from eddies.parallel.communicator import Comm
 from eddies.parallel.reduction import any_rank
 from eddies.particles.flow_units import ReferenceScales
-from eddies.particles.forms import Form, form_of
+from eddies.particles.forms import Form
 from eddies.particles.model import LagrangianModel, build_model
 from eddies.particles.smoothing_kernels import HermiteKernel, KernelNetwork
 from eddies.scene.scene import SceneError
@@ -125,8 +125,8 @@ def load_form(comm: Comm, path: str | Path, scales: ReferenceScales) -> Form:
     Raises ProductError as `load_kernel`.
     """
     description, tensors = load_weights(comm, path, "kernel")
-    return form_of(description.get("reconstruction", "average"), _table_of(description, tensors, path),
-                   scales.filter_width, scales.spacing**3)
+    return Form(description.get("reconstruction", "average"), _table_of(description, tensors, path),
+                scales.filter_width, scales.spacing**3)
 
 
 def _table_of(description: Mapping[str, Any], tensors: Mapping[str, np.ndarray], path: str | Path,

@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 import torch
 
+from eddies.analysis.lagrangian import evenly
 from eddies.clock import ProgressLine
 from eddies.learning.force_training import ForceTrainer, LossWeights, TrainingFrame
 from eddies.learning.rollout_training import RolloutTrainer, TrainingWindow
@@ -54,7 +55,7 @@ class TrainingData:
     @cached_property
     def frames(self) -> list[TrainingFrame]:
         """The single frames for training; the first use is collective."""
-        seen = np.array(self.usable)[np.unique(np.linspace(0, len(self.usable) - 1, self.count).astype(int))]
+        seen = np.array(self.usable)[evenly(len(self.usable), self.count)]
         progress, frames = ProgressLine("train", lambda: "prepared", unit="frame"), []
         for index in seen:
             frames.append(self._frame(index))
@@ -84,7 +85,7 @@ class TrainingData:
         if resolution is not None:
             # Gradients are with respect to the particles alone, so an extrapolated start may not affect the result.
             resolution.tolerance_foreseen = resolution.tolerance
-        starts = np.unique(np.linspace(0, self.learned - self.longest, self.count).astype(int))
+        starts = evenly(self.learned - self.longest + 1, self.count)
         windows = [self._window(start, resolution) for start in starts]
         substeps = round(interval / (settings.time_step or interval))
         trainer = RolloutTrainer(slab.comm, INTEGRATORS[settings.integrator](dynamics), windows, interval,
