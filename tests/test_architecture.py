@@ -41,7 +41,7 @@ ONLY_IN = {
     "matplotlib*": ("report*",),
     "eddies.report*": ("report*", "workflows.report", "workflows.diff", "workflows.train"),
     # Modules that compute may import only the records of integrators and terms.
-    "eddies.scene.[!it]*": ("scene*", "workflows*", "cli", "api", "stored_run", "stages", "logs"),
+    "eddies.scene.[!it]*": ("scene*", "workflows*", "cli", "api", "stored_run", "stages"),
     "eddies.scene.integrators*": ("scene*", "particles.integrators", "workflows*"),
     "eddies.scene.terms*": ("scene*", "particles.context", "particles.model", "particles.terms*", "workflows*"),
     "eddies.import_path*": ("scene*", "particles.model", "particles.terms.pair_basis", "workflows*"),

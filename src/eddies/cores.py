@@ -66,7 +66,7 @@ def local_cores() -> int:
 
 
 def within_quota(cores: Iterable[object]) -> int:
-    """Number of cores, of some, that the quota of a container allows to keep busy; at least 1."""
+    """Number of the given cores that the quota of a container allows to keep busy; at least 1."""
     limit, period = CPU_QUOTA.read_text().split() if CPU_QUOTA.exists() else ("max", "1")
     most = math.inf if limit == "max" else math.ceil(int(limit) / int(period))
     return max(1, min(len(set(cores)), most))

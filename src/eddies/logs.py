@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from eddies.scene.scene import SceneError
+from eddies.errors import UserError
 
 OUTCOME = (logging.INFO + logging.WARNING) // 2  # level of the line about the final product
 LEVELS = {"debug": logging.DEBUG, "info": logging.INFO, "outcome": OUTCOME, "warning": logging.WARNING}
@@ -17,10 +17,10 @@ LEVELS = {"debug": logging.DEBUG, "info": logging.INFO, "outcome": OUTCOME, "war
 
 def configure_logging(rank: int, level: str | None = None) -> None:
     """Send the logger "eddies" to standard output. `level` is that of rank 0: debug, info, outcome or warning, by
-    default the value of EDDIES_LOG. Raises SceneError if EDDIES_LOG has another value."""
+    default the value of EDDIES_LOG. Raises UserError if EDDIES_LOG has another value."""
     name = level or os.environ.get("EDDIES_LOG", "info")
     if name not in LEVELS:
-        raise SceneError(f"EDDIES_LOG = {name}: must be one of {', '.join(LEVELS)}")
+        raise UserError(f"EDDIES_LOG = {name}: must be one of {', '.join(LEVELS)}")
     handler = logging.StreamHandler(sys.stdout)
     handler.setFormatter(_RankFormatter(rank))
     logger = logging.getLogger("eddies")

@@ -1,5 +1,8 @@
 """The measures that compare rollouts with the truth: key and title, in the order of tables and figures."""
 
+import math
+from typing import Any
+
 #: The best value is 0, except 1 for ratios and for the variance of counts.
 MEASURES = {
     "velocity_error_early": "velocity error at t_η",
@@ -35,3 +38,8 @@ SHOWN = ("velocity_error_early", "velocity_error_half", "velocity_error_end", "s
          "velocity_kl", "velocity_kl_floor", "acceleration_kl", "acceleration_kl_floor", "qr_kl", "qr_kl_floor",
          "acceleration_error", "momentum_drift", "momentum_drift_floor", "density_drift", "density_drift_floor",
          "count_variance", "count_variance_floor")
+
+
+def finite(value: Any) -> Any:
+    """Return the value, or None for a float that is not finite."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -213,7 +213,6 @@ def check_inputs(step: Step, comm: Comm, making: Collection[tuple[str, Path]] = 
     Inputs in `making`, by stage and directory, are not checked, because the same job makes them first.
     """
     stages, scene = step.stages, step.scene
-    check_sections(stages, scene)
     weights = scene.model.weights_file if "train" in stages and scene.model is not None else None
     if weights is not None and ("train", weights.parent) not in making:
         read_source(scene, comm)
@@ -229,8 +228,8 @@ def check_inputs(step: Step, comm: Comm, making: Collection[tuple[str, Path]] = 
             pass
         if not on_first_rank(comm, partial(is_done, needed.name, scene, holder)):
             raise SceneError(f"{holder / needed.file}: was made with other settings than this scene's; run "
-                             f"`eddies {needed.name} --overwrite` with these, or give `eddies {stages[0]}` the --set "
-                             "of then")
+                             f"`eddies {needed.name} --overwrite` with these, or give `eddies {stages[0]}` the "
+                             "same --set as then")
 
 
 def prepare_directory(scene: str, comm: Comm, directory: Path) -> None:

@@ -121,7 +121,8 @@ class StoredRun:
             found = found.sel(particle=ids)
         if unwrapped:
             if "image" not in found:
-                raise UserError(f"{self.path}: its particles have no image, as before eddies 0.3; make them again")
+                raise UserError(f"{self.path}: its particles have no image, because eddies before 1.0 made them; make "
+                                "them again")
             position = found["position"]
             path = np.asarray(position) + 2 * np.pi * np.asarray(found["image"])
             if isinstance(found, dict):

@@ -85,7 +85,7 @@ class ETDRK4:
 
     def __call__(self, state: np.ndarray, step: float) -> np.ndarray:
         """The state one `step` later."""
-        full, half, q, f1, f2, f3 = self._operators.setdefault(step, None) or self._prepare(step)
+        full, half, q, f1, f2, f3 = self._operators.get(step) or self._prepare(step)
         N, combine = self.equation.nonlinear, self.equation.combine
         n0 = N(state)
         a = combine((half, state), (q, n0))

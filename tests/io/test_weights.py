@@ -29,7 +29,7 @@ def test_weights_survive(comm, tmp_path):
     assert loaded.keys() == tensors().keys()
     for name, tensor in tensors().items():
         assert loaded[name].dtype == tensor.dtype and np.array_equal(loaded[name], tensor)
-    tables = load_tables(tmp_path / "m.h5")
+    tables = load_tables(comm, tmp_path / "m.h5")
     assert tables.keys() == {"history"} and np.array_equal(tables["history"]["step"], np.arange(4))
 
 

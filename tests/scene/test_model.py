@@ -90,8 +90,6 @@ def test_inputs_and_outputs_of_terms():
     assert (model.reads, model.gives) == ({"resolved", "pairs", "density"}, {"acceleration", "density"})
     alone = Model(terms=["pairs"], settings={"pairs": {"inputs": ["distance"]}})
     assert (alone.reads, alone.gives) == ({"pairs"}, {"acceleration"})
-    assert PairNetwork(hidden=(8, 8)).numbers_per_pair == 5 + 16 + 3
-    assert PairNetwork(hidden=(8,), inputs=("distance", "speed")).numbers_per_pair == 2 + 8 + 3
     assert Continuity(diffusion=0.1).learns_through_horizons and not Continuity().learns_through_horizons
 
 
@@ -127,7 +125,7 @@ def test_an_own_term_has_keys_of_its_own(tmp_path, own):
     text = COMPRESSIBLE + '[model]\nterms = ["pressure", "own_drag:Drag"]\n[model.Drag]\nconstant = 2\n'
     scene = read(tmp_path, text, "model.Drag.strong=true")
     drag = scene.model.settings["Drag"]
-    assert (drag.constant, drag.levels, drag.strong, drag.numbers_per_pair) == (2.0, (1, 2), True, 0)
+    assert (drag.constant, drag.levels, drag.strong) == (2.0, (1, 2), True)
     assert scene.model.reads == {"resolved"} and scene.foreign == ("own_drag:Drag",)
     (tmp_path / "again.toml").write_text(scene.to_toml())
     assert load_scene(tmp_path / "again.toml").to_toml() == scene.to_toml()

@@ -29,6 +29,7 @@ def write_scene(directory, *changes):
 def test_the_state_of_every_stage(comm, tmp_path, capfd):
     scene = write_scene(tmp_path / "one")
     checkpoints = CheckpointDirectory(comm, tmp_path / "one/checkpoints-train", stage_fingerprint(scene, "train"))
+    checkpoints.write(20, {"weights": np.ones(3)})
     checkpoints.write(40, {"weights": np.ones(3)})
     with create_product(comm, tmp_path / "one/ground_truth.h5", "ground_truth", stage_provenance(scene, "dns")):
         pass

@@ -31,7 +31,7 @@ from eddies.io.frame_segments import FrameSegments
 from eddies.io.hdf5 import in_files, write_block
 from eddies.io.new_files import HEADER_BYTES, new_file, own_part, writing
 from eddies.kernels.library import in_use
-from eddies.parallel.broadcast import first_complaint, on_all_ranks, on_first_rank, share_text
+from eddies.parallel.broadcast import on_all_ranks, on_first_rank, share_text
 from eddies.parallel.stop import Stopped, StopRequest
 
 log = logging.getLogger("eddies")
@@ -102,7 +102,7 @@ class CheckpointDirectory:
             return
         arrays = {name: part for name, part in state.items() if isinstance(part, np.ndarray | Block)}
         plain = json.dumps({name: part for name, part in state.items() if name not in arrays})
-        plain = share_text(self.comm, plain if self.comm.rank == 0 else "")  # HDF5 needs equal lengths
+        plain = share_text(self.comm, plain)  # HDF5 needs equal lengths
         arrays = {PLAIN: np.frombuffer(plain.encode(), np.uint8), **arrays}
         content = {"step": step, "format": FORMAT, "fingerprint": self.fingerprint, "computed_by": _computed_by()}
         try:
@@ -153,21 +153,20 @@ class CheckpointDirectory:
         in_files(self.comm, self.path, lambda: shutil.rmtree(self.path) if self.path.exists() else None)
 
     def _examine(self, path: Path) -> tuple[dict[str, Any] | None, str | None]:
-        """The manifest's content, and why the checkpoint cannot be used, or None."""
+        """The manifest's content, and why the checkpoint cannot be used, or None; the same on all ranks."""
         manifest = path / MANIFEST
-        content = _parse_manifest(manifest.read_bytes()) if manifest.is_file() else None
-        # All ranks must have the same manifest before they compare checksums together.
-        complaint = f"{manifest}: missing, or not what was written" if content is None else None
-        complaint = first_complaint(self.comm, complaint)
-        if complaint is None and content.get("format") != FORMAT:
-            complaint = f"{path}: was made by another version of eddies"
-        if complaint is None and content["fingerprint"] != self.fingerprint:
-            complaint = f"{path}: was made with other settings"
-        if complaint is None:
-            complaint = find_damage(self.comm, path / STATE, content["state"])
-        for name, known in content["files"].items() if complaint is None else ():
-            complaint = complaint or find_damage(self.comm, self.path / name, known)
-        return content, complaint
+        content = in_files(self.comm, manifest, lambda: (
+            _parse_manifest(manifest.read_bytes()) if manifest.is_file() else None))
+        if content is None:
+            return None, f"{manifest}: missing, or not what was written"
+        if content.get("format") != FORMAT:
+            return None, f"{path}: was made by another version of eddies"
+        if content["fingerprint"] != self.fingerprint:
+            return None, f"{path}: was made with other settings"
+        files = {path / STATE: content["state"],
+                 **{self.path / name: known for name, known in content["files"].items()}}
+        complaints = (find_damage(self.comm, file, known) for file, known in files.items())
+        return content, next(filter(None, complaints), None)
 
     def _names(self) -> list[str]:
         """The checkpoints, the newest first."""
@@ -228,8 +227,11 @@ def _name(step: int) -> str:
 
 
 def _write_array(file: h5py.File, name: str, block: Block) -> None:
-    """Write a global array from the blocks of all ranks, component by component if these are cut along a later axis:
-    MPI counts bytes in 32 bits, and rank 0 may have to hold what is written at once."""
+    """Write a global array from the blocks of all ranks.
+
+    Blocks that are cut along a later axis than the first are written one component at a time: MPI counts bytes in 32
+    bits, and a single writer holds in memory what is written at once.
+    """
     values, axis = block.values, block.axis
     shape = (*values.shape[:axis], block.total, *values.shape[axis + 1:])
     with writing(file, math.prod(shape) * values.dtype.itemsize + HEADER_BYTES):

@@ -162,9 +162,9 @@ def find_damage(comm: MPI.Comm, path: Path, known: int | None = None) -> str | N
         if isinstance(size, str):
             return size
         block = int(global_min(comm, on_all_ranks(comm, first_wrong)))
+        return on_first_rank(comm, lambda: _damage(path, block)) if block < _count_blocks(size) else None
     except OSError as error:
         return f"{path}: cannot be read ({error})"
-    return on_first_rank(comm, lambda: _damage(path, block)) if block < _count_blocks(size) else None
 
 
 @contextmanager

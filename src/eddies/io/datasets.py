@@ -84,7 +84,7 @@ def open_group(path: Path, name: str) -> Any:
 
 
 def made_group(arrays: Mapping[str, MadeArray]) -> Any:
-    """The same of arrays that are computed."""
+    """Computed arrays by name, in the form in which `open_group` returns stored ones."""
     if xarray is None:
         return {key: array[:] for key, array in arrays.items()}
     return _dataset({key: (array, array.__getitem__) for key, array in arrays.items()}, {})

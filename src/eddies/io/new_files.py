@@ -93,8 +93,9 @@ def new_file(comm: MPI.Comm, path: Path, checksums: bool = True) -> Iterator[h5p
         yield new.file
         with writing(new.file, 0):
             new.close()
-        if checksums and on_first_rank(comm, new.is_own):
-            add_checksums(comm, new.path)
+        with file_errors(path):
+            if checksums and on_first_rank(comm, new.is_own):
+                add_checksums(comm, new.path)
     except BaseException as error:
         if comm.size > 1 and not isinstance(error, Stopped | WriteError | RunTakenOver):
             new.abandon()

@@ -159,7 +159,7 @@ class RunLock:
 def lock_directory(comm: MPI.Comm, directory: Path, take_over: bool = False) -> Iterator[Loss]:
     """Hold a run directory, which is made if it is missing; collective. Yields `RunLock.loss` of rank 0.
 
-    A stale lock is ignored. With `take_over` any lock is: its job ends at its next step.
+    A stale lock is replaced. With `take_over` every lock is replaced; its job ends at its next step.
 
     Raises:
         RunInUse: another job works there.

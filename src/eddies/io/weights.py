@@ -42,7 +42,7 @@ def load_weights(comm: MPI.Comm, path: str | Path, kind: str) -> tuple[dict[str,
     return description, tensors
 
 
-def load_tables(path: str | Path) -> dict[str, dict[str, np.ndarray]]:
-    """The tables saved with the weights, by name; on one rank."""
-    with open_product(MPI.COMM_SELF, path, None) as file:
+def load_tables(comm: MPI.Comm, path: str | Path) -> dict[str, dict[str, np.ndarray]]:
+    """The tables saved with the weights, by name, on all ranks; collective."""
+    with open_product(comm, path, None) as file:
         return {name: read_table(file, name) for name in file if name != "weights"}

@@ -95,7 +95,8 @@ class StopRequest:
         self._checkpoint_at = time.monotonic() + self._interval
 
     def _raise_loss(self) -> None:
-        for error in filter(None, (loss() for loss in self._losses)):
+        error = next(filter(None, (loss() for loss in self._losses)), None)
+        if error is not None:
             raise error
 
     def _own_answer(self) -> int:

@@ -45,7 +45,7 @@ def styled(draw: Callable) -> Callable:
 
 
 class Panel(Axes):
-    """Axes whose labels are measured once for the layout. A constrained layout asks several times, and to measure tick
+    """Axes whose labels are measured once in a drawing. A constrained layout asks several times, and to measure tick
     labels is most of the time of a figure."""
 
     _around: np.ndarray | None = None
@@ -59,6 +59,11 @@ class Panel(Axes):
             self._around = box.extents - self.bbox.extents
         self.apply_aspect()
         return Bbox.from_extents(self.bbox.extents + self._around)
+
+    def draw(self, renderer) -> None:
+        """Draw, and forget the labels: the next drawing may have another resolution or other labels."""
+        super().draw(renderer)
+        self._around = None
 
 
 def panels(rows: int, columns: int, size: tuple[float, float], **sharing) -> tuple[Figure, np.ndarray]:

@@ -2,7 +2,6 @@
 
 import base64
 import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +11,7 @@ import jinja2
 from markupsafe import Markup
 
 from eddies.io.new_files import write_files
+from eddies.measures import finite
 
 Number = float | int | bool | str | dict | None
 
@@ -96,11 +96,6 @@ class RunRecord:
     products: Sequence[Sequence[str]]
     warnings: Sequence[str] = ()
     links: Sequence[tuple[str, str]] = ()
-
-
-def finite(value: Any) -> Any:
-    """Return the value, or None for a float that is not finite."""
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def shown(value: Number) -> str:

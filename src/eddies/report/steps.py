@@ -27,7 +27,7 @@ def section(found: Mapping[str, float | str], trials: Trials) -> Section:
         "has converged if it adds less than 2 % to the error of the final velocities. For this, halving the step may "
         f"change the velocities by {found['tolerance']:.2g}. The cheapest converged step is chosen. It takes "
         f"{found['seconds_per_turnover']:.3g} s per turnover. Its error is {found['error']:.4f}; half the step has "
-        f"{found['error_with_half']:.4f}. The search took {found['seconds']:.3g} s.", metrics=metrics, folded=True)
+        f"{found['error_with_half']:.4f}. The search took {found['seconds']:.3g} s.", metrics=metrics)
     shown.add_figure("step", "Convergence in the step", convergence(found, trials, size),
                      "Circle: the chosen step. Dashed: the largest change of a converged step.")
     return shown

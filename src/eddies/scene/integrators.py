@@ -17,7 +17,6 @@ class Scheme:
     name: str
     order: int  # of the error in the step
     evaluations: int  # of the rates in a step
-    at_a_place: int = 1  # so many of these evaluations have the same positions
     dense: bool = True  # it can interpolate between steps; if not, frames lie at ends of steps
     angle: float  # largest k_c u' dt with which a velocity resolved up to k_c follows the flow
     decay: float  # largest rate of relaxation times step
@@ -28,7 +27,7 @@ class Scheme:
 
 SCHEMES = {scheme.name: scheme for scheme in (
     Scheme(name="verlet", order=2, evaluations=1, dense=False, angle=0.5, decay=1.0, iterations=1.0),
-    Scheme(name="corrected-verlet", order=2, evaluations=2, at_a_place=2, angle=0.5, decay=2.0, iterations=1.0),
+    Scheme(name="corrected-verlet", order=2, evaluations=2, angle=0.5, decay=2.0, iterations=1.0),
     Scheme(name="rk2", order=2, evaluations=2, angle=1.2, decay=2.0, iterations=1.2, nodes=(0, 1 / 2), weights=(0, 1)),
     # Heun's scheme: its stages are a third of a step apart, which suits a solve that starts from an extrapolation.
     Scheme(name="rk3", order=3, evaluations=3, angle=1.2, decay=2.51, iterations=3.0, nodes=(0, 1 / 3, 2 / 3),

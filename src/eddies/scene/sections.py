@@ -45,7 +45,6 @@ class InitialFlow:
     keys: tuple[str, ...] = ("amplitude", "peak_wavenumber", "wavenumber", "path", "state")  # of [initial], as it reads
     rms: float | None = None  # root mean square of |u| over the amplitude; None: unknown, or at rest
     peak: float | None = None  # largest |u| + |v| + |w| over the amplitude; None: unknown, or at rest
-    wave: float | None = None  # |k| of its modes over `wavenumber`; None: it has many
     turbulent: bool = False  # it has many scales, with the spectrum's peak at `peak_wavenumber`
     sound: bool = False  # at rest except for sound waves
     steady: bool = False  # without viscosity nothing in it accelerates
@@ -58,9 +57,9 @@ class InitialFlow:
 
 INITIAL_FLOWS = {
     "random": InitialFlow(("amplitude", "peak_wavenumber"), rms=math.sqrt(3), turbulent=True),
-    "taylor-green": InitialFlow(("amplitude",), rms=0.5, peak=1.0, wave=math.sqrt(3)),
-    "abc": InitialFlow(("amplitude", "wavenumber"), rms=math.sqrt(3), peak=3 * math.sqrt(2), wave=1.0),
-    "shear-wave": InitialFlow(("amplitude", "wavenumber"), rms=math.sqrt(0.5), peak=1.0, wave=1.0, steady=True),
+    "taylor-green": InitialFlow(("amplitude",), rms=0.5, peak=1.0),
+    "abc": InitialFlow(("amplitude", "wavenumber"), rms=math.sqrt(3), peak=3 * math.sqrt(2)),
+    "shear-wave": InitialFlow(("amplitude", "wavenumber"), rms=math.sqrt(0.5), peak=1.0, steady=True),
     "sound-wave": InitialFlow(("amplitude", "wavenumber"), sound=True),
     "file": InitialFlow(("path", "state")),
 }

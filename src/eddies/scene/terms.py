@@ -58,7 +58,6 @@ class TermSettings(Section):
         grid) and "density" (computed, stored, and needed in the ground truth). Nothing else is built for it.
     gives : any of "acceleration", "density" (a part of it), "density_rate" and "shift_velocity".
     learns_through_horizons : only training through several steps of the simulation fits its parameters.
-    numbers_per_pair : so many numbers of each pair are held during an evaluation, for an estimate of the memory.
     damps_by : its parameter with rates of damping by wavenumber, which a coarse grid can take; empty: it has none.
     too_long : error for a step beyond `longest_step`, with the term's {name}, the {longest} step and the {integrator}.
     """
@@ -67,7 +66,6 @@ class TermSettings(Section):
     reads: ClassVar[tuple[str, ...]] = ()
     gives: ClassVar[tuple[str, ...]] = ("acceleration",)
     learns_through_horizons: ClassVar[bool] = False
-    numbers_per_pair: ClassVar[int] = 0
     damps_by: ClassVar[str] = ""
     too_long: ClassVar[str] = ""
 
@@ -121,11 +119,6 @@ class NetworkSettings(PairSum):
         """Pairs, and the density if it is an input."""
         return ("pairs", "density") if "density" in self.inputs else ("pairs",)
 
-    @property
-    def numbers_per_pair(self) -> int:  # type: ignore[override]
-        """The inputs, with the density of both particles, the outputs of every layer, and a vector."""
-        return len(self.inputs) + ("density" in self.inputs) + sum(self.hidden) + 3
-
 
 @dataclass(frozen=True, kw_only=True)
 class PairNetwork(ForceSum, NetworkSettings):
@@ -151,7 +144,6 @@ class EddyViscosity(ForceSum):
 
     form: str = choice("two-sided: all pairs; monaghan: approaching pairs; bounded: all, with tanh(x.v) for x.v",
                        "two-sided", "monaghan", "bounded", default="two-sided")
-    numbers_per_pair = 8
     reads = ("pairs",)
 
 
@@ -178,7 +170,6 @@ class DensityDiffusion(PairSum):
     word = "density-diffusion"
     reads = ("pairs", "density")
     gives = ("density_rate",)
-    numbers_per_pair = 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -247,7 +238,6 @@ class Continuity(TermSettings):
     diffusion: float = number("delta of the density's diffusion (Molteni & Colagrossi 2009), at first; 0: without",
                               default=0.0, at_least=0)
 
-    numbers_per_pair = 8
     reads = ("pairs", "density")
     gives = ("density_rate",)
 
@@ -268,7 +258,6 @@ class WCSPH(TermSettings):
     exponent: float = number("gamma of the pressure c^2 rho_0 / gamma ((rho / rho_0)^gamma - 1)", default=1.0,
                              at_least=1)
 
-    numbers_per_pair = 8
     reads = ("pairs", "density")
     too_long = ('the term "{name}" has to resolve sound, with a step of at most {longest} unless it learns a slower '
                 'one; lower step, and use integrator = "verlet"')
@@ -285,7 +274,6 @@ class TransportVelocity(TermSettings):
     """The shift of particles to sparser places by a constant background pressure (Adami, Hu & Adams 2013)."""
 
     word = "transport-velocity"
-    numbers_per_pair = 16
     reads = ("pairs", "density")
     gives = ("shift_velocity",)
     learns_through_horizons = True

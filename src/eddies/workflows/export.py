@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from eddies.io.fields import FieldSeries
-from eddies.io.hdf5 import ProductError, open_product
+from eddies.io.hdf5 import ProductError, in_files, open_product
 from eddies.io.lagrangebench import shortcoming, write_dataset
 from eddies.io.provenance import read_provenance
 from eddies.io.trajectories import Trajectory
 from eddies.io.vtkhdf import write_images, write_points
-from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm
 from eddies.scene.sections import BOX_LENGTH
 
@@ -36,9 +35,7 @@ def run(run_directory: Path, output: Path, comm: Comm, layout: str = "vtkhdf") -
     """
     alone = comm.Split(comm.rank)
     try:
-        on_first_rank(comm, lambda: _export(run_directory, output, alone, layout))
-    except OSError as error:
-        raise ProductError(f"{error}; check the files and the directory") from None
+        in_files(comm, output, lambda: _export(run_directory, output, alone, layout))
     finally:
         alone.Free()
 

@@ -117,7 +117,7 @@ def refuse(scene: Scene, context: Context) -> list[str]:
     return [problem.text for problem in found]
 
 
-# ---- what ends a run
+# ---- problems that end a run
 
 
 def _refusals(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str]:
@@ -244,7 +244,7 @@ def _unfit_files(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str
         yield from (f"{scene.name}: {problem}" for problem in truth_problems(scene, comm, step.holder("dns")))
 
 
-# ---- what gives reason to doubt a result
+# ---- reasons to doubt a result
 
 
 def _warnings(step: Step, made: Collection[Path]) -> Iterator[str]:
@@ -252,6 +252,8 @@ def _warnings(step: Step, made: Collection[Path]) -> Iterator[str]:
     for stage in step.stages:
         for subject in SUBJECTS.get(stage, ()):
             yield from subject(step.scene)
+    if "simulate" in step.stages:
+        yield from beyond_truth(step.scene, step.scene.seen_in(step.holder("dns")))
     model = step.scene.model if "train" in step.stages else None
     if model is not None and model.path and model.weights_file not in made and not model.weights_file.is_file():
         yield f'[model] path = "{model.path}": there is no {model.weights_file} yet, which `eddies train` needs'
@@ -351,11 +353,13 @@ def rollout_steps(scene: Scene) -> Iterator[str]:
                 name=name, longest=at_most(longest), integrator=settings.scheme.name)
 
 
-def beyond_truth(scene: Scene) -> Iterator[str]:
-    """A rollout that goes on after the end of its ground truth. Later frames of a flow that is forced throughout are
-    compared with the mean of the ground truth."""
+def beyond_truth(scene: Scene, seen: float) -> Iterator[str]:
+    """A rollout that goes on after the end of its ground truth; training has `seen` this fraction of it.
+
+    Later frames of a flow that is forced throughout are compared with the mean of the ground truth.
+    """
     settings, tracers, start = scene.simulation, scene.tracers, scene.simulation.start
-    start = scene.seen_in(scene.directory) if start is None else start
+    start = seen if start is None else start
     left = (1 - start) * tracers.turnovers
     if settings.turnovers > left * (1 + 1e-9) and not tracers.forced:
         yield (f"[simulation] turnovers = {settings.turnovers:g}: the ground truth ends {left:.3g} turnovers after its "
@@ -365,7 +369,7 @@ def beyond_truth(scene: Scene) -> Iterator[str]:
 
 SUBJECTS: dict[str, tuple[Callable[[Scene], Iterator[str]], ...]] = {
     "dns": (resolution, compressibility, turbulence_at_all, stability, filter_width),
-    "train": (untrained_terms,), "simulate": (rollout_steps, beyond_truth)}
+    "train": (untrained_terms,), "simulate": (rollout_steps,)}
 
 
 def two_digits(rounded: Callable[[float], int], value: float) -> str:
@@ -377,7 +381,7 @@ def two_digits(rounded: Callable[[float], int], value: float) -> str:
 at_least, at_most = partial(two_digits, math.ceil), partial(two_digits, math.floor)
 
 
-# ---- what only the flow tells
+# ---- problems that only the flow shows
 
 
 def check_span(scene: Scene, span: float, bound: float, frames: bool = False) -> None:

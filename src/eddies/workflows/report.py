@@ -28,6 +28,7 @@ from eddies.io.fields import FieldSeries
 from eddies.io.hdf5 import File, ProductError, in_files, open_product, read_attributes, read_table
 from eddies.io.provenance import others_trained_on, product_attributes, read_json, read_provenance
 from eddies.io.trajectories import Trajectory
+from eddies.measures import finite
 from eddies.parallel.broadcast import on_all_ranks
 from eddies.parallel.communicator import Comm
 from eddies.parallel.stop import StopRequest
@@ -39,7 +40,7 @@ from eddies.scene.scene import Scene, SceneError, load_scene
 from eddies.workflows.problems import place_problems
 from eddies.workflows.product_warnings import changed_truths, mixed_products, not_finite
 from eddies.workflows.run_directory.work import read_stage_seconds
-from eddies.workflows.variant_rows import COLUMNS, ROLLOUT, finite, machine, notes, numbers, row
+from eddies.workflows.variant_rows import COLUMNS, ROLLOUT, machine, notes, numbers, row
 from eddies.workflows.variants import Place, rollouts
 
 if TYPE_CHECKING:

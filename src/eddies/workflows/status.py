@@ -121,7 +121,7 @@ def stage_state(name: str, step: Step) -> str:
         return f"complete, {in_units(product.stat().st_size)}"
     if checkpoints:
         fits = stage_fingerprint(scene, name) in [fingerprint for _, fingerprint in checkpoints]
-        return f"stopped at step {checkpoints[-1][0]}, {'can continue' if fits else 'with other settings'}"
+        return f"stopped at step {checkpoints[0][0]}, {'can continue' if fits else 'with other settings'}"
     if product.is_file():
         origin = product_provenance(product)
         if not origin:

@@ -94,7 +94,8 @@ def keep_form(comm: Comm, path: Path, form: str | None, provenance: Mapping[str,
     description, weights = load_weights(comm, path, "kernel")
     if description.get("reconstruction", "average") != form:
         origin = {**provenance, "id": product_provenance(path).get("id")}
-        save_weights(comm, path, "kernel", {**description, "reconstruction": form}, weights, origin, load_tables(path))
+        save_weights(comm, path, "kernel", {**description, "reconstruction": form}, weights, origin,
+                     load_tables(comm, path))
         log.info('train-kernel: %s now has form = "%s"', path, form)
 
 

@@ -14,7 +14,7 @@ from eddies.analysis.accuracy import accuracy
 from eddies.cores import threads
 from eddies.io.hdf5 import open_product, read_attributes, read_table
 from eddies.io.provenance import environment, read_json
-from eddies.measures import MEASURES
+from eddies.measures import MEASURES, finite
 from eddies.parallel.communicator import Comm
 from eddies.pipeline import STAGES
 from eddies.scene.scene import Eulerian, Scene
@@ -156,11 +156,6 @@ def step_costs(rollout: Mapping[str, Any], turnover: float, ranks: int) -> dict[
     steps = turnover / rollout["time_step"]
     return {"seconds_per_step": seconds, "wall_seconds": seconds * steps, "wall_seconds_low": low * steps,
             "wall_seconds_high": high * steps, "core_seconds": seconds * steps * ranks * threads()}
-
-
-def finite(value: Any) -> Any:
-    """Return the value, or None for a float that is not finite."""
-    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def machine(device: str, ranks: int) -> dict[str, Any]:

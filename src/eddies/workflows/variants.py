@@ -80,7 +80,7 @@ def rollouts(scene: Scene, directory: Path) -> dict[str, list[Place]]:
 
 
 def rollouts_of(scene: Scene, name: str | None, directory: Path) -> list[Place]:
-    """The rollouts of one variant, or for None of a scene without variants."""
+    """The rollouts of one variant. The name None stands for a scene without variants."""
     own, where = scene.variant[name] if name else scene.without_variants, directory / (name or "")
     if scene.realisations is None:
         return [Place(own, where)]

@@ -106,9 +106,10 @@ def read_source(scene: Scene, comm: Comm) -> ModelSource:
         description, weights = load_weights(comm, path, "model")
         with open_product(comm, path, "model") as file:
             provenance = read_provenance(file)
+        tables = load_tables(comm, path)
     except ProductError as error:
         raise ProductError(f"{scene.name}: [model] path = {quoted(scene.model.path)}: {error}") from None
     for key, wanted, trained in ModelDefinition.of(scene).differences(description):
         raise SceneError(f"{scene.name}: {key} = {wanted}, but {path} was trained with {trained}; set it to "
                          "that, or give another [model] path")
-    return ModelSource(path, description, weights, load_tables(path), provenance)
+    return ModelSource(path, description, weights, tables, provenance)

@@ -183,8 +183,9 @@ class MeasuredRollout:
         if whole and run.forced and self._stationary:
             tasks += [("spectra", "model", int(frame)) for frame in run.late_spectra()]
         if self.fields is not None:
+            beyond = whole and run.forced and self._stationary  # the forced section also uses later frames
             tasks += [("reconstructions", of, int(frame)) for of in frames
-                      for frame in (run.before_broken(of) if whole else frames[of][-1:])]
+                      for frame in (run.before_broken(of) if beyond else frames[of] if whole else frames[of][-1:])]
         return list(dict.fromkeys(tasks))
 
     def _key(self, task: Task) -> Any:

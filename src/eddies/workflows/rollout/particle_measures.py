@@ -23,7 +23,7 @@ GRADIENT = "velocity_gradient"
 
 
 class FieldsOfParticles:
-    """Fields that a form of reconstruction makes of particles. The result of the last call is kept.
+    """Fields that a form of reconstruction makes of particles. The results for the last frame are kept.
 
     Parameters
     ----------
@@ -33,16 +33,16 @@ class FieldsOfParticles:
 
     def __init__(self, form: Form, slab: SlabDecomposition) -> None:
         self.form, self.slab = form, slab
-        self._last: tuple[Any, Any] = None, None
+        self._kept: dict[str, tuple[Any, Any]] = {}  # by name: particles and frame of the last call, and its result
 
     def gradients(self, particles: Frames, frame: int) -> np.ndarray:
         """Velocity gradients (n, 3, 3) [component, direction] at the particles."""
-        return self._kept(("gradients", id(particles), frame),
+        return self._once("gradients", particles, frame,
                           lambda: as_numpy(self._made(particles, frame).at_particles()[1]))
 
     def velocity(self, particles: Frames, frame: int) -> np.ndarray:
         """The velocity (3, z, y, x) on the grid."""
-        return self._kept(("velocity", id(particles), frame),
+        return self._once("velocity", particles, frame,
                           lambda: self._by_component(self._made(particles, frame).velocity_on_grid(), 3))
 
     def plane(self, particles: Frames, frame: int) -> tuple[np.ndarray, np.ndarray]:
@@ -55,13 +55,17 @@ class FieldsOfParticles:
         vorticity = antisymmetric.square().sum((1, 2)).div(2).sqrt()
         return self._by_component(velocity, 2), as_numpy(vorticity).reshape([self.slab.planes] * 2)
 
-    def _kept(self, key: Any, make: Callable[[], np.ndarray]) -> np.ndarray:
-        if self._last[0] != key:
-            self._last = key, make()
-        return self._last[1]
+    def _once(self, name: str, particles: Frames, frame: int, make: Callable[[], Any]) -> Any:
+        key = id(particles), frame
+        if name not in self._kept or self._kept[name][0] != key:
+            self._kept[name] = key, make()
+        return self._kept[name][1]
+
+    def _made(self, particles: Frames, frame: int) -> Reconstructed:
+        return self._once("made", particles, frame, lambda: self._reconstruct(particles, frame))
 
     @torch.no_grad()
-    def _made(self, particles: Frames, frame: int) -> Reconstructed:
+    def _reconstruct(self, particles: Frames, frame: int) -> Reconstructed:
         position, velocity = (torch.from_numpy(particles.read(frame, name)) for name in ("position", "velocity"))
         return self.form.of(ParticleField(self.slab, self.form.support, position, velocity))
 

@@ -95,7 +95,7 @@ def stage_seconds(directory: Path) -> dict[str, float]:
 
 
 def read_stage_seconds(directory: Path) -> dict[str, float]:
-    """The same; ProductError if the file is damaged."""
+    """Wall time of each stage in earlier runs; empty if the file is missing. ProductError if it is damaged."""
     path = directory / SECONDS
     if not path.exists():
         return {}
@@ -121,7 +121,7 @@ def changed_settings(stage: Stage, then: str | None, now: str | None) -> list[st
 
 
 def of_other_settings(changes: Sequence[str]) -> str:
-    """"other settings", with the first of the changes."""
+    """The words "other settings", followed by the first of the changes."""
     listed = [*changes[:MOST_CHANGES], *(["..."] if changes[MOST_CHANGES:] else [])]
     return "other settings" + (f" ({', '.join(listed)})" if listed else "")
 
