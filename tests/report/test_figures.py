@@ -46,3 +46,14 @@ def test_nothing_covers_anything_else_or_leaves_the_figure():
         assert figure.bbox.y0 <= box.y0 and box.y1 <= figure.bbox.y1
         assert not any(box.overlaps(other) for other in boxes[:index])
         assert not any(box.overlaps(axis.bbox) for axis in figure.axes)
+
+
+def test_ticks_that_depend_on_the_size_of_a_panel_leave_room_for_the_label():
+    """Labels with more digits appear if the layout makes the panel higher."""
+    figure, axes = panels(2, 2, (4.6, 3.1))
+    axes[0, 0].plot([0, 1], [0.9905, 1.0095])
+    axes[0, 0].set(title="A title", ylabel="ratio")
+    for axis in axes.flat:
+        axis.set_xlabel("time")
+    png(figure)
+    assert axes[0, 0].yaxis.label.get_window_extent(figure.canvas.get_renderer()).x0 >= 0
