@@ -3,7 +3,7 @@
     .venv/bin/python docs/tables.py
 
 A table stands between two comments. The first names the comparison in docs/results, the columns, and the rows with the
-words for them; a row `floor` is the truth's own:
+words for them; a row `floor` is the truth's own, and a line `*` takes all rows under their names:
 
     <!-- table of compare-small: wall_seconds velocity_error_half
     learned: the default
@@ -29,7 +29,7 @@ from typing import Any
 from eddies.measures import MEASURES
 
 HERE = Path(__file__).parent
-PAGES = (HERE.parent / "README.md", *sorted(HERE.glob("*.md")))
+PAGES = (HERE.parent / "README.md", *sorted(HERE.glob("*.md")), *sorted(HERE.glob("notes/*.md")))
 TABLE = re.compile(r"(<!-- table of ([\w-]+): ([^\n]*)\n(.*?)-->\n).*?(?=<!-- end of table -->)", re.DOTALL)
 NUMBERS = re.compile(r"(<!-- numbers of ([\w-]+)\n(.*?)-->\n).*?(?=<!-- end of numbers -->)", re.DOTALL)
 WORDS = MEASURES | {"wall_seconds": "seconds a turnover", "core_seconds": "core seconds a turnover",
@@ -53,8 +53,8 @@ def table(comparison: str, columns: str, rows: str) -> str:
     results[FLOOR] = {key.removesuffix("_floor"): value for key, value in record["rows"][0].items()
                       if key.endswith("_floor")}
     lines = ["| |" + "".join(f" {WORDS[key]} |" for key in keys), "|---|" + "---|" * len(keys)]
-    for row in rows.strip().splitlines():
-        name, words = row.split(": ", 1)
+    asked = [] if rows.strip() == "*" else [row.split(": ", 1) for row in rows.strip().splitlines()]
+    for name, words in asked or [(row["name"], f"`{row['name']}`") for row in record["rows"]]:
         lines.append(f"| {words} |" + "".join(f" {number(results[name], key)} |" for key in keys))
     return "\n".join(lines) + "\n"
 
@@ -71,12 +71,14 @@ def numbers(run: str, rows: str) -> str:
 
 def number(row: Mapping[str, Any], key: str) -> str:
     """Two digits, or as many as the standard deviation tells where there is one; ratios to three digits after the
-    point, errors of steps, which hardly differ, to four; a word as it is; nothing without a number."""
+    point; steps to three digits and their errors, which hardly differ, to four; a word as it is; nothing without a number."""
     value, spread = row.get(key), row.get(f"{key}_spread")
     if value is None or isinstance(value, str):
         return value or ""
     if key.startswith("step_error"):
-        return f"{value:.4f}"
+        return f"{value:.4f}" if value >= 1e-3 else f"{value:.1e}"
+    if key == "step_size":
+        return f"{value:.3g}"
     if key.endswith("_ratio"):
         return f"{value:.3f}" + (f" ± {spread:.3f}" if spread is not None else "")
     if spread is None or spread == 0:
