@@ -79,7 +79,7 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
     if not planned and not reported:
         for each in [scene.variant[name] for name in variants] or [scene]:
             check_sections(stages, each)
-    warnings = refuse(scene, Context(comm, stages, directory, variants, memory_of_node()))
+    warnings = refuse(scene, Context(comm, stages, directory, variants, memory_of_node(comm)))
     if take_over:
         for step in planned:
             look_at_work(step, comm, overwrite)  # a command that is refused must not end another job

@@ -37,6 +37,21 @@ class Flow(Section):
         """Whether the fluid has a density, and sound."""
         return load(self.fluid).compressible if is_path(self.fluid) else self.fluid == "compressible"
 
+    @property
+    def components(self) -> int:
+        """Number of fields of the state: velocity, and density of a compressible fluid."""
+        return 4 if self.compressible else 3
+
+    @property
+    def real_bytes(self) -> int:
+        """Bytes of a real number on the grid."""
+        return 4 if self.precision == "float32" else 8
+
+    @property
+    def largest_wavenumber(self) -> int:
+        """k_max of the 2/3 rule: the largest integer below cells / 3."""
+        return (self.cells - 1) // 3
+
 
 @dataclass(frozen=True)
 class InitialFlow:
@@ -270,6 +285,11 @@ class Training(Section):
     def wants_fields(self) -> bool:
         """Whether each frame of the training needs a filtered field one frame later."""
         return self.field_target == "flow" and self.field_weight > 0
+
+    @property
+    def steps_in_all(self) -> int:
+        """Number of optimiser steps, with those through horizons."""
+        return self.steps + (self.horizons.steps * len(self.horizons.frames) if self.horizons else 0)
 
     @property
     def truth_files(self) -> tuple[Path, ...]:
