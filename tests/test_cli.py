@@ -190,10 +190,11 @@ def test_more_ranks_than_slabs_are_refused_before_any_work(comm, tmp_path, capfd
 @pytest.mark.mpi(1)
 def test_limit_of_ranks_is_that_of_the_stages(comm):
     from eddies.scene.scene import load_scene
-    from eddies.workflows.foreseen.ranks import rank_problems
+    from eddies.workflows.foreseen.ranks import most_ranks, rank_problems
     scene = load_scene(TINY)
-    assert not [*rank_problems(scene, ["dns"], 8), *rank_problems(load_scene("hit-small"), ["dns", "train"], 8)]
-    problem, = rank_problems(scene, scene.stages, 5)
+    assert not [*rank_problems(most_ranks(scene.ground_truth_alone), 8),
+                *rank_problems(most_ranks(load_scene("hit-small")), 8)]
+    problem, = rank_problems(most_ranks(scene), 5)
     assert "start at most 4" in problem
 
 

@@ -13,7 +13,7 @@ from eddies.scene.scene import Scene, SceneError
 from eddies.workflows.foreseen.numbers import estimate
 from eddies.workflows.foreseen.ranks import most_ranks
 from eddies.workflows.foreseen.seconds import seconds
-from eddies.workflows.foreseen.storage import disk, in_units, memory, most_disk, scratch
+from eddies.workflows.foreseen.storage import disk, in_units, memory, most_disk
 from eddies.workflows.problems import here, problems
 from eddies.workflows.variants import rollouts, steps
 
@@ -44,7 +44,7 @@ def numbers(scene: Scene, comm: Comm) -> dict[str, Any]:
     """All estimates by the keys that docs/check.md describes; None where a number is unknown before a run. All ranks
     call it."""
     expected, tracers, k_max = estimate(scene), scene.tracers, scene.flow.largest_wavenumber
-    rollout_of = {name: estimate(variant).rollout for name, variant in (scene.variant or {scene.name: scene}).items()}
+    rollout_of = {name: estimate(each).rollout for name, each in (scene.variant or {scene.name: scene}).items()}
     (refusals, warnings), limits, work = problems(scene, here(scene, comm)), most_ranks(scene), work_of(scene)
     turbulence = expected.turbulence
     costs = [cost(variant, stage, scenes, comm.size) for (variant, stage), scenes in work.items()]
@@ -64,8 +64,7 @@ def numbers(scene: Scene, comm: Comm) -> dict[str, Any]:
         "stage_costs": costs,
         "totals": {"seconds": sum(row["seconds"] or 0.0 for row in costs),
                    "memory": max(row["memory"] for row in costs), "disk": sum(row["disk"] or 0.0 for row in costs),
-                   "most_disk": most_disk((disk(each, stage), scratch(each, stage)) for (_, stage), scenes in work.items()
-                                          for each in scenes)},
+                   "most_disk": most_disk(disk(each, stage) for (_, stage), scenes in work.items() for each in scenes)},
         "warnings": warnings, "refusals": refusals,
     }
 
@@ -91,8 +90,8 @@ def cost(variant: str | None, stage: str, scenes: Sequence[Scene], ranks: int) -
     return {"stage": stage, "variant": variant, "runs": 1 if stage == "report" else len(scenes),
             "seconds": total([seconds(each, stage, ranks) for each in scenes]),
             "memory": max(memory(each, stage, ranks) for each in scenes),
-            "disk": total([disk(each, stage) for each in scenes]),
-            "scratch": scratch(scenes[0], stage), "most_ranks": most,
+            "disk": total([disk(each, stage).kept for each in scenes]),
+            "scratch": disk(scenes[0], stage).scratch, "most_ranks": most,
             "least_seconds": total([seconds(each, stage, most) for each in scenes]),
             "least_memory": max(memory(each, stage, most) for each in scenes)}
 

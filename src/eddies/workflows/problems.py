@@ -27,7 +27,7 @@ from eddies.scene.scene import (BOX_LENGTH, Flow, Forcing, Initial, Model, Scene
 from eddies.scene.terms import StepUnits
 from eddies.workflows.foreseen.numbers import Estimates, Turbulence, estimate
 from eddies.workflows.foreseen.ranks import most_ranks, rank_problems
-from eddies.workflows.foreseen.storage import disk, in_units, memory, most_disk, scratch
+from eddies.workflows.foreseen.storage import disk, in_units, memory, most_disk
 from eddies.workflows.ground_truth.frame_counts import check_frames
 from eddies.workflows.ground_truth.scene_flow import stored_states
 from eddies.workflows.variants import Step, steps
@@ -93,22 +93,12 @@ def problems(scene: Scene, context: Context) -> tuple[list[str], list[str]]:
                        f"{in_units(context.memory)} of memory here; take more nodes, or fewer cells or particles"] = []
     if "report" in context.stages:
         refused |= dict.fromkeys(place_problems(("report",), comm, context.directory))
-    needed = most_disk((disk(step.scene, stage), scratch(step.scene, stage))
-                       for step in planned for stage in step.stages)
+    needed = most_disk(disk(step.scene, stage) for step in planned for stage in step.stages)
     if needed > context.free_disk:
         doubts[f"the stages need about {in_units(needed)} of disk, and {in_units(context.free_disk)} are free here; "
                "choose another --output, or raise [tracers] frame_interval or field_every"] = []
     named = {text: ", ".join(dict.fromkeys(filter(None, names))) for text, names in doubts.items()}
     return [*refused], [f"variant {names}: {text}" if names else text for text, names in named.items()]
-
-
-def refuse(scene: Scene, context: Context) -> list[str]:
-    """Raise SceneError with the first problem for which a scene is refused, or return its warnings; all ranks call
-    it."""
-    refused, warnings = problems(scene, context)
-    for problem in refused:
-        raise SceneError(problem)
-    return warnings
 
 
 # ---- problems that end a run
@@ -140,7 +130,7 @@ def _infeasible(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str]
     limits = most_ranks(scene.ground_truth_alone if set(stages) == {"dns"} else scene)
     yield from rank_problems(limits, comm.size)
     if has_single_writer(comm):
-        yield from _large_files({stage: disk(scene, stage) or 0.0 for stage in stages}, comm.size)
+        yield from _large_files({stage: disk(scene, stage).kept or 0.0 for stage in stages}, comm.size)
 
 
 def _strong_forcing(initial: Initial, forcing: Forcing, time: Time) -> Iterator[str]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from eddies.clock import ladder_step
 from eddies.particles.flow_units import allowed_step, resolved_wavenumber
-from eddies.scene.scene import BOX_LENGTH, Flow, Forcing, Initial, Scene, Simulation, Time, Tracers
+from eddies.scene.scene import BOX_LENGTH, Flow, Forcing, Initial, Scene, Simulation, Time
 from eddies.scene.sections import METHODS
 
 DISSIPATION_CONSTANT = 0.5   # C_eps = eps L / u'^3 of developed turbulence
@@ -68,6 +68,7 @@ class Estimates:
     run_time : physical time that the direct simulation covers.
     frame_intervals : number of frame intervals of the tracers, 0 without tracers.
     steps : number of steps of the direct simulation.
+    resolved_shells : largest wavenumber along each axis of the resolved velocity of particles; 0 without tracers.
     allowed_step : longest step of particles with a resolved velocity, at the speed at which the tracers start.
     rollout_step : longest step of the rollout.
     rollout : None also without a rollout, and for a method of the user's.
@@ -83,9 +84,10 @@ class Estimates:
     run_time: float | None
     frame_intervals: int | None
     steps: int | None
-    allowed_step: float | None = None
-    rollout_step: float = math.inf
-    rollout: Rollout | None = None
+    resolved_shells: int
+    allowed_step: float | None
+    rollout_step: float
+    rollout: Rollout | None
 
 
 def estimate(scene: Scene) -> Estimates:
@@ -108,10 +110,14 @@ def estimate(scene: Scene) -> Estimates:
             longest = min(time.step or bound, time.max_step)
             # With tracers, each frame interval is divided into equal steps.
             steps = _whole(alone / step) + (intervals * _whole(tracers.frame_interval / longest) if tracers else 0)
-    allowed, rollout_step, rollout = None, math.inf, None
+    shells, allowed, rollout_step, rollout = 0, None, math.inf, None
+    if tracers:
+        highest = resolved_wavenumber(tracers.spacing, tracers.filter_width,
+                                      turbulence.kolmogorov_length if turbulence else 0.0)
+        shells = min(max(int(highest + 1e-9), 1), (tracers.planes - 1) // 2)
     if settings is not None:
         if turbulence is not None:
-            allowed = allowed_step(settings.scheme.angle, resolved_shells(tracers, turbulence), turbulence.velocity_rms)
+            allowed = allowed_step(settings.scheme.angle, shells, turbulence.velocity_rms)
         # A step that is still to be found counts as one frame interval at most.
         rollout_step = settings.frame_interval if math.isinf(settings.longest_step) else settings.longest_step
         if scene.coarse_cells and peak:
@@ -124,7 +130,7 @@ def estimate(scene: Scene) -> Estimates:
         turbulence=turbulence, peak_speed=peak, rms_speed=rms,
         mach=rms / scene.flow.sound_speed if rms is not None and scene.flow.sound_speed else None, courant_step=bound,
         step=step, limited_by=limited_by, run_time=run_time, frame_intervals=intervals, steps=steps,
-        allowed_step=allowed, rollout_step=rollout_step, rollout=rollout)
+        resolved_shells=shells, allowed_step=allowed, rollout_step=rollout_step, rollout=rollout)
 
 
 def expected_turbulence(flow: Flow, initial: Initial, forcing: Forcing | None) -> Turbulence | None:
@@ -188,13 +194,6 @@ def rollout_in(settings: Simulation, turnover_time: float, longest: float) -> Ro
         steps = _whole(intervals * interval / longest)
     return Rollout(turnover_time, intervals, step, steps,
                    0 if settings.on_grid else settings.scheme.evaluations * steps + 1)
-
-
-def resolved_shells(tracers: Tracers, turbulence: Turbulence | None) -> int:
-    """Largest wavenumber along each axis of the resolved velocity of the particles."""
-    highest = resolved_wavenumber(tracers.spacing, tracers.filter_width,
-                                  turbulence.kolmogorov_length if turbulence else 0.0)
-    return min(max(int(highest + 1e-9), 1), (tracers.planes - 1) // 2)
 
 
 def _whole(ratio: float) -> int:

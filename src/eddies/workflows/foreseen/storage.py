@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from typing import NamedTuple
 
 from eddies.cores import threads
 from eddies.flow.history import EVERY
@@ -59,45 +60,43 @@ def flow_memory(flow: Flow, tracers: Tracers | None, ranks: int) -> float:
     return size + (3 * real * points + TRACER_BYTES * tracers.particles / ranks if tracers else 0.0)
 
 
-def disk(scene: Scene, stage: str) -> float | None:
-    """Size of what a stage leaves in the run directory; None where the number of its frames is unknown."""
+class Disk(NamedTuple):
+    """Bytes that a stage leaves in the run directory, None where they are unknown, and those of files that it removes
+    at its end."""
+
+    kept: float | None
+    scratch: float = 0.0
+
+
+def disk(scene: Scene, stage: str) -> Disk:
+    """Disk that a stage needs."""
     flow, tracers, expected = scene.flow, scene.tracers, estimate(scene)
     if stage == "dns":
-        shells = math.ceil(math.sqrt(3) * flow.largest_wavenumber) + 1
-        statistics = (SAMPLE_BYTES + 8 * shells) * ((expected.steps or 0) // EVERY)
+        k_max, intervals = flow.largest_wavenumber, expected.frame_intervals
+        statistics = (SAMPLE_BYTES + 8 * (math.ceil(math.sqrt(3) * k_max) + 1)) * ((expected.steps or 0) // EVERY)
+        state = flow.components * (2 * k_max + 1) ** 2 * (k_max + 1) * 2 * flow.real_bytes
+        checkpoints = (KEPT + 1) * state  # with the one that is written
         if tracers is None:
-            return statistics + 4 * flow.components * flow.cells**3
-        if expected.frame_intervals is None:
-            return None
-        frames = expected.frame_intervals + 1
-        return statistics + trajectory_bytes(flow, tracers, frames, len(whole_frames(scene, frames)))
+            return Disk(statistics + 4 * flow.components * flow.cells**3, checkpoints)
+        during, after = (trajectory_bytes(flow, tracers, frames, len(whole_frames(scene, frames)))
+                         for frames in (intervals or 0, (intervals or 0) + 1))
+        return Disk(None if intervals is None else statistics + after, checkpoints + during)
     if stage == "train-kernel":  # planes of five reconstructions, velocity and gradient
-        return PRODUCT_BYTES + 80 * tracers.cells**2 + 64 * scene.kernel.steps
+        return Disk(PRODUCT_BYTES + 80 * tracers.cells**2 + 64 * scene.kernel.steps)
     if stage == "train":         # samples of rates, and the history
         steps = scene.own_training.steps_in_all if scene.own_training else 0
-        return PRODUCT_BYTES + 48 * min(tracers.particles, TESTED_PARTICLES) + 100 * steps
+        return Disk(PRODUCT_BYTES + 48 * min(tracers.particles, TESTED_PARTICLES) + 100 * steps)
     if stage == "simulate":
-        return expected.rollout and rollout_bytes(tracers.particles, expected.rollout.intervals + 1)
-    return PRODUCT_BYTES if stage == "find-step" else REPORT_BYTES
+        return Disk(expected.rollout and rollout_bytes(tracers.particles, expected.rollout.intervals + 1))
+    return Disk(PRODUCT_BYTES if stage == "find-step" else REPORT_BYTES)
 
 
-def scratch(scene: Scene, stage: str) -> float:
-    """Disk that a stage needs until it ends: frames of a direct simulation, and checkpoints with the one that is
-    written."""
-    if stage != "dns":
-        return 0.0
-    flow, k_max, frames = scene.flow, scene.flow.largest_wavenumber, estimate(scene).frame_intervals or 0
-    state = flow.components * (2 * k_max + 1) ** 2 * (k_max + 1) * 2 * flow.real_bytes
-    stored = trajectory_bytes(flow, scene.tracers, frames, len(whole_frames(scene, frames))) if scene.tracers else 0
-    return (KEPT + 1) * state + stored
-
-
-def most_disk(work: Iterable[tuple[float | None, float]]) -> float:
-    """The disk that stages, one after the other, need at the worst moment, from the `disk` and `scratch` of each."""
+def most_disk(work: Iterable[Disk]) -> float:
+    """The disk that stages, one after the other, need at the worst moment."""
     left = most = 0.0
-    for kept, scratch in work:
-        left += kept or 0.0
-        most = max(most, left + scratch)
+    for needed in work:
+        left += needed.kept or 0.0
+        most = max(most, left + needed.scratch)
     return most
 
 
