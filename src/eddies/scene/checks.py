@@ -19,14 +19,14 @@ from eddies.scene.values import Section, import_paths
 
 Problems = Iterator[tuple[str, str]]
 
-# The attributes that a class of the user's must have, by the key that names it.
+# Attributes that a user's class must have, by the key that names the class.
 REQUIRED = {"fluid": ("nonlinear", "linear", "linear_function", "combine", "compressible"), "kind": ("__call__",),
             "method": ("advance", "frame", "status", "series", "description", "has_density"), "network": ("forward",)}
 # Other names in a run directory, beside the products and directories of the stages.
 RESERVED = ("report", "vtkhdf", "lagrangebench", "STOP", "LOCK")
 REALISATION = "realisation-"
 NAME = r"[A-Za-z0-9][A-Za-z0-9._-]{,99}"
-# The keys in which a variant must agree with the scene, by the reason; STARTS: where rollouts start after the training.
+# Keys that a variant must share with the scene, with the reason. STARTS apply to rollouts that start after the training.
 SAME_TIMES = "all variants start at the same moment and are compared at the same times; change it for the whole scene"
 SAME_START = "rollouts start after it, and all must start at the same moment; give the scene a [simulation] start"
 COMPARED = {**dict.fromkeys(("simulation.turnovers", "simulation.start", "simulation.frame_interval"), SAME_TIMES),
@@ -35,7 +35,7 @@ STARTS = dict.fromkeys(("training.window", "training.truths"), SAME_START)
 
 
 def check_names(name: str, seed: int, realisations: Sequence[int], has_rollouts: bool) -> Problems:
-    """The name of a directory, and seeds of realisations that are different."""
+    """A name that is no name of a directory, and seeds of realisations that are not new."""
     if not re.fullmatch(NAME, name):
         yield "name", ('must be the name of a directory: at most 100 letters, digits, ".", "_" and "-", the first a '
                        'letter or a digit; choose another, such as "my-run_2"')
@@ -60,7 +60,7 @@ def problem_of_name(variant: str) -> str:
 
 
 def check_foreign(flow: Flow, initial: Initial, simulation: Simulation | None, model: Model | None) -> Problems:
-    """Import paths that lead nowhere, or to a class without what its key needs; [model] checks those of terms."""
+    """Import paths that cannot be loaded, or whose class lacks an attribute. [model] checks the paths of terms."""
     sections: dict[str, Section | None] = {"flow": flow, "initial": initial, "simulation": simulation}
     if model:
         sections |= {f"model.{name}": settings for name, settings in model.settings.items()}
@@ -79,7 +79,7 @@ def check_foreign(flow: Flow, initial: Initial, simulation: Simulation | None, m
 
 
 def check_flow(flow: Flow, initial: Initial, forcing: Forcing | None, model: Model | None) -> Problems:
-    """The sound speed, keys that only some initial flows read, and waves within the resolved scales."""
+    """A sound speed, keys and waves that the fluid, the initial flow or the grid does not have."""
     if flow.compressible and flow.sound_speed is None:
         yield "flow.sound_speed", "this key is missing; a compressible fluid needs a number above 0"
     if not flow.compressible and flow.sound_speed is not None:
@@ -106,7 +106,7 @@ def check_flow(flow: Flow, initial: Initial, forcing: Forcing | None, model: Mod
 
 def check_time(time: Time, flow: Flow, forcing: Forcing | None, spin_up: SpinUp | None,
                tracers: Tracers | None) -> Problems:
-    """One run time, and a forcing that acts in it."""
+    """A missing or second run time, and a forcing that never acts."""
     if tracers is None and time.duration is None:
         yield "time.duration", "this key is missing; without [tracers] it is the run time, a number above 0"
     if tracers is not None and time.duration is not None:
@@ -126,7 +126,7 @@ def check_time(time: Time, flow: Flow, forcing: Forcing | None, spin_up: SpinUp 
 
 
 def check_tracers(tracers: Tracers, flow: Flow, initial: Initial) -> Problems:
-    """A flow that moves the tracers, and fields no finer than the flow."""
+    """A flow at rest, and stored fields finer than the flow."""
     if initial.flow.sound:
         yield "initial.kind", ("starts from rest, and [tracers] are followed for turnovers of a flow that moves; "
                                "choose another kind, or remove [tracers]")
@@ -137,7 +137,7 @@ def check_tracers(tracers: Tracers, flow: Flow, initial: Initial) -> Problems:
 
 
 def check_reach(section: str, neighbors: float, tracers: Tracers, skin: float) -> Problems:
-    """A support of the kernel, or a radius of interaction, that ends below half the cube."""
+    """A support of the kernel, or a radius of interaction, beyond half the cube."""
     reach = tracers.radius_of(neighbors) * (1 + skin)
     if reach >= math.pi:  # a particle would see another one and its image
         yield f"{section}.neighbors", (
@@ -146,7 +146,7 @@ def check_reach(section: str, neighbors: float, tracers: Tracers, skin: float) -
 
 
 def check_needs(present: Collection[str], needs_model: bool, has_weights: bool) -> Problems:
-    """Sections that need others. A rollout may need a model, and a model without weights a training."""
+    """Missing sections that others need."""
     needs = {"kernel": "tracers", "model": "tracers", "training": "model",
              "simulation": "model" if needs_model else "tracers"}
     for name, other in needs.items():
@@ -158,7 +158,7 @@ def check_needs(present: Collection[str], needs_model: bool, has_weights: bool) 
 
 
 def check_density(flow: Flow, model: Model | None, simulation: Simulation | None) -> Problems:
-    """A density that is given twice, or that is read where the terms or the flow give none."""
+    """A density that is given twice, and one that is read but not given by the terms or the flow."""
     incompressible, rates = not flow.compressible, {"density", "density_rate"}
     remedy = 'or set [flow] fluid = "compressible" and sound_speed'
     settings = model.settings if model else {}
@@ -220,8 +220,8 @@ def check_training(training: Training, tracers: Tracers | None, kernel: Kernel |
 
 
 def check_simulation(simulation: Simulation, tracers: Tracers, seen: float) -> Problems:
-    """Frames at the times of the ground truth and of steps, and a start within the ground truth; training has `seen`
-    this fraction of it."""
+    """Frames between steps or between those of the ground truth, and a missing start. Training has seen the fraction
+    `seen` of the ground truth."""
     step, frame_interval = simulation.longest_step, simulation.frame_interval
     if not (simulation.scheme.dense or math.isinf(step) or _is_multiple(frame_interval, step)):
         yield "simulation.frame_interval", (
@@ -237,8 +237,8 @@ def check_simulation(simulation: Simulation, tracers: Tracers, seen: float) -> P
 
 
 def check_coarse_grid(eulerian: Eulerian | None, cells: int, flow: Flow, model: Model | None) -> Problems:
-    """A coarse grid of its own method, no finer than the flow, and with what its fluid and closure need. The rollout
-    has a grid of so many `cells`, or 0 without one."""
+    """A coarse grid that is not used, is finer than the flow, or lacks sound or damping rates. `cells` along a side is
+    0 without a coarse grid."""
     if eulerian is None:
         eulerian = Eulerian()
     elif not cells:

@@ -42,7 +42,7 @@ class Scene(Section):
 
     name: str = text("names the run; absent: the file's name", default="scene")
     title: str = text("one line for lists and reports", default="untitled scene")
-    label: str | None = text("name of a variant in tables and figures; absent: NAME of its section", default=None)
+    label: str | None = text("name of the variant in tables and figures; absent: NAME of [variant.NAME]", default=None)
     seed: int = integer("seed of every random number", default=1, at_least=0, at_most=10**18)
     realisations: tuple[int, ...] | None = integers(
         "seeds of further ground truths, which no training sees: rollouts are made on each from its beginning; absent: "
