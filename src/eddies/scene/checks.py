@@ -26,7 +26,7 @@ REQUIRED = {"fluid": ("nonlinear", "linear", "linear_function", "combine", "comp
 RESERVED = ("report", "vtkhdf", "lagrangebench", "STOP", "LOCK")
 REALISATION = "realisation-"
 NAME = r"[A-Za-z0-9][A-Za-z0-9._-]{,99}"
-# Keys that a variant must share with the scene, with the reason. STARTS apply to rollouts that start after the training.
+# Keys that a variant must share with the scene, with the reason; STARTS: for rollouts that start after the training.
 SAME_TIMES = "all variants start at the same moment and are compared at the same times; change it for the whole scene"
 SAME_START = "rollouts start after it, and all must start at the same moment; give the scene a [simulation] start"
 COMPARED = {**dict.fromkeys(("simulation.turnovers", "simulation.start", "simulation.frame_interval"), SAME_TIMES),

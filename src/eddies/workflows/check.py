@@ -1,4 +1,4 @@
-"""Estimates of a scene before a run: resolution, steps, ranks, memory, disk, time, and problems. Writes nothing."""
+"""`eddies check`: estimates of a scene before a run, and its problems. It writes no file."""
 
 from __future__ import annotations
 
@@ -24,8 +24,10 @@ OF_TURBULENCE = ("velocity_rms", "dissipation_rate", "reynolds_lambda", "turnove
 
 
 def run(scene: Scene, comm: Comm, as_json: bool = False) -> None:
-    """Log estimates of a scene with its variants and their stages on these ranks, or print them as JSON; all ranks call
-    it. Raises SceneError, after all is shown, where a run would be refused."""
+    """Log the estimates of a scene and its variants on these ranks, or print them as JSON; all ranks call it.
+
+    Raises SceneError at the end if a run would be refused.
+    """
     found, subject = numbers(scene, comm), ""
     if comm.rank == 0 and as_json:
         print(json.dumps(found, indent=2, allow_nan=False))
@@ -41,8 +43,7 @@ def run(scene: Scene, comm: Comm, as_json: bool = False) -> None:
 
 
 def numbers(scene: Scene, comm: Comm) -> dict[str, Any]:
-    """All estimates by the keys that docs/check.md describes; None where a number is unknown before a run. All ranks
-    call it."""
+    """Return all estimates by the keys that docs/check.md describes, None if unknown; all ranks call it."""
     expected, tracers, k_max = estimate(scene), scene.tracers, scene.flow.largest_wavenumber
     rollout_of = {name: estimate(each).rollout for name, each in (scene.variant or {scene.name: scene}).items()}
     (refusals, warnings), limits, work = problems(scene, here(scene, comm)), most_ranks(scene), work_of(scene)
@@ -70,7 +71,7 @@ def numbers(scene: Scene, comm: Comm) -> dict[str, Any]:
 
 
 def work_of(scene: Scene) -> dict[tuple[str | None, str], list[Scene]]:
-    """The scenes for which each stage runs, by variant (None: shared by all) and stage; several with realisations."""
+    """The scenes of each stage by variant (None: shared by all) and stage; several with realisations."""
     work: dict[tuple[str | None, str], list[Scene]] = {}
     planned = steps(scene, scene.stages_of_all, scene.directory)
     for step in sorted(planned, key=lambda step: [None, *scene.variant].index(step.variant)):
@@ -97,7 +98,7 @@ def cost(variant: str | None, stage: str, scenes: Sequence[Scene], ranks: int) -
 
 
 def lines(found: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """The same as text: subject and line."""
+    """Yield the estimates as text: subject and line."""
     for key, value in found.items():
         if key == "limits":
             yield from ((key, f"{ranks}: {reason}") for reason, ranks in value.items())
@@ -122,7 +123,7 @@ def lines(found: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
 
 
 def as_text(value: Any) -> str:
-    """A value of the numbers as text."""
+    """An estimate as text."""
     if isinstance(value, dict):
         return ", ".join(f"{name} {as_text(part)}" for name, part in value.items())
     if isinstance(value, list):

@@ -1,5 +1,5 @@
-"""Problems of a scene on a machine and in a run directory, which are known before any work. Each text names a key, its
-value, the reason and the remedy."""
+"""Problems of a scene on a machine and in a run directory that are known before any work. Each text names the key, its
+value, the reason and a remedy."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ KMAX_ETA = 1.0, 4.0          # the least that resolves the dissipation, and more
 MOST_STEPS = 10**9           # of a flow or rollout, and frames: a quarter of an hour at a microsecond each
 MOST_FORCED = 50             # how many times the energy of a flow the forcing may add in one step
 SILENCE = -40.0              # logarithm of a share of the energy that is round-off
-# Largest turnover time at the release of tracers over the expected one, of a flow with at least this Re_lambda.
+# Largest turnover time at the release of tracers over the expected one; the least Re_lambda for which it holds.
 LATER, TURBULENT = 3.0, 20.0
 
 
 @dataclass(frozen=True)
 class Context:
-    """Ranks, machine and run directory, with which a scene is compared.
+    """The ranks, machine and run directory of a run.
 
     Parameters
     ----------
@@ -63,20 +63,22 @@ class Context:
 
 
 def here(scene: Scene, comm: Comm) -> Context:
-    """All stages of a scene in its own run directory on this machine; all ranks call it."""
+    """Return the context of all stages of a scene in its own run directory on this machine; all ranks call it."""
     place = next(path for path in (scene.directory, *scene.directory.parents) if path.is_dir())
     free = on_first_rank(comm, lambda: shutil.disk_usage(place).free)
     return Context(comm, scene.stages_of_all, scene.directory, memory=memory_of_node(comm), free_disk=free)
 
 
 def memory_of_node(comm: Comm) -> float:
-    """Physical memory in bytes of the node with the least; all ranks call it."""
+    """Physical memory in bytes of the smallest node; all ranks call it."""
     return float(global_min(comm, os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")))
 
 
 def problems(scene: Scene, context: Context) -> tuple[list[str], list[str]]:
-    """Problems of the stages of a scene and of its variants: those for which `eddies run` refuses the scene, and those
-    of which it warns. All ranks call it and get the same."""
+    """Return the problems of the stages of a scene and of its variants; all ranks call it and get the same.
+
+    `eddies run` refuses the scene for the first list, and warns of the second.
+    """
     comm, planned = context.comm, steps(scene, context.stages, context.directory, context.variants)
     on_node = node_ranks(comm)
     made = {step.directory / STAGES[stage].file for step in planned for stage in step.stages}
@@ -111,7 +113,7 @@ def _refusals(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str]:
 
 
 def _infeasible(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str]:
-    """Flows that cannot run; too many steps, frames, ranks or bytes; too few frames."""
+    """Unstable or decayed flows; too many steps, frames, ranks or bytes; too few frames."""
     scene, stages, expected = step.scene, step.stages, estimate(step.scene)
     tracers, turbulence = scene.tracers, expected.turbulence
     if "dns" in stages:
@@ -147,7 +149,7 @@ def _strong_forcing(initial: Initial, forcing: Forcing, time: Time) -> Iterator[
 
 
 def _decay(flow: Flow, tracers: Tracers, turbulence: Turbulence) -> Iterator[str]:
-    """A flow that viscosity ends before the tracers do."""
+    """A flow that viscosity stops before the tracers end."""
     time = tracers.turnovers * turbulence.turnover_time
     exponent = -2 * flow.viscosity * time  # of the largest modes, |k| = 1
     if exponent < SILENCE and not tracers.forced:
@@ -176,8 +178,10 @@ def _too_many(key: str, value: float | str, step: float, span: float) -> Iterato
 
 
 def _too_few_frames(step: Step, turbulence: Turbulence, made: Collection[Path]) -> Iterator[str]:
-    """Too few frames of a ground truth that is yet to be made, even if the flow turns over as slowly as it may. A flow
-    that decays before the tracers start, or is hardly turbulent, may have any turnover time."""
+    """Too few frames of a ground truth that this job makes, even with the longest possible turnover time.
+
+    The turnover time of a flow that decays before the tracers start, or is hardly turbulent, has no limit.
+    """
     scene = step.scene
     unsure = step.holder("dns") / STAGES["dns"].file not in made or scene.spin_up is not None and scene.forcing is None
     if unsure or scene.tracers is None or turbulence.reynolds_lambda < TURBULENT:
@@ -201,7 +205,7 @@ def _large_files(sizes: Mapping[str, float], ranks: int) -> Iterator[str]:
 
 
 def place_problems(stages: Sequence[str], comm: Comm, directory: Path) -> list[str]:
-    """A run directory that is none or cannot be written, or in which something else has the name of a product."""
+    """A run directory that cannot be used, or a file or directory in it with the name of a product."""
     def look() -> list[str]:
         if directory.is_dir() and not os.access(directory, os.W_OK | os.X_OK):
             return [f"{directory}: cannot be written; change its permissions, or choose another directory"]
@@ -221,8 +225,8 @@ def place_problems(stages: Sequence[str], comm: Comm, directory: Path) -> list[s
 
 
 def _unfit_files(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str]:
-    """A file to start from, trained weights or other ground truths that do not fit; a missing GPU. Weights that earlier
-    steps make are not read."""
+    """Unfit files: the initial flow, trained weights, other ground truths. A missing GPU. Weights that earlier steps
+    make are not read."""
     scene, stages, model = step.scene, step.stages, step.scene.model if "train" in step.stages else None
     try:
         if "dns" in stages and scene.initial.flow.from_file:
@@ -316,7 +320,7 @@ def stability(flow: Flow, time: Time, expected: Estimates) -> Iterator[str]:
 
 
 def filter_width(tracers: Tracers, flow: Flow, initial: Initial, forcing: Forcing | None) -> Iterator[str]:
-    """A filter that filters nothing, or removes the flow."""
+    """A filter narrower than a cell, or so wide that it removes the energy of the flow."""
     width, cell = tracers.filter_width, BOX_LENGTH / flow.cells
     if width < cell:
         yield (f"[tracers] filter_width = {width:.3g}: is narrower than a cell of the grid, so that nothing is "
@@ -330,7 +334,7 @@ def filter_width(tracers: Tracers, flow: Flow, initial: Initial, forcing: Forcin
 
 
 def untrained_terms(model: Model, training: Training) -> Iterator[str]:
-    """Terms that nothing trains."""
+    """Terms that are not trained."""
     for name, settings in model.settings.items():
         if settings.learns_through_horizons and training.horizons is None:
             yield (f'[model] terms: "{name}" is trained through horizons alone, and keeps its initial parameters '
@@ -350,7 +354,7 @@ def rollout_steps(settings: Simulation, allowed: float | None, model: Model, uni
 
 
 def beyond_truth(settings: Simulation, tracers: Tracers, seen: float) -> Iterator[str]:
-    """A rollout that goes on after the end of its ground truth; training has `seen` this fraction of it.
+    """A rollout beyond the end of its ground truth, of which training has seen the fraction `seen`.
 
     Later frames of a flow that is forced throughout are compared with the mean of the ground truth.
     """
@@ -370,12 +374,14 @@ def two_digits(rounded: Callable[[float], int], value: float) -> str:
 at_least, at_most = partial(two_digits, math.ceil), partial(two_digits, math.floor)
 
 
-# ---- problems that only the flow shows
+# ---- problems that show during the run
 
 
 def check_span(time: Time, span: float, bound: float, tracers: Tracers | None = None) -> None:
-    """Raise SceneError where a flow at rest never turns over, or where the present flow takes too many steps in a time
-    `span`, or `tracers` have too many frames in it. `bound` is the longest step that the flow allows now."""
+    """Raise SceneError for a flow at rest, or if a time `span` has too many steps or too many frames of `tracers`.
+
+    `bound` is the longest step that the present flow allows. A flow at rest has an infinite `span`.
+    """
     if span == math.inf:
         raise SceneError("the flow is at rest, so that it never turns over; start from another one")
     key = "step" if time.step else "max_step" if bound >= time.max_step else "courant"
@@ -385,8 +391,8 @@ def check_span(time: Time, span: float, bound: float, tracers: Tracers | None = 
 
 
 def check_ground_truth(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path) -> None:
-    """Raise SceneError where the ground truth of a run directory has too few frames for some stages, or scales that
-    vanish; all ranks call it."""
+    """Raise SceneError if the ground truth of a run directory has too few frames for the stages, or a scale of 0; all
+    ranks call it."""
     path = directory / STAGES["dns"].file
     with open_product(comm, path, "ground_truth") as file:
         check_frames(stages, scene, scene.seen_in(directory), len(Trajectory(file, "tracers").times))

@@ -1,5 +1,5 @@
-"""`eddies check --time`: a few real steps of each stage in a temporary directory, from which follows its wall time. The
-stages work with a short ground truth of the scene's own flow, on its own grid."""
+"""`eddies check --time`: wall time of each stage, estimated from a few steps in a temporary directory. The stages work
+with a short ground truth of the scene's own flow, on its own grid."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ A_MOMENT = 1e-9              # turnovers of a spin-up or ground truth of as few 
 
 
 class StepTimes(StopRequest):
-    """Notes the time whenever a stage asks, before each step, whether it is to end."""
+    """Records the time of each call: stages ask before each step whether they must stop."""
 
     def __init__(self, comm: Comm, signals: Sequence[int]) -> None:
         super().__init__(comm, signals)
@@ -106,8 +106,11 @@ def measured(name: str, measure: Callable[[], tuple[float, float, int | None]]) 
 
 def wall_time_of(stage: str, few: Scene, whole: Scene, directory: Path,
                  stop: StepTimes) -> tuple[float, float, int | None]:
-    """Wall time of a stage, seconds of one of its steps with what is stored between steps, and the number of steps,
-    None where it is unknown; from a run of a short scene. A stage without equal steps has 0."""
+    """Estimate a stage of the `whole` scene from a run of the short scene `few`.
+
+    Returns its wall time, the seconds of a step and of what is stored between steps, and the number of steps, None if
+    unknown. A stage without equal steps has 0 steps.
+    """
     stop.check()
     comm, first, expected, once = stop.comm, len(stop.times), estimate(whole), few
     if stage == "train" and few.training:  # its phases are measured one by one
@@ -135,8 +138,11 @@ def wall_time_of(stage: str, few: Scene, whole: Scene, directory: Path,
 
 def rest_of_training(seconds: float, few: Scene, whole: Scene, directory: Path,
                      stop: StopRequest) -> tuple[float, float, int | None]:
-    """Wall time, mean step and steps of the training of the model: `seconds` of a run with one step and `few` frames,
-    and what some frames, steps and validations of each phase take."""
+    """Wall time, seconds of a mean step and number of steps of the training of the model.
+
+    It adds to the `seconds` of a run with one step and few frames those of all frames, and of the steps and validations
+    of each phase.
+    """
     if whole.model.path is not None:
         return seconds, 0.0, 0
     comm, stepping, number = stop.comm, 0.0, 0
@@ -158,8 +164,10 @@ def rest_of_training(seconds: float, few: Scene, whole: Scene, directory: Path,
 
 
 def shortened(scene: Scene, turnover: float | None) -> Scene:
-    """A scene and its variants with few frames and steps, in a flow of a given turnover time; with one interval of
-    frames where it is None. The number of steps of the training remains."""
+    """Return a scene and its variants with few frames and steps, in a flow of a given turnover time.
+
+    With the turnover time None they have one interval of frames. The number of training steps remains.
+    """
     variants = {name: shortened(variant, turnover) for name, variant in scene.variant.items()}
     few, tracers, simulation, training = scene.without_variants, scene.tracers, scene.simulation, scene.training
     if tracers is None:
