@@ -173,7 +173,7 @@ def test_a_run_logs_the_warnings_of_its_stages_when_it_starts(comm, tmp_path, mo
 @pytest.mark.parametrize("override, message", INFEASIBLE, ids=[override for override, _ in INFEASIBLE])
 def test_what_cannot_end_is_refused_before_it_begins(comm, tmp_path, monkeypatch, capfd, override, message):
     monkeypatch.chdir(tmp_path)
-    for command in ("check", "run"):
+    for command in ("check", "run") if override.startswith("initial") else ("run",):
         assert eddies(command, TINY, "--set", override) == 2
         output, errors = capfd.readouterr()
         assert errors.startswith("eddies: error: tiny: ") and errors.count("\n") == 1 and message in errors
