@@ -105,7 +105,7 @@ class Forcing(Section):
     """Linear solenoidal forcing of the largest scales at a prescribed power."""
 
     injection_rate: float = number("power injected per unit mass", at_least=0)
-    wavenumber: float = number("upper bound of |k| of the forced modes", default=2.0, above=1)
+    wavenumber: float = number("limit of the forced modes, 0 < |k| < wavenumber", default=2.0, above=1)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -225,7 +225,7 @@ class Forcing(TermSettings):
     """Linear forcing of the large scales at a prescribed power."""
 
     injection_rate: float = number("power injected per unit mass of the flow, before the filter", at_least=0)
-    wavenumber: float = number("upper bound of |k| of the forced modes", default=2.0, above=1)
+    wavenumber: float = number("limit of the forced modes, 0 < |k| < wavenumber", default=2.0, above=1)
 
     reads = ("resolved",)
 
