@@ -15,7 +15,7 @@ from eddies.workflows.foreseen.seconds import START, seconds
 from eddies.workflows.foreseen.storage import (FLOW_PROCESS, TORCH_PROCESS, Disk, disk, flow_memory, memory, most_disk,
                                                rollout_bytes, trajectory_bytes)
 from eddies.workflows.ground_truth.frame_counts import whole_frames
-from tests.small_scene import TINY, one_model
+from tests.small_scene import one_model
 
 SCENE = """
 [flow]
