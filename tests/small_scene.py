@@ -17,5 +17,4 @@ def one_model(name: str, overrides: Sequence[str] = (), removals: Sequence[str] 
 def problems_of(scene: Scene, comm) -> tuple[list[str], list[str]]:
     """Refusals and warnings of all stages of a scene."""
     from eddies.workflows.problems import here, problems
-    found = problems(scene, here(scene, comm))
-    return [each.text for each in found if each.fatal], [each.text for each in found if not each.fatal]
+    return problems(scene, here(scene, comm))

@@ -187,14 +187,13 @@ def test_more_ranks_than_slabs_are_refused_before_any_work(comm, tmp_path, capfd
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.mpi(1)
-def test_limit_of_ranks_is_that_of_the_stages(comm):
+@pytest.mark.mpi(2)
+def test_the_ground_truth_alone_may_use_more_ranks(comm, tmp_path):
     from eddies.scene.scene import load_scene
-    from eddies.workflows.foreseen.ranks import rank_problems
-    scene = load_scene(TINY)
-    assert not [*rank_problems(scene, ["dns"], 8), *rank_problems(load_scene("hit-small"), ["dns", "train"], 8)]
-    problem, = rank_problems(scene, scene.stages, 5)
-    assert "start at most 4" in problem
+    from eddies.workflows.problems import Context, problems
+    scene = load_scene(TINY, ["tracers.field_cells=6"])
+    refused = [problems(scene, Context(comm, stages, tmp_path))[0] for stages in (["dns"], ["dns", "train"])]
+    assert refused[0] == [] and "start at most 1" in refused[1][0]
 
 
 @pytest.mark.mpi(1)
@@ -298,9 +297,8 @@ def launch(ranks, *command):
                             stderr=subprocess.STDOUT, stdout=subprocess.PIPE)
 
 
-# During set-up, and some steps later.
-@pytest.mark.parametrize("number, after", [(signal.SIGTERM, 0), (signal.SIGUSR1, 1), (signal.SIGHUP, 1),
-                                           (signal.SIGINT, 1)])
+# During set-up, and some steps later. The launcher passes on every signal as SIGUSR1.
+@pytest.mark.parametrize("number, after", [(signal.SIGTERM, 0), (signal.SIGHUP, 1)])
 def test_a_signal_ends_the_job_to_be_resumed(tmp_path, number, after):
     job, output = launch(2, "-m", "eddies", "dns", "hit-small", "--output", tmp_path), ""
     while "dns: starts" not in output:

@@ -29,7 +29,7 @@ from eddies.pipeline import STAGES
 from eddies.scene.scene import Scene, SceneError
 from eddies.workflows.foreseen.storage import in_units
 from eddies.workflows.learned.source import read_source
-from eddies.workflows.problems import Context, check_ground_truth, memory_of_node, refuse
+from eddies.workflows.problems import Context, check_ground_truth, memory_of_node, problems
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
 from eddies.workflows.run_directory.work import FAILURE, SECONDS, Work, find_work, is_done, stage_seconds
 from eddies.workflows.variants import Step, check_unseen, steps
@@ -79,7 +79,9 @@ def run_stages(stages: Sequence[str], scene: Scene, comm: Comm, directory: Path,
     if not planned and not reported:
         for each in [scene.variant[name] for name in variants] or [scene]:
             check_sections(stages, each)
-    warnings = refuse(scene, Context(comm, stages, directory, variants, memory_of_node()))
+    refused, warnings = problems(scene, Context(comm, stages, directory, variants, memory_of_node(comm)))
+    for problem in refused:
+        raise SceneError(problem)
     if take_over:
         for step in planned:
             look_at_work(step, comm, overwrite)  # a command that is refused must not end another job

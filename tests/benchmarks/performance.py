@@ -26,7 +26,7 @@ from eddies.parallel.slab import SlabDecomposition
 from eddies.report.figures import MODEL, SECOND, THIRD, TRUTH, letter, panels, png, styled
 from eddies.scene.scene import Scene, load_scene
 from eddies.spectral.spectral_grid import SpectralGrid
-from eddies.workflows.foreseen.numbers import resolved_shells
+from eddies.workflows.foreseen.numbers import estimate
 from eddies.workflows.variant_rows import processor
 
 HERE = Path(__file__).parent
@@ -80,7 +80,7 @@ def bounds(iterations: float) -> dict[str, float]:
     flops = 2 * 1024**3 / best(lambda: a @ b)
     scene = scene_of(64, MODELS[1])
     particles, slab = scene.tracers.particles, SlabDecomposition(MPI.COMM_SELF, 2 * math.pi, scene.tracers.planes)
-    grid = SpectralGrid(slab, "float32", resolved_shells(scene))
+    grid = SpectralGrid(slab, "float32", estimate(scene).resolved_shells)
     return {"flops": flops,
             "pairs": particles * scene.neighbors / 2 * PAIR_FLOPS / flops,
             "transforms": sum(transform_bounds(grid, 1, 1, 1).values()) * (6 * iterations + TRANSFORMED) / 2,

@@ -20,8 +20,8 @@ from performance import INTERPOLATED, MODELS, TRANSFORMED, scene_of
 
 from eddies.clock import duration
 from eddies.scene.scene import BOX_LENGTH, Scene, load_scene
-from eddies.workflows.foreseen.numbers import flow_steps, resolved_shells
-from eddies.workflows.foreseen.ranks import ground_truth_alone, most_ranks
+from eddies.workflows.foreseen.numbers import estimate
+from eddies.workflows.foreseen.ranks import most_ranks
 from eddies.workflows.foreseen.seconds import seconds
 from eddies.workflows.foreseen.storage import flow_memory, in_units
 
@@ -68,7 +68,7 @@ class Job:
         return {"pairs": own * self.scene.neighbors / 2 * (1 + doubled) * paired,
                 "splines": self.components("splines") * own,
                 "transforms": self.components("transforms") * points * growth(tracers.planes),
-                "modes": self.iterations * resolved_shells(self.scene) ** 3 * self.share, "formulas": own,
+                "modes": self.iterations * estimate(self.scene).resolved_shells ** 3 * self.share, "formulas": own,
                 "settling": own * (MIGRATION if self.ranks > 1 else 1.0)}
 
     def messages(self) -> float:
@@ -76,7 +76,7 @@ class Job:
         that migrate, and sums along a tree."""
         if self.ranks == 1:
             return 0.0
-        tracers, k = self.scene.tracers, resolved_shells(self.scene)
+        tracers, k = self.scene.tracers, estimate(self.scene).resolved_shells
         on_node = min(self.ranks, max(NODE_CORES // self.threads, 1))
         own = self.components("transforms") * tracers.planes * (2 * k + 1) * (k + 1) * 8 / self.ranks
         calls = 2 * self.iterations + CALLS
@@ -172,11 +172,12 @@ def tables(found: dict) -> str:
 
 def flow_table(scene: Scene) -> str:
     """Memory of a rank, seconds a step and wall time of the direct simulation by ranks."""
-    lines, steps = ["ranks  planes  memory a rank  s a step     wall time"], flow_steps(scene)
-    for ranks in (2**m for m in range(min(most_ranks(ground_truth_alone(scene)).values()).bit_length())):
+    lines, steps = ["ranks  planes  memory a rank  s a step     wall time"], estimate(scene).steps
+    for ranks in (2**m for m in range(min(most_ranks(scene.ground_truth_alone).values()).bit_length())):
         whole = seconds(scene, "dns", ranks)
-        lines.append(f"{ranks:5}  {math.ceil(scene.flow.cells / ranks):6}  {in_units(flow_memory(scene, ranks)):>13}  "
-                     f"{whole / steps:8.3g}  {duration(whole):>12}")
+        size = in_units(flow_memory(scene.flow, scene.tracers, ranks))
+        lines.append(f"{ranks:5}  {math.ceil(scene.flow.cells / ranks):6}  {size:>13}  {whole / steps:8.3g}  "
+                     f"{duration(whole):>12}")
     return "\n".join(lines)
 
 

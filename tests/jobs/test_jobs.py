@@ -82,15 +82,15 @@ def test_local_refuses_a_wrong_scene_or_number_of_ranks(checkout, variables, err
 def test_large_job_fits_the_scene():
     # Every rank has planes, and the ranks of a node fit its memory. The comment names the most ranks of later stages.
     from eddies.scene.scene import load_scene
-    from eddies.workflows.foreseen.ranks import ground_truth_alone, most_ranks
+    from eddies.workflows.foreseen.ranks import most_ranks
     from eddies.workflows.foreseen.storage import flow_memory
     text = (CHECKOUT / "jobs/hit-paper.slurm.sh").read_text()
     scene, asked = load_scene("hit-paper"), dict(re.findall(r"^#SBATCH --([a-z-]+)=(\S+)", text, re.MULTILINE))
     on_node = int(asked["ntasks-per-node"])
     ranks = int(asked["nodes"]) * on_node
     assert scene.flow.cells % ranks == 0
-    assert ranks <= min(most_ranks(ground_truth_alone(scene)).values())
-    assert 1.1 * on_node * flow_memory(scene, ranks) < 1e9 * int(asked["mem"].removesuffix("G"))
+    assert ranks <= min(most_ranks(scene.ground_truth_alone).values())
+    assert 1.1 * on_node * flow_memory(scene.flow, scene.tracers, ranks) < 1e9 * int(asked["mem"].removesuffix("G"))
     most = min(most_ranks(scene).values())
     assert f"at most {most} ranks" in text
     assert int(re.search(r"--ntasks-per-node=(\d+) jobs/slurm.sh", text)[1]) <= most

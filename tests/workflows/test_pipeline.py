@@ -73,18 +73,22 @@ def check_words(path, dataset):
 
 
 def test_what_check_foresees_is_what_was_run(run_directory):
-    from eddies.workflows.foreseen.numbers import mach, rollout_of
+    from eddies.workflows.foreseen.numbers import estimate, rollout_in
     from eddies.workflows.foreseen.storage import disk, rollout_bytes, trajectory_bytes
+    from eddies.workflows.ground_truth.frame_counts import whole_frames
     scene = load_scene(TINY)
+    expected = estimate(scene)
     with h5py.File(run_directory / "rollout.h5") as file:
         rollout = dict(file["rollout"].attrs)
     with h5py.File(run_directory / "ground_truth.h5") as file:
         frames, measured = len(file["particles/tracers/time"]), file["reference"].attrs["mach_turbulent"]
-    course = rollout_of(scene, rollout["eddy_turnover_time"])
+    course = rollout_in(scene.simulation, rollout["eddy_turnover_time"], expected.rollout_step)
     assert (course.steps, course.evaluations) == (rollout["steps"], rollout["evaluations"]) == (9, 28)
-    assert mach(scene) == pytest.approx(measured, rel=0.5)
-    sizes = {"ground_truth": trajectory_bytes(scene, frames), "rollout": rollout_bytes(scene, course),
-             "kernel": disk(scene, "train-kernel"), "model": disk(scene, "train")}
+    assert expected.mach == pytest.approx(measured, rel=0.5)
+    whole = len(whole_frames(scene, frames))
+    sizes = {"ground_truth": trajectory_bytes(scene.flow, scene.tracers, frames, whole),
+             "rollout": rollout_bytes(scene.tracers.particles, course.intervals + 1),
+             "kernel": disk(scene, "train-kernel").kept, "model": disk(scene, "train").kept}
     for name, size in sizes.items():
         assert (run_directory / f"{name}.h5").stat().st_size == pytest.approx(size, rel=0.2), name
 

@@ -20,7 +20,7 @@ from eddies.scene.values import SceneError
 
 BUILT_IN = Path(__file__).parents[1] / "scenes"
 VARIANT = "variant"
-OF_FILES = ("base", "unset")  # keys that only a file has
+OF_FILES = ("base", "unset")  # keys that only a file may have
 DEEPEST = 3  # parts of a dotted key: [section.sub.key], and the same in [variant.NAME]
 
 Document = dict[str, Any]
@@ -101,7 +101,7 @@ def with_sections(key: str) -> Iterator[str]:
 
 
 def read_document(name_or_path: str, above: Sequence[Path] = ()) -> tuple[Path, Document]:
-    """Return the file of a scene, and its document over those of its bases; `above` are the files that it is a base of.
+    """Return the file of a scene, and its document laid over its bases. `above` are the files that have it as a base.
 
     Variants of a scene replace those of its base. Raises SceneError if there is no such scene, a file is not TOML, or a
     scene is its own base.
@@ -151,7 +151,7 @@ def _find(name_or_path: str, beside: Path | None) -> Path:
 
 
 def _parse(path: Path) -> Document:
-    """The tables and keys of a TOML file; SceneError if it cannot be read, or with the line that is not TOML."""
+    """The tables and keys of a TOML file. Raises SceneError, with the line at fault, if it cannot be read."""
     try:
         # Some editors begin a file with a mark of its encoding.
         return tomllib.loads(path.read_text(encoding="utf-8-sig"))
@@ -194,10 +194,9 @@ def _parsed(value: str) -> Any:
 
 
 def check_command_line(given: Layer, variants: Mapping[str, Layer], existing: Iterable[str]) -> None:
-    """Refuse a command line that changes a variant which is not among those `existing`, or, for all variants, a key
-    that one of them changes itself.
+    """Raise SceneError if the command line changes an unknown variant, or a key that a variant changes itself.
 
-    Raises SceneError with the option that reaches one variant.
+    The error names the option that reaches this one variant.
     """
     for option, keys in (("--set", given.values), ("--unset", given.unset)):
         for key in keys:

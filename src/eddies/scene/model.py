@@ -25,14 +25,14 @@ def weights_that_come_along() -> list[str]:
 class Model(Section):
     """The terms whose sum moves the particles, each with its settings; a preset is a list of terms with a name.
 
-    An object holds all `terms`, their `settings` by NAME, and no preset. A program gives settings as objects or as
-    dicts; keys that a dict lacks have the values of the preset.
+    When the section is made, the preset gives `terms` and the absent keys of their `settings`, and becomes None. A
+    program gives settings as objects or as dicts.
     """
 
     preset: str | None = choice(f"a list of terms with a name; absent: {DEFAULT_PRESET}, if there are no terms",
                                 *PRESETS, default=None)
-    terms: tuple[str, ...] | None = texts("what accelerates the particles and gives their density, each with the keys "
-                                          "of [model.NAME]", *TERMS, default=None, paths=True)
+    terms: tuple[str, ...] | None = texts("names of the terms that accelerate the particles and give their density, "
+                                          "each with the keys of [model.NAME]", *TERMS, default=None, paths=True)
     neighbors: float | None = number("mean number of particles within the radius of interaction, with terms that read "
                                      "pairs; absent: as in [kernel], or 60", default=None, at_least=8)
     path: str | None = text("run directory or model.h5 whose trained weights are used, or \"eddies:NAME\", those of a "
@@ -71,7 +71,7 @@ class Model(Section):
     def weights_file(self) -> Path | None:
         """The file of the weights that `path` names; None without it."""
         if self.path is None or not self.path.startswith(COME_ALONG):
-            return None if self.path is None else product_file(self.path, "model.h5")
+            return None if self.path is None else product_file(self.path, "train")
         return WEIGHTS / f"{self.path.removeprefix(COME_ALONG)}.h5"
 
     @property
@@ -96,9 +96,9 @@ class Model(Section):
 
 
 def replace_terms(table: dict[str, Any], keys: set[str]) -> None:
-    """Make a new list of terms replace that of a [model] table below it, be one of them a preset or both.
+    """Keep only the list of terms that was set last in a [model] table, whether it is a preset or `terms`.
 
-    `keys` are the keys "section.key" that were set. Settings of terms that are no longer in the list are removed.
+    `keys` are the keys "section.key" that were set last. Settings of terms that are no longer listed are removed.
     """
     if ("model.preset" in keys) == ("model.terms" in keys):
         return
@@ -113,10 +113,9 @@ def replace_terms(table: dict[str, Any], keys: set[str]) -> None:
 
 
 def settings_class(term: str) -> type[TermSettings]:
-    """Return the class of a term's settings: of a word of ours, or `Settings` of a user's class.
+    """Return the class of a term's settings: that of a built-in term, or `Settings` of a user's class.
 
-    Raises ImportPathError for a wrong import path; SceneError if it names no class of a term, or its Settings are not
-    settings.
+    Raises ImportPathError for a wrong import path, SceneError for a class that is no term or has unfit Settings.
     """
     if not is_path(term):
         return TERMS[term]
@@ -133,7 +132,7 @@ def settings_class(term: str) -> type[TermSettings]:
 
 def _settings(term: str, name: str, preset: Mapping[str, Any],
               given: TermSettings | Mapping[str, Any]) -> TermSettings:
-    """The settings of a term: an object as given, or the given keys over those of the preset."""
+    """The settings of a term: the given object, or the preset with the given keys."""
     try:
         kind = settings_class(term)
     except (ImportPathError, SceneError) as error:

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import Any
 
 IMPORT_PATH = 'the import path "module:name" of your own'
-# Squares and cubes of numbers beyond these overflow, or a run with them does not end.
+# Bounds of numbers and of whole numbers: beyond them squares and cubes overflow, or a run does not end.
 SMALLEST, LARGEST, MOST = 1e-15, 1e15, 10**9
-# An error shows so many characters of a value; Python writes whole numbers of at most so many bits with decimals.
+# Most characters of a value in an error; most bits of a whole number that is written with decimals.
 SHOWN, MOST_BITS = 60, 10_000
 
 
@@ -45,7 +45,7 @@ class Rule:
     Parameters
     ----------
     kind : type of the value, or of each entry of a list: float, int, bool or str.
-    about : one line on what the key means.
+    about : meaning of the key in one line.
     bounds : interval of a number.
     words : strings that are allowed, beside numbers or alone; without any a string may be any text.
     paths : whether the import path "module:name" of a user's own class is allowed too.

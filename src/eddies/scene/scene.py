@@ -7,48 +7,248 @@ differ from it in some keys.
 import copy
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 from eddies.import_path import search_in
-from eddies.scene.checks import OF_THE_WHOLE, REALISATION, problems
+from eddies.pipeline import STAGES, Stage
+from eddies.scene import checks
 from eddies.scene.layers import (BUILT_IN, OF_FILES, VARIANT, Layer, check_command_line, check_variant, command_line,
                                  dotted, read_document, with_sections)
 from eddies.scene.model import Model
-from eddies.scene.parts import Parts
 from eddies.scene.rules import quoted
-from eddies.scene.sections import (BOX_LENGTH, Eulerian, Flow, Forcing, Horizons, Initial, Kernel, Simulation, SpinUp,
-                                   Time, Tracers, Training)
-from eddies.scene.values import SceneError, read_section, sections, write_section
+from eddies.scene.sections import (BOX_LENGTH, DEFAULT_WINDOW, NEIGHBORS, Eulerian, Flow, Forcing, Horizons, Initial,
+                                   Kernel, Simulation, SpinUp, Time, Tracers, Training)
+from eddies.scene.values import (SceneError, Section, choice, import_paths, integer, integers, place, read_section,
+                                 section, sections, text, write_section)
 
 __all__ = ["BOX_LENGTH", "REALISATION", "Scene", "SceneError", "builtin_scenes", "load_scene", "Eulerian", "Flow",
            "Forcing", "Horizons", "Initial", "Kernel", "Model", "Simulation", "SpinUp", "Time", "Tracers", "Training"]
 
+REALISATION = checks.REALISATION
+# The keys of a scene that a variant cannot change.
+OF_THE_WHOLE = ("name", "base", "realisations", VARIANT)
+# The sections that may name classes and functions of the user's.
+FOREIGN_IN = ("flow", "initial", "model", "simulation")
+
 
 @dataclass(frozen=True, kw_only=True)
-class Scene(Parts):
+class Scene(Section):
     """A whole scene; making one checks its values and that its sections fit together (SceneError).
 
     `variant` has the scenes of the variants by name, each whole and without variants of its own.
     """
 
+    name: str = text("names the run; absent: the file's name", default="scene")
+    title: str = text("one line for lists and reports", default="untitled scene")
+    label: str | None = text("name of the variant in tables and figures; absent: NAME of [variant.NAME]", default=None)
+    seed: int = integer("seed of every random number", default=1, at_least=0, at_most=10**18)
+    realisations: tuple[int, ...] | None = integers(
+        "seeds of further ground truths, which no training sees: rollouts are made on each from its beginning; absent: "
+        "on the ground truth of the scene, after the training window", default=None, at_least=0)
+    device: str = choice("where particles are computed", "cpu", "cuda", default="cpu")
+    flow: Flow = section(Flow)
+    initial: Initial = section(Initial, default=Initial())
+    forcing: Forcing | None = section(Forcing, default=None)
+    time: Time = section(Time, default=Time())
+    spin_up: SpinUp | None = section(SpinUp, default=None)
+    tracers: Tracers | None = section(Tracers, default=None)
+    kernel: Kernel | None = section(Kernel, default=None)
+    model: Model | None = section(Model, default=None)
+    training: Training | None = section(Training, default=None)
+    simulation: Simulation | None = section(Simulation, default=None)
+    eulerian: Eulerian | None = section(Eulerian, default=None)
     variant: "Mapping[str, Scene]" = sections()
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for problem in problems(self):
-            raise problem
+        for key, problem in self._problems():
+            raise SceneError(f"{self._given(key)}: {problem}", key)
+
+    @classmethod
+    def section_name(cls) -> str:
+        """Empty: the keys of a scene are outside all sections."""
+        return ""
 
     @property
     def without_variants(self) -> "Scene":
         """The scene without variants and realisations."""
         return replace(self, variant={}, realisations=None) if self.variant or self.realisations else self
 
+    @property
+    def ground_truth_alone(self) -> "Scene":
+        """The scene without kernel, model and rollout."""
+        return replace(self.without_variants, kernel=None, model=None, training=None, simulation=None, eulerian=None)
+
+    # ---- values that follow from several sections
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """The stages that this scene asks for, in the order in which they run."""
+        learned = self.simulation is None or self.needs_model
+        finds = self.simulation is not None and self.simulation.finds_step
+        return tuple(stage.name for stage in STAGES.values()
+                     if (learned or stage.name != "train") and (finds or stage.name != "find-step")
+                     and (stage.section is None or getattr(self, stage.section) is not None))
+
+    @property
+    def stages_of_all(self) -> tuple[str, ...]:
+        """The stages that the scene or one of its variants asks for, in the order in which they run."""
+        asked = {stage for scene in (self, *self.variant.values()) for stage in scene.stages}
+        return tuple(stage for stage in STAGES if stage in asked)
+
+    def inputs(self, stage: str) -> tuple[Stage, ...]:
+        """The stages of the scene from whose products a stage makes its own."""
+        return tuple(STAGES[name] for name in STAGES[stage].depends_on if name in self.stages)
+
+    @property
+    def needs_model(self) -> bool:
+        """Whether the rollout needs a trained model: to move the particles, or for a coefficient of a coarse grid."""
+        on_grid = self.eulerian is not None and self.eulerian.form.learned
+        return self.simulation is not None and ("model" in self.simulation.needs or on_grid)
+
+    @property
+    def own_training(self) -> Training | None:
+        """The section [training]; None where [model] path gives trained weights."""
+        return self.training if self.model is None or self.model.path is None else None
+
+    @property
+    def directory(self) -> Path:
+        """The run directory, unless another is given."""
+        return Path("runs") / self.name
+
+    @property
+    def step_file(self) -> Path | None:
+        """The file of a converged step from another run; None where none is named."""
+        named = self.simulation and self.simulation.step_from
+        return Path(named) / STAGES["find-step"].file if named else None
+
+    @property
+    def window(self) -> float:
+        """Fraction of the ground truth for training; of a kernel alone the default of [training]."""
+        return self.training.window if self.training else DEFAULT_WINDOW
+
+    def seen_in(self, directory: Path) -> float:
+        """Fraction of the ground truth of a run directory that the model is trained on.
+
+        It is 0 without [training], and where [training] truths names only other ground truths.
+        """
+        if self.training is None:
+            return 0.0
+        own = (directory / STAGES["dns"].file).resolve()
+        others = self.training.truths is not None and own not in [path.resolve() for path in self.training.truth_files]
+        return 0.0 if others else self.training.window
+
+    @property
+    def injects(self) -> bool:
+        """Whether particles of the rollout are forced."""
+        injection = self.simulation.injection if self.simulation else "none"
+        return bool(self.tracers and self.tracers.forced) if injection == "truth" else injection != "none"
+
+    @property
+    def resolves(self) -> bool:
+        """Whether a grid resolves the velocity for the model: its terms read that velocity, or particles are forced."""
+        return bool(self.model and "resolved" in self.model.reads or self.tracers and self.tracers.forced
+                    or self.injects)
+
+    @property
+    def coarse_cells(self) -> int:
+        """Cells along each side of the coarse grid that moves the particles of the rollout; 0 without one."""
+        if self.simulation is None or self.tracers is None or not self.simulation.on_grid:
+            return 0
+        return (self.eulerian or Eulerian()).cells_for(self.tracers.filter_width)
+
+    @property
+    def kernel_support(self) -> float | None:
+        """Radius h of the smoothing kernel; None without [kernel]."""
+        return self.tracers.radius_of(self.kernel.neighbors) if self.kernel and self.tracers else None
+
+    @property
+    def neighbors(self) -> float:
+        """Mean number of particles within the radius of interaction of pairs."""
+        if self.model and self.model.neighbors is not None:
+            return self.model.neighbors
+        return self.kernel.neighbors if self.kernel else NEIGHBORS
+
+    @property
+    def interaction_radius(self) -> float:
+        """Radius of interaction of pairs; 0 without [tracers]."""
+        return self.tracers.radius_of(self.neighbors) if self.tracers else 0.0
+
+    def foreign_in(self, name: str) -> tuple[str, ...]:
+        """The import paths of the user's classes and functions that a section names, each once."""
+        part = getattr(self, name)
+        if isinstance(part, Model):
+            return part.foreign
+        return tuple(dict.fromkeys(path for _, path in import_paths(part))) if part is not None else ()
+
+    @property
+    def foreign(self) -> tuple[str, ...]:
+        """The import paths of the user's fluid, initial flow, terms, networks, and method of the simulation."""
+        return tuple(dict.fromkeys(path for name in FOREIGN_IN for path in self.foreign_in(name)))
+
+    # ---- checks
+
     def check_variants(self, names: Sequence[str]) -> None:
         """Raise SceneError for a name that is not one of the variants."""
         for name in names:
             check_variant(name, self.variant, self.name)
+
+    def _problems(self) -> checks.Problems:
+        """Yield the problems of names, of sections side by side, and of variants, each with the key at fault."""
+        flow, tracers, kernel, model, simulation = self.flow, self.tracers, self.kernel, self.model, self.simulation
+        present = {field.name for field in fields(self) if getattr(self, field.name) is not None}
+        yield from checks.check_names(self.name, self.seed, self.realisations or (), bool(simulation or self.variant))
+        yield from checks.check_foreign(flow, self.initial, simulation, model)
+        yield from checks.check_flow(flow, self.initial, self.forcing, model)
+        yield from checks.check_time(self.time, flow, self.forcing, self.spin_up, tracers)
+        if tracers is not None:
+            yield from checks.check_tracers(tracers, flow, self.initial)
+            for name, neighbors in (("kernel", kernel and kernel.neighbors), ("model", model and model.neighbors)):
+                yield from checks.check_reach(name, neighbors or 0.0, tracers, simulation.skin if simulation else 0.0)
+        yield from checks.check_needs(present, self.needs_model, model is not None and model.path is not None)
+        yield from checks.check_density(flow, model, simulation)
+        if self.training is not None:
+            yield from checks.check_training(self.training, tracers, kernel)
+        if simulation is not None and tracers is not None:
+            yield from checks.check_simulation(simulation, tracers, self.seen_in(self.directory))
+        yield from checks.check_coarse_grid(self.eulerian, self.coarse_cells, flow, model)
+        for name, variant in self.variant.items():
+            yield from ((f"{VARIANT}.{name}", problem) for problem in self._problems_of_variant(name, variant))
+
+    def _problems_of_variant(self, name: str, variant: "Scene") -> Iterator[str]:
+        """Yield the problems of a variant that cannot run beside the others, or whose rollouts cannot be compared."""
+        if problem := checks.problem_of_name(name):
+            yield problem
+        elif not isinstance(variant, Scene) or variant.variant or variant.realisations:
+            yield "must be a scene without variants and realisations of its own"
+        elif variant.simulation is None or self.simulation is None:
+            yield "variants are compared by their rollouts; add [simulation] to the scene and to its variants"
+        else:
+            after_training = self.realisations is None and variant.simulation.start is None
+            for key, reason in (checks.COMPARED | (checks.STARTS if after_training else {})).items():
+                within, _, last = key.partition(".")
+                own, whole = getattr(variant, within), getattr(self, within)
+                ours, theirs = getattr(own, last, None), getattr(whole, last, None)
+                if ours != theirs and (own and whole or within == "training"):
+                    yield f"{place(last, within)} = {quoted(ours)} where the scene has {quoted(theirs)}: {reason}"
+
+    def _given(self, key: str) -> str:
+        """Return a key and its value as an error begins: "[flow] cells = 8"; without the value where there is none."""
+        within, _, name = key.rpartition(".")
+        value: Any = self
+        for part in key.split("."):
+            value = getattr(value, part, None)
+        if within == VARIANT:
+            return f'variant "{name}"'
+        if isinstance(value, Section) or within == "model" and not hasattr(self.model, name):
+            return f"[{key}]"
+        if value is None:
+            return place(name, within)
+        return f"{place(name, within)} = {f'{value:g}' if isinstance(value, float) else quoted(value)}"
+
+    # ---- text
 
     def to_toml(self, all_keys: bool = False) -> str:
         """Return the scene as a TOML text with a comment on every key, and the changed keys of each variant.

@@ -18,7 +18,7 @@ BOX_LENGTH = 2 * math.pi
 DEFAULT_WINDOW = 0.5
 # Cells along a side of the cube: twice those of the largest direct simulations.
 MOST_CELLS = 65536
-# Mean number of particles within a support or a radius of interaction, as in the paper, unless a scene gives another.
+# Default mean number of particles within a support or a radius of interaction, as in the paper.
 NEIGHBORS = 60.0
 
 
@@ -30,19 +30,34 @@ class Flow(Section):
     cells: int = integer("grid cells along each side of the cube", at_least=8, at_most=MOST_CELLS)
     viscosity: float = number("kinematic viscosity", at_least=0)
     sound_speed: float | None = number("speed of sound, compressible fluid only", default=None, above=0)
-    precision: str = choice("of the grid arrays", "float64", "float32", default="float64")
+    precision: str = choice("precision of the grid arrays", "float64", "float32", default="float64")
 
     @property
     def compressible(self) -> bool:
         """Whether the fluid has a density, and sound."""
         return load(self.fluid).compressible if is_path(self.fluid) else self.fluid == "compressible"
 
+    @property
+    def components(self) -> int:
+        """Number of fields of the state: velocity, and density of a compressible fluid."""
+        return 4 if self.compressible else 3
+
+    @property
+    def real_bytes(self) -> int:
+        """Bytes of a real number on the grid."""
+        return 4 if self.precision == "float32" else 8
+
+    @property
+    def largest_wavenumber(self) -> int:
+        """k_max of the 2/3 rule: the largest integer below cells / 3."""
+        return (self.cells - 1) // 3
+
 
 @dataclass(frozen=True)
 class InitialFlow:
     """Properties of an initial flow that are known before it is made."""
 
-    keys: tuple[str, ...] = ("amplitude", "peak_wavenumber", "wavenumber", "path", "state")  # of [initial], as it reads
+    keys: tuple[str, ...] = ("amplitude", "peak_wavenumber", "wavenumber", "path", "state")  # keys that it reads
     rms: float | None = None  # root mean square of |u| over the amplitude; None: unknown, or at rest
     peak: float | None = None  # largest |u| + |v| + |w| over the amplitude; None: unknown, or at rest
     turbulent: bool = False  # it has many scales, with the spectrum's peak at `peak_wavenumber`
@@ -70,12 +85,12 @@ class Initial(Section):
     """The velocity, and with a compressible fluid the density, at time 0."""
 
     kind: str = named("initial flow", *INITIAL_FLOWS, default="random")
-    amplitude: float = number("of the velocity, random: rms of a component; sound-wave: of ln density", default=1.0,
-                              above=0)
+    amplitude: float = number("amplitude of the velocity; random: rms of a component; sound-wave: that of ln density",
+                              default=1.0, above=0)
     peak_wavenumber: float = number("wavenumber of the spectrum's peak, random only", default=3.0, above=0)
-    wavenumber: int = integer("waves in the cube; abc, shear-wave, sound-wave only", default=1, at_least=1)
-    path: str | None = text("ground_truth.h5, JHTDB cutout or fluidsim state to start from, on any grid; file only",
-                            default=None)
+    wavenumber: int = integer("number of waves in the cube; abc, shear-wave, sound-wave only", default=1, at_least=1)
+    path: str | None = text("file to start from, on any grid: ground_truth.h5, JHTDB cutout or fluidsim state; kind "
+                            "file only", default=None)
     state: int = integer("index in time of the state in this file: fields/final, with tracers fields/unfiltered, in a "
                          "cutout Velocity_####", default=0, at_least=0)
 
@@ -90,7 +105,7 @@ class Forcing(Section):
     """Linear solenoidal forcing of the largest scales at a prescribed power."""
 
     injection_rate: float = number("power injected per unit mass", at_least=0)
-    wavenumber: float = number("modes with 0 < |k| < this are forced", default=2.0, above=1)
+    wavenumber: float = number("limit of the forced modes, 0 < |k| < wavenumber", default=2.0, above=1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,7 +115,7 @@ class Time(Section):
     stepper: str = choice("time stepping method", "etdrk4", "rk4", default="etdrk4")
     courant: float = number("Courant number of the step (advective; rk4 also acoustic)", default=0.8, above=0)
     max_step: float = number("largest step; smaller ones are this over a power of two", default=0.05, above=0)
-    step: float | None = number("fixed step instead", default=None, above=0)
+    step: float | None = number("fixed time step; absent: courant and max_step give it", default=None, above=0)
     duration: float | None = number("run time after spin-up, without tracers only", default=None, above=0)
 
     @property
@@ -113,8 +128,8 @@ class Time(Section):
 class SpinUp(Section):
     """The time before tracers are released, in which forced turbulence becomes stationary."""
 
-    turnovers: float = number("large-eddy turnovers", above=0)
-    stationary: float | None = number("the last of these turnovers, over which the stationary state is averaged",
+    turnovers: float = number("length of the spin-up in large-eddy turnovers", above=0)
+    stationary: float | None = number("number of turnovers at its end, over which the stationary state is averaged",
                                       default=None, above=0)
 
 
@@ -122,21 +137,21 @@ class SpinUp(Section):
 class Tracers(Section):
     """Particles that follow the filtered flow: the ground truth of learning.
 
-    An object holds the filter width in use.
+    An absent `filter_width` gets its value when the section is made.
     """
 
-    particles_per_side: int = integer("the number of particles is the cube of this", at_least=2, at_most=MOST_CELLS)
+    particles_per_side: int = integer("cube root of the number of particles", at_least=2, at_most=MOST_CELLS)
     placement: str = choice("initial positions of the particles", "random", "lattice", default="random")
-    filter_width: float = number("of the Gaussian filter, whose tails meet beyond half the cube; absent: twice the "
-                                 "mean spacing, or half the cube where that is less",
+    filter_width: float = number("width of the Gaussian filter, whose tails meet beyond half the cube; absent: twice "
+                                 "the mean spacing, or half the cube where that is less",
                                  default=None, above=0, at_most=BOX_LENGTH / 2)
     interpolation: str = choice("splines from grid to particles", "cubic", "quintic", default="cubic")
-    turnovers: float = number("large-eddy turnovers to follow the particles", above=0)
+    turnovers: float = number("time for which the particles are followed, in large-eddy turnovers", above=0)
     forced: bool = boolean("whether [forcing] stays on meanwhile, so that the flow is stationary", default=False)
     frame_interval: float = number("time between stored frames", above=0)
-    field_cells: int | None = integer("grid of the stored fields; absent: 1.5 x particles_per_side, even",
-                                      default=None, at_least=4)
-    field_every: int = integer("frames per stored field", default=5, at_least=1)
+    field_cells: int | None = integer("cells along each side of the stored fields; absent: 1.5 x particles_per_side, "
+                                      "even", default=None, at_least=4)
+    field_every: int = integer("number of frames per stored field", default=5, at_least=1)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -172,12 +187,12 @@ class Tracers(Section):
         return 2 * round(0.875 * self.particles_per_side)
 
 
-#: The values of absent keys of [kernel], and those that a preset has in their place.
+#: Values of absent keys of [kernel], and those of a preset in their place.
 KERNEL_DEFAULTS = {"form": "kriging", "positive": True, "cutoff": "smooth", "normalization_weight": 0.0,
                    "learning_rate": 2e-3}
 KERNEL_PRESETS = {"paper": {"form": "average", "positive": False, "cutoff": "sigmoid", "normalization_weight": 1.0,
                             "learning_rate": 1e-3, "final_learning_rate": 1e-6}}
-# The learning rate at the end of a training over that at the start, unless a scene gives another.
+# Default learning rate at the end of the training over that at the start.
 FINAL_RATE = 0.05
 
 
@@ -185,7 +200,7 @@ FINAL_RATE = 0.05
 class Kernel(Section):
     """The smoothing kernel W, learned by reconstructing the filtered field, and the reconstruction of fields.
 
-    An object holds the values of all keys, and no preset.
+    When the section is made, the preset fills the absent keys, and `preset` becomes None.
     """
 
     preset: str | None = choice("a named set of values, below those that are given; paper: Eqs. 6 to 11 as published",
@@ -193,7 +208,7 @@ class Kernel(Section):
     form: str | None = choice("reconstruction of fields and gradients from particles: average: with weights W; linear, "
                               "quadratic: polynomials fitted with W as weight; kriging: the best estimate for filtered "
                               "turbulence; absent: kriging", "average", "linear", "quadratic", "kriging", default=None)
-    positive: bool | None = boolean("true: W = alpha exp(NN) g, of unit integral; false: NN g of Eq. 7, which may be "
+    positive: bool | None = boolean("whether W = alpha exp(NN) g, of unit integral; false: NN g of Eq. 7, which may be "
                                     "negative, and the sums of Eq. 6 without a divisor; absent: true", default=None)
     neighbors: float = number("mean number of particles within the support", default=NEIGHBORS, at_least=8)
     hidden: tuple[int, ...] = integers("widths of the network's tanh layers", default=(20, 20, 20, 20), at_least=1)
@@ -204,8 +219,8 @@ class Kernel(Section):
                                                 "absent: 0", default=None, at_least=0)
     steps: int = integer("optimiser steps", at_least=1)
     points: int = integer("grid points drawn per step", default=2048, at_least=1)
-    learning_rate: float | None = number("of the optimiser, at the start; absent: 2e-3", default=None, above=0)
-    final_learning_rate: float | None = number("of the optimiser, at the end; absent: a twentieth of the first",
+    learning_rate: float | None = number("learning rate at the start; absent: 2e-3", default=None, above=0)
+    final_learning_rate: float | None = number("learning rate at the end; absent: a twentieth of the first",
                                                default=None, above=0)
 
     def __post_init__(self) -> None:
@@ -228,9 +243,10 @@ class Horizons(Section):
     frames: tuple[int, ...] = integers("numbers of frames through which the simulation is differentiated, in turn",
                                        default=(1, 2, 4, 8), at_least=1)
     steps: int = integer("optimiser steps through each number of frames", at_least=1)
-    time_step: float | None = number("of the simulation; absent: the interval of frames", default=None, above=0)
-    integrator: str = choice("time stepping of the simulation", *SCHEMES, default="verlet")
-    learning_rate: float = number("of the optimiser, at the start of each number of frames", default=1e-3, above=0)
+    time_step: float | None = number("time step of the simulation; absent: the interval of frames", default=None,
+                                     above=0)
+    integrator: str = choice("time stepping method of the simulation", *SCHEMES, default="verlet")
+    learning_rate: float = number("learning rate at the start of each number of frames", default=1e-3, above=0)
     energy_weight: float = number("weight of the energies by bands of wavenumbers in the loss", default=0.1, at_least=0)
 
     @property
@@ -243,27 +259,27 @@ class Horizons(Section):
 class Training(Section):
     """The fit of the force to trajectories, then to all losses together, then through the simulation."""
 
-    truths: tuple[str, ...] | None = texts("run directories or files of the ground truths that are used, each with its "
+    truths: tuple[str, ...] | None = texts("run directories or files of the ground truths to train on, each with its "
                                            "own scales; absent: the run's own", default=None)
-    window: float = number("fraction of each ground truth that is used, the rest stays unseen",
+    window: float = number("fraction of each ground truth to train on; the rest stays unseen",
                            default=DEFAULT_WINDOW, above=0, at_most=1)
-    frames: int = integer("frames to draw from, in all, evenly shared by the ground truths", at_least=2)
+    frames: int = integer("number of frames to draw from, shared evenly by the ground truths", at_least=2)
     batch: int = integer("particles per step", at_least=1)
     steps: int = integer("optimiser steps; 0: parameters stay as they start", at_least=0)
-    patience: int | None = integer("a phase, on trajectories or on all losses, ends after so many steps without a "
-                                   "smaller validation error; absent: all steps are taken", default=None, at_least=1)
-    learning_rate: float = number("of the optimiser, at the start", default=5e-3, above=0)
-    final_learning_rate: float = number("of the optimiser, at the end", default=1e-4, above=0)
-    precision: str = choice("of the training", "float32", "float64", default="float32")
+    patience: int | None = integer("steps without a smaller validation error that end a phase, on trajectories or on "
+                                   "all losses; absent: all steps are taken", default=None, at_least=1)
+    learning_rate: float = number("learning rate at the start", default=5e-3, above=0)
+    final_learning_rate: float = number("learning rate at the end", default=1e-4, above=0)
+    precision: str = choice("precision of the training", "float32", "float64", default="float32")
     field_weight: float = number("weight of the field loss beside the trajectory loss", default=0.0, at_least=0)
     field_target: str = choice("reference of the field loss; tracers: the kernel average of the true particles; flow: "
                                "the filtered field stored one frame later, on frames that have one", "tracers", "flow",
                                default="tracers")
     velocity_kl_weight: float = number("weight of the divergence of velocity PDFs", default=0.0, at_least=0)
-    acceleration_kl_weight: float = number("the same for acceleration PDFs", default=0.0, at_least=0)
+    acceleration_kl_weight: float = number("weight of the divergence of acceleration PDFs", default=0.0, at_least=0)
     power_weight: float = number("weight of the loss of the power, in all steps: the work of the force, in units of "
                                  "u'^3 over the filter width", default=0.0, at_least=0)
-    combined_steps: int = integer("steps at the end that use every loss", default=0, at_least=0)
+    combined_steps: int = integer("number of steps at the end that use every loss", default=0, at_least=0)
     horizons: Horizons | None = section(Horizons, default=None)
 
     @property
@@ -272,17 +288,22 @@ class Training(Section):
         return self.field_target == "flow" and self.field_weight > 0
 
     @property
+    def steps_in_all(self) -> int:
+        """Number of optimiser steps, with those through horizons."""
+        return self.steps + (self.horizons.steps * len(self.horizons.frames) if self.horizons else 0)
+
+    @property
     def truth_files(self) -> tuple[Path, ...]:
         """The files of `truths`; none without the key."""
-        return tuple(product_file(path, "ground_truth.h5") for path in self.truths or ())
+        return tuple(product_file(path, "dns") for path in self.truths or ())
 
 
 @dataclass(frozen=True)
 class Method:
     """Properties of a method that moves the particles of a rollout."""
 
-    needs: tuple[str, ...] = ()  # of NEEDS
-    title: str = "own method"  # in tables and figures
+    needs: tuple[str, ...] = ()  # some of NEEDS
+    title: str = "own method"  # name in tables and figures
     on_grid: bool = False  # a flow on a coarse grid moves the particles, as [eulerian] says
 
 
@@ -301,9 +322,9 @@ CONVERGED = "converged"
 class Simulation(Section):
     """The run of the particles, without the direct simulation."""
 
-    method: str = named("what moves the particles; see Baselines", *METHODS, default="learned")
-    integrator: str | None = choice("time stepping of the particles; absent: rk3, or with step = \"converged\" the "
-                                    "cheapest", *SCHEMES, default=None)
+    method: str = named("method that moves the particles; see Baselines", *METHODS, default="learned")
+    integrator: str | None = choice("time stepping method of the particles; absent: rk3, or with step = \"converged\" "
+                                    "the cheapest", *SCHEMES, default=None)
     step: float | str = number("longest time step; converged: the cheapest that has converged, found by short rollouts",
                                default=CONVERGED, words=(CONVERGED,), above=0)
     step_from: str | None = text("run directory whose converged step is used; absent: it is found for this rollout",
@@ -311,12 +332,13 @@ class Simulation(Section):
     confirmed_on: tuple[str, ...] | None = texts(
         "run directories or files of further ground truths, on each of which a step must have converged as well; "
         "absent: the realisations of the scene", default=None)
-    turnovers: float = number("large-eddy turnovers to simulate", above=0)
-    start: float | None = number("as a fraction of the ground truth; absent: the end of the training window, or the "
-                                 "first field of a ground truth without training", default=None, at_least=0, below=1)
+    turnovers: float = number("length of the rollout in large-eddy turnovers", above=0)
+    start: float | None = number("start of the rollout as a fraction of the ground truth; absent: the end of the "
+                                 "training window, or the first field of a ground truth without training",
+                                 default=None, at_least=0, below=1)
     frame_interval: float = number("time between stored frames", above=0)
     skin: float = number("extra reach of the neighbour list, in supports", default=0.1, at_least=0, at_most=1)
-    precision: str = choice("of the forces", "float32", "float64", default="float32")
+    precision: str = choice("precision of the forces", "float32", "float64", default="float32")
     injection: float | str = number("large-scale forcing power per mass; truth: as in the ground truth while tracers "
                                     "were followed; dissipation: as the flow loses", default="truth",
                                     words=("truth", "none", "dissipation"), above=0)
@@ -353,11 +375,11 @@ class Simulation(Section):
     @property
     def confirming_files(self) -> tuple[Path, ...]:
         """The files of `confirmed_on`; none without the key."""
-        return tuple(product_file(path, "ground_truth.h5") for path in self.confirmed_on or ())
+        return tuple(product_file(path, "dns") for path in self.confirmed_on or ())
 
     @property
     def _properties(self) -> Method:
-        """The properties of the method. A class of the user's, loaded only here, has `needs` as an attribute."""
+        """The properties of the method. A user's class declares its `needs` as an attribute."""
         if not is_path(self.method):
             return METHODS[self.method]
         needs = getattr(load(self.method), "needs", ())
@@ -386,8 +408,8 @@ class Simulation(Section):
 class Closure:
     """Properties of a closure of the coarse grid."""
 
-    equations: tuple[str, ...]  # that it closes
-    constant: str | None = None  # the key of [eulerian] with its constant; None: it has none
+    equations: tuple[str, ...]  # equations that it closes
+    constant: str | None = None  # key of [eulerian] with its constant
     learned: bool = False  # it takes the rates of damping that a model has learned
 
 
@@ -407,12 +429,12 @@ CLOSURES = {
 class Eulerian(Section):
     """Large-eddy simulation on a coarse grid, with method = "eulerian"; absent: the defaults."""
 
-    cells: int | None = integer("of the coarse grid; absent: its Nyquist wavenumber is pi / filter width, at least 8",
-                                default=None, at_least=8)
+    cells: int | None = integer("cells along each side of the coarse grid; absent: the fewest whose Nyquist wavenumber "
+                                "reaches pi / filter width, at least 8", default=None, at_least=8)
     fluid: str = choice("equations of motion on the coarse grid", "incompressible", "compressible",
                         default="incompressible")
-    equations: str = choice("unfiltered: of the velocity, whose filtered part moves the particles; filtered: of the "
-                            "filtered velocity", *EQUATIONS, default="unfiltered")
+    equations: str = choice("velocity of the equations; unfiltered: the whole velocity, whose filtered part moves the "
+                            "particles; filtered: the filtered velocity", *EQUATIONS, default="unfiltered")
     closure: str = choice("model of the scales that the grid, or the filter, leaves out; see Baselines",
                           *CLOSURES, default="none")
     smagorinsky: float = number("C_s of closure smagorinsky, the eddy viscosity (C_s Delta)^2 (2 S:S)^(1/2)",

@@ -86,8 +86,8 @@ class PairSum(TermSettings):
     window: str = choice("factor of a pair at the distance q, over the radius of interaction; smooth: (1 - q^2)^2; "
                          "none: 1, and a rate jumps where a neighbour enters or leaves", "smooth", "none",
                          default="smooth")
-    scaling: str = choice("of the sum, by the expected number n of neighbours; number: 1/n; root: n^(-1/2)", "number",
-                          "root", default="number")
+    scaling: str = choice("factor of the sum, by the expected number n of neighbours; number: 1/n; root: n^(-1/2)",
+                          "number", "root", default="number")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,8 +126,8 @@ class PairNetwork(ForceSum, NetworkSettings):
 
     word = "pairs"
 
-    symmetry: str = choice("antisymmetric: pairs get opposite forces, which keep the momentum; not with basis "
-                           "corrected", "none", "antisymmetric", default="none")
+    symmetry: str = choice("symmetry of a pair; antisymmetric: opposite forces, which keep the momentum; not with "
+                           "basis corrected", "none", "antisymmetric", default="none")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -142,8 +142,8 @@ class EddyViscosity(ForceSum):
 
     word = "eddy-viscosity"
 
-    form: str = choice("two-sided: all pairs; monaghan: approaching pairs; bounded: all, with tanh(x.v) for x.v",
-                       "two-sided", "monaghan", "bounded", default="two-sided")
+    form: str = choice("pairs that it acts on; two-sided: all; monaghan: approaching; bounded: all, with tanh(x.v) "
+                       "for x.v", "two-sided", "monaghan", "bounded", default="two-sided")
     reads = ("pairs",)
 
 
@@ -153,7 +153,7 @@ class DensityFlux(NetworkSettings):
 
     word = "density-flux"
 
-    sign: bool = boolean("multiply by the sign of the density difference of the pair", default=False)
+    sign: bool = boolean("whether the sign of the density difference of the pair is a factor", default=False)
 
     gives = ("density_rate",)
 
@@ -187,8 +187,9 @@ class Stress(TermSettings):
 
     word = "stress"
 
-    form: str = choice("deconvolution: of the velocity with the filter undone; gradient: the leading term of its "
-                       "expansion in the filter width", "deconvolution", "gradient", default="deconvolution")
+    form: str = choice("form of the stress; deconvolution: from the velocity with the filter undone; gradient: the "
+                       "leading term of its expansion in the filter width", "deconvolution", "gradient",
+                       default="deconvolution")
 
     reads = ("resolved",)
     gives = ("acceleration", "density")
@@ -224,7 +225,7 @@ class Forcing(TermSettings):
     """Linear forcing of the large scales at a prescribed power."""
 
     injection_rate: float = number("power injected per unit mass of the flow, before the filter", at_least=0)
-    wavenumber: float = number("modes with 0 < |k| < this are forced", default=2.0, above=1)
+    wavenumber: float = number("limit of the forced modes, 0 < |k| < wavenumber", default=2.0, above=1)
 
     reads = ("resolved",)
 

@@ -14,16 +14,17 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from eddies.errors import UserError
+from eddies.pipeline import STAGES
 from eddies.scene.rules import Bounds, Rule, nearest, quoted, shortened
 
-# This value of an optional key leaves the key out.
+# The value that makes an optional key absent.
 ABSENT = "none"
 
 
 class SceneError(UserError, ValueError):
-    """The user asks for something that cannot be done; the text gives the value, what is allowed, and a remedy.
+    """A scene cannot be used; the text gives the value, the allowed values, and a remedy.
 
-    `key` is the "section.key" at fault, if there is one.
+    `key` is the "section.key" at fault; empty if no single key is.
     """
 
     def __init__(self, message: str, key: str = ""):
@@ -39,7 +40,7 @@ class KeyProblem(SceneError):
         self.section, self._parts = section, (key, problem)
 
     def within(self, section: str) -> "KeyProblem":
-        """Return the same problem of a section with another name."""
+        """Return the same problem with another name of the section."""
         return KeyProblem(section, *self._parts)
 
 
@@ -50,7 +51,7 @@ class Section:
 
     Attributes
     ----------
-    _holder : field that holds the section's own sections [section.NAME] by NAME; empty if it has none.
+    _holder : field with the sections [section.NAME] by NAME; empty for a class without them.
     """
 
     _holder: ClassVar[str] = ""
@@ -160,8 +161,8 @@ ANNOTATIONS = {"float": Rule(float), "int": Rule(int), "bool": Rule(bool), "str"
 def read_section(kind: type[Section], table: Any, name: str = "", others: Sequence[str] = ()) -> Any:
     """Make a section of the class `kind` from a TOML table.
 
-    `name` is that of the section, empty for the whole document; `others` are keys that an error names beside those of
-    the class. Raises SceneError for an unknown key, a missing key, or a value that its declaration refuses.
+    `name` is the name of the section, empty for the whole document. An error about an unknown key lists the keys of the
+    class and `others`. Raises SceneError for an unknown key, a missing key, or a value that its declaration refuses.
     """
     if not isinstance(table, dict):
         message = f"{name} = {shortened(quoted(table))}: must be a section; write [{name}] and its keys below"
@@ -244,9 +245,10 @@ def import_paths(part: Section) -> Iterator[tuple[str, str]]:
                         if ":" in path)
 
 
-def product_file(path: str, name: str) -> Path:
-    """Return the file of a product that a key names: the path itself if it ends in .h5, else NAME in that directory."""
-    return Path(path) if path.endswith(".h5") else Path(path) / name
+def product_file(path: str, stage: str) -> Path:
+    """Return the file of a stage's product that a key names: the path itself if it ends in .h5, else in this run
+    directory."""
+    return Path(path) if path.endswith(".h5") else Path(path) / STAGES[stage].file
 
 
 def place(key: str, section: str) -> str:

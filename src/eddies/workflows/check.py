@@ -1,4 +1,4 @@
-"""Estimates of a scene before a run: resolution, steps, ranks, memory, disk, time, and problems. Writes nothing."""
+"""`eddies check`: estimates of a scene before a run, and its problems. It writes no file."""
 
 from __future__ import annotations
 
@@ -10,11 +10,10 @@ from typing import Any
 from eddies.clock import duration
 from eddies.parallel.communicator import Comm
 from eddies.scene.scene import Scene, SceneError
-from eddies.workflows.foreseen.numbers import (expected_step, expected_turbulence, flow_steps, largest_wavenumber, mach,
-                                               rollout_of)
-from eddies.workflows.foreseen.ranks import ground_truth_alone, most_ranks
+from eddies.workflows.foreseen.numbers import estimate
+from eddies.workflows.foreseen.ranks import most_ranks
 from eddies.workflows.foreseen.seconds import seconds
-from eddies.workflows.foreseen.storage import disk, in_units, memory, most_disk, scratch
+from eddies.workflows.foreseen.storage import disk, in_units, memory, most_disk
 from eddies.workflows.problems import here, problems
 from eddies.workflows.variants import rollouts, steps
 
@@ -25,8 +24,10 @@ OF_TURBULENCE = ("velocity_rms", "dissipation_rate", "reynolds_lambda", "turnove
 
 
 def run(scene: Scene, comm: Comm, as_json: bool = False) -> None:
-    """Log estimates of a scene with its variants and their stages on these ranks, or print them as JSON; all ranks call
-    it. Raises SceneError, after all is shown, where a run would be refused."""
+    """Log the estimates of a scene and its variants on these ranks, or print them as JSON; all ranks call it.
+
+    Raises SceneError at the end if a run would be refused.
+    """
     found, subject = numbers(scene, comm), ""
     if comm.rank == 0 and as_json:
         print(json.dumps(found, indent=2, allow_nan=False))
@@ -42,36 +43,35 @@ def run(scene: Scene, comm: Comm, as_json: bool = False) -> None:
 
 
 def numbers(scene: Scene, comm: Comm) -> dict[str, Any]:
-    """All estimates by the keys that docs/check.md describes; None where a number is unknown before a run. All ranks
-    call it."""
-    step, turbulence, tracers = expected_step(scene), expected_turbulence(scene), scene.tracers
-    courses = {name: rollout_of(variant) for name, variant in (scene.variant or {scene.name: scene}).items()}
-    k_max, work, context = largest_wavenumber(scene), work_of(scene), here(scene, comm)
-    found, limits = problems(scene, context), most_ranks(scene)
+    """Return all estimates by the keys that docs/check.md describes, None if unknown; all ranks call it."""
+    expected, tracers, k_max = estimate(scene), scene.tracers, scene.flow.largest_wavenumber
+    rollout_of = {name: estimate(each).rollout for name, each in (scene.variant or {scene.name: scene}).items()}
+    (refusals, warnings), limits, work = problems(scene, here(scene, comm)), most_ranks(scene), work_of(scene)
+    turbulence = expected.turbulence
     costs = [cost(variant, stage, scenes, comm.size) for (variant, stage), scenes in work.items()]
     return {
         "scene": scene.name, "stages": list(scene.stages_of_all), "cells": scene.flow.cells,
         "largest_wavenumber": k_max,
         "turbulence": turbulence and {**{name: getattr(turbulence, name) for name in OF_TURBULENCE},
                                       "kmax_eta": k_max * turbulence.kolmogorov_length},
-        "mach_turbulent": mach(scene),
+        "mach_turbulent": expected.mach,
         "particles": tracers and tracers.particles, "spacing": tracers and tracers.spacing,
         "filter_width": tracers and tracers.filter_width, "kernel_support": scene.kernel_support,
-        "time_step": step and step[0], "limited_by": step and f"[time] {step[1]}", "steps": flow_steps(scene),
-        "rollouts": {name: course and vars(course) for name, course in courses.items()},
+        "time_step": expected.step, "limited_by": expected.step and f"[time] {expected.limited_by}",
+        "steps": expected.steps,
+        "rollouts": {name: rollout and vars(rollout) for name, rollout in rollout_of.items()},
         "ranks": comm.size, "most_ranks": min(limits.values()), "limits": limits,
-        "most_ranks_dns": min(most_ranks(ground_truth_alone(scene)).values()),
+        "most_ranks_dns": min(most_ranks(scene.ground_truth_alone).values()),
         "stage_costs": costs,
         "totals": {"seconds": sum(row["seconds"] or 0.0 for row in costs),
                    "memory": max(row["memory"] for row in costs), "disk": sum(row["disk"] or 0.0 for row in costs),
-                   "most_disk": most_disk((each, stage) for (_, stage), scenes in work.items() for each in scenes)},
-        "warnings": [problem.text for problem in found if not problem.fatal],
-        "refusals": [problem.text for problem in found if problem.fatal],
+                   "most_disk": most_disk(disk(each, stage) for (_, stage), scenes in work.items() for each in scenes)},
+        "warnings": warnings, "refusals": refusals,
     }
 
 
 def work_of(scene: Scene) -> dict[tuple[str | None, str], list[Scene]]:
-    """The scenes for which each stage runs, by variant (None: shared by all) and stage; several with realisations."""
+    """The scenes of each stage by variant (None: shared by all) and stage; several with realisations."""
     work: dict[tuple[str | None, str], list[Scene]] = {}
     planned = steps(scene, scene.stages_of_all, scene.directory)
     for step in sorted(planned, key=lambda step: [None, *scene.variant].index(step.variant)):
@@ -83,7 +83,7 @@ def work_of(scene: Scene) -> dict[tuple[str | None, str], list[Scene]]:
 
 def cost(variant: str | None, stage: str, scenes: Sequence[Scene], ranks: int) -> dict[str, Any]:
     """Time, memory and disk of a stage of some scenes, on the given ranks and on the most that it can use."""
-    most = min(min(most_ranks(ground_truth_alone(each) if stage == "dns" else each).values()) for each in scenes)
+    most = min(min(most_ranks(each.ground_truth_alone if stage == "dns" else each).values()) for each in scenes)
 
     def total(values: Sequence[float | None]) -> float | None:
         return None if None in values else sum(values)
@@ -91,14 +91,14 @@ def cost(variant: str | None, stage: str, scenes: Sequence[Scene], ranks: int) -
     return {"stage": stage, "variant": variant, "runs": 1 if stage == "report" else len(scenes),
             "seconds": total([seconds(each, stage, ranks) for each in scenes]),
             "memory": max(memory(each, stage, ranks) for each in scenes),
-            "disk": total([disk(each, stage) for each in scenes]),
-            "scratch": scratch(scenes[0]) if stage == "dns" else 0.0, "most_ranks": most,
+            "disk": total([disk(each, stage).kept for each in scenes]),
+            "scratch": disk(scenes[0], stage).scratch, "most_ranks": most,
             "least_seconds": total([seconds(each, stage, most) for each in scenes]),
             "least_memory": max(memory(each, stage, most) for each in scenes)}
 
 
 def lines(found: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """The same as text: subject and line."""
+    """Yield the estimates as text: subject and line."""
     for key, value in found.items():
         if key == "limits":
             yield from ((key, f"{ranks}: {reason}") for reason, ranks in value.items())
@@ -123,7 +123,7 @@ def lines(found: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
 
 
 def as_text(value: Any) -> str:
-    """A value of the numbers as text."""
+    """An estimate as text."""
     if isinstance(value, dict):
         return ", ".join(f"{name} {as_text(part)}" for name, part in value.items())
     if isinstance(value, list):

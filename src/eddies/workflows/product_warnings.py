@@ -21,8 +21,8 @@ MOST_NAMED = 4  # places in a sentence
 
 
 def mixed_products(provenance: Mapping[str, Provenance]) -> list[str]:
-    """A sentence for each product of a run directory, given the provenance by kind, that was made from other products
-    than lie beside it."""
+    """Return a sentence for each product that was made from other products than those beside it. `provenance` has that
+    of each kind of product in a run directory."""
     found = []
     for kind, origin in provenance.items():
         others = {needed: provenance.get(needed) for needed, known in origin.get("made_from", {}).items()
@@ -36,8 +36,10 @@ def mixed_products(provenance: Mapping[str, Provenance]) -> list[str]:
 
 
 def changed_truths(origin: Provenance) -> list[str]:
-    """A sentence for each ground truth of another run that has changed since a model was trained on it; `origin` is the
-    provenance of the model. Ground truths that are gone are skipped."""
+    """Return a sentence for each ground truth of another run that has changed since a model was trained on it.
+
+    `origin` is the provenance of the model. Removed ground truths are skipped.
+    """
     now = {path: product_provenance(path).get("id") for path in origin.get("truths", {})}
     return [f"{_made('model', origin)} was trained on another {path} than is there now; {make_again('model')}, or read "
             "comparisons as those of another flow"
@@ -45,7 +47,8 @@ def changed_truths(origin: Provenance) -> list[str]:
 
 
 def not_finite(file: File, kind: str) -> str:
-    """A sentence on the numbers of an open product that are not finite, or ""; of series only the last frame counts."""
+    """Return a sentence on the numbers of an open product that are not finite; empty if all are. The last frame of a
+    series is read."""
     places = []
     for place, frame, values in stored_numbers(file):
         table, _, column = place.partition("/")
@@ -69,7 +72,7 @@ def _made(kind: str, origin: Provenance) -> str:
 
 
 def _other(kind: str, origin: Provenance, present: Provenance | None) -> str:
-    """The product that another one was made from, compared with the one that is `present`."""
+    """Describe the product that another one was made from, compared with the `present` one."""
     if present is None:
         return f"a {MAKER_OF[kind].file} that is not here"
     changes = changed_settings(MAKER_OF[kind], origin.get("scene"), present.get("scene"))

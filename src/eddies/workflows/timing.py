@@ -1,5 +1,5 @@
-"""`eddies check --time`: a few real steps of each stage in a temporary directory, from which follows its wall time. The
-stages work with a short ground truth of the scene's own flow, on its own grid."""
+"""`eddies check --time`: wall time of each stage, estimated from a few steps in a temporary directory. The stages work
+with a short ground truth of the scene's own flow, on its own grid."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from eddies.particles.devices import prepare_torch
 from eddies.pipeline import STAGES
 from eddies.scene.scene import Scene
 from eddies.workflows import dns, find_step, report, simulate, train, train_kernel
-from eddies.workflows.foreseen.numbers import expected_step, flow_steps, rollout_of
+from eddies.workflows.foreseen.numbers import estimate
 from eddies.workflows.ground_truth.frame_counts import TESTED_FRAMES
 from eddies.workflows.learned.model import load_kernel
 from eddies.workflows.learned.source import ModelDefinition
@@ -43,7 +44,7 @@ A_MOMENT = 1e-9              # turnovers of a spin-up or ground truth of as few 
 
 
 class StepTimes(StopRequest):
-    """Notes the time whenever a stage asks, before each step, whether it is to end."""
+    """Records the time of each call: stages ask before each step whether they must stop."""
 
     def __init__(self, comm: Comm, signals: Sequence[int]) -> None:
         super().__init__(comm, signals)
@@ -79,18 +80,20 @@ def measure_stages(scene: Scene, directory: Path, stop: StepTimes) -> None:
         in_files(comm, step.directory, step.link)
         for stage in step.stages:
             name = f"{step.variant}: {stage}" if step.variant else stage
-            if step.variant not in failed and not measured(name, stage, step.scene, whole, step.directory, stop):
+            measure = partial(wall_time_of, stage, step.scene, whole, step.directory, stop)
+            if step.variant not in failed and not measured(name, measure):
                 failed.add(step.variant)
     if "report" in scene.stages_of_all:
         in_files(comm, directory, lambda: write_files({directory / "scene.toml": few.to_toml()}))
-        measured("report", "report", few, scene, directory, stop)
+        measured("report", partial(wall_time_of, "report", few, scene, directory, stop))
 
 
-def measured(name: str, stage: str, few: Scene, whole: Scene, directory: Path, stop: StepTimes) -> bool:
-    """Run a stage of a short scene and log the wall time of that of the `whole` scene; False where it fails."""
+def measured(name: str, measure: Callable[[], tuple[float, float, int | None]]) -> bool:
+    """Log the wall time of a stage, its seconds a step and its steps, as `measure` returns them; False where it
+    fails."""
     try:
         with quiet():
-            seconds, step, number = wall_time_of(stage, few, whole, directory, stop)
+            seconds, step, number = measure()
     except UserError as error:
         log.info("%-28s  not measured: %s", name, error)
         return False
@@ -103,10 +106,13 @@ def measured(name: str, stage: str, few: Scene, whole: Scene, directory: Path, s
 
 def wall_time_of(stage: str, few: Scene, whole: Scene, directory: Path,
                  stop: StepTimes) -> tuple[float, float, int | None]:
-    """Wall time of a stage, seconds of one of its steps with what is stored between steps, and the number of steps,
-    None where it is unknown; from a run of a short scene. A stage without equal steps has 0."""
+    """Estimate a stage of the `whole` scene from a run of the short scene `few`.
+
+    Returns its wall time, the seconds of a step and of what is stored between steps, and the number of steps, None if
+    unknown. A stage without equal steps has 0 steps.
+    """
     stop.check()
-    comm, first, rollout, once = stop.comm, len(stop.times), rollout_of(whole), few
+    comm, first, expected, once = stop.comm, len(stop.times), estimate(whole), few
     if stage == "train" and few.training:  # its phases are measured one by one
         once = replace(few, training=replace(few.training, steps=1, combined_steps=0, horizons=None, field_weight=0.0,
                                              velocity_kl_weight=0.0, acceleration_kl_weight=0.0))
@@ -116,24 +122,27 @@ def wall_time_of(stage: str, few: Scene, whole: Scene, directory: Path,
     if stage == "report":
         return seconds, 0.0, 0
     if stage == "find-step":  # here its rollouts are one interval long
-        span = rollout.turnover_time * find_step.TURNOVERS if rollout else 0.0
-        return seconds * max(round(span / whole.simulation.frame_interval), 1), 0.0, 0 if rollout else None
+        span = expected.rollout.turnover_time * find_step.TURNOVERS if expected.rollout else 0.0
+        return seconds * max(round(span / whole.simulation.frame_interval), 1), 0.0, 0 if expected.rollout else None
     paces = [after - before for before, after in zip(stop.times[first:], stop.times[first + 1:])]
     usual, taken = paces[WARM_UP_STEPS:] or paces or [seconds], len(paces) + 1
     step = sum(usual) / len(usual)
     if stage == "dns":
-        number = flow_steps(whole)
+        number = expected.steps
     elif stage == "train-kernel":
         number = 2 * whole.kernel.steps
     else:
-        number = rollout and round(taken * rollout.intervals / FEW)
+        number = expected.rollout and round(taken * expected.rollout.intervals / FEW)
     return seconds + max((number or 0) - taken, 0) * step, step, number
 
 
 def rest_of_training(seconds: float, few: Scene, whole: Scene, directory: Path,
                      stop: StopRequest) -> tuple[float, float, int | None]:
-    """Wall time, mean step and steps of the training of the model: `seconds` of a run with one step and `few` frames,
-    and what some frames, steps and validations of each phase take."""
+    """Wall time, seconds of a mean step and number of steps of the training of the model.
+
+    It adds to the `seconds` of a run with one step and few frames those of all frames, and of the steps and validations
+    of each phase.
+    """
     if whole.model.path is not None:
         return seconds, 0.0, 0
     comm, stepping, number = stop.comm, 0.0, 0
@@ -155,13 +164,15 @@ def rest_of_training(seconds: float, few: Scene, whole: Scene, directory: Path,
 
 
 def shortened(scene: Scene, turnover: float | None) -> Scene:
-    """A scene and its variants with few frames and steps, in a flow of a given turnover time; with one interval of
-    frames where it is None. The number of steps of the training remains."""
+    """Return a scene and its variants with few frames and steps, in a flow of a given turnover time.
+
+    With the turnover time None they have one interval of frames. The number of training steps remains.
+    """
     variants = {name: shortened(variant, turnover) for name, variant in scene.variant.items()}
     few, tracers, simulation, training = scene.without_variants, scene.tracers, scene.simulation, scene.training
     if tracers is None:
-        step = expected_step(scene)
-        return replace(few, time=replace(few.time, duration=2 * FEW * (step[0] if step else few.time.max_step)))
+        step = estimate(scene).step or few.time.max_step
+        return replace(few, time=replace(few.time, duration=2 * FEW * step))
     changed: dict[str, Any] = {}
     if scene.spin_up:
         changed["spin_up"] = replace(scene.spin_up, turnovers=A_MOMENT, stationary=None)

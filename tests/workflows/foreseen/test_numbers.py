@@ -10,11 +10,12 @@ import pytest
 
 from eddies.clock import Clock, ProgressLine
 from eddies.scene.scene import Time, load_scene
-from eddies.workflows.foreseen.numbers import expected_step, expected_turbulence, mach, rms_speed, rollout_of
+from eddies.workflows.foreseen.numbers import estimate, rollout_in
 from eddies.workflows.foreseen.seconds import START, seconds
-from eddies.workflows.foreseen.storage import (FLOW_PROCESS, TORCH_PROCESS, flow_memory, memory, most_disk,
-                                               rollout_bytes, scratch, trajectory_bytes)
-from tests.small_scene import TINY, one_model
+from eddies.workflows.foreseen.storage import (FLOW_PROCESS, TORCH_PROCESS, Disk, disk, flow_memory, memory, most_disk,
+                                               rollout_bytes, trajectory_bytes)
+from eddies.workflows.ground_truth.frame_counts import whole_frames
+from tests.small_scene import one_model
 
 SCENE = """
 [flow]
@@ -37,12 +38,12 @@ start = 0
 
 
 def test_expected_turbulence_agrees_with_the_definitions():
-    turbulence = expected_turbulence(load_scene("hit-small"))
+    turbulence = estimate(load_scene("hit-small")).turbulence
     eta, t_eta, nu = turbulence.kolmogorov_length, turbulence.kolmogorov_time, turbulence.viscosity
     assert eta**2 / t_eta == pytest.approx(nu) and nu / t_eta**2 == pytest.approx(turbulence.dissipation_rate)
     # Pope (2000), Eq. 6.64 with k = 3 u'^2 / 2: Re_lambda^2 = 15 u'^4 / (nu eps)
     assert turbulence.reynolds_lambda**2 == pytest.approx(15 * turbulence.velocity_rms**4 / (nu * 0.5))
-    decaying = expected_turbulence(load_scene("tracers-only"))
+    decaying = estimate(load_scene("tracers-only")).turbulence
     assert decaying.velocity_rms == 1.0 and decaying.turnover_time == pytest.approx(math.sqrt(2 * math.pi) / 3)
 
 
@@ -50,7 +51,8 @@ def test_expected_turbulence_agrees_with_the_definitions():
     ("time.max_step=0.001", 0.001, "max_step"), ("seed=1", 0.01, "courant"), ("time.step=0.004", 0.004, "step"),
     ("time.stepper=rk4", 0.02 / 16, "courant")])
 def test_the_step_and_the_key_that_limits_it(override, step, limit):
-    assert expected_step(load_scene("hit-small", [override])) == (pytest.approx(step), limit)
+    expected = estimate(load_scene("hit-small", [override]))
+    assert (expected.step, expected.limited_by) == (pytest.approx(step), limit)
 
 
 @pytest.mark.mpi(1, 2)
@@ -64,12 +66,12 @@ def test_speeds_and_steps_are_those_of_the_flow_at_its_start(comm):
         fluid = build_fluid(scene, comm)
         state = initial_state(scene, fluid)
         energy = sum(component_energies(fluid.grid, state[:3]).values())
-        assert rms_speed(scene) == pytest.approx(np.sqrt(2 * energy), rel=1e-6)
-        assert mach(scene) == pytest.approx(np.sqrt(2 * energy) / 10, rel=1e-6)
+        assert estimate(scene).rms_speed == pytest.approx(np.sqrt(2 * energy), rel=1e-6)
+        assert estimate(scene).mach == pytest.approx(np.sqrt(2 * energy) / 10, rel=1e-6)
         if name in ("taylor-green", "abc"):
             scene = replace(scene, time=Time(duration=1e9, max_step=1e3))
             taken = build_step_limit(scene, fluid.grid)(state, Clock())
-            assert expected_step(scene)[0] == pytest.approx(taken)
+            assert estimate(scene).step == pytest.approx(taken)
 
 
 @pytest.fixture(scope="module")
@@ -94,14 +96,16 @@ def test_runs_take_the_steps_and_bytes_that_are_expected(comm, folder, overrides
     simulate.run(scene, comm, folder)
     with h5py.File(folder / "rollout.h5") as file:
         found, frames = dict(file["rollout"].attrs), len(file["particles/model/time"])
-    rollout = rollout_of(scene, found["eddy_turnover_time"])
+    rollout = rollout_in(scene.simulation, found["eddy_turnover_time"], estimate(scene).rollout_step)
     assert (rollout.steps, rollout.intervals) == (found["steps"], frames - 1)
     assert rollout.time_step == pytest.approx(found["time_step"])
     assert rollout.evaluations == found.get("evaluations", 0)
     with h5py.File(folder / "ground_truth.h5") as file:
         frames = len(file["particles/tracers/time"])
+    flow, tracers, whole = scene.flow, scene.tracers, len(whole_frames(scene, frames))
     # A third of files this small is headers and text.
-    for name, size in (("rollout", rollout_bytes(scene, rollout)), ("ground_truth", trajectory_bytes(scene, frames))):
+    for name, size in (("rollout", rollout_bytes(tracers.particles, rollout.intervals + 1)),
+                       ("ground_truth", trajectory_bytes(flow, tracers, frames, whole))):
         assert (folder / f"{name}.h5").stat().st_size == pytest.approx(size, rel=0.5)
     # The progress line is called after every step, not only at frames.
     assert [step for _, step in shown] == list(range(1, rollout.steps + 1))
@@ -113,8 +117,8 @@ def test_what_is_unknown_is_none(own):
                     "    advance = frame = status = series = description = 0\n"
                     "def swirl(grid, initial, seed): pass\n")
     for changes in (["simulation.method=own_flow:Own"], ["flow.viscosity=0"]):
-        assert rollout_of(one_model("hit-small", changes)) is None
-    assert rollout_of(load_scene("taylor-green")) is None
+        assert estimate(one_model("hit-small", changes)).rollout is None
+    assert estimate(load_scene("taylor-green")).rollout is None
     assert seconds(load_scene("taylor-green", ["initial.kind=own_flow:swirl"]), "dns", 1) > 0  # a fixed step
     assert seconds(load_scene("hit-small", ["initial.kind=own_flow:swirl", "flow.viscosity=0"]), "dns", 1) is None
 
@@ -133,7 +137,7 @@ def test_memory_of_a_step_is_as_expected(comm, fluid):
     stepper(state, build_step_limit(scene, equation.grid)(state, Clock()))
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    expected = flow_memory(scene, comm.size) - FLOW_PROCESS
+    expected = flow_memory(scene.flow, scene.tracers, comm.size) - FLOW_PROCESS
     assert 0.4 * expected < peak < 1.1 * expected
 
 
@@ -148,10 +152,9 @@ def test_memory_falls_with_the_ranks_and_grows_with_the_frames():
 
 
 def test_the_disk_of_the_worst_moment():
-    scene = load_scene("taylor-green", ["flow.cells=256"])
-    assert most_disk([(scene, "dns")]) > scratch(scene) > 256**3
-    scene = load_scene(TINY)
-    assert most_disk([(scene, "dns"), (scene, "simulate")] * 2) > 2 * most_disk([(scene, "simulate")])
+    assert most_disk([Disk(4.0, 2.0), Disk(None, 9.0), Disk(3.0)]) == 13 and most_disk([Disk(2.0)] * 3) == 6
+    kept, scratch = disk(load_scene("taylor-green", ["flow.cells=256"]), "dns")
+    assert kept > 4 * 3 * 256**3 and scratch > 256**3
 
 
 @pytest.mark.parametrize("stage, override", [

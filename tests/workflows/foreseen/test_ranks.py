@@ -5,9 +5,8 @@ from contextlib import nullcontext
 import pytest
 
 from eddies.scene.scene import load_scene
-from eddies.workflows.foreseen.numbers import expected_turbulence
-from eddies.workflows.foreseen.ranks import (ALLOWED_VELOCITY, PEAK_VELOCITY, half_skin, most_ranks,
-                                             most_training_ranks)
+from eddies.workflows.foreseen.numbers import estimate
+from eddies.workflows.foreseen.ranks import ALLOWED_VELOCITY, PEAK_VELOCITY, most_ranks
 from tests.small_scene import TINY, one_model
 
 
@@ -27,7 +26,7 @@ def test_most_ranks_is_what_the_parts_accept(comm, neighbors, most):
     SplineInterpolation(SpectralGrid(particles), "cubic")
     with nullcontext() if comm.size <= most else pytest.raises(HaloError):
         require_thick_slabs(fields, scene.kernel_support)
-        require_thick_slabs(particles, scene.interaction_radius + 2 * half_skin(scene))
+        require_thick_slabs(particles, scene.interaction_radius * (1 + scene.simulation.skin))
 
 
 @pytest.mark.parametrize("overrides, planes", [([], 4), (["simulation.step=0.1"], 3),
@@ -60,11 +59,11 @@ def test_ranks_for_horizons_are_those_that_the_grid_and_the_particles_accept(com
         return True
 
     scene = load_scene(TINY, ["training.horizons.steps=5", f"training.horizons.frames=[1, {frames}]"])
-    limits = most_training_ranks(scene)
-    by_reach, = (ranks for reason, ranks in limits.items() if reason.startswith("slabs no thinner"))
+    limits = most_ranks(scene)
+    by_reach, = (ranks for reason, ranks in limits.items() if "reach" in reason and "horizons" in reason)
     by_grid = limits["ghost planes of the grid in the training through horizons"]
     assert (by_reach, by_grid) == (thick, planes)
-    speed, tracers = expected_turbulence(scene).velocity_rms, scene.tracers
+    speed, tracers = estimate(scene).turbulence.velocity_rms, scene.tracers
     slab, support = SlabDecomposition(comm, BOX_LENGTH, tracers.planes), scene.kernel_support
     time = frames * tracers.frame_interval
     drift = ALLOWED_VELOCITY * speed * time

@@ -276,12 +276,13 @@ def test_another_truth_limits_the_number_of_ranks(comm, tmp_path):
         alone = scene_of(tmp_path, "tracers.particles_per_side=8", f"model={model}")
         alone = replace(alone, training=replace(alone.training, horizons=None))
         scene = trained_on(alone, tmp_path / "nowhere", tmp_path / "other")
-        assert not [*rank_problems(alone, ("train",), 3), *rank_problems(scene, ("train",), most)]
-        problem, = rank_problems(scene, ("train",), 3)
+        limits = most_ranks(scene)
+        assert not [*rank_problems(most_ranks(alone), 3), *rank_problems(limits, most)]
+        problem, = rank_problems(limits, 3)
         assert f"({place}: {reason}" in problem and f"at most {most}" in problem
         # The own ground truth, and weights of another run, allow more ranks.
         taken = replace(scene, model=replace(scene.model, path="runs/other"))
-        assert not [*rank_problems(scene, ("dns",), 3), *rank_problems(taken, ("train",), 3)]
+        assert not [*rank_problems(most_ranks(scene.ground_truth_alone), 3), *rank_problems(most_ranks(taken), 3)]
 
     with changed(tmp_path / "other/ground_truth.h5") as file:
         file["reference"].attrs["velocity_rms"] = 30.0

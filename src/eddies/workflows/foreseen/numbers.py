@@ -5,15 +5,15 @@ from dataclasses import dataclass
 
 from eddies.clock import ladder_step
 from eddies.particles.flow_units import allowed_step, resolved_wavenumber
+from eddies.scene.scene import BOX_LENGTH, Flow, Forcing, Initial, Scene, Simulation, Time
 from eddies.scene.sections import METHODS
-from eddies.scene.scene import BOX_LENGTH, Eulerian, Scene
 
 DISSIPATION_CONSTANT = 0.5   # C_eps = eps L / u'^3 of developed turbulence
 PEAK_SPEED = 7.0             # max(|u| + |v| + |w|) over u' in turbulence: at most four rms in each component
 
 
 @dataclass(frozen=True)
-class ExpectedTurbulence:
+class Turbulence:
     """Expected turbulence of a scene, from u', eps and nu; the integral scale follows from eps = C_eps u'^3 / L."""
 
     velocity_rms: float
@@ -41,112 +41,6 @@ class ExpectedTurbulence:
         return self.velocity_rms**2 * math.sqrt(15 / (self.viscosity * self.dissipation_rate))
 
 
-def largest_wavenumber(scene: Scene) -> int:
-    """k_max of the 2/3 rule: the largest integer below cells / 3."""
-    return (scene.flow.cells - 1) // 3
-
-
-def expected_turbulence(scene: Scene) -> ExpectedTurbulence | None:
-    """Turbulence that the forcing sustains, or that decays from a random start; None for other flows.
-
-    The integral scale is sqrt(2 pi) / k, with k of the forcing or of the initial peak. This is exact for the initial
-    spectrum and holds within about 10 % for forced turbulence.
-    """
-    forcing, initial, viscosity = scene.forcing, scene.initial, scene.flow.viscosity
-    if viscosity == 0:
-        return None
-    if forcing and forcing.injection_rate > 0:
-        scale = math.sqrt(2 * math.pi) / forcing.wavenumber
-        speed = (forcing.injection_rate * scale / DISSIPATION_CONSTANT) ** (1 / 3)
-        return ExpectedTurbulence(speed, forcing.injection_rate, viscosity)
-    if initial.flow.turbulent:
-        scale = math.sqrt(2 * math.pi) / initial.peak_wavenumber
-        return ExpectedTurbulence(initial.amplitude, DISSIPATION_CONSTANT * initial.amplitude**3 / scale, viscosity)
-    return None
-
-
-def peak_speed(scene: Scene) -> float | None:
-    """Expected maximum of |u| + |v| + |w|; None for a flow from a file or of the user's without forcing."""
-    initial, turbulence = scene.initial, expected_turbulence(scene)
-    if turbulence or initial.flow.turbulent:
-        return PEAK_SPEED * (turbulence.velocity_rms if turbulence else initial.amplitude)
-    if initial.flow.sound:
-        return initial.amplitude * scene.flow.sound_speed
-    return initial.flow.peak and initial.flow.peak * initial.amplitude
-
-
-def rms_speed(scene: Scene) -> float | None:
-    """Expected rms of the velocity vector; None where `peak_speed` is None, and for a pure sound wave."""
-    initial, turbulence = scene.initial, expected_turbulence(scene)
-    if turbulence:
-        return math.sqrt(3) * turbulence.velocity_rms
-    return initial.flow.rms and initial.flow.rms * initial.amplitude
-
-
-def mach(scene: Scene) -> float | None:
-    """Expected turbulent Mach number; None without sound."""
-    speed = rms_speed(scene)
-    return speed / scene.flow.sound_speed if speed is not None and scene.flow.sound_speed else None
-
-
-# ---- the direct simulation
-
-
-def courant_bound(scene: Scene) -> float | None:
-    """Longest step that the Courant number allows; None where the speed is unknown. An explicit stepper resolves
-    sound."""
-    speed, sound = peak_speed(scene), scene.flow.sound_speed if scene.time.explicit else None
-    return None if speed is None else (
-        scene.time.courant * BOX_LENGTH / scene.flow.cells / (speed + math.sqrt(3) * (sound or 0.0)))
-
-
-def expected_step(scene: Scene) -> tuple[float, str] | None:
-    """Time step of the direct simulation and the key of [time] that limits it; None where the speed is unknown."""
-    settings, bound = scene.time, courant_bound(scene)
-    if settings.step is not None:
-        return settings.step, "step"
-    if bound is None:
-        return None
-    return ladder_step(settings.max_step, bound), "max_step" if bound >= settings.max_step else "courant"
-
-
-def time_of(scene: Scene, turnovers: float) -> float | None:
-    """Physical time of a number of turnovers; None where the turnover time is unknown."""
-    turbulence = expected_turbulence(scene)
-    return turbulence and turnovers * turbulence.turnover_time
-
-
-def run_time(scene: Scene) -> float | None:
-    """Physical time that the direct simulation covers; None where the turnover time is unknown."""
-    parts = [time_of(scene, part.turnovers) for part in (scene.spin_up, scene.tracers) if part]
-    return None if None in parts else sum(parts) + (scene.time.duration or 0.0)
-
-
-def tracer_intervals(scene: Scene) -> int | None:
-    """Number of frame intervals of the tracers, 0 without tracers; None where the turnover time is unknown."""
-    if scene.tracers is None:
-        return 0
-    span = time_of(scene, scene.tracers.turnovers)
-    return span and max(math.ceil(span / scene.tracers.frame_interval - 1e-9), 1)
-
-
-def flow_steps(scene: Scene) -> int | None:
-    """Number of steps of the direct simulation; None where it is unknown. With tracers, each frame interval is divided
-    into equal steps."""
-    expected, span, intervals = expected_step(scene), run_time(scene), tracer_intervals(scene)
-    if expected is None or not span:
-        return None
-    alone = time_of(scene, scene.spin_up.turnovers) if scene.spin_up else 0.0
-    steps = math.ceil((alone + (scene.time.duration or 0.0)) / expected[0] - 1e-9)
-    if not intervals:
-        return steps
-    longest = min(scene.time.step or courant_bound(scene), scene.time.max_step)
-    return steps + intervals * math.ceil(scene.tracers.frame_interval / longest - 1e-9)
-
-
-# ---- the rollout
-
-
 @dataclass(frozen=True)
 class Rollout:
     """Number of frame intervals of a rollout, its longest step, its number of steps, and how often it evaluates the
@@ -159,49 +53,149 @@ class Rollout:
     evaluations: int
 
 
-def rollout_of(scene: Scene, turnover_time: float | None = None) -> Rollout | None:
-    """Rollout of a scene in a flow of the expected turnover time, or of a given one.
+@dataclass(frozen=True, kw_only=True)
+class Estimates:
+    """Expected numbers of a scene; None where they are unknown before a run.
 
-    Returns None without a rollout, where the turnover time is unknown, and for a method of the user's.
+    Parameters
+    ----------
+    turbulence : sustained by the forcing, or decaying from a random start; None for other flows.
+    peak_speed : maximum of |u| + |v| + |w|; None for a flow from a file or of the user's without forcing.
+    rms_speed : rms of the velocity vector; None where `peak_speed` is None, and for a pure sound wave.
+    mach : turbulent Mach number; None without sound.
+    courant_step : longest step of the direct simulation that its Courant number allows.
+    step, limited_by : time step of the direct simulation, and the key of [time] that limits it.
+    run_time : physical time that the direct simulation covers.
+    frame_intervals : number of frame intervals of the tracers, 0 without tracers.
+    steps : number of steps of the direct simulation.
+    resolved_shells : largest wavenumber along each axis of the resolved velocity of particles; 0 without tracers.
+    allowed_step : longest step of particles with a resolved velocity, at the speed at which the tracers start.
+    rollout_step : longest step of the rollout.
+    rollout : None also without a rollout, and for a method of the user's.
     """
-    settings, turbulence = scene.simulation, expected_turbulence(scene)
-    if settings is None or settings.method not in METHODS or turbulence is None and turnover_time is None:
+
+    turbulence: Turbulence | None
+    peak_speed: float | None
+    rms_speed: float | None
+    mach: float | None
+    courant_step: float | None
+    step: float | None
+    limited_by: str
+    run_time: float | None
+    frame_intervals: int | None
+    steps: int | None
+    resolved_shells: int
+    allowed_step: float | None
+    rollout_step: float
+    rollout: Rollout | None
+
+
+def estimate(scene: Scene) -> Estimates:
+    """Estimate the turbulence, the speeds and the steps of a scene."""
+    initial, time, tracers, settings = scene.initial, scene.time, scene.tracers, scene.simulation
+    turbulence = expected_turbulence(scene.flow, initial, scene.forcing)
+    peak, rms = peak_speed(scene.flow, initial, turbulence), rms_speed(initial, turbulence)
+    bound = courant_step(scene.flow, time, peak)
+    step, limited_by = flow_step(time, bound)
+    spin_up, followed = (0.0 if part is None else part.turnovers * turbulence.turnover_time if turbulence else None
+                         for part in (scene.spin_up, tracers))
+    intervals: int | None = 0
+    if tracers:
+        intervals = None if followed is None else max(_whole(followed / tracers.frame_interval), 1)
+    run_time = steps = None
+    if spin_up is not None and followed is not None:
+        alone = spin_up + (time.duration or 0.0)
+        run_time = alone + followed
+        if step is not None:
+            longest = min(time.step or bound, time.max_step)
+            # With tracers, each frame interval is divided into equal steps.
+            steps = _whole(alone / step) + (intervals * _whole(tracers.frame_interval / longest) if tracers else 0)
+    shells, allowed, rollout_step, rollout = 0, None, math.inf, None
+    if tracers:
+        highest = resolved_wavenumber(tracers.spacing, tracers.filter_width,
+                                      turbulence.kolmogorov_length if turbulence else 0.0)
+        shells = min(max(int(highest + 1e-9), 1), (tracers.planes - 1) // 2)
+    if settings is not None:
+        if turbulence is not None:
+            allowed = allowed_step(settings.scheme.angle, shells, turbulence.velocity_rms)
+        # A step that is still to be found counts as one frame interval at most.
+        rollout_step = settings.frame_interval if math.isinf(settings.longest_step) else settings.longest_step
+        if scene.coarse_cells and peak:
+            rollout_step = min(rollout_step, time.courant * BOX_LENGTH / scene.coarse_cells / peak)
+        elif "model" in settings.needs and scene.resolves:
+            rollout_step = min(rollout_step, allowed or math.inf)
+        if turbulence is not None and settings.method in METHODS:
+            rollout = rollout_in(settings, turbulence.turnover_time, rollout_step)
+    return Estimates(
+        turbulence=turbulence, peak_speed=peak, rms_speed=rms,
+        mach=rms / scene.flow.sound_speed if rms is not None and scene.flow.sound_speed else None, courant_step=bound,
+        step=step, limited_by=limited_by, run_time=run_time, frame_intervals=intervals, steps=steps,
+        resolved_shells=shells, allowed_step=allowed, rollout_step=rollout_step, rollout=rollout)
+
+
+def expected_turbulence(flow: Flow, initial: Initial, forcing: Forcing | None) -> Turbulence | None:
+    """Turbulence that the forcing sustains, or that decays from a random start; None for other flows.
+
+    The integral scale is sqrt(2 pi) / k, with k of the forcing or of the initial peak. This is exact for the initial
+    spectrum and holds within about 10 % for forced turbulence.
+    """
+    if flow.viscosity == 0:
         return None
-    turnover_time = turnover_time or turbulence.turnover_time
-    intervals = math.ceil(settings.turnovers * turnover_time / settings.frame_interval - 1e-9)
-    step, interval = rollout_step(scene), settings.frame_interval
+    if forcing and forcing.injection_rate > 0:
+        scale = math.sqrt(2 * math.pi) / forcing.wavenumber
+        speed = (forcing.injection_rate * scale / DISSIPATION_CONSTANT) ** (1 / 3)
+        return Turbulence(speed, forcing.injection_rate, flow.viscosity)
+    if initial.flow.turbulent:
+        scale = math.sqrt(2 * math.pi) / initial.peak_wavenumber
+        return Turbulence(initial.amplitude, DISSIPATION_CONSTANT * initial.amplitude**3 / scale, flow.viscosity)
+    return None
+
+
+def peak_speed(flow: Flow, initial: Initial, turbulence: Turbulence | None) -> float | None:
+    """Expected maximum of |u| + |v| + |w|; None for a flow from a file or of the user's without forcing."""
+    if turbulence or initial.flow.turbulent:
+        return PEAK_SPEED * (turbulence.velocity_rms if turbulence else initial.amplitude)
+    if initial.flow.sound:
+        return initial.amplitude * flow.sound_speed
+    return initial.flow.peak and initial.flow.peak * initial.amplitude
+
+
+def rms_speed(initial: Initial, turbulence: Turbulence | None) -> float | None:
+    """Expected rms of the velocity vector; None where it is unknown, and for a pure sound wave."""
+    if turbulence:
+        return math.sqrt(3) * turbulence.velocity_rms
+    return initial.flow.rms and initial.flow.rms * initial.amplitude
+
+
+def courant_step(flow: Flow, time: Time, speed: float | None) -> float | None:
+    """Longest step that the Courant number allows. An explicit stepper resolves sound."""
+    sound = flow.sound_speed if time.explicit else None
+    return None if speed is None else time.courant * BOX_LENGTH / flow.cells / (speed + math.sqrt(3) * (sound or 0.0))
+
+
+def flow_step(time: Time, bound: float | None) -> tuple[float | None, str]:
+    """Time step of the direct simulation, and the key of [time] that limits it; `bound` is that of the Courant
+    number."""
+    if time.step is not None:
+        return time.step, "step"
+    if bound is None:
+        return None, ""
+    return ladder_step(time.max_step, bound), "max_step" if bound >= time.max_step else "courant"
+
+
+def rollout_in(settings: Simulation, turnover_time: float, longest: float) -> Rollout:
+    """Rollout in a flow of a given turnover time, with steps no longer than `longest`."""
+    interval = settings.frame_interval
+    intervals, step = _whole(settings.turnovers * turnover_time / interval), longest
     if settings.on_grid or not settings.scheme.dense:  # a whole number of steps between two frames
-        within = math.ceil(interval / step - 1e-9)
+        within = _whole(interval / longest)
         step, steps = interval / within, intervals * within
     else:
-        steps = math.ceil(intervals * interval / step - 1e-9)
-    evaluations = 0 if settings.on_grid else settings.scheme.evaluations * steps + 1
-    return Rollout(turnover_time, intervals, step, steps, evaluations)
+        steps = _whole(intervals * interval / longest)
+    return Rollout(turnover_time, intervals, step, steps,
+                   0 if settings.on_grid else settings.scheme.evaluations * steps + 1)
 
 
-def rollout_step(scene: Scene) -> float:
-    """Time step of the particles: the scene's, unless the resolved velocity or the Courant number of a coarse grid
-    demands a shorter one. A step that is still to be found counts as one frame interval at most."""
-    settings, allowed = scene.simulation, None
-    if settings.on_grid:
-        cells, speed = (scene.eulerian or Eulerian()).cells_for(scene.tracers.filter_width), peak_speed(scene)
-        allowed = speed and scene.time.courant * BOX_LENGTH / cells / speed
-    elif "model" in settings.needs and scene.resolves:
-        allowed = expected_allowed_step(scene)
-    return min(settings.longest_step if math.isfinite(settings.longest_step) else settings.frame_interval,
-               allowed or math.inf)
-
-
-def resolved_shells(scene: Scene) -> int:
-    """Largest wavenumber along each axis of the resolved velocity of the particles."""
-    tracers, turbulence = scene.tracers, expected_turbulence(scene)
-    highest = resolved_wavenumber(tracers.spacing, tracers.filter_width,
-                                  turbulence.kolmogorov_length if turbulence else 0.0)
-    return min(max(int(highest + 1e-9), 1), (tracers.planes - 1) // 2)
-
-
-def expected_allowed_step(scene: Scene) -> float | None:
-    """Longest time step of particles with a resolved velocity, at the speed at which the tracers start; None where that
-    is unknown."""
-    turbulence = expected_turbulence(scene)
-    return turbulence and allowed_step(scene.simulation.scheme.angle, resolved_shells(scene), turbulence.velocity_rms)
+def _whole(ratio: float) -> int:
+    """The next whole number, which round-off does not raise."""
+    return math.ceil(ratio - 1e-9)

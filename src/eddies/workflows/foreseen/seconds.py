@@ -7,11 +7,10 @@
 from itertools import pairwise
 
 from eddies.flow.navier_stokes import FLUIDS, CompressibleFluid
-from eddies.scene.scene import BOX_LENGTH, Eulerian, Scene
+from eddies.scene.scene import BOX_LENGTH, Scene
 from eddies.scene.terms import NetworkSettings
 from eddies.time_stepping import ETDRK4, STEPPERS
-from eddies.workflows.foreseen.numbers import flow_steps, rollout_of
-from eddies.workflows.foreseen.storage import training_steps
+from eddies.workflows.foreseen.numbers import estimate
 from eddies.workflows.ground_truth.frame_counts import KERNEL_FIELDS, TESTED_FRAMES
 
 # Seconds on one and two cores of an AMD EPYC with AVX-512 (`tiny`, `hit-small`, `hit-coarse`): a transform of a grid
@@ -27,22 +26,23 @@ GRADIENT = 4                 # an evaluation with its gradient, over an evaluati
 
 def seconds(scene: Scene, stage: str, ranks: int) -> float | None:
     """Wall time of a stage; None where the number of its steps is unknown."""
-    tracers, kernel, model, rollout = scene.tracers, scene.kernel, scene.model, rollout_of(scene)
+    tracers, kernel, model, expected = scene.tracers, scene.kernel, scene.model, estimate(scene)
+    rollout = expected.rollout
     transforms = pairs = calls = solves = weights = 0.0
     neighbors = scene.neighbors if model and "pairs" in model.reads else 0.0
     if stage == "dns":
-        if (steps := flow_steps(scene)) is None:
+        if expected.steps is None:
             return None
-        calls, cells = steps * STEPPERS[scene.time.stepper].evaluations, scene.flow.cells
+        calls, cells = expected.steps * STEPPERS[scene.time.stepper].evaluations, scene.flow.cells
         fluid = FLUIDS.get(scene.flow.fluid, CompressibleFluid)
         transforms = calls * fluid.transforms * cells**3 * (1 + cells / CACHED)
     elif stage == "train-kernel":  # twice
         calls = 2 * kernel.steps * GRADIENT
         pairs = kernel.neighbors * (kernel.steps * tracers.particles + 2 * KERNEL_FIELDS * tracers.cells**3)
     elif stage == "train":
-        training, solves = scene.training if model.path is None else None, TESTED_FRAMES
-        calls = GRADIENT * training_steps(scene)
-        if training:
+        solves = TESTED_FRAMES
+        if training := scene.own_training:
+            calls = GRADIENT * training.steps_in_all
             solves, pairs = solves + training.frames + 1, GRADIENT * training.steps * training.batch * neighbors
             if training.field_weight > 0:  # in a cube of a quarter of the box, and around it
                 width = min(1 / 4 + 2 * scene.kernel_support / BOX_LENGTH, 1)
@@ -56,10 +56,9 @@ def seconds(scene: Scene, stage: str, ranks: int) -> float | None:
         if rollout is None:
             return None
         calls, pairs = rollout.evaluations, rollout.evaluations * tracers.particles * neighbors / 2
-        if scene.simulation.on_grid:
-            cells, calls = (scene.eulerian or Eulerian()).cells_for(tracers.filter_width), rollout.steps
-            calls *= ETDRK4.evaluations
-            transforms = calls * CompressibleFluid.transforms * cells**3
+        if scene.coarse_cells:
+            calls = rollout.steps * ETDRK4.evaluations
+            transforms = calls * CompressibleFluid.transforms * scene.coarse_cells**3
         elif "model" in scene.simulation.needs:
             solves = rollout.evaluations * scene.simulation.scheme.iterations / COLD
     elif rollout and kernel:       # a report reconstructs model and truth at particles and grid points

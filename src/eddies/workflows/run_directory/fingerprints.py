@@ -12,8 +12,7 @@ from typing import Any
 
 from eddies.import_path import origins
 from eddies.pipeline import STAGES
-from eddies.scene.parts import FOREIGN_IN
-from eddies.scene.scene import Scene
+from eddies.scene.scene import FOREIGN_IN, Scene
 
 
 def stage_fingerprint(scene: Scene, stage: str) -> str:
