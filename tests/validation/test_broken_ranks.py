@@ -59,7 +59,7 @@ def test_a_broken_rank_ends_the_job(jobs, case):
     assert len(list(directory.glob("process-*"))) == ranks
     if place == "checkpoint":  # the checkpoints before are whole
         names = {path.name for path in directory.glob("run/checkpoints/step-*")}
-        assert names == {"step-00000000", "step-00000001.partial"}
+        assert names == {"step-00000000.h5", "step-00000001.h5.partial"}
 
 
 def is_alive(process):
