@@ -4,7 +4,6 @@ import errno
 import fcntl
 import os
 import random
-import shutil
 
 import h5py
 import numpy as np
@@ -156,19 +155,6 @@ def test_another_or_a_missing_file_is_found(comm, path, tmp_path):
     assert find_damage(comm, path, known) is None
     assert "is another file" in find_damage(comm, path, known + 1)
     assert "nowhere.h5: missing" in find_damage(comm, tmp_path / "nowhere.h5")
-
-
-@pytest.mark.mpi(2)
-def test_checksums_do_not_depend_on_ranks(comm, tmp_path):
-    for size in (0, 1, 4096, 4097, 10**6):
-        if comm.rank == 0:
-            (tmp_path / "plain").write_bytes(random.Random(size).randbytes(size))
-            shutil.copy(tmp_path / "plain", tmp_path / "alone")
-            add_checksums(comm.Create_group(comm.group.Incl([0])), tmp_path / "alone")
-        comm.Barrier()
-        add_checksums(comm, tmp_path / "plain")
-        assert (tmp_path / "plain").read_bytes() == (tmp_path / "alone").read_bytes()
-        comm.Barrier()
 
 
 @pytest.mark.mpi(1)
