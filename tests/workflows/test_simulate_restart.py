@@ -121,7 +121,7 @@ def go_on_from(comm, scene, directory, saved, step):
         checkpoints.mkdir()
         for path in saved.glob("frames-*.h5"):
             shutil.copy(path, checkpoints)
-        shutil.copytree(saved / f"step-{step:08d}", checkpoints / f"step-{step:08d}")
+        shutil.copy(saved / f"step-{step:08d}.h5", checkpoints)
         (directory / "rollout.h5").unlink()
     comm.Barrier()
     simulate.run(scene, comm, directory)
