@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from eddies.io import checksums
-from eddies.io.checksums import ATTRIBUTE, BLOCK_BYTES, PIECE, add_checksums, find_damage, known_sums
+from eddies.io.checksums import ATTRIBUTE, BLOCK_BYTES, PIECE, find_damage, known_sums
 from eddies.io.errors import ProductError
 from eddies.io.hdf5 import (append_frame, create_product, growing_dataset, open_product, read_frame, read_table,
                             write_table)

@@ -36,7 +36,7 @@ log = logging.getLogger("eddies")
 
 KEPT = 3
 PLAIN = "plain"  # the dataset of everything that is not an array, as JSON
-FORMAT = 10  # of the layout; other checkpoints are not used. Raise it also with the format of products: frames are such.
+FORMAT = 10  # of the layout; others are not used. Raise it also with the format of products: frames are such.
 
 
 @dataclass(frozen=True)

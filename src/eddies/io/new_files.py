@@ -39,7 +39,7 @@ import numpy as np
 from mpi4py import MPI
 
 from eddies.io.checksums import add_checksums
-from eddies.io.errors import ProductError, WriteError, file_errors, room, write_error
+from eddies.io.errors import ProductError, WriteError, file_errors, room
 from eddies.io.run_lock import RunTakenOver
 from eddies.parallel.broadcast import on_all_ranks, on_first_rank
 from eddies.parallel.stop import Stopped
