@@ -93,6 +93,17 @@ def test_hdf5_stays_within_the_reserved_space(comm, tmp_path, monkeypatch, shape
         assert size == file.id.get_filesize() + 4 * blocks + FOOTER.size and file["values"].shape[0] == frames
 
 
+@pytest.mark.mpi(1, 2)
+def test_a_file_is_forced_to_the_disk_before_it_gets_its_name(comm, tmp_path, monkeypatch):
+    """By every rank, which may be on another node; then the name is, by rank 0."""
+    done, fsync, replace, folder = [], os.fsync, os.replace, tmp_path.resolve()
+    monkeypatch.setattr(os, "fsync", lambda file: done.append(os.readlink(f"/proc/self/fd/{file}")) or fsync(file))
+    monkeypatch.setattr(os, "replace", lambda *paths: done.append("named") or replace(*paths))
+    with create_product(comm, tmp_path / "a.h5", "frames", {}):
+        pass
+    assert done == [f"{folder}/a.h5.partial", "named", str(folder)][:3 if comm.rank == 0 else 1]
+
+
 # On a file system of 3 MiB: the files that are left, and the error.
 ON_A_SMALL_DISK = """
 import os, subprocess, sys
