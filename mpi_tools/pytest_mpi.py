@@ -118,6 +118,14 @@ class OuterRun:
             for ranks in later[:1]:
                 self.start(self.waiting[ranks])
 
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_makereport(self, item, call):
+        """Report the seconds of the slowest rank, not those of waiting for it."""
+        report = yield
+        if call.when == "call" and isinstance(item, MpiItem):
+            report.duration = item.seconds
+        return report
+
     def start(self, items, count=1):
         """Start `count` mpirun that share these tests."""
         first = RankRun(self.config, items)
@@ -162,11 +170,12 @@ class MpiItem(pytest.Item):
         marker = function.get_closest_marker("mpi")
         item.outer, item.ranks = outer, function.callspec.params["mpi_ranks"]
         item.timeout = float(marker.kwargs.get("timeout", TIMEOUT))
-        item.place = function.reportinfo()
+        item.place, item.seconds = function.reportinfo(), 0.0
         return item
 
     def runtest(self):
         records = self.outer.records(self)
+        self.seconds = max(record["seconds"] for record in records)
         for record in records:
             for title, text in record["sections"]:
                 stream, phase = title.split()[1:]  # "Captured stdout call"
@@ -277,7 +286,7 @@ class RankRun:
             stack = self.output.read().decode(errors="replace").splitlines()[-60:]
             text = "died; output of the run:\n"
         return {"rank": rank, "outcome": "failed", "phase": None, "text": text + "\n".join(stack),
-                "sections": []}
+                "sections": [], "seconds": 0.0}
 
     def stop(self):
         """End mpirun and its ranks."""

@@ -82,6 +82,7 @@ class InnerRun:
         report = next((r for r in self.reports if not r.passed), self.reports[-1])
         return {"rank": self.comm.rank, "outcome": report.outcome, "phase": report.when,
                 "text": reason(report), "expected": hasattr(report, "wasxfail"),
+                "seconds": sum(r.duration for r in self.reports),
                 "sections": self.reports[-1].sections}
 
     def agree(self, outcome: str) -> bool:

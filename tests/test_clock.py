@@ -57,6 +57,6 @@ def test_with_verbose_there_is_a_line_for_every_step(progressed, caplog):
 
 
 @pytest.mark.parametrize("seconds, text", [(41.6, "42 s"), (200, "3 min 20 s"), (7500, "2 h 05 min"),
-                                           (3.2e8, "10 years")])
+                                           (3.2e8, "10 years"), (86400 * 365.25 * 1.2e30, "1.2e+30 years")])
 def test_durations_are_readable(seconds, text):
     assert clock.duration(seconds) == text

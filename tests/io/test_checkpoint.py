@@ -7,13 +7,14 @@ import shutil
 import subprocess
 import sys
 import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import h5py
 import numpy as np
 import pytest
 
-from eddies.io.checkpoint import Block, CheckpointDirectory, Guard
+from eddies.io.checkpoint import Block, CheckpointDirectory, Guard, checkpoints_in
 from eddies.io.checksums import add_checksums
 from eddies.io.errors import WriteError
 from eddies.parallel.slab import block_starts
@@ -43,7 +44,7 @@ def fill(comm, path, steps, fingerprint="settings"):
     return directory
 
 
-@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.mpi(1, 3)
 @pytest.mark.parametrize("mpi", [True, False])
 def test_what_is_read_is_what_was_written(comm, tmp_path, monkeypatch, mpi):
     """Also if rank 0 writes for all. The numbers that are no blocks are those of rank 0."""
@@ -62,7 +63,8 @@ def test_what_is_read_is_what_was_written(comm, tmp_path, monkeypatch, mpi):
 @pytest.mark.mpi(1, 2)
 def test_the_newest_three_are_kept(comm, tmp_path):
     directory = fill(comm, tmp_path, [1, 2, 3, 10, 11])
-    assert sorted(path.name for path in directory.path.iterdir()) == [f"step-{n:08d}" for n in (3, 10, 11)]
+    assert sorted(path.name for path in directory.path.iterdir()) == [f"step-{n:08d}.h5" for n in (3, 10, 11)]
+    assert checkpoints_in(directory.path) == [(11, "settings"), (10, "settings"), (3, "settings")]
     assert directory.newest().content["step"] == 11
     directory.remove()
     assert not directory.path.exists()
@@ -74,25 +76,27 @@ def test_which_checkpoints_are_used(comm, tmp_path, caplog, monkeypatch):
     removed."""
     directory = fill(comm, tmp_path, [1])
     if comm.rank == 0:
-        (directory.path / "step-00000002.partial").mkdir()
+        (directory.path / "step-00000002.h5.partial").write_bytes(b"half")
         (directory.path / "frames-00000001.h5").write_bytes(b"later than the checkpoint")
+        (directory.path / "step-00000003").mkdir()  # as of version 1
+        assert checkpoints_in(directory.path) == [(3, ""), (1, "settings")]
     comm.Barrier()
-    assert directory.newest().content["step"] == 1 and not caplog.text
-    assert [path.name for path in directory.path.iterdir()] == ["step-00000001"]
     with monkeypatch.context() as patch:
         patch.setattr("eddies.io.checkpoint.in_use", lambda: "another")
         assert directory.newest().content["step"] == 1
+    assert [path.name for path in directory.path.iterdir()] == ["step-00000001.h5"]
     assert comm.rank > 0 or "compiled kernels: another" in caplog.text and "not bit for bit" in caplog.text
+    assert comm.rank > 0 or "step-00000003: was made by another version" in caplog.text
     comm.Barrier()
     assert CheckpointDirectory(comm, directory.path, "others").newest() is None
-    assert comm.rank > 0 or "step-00000001: was made with other settings" in caplog.text
+    assert comm.rank > 0 or "step-00000001.h5: was made with other settings" in caplog.text
     assert list(directory.path.iterdir()) == []
     comm.Barrier()
     monkeypatch.setattr("eddies.io.checkpoint.FORMAT", 1)
     directory = fill(comm, tmp_path, [1])
     monkeypatch.undo()
     assert directory.newest() is None
-    assert comm.rank > 0 or "step-00000001: was made by another version" in caplog.text
+    assert comm.rank > 0 or "step-00000001.h5: was made by another version" in caplog.text
 
 
 def harm(path, kind, chooser):
@@ -108,43 +112,34 @@ def harm(path, kind, chooser):
 
 
 @pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("kind", ["flip", "truncation"])
-def test_damage_is_found_and_the_checkpoint_before_is_used(comm, tmp_path, caplog, kind):
-    complete, chooser = fill(comm, tmp_path, [1, 2]).path, random.Random(comm.size)
-    for trial in range(25):
+def test_damage_is_found_and_the_checkpoint_before_is_used(comm, tmp_path, caplog):
+    """Also damage of the frames that belong to it, and sound frames of another run."""
+    path, chooser = tmp_path / "checkpoints", random.Random(comm.size)
+    frames = path / "frames-00000000.h5"
+    if comm.rank == 0:
+        path.mkdir()
+        frames.write_bytes(b"frames" * 1000)
+    add_checksums(comm, frames)
+    fill(comm, tmp_path, [1])
+    CheckpointDirectory(comm, path, "settings").write(2, arrays(comm, 2)[0], [frames.name])
+    assert CheckpointDirectory(comm, path, "settings").newest().files == [frames.name]
+    for kind, name in 8 * [("flip", "step-00000002.h5"), ("cut", "step-00000002.h5")] + [
+            ("flip", frames.name), ("cut", frames.name), ("others", frames.name)]:
         directory = CheckpointDirectory(comm, tmp_path / "trial", "settings")
         directory.remove()
         caplog.clear()
+        harmed = f"{kind} {name}"
         if comm.rank == 0:
-            shutil.copytree(complete, directory.path)
-            name = chooser.choices(("state.h5", "manifest.json"), [3, 1])[0]
-            harmed = harm(directory.path / "step-00000002" / name, kind, chooser)
-        comm.Barrier()
-        assert directory.newest().content["step"] == 1, trial
-        assert comm.rank > 0 or f"step-00000002/{name}: " in caplog.text and "not used" in caplog.text, harmed
-
-
-@pytest.mark.mpi(1, 2)
-def test_damage_of_frames_is_found(comm, tmp_path, caplog):
-    """Also sound frames of another run."""
-    directory, chooser = CheckpointDirectory(comm, tmp_path / "checkpoints", "settings"), random.Random(1)
-    for kind in ("flip", "truncation", "others"):
-        frames = directory.path / f"frames-{kind}.h5"
-        directory.write(1, arrays(comm, 1)[0])
-        if comm.rank == 0:
-            frames.write_bytes(b"frames" * 1000)
-        add_checksums(comm, frames)
-        directory.write(2, arrays(comm, 2)[0], [frames.name])
-        assert directory.newest().files == [frames.name]
-        comm.Barrier()
-        if comm.rank == 0:
-            frames.write_bytes(b"others" * 1000) if kind == "others" else harm(frames, kind, chooser)
+            shutil.copytree(path, directory.path)
+            if kind == "others":
+                (directory.path / name).write_bytes(b"others" * 1000)
+            else:
+                harmed = harm(directory.path / name, kind, chooser)
         if kind == "others":
-            add_checksums(comm, frames)
+            add_checksums(comm, directory.path / name)
         comm.Barrier()
-        assert directory.newest().content["step"] == 1
-        assert comm.rank > 0 or re.search(f"{frames.name}: .*not used", caplog.text)
-        comm.Barrier()
+        assert directory.newest().content["step"] == 1, harmed
+        assert comm.rank > 0 or re.search(f"{name}: .*not used", caplog.text), harmed
 
 
 @pytest.mark.mpi(1, 2)
@@ -154,16 +149,10 @@ def test_a_full_disk_keeps_the_earlier_checkpoints(comm, tmp_path):
     for kilobytes in (1, 1100):  # at the beginning, and in the arrays
         with largest_file(comm, kilobytes * 1024, comm.size - 1), pytest.raises(WriteError, match="wanted.*intact"):
             directory.write(2, {**arrays(comm, 2)[0], "much": np.zeros(65000)})
-        assert [path.name for path in directory.path.iterdir()] == ["step-00000001"]
+        assert [path.name for path in directory.path.iterdir()] == ["step-00000001.h5"]
         assert directory.newest().content["step"] == 1
     directory.write(2, arrays(comm, 2)[0])
     assert directory.newest().content["step"] == 2
-
-
-def refuse(path, *_, ignore_errors=False, **__):
-    """In place of shutil.rmtree."""
-    if not ignore_errors:
-        raise PermissionError(13, "Permission denied", str(path))
 
 
 @pytest.mark.mpi(1, 2, timeout=30)
@@ -171,11 +160,15 @@ def refuse(path, *_, ignore_errors=False, **__):
                                  lambda directory: directory.write(4, {"time": 1.0})],
                          ids=["remove", "clean", "keep the newest"])
 def test_all_ranks_raise_if_a_file_cannot_be_removed(comm, tmp_path, monkeypatch, act):
+    def refuse(path, **_):
+        raise PermissionError(13, "Permission denied", str(path))
+
     directory = fill(comm, tmp_path, [1, 2, 3])
     if comm.rank == 0:
-        (directory.path / "step-00000009.partial").mkdir()
+        (directory.path / "step-00000009.h5.partial").write_bytes(b"half")
     comm.Barrier()
     monkeypatch.setattr(shutil, "rmtree", refuse)
+    monkeypatch.setattr(Path, "unlink", refuse)
     with pytest.raises(WriteError, match="checkpoints.*: Permission denied"):
         act(directory)
 
@@ -200,7 +193,7 @@ def test_a_kill_leaves_a_checkpoint(comm, tmp_path):
     # The writer is a job of its own, not another rank of this one.
     environment = {name: value for name, value in os.environ.items() if not name.startswith(("OMPI_", "PMIX_"))}
     chooser = random.Random(3)
-    for _ in range(3):
+    for _ in range(2):
         writer = subprocess.Popen([sys.executable, "-c", WRITER, tmp_path / "checkpoints"], stdout=subprocess.PIPE,
                                   text=True, env=environment)
         steps = [int(writer.stdout.readline()) for _ in range(4)]

@@ -4,14 +4,13 @@ import errno
 import fcntl
 import os
 import random
-import shutil
 
 import h5py
 import numpy as np
 import pytest
 
 from eddies.io import checksums
-from eddies.io.checksums import ATTRIBUTE, BLOCK_BYTES, PIECE, add_checksums, find_damage, known_sums, open_to_read
+from eddies.io.checksums import ATTRIBUTE, BLOCK_BYTES, PIECE, find_damage, known_sums
 from eddies.io.errors import ProductError
 from eddies.io.hdf5 import (append_frame, create_product, growing_dataset, open_product, read_frame, read_table,
                             write_table)
@@ -42,17 +41,17 @@ def place_of(path, frame):
         return file["series"].id.get_chunk_info_by_coord((frame, 0, 0)).byte_offset
 
 
-def harm(comm, path, at, count=1):
-    """Invert bytes of a file while no rank reads it."""
+def harm(comm, path, at):
+    """Invert a byte of a file while no rank reads it."""
     comm.Barrier()
     if comm.rank == 0:
         content = bytearray(path.read_bytes())
-        content[at:at + count] = bytes(255 - byte for byte in content[at:at + count])
+        content[at] ^= 255
         path.write_bytes(content)
     comm.Barrier()
 
 
-@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.mpi(1, 3)
 def test_other_programs_read_a_product(comm, path):
     with h5py.File(path) as file:
         assert "CRC-32" in file.attrs[ATTRIBUTE]
@@ -60,10 +59,9 @@ def test_other_programs_read_a_product(comm, path):
 
 
 @pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("count", [1, 3000])
-def test_a_reader_of_a_frame_is_told_of_its_bytes_alone(comm, path, count):
+def test_a_reader_of_a_frame_is_told_of_its_bytes_alone(comm, path):
     whole = slice(None), slice(None)
-    harm(comm, path, place_of(path, 2) + BLOCK_BYTES, count)
+    harm(comm, path, place_of(path, 2) + BLOCK_BYTES)
     with open_product(comm, path, "rollout") as file:
         assert np.array_equal(read_table(file, "table")["a"], np.arange(1000.0))
         for frame in (0, 4):
@@ -77,17 +75,6 @@ def test_a_reader_of_a_frame_is_told_of_its_bytes_alone(comm, path, count):
 
 
 @pytest.mark.mpi(1)
-def test_exchanged_frames_are_found(comm, path):
-    content, places = bytearray(path.read_bytes()), [place_of(path, frame) for frame in (1, 3)]
-    parts = [content[at:at + values(0).nbytes] for at in places]
-    for at, part in zip(places, reversed(parts)):
-        content[at:at + len(part)] = part
-    path.write_bytes(content)
-    with open_product(comm, path, "rollout") as file, pytest.raises(ProductError, match="series, frame [01] "):
-        read_frame(file["series"], 1, (slice(None),))
-
-
-@pytest.mark.mpi(1, 2)
 def test_structure_and_attributes_are_covered(comm, path):
     for at in 40, path.read_bytes().index(b"CRC-32 of every"):
         harm(comm, path, at)
@@ -100,13 +87,12 @@ def test_structure_and_attributes_are_covered(comm, path):
 
 
 @pytest.mark.mpi(1)
-@pytest.mark.parametrize("change", [lambda content: content[:-1], lambda content: content[:-5000],
-                                    lambda content: content[:len(content) // 2], lambda content: b"x" + content[1:-1],
-                                    lambda content: b""])
-def test_a_file_that_is_cut_off_or_overwritten_is_damaged(comm, path, change):
-    path.write_bytes(change(path.read_bytes()))
-    with pytest.raises(ProductError, match="rollout.h5: damaged"), open_product(comm, path, "rollout"):
-        pass
+def test_a_file_that_is_cut_off_or_overwritten_is_damaged(comm, path):
+    content = path.read_bytes()
+    for changed_content in (content[:-1], content[:-5000], content[:len(content) // 2], b"x" + content[1:-1], b""):
+        path.write_bytes(changed_content)
+        with pytest.raises(ProductError, match="rollout.h5: damaged"), open_product(comm, path, "rollout"):
+            pass
 
 
 @pytest.mark.mpi(1)
@@ -139,12 +125,12 @@ def test_an_array_that_is_read_in_pieces(comm, tmp_path):
         read_table(file, "table")
 
 
-@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.mpi(1, 3)
 def test_every_changed_byte_is_found(comm, path):
     assert find_damage(comm, path) is None
     size, chooser = path.stat().st_size, random.Random(comm.size)
     comm.Barrier()
-    for at in [0, size - 1, size - 20, size - 30, *(chooser.randrange(size) for _ in range(60 // comm.size))]:
+    for at in [0, size - 1, size - 20, size - 30, *(chooser.randrange(size) for _ in range(40 // comm.size))]:
         with open(path, "r+b", buffering=0) as file:
             if comm.rank == 0:
                 file.seek(at)
@@ -163,7 +149,7 @@ def test_every_changed_byte_is_found(comm, path):
     assert find_damage(comm, path) is None
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(1)
 def test_another_or_a_missing_file_is_found(comm, path, tmp_path):
     known = known_sums(path)
     assert find_damage(comm, path, known) is None
@@ -171,36 +157,20 @@ def test_another_or_a_missing_file_is_found(comm, path, tmp_path):
     assert "nowhere.h5: missing" in find_damage(comm, tmp_path / "nowhere.h5")
 
 
-@pytest.mark.mpi(2)
-def test_checksums_do_not_depend_on_ranks(comm, tmp_path):
-    for size in (0, 1, 4096, 4097, 10**6):
-        if comm.rank == 0:
-            (tmp_path / "plain").write_bytes(random.Random(size).randbytes(size))
-            shutil.copy(tmp_path / "plain", tmp_path / "alone")
-            add_checksums(comm.Create_group(comm.group.Incl([0])), tmp_path / "alone")
-        comm.Barrier()
-        add_checksums(comm, tmp_path / "plain")
-        assert (tmp_path / "plain").read_bytes() == (tmp_path / "alone").read_bytes()
-        comm.Barrier()
-
-
-@pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("old", [False, True])
-def test_a_file_that_another_program_locks_is_read(comm, path, old):
+@pytest.mark.mpi(1)
+def test_a_file_that_another_program_locks_is_read(comm, path):
     """With checksums, and an old one without."""
-    if old and comm.rank == 0:
-        with h5py.File(path, "r+") as file:
-            del file.attrs[ATTRIBUTE]
-    with open(path, "r+b") as held:
-        if comm.rank == 0:
+    for old in (False, True):
+        if old:
+            with h5py.File(path, "r+") as file:
+                del file.attrs[ATTRIBUTE]
+        with open(path, "r+b") as held:
             fcntl.flock(held, fcntl.LOCK_EX)
-        comm.Barrier()
-        with open_product(comm, path, "rollout") as file:
-            assert len(file["series"]) == FRAMES
-        comm.Barrier()
+            with open_product(comm, path, "rollout") as file:
+                assert len(file["series"]) == FRAMES
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(1)
 def test_a_refusal_of_the_system_is_no_damage(comm, path, monkeypatch):
     for number in (errno.ENOLCK, errno.EIO):
         def refuse(path):
@@ -211,10 +181,3 @@ def test_a_refusal_of_the_system_is_no_damage(comm, path, monkeypatch):
             with open_product(comm, path, "rollout"):
                 pass
         assert "damaged" not in str(error.value) and "delete" not in str(error.value)
-
-
-@pytest.mark.mpi(1, timeout=30)
-def test_a_pipe_is_not_waited_for(comm, tmp_path):
-    os.mkfifo(tmp_path / "kernel.h5")
-    with pytest.raises(OSError, match="not a regular file"):
-        open_to_read(tmp_path / "kernel.h5")

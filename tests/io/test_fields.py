@@ -16,7 +16,7 @@ def field(index, variable):
     return np.random.default_rng([index, VARIABLES[variable]]).random(shape)
 
 
-@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.mpi(1, 3)
 def test_fields_survive(comm, tmp_path):
     """The first of three ranks has all planes but one, the second none."""
     starts = [0, *[CELLS - 1] * (comm.size - 1), CELLS]

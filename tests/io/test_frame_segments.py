@@ -14,7 +14,7 @@ LAYOUT = FrameLayout(5, 1.0, {"all": {"velocity": (3,), "density": ()}, "some": 
                      {"flow": FieldLayout(3, {"velocity": 2}), "finer": FieldLayout(4, {"density": 1})})
 
 
-@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.mpi(1, 3)
 def test_images_are_counted_over_all_segments(comm, tmp_path):
     """A particle that goes on through the box, segment by segment, on whichever rank its row is; another stays."""
     layout = FrameLayout(2, 2.0, {"model": {"position": (3,)}}, np.float64, {})
@@ -34,7 +34,7 @@ def test_images_are_counted_over_all_segments(comm, tmp_path):
             assert np.allclose(found.read(step, "position") + 2.0 * found.read(step, "image"), frame)
 
 
-@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.mpi(1, 3)
 def test_frames_of_all_segments_are_put_together_in_order(comm, tmp_path):
     """Also those of a trajectory, or of fields, of which a segment has none."""
     start, stop = id_block(comm, 5)

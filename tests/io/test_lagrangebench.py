@@ -6,9 +6,11 @@ import h5py
 import numpy as np
 import pytest
 
-from eddies.io.hdf5 import ProductError, create_product, open_product
+from eddies.io.errors import WriteError
+from eddies.io.hdf5 import create_product, open_product
 from eddies.io.lagrangebench import shortcoming, write_dataset
 from eddies.io.trajectories import Trajectory, TrajectoryWriter
+from tests.full_disk import largest_file
 
 PARTICLES, FRAMES, INTERVAL, LENGTH = 40, 18, 0.1, 2 * np.pi
 PARTS = {"train": range(0, 8), "valid": range(8, 13), "test": range(13, 18)}
@@ -113,10 +115,14 @@ def test_trajectories_that_make_no_data_set(trajectory):
 
 
 @pytest.mark.mpi(1)
-def test_a_part_that_cannot_be_written_leaves_the_whole_set_as_it_was(trajectory, tmp_path):
+def test_a_part_that_cannot_be_written_leaves_the_whole_set_as_it_was(comm, trajectory, tmp_path):
     write_dataset(tmp_path / "set", trajectory(), "older", {})
-    (tmp_path / "set" / "test.h5.partial").mkdir()
-    before = {path.name: path.is_file() and path.read_bytes() for path in (tmp_path / "set").iterdir()}
-    with pytest.raises(ProductError, match="test.h5.partial: Is a directory"):
-        write_dataset(tmp_path / "set", trajectory(), "newer", {})
-    assert {path.name: path.is_file() and path.read_bytes() for path in (tmp_path / "set").iterdir()} == before
+    before = {path: path.read_bytes() for path in (tmp_path / "set").iterdir()}
+    other = trajectory()
+    with largest_file(comm, 100_000), pytest.raises(WriteError, match="train.h5.partial: .* bytes wanted"):
+        write_dataset(tmp_path / "set", other, "newer", {})
+    (tmp_path / "set/test.h5.partial").mkdir()
+    with pytest.raises(WriteError, match="test.h5.partial: Is a directory"):
+        write_dataset(tmp_path / "set", other, "newer", {})
+    (tmp_path / "set/test.h5.partial").rmdir()
+    assert {path: path.read_bytes() for path in (tmp_path / "set").iterdir()} == before

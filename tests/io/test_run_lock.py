@@ -39,9 +39,9 @@ def elsewhere():
 
 @pytest.fixture
 def quick(monkeypatch):
-    """A lost directory is noticed at once."""
+    """A lost directory is noticed at once, and a lock replaced without a pause."""
     monkeypatch.setattr(run_lock, "LOOK_SECONDS", 0.0)
-    monkeypatch.setattr(run_lock, "MOVE_SECONDS", 0.0)
+    monkeypatch.setattr(run_lock, "SETTLE_SECONDS", 0.0)
 
 
 @pytest.mark.mpi(1, 2)
@@ -63,35 +63,30 @@ def test_a_job_holds_its_directory_and_leaves_nothing(comm, tmp_path):
 
 
 @pytest.mark.mpi(1)
-@pytest.mark.parametrize("silent, ahead, free", [(0, 0, False), (290, 0, False), (310, 0, True), (-3600, 0, False),
-                                                 (0, 400, False)])
-def test_a_job_elsewhere_counts_for_five_minutes_after_its_last_sign(comm, tmp_path, elsewhere, monkeypatch, silent,
-                                                                     ahead, free):
+@pytest.mark.usefixtures("quick")
+def test_a_job_elsewhere_counts_for_five_minutes_after_its_last_sign(comm, tmp_path, elsewhere, monkeypatch):
     """The clock of the file system counts, also if the clock of the machine is ahead."""
-    put(tmp_path, elsewhere, silent)
     clock = time.time
-    monkeypatch.setattr(time, "time", lambda: clock() + ahead)
-    if free:
-        with lock_directory(comm, tmp_path):
-            assert json.loads((tmp_path / "LOCK").read_text())["pid"] == os.getpid()
-    else:
-        with pytest.raises(RunInUse, match="process 4242 on node7, since 2026-01-01"), lock_directory(comm, tmp_path):
-            pass
+    for silent, ahead in ((0, 0), (290, 0), (-3600, 0), (0, 400)):
+        put(tmp_path, elsewhere, silent)
+        with monkeypatch.context() as patch:
+            patch.setattr(time, "time", lambda: clock() + ahead)
+            with pytest.raises(RunInUse, match="process 4242 on node7"), lock_directory(comm, tmp_path):
+                pass
         assert json.loads((tmp_path / "LOCK").read_text())["pid"] == 4242
+    put(tmp_path, elsewhere, 310)
+    with lock_directory(comm, tmp_path):
+        assert json.loads((tmp_path / "LOCK").read_text())["pid"] == os.getpid()
 
 
 @pytest.mark.mpi(1)
-def test_a_machine_knows_which_of_its_processes_live(comm, tmp_path, monkeypatch):
+def test_a_machine_knows_which_of_its_processes_live(comm, tmp_path):
     """A living process holds the lock without recent signs of life. Its number may belong to another process later."""
     process = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
     job = replace(Holder.this_job(), job="another", pid=process.pid, born=run_lock._born(process.pid))
     put(tmp_path, job, silent=3600)
     with pytest.raises(RunInUse, match="1 h 00 min ago"):
         refuse_if_held(comm, tmp_path)
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "kill", failing(PermissionError))  # a process of another user
-        with pytest.raises(RunInUse):
-            refuse_if_held(comm, tmp_path)
     put(tmp_path, replace(job, born="1"))
     refuse_if_held(comm, tmp_path)
     put(tmp_path, job)
@@ -116,23 +111,17 @@ def test_a_batch_job_that_was_queued_again_knows_that_it_had_ended(comm, tmp_pat
                 refuse_if_held(comm, tmp_path)
 
 
-@pytest.mark.mpi(1, timeout=30)
-@pytest.mark.parametrize("content", ["", "[]", '{"job": 3}', "\xff", {"pid": "abc"}, {"pid": -1}, {"pid": 10**30},
-                                     {"restarts": "x"}, {"start": 3}, None], ids=repr)
-def test_an_unreadable_lock_holds_while_it_is_new(comm, tmp_path, monkeypatch, content):
-    """Damaged, with values of other types, or a pipe (None)."""
-    monkeypatch.setenv("SLURM_JOB_ID", "7")
-    lock = tmp_path / "LOCK"
-    if content is None:
-        os.mkfifo(lock)
-    else:
-        lock.write_text(content if isinstance(content, str) else json.dumps(vars(Holder.this_job()) | content),
-                        encoding="latin-1")
-    with pytest.raises(RunInUse, match="an unknown machine"):
-        refuse_if_held(comm, tmp_path)
-    with lock_directory(comm, tmp_path, take_over=True):
-        pass
-    assert not list(tmp_path.iterdir())
+@pytest.mark.mpi(1)
+@pytest.mark.usefixtures("quick")
+def test_an_unreadable_lock_holds_while_it_is_new(comm, tmp_path):
+    """Empty, of another program, cut off, of another version."""
+    for content in ("", "[]", '{"job": 3}', "\xff", json.dumps(vars(Holder.this_job()))[:-9]):
+        (tmp_path / "LOCK").write_text(content, encoding="latin-1")
+        with pytest.raises(RunInUse, match="an unknown machine"):
+            refuse_if_held(comm, tmp_path)
+        with lock_directory(comm, tmp_path, take_over=True):
+            pass
+        assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.mpi(1, 2)
@@ -186,20 +175,6 @@ def test_signs_of_life(comm, tmp_path, monkeypatch, elsewhere):
     assert json.loads(path.read_text())["job"] == "another"
 
 
-@pytest.mark.mpi(1)
-def test_of_two_that_find_a_dead_job_one_gets_in(comm, tmp_path, elsewhere, monkeypatch):
-    """The second one looks before the first has replaced the lock, and removes it afterwards."""
-    put(tmp_path, elsewhere, silent=1000)
-    found, find = [run_lock.find_lock(tmp_path)], run_lock.find_lock
-    with lock_directory(comm, tmp_path):
-        before = (tmp_path / "LOCK").read_text()
-        monkeypatch.setattr(run_lock, "find_lock", lambda directory: found.pop() if found else find(directory))
-        with pytest.raises(RunInUse, match=f"process {os.getpid()} on"), lock_directory(comm, tmp_path):
-            pass
-        assert (tmp_path / "LOCK").read_text() == before
-    assert not list(tmp_path.iterdir())
-
-
 STARTS = """
 import sys, time
 from pathlib import Path
@@ -220,11 +195,11 @@ for place in sorted(Path(sys.argv[1]).iterdir()):
 
 
 def test_of_jobs_that_start_together_one_gets_in(tmp_path):
-    """Twenty times, without a lock and with that of a job that was killed."""
-    places = [tmp_path / f"{trial:02d}" for trial in range(20)]
+    """Without a lock, and with that of a job that was killed, which the last of them replaces."""
+    places = [tmp_path / f"{trial:02d}" for trial in range(12)]
     for trial, place in enumerate(places):
         place.mkdir()
-        if trial % 2:
+        if trial % 3 == 0:
             put(place / "run", Holder("dead", "node7", "", 1, "", "", 0, ""), silent=1000)
     jobs = [subprocess.Popen([sys.executable, "-c", STARTS, str(tmp_path)], stdin=subprocess.PIPE,
                              stdout=subprocess.PIPE, text=True) for _ in range(2)]
@@ -238,12 +213,3 @@ def test_of_jobs_that_start_together_one_gets_in(tmp_path):
             job.stdin.flush()
     assert [job.wait(timeout=60) for job in jobs] == [0, 0]
     assert {path.name for path in tmp_path.rglob("*") if path.is_file()} == {"go"}
-
-
-@pytest.mark.mpi(1, 2)
-def test_a_directory_that_cannot_be_made(comm, tmp_path):
-    if comm.rank == 0:
-        (tmp_path / "file").write_text("")
-    comm.Barrier()
-    with pytest.raises(run_lock.UserError, match="choose another --output"), lock_directory(comm, tmp_path / "file/a"):
-        pass

@@ -21,7 +21,7 @@ def save(comm, path):
                  {"history": {"step": np.arange(4), "loss": np.ones(4)}})
 
 
-@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.mpi(1, 2)
 def test_weights_survive(comm, tmp_path):
     save(comm, tmp_path / "m.h5")
     description, loaded = load_weights(comm, tmp_path / "m.h5", "model")

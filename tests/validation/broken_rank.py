@@ -17,14 +17,12 @@ import eddies.cli
 import eddies.io.checkpoint
 import eddies.io.hdf5
 import eddies.parallel.halo
-import eddies.parallel.reduction
 import eddies.spectral.fourier_passes
 
 # The function that fails, and the number of the failing call. At each place the other ranks wait for this one.
 PLACES = {
     "transform": (eddies.spectral.fourier_passes.PlanePass, "to_physical", 50),  # between two transposes
     "halo": (eddies.parallel.halo.PlaneHalo, "forward", 2),
-    "reduction": (eddies.parallel.reduction, "_reduce", 60),
     "product": (eddies.io.hdf5, "frame_bytes", 15),  # before a collective write: the second frame
     "checkpoint": (eddies.io.checkpoint, "own_part", 45),  # half of the second checkpoint is written
 }

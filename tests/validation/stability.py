@@ -13,37 +13,23 @@ import math
 from pathlib import Path
 
 import numpy as np
-from flows import make_grid, march, turbulence
+from flows import amplification, measured_growth, turbulence
 from mpi4py import MPI
 from PIL import Image
 
 from eddies.clock import Clock
 from eddies.flow.history import FlowHistory
-from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid, advective_speed
+from eddies.flow.navier_stokes import advective_speed
 from eddies.flow.stability import IMAGINARY_REACH, REAL_REACH, FlowDiverged, StabilityWatch, step_limits
-from eddies.parallel.reduction import global_max, global_sum
+from eddies.parallel.reduction import global_max
 from eddies.report.figures import GUIDE, MODEL, SECOND, THIRD, TRUTH, letter, panels, styled
-from eddies.time_stepping import STEPPERS, phi
+from eddies.time_stepping import STEPPERS
 
-WAVE = 1e-6  # amplitude of a wave: its square, what it does to itself, stays below what is measured
-STEPS, TURBULENT_STEPS = 20, 60
+TURBULENT_STEPS = 60
 HIGHEST = 8.0  # of the advective numbers that are tried
 ANY, PERCENT = 1e-6, 1e-2  # growths a step: as good as none; one that a little viscosity stops
 NAMES = {"etdrk4": "ETDRK4", "rk4": "RK4"}
 COLOURS = {("etdrk4", ANY): TRUTH, ("etdrk4", PERCENT): SECOND, ("rk4", ANY): MODEL}
-
-
-def amplification(stepper, z, w):
-    """Amplification of u in a step, for u' = L u + i a u with z = step L and w = step a of equal shape."""
-    z, w = np.asarray(z, complex), 1j * np.asarray(w)
-    if stepper == "rk4":
-        return sum((z + w) ** n / factorial for n, factorial in enumerate((1, 1, 2, 6, 24)))
-    full, half, q = np.exp(z), np.exp(z / 2), phi(1, z / 2) / 2
-    p1, p2, p3 = (phi(order, z) for order in (1, 2, 3))
-    a = half + q * w
-    b = half + q * w * a
-    c = half * a + q * w * (2 * b - 1)
-    return full + w * ((p1 - 3 * p2 + 4 * p3) + (2 * p2 - 4 * p3) * (a + b) + (4 * p3 - p2) * c)
 
 
 def theoretical_boundary(stepper, growth, viscosity=0.0, sound=0.0):
@@ -52,26 +38,6 @@ def theoretical_boundary(stepper, growth, viscosity=0.0, sound=0.0):
     factors = [np.abs(amplification(stepper, np.full(len(w), sign * 1j * sound - viscosity), w)) for sign in (1, -1)]
     growing = np.maximum(*factors) > 1 + growth
     return float(w[np.argmax(growing)]) if growing.any() else math.inf
-
-
-def measured_growth(comm, stepper, advection, viscosity=0.0, sound=0.0):
-    """Largest growth a step of waves of k_max in a uniform flow along x, from step k U, step nu k^2 and step c k."""
-    grid = make_grid(comm, 8)
-    k, here, step = grid.cutoff, 0 in grid.index[1], 1.0  # only the rank with ky = 0 holds the wave
-    state = np.zeros((4 if sound else 3, *grid.spectral_shape), complex)
-    if here:
-        state[0, 0, 0, 0] = advection / k
-        state[0 if sound else 1, 0, 0, k] = WAVE
-    fluid = CompressibleFluid(grid, 0.0, sound / k) if sound else IncompressibleFluid(grid, viscosity / k**2)
-
-    def amplitudes(state):
-        """Amplitudes of the eigenmodes: sound to the right and to the left, or the transverse velocity."""
-        u, v, s = (state[i, 0, 0, k] if here else 0j for i in (0, 1, -1))
-        c = sound / k
-        return np.abs(global_sum(comm, [u + c * s, u - c * s] if sound else [v]))
-
-    end = march(fluid, state, step, STEPS, stepper)
-    return float(np.max(amplitudes(end) / amplitudes(state)) ** (1 / STEPS))
 
 
 def measured_boundary(comm, stepper, growth, **stiffness):

@@ -72,7 +72,7 @@ def product(path):
 def last_step(checkpoints):
     """Step of the newest named checkpoint."""
     names = [path.name for path in checkpoints.glob("step-*") if path.suffix != ".partial"]
-    return max((int(name.removeprefix("step-")) for name in names), default=-1)
+    return max((int(name.removeprefix("step-").removesuffix(".h5")) for name in names), default=-1)
 
 
 def kills(stage, ranks, count, directory, chooser):

@@ -180,15 +180,14 @@ def test_a_model_without_pairs_has_neither_list_nor_ghosts(comm):
 
 
 @pytest.mark.mpi(1)
-@pytest.mark.parametrize("terms", [PRESETS["resolved"], NO_DENSITY, FORCING, {}],
-                         ids=["resolved", "pairs", "forcing", "nothing"])
-def test_a_density_that_no_term_reads_is_neither_computed_nor_kept(comm, terms):
-    dynamics, particles = set_up(comm, terms, density=False)
-    with torch.no_grad():
-        rates = dynamics.rates(particles)
-        ends = [integrator(dynamics).step(particles, STEP) for integrator in INTEGRATORS.values()]
-    assert rates.density is None and rates.density_rate is None
-    assert all(end.density is None and "density" not in end.columns() for end in ends)
+def test_a_density_that_no_term_reads_is_neither_computed_nor_kept(comm):
+    for terms in (PRESETS["resolved"], NO_DENSITY, {}):
+        dynamics, particles = set_up(comm, terms, density=False)
+        with torch.no_grad():
+            rates = dynamics.rates(particles)
+            ends = [integrator(dynamics).step(particles, STEP) for integrator in INTEGRATORS.values()]
+        assert rates.density is None and rates.density_rate is None
+        assert all(end.density is None and "density" not in end.columns() for end in ends)
 
 
 @pytest.mark.mpi(1)
@@ -230,14 +229,6 @@ def test_a_term_that_is_not_there_is_not_evaluated(comm):
             step()
         found.append(set(calls))
     assert found == [set(), {"rates_of"}]
-
-
-@pytest.mark.mpi(1)
-def test_a_given_density_has_no_flux(comm):
-    given = model({"pressure": {}, "pairs": {}})
-    names = {name for name, _ in given.named_parameters()}
-    assert names and all(name.startswith("terms.pairs.network") for name in names)
-    assert len(given.terms["pairs"].network.biases[-1]) == 2
 
 
 @pytest.mark.mpi(2)

@@ -28,7 +28,7 @@ def test_a_simulation_without_room_keeps_its_checkpoint_and_goes_on(comm, tmp_pa
     with pytest.raises(Stopped):
         dns.run(scene, comm, run, StopAtStep(comm, 11))
     comm.Barrier()
-    before = {path: path.read_bytes() for path in run.rglob("step-*/*")}
+    before = {path: path.read_bytes() for path in run.rglob("step-*")}
     assert before
     comm.Barrier()
     for kilobytes in (1, 100, 400):

@@ -1,17 +1,15 @@
-"""Checkpoints: directories step-NNNNNNNN with a file state.h5 and a manifest. A damaged checkpoint is not used.
+"""Checkpoints: files step-NNNNNNNN.h5 with global arrays, which do not depend on the number of ranks.
 
-state.h5 holds global arrays, which do not depend on the number of ranks. It is written as io/new_files.py says. The
-manifest holds the settings' fingerprint, the checksums of state.h5 and of files beside the checkpoint, and a hash of
-itself. It is written last; then the directory gets its name.
+They are written as io/new_files.py says. Settings, and values that are not arrays, are one dataset of JSON. Checksums
+(io/checksums.py) cover every byte, and a damaged checkpoint is not used. A checkpoint may belong together with other
+files of its directory, whose checksums it knows.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 import logging
 import math
-import os
 import shutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -26,20 +24,19 @@ from mpi4py import MPI
 
 from eddies.cores import threads
 from eddies.io.checksums import find_damage, known_sums, open_to_read
-from eddies.io.errors import WriteError, file_errors
+from eddies.io.errors import WriteError
 from eddies.io.frame_segments import FrameSegments
 from eddies.io.hdf5 import in_files, write_block
 from eddies.io.new_files import HEADER_BYTES, new_file, own_part, writing
 from eddies.kernels.library import in_use
-from eddies.parallel.broadcast import on_all_ranks, on_first_rank, share_text
+from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.stop import Stopped, StopRequest
 
 log = logging.getLogger("eddies")
 
 KEPT = 3
-STATE, MANIFEST = "state.h5", "manifest.json"
 PLAIN = "plain"  # the dataset of everything that is not an array, as JSON
-FORMAT = 9  # of the layout; other checkpoints are not used. Raise it also with the format of products: frames are such.
+FORMAT = 10  # of the layout; others are not used. Raise it also with the format of products: frames are such.
 
 
 @dataclass(frozen=True)
@@ -57,30 +54,30 @@ class Checkpoint(Mapping):
     """A sound checkpoint: the state that was given to `CheckpointDirectory.write`, by name."""
 
     path: Path
-    content: Mapping[str, Any]
+
+    @cached_property
+    def content(self) -> dict[str, Any]:
+        """Step, format, fingerprint, what computed it, checksums of other `files` by name, and the plain `values`."""
+        return json.loads(self.read(PLAIN).tobytes())
 
     @property
     def files(self) -> list[str]:
         """The files beside the checkpoint that belong to it."""
         return list(self.content["files"])
 
-    @cached_property
-    def _plain(self) -> dict[str, Any]:
-        return json.loads(self.read(PLAIN).tobytes())
-
     def __getitem__(self, name: str) -> Any:
-        return self._plain[name] if name in self._plain else self.read(name)
+        return self.content["values"][name] if name in self.content["values"] else self.read(name)
 
     def __iter__(self) -> Iterator[str]:
-        with open_to_read(self.path / STATE) as file:
-            yield from [*self._plain, *(name for name in file if name != PLAIN)]
+        with open_to_read(self.path) as file:
+            yield from [*self.content["values"], *(name for name in file if name != PLAIN)]
 
     def __len__(self) -> int:
         return sum(1 for _ in self)
 
     def read(self, name: str, start: int = 0, stop: int | None = None, axis: int = 0) -> np.ndarray:
         """Rows start to stop of an array along an axis; every rank reads what it needs."""
-        with open_to_read(self.path / STATE) as file:
+        with open_to_read(self.path) as file:
             return file[name][(slice(None),) * axis + (slice(start, stop),)]
 
 
@@ -97,52 +94,47 @@ class CheckpointDirectory:
         `state` holds `Block`s of arrays, and arrays and values for JSON, of which those of rank 0 count: the ranks may
         have measured different times. `files` names closed files in this directory that belong to the checkpoint.
         """
-        final, partial = self.path / _name(step), self.path / f"{_name(step)}.partial"
-        if on_first_rank(self.comm, final.exists):
-            return
+        path = self.path / f"step-{step:08d}.h5"
         arrays = {name: part for name, part in state.items() if isinstance(part, np.ndarray | Block)}
-        plain = json.dumps({name: part for name, part in state.items() if name not in arrays})
-        plain = share_text(self.comm, plain)  # HDF5 needs equal lengths
-        arrays = {PLAIN: np.frombuffer(plain.encode(), np.uint8), **arrays}
-        content = {"step": step, "format": FORMAT, "fingerprint": self.fingerprint, "computed_by": _computed_by()}
+        values = {name: part for name, part in state.items() if name not in arrays}
+
+        def begin() -> str:
+            self.path.mkdir(parents=True, exist_ok=True)
+            return json.dumps({"step": step, "format": FORMAT, "fingerprint": self.fingerprint,
+                               "computed_by": _computed_by(), "values": values,
+                               "files": {name: known_sums(self.path / name) for name in files}})
+
+        if on_first_rank(self.comm, path.exists):
+            return
         try:
-            in_files(self.comm, partial, lambda: _make_empty(partial))
-            with new_file(self.comm, partial / STATE) as file:
-                for name, array in arrays.items():
+            plain = in_files(self.comm, path, begin)
+            with new_file(self.comm, path) as file:
+                for name, array in {PLAIN: np.frombuffer(plain.encode(), np.uint8), **arrays}.items():
                     if not isinstance(array, Block):
                         array = Block(array if self.comm.rank == 0 else array[:0], 0, len(array))
                     _write_array(file, name, array)
-            with file_errors(partial):
-                on_all_ranks(self.comm, lambda: _sync(partial / STATE))  # on every node
-            in_files(self.comm, final, lambda: _finish(partial, final, content, files))
         except WriteError as error:
-            if self.comm.rank == 0:
-                shutil.rmtree(partial, ignore_errors=True)
             raise WriteError(f"{error}; the checkpoints before step {step} are intact") from None
-        for name in self._names()[KEPT:]:
-            in_files(self.comm, self.path / name, lambda: _delete(self.path / name))
+        in_files(self.comm, self.path, lambda: [old.unlink() for old in _newest_first(self.path)[KEPT:]])
 
     def newest(self) -> Checkpoint | None:
         """The newest sound checkpoint with these settings. Everything else in the directory is removed; a warning says
         why a complete checkpoint is not used."""
-        names, newest = self._names(), None
-        while names and newest is None:
-            content, complaint = self._examine(self.path / names[0])
-            if complaint is None:
-                newest = Checkpoint(self.path / names[0], content)
-                break
+        paths = in_files(self.comm, self.path, lambda: _newest_first(self.path))
+        while paths and (complaint := self._complaint(paths[0])):
             if self.comm.rank == 0:
                 log.warning("%s; this checkpoint is not used", complaint)
-            names.pop(0)
+            paths.pop(0)
+        newest = Checkpoint(paths[0]) if paths else None
         if newest is not None and self.comm.rank == 0 and newest.content["computed_by"] != _computed_by():
             log.warning("the checkpoint was made with %s; now there are %s: the run continues, but not bit for bit",
                         newest.content["computed_by"], _computed_by())
-        kept = set() if newest is None else {*names, *newest.files}
+        kept = {path.name for path in paths}.union(() if newest is None else newest.files)
 
         def clean() -> None:
             for path in self.path.iterdir() if self.path.exists() else ():
                 if path.name not in kept:
-                    _delete(path)
+                    shutil.rmtree(path) if path.is_dir() else path.unlink()
 
         in_files(self.comm, self.path, clean)
         return newest
@@ -152,26 +144,17 @@ class CheckpointDirectory:
         self.comm.Barrier()  # other ranks may still read a file in it
         in_files(self.comm, self.path, lambda: shutil.rmtree(self.path) if self.path.exists() else None)
 
-    def _examine(self, path: Path) -> tuple[dict[str, Any] | None, str | None]:
-        """The manifest's content, and why the checkpoint cannot be used, or None; the same on all ranks."""
-        manifest = path / MANIFEST
-        content = in_files(self.comm, manifest, lambda: (
-            _parse_manifest(manifest.read_bytes()) if manifest.is_file() else None))
+    def _complaint(self, path: Path) -> str | None:
+        """Why a checkpoint cannot be used, or None; the same on all ranks."""
+        content = in_files(self.comm, path, lambda: _content(path))
         if content is None:
-            return None, f"{manifest}: missing, or not what was written"
-        if content.get("format") != FORMAT:
-            return None, f"{path}: was made by another version of eddies"
+            return find_damage(self.comm, path) or f"{path}: is no checkpoint"
+        if content["format"] != FORMAT:
+            return f"{path}: was made by another version of eddies"
         if content["fingerprint"] != self.fingerprint:
-            return None, f"{path}: was made with other settings"
-        files = {path / STATE: content["state"],
-                 **{self.path / name: known for name, known in content["files"].items()}}
-        complaints = (find_damage(self.comm, file, known) for file, known in files.items())
-        return content, next(filter(None, complaints), None)
-
-    def _names(self) -> list[str]:
-        """The checkpoints, the newest first."""
-        return on_first_rank(self.comm, lambda: sorted(
-            (path.name for path in self.path.glob("step-*") if path.suffix != ".partial"), reverse=True))
+            return f"{path}: was made with other settings"
+        files = {path: None} | {self.path / name: known for name, known in content["files"].items()}
+        return next(filter(None, (find_damage(self.comm, file, known) for file, known in files.items())), None)
 
 
 class Guard:
@@ -207,23 +190,32 @@ class Guard:
 
 
 def checkpoints_in(path: Path) -> list[tuple[int, str]]:
-    """Step and fingerprint of each checkpoint in a directory, the newest first; on one rank.
+    """Step and fingerprint of each readable checkpoint in a directory, the newest first; on one rank.
 
-    Only the manifests are checked. The fingerprint is "" for a checkpoint of another format.
+    The fingerprint is "" for a checkpoint of another format.
     """
-    manifests = [folder / MANIFEST for folder in sorted(path.glob("step-*"), reverse=True) if not folder.suffix]
-    contents = [_parse_manifest(manifest.read_bytes()) for manifest in manifests if manifest.is_file()]
-    return [(content["step"], content["fingerprint"] if content.get("format") == FORMAT else "")
-            for content in contents if content is not None]
+    contents = [content for each in _newest_first(path) if (content := _content(each)) is not None]
+    return [(content["step"], content["fingerprint"] if content["format"] == FORMAT else "") for content in contents]
+
+
+def _newest_first(directory: Path) -> list[Path]:
+    """The checkpoints in a directory."""
+    return sorted((path for path in directory.glob("step-*") if path.suffix != ".partial"), reverse=True)
+
+
+def _content(path: Path) -> dict[str, Any] | None:
+    """The content of a checkpoint; None if it is damaged. Up to version 1, a checkpoint was a directory."""
+    if path.is_dir():
+        return {"step": int(path.name.removeprefix("step-")), "format": 0}
+    try:
+        return Checkpoint(path).content
+    except (OSError, ValueError, KeyError, RuntimeError):  # ProductError is a RuntimeError
+        return None
 
 
 def _computed_by() -> str:
     """The kernels and threads; a result depends on them in its last bits."""
     return f"compiled kernels: {in_use()}, threads a rank: {threads()}"
-
-
-def _name(step: int) -> str:
-    return f"step-{step:08d}"
 
 
 def _write_array(file: h5py.File, name: str, block: Block) -> None:
@@ -243,51 +235,3 @@ def _write_array(file: h5py.File, name: str, block: Block) -> None:
         part, offset = own_part(file, shape[len(lead):], np.ascontiguousarray(values[lead]), offset)
         with writing(file, 0):
             write_block(dataset, part[(None,) * len(lead)], (*lead, *offset))
-
-
-def _manifest_text(content: Mapping[str, Any]) -> str:
-    """A manifest with a hash of its content."""
-    own = hashlib.blake2b(json.dumps(content).encode(), digest_size=32).hexdigest()
-    return json.dumps({"blake2b": own, "content": content}, indent=1)
-
-
-def _parse_manifest(text: bytes) -> dict[str, Any] | None:
-    """The content of a manifest; None if any byte has changed."""
-    try:
-        content = json.loads(text)["content"]
-        return content if _manifest_text(content).encode() == text else None
-    except (ValueError, KeyError, TypeError):
-        return None
-
-
-def _make_empty(directory: Path) -> None:
-    shutil.rmtree(directory, ignore_errors=True)
-    directory.mkdir(parents=True)
-
-
-def _delete(path: Path) -> None:
-    if path.is_dir():
-        # It is renamed first: a half-deleted directory must not look like a checkpoint.
-        dying = path.with_name(path.name.removesuffix(".partial") + ".partial")
-        shutil.rmtree(path.rename(dying))
-    else:
-        path.unlink()
-
-
-def _finish(partial: Path, final: Path, content: Mapping[str, Any], files: Sequence[str]) -> None:
-    """Write the manifest, wait until all files are on the disk, and give the checkpoint its name."""
-    known = {name: known_sums(final.parent / name) for name in files}
-    manifest = _manifest_text({**content, "state": known_sums(partial / STATE), "files": known})
-    (partial / MANIFEST).write_text(manifest, encoding="utf-8")
-    for path in (*(final.parent / name for name in files), partial / MANIFEST, partial):
-        _sync(path)
-    partial.rename(final)
-    _sync(final.parent)
-
-
-def _sync(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

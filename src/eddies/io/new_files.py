@@ -7,17 +7,15 @@ leaves the former file as it was. There are two ways to write:
 - `new_file`: an HDF5 file, by all ranks together; `create_export` is a short form for files of other programs.
 
 HDF5 does not survive a write that fails: it crashes when it closes the file, or ranks wait for each other for ever.
-Four measures keep failures away from it:
+Two measures answer this, and a third serves an h5py that is built without MPI, as its wheels are:
 
 1. Each write is announced by `writing`, which reserves the space on the disk first. If there is too little, all ranks
    raise WriteError before HDF5 writes; the file can then be closed and removed. A margin stays reserved for what HDF5
    writes at the end.
-2. A file that one rank writes lies on a `Sink`, which hides failures from HDF5 and reports them to us. This covers
-   file systems that cannot reserve space.
-3. If h5py is built without MPI, as its wheels are, rank 0 writes for all: `own_part` sends it the blocks of the other
-   ranks. These have a file in memory with the same groups, attributes and shapes, so callers see no difference.
-4. If several ranks share a file, closing it is collective. After an exception that other ranks may not know of, the
-   file is left open, as NAME.partial, and the job is aborted.
+2. If a write fails nevertheless, or a rank of several raises an exception that the others may not know of, the file is
+   left open, as NAME.partial, and the job is aborted.
+3. Without MPI in h5py, rank 0 writes for all: `own_part` sends it the blocks of the other ranks. These have a file in
+   memory with the same groups, attributes and shapes, so callers see no difference.
 
 A job may lose its run directory to another one (io/run_lock.py), which then writes a NAME.partial of its own. So a file
 is renamed or removed only if it still is the file that this job created.
@@ -34,14 +32,14 @@ import resource
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import h5py
 import numpy as np
 from mpi4py import MPI
 
 from eddies.io.checksums import add_checksums
-from eddies.io.errors import ProductError, WriteError, file_errors, room, write_error
+from eddies.io.errors import ProductError, WriteError, file_errors, room
 from eddies.io.run_lock import RunTakenOver
 from eddies.parallel.broadcast import on_all_ranks, on_first_rank
 from eddies.parallel.stop import Stopped
@@ -57,7 +55,7 @@ Layout = Mapping[str, tuple[tuple[int, ...], Any]]  # shape and type of each lar
 
 # The files that are being written, by the name that HDF5 has for them.
 _open: dict[str, _NewFile] = {}
-# Files left open after an error, until the process ends: Python must not close them on one rank alone.
+# Files left open after an error, until the process ends: HDF5 would crash, or one rank would wait for the others.
 _abandoned: list[_NewFile] = []
 
 
@@ -96,14 +94,15 @@ def new_file(comm: MPI.Comm, path: Path, checksums: bool = True) -> Iterator[h5p
         with file_errors(path):
             if checksums and on_first_rank(comm, new.is_own):
                 add_checksums(comm, new.path)
+                on_all_ranks(comm, lambda: _force_to_disk(new.path))  # of every node
     except BaseException as error:
-        if comm.size > 1 and not isinstance(error, Stopped | WriteError | RunTakenOver):
-            new.abandon()
+        _open.pop(new.name, None)
+        if new.broken or comm.size > 1 and not isinstance(error, Stopped | WriteError | RunTakenOver):
+            _abandoned.append(new)
         else:
             new.close()
             with file_errors(new.path):
                 on_first_rank(comm, new.remove)
-            new.check()
         raise
     with file_errors(path):
         on_first_rank(comm, lambda: new.publish(path))
@@ -137,19 +136,17 @@ def writing(group: h5py.Group | h5py.Dataset, size: int) -> Iterator[None]:
         ProductError: on this rank; HDF5 failed although the space was reserved.
     """
     new = _open[group.file.filename]
-    new.take(size)
+    new.reserve(size)
     try:
         yield
     except (OSError, RuntimeError) as error:
-        new.check()
         new.broken = True
         raise ProductError(f"{new.path}: cannot be written: {error}: {room(new.path, size)}; make room, or check the "
                            "disk, then run the command again") from None
-    new.check()
 
 
 def writing_failed() -> bool:
-    """Whether HDF5 failed to write a file that ranks share. The process then crashes unless it is aborted."""
+    """Whether HDF5 failed to write a file. The process then crashes at its end unless it is aborted."""
     return any(new.broken for new in _abandoned)
 
 
@@ -190,116 +187,48 @@ def frame_bytes(dataset: h5py.Dataset) -> int:
     return chunks * (math.prod(dataset.chunks) * dataset.dtype.itemsize + INDEX_BYTES)
 
 
-class Sink(io.FileIO):
-    """A new file for h5py.File(sink, "w"). HDF5 sees no failure: the first one is kept, later writes are dropped."""
-
-    def __init__(self, path: Path) -> None:
-        super().__init__(path, "w+")
-        self.path = path
-        self.failure: WriteError | None = None
-
-    def __repr__(self) -> str:
-        return str(self.path)  # h5py takes it as the name of the file
-
-    def write(self, data) -> int:
-        """Write all bytes, or keep the failure."""
-        rest = memoryview(data)
-        with self._kept(len(rest)):
-            while rest and self.failure is None:
-                rest = rest[super().write(rest):]
-        return len(data)
-
-    def truncate(self, size: int | None = None) -> int:
-        """Set the length of the file, or keep the failure."""
-        with self._kept(size or 0):
-            super().truncate(size)
-        return size or 0
-
-    def close(self) -> None:
-        """Close the file, or keep the failure: some file systems report it only then."""
-        with self._kept(0):
-            super().close()
-
-    def check(self) -> None:
-        """Raise the failure, if there was one."""
-        if self.failure is not None:
-            raise self.failure
-
-    @contextmanager
-    def _kept(self, wanted: int) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            self.failure = self.failure or write_error(self.path, error, wanted)
-
-
 class _NewFile:
-    """An HDF5 file that all ranks write together. All methods are collective, unless they say otherwise."""
+    """An HDF5 file that all ranks write together. `reserve` and `close` are collective; rank 0 calls the others."""
 
     def __init__(self, comm: MPI.Comm, path: Path) -> None:
         self.comm, self.path, self.broken = comm, path, False
-        self._needed, self._held = 0, 0
-        self._sink: Sink | None = None
-        self._together = comm.size > 1 and not has_single_writer(comm)
-        if self._together:
-            self._alike(self._make_empty)
-            self._alike(self._open_together)
-        else:
-            self._alike(self._open_sink if comm.rank == 0 else self._open_in_memory)
+        self._needed, self._reserved = 0, 0
+        self._alike(self._make_empty)
+        self._alike(self._open)
         self._inode = path.stat().st_ino if comm.rank == 0 else 0
-        self._name = self.file.filename
-        _open[self._name] = self
+        self.name = self.file.filename
+        _open[self.name] = self
 
-    def take(self, size: int) -> None:
+    def reserve(self, size: int) -> None:
         """Reserve space for `size` more bytes, beside those of earlier calls. WriteError on all ranks."""
         self._needed += size
-        if self._needed + MARGIN_BYTES > self._held:
+        if self._needed + MARGIN_BYTES > self._reserved:
             stop = self._needed + 2 * MARGIN_BYTES
-            self._alike(lambda: self._reserve(stop))
-            self._held = stop
-
-    def check(self) -> None:
-        """Raise WriteError on all ranks if the only writer has failed."""
-        if not self._together:
-            on_all_ranks(self.comm, lambda: self._sink and self._sink.check(), WriteError)
+            self._alike(lambda: self._reserve_until(stop))
+            self._reserved = stop
 
     def close(self) -> None:
         """Close the file. HDF5 cuts off the space that it does not need."""
-        _open.pop(self._name, None)
+        _open.pop(self.name, None)
         self.file.close()
-        if self._sink is not None:
-            self._sink.close()
-
-    def abandon(self) -> None:
-        """Leave the file in place, and open if closing it is collective. One rank may call it alone."""
-        if self._together:
-            _open.pop(self._name, None)
-            _abandoned.append(self)
-        else:
-            self.close()
+        if self._stream is not None:
+            self._stream.close()
 
     def is_own(self) -> bool:
-        """Whether the file is still the one that this job created; on rank 0."""
+        """Whether the file is still the one that this job created."""
         return self.path.exists() and self.path.stat().st_ino == self._inode
 
     def remove(self) -> None:
-        """Remove the closed file; on rank 0."""
+        """Remove the closed file."""
         if self.is_own():
             self.path.unlink()
 
     def publish(self, path: Path) -> None:
-        """Give the closed file its name; on rank 0."""
+        """Give the closed file its name."""
         if not self.is_own():
-            raise RunTakenOver(f"{path}: another job has taken this run directory over; this job ends and leaves all "
-                               "files as they are")
+            raise RunTakenOver(path)
         os.replace(self.path, path)
-
-    def _open_sink(self) -> None:
-        self._sink = Sink(self.path)
-        self.file = h5py.File(self._sink, "w")
-
-    def _open_in_memory(self) -> None:
-        self.file = h5py.File(self.path, "w", driver="core", backing_store=False)
+        _force_to_disk(path.parent)
 
     def _make_empty(self) -> None:
         """Write an empty HDF5 file on rank 0. Without it, HDF5 could not even close the file on a full disk."""
@@ -312,41 +241,41 @@ class _NewFile:
                 self.path.unlink(missing_ok=True)
                 raise
 
-    def _open_together(self) -> None:
-        self.file = h5py.File(self.path, "r+", driver="mpio", comm=self.comm)
+    def _open(self) -> None:
+        self._stream: BinaryIO | None = None
+        if self.comm.size > 1 and not has_single_writer(self.comm):
+            self.file = h5py.File(self.path, "r+", driver="mpio", comm=self.comm)
+        elif self.comm.rank == 0:
+            # Through Python's file, HDF5 takes no file lock, which some network file systems do not have.
+            self._stream = open(self.path, "r+b")
+            self.file = h5py.File(self._stream, "r+")
+        else:
+            self.file = h5py.File(self.path, "w", driver="core", backing_store=False)
 
-    def _reserve(self, stop: int) -> None:
-        check_limit(stop)
+    def _reserve_until(self, stop: int) -> None:
+        limit = resource.getrlimit(resource.RLIMIT_FSIZE)[0]  # of this process
+        if limit != resource.RLIM_INFINITY and stop > limit:
+            raise OSError(errno.EFBIG, os.strerror(errno.EFBIG))
         if self.comm.rank == 0:
             with open(self.path, "r+b", buffering=0) as file:
-                reserve(file.fileno(), self._held, stop)
+                try:
+                    os.posix_fallocate(file.fileno(), self._reserved, stop - self._reserved)
+                except OSError as error:
+                    if error.errno not in (errno.EOPNOTSUPP, errno.EINVAL):  # this file system cannot reserve space
+                        raise
 
     def _alike(self, work: Callable[[], None]) -> None:
         """Do work that may fail on some ranks. All ranks raise the WriteError of the lowest of them."""
         def guarded() -> None:
-            with file_errors(self.path, max(self._needed + 2 * MARGIN_BYTES - self._held, 0)):
+            with file_errors(self.path, max(self._needed + 2 * MARGIN_BYTES - self._reserved, 0)):
                 work()
 
         on_all_ranks(self.comm, guarded, WriteError)
 
 
-def reserve(descriptor: int, start: int, stop: int) -> None:
-    """Reserve the bytes from start to stop of an open file on the disk; the file gets at least this length.
-
-    Raises OSError if the disk is full. If the file system cannot reserve space, this compares with its free space.
-    """
+def _force_to_disk(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
     try:
-        os.posix_fallocate(descriptor, start, stop - start)
-    except OSError as error:
-        if error.errno not in (errno.EOPNOTSUPP, errno.EINVAL):
-            raise
-        disk = os.fstatvfs(descriptor)
-        if disk.f_bavail * disk.f_frsize < stop - start:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)) from None
-
-
-def check_limit(size: int) -> None:
-    """Raise OSError if this process may not write files of this size."""
-    limit = resource.getrlimit(resource.RLIMIT_FSIZE)[0]
-    if limit != resource.RLIM_INFINITY and size > limit:
-        raise OSError(errno.EFBIG, os.strerror(errno.EFBIG))
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

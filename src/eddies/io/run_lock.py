@@ -17,7 +17,7 @@ import threading
 import time
 import uuid
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from mpi4py import MPI
@@ -33,7 +33,7 @@ log = logging.getLogger("eddies")
 LOCK = "LOCK"
 SIGN_SECONDS = 30.0
 STALE_SECONDS = 300.0  # ten missed signs of life, as on a file system that hangs for a while
-MOVE_SECONDS = 0.1  # a job that is late to take over may move the LOCK of another for a moment
+SETTLE_SECONDS = 0.5  # in which other jobs that have found the same stale lock replace it, too
 UNREADABLE = "unknown"
 
 
@@ -44,6 +44,10 @@ class RunInUse(UserError):
 class RunTakenOver(UserError):
     """Another job has taken the run directory of this job over; raised on all ranks."""
 
+    def __init__(self, path: Path, by: str = "") -> None:
+        super().__init__(f"{path}: another job has taken this run directory over{by}; this job ends and leaves all "
+                         "files as they are")
+
 
 @dataclass(frozen=True)
 class Holder:
@@ -53,7 +57,7 @@ class Holder:
     host: str
     machine: str  # the boot of the machine and the process namespace; empty if unknown
     pid: int
-    born: str  # start time of the process, in units of its machine; empty if unknown
+    born: str  # start time of the process, in units of its machine
     batch: str  # number of the Slurm job, or empty
     restarts: int  # how often Slurm has queued this job again
     start: str  # when the job took the directory, UTC
@@ -76,13 +80,7 @@ class Holder:
             return False
         if not self.machine or self.machine != own.machine:
             return None
-        try:
-            os.kill(self.pid, 0)
-        except ProcessLookupError:
-            return False
-        except PermissionError:  # a process of another user
-            return True
-        return _born(self.pid) == self.born if self.born else None
+        return _born(self.pid) == self.born  # its number may belong to another process by now
 
     def __str__(self) -> str:
         return f"process {self.pid} on {self.host}, since {self.start}"
@@ -114,7 +112,8 @@ class RunLock:
 
     def __init__(self, directory: Path, holder: Holder, made: bool) -> None:
         self.directory, self.path, self.holder, self.made = directory, directory / LOCK, holder, made
-        self._look_at, self._lost = 0.0, ""
+        self._look_at = 0.0
+        self._lost: RunTakenOver | None = None
         self._ended = threading.Event()
         self._signs = threading.Thread(target=self._give_signs, name="run lock", daemon=True)
         self._signs.start()
@@ -122,21 +121,15 @@ class RunLock:
     def loss(self) -> RunTakenOver | None:
         """The error to raise after another job has taken the directory over; looks at most once a second."""
         now = time.monotonic()
-        if not self._lost and now >= self._look_at:
+        if self._lost is None and now >= self._look_at:
             self._look_at = now + LOOK_SECONDS
             with contextlib.suppress(OSError):  # a file system that hangs: nothing is known
                 found = find_lock(self.directory)
                 if found is None:
-                    time.sleep(MOVE_SECONDS)
-                    found = find_lock(self.directory)
-                if found is None:
-                    self._lost = ", or has removed its LOCK"
+                    self._lost = RunTakenOver(self.directory, ", or has removed its LOCK")
                 elif found.holder.job not in (self.holder.job, UNREADABLE):
-                    self._lost = f" ({found.holder})"
-        if not self._lost:
-            return None
-        return RunTakenOver(f"{self.directory}: another job has taken this run directory over{self._lost}; this job "
-                            "ends and leaves all files as they are")
+                    self._lost = RunTakenOver(self.directory, f" ({found.holder})")
+        return self._lost
 
     def release(self) -> None:
         """Remove the lock, unless it is that of another job."""
@@ -201,21 +194,27 @@ def _refuse(directory: Path, found: FoundLock | None) -> None:
 
 
 def _take(directory: Path, take_over: bool) -> RunLock:
-    holder, found = Holder.this_job(), find_lock(directory)
+    holder, found, path = Holder.this_job(), find_lock(directory), directory / LOCK
     if not take_over:
         _refuse(directory, found)
     made = not directory.exists()
     directory.mkdir(parents=True, exist_ok=True)
+    if found is None:
+        with contextlib.suppress(FileExistsError):  # another job was quicker
+            _write(path, holder)
+    else:
+        # Of several jobs that replace a stale lock at the same time, the last one holds the directory.
+        own = directory / f"{LOCK}.{holder.job}"
+        _write(own, holder)
+        os.replace(own, path)
+        time.sleep(SETTLE_SECONDS)
+    if not _is_held_by(path, holder):
+        _refuse(directory, find_lock(directory))
+        raise RunInUse(f"{directory}: another job has just been here; run the command again")
     if found is not None:
-        _remove(directory, found.holder)
         log.warning("%s: takes over from a job that %s (%s)", directory,
                     "has ended" if found.stale and found.holder.lives() is False else
                     "has given no sign of life" if found.stale else "may still work there", found.holder)
-    try:
-        _write(directory / LOCK, holder)
-    except FileExistsError:  # another job was quicker
-        _refuse(directory, find_lock(directory))
-        raise RunInUse(f"{directory}: another job has just been here; run the command again") from None
     return RunLock(directory, holder, made)
 
 
@@ -230,23 +229,10 @@ def _write(path: Path, holder: Holder) -> None:
             raise write_error(path, error, len(content)) from None
 
 
-def _remove(directory: Path, holder: Holder) -> None:
-    """Remove the lock of a job. If another job has replaced it meanwhile, that one gets its lock back."""
-    aside = directory / f"{LOCK}.{uuid.uuid4().hex}"
-    with contextlib.suppress(FileNotFoundError):
-        os.replace(directory / LOCK, aside)
-        if not _is_held_by(aside, holder):
-            with contextlib.suppress(OSError):
-                os.link(aside, directory / LOCK)
-        aside.unlink()
-
-
 def _now(directory: Path) -> float:
     """The time by the clock that stamps files there, or by this machine's if no file can be written."""
     try:
         with tempfile.TemporaryFile(dir=directory) as file:
-            file.write(b"now")
-            file.flush()
             return os.fstat(file.fileno()).st_mtime
     except OSError:
         return time.time()
@@ -257,19 +243,12 @@ def _is_held_by(path: Path, holder: Holder) -> bool:
 
 
 def _read(path: Path) -> Holder:
-    """The job that a lock names; one with the name UNREADABLE if the content is damaged, incomplete or not readable."""
+    """The job that a lock names; one with the name UNREADABLE if the content is incomplete or cannot be read."""
     try:
-        if path.exists() and not path.is_file():  # reading a pipe would wait for its writer
-            raise OSError
-        content = json.loads(path.read_text(errors="replace"))
-        values = {field.name: content[field.name] for field in fields(Holder)}
-        typed = all(type(values[field.name]).__name__ == field.type for field in fields(Holder))
-        if not typed or not 0 < values["pid"] < 2**31:
-            raise ValueError
-        return Holder(**values)
+        return Holder(**json.loads(path.read_text()))
     except (FileNotFoundError, NotADirectoryError):
         raise
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, TypeError):
         return Holder(UNREADABLE, "an unknown machine", "", 0, "", "", 0, "an unknown time")
 
 
@@ -282,7 +261,7 @@ def _machine() -> str:
 
 
 def _born(pid: int) -> str:
-    """Start time of a process of this machine; empty if it has ended or is unknown."""
+    """Start time of a process of this machine; empty if it has ended."""
     try:
         state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     except OSError:

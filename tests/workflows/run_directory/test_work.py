@@ -98,7 +98,7 @@ def test_checkpoints_of_other_settings_are_work_too(comm, tmp_path, scene):
     assert not find_work(["dns"], scene, tmp_path).lost
     save(comm, tmp_path, scene, "train", 3)
     assert not find_work(scene.stages, scene, tmp_path).lost  # there is one to go on from
-    (tmp_path / "checkpoints-train/step-00000003/manifest.json").write_text("damaged")
+    (tmp_path / "checkpoints-train/step-00000003.h5").write_text("damaged")
     assert find_work(scene.stages, scene, tmp_path).useless == {"train"}
 
 
