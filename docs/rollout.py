@@ -24,7 +24,7 @@ def picture(run: Path, variants: list[str]) -> bytes:
         with open_rollout(run / variant, MPI.COMM_SELF) as measured:
             rollout = measured.rollout
             shown = rollout.common.spread(SHOWN)
-            model, truth = zip(*(rollout.reconstructed(index) for index in shown))
+            model, truth = zip(*(rollout.both(rollout.planes, index) for index in shown))
             if times is None:
                 times = rollout.common.times[list(shown)] / rollout.turnover
                 rows["true tracers"] = [one.velocity[0] for one in truth]
