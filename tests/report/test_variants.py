@@ -28,7 +28,7 @@ def boxes_of_names(points, names):
     figure = Figure(figsize=(6.7, 5.0), dpi=150)
     FigureCanvasAgg(figure)
     axis = figure.add_subplot()
-    return name_points(axis, axis.bbox.p0 + points * axis.bbox.size, names, [False] * len(names)), axis.bbox
+    return name_points(axis, points, names, [False] * len(names)), axis.bbox
 
 
 def test_names_of_a_crowd_neither_cover_each_other_nor_leave_the_panel():

@@ -10,26 +10,30 @@ from matplotlib.figure import Figure
 from eddies.analysis.against_truth import InvariantStatistics, conditional_flows, last_invariants
 from eddies.analysis.rollout import Rollout
 from eddies.analysis.velocity_gradients import ConditionalVelocity, InvariantBins, vieillefosse_line
-from eddies.report.figures import GUIDE, MODEL, colour_bar, letter, panels, styled
+from eddies.report.figures import BAR, GUIDE, MODEL, colour_bar, letter, panels, styled
 from eddies.report.page import Metric, Section
 
 FEWEST = 8  # particles that a cell needs before its conditional mean is drawn
 
 
-def add(shown: Section, run: Rollout) -> None:
-    """Add the figure and its numbers, at the last common time, to the section of the rollout."""
+def add(shown: Section, run: Rollout, main: bool) -> None:
+    """Add the figure and its numbers, at the last common time, to the section of the rollout.
+
+    The main page also shows the mean motion in the plane.
+    """
     statistics = last_invariants(run)
     shown.metrics += [
         Metric("qr_kl", "KL divergence of the Q–R joint PDF", statistics.divergence),
         Metric("qr_kl_floor", "KL divergence between two samples of the true Q–R plane, of the same size",
                statistics.floor)]
+    flows = conditional_flows(run, statistics.bins) if main else None
     shown.add_figure(
         "figure-7-invariants", "Invariants Q and R of the velocity gradient (the paper's Fig. 7)",
-        invariant_plane(statistics, conditional_flows(run, statistics.bins)),
-        f"Top: joint PDF at t = {run.common.times[-1] / run.turnover:.2f} T. Isolines are half a decade apart and "
+        invariant_plane(statistics, flows),
+        f"Joint PDF at t = {run.common.times[-1] / run.turnover:.2f} T. Isolines are half a decade apart and "
         f"smoothed over one bin. KL divergence of the raw bins: {statistics.divergence:.2g}; between samples of the "
-        f"truth: {statistics.floor:.2g}. Bottom: mean motion over all frames until then. Orange: Vieillefosse line. "
-        "Both are in units of the truth's ⟨Q_w⟩ = ⟨W:W⟩/2.")
+        f"truth: {statistics.floor:.2g}. Orange: Vieillefosse line. Units: the truth's ⟨Q_w⟩ = ⟨W:W⟩/2."
+        + (" Bottom: mean motion over all frames until then." if flows else ""))
 
 
 @styled
@@ -40,7 +44,7 @@ def invariant_plane(statistics: InvariantStatistics,
     Arrows show directions on the page; colour is the speed in the plane.
     """
     rows = 1 if flows is None else 2
-    figure, axes = panels(rows, 2, (4.0, 3.5), sharex=True, sharey=True)
+    figure, axes = panels(rows, 2, (4.3, 3.2), right=BAR + 0.1, sharex=True, sharey=True)
     densities = [_smoothed(statistics.bins.density(cells)) for cells in (statistics.truth, statistics.model)]
     levels = _levels(densities[0])
     for axis, density, name in zip(axes[0], densities, ("true tracers", "model")):

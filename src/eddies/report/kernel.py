@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from matplotlib.figure import Figure
 
-from eddies.report.figures import (DNS, FOURTH, MODEL, SECOND, SIGNED, THIRD, TRUTH, colour_bar, largest, letter,
+from eddies.report.figures import (BAR, DNS, FOURTH, MODEL, SECOND, SIGNED, THIRD, TRUTH, colour_bar, largest, letter,
                                    panels, show_plane, styled)
 from eddies.report.page import Metric, Section
 
@@ -49,7 +49,7 @@ def shapes(kernels: Mapping[str, np.ndarray]) -> Figure:
 def reconstructed_planes(slices: Mapping[str, np.ndarray], errors: Mapping[str, float]) -> Figure:
     """Draw planes [y, x] of u_x and du_x/dx, truth and reconstructions, with one colour scale a row."""
     names = [name for name in KERNELS if f"velocity_{name}" in slices and name != "wendland"]
-    figure, axes = panels(2, 1 + len(names), (2.7, 2.75), sharex=True, sharey=True)
+    figure, axes = panels(2, 1 + len(names), (2.665, 2.675), right=BAR, sharex=True, sharey=True)
     rows = (("velocity", "$u_x$"), ("gradient", r"$\partial u_x/\partial x$"))
     for row, (quantity, symbol) in zip(axes, rows):
         truth = slices[f"truth_{quantity}"]
@@ -69,7 +69,7 @@ def reconstructed_planes(slices: Mapping[str, np.ndarray], errors: Mapping[str, 
 @styled
 def training_history(history: Mapping[str, np.ndarray]) -> Figure:
     """Draw the losses of both trained kernels over the step; columns LOSS_KERNEL."""
-    figure, ((axis,),) = panels(1, 1, (7.5, 3.2))
+    figure, ((axis,),) = panels(1, 1, (8.6, 3.2), right=2.4)
     for name in ("learned", "learned_no_gradient"):
         kernel, _, style = KERNELS[name]
         for loss, colour in LOSSES.items():

@@ -9,9 +9,9 @@ from eddies.analysis import disorder
 from eddies.analysis.against_truth import EDGES, pdf_divergence
 from eddies.analysis.lagrangian import PathStatistics
 from eddies.analysis.rollout import Pair, SpectraAt
-from eddies.report.figures import (DNS, FILTERED, FOURTH, GUIDE, MODEL, POSITIVE, SIGNED, TRUTH, colour_bar,
-                                   draw_pdfs, guide_power_law, largest, letter, note, number_wavenumbers, panels,
-                                   show_plane, styled)
+from eddies.report.figures import (BAR, DNS, FILTERED, FOURTH, GUIDE, MODEL, POSITIVE, SIGNED, TRUTH, colour_bar,
+                                   draw_pdfs, guide_power_law, largest, legend_at_foot, letter, note,
+                                   number_wavenumbers, panels, show_plane, styled)
 
 LINES = {"truth": {"label": "true tracers", "color": TRUTH},
          "model": {"label": "model", "color": MODEL, "linestyle": "--"}}
@@ -20,7 +20,7 @@ LINES = {"truth": {"label": "true tracers", "color": TRUTH},
 @styled
 def velocity_planes(pairs: Sequence[Pair], turnover: float) -> Figure:
     """Draw u_x in planes [y, x] over time, truth above and model below, with one colour scale."""
-    figure, axes = panels(2, len(pairs), (2.7, 2.6), sharex=True, sharey=True)
+    figure, axes = panels(2, len(pairs), (2.665, 2.675), right=BAR, sharex=True, sharey=True)
     limit = largest(*(pair.truth for pair in pairs))
     for column, pair in zip(axes.T, pairs):
         image = show_plane(column[0], pair.truth, (-limit, limit), SIGNED)
@@ -37,7 +37,7 @@ def velocity_planes(pairs: Sequence[Pair], turnover: float) -> Figure:
 @styled
 def vorticity_and_energy(vorticity: Pair, energy: Pair) -> Figure:
     """Draw planes [y, x] of vorticity magnitude and kinetic energy, truth and model, with one colour scale a row."""
-    figure, axes = panels(2, 2, (3.2, 3.0), sharex=True, sharey=True)
+    figure, axes = panels(2, 2, (3.65, 3.4), right=BAR, sharex=True, sharey=True)
     for row, pair, label in zip(axes, (vorticity, energy), (r"$|\omega|$", r"$\frac{1}{2}|u|^2$")):
         limit = largest(pair.truth)
         image = show_plane(row[0], pair.truth, (0, limit), POSITIVE)
@@ -89,7 +89,7 @@ def errors_over_time(model: Mapping[str, np.ndarray], truth: Mapping[str, np.nda
 @styled
 def particle_pdfs(pairs: Mapping[str, Sequence[Pair]], turnover: float) -> Figure:
     """Draw PDFs of all components of "velocity" and "acceleration", given as a Pair of (n, 3) for each time."""
-    figure, axes = panels(2, len(pairs["velocity"]), (3.3, 2.8), sharex="row", sharey="row")
+    figure, axes = panels(2, len(pairs["velocity"]), (3.5, 2.6), foot=0.3, sharex="row", sharey="row")
     for row, quantity in zip(axes, ("velocity", "acceleration")):
         for axis, pair in zip(row, pairs[quantity]):
             draw_pdfs(axis, pair.truth, pair.model, EDGES[quantity])
@@ -97,7 +97,7 @@ def particle_pdfs(pairs: Mapping[str, Sequence[Pair]], turnover: float) -> Figur
             axis.set_title(f"$t = {pair.time / turnover:.2f}\\,T$,  KL {divergence:.2g}")
             axis.set_xlabel(f"${quantity[0]}$ / standard deviation of the truth")
         row[0].set_ylabel(f"{quantity} PDF")
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncol=3)
+    legend_at_foot(figure, axes[0, 0], 3)
     letter(axes.flat)
     return figure
 
@@ -110,7 +110,7 @@ def energy_spectra(series: Sequence[SpectraAt], flow: Mapping[str, np.ndarray], 
     `flow` is a table with time (m,), wavenumber (k,), energy and filtered (m, k). The times of the model count from
     start_time.
     """
-    figure, axes = panels(1, len(series), (3.6, 3.5), sharex=True, sharey=True)
+    figure, axes = panels(1, len(series), (3.5, 3.2), foot=0.3, sharex=True, sharey=True)
     known = flow["wavenumber"] >= 1
     for axis, at in zip(axes.flat, series):
         nearest = int(np.argmin(np.abs(flow["time"] - (start_time + at.time))))
@@ -128,7 +128,7 @@ def energy_spectra(series: Sequence[SpectraAt], flow: Mapping[str, np.ndarray], 
     peak, top = max(at.truth[1:].max() for at in series), 1.5 * series[0].wavenumber[-1]
     guide_power_law(axes[0, 0], (2, min(10, 0.7 * top)), 2.2 * peak, -5 / 3, r"$k^{-5/3}$")
     axes[0, 0].set(ylabel="$E(k)$", ylim=(1e-6 * peak, 6 * peak), xlim=(0.9, max(top, 2)))
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncol=4)
+    legend_at_foot(figure, axes[0, 0], 4)
     letter(axes.flat)
     return figure
 
@@ -136,7 +136,7 @@ def energy_spectra(series: Sequence[SpectraAt], flow: Mapping[str, np.ndarray], 
 @styled
 def path_statistics(model: PathStatistics, truth: PathStatistics, turnover: float) -> Figure:
     """Draw correlations and increments of velocities, accelerations, and the spreading of pairs and tetrads."""
-    figure, axes = panels(3, 3, (3.5, 2.8))
+    figure, axes = panels(3, 3, (3.6, 2.6))
     (memory, structure, accelerations), (variance, flatness, pairs), (sizes, shapes, unused) = axes
     for run, name in ((truth, "truth"), (model, "model")):
         line, time, lags = LINES[name], run.times / turnover, run.lags / turnover
