@@ -10,7 +10,7 @@ from eddies.analysis.lagrangian import differences, of_both
 from eddies.analysis.pdfs import kl_divergence
 from eddies.analysis.rollout import PLANES, Pair, Rollout
 from eddies.measures import MEASURES
-from eddies.report import invariants, rollout_figures
+from eddies.report import rollout_figures
 from eddies.report.page import Metric, Section
 
 MAIN = ("turnovers", "energy_ratio", "velocity_error", "spectrum_error", "velocity_kl", "acceleration_kl",
@@ -68,7 +68,7 @@ def section(run: Rollout, main: bool = True) -> Section:
     _add_particles(shown, run)
     if run.invariants is not None:
         _add_planes(shown, run, main)
-        invariants.add(shown, run, main)
+        _add_invariants(shown, run, main)
     else:
         shown.metrics += [Metric(key, key.replace("_", " "), None, WITHOUT_KERNEL) for key in ("qr_kl", "qr_kl_floor")]
     _add_spectra(shown, run)
@@ -132,6 +132,24 @@ def _add_planes(shown: Section, run: Rollout, main: bool) -> None:
         rollout_figures.vorticity_and_energy(rotation, energy),
         f"Plane z = π at t = {time / run.turnover:.2f} T, both from {run.reconstructed_by}. Mean over the plane, "
         f"model / truth: vorticity {ratios[0]:.2f}, energy {ratios[1]:.2f}.")
+
+
+def _add_invariants(shown: Section, run: Rollout, main: bool) -> None:
+    """Add joint PDFs of the invariants Q and R of the velocity gradient at the last common time, and their mean motion.
+    """
+    statistics = against_truth.last_invariants(run)
+    shown.metrics += [
+        Metric("qr_kl", "KL divergence of the Q–R joint PDF", statistics.divergence),
+        Metric("qr_kl_floor", "KL divergence between two samples of the true Q–R plane, of the same size",
+               statistics.floor)]
+    flows = against_truth.conditional_flows(run, statistics.bins) if main else None
+    shown.add_figure(
+        "figure-7-invariants", "Invariants Q and R of the velocity gradient (the paper's Fig. 7)",
+        rollout_figures.invariant_plane(statistics, flows),
+        f"Joint PDF at t = {run.common.times[-1] / run.turnover:.2f} T, in steps of half a decade. KL divergence: "
+        f"{statistics.divergence:.2g}; between samples of the truth: {statistics.floor:.2g}. Orange: Vieillefosse "
+        "line. Units: the truth's ⟨Q_w⟩ = ⟨W:W⟩/2."
+        + (" Bottom: mean motion over all frames until then." if flows else ""))
 
 
 def _add_particles(shown: Section, run: Rollout) -> None:

@@ -1,18 +1,22 @@
-"""Figures of a rollout and the true tracers: planes, particle PDFs, spectra, errors over time, paths, disorder."""
+"""Figures of a rollout and the true tracers: the paper's Figs. 4 to 9, Lagrangian statistics, disorder."""
 
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from eddies.analysis import disorder
-from eddies.analysis.against_truth import EDGES, pdf_divergence
+from eddies.analysis.against_truth import EDGES, InvariantStatistics, pdf_divergence
 from eddies.analysis.lagrangian import PathStatistics
 from eddies.analysis.rollout import Pair, SpectraAt
+from eddies.analysis.velocity_gradients import ConditionalVelocity, vieillefosse_line
 from eddies.report.figures import (BAR, DNS, FILTERED, FOURTH, GUIDE, MODEL, POSITIVE, SIGNED, TRUTH, colour_bar,
                                    draw_pdfs, guide_power_law, largest, legend_at_foot, letter, note,
                                    number_wavenumbers, panels, show_plane, styled)
 
+FEWEST = 8  # particles that a cell of the plane of Q and R needs before its mean motion is drawn
 LINES = {"truth": {"label": "true tracers", "color": TRUTH},
          "model": {"label": "model", "color": MODEL, "linestyle": "--"}}
 
@@ -194,3 +198,64 @@ def particle_disorder(distances: Mapping[str, np.ndarray], counts: Mapping[str, 
     variance.set(title="Variance of counts", ylabel="relative to random points", xlabel="time $t/T$", ylim=(0, None))
     letter(axes.flat)
     return figure
+
+
+@styled
+def invariant_plane(statistics: InvariantStatistics,
+                    flows: tuple[ConditionalVelocity, ConditionalVelocity] | None) -> Figure:
+    """Draw joint PDFs of (R, Q), and below them the conditional mean (dR/dt, dQ/dt) from `flows` of model and truth.
+
+    Arrows show directions on the page; colour is the speed in the plane.
+    """
+    names = "true tracers", "model"
+    figure, axes = panels(1 if flows is None else 2, 2, (4.3, 3.2), right=BAR + 0.1, sharex=True, sharey=True)
+    bins = statistics.bins
+    densities = [bins.density(cells) for cells in (statistics.truth, statistics.model)]
+    # Levels are half a decade apart, from the peak of the truth down to the density of a single particle.
+    peak, single = (np.log10(extreme) for extreme in (densities[0].max(), densities[0][densities[0] > 0].min()))
+    levels = 10.0 ** (np.arange(np.floor(2 * peak), 2 * single, -1)[:8][::-1] / 2)
+    for axis, density, name in zip(axes[0], densities, names):
+        # The outer cells also count all values beyond them. An empty cell has no logarithm.
+        shown = np.maximum(density[1:-1, 1:-1], 1e-3 * levels[0])
+        filled = axis.contourf(_centres(bins.third)[1:-1], _centres(bins.second)[1:-1], shown, levels, cmap="YlGnBu",
+                               norm=LogNorm(levels[0], levels[-1]), extend="max")
+        axis.set_title(f"joint PDF, {name}")
+    bar = colour_bar(figure, filled, axes[0], "joint PDF", extend="neither")
+    bar.set_ticks(levels[::2], labels=[f"{level:.0e}" for level in levels[::2]])
+    if flows is not None:
+        speeds = np.concatenate([np.hypot(*flow.mean(FEWEST)).ravel() for flow in flows])
+        speeds = speeds[speeds > 0]
+        norm = LogNorm(*np.quantile(speeds, (0.02, 0.98))) if speeds.size else None
+        for axis, flow, name in zip(axes[1], flows[::-1], names):
+            arrows = _draw_arrows(axis, flow, norm)
+            axis.set_title(f"mean motion, {name}")
+        colour_bar(figure, arrows, axes[1], r"$|(dR/dt,\ dQ/dt)|$, normalised")
+    across, up = _centres(bins.third)[-2], _centres(bins.second)[-2]
+    third = np.linspace(-across, across, 401)
+    for axis in axes.flat:
+        axis.plot(third, vieillefosse_line(third), color=MODEL, linewidth=1.3)
+        axis.axhline(0, color=GUIDE, linewidth=0.6, zorder=0)
+        axis.axvline(0, color=GUIDE, linewidth=0.6, zorder=0)
+        axis.set(xlim=(-across, across), ylim=(-up, up))
+    for axis in axes[:, 0]:
+        axis.set_ylabel(r"$Q\,/\,\langle Q_w\rangle$")
+    for axis in axes[-1]:
+        axis.set_xlabel(r"$R\,/\,\langle Q_w\rangle^{3/2}$")
+    letter(axes.flat)
+    return figure
+
+
+def _draw_arrows(axis: Axes, flow: ConditionalVelocity, norm: LogNorm | None):
+    """Draw arrows of equal length in all cells but the outermost, whose arrows the frame would cut."""
+    inner = np.s_[1:-1, 1:-1]
+    second_rate, third_rate = (rate[inner] for rate in flow.mean(FEWEST))
+    across, up = third_rate / np.ptp(flow.bins.third), second_rate / np.ptp(flow.bins.second)
+    length = np.hypot(across, up)
+    length[length == 0] = np.nan
+    return axis.quiver(_centres(flow.bins.third)[1:-1], _centres(flow.bins.second)[1:-1], across / length, up / length,
+                       np.hypot(second_rate, third_rate), norm=norm, cmap="cividis", pivot="middle", scale=20,
+                       width=0.006, headwidth=4)
+
+
+def _centres(edges: np.ndarray) -> np.ndarray:
+    return (edges[1:] + edges[:-1]) / 2

@@ -231,7 +231,7 @@ def read_page(directory: Path, alone: Comm, measured: MeasuredRollout | None, sc
     readers = {
         "ground_truth": _ground_truth_sections,
         "kernel": lambda file, page: [kernel.section(read_json(file, "description")["support"], **{
-            name: read_table(file, name) for name in ("kernels", "slices", "errors", "history")})],
+            name: read_table(file, name) for name in ("kernels", "slices", "errors")})],
         "model": lambda file, page: [_model_section(file, page, main)],
         "step": lambda file, page: [steps.section(read_attributes(file, "found"), {
             name: read_table(file, f"trials/{name}") for name in file["trials"]})],
