@@ -1,8 +1,9 @@
 import matplotlib
 import numpy as np
+import pytest
 from matplotlib.text import Text
 
-from eddies.report.figures import POSITIVE, colour_bar, letter, panels, png, show_plane, styled
+from eddies.report.figures import BAR, POSITIVE, colour_bar, letter, panels, png, show_plane, styled
 
 
 def test_drawing_leaves_the_settings_of_the_user(monkeypatch):
@@ -22,7 +23,7 @@ def test_drawing_leaves_the_settings_of_the_user(monkeypatch):
 @styled
 def curves():
     """Panels with wide and narrow tick labels, a legend, a plane with a colour bar, and values that need a factor."""
-    figure, axes = panels(2, 2, (3, 2.6))
+    figure, axes = panels(2, 2, (3.8, 2.6), right=BAR)
     for axis, factor in zip(axes.flat, (1, 1e-9, 12345)):
         axis.plot([0, 1], [0, factor], label="a curve")
         axis.set(title="A title", xlabel="time", ylabel="value")
@@ -48,12 +49,10 @@ def test_nothing_covers_anything_else_or_leaves_the_figure():
         assert not any(box.overlaps(axis.bbox) for axis in figure.axes)
 
 
-def test_ticks_that_depend_on_the_size_of_a_panel_leave_room_for_the_label():
-    """Labels with more digits appear if the layout makes the panel higher."""
-    figure, axes = panels(2, 2, (4.6, 3.1))
-    axes[0, 0].plot([0, 1], [0.9905, 1.0095])
-    axes[0, 0].set(title="A title", ylabel="ratio")
-    for axis in axes.flat:
-        axis.set_xlabel("time")
+@pytest.mark.parametrize("values", [[0.9905, 1.0095], [-12000.0, 12000.0], [1e-12, 1e-3]])
+def test_wide_tick_labels_leave_room_for_the_label(values):
+    figure, axes = panels(2, 2, (3.6, 2.6))
+    axes[0, 0].plot([0, 1], values)
+    axes[0, 0].set(ylabel="ratio", yscale="log" if values[0] == 1e-12 else "linear")
     png(figure)
     assert axes[0, 0].yaxis.label.get_window_extent(figure.canvas.get_renderer()).x0 >= 0

@@ -41,7 +41,7 @@ def velocity_planes(pairs: Sequence[Pair], turnover: float) -> Figure:
 @styled
 def vorticity_and_energy(vorticity: Pair, energy: Pair) -> Figure:
     """Draw planes [y, x] of vorticity magnitude and kinetic energy, truth and model, with one colour scale a row."""
-    figure, axes = panels(2, 2, (3.65, 3.4), right=BAR, sharex=True, sharey=True)
+    figure, axes = panels(2, 2, (3.65, 3.295), right=BAR, sharex=True, sharey=True)
     for row, pair, label in zip(axes, (vorticity, energy), (r"$|\omega|$", r"$\frac{1}{2}|u|^2$")):
         limit = largest(pair.truth)
         image = show_plane(row[0], pair.truth, (0, limit), POSITIVE)
