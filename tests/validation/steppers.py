@@ -93,7 +93,8 @@ def study(fluid, start):
 @styled
 def draw(found, path):
     """Errors of density and spectrum over cost, a panel for each Mach number."""
-    figure, axes = panels(1, len(found), (3.25, 3.2), foot=0.45, sharex=True, sharey=True)
+    figure, axes = panels(1, len(found), (3.25, 3.2), sharex=True, sharey=True)
+    figure.set_layout_engine("constrained")  # for labels and legends that are wide
     for (mach, runs), axis in zip(found.items(), axes.flat):
         for stepper, colour, marker in (("etdrk4", TRUTH, "o"), ("rk4", MODEL, "s")):
             stable = [run for run in runs[:-1] if run["stepper"] == stepper and "density" in run]
@@ -105,7 +106,7 @@ def draw(found, path):
     axes[0, 1].set_xlabel("wall seconds per unit of time")
     letter(axes.flat)
     handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="lower center", ncols=2)
+    figure.legend(handles, labels, loc="outside lower center", ncols=2)
     figure.savefig(path, dpi=100, facecolor="white", pil_kwargs={"optimize": True})
 
 

@@ -160,6 +160,9 @@ class MeasuredRollout:
         new = [task for task in tasks if self._key(task) not in known]
         own = on_all_ranks(comm, lambda: {(quantity, of, frame): getattr(self.rollout, quantity)[of][frame]
                                           for quantity, of, frame in new[comm.rank::comm.size]}, ProductError)
+        for maker in (self._solver, self.fields):
+            if maker is not None:
+                maker.forget()  # many rollouts are open at a time
         for task in new:
             if task[1] == "truth":
                 known[self._key(task)] = own.get(task)
