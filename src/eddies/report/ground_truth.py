@@ -6,8 +6,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from eddies.report.figures import (BAR, DNS, FILTERED, FOURTH, GUIDE, MODEL, POSITIVE, SECOND, SIGNED, TRUTH,
-                                   colour_bar, guide_power_law, largest, letter, mark_time, note, number_wavenumbers,
-                                   panels, show_plane, styled)
+                                   colour_bar, guide_power_law, largest, legend_below, letter, mark_time, note,
+                                   number_wavenumbers, panels, show_plane, styled)
 from eddies.report.page import Metric, Section
 
 Table = Mapping[str, np.ndarray]
@@ -83,7 +83,7 @@ def statistics_history(statistics: Table, release: float | None) -> Figure:
     known = {name for name, values in statistics.items() if np.isfinite(values).any()}
     shown = [(title, label, [line for line in lines if line[0] in known]) for title, label, lines in HISTORY]
     shown = [panel for panel in shown if panel[2]]
-    figure, axes = panels(-(-len(shown) // 3), 3, (3.6, 2.5))
+    figure, axes = panels(-(-len(shown) // 3), 3, (3.6, 2.7), below=0.2)
     for axis, (title, label, lines) in zip(axes.flat, shown):
         for column, name, colour, style in lines:
             values = statistics[column]
@@ -95,7 +95,7 @@ def statistics_history(statistics: Table, release: float | None) -> Figure:
         if title == LOGARITHMIC:
             axis.set_yscale("log")
         if len(lines) > 1:
-            axis.legend(loc="best")
+            legend_below(axis, len(lines))
         if release is not None and release > statistics["time"][0]:
             mark_time(axis, release, "tracers")
     for axis in axes.flat[len(shown):]:

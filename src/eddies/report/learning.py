@@ -29,7 +29,7 @@ def curves(history: Mapping[str, np.ndarray]) -> Figure:
     _, index, count = np.unique(history["phase"], return_inverse=True, return_counts=True)
     before = np.cumsum(count) - count
     history = {**history, "place": index + (np.arange(len(index)) - before[index] + 1) / count[index]}
-    figure, axes = panels(1, 2, (5.3, 3.2), below=0.12, foot=0.45)
+    figure, axes = panels(1, 2, (5.3, 3.2), below=0.15, foot=0.5)
     losses, errors = axes[0]
     for name, label, colour in LOSSES:
         if name in history and np.any(history[name] > 0):

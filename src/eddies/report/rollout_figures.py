@@ -14,7 +14,7 @@ from eddies.analysis.rollout import Pair, SpectraAt
 from eddies.analysis.velocity_gradients import ConditionalVelocity, vieillefosse_line
 from eddies.report.figures import (BAR, DNS, FILTERED, FOURTH, GUIDE, MODEL, POSITIVE, SIGNED, TRUTH, colour_bar,
                                    draw_pdfs, guide_power_law, largest, legend_at_foot, letter, note,
-                                   number_wavenumbers, panels, show_plane, styled)
+                                   number_wavenumbers, panels, plain_log_ticks, show_plane, styled)
 
 FEWEST = 8  # particles that a cell of the plane of Q and R needs before its mean motion is drawn
 LINES = {"truth": {"label": "true tracers", "color": TRUTH},
@@ -205,11 +205,12 @@ def invariant_plane(statistics: InvariantStatistics,
                     flows: tuple[ConditionalVelocity, ConditionalVelocity] | None) -> Figure:
     """Draw joint PDFs of (R, Q), and below them the conditional mean (dR/dt, dQ/dt) from `flows` of model and truth.
 
-    Arrows show directions on the page; colour is the speed in the plane.
+    Arrows show directions on the page; colour is the speed |(dR/dt, dQ/dt)| in the units of the axes.
     """
     names = "true tracers", "model"
     figure, axes = panels(1 if flows is None else 2, 2, (4.3, 3.2), right=BAR + 0.1, sharex=True, sharey=True)
     bins = statistics.bins
+    across, up = _centres(bins.third)[-2], _centres(bins.second)[-2]
     densities = [bins.density(cells) for cells in (statistics.truth, statistics.model)]
     # Levels are half a decade apart, from the peak of the truth down to the density of a single particle.
     peak, single = (np.log10(extreme) for extreme in (densities[0].max(), densities[0][densities[0] > 0].min()))
@@ -227,10 +228,10 @@ def invariant_plane(statistics: InvariantStatistics,
         speeds = speeds[speeds > 0]
         norm = LogNorm(*np.quantile(speeds, (0.02, 0.98))) if speeds.size else None
         for axis, flow, name in zip(axes[1], flows[::-1], names):
-            arrows = _draw_arrows(axis, flow, norm)
+            arrows = _draw_arrows(axis, flow, norm, 0.97 * across, 0.97 * up)
             axis.set_title(f"mean motion, {name}")
-        colour_bar(figure, arrows, axes[1], r"$|(dR/dt,\ dQ/dt)|$, normalised")
-    across, up = _centres(bins.third)[-2], _centres(bins.second)[-2]
+        bar = colour_bar(figure, arrows, axes[1], "speed")
+        plain_log_ticks(bar.ax.yaxis)
     third = np.linspace(-across, across, 401)
     for axis in axes.flat:
         axis.plot(third, vieillefosse_line(third), color=MODEL, linewidth=1.3)
@@ -245,16 +246,16 @@ def invariant_plane(statistics: InvariantStatistics,
     return figure
 
 
-def _draw_arrows(axis: Axes, flow: ConditionalVelocity, norm: LogNorm | None):
-    """Draw arrows of equal length in all cells but the outermost, whose arrows the frame would cut."""
-    inner = np.s_[1:-1, 1:-1]
-    second_rate, third_rate = (rate[inner] for rate in flow.mean(FEWEST))
+def _draw_arrows(axis: Axes, flow: ConditionalVelocity, norm: LogNorm | None, third_limit: float, second_limit: float):
+    """Draw arrows of equal length in the cells within the limits, so that the frame cuts no arrow."""
+    third, second = np.meshgrid(_centres(flow.bins.third), _centres(flow.bins.second))
+    inside = (np.abs(third) < third_limit) & (np.abs(second) < second_limit)
+    second_rate, third_rate = (rate[inside] for rate in flow.mean(FEWEST))
     across, up = third_rate / np.ptp(flow.bins.third), second_rate / np.ptp(flow.bins.second)
     length = np.hypot(across, up)
     length[length == 0] = np.nan
-    return axis.quiver(_centres(flow.bins.third)[1:-1], _centres(flow.bins.second)[1:-1], across / length, up / length,
-                       np.hypot(second_rate, third_rate), norm=norm, cmap="cividis", pivot="middle", scale=20,
-                       width=0.006, headwidth=4)
+    return axis.quiver(third[inside], second[inside], across / length, up / length, np.hypot(second_rate, third_rate),
+                       norm=norm, cmap="cividis", pivot="middle", scale=20, width=0.006, headwidth=4)
 
 
 def _centres(edges: np.ndarray) -> np.ndarray:

@@ -142,7 +142,8 @@ def _draw_panel(axis: Axes, table: ErrorAgainstTime, measure: str) -> None:
     rows, stopped = table.finished(measure), table.stopped()
     axis.set_xscale("log")
     axis.set_yscale("log")
-    _set_limits(axis, [row[COST] for row in [*rows, *stopped]], [row[measure] for row in rows])
+    costs = [row[key] for row in [*rows, *stopped] for key in (COST, "wall_seconds_low", "wall_seconds_high")]
+    _set_limits(axis, costs, [row[measure] for row in rows])
     for row in rows:
         colour, marker = table.looks[row["kind"]]
         chosen = row["name"] == table.subject
