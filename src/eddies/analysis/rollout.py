@@ -206,9 +206,9 @@ class Rollout:
         """The common frames at which the spectrum of the flow is stored."""
         return np.flatnonzero(self._has_flow(self.common.times))
 
-    def shown_spectra(self) -> np.ndarray:
-        """A few of these frames, from the first to the last."""
-        return _spread(self.spectral(), SHOWN)
+    def shown_spectra(self, several: bool = True) -> np.ndarray:
+        """A few of these frames, from the first to the last, or only the last."""
+        return _spread(self.spectral(), SHOWN) if several else self.spectral()[-1:]
 
     def late_spectra(self) -> np.ndarray:
         """Frames of the model over which its spectrum is averaged, in the second half before it broke.

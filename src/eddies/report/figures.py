@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
+from matplotlib.ticker import FuncFormatter, LogFormatter, LogLocator, NullLocator, StrMethodFormatter
 from matplotlib.transforms import Bbox
 
 from eddies.analysis.pdfs import gaussian, pdf, standardized
@@ -22,6 +22,7 @@ SECOND, THIRD, FOURTH = "#009E73", "#CC79A7", "#E69F00"
 GUIDE, NOTE = "#9a9a9a", "#5a5a5a"
 SIGNED, POSITIVE = "RdBu_r", "viridis"
 LEFT, RIGHT, BOTTOM, TOP = 0.74, 0.12, 0.5, 0.3  # inches around a panel, for its labels and its title
+SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 BAR = 0.8  # inches beside a panel for a colour bar with its labels
 
 STYLE = {
@@ -30,7 +31,7 @@ STYLE = {
     "mathtext.fontset": "dejavusans",
     "axes.titley": 1.0,  # a fixed place: finding one measures all tick labels again
     "axes.spines.top": False, "axes.spines.right": False, "axes.linewidth": 0.8, "lines.linewidth": 1.7,
-    "legend.frameon": False, "figure.dpi": 150, "savefig.dpi": 150, "axes.prop_cycle": matplotlib.cycler(
+    "axes.formatter.limits": (-3, 4), "legend.frameon": False, "figure.dpi": 150, "savefig.dpi": 150, "axes.prop_cycle": matplotlib.cycler(
         color=[TRUTH, MODEL, SECOND, THIRD, FOURTH, DNS]),
 }
 # The backend is left out: rc_context does not restore it, and a notebook would no longer show its figures.
@@ -87,16 +88,28 @@ def letter(axes: Sequence[Axes]) -> None:
 
 @styled
 def png(figure: Figure) -> bytes:
-    """Return the figure as a PNG image. Logarithmic axes over two decades or more get no minor ticks: they take long.
+    """Return the figure as a PNG image.
+
+    Logarithmic axes get plain text as labels, and no minor ticks over two decades or more: both save much time.
     """
-    for axis in (axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)):
+    for axis in (axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis) if axis.get_scale() == "log"):
         low, high = sorted(axis.get_view_interval())
-        if axis.get_scale() == "log" and high >= 100 * low:
+        if high >= 100 * low:
             axis.set_minor_locator(NullLocator())
+        if isinstance(axis.get_major_formatter(), LogFormatter):
+            axis.set_major_formatter(FuncFormatter(_power_of_ten))
     buffer = io.BytesIO()
     # `Figure.savefig` draws a figure twice. Compression level 2 takes half the time of 6 and a fifth more space.
     FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": None}, pil_kwargs={"compress_level": 2})
     return buffer.getvalue()
+
+
+def _power_of_ten(value: float, position: int | None) -> str:
+    """Write 0.001 as 10⁻³, and values that are no power of ten as decimals."""
+    exponent = np.log10(value)
+    if abs(exponent - round(exponent)) > 1e-6:
+        return f"{value:g}"
+    return "10" + str(round(exponent)).translate(SUPERSCRIPTS)
 
 
 def largest(*arrays: np.ndarray, quantile: float = 0.998) -> float:

@@ -21,7 +21,7 @@ SMOOTHED = 0.04  # share of a phase's steps over which noisy curves are averaged
 
 @styled
 def curves(history: Mapping[str, np.ndarray]) -> Figure:
-    """Draw losses and validation errors over the steps of a training. Phases have equal widths and dotted lines between.
+    """Draw losses and validation errors over the steps of a training. All phases are equally wide.
 
     history: columns (steps,). A loss that is not used in a step is NaN; a loss that is never used has no column.
     """

@@ -65,13 +65,13 @@ def section(run: Rollout, main: bool = True) -> Section:
                    "tracers.")
     shown.notices += _notices(run, last)
     shown.metrics.append(Metric("last_common_time", "last common time / T", last / run.turnover))
-    _add_particles(shown, run)
+    _add_particles(shown, run, main)
     if run.invariants is not None:
         _add_planes(shown, run, main)
         _add_invariants(shown, run, main)
     else:
         shown.metrics += [Metric(key, key.replace("_", " "), None, WITHOUT_KERNEL) for key in ("qr_kl", "qr_kl_floor")]
-    _add_spectra(shown, run)
+    _add_spectra(shown, run, main)
     _add_paths(shown, run, main)
     _add_disorder(shown, run, main)
     shown.illustrations.sort(key=lambda illustration: illustration.name)
@@ -152,7 +152,7 @@ def _add_invariants(shown: Section, run: Rollout, main: bool) -> None:
         + (" Bottom: mean motion over all frames until then." if flows else ""))
 
 
-def _add_particles(shown: Section, run: Rollout) -> None:
+def _add_particles(shown: Section, run: Rollout, main: bool) -> None:
     errors, common = against_truth.error_series(run), run.common
     final = {name: float(values[-1]) for name, values in errors.items()}
     model = against_truth.particle_series(run.model, np.arange(run.model.times.size))
@@ -162,7 +162,8 @@ def _add_particles(shown: Section, run: Rollout) -> None:
     early = min(run.turnover / 2, float(errors["time"][-1]))
     early_error, early_without = (float(np.interp(early, errors["time"], errors[name]))
                                   for name in ("velocity_error", "no_force"))
-    pairs = {column: [run.pair(index, column) for index in common.spread(3)] for column in against_truth.EDGES}
+    times = common.spread(3) if main else [-1]
+    pairs = {column: [run.pair(index, column) for index in times] for column in against_truth.EDGES}
     floors = {column: against_truth.sampling_floor(pairs[column][-1], edges)
               for column, edges in against_truth.EDGES.items()}
     accelerations = pairs["acceleration"][-1]
@@ -196,9 +197,9 @@ def _add_particles(shown: Section, run: Rollout) -> None:
         "Dotted: an error as large as the velocity itself.")
 
 
-def _add_spectra(shown: Section, run: Rollout) -> None:
+def _add_spectra(shown: Section, run: Rollout, main: bool) -> None:
     """Add spectra; numbers are those at the last common time for which the flow's spectrum is stored."""
-    cutoff, series = run.filter_wavenumber, [run.spectra_at(index) for index in run.shown_spectra()]
+    cutoff, series = run.filter_wavenumber, [run.spectra_at(index) for index in run.shown_spectra(main)]
     last = series[-1]
     errors = {name: last.error(name, cutoff) for name in ("model", "truth")}
     shown.metrics += [

@@ -93,7 +93,12 @@ def errors_over_time(model: Mapping[str, np.ndarray], truth: Mapping[str, np.nda
 @styled
 def particle_pdfs(pairs: Mapping[str, Sequence[Pair]], turnover: float) -> Figure:
     """Draw PDFs of all components of "velocity" and "acceleration", given as a Pair of (n, 3) for each time."""
-    figure, axes = panels(2, len(pairs["velocity"]), (3.5, 2.6), foot=0.3, sharex="row", sharey="row")
+    times = len(pairs["velocity"])
+    if times > 1:
+        figure, axes = panels(2, times, (3.5, 2.6), foot=0.3, sharex="row", sharey="row")
+    else:
+        figure, axes = panels(1, 2, (4.6, 3.0), foot=0.3)
+        axes = axes.T
     for row, quantity in zip(axes, ("velocity", "acceleration")):
         for axis, pair in zip(row, pairs[quantity]):
             draw_pdfs(axis, pair.truth, pair.model, EDGES[quantity])
@@ -114,7 +119,8 @@ def energy_spectra(series: Sequence[SpectraAt], flow: Mapping[str, np.ndarray], 
     `flow` is a table with time (m,), wavenumber (k,), energy and filtered (m, k). The times of the model count from
     start_time.
     """
-    figure, axes = panels(1, len(series), (3.5, 3.2), foot=0.3, sharex=True, sharey=True)
+    size = (3.5, 3.2) if len(series) > 1 else (5.6, 3.6)
+    figure, axes = panels(1, len(series), size, foot=0.3, sharex=True, sharey=True)
     known = flow["wavenumber"] >= 1
     for axis, at in zip(axes.flat, series):
         nearest = int(np.argmin(np.abs(flow["time"] - (start_time + at.time))))

@@ -148,8 +148,8 @@ class MeasuredRollout:
                 known: TruthMeasures | None = None) -> None:
         """Measure a share of the frames on each rank and collect everything on rank `root`; all ranks call it.
 
-        page: measure what a page shows, otherwise only what `accuracy` needs. every_frame: measure the velocity gradient
-        at all common frames. known: measures of true tracers from earlier calls, which are used and added to.
+        page: measure what a page shows, otherwise only what `accuracy` needs. every_frame: for a main page, measure the
+        velocity gradient at all common frames and spectra at several. known: measures of true tracers from earlier calls, which are used and added to.
         ProductError on all ranks if one of them cannot read a frame.
         """
         if self._solver is None:
@@ -182,7 +182,7 @@ class MeasuredRollout:
         except ValueError:
             return []
         every = np.arange(len(common.times))
-        chosen = {"spectra": run.shown_spectra() if page else np.intersect1d(run.spectral(), every[-1])}
+        chosen = {"spectra": run.shown_spectra(every_frame) if page else np.intersect1d(run.spectral(), every[-1])}
         if self.fields is not None:
             chosen["invariants"] = every if every_frame else every[-1:]
             chosen["planes"] = common.spread(PLANES if page else 0)
