@@ -149,8 +149,8 @@ class MeasuredRollout:
         """Measure a share of the frames on each rank and collect everything on rank `root`; all ranks call it.
 
         page: measure what a page shows, otherwise only what `accuracy` needs. every_frame: for a main page, measure the
-        velocity gradient at all common frames and spectra at several. known: measures of true tracers from earlier calls, which are used and added to.
-        ProductError on all ranks if one of them cannot read a frame.
+        velocity gradient at all common frames and spectra at several. known: measures of true tracers from earlier
+        calls, which are used and added to. ProductError on all ranks if one of them cannot read a frame.
         """
         if self._solver is None:
             return
