@@ -146,7 +146,7 @@ def _errors_panel(axis: Axes, table: Table) -> None:
     axis.axhline(1, color=GUIDE, linestyle=":", linewidth=1.2, label="no model")
     if seen:
         axis.axvspan(delay.min() - 0.03 * np.ptp(delay), 0, color="#eeeeee", zorder=0)
-        note(axis, "training", (delay.min(), 0.03), ("data", "axes fraction"), (0, 0))
+        note(axis, "training", (delay.min(), 1), ("data", "axes fraction"), (0, 0), va="top", fontsize=8)
     drawn = [each for each in ERRORS if each[0] in table]
     for column, label, colour, style, marker in drawn:
         axis.plot(delay, table[column], color=colour, linestyle=style, marker=marker, markersize=4, label=label)
