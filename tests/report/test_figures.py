@@ -49,10 +49,16 @@ def test_nothing_covers_anything_else_or_leaves_the_figure():
         assert not any(box.overlaps(axis.bbox) for axis in figure.axes)
 
 
-@pytest.mark.parametrize("values", [[0.9905, 1.0095], [-12000.0, 12000.0], [1e-12, 1e-3], [0.02, 0.06]])
-def test_wide_tick_labels_leave_room_for_the_label(values):
-    figure, axes = styled(panels)(2, 2, (3.6, 2.6))
-    axes[0, 0].plot([0, 1], values)
-    axes[0, 0].set(ylabel="ratio", yscale="log" if values[0] > 0 and values[1] < 0.5 else "linear")
+@pytest.mark.parametrize("draw, values", [("plot", [0.9905, 1.0095]), ("plot", [-12000.0, 12000.0]),
+                                          ("semilogy", [1e-12, 1e-3]), ("semilogy", [0.02, 0.06])])
+def test_wide_tick_labels_leave_room_for_the_label(draw, values):
+    @styled
+    def drawn():
+        figure, axes = panels(2, 2, (3.6, 2.6))
+        getattr(axes[0, 0], draw)([0, 1], values)
+        axes[0, 0].set_ylabel("ratio")
+        return figure, axes
+
+    figure, axes = drawn()
     png(figure)
     assert axes[0, 0].yaxis.label.get_window_extent(figure.canvas.get_renderer()).x0 >= 0
