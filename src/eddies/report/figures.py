@@ -31,7 +31,7 @@ STYLE = {
     "mathtext.fontset": "dejavusans",
     "axes.titley": 1.0,  # a fixed place: finding one measures all tick labels again
     "axes.spines.top": False, "axes.spines.right": False, "axes.linewidth": 0.8, "lines.linewidth": 1.7,
-    "axes.formatter.limits": (-3, 4),  # wider tick labels get a common factor
+    "axes.formatter.limits": (-4, 4),  # wider tick labels get a common factor
     "legend.frameon": False, "figure.dpi": 150, "savefig.dpi": 150, "axes.prop_cycle": matplotlib.cycler(
         color=[TRUTH, MODEL, SECOND, THIRD, FOURTH, DNS]),
 }
