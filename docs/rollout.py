@@ -10,7 +10,7 @@ from pathlib import Path
 from mpi4py import MPI
 from PIL import Image
 
-from eddies.report.figures import SIGNED, colour_bar, largest, panels, png, show_plane, styled
+from eddies.report.figures import BAR, SIGNED, colour_bar, largest, panels, png, show_plane, styled
 from eddies.workflows.rollout.measured import open_rollout
 
 SHOWN = 4  # times
@@ -24,12 +24,12 @@ def picture(run: Path, variants: list[str]) -> bytes:
         with open_rollout(run / variant, MPI.COMM_SELF) as measured:
             rollout = measured.rollout
             shown = rollout.common.spread(SHOWN)
-            model, truth = zip(*(rollout.reconstructed(index) for index in shown))
+            model, truth = zip(*(rollout.both(rollout.planes, index) for index in shown))
             if times is None:
                 times = rollout.common.times[list(shown)] / rollout.turnover
                 rows["true tracers"] = [one.velocity[0] for one in truth]
             rows[variant] = [one.velocity[0] for one in model]
-    figure, axes = panels(len(rows), SHOWN, (2.1, 2.0), sharex=True, sharey=True)
+    figure, axes = panels(len(rows), SHOWN, (2.1, 2.0), right=BAR, sharex=True, sharey=True)
     limit = largest(*rows["true tracers"])
     for row, (name, planes) in zip(axes, rows.items()):
         for axis, plane in zip(row, planes):

@@ -58,6 +58,7 @@ def points(results: Iterable[Mapping[str, Any]], name: str, measure: str) -> lis
 def drawn(results: Sequence[Mapping[str, Any]]) -> Figure:
     """A panel for each measure."""
     figure, axes = panels(1, len(DRAWN), (5.4, 4.2))
+    figure.set_layout_engine("constrained")  # for labels and legends that are wide
     for axis, measure in zip(axes.flat, DRAWN):
         for name, (words, colour, marker) in LOOKS.items():
             if not (line := points(results, name, measure)):

@@ -91,6 +91,7 @@ def bounds(iterations: float) -> dict[str, float]:
 def draw(found: dict) -> bytes:
     """Figure: seconds over particles, parts with bounds, and seconds over cores."""
     figure, (axes,) = panels(1, 3, (4.2, 3.6))
+    figure.set_layout_engine("constrained")  # for labels and legends that are wide
     over_particles(axes[0], found)
     parts(axes[1], found)
     over_cores(axes[2], found)

@@ -1,8 +1,9 @@
 import matplotlib
 import numpy as np
+import pytest
 from matplotlib.text import Text
 
-from eddies.report.figures import POSITIVE, colour_bar, letter, panels, png, show_plane, styled
+from eddies.report.figures import BAR, POSITIVE, colour_bar, letter, panels, png, show_plane, styled
 
 
 def test_drawing_leaves_the_settings_of_the_user(monkeypatch):
@@ -22,7 +23,7 @@ def test_drawing_leaves_the_settings_of_the_user(monkeypatch):
 @styled
 def curves():
     """Panels with wide and narrow tick labels, a legend, a plane with a colour bar, and values that need a factor."""
-    figure, axes = panels(2, 2, (3, 2.6))
+    figure, axes = panels(2, 2, (3.8, 2.6), right=BAR)
     for axis, factor in zip(axes.flat, (1, 1e-9, 12345)):
         axis.plot([0, 1], [0, factor], label="a curve")
         axis.set(title="A title", xlabel="time", ylabel="value")
@@ -33,13 +34,13 @@ def curves():
 
 
 def test_nothing_covers_anything_else_or_leaves_the_figure():
-    """Titles, labels of axes, and the factor above the second panel."""
+    """Titles, labels of axes, and the factors above the second and the third panel."""
     figure = curves()
     png(figure)
     texts = [text for axis in figure.axes for text in (
         axis.xaxis.label, axis.yaxis.label, axis.yaxis.get_offset_text(),
         *(child for child in axis.get_children() if isinstance(child, Text))) if text.get_text()]
-    assert "1e−9" in [text.get_text() for text in texts] and len(texts) == 12
+    assert {"1e−9", "1e4"} <= {text.get_text() for text in texts} and len(texts) == 13
     boxes = [text.get_window_extent(figure.canvas.get_renderer()) for text in texts]
     for index, box in enumerate(boxes):
         assert figure.bbox.x0 <= box.x0 and box.x1 <= figure.bbox.x1
@@ -48,12 +49,16 @@ def test_nothing_covers_anything_else_or_leaves_the_figure():
         assert not any(box.overlaps(axis.bbox) for axis in figure.axes)
 
 
-def test_ticks_that_depend_on_the_size_of_a_panel_leave_room_for_the_label():
-    """Labels with more digits appear if the layout makes the panel higher."""
-    figure, axes = panels(2, 2, (4.6, 3.1))
-    axes[0, 0].plot([0, 1], [0.9905, 1.0095])
-    axes[0, 0].set(title="A title", ylabel="ratio")
-    for axis in axes.flat:
-        axis.set_xlabel("time")
+@pytest.mark.parametrize("draw, values", [("plot", [0.9905, 1.0095]), ("plot", [-12000.0, 12000.0]),
+                                          ("semilogy", [1e-12, 1e-3]), ("semilogy", [0.02, 0.06])])
+def test_wide_tick_labels_leave_room_for_the_label(draw, values):
+    @styled
+    def drawn():
+        figure, axes = panels(2, 2, (3.6, 2.6))
+        getattr(axes[0, 0], draw)([0, 1], values)
+        axes[0, 0].set_ylabel("ratio")
+        return figure, axes
+
+    figure, axes = drawn()
     png(figure)
     assert axes[0, 0].yaxis.label.get_window_extent(figure.canvas.get_renderer()).x0 >= 0

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from eddies.analysis.isotropic_turbulence import StationarySpan
-from eddies.analysis.rollout import Reconstruction, Rollout
+from eddies.analysis.rollout import Rollout
 from eddies.analysis.velocity_gradients import Invariants
 from eddies.report.figures import png
 from eddies.report.forced import section
@@ -30,11 +30,11 @@ def rollout(factors=FACTORS):
     attributes = {"eddy_turnover_time": 1.0, "injection_rate": 0.5, "start_time": 0.0}
     runs = {"model": Stored(columns, factors), "truth": Stored(columns, np.ones(1))}
     spectra = {name: dict(enumerate(np.outer(run.factors**2, SPECTRUM[:8]))) for name, run in runs.items()}
-    reconstructions = {name: {frame: Reconstruction(Invariants.of(factor * gradient), *[None] * 2)
-                              for frame, factor in enumerate(run.factors)} for name, run in runs.items()}
+    gradients = {name: {frame: Invariants.of(factor * gradient) for frame, factor in enumerate(run.factors)}
+                 for name, run in runs.items()}
     flow = {"time": runs["model"].times}
     return Rollout(attributes, *runs.values(), 2 * np.pi, flow, {"filter_width": WIDTH}, spectra,
-                   reconstructions), columns
+                   gradients), columns
 
 
 def stationary():

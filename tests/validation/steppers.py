@@ -94,6 +94,7 @@ def study(fluid, start):
 def draw(found, path):
     """Errors of density and spectrum over cost, a panel for each Mach number."""
     figure, axes = panels(1, len(found), (3.25, 3.2), sharex=True, sharey=True)
+    figure.set_layout_engine("constrained")  # for labels and legends that are wide
     for (mach, runs), axis in zip(found.items(), axes.flat):
         for stepper, colour, marker in (("etdrk4", TRUTH, "o"), ("rk4", MODEL, "s")):
             stable = [run for run in runs[:-1] if run["stepper"] == stepper and "density" in run]

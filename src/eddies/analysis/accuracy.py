@@ -61,7 +61,7 @@ def _at_the_end(run: Rollout) -> Mapping[str, float | None]:
         spectra = run.spectra_at(last)
         measures |= {"spectrum_error": spectra.error("model", run.filter_wavenumber),
                      "spectrum_error_floor": spectra.error("truth", run.filter_wavenumber)}
-    if run.reconstructions is not None:
+    if run.invariants is not None:
         invariants = last_invariants(run)
         measures |= {"qr_kl": invariants.divergence, "qr_kl_floor": invariants.floor}
     return measures

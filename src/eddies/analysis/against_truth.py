@@ -84,7 +84,7 @@ class InvariantStatistics:
 
 def last_invariants(run: Rollout) -> InvariantStatistics:
     """Q-R statistics at the last common frame of a rollout with a kernel."""
-    return InvariantStatistics.of(*(fields.invariants for fields in run.reconstructed(-1)))
+    return InvariantStatistics.of(*run.both(run.invariants, -1))
 
 
 def conditional_flows(run: Rollout, bins: InvariantBins) -> tuple[ConditionalVelocity, ConditionalVelocity] | None:
@@ -96,9 +96,9 @@ def conditional_flows(run: Rollout, bins: InvariantBins) -> tuple[ConditionalVel
     if times.size < 2:
         return None
     flows = ConditionalVelocity(bins.coarser()), ConditionalVelocity(bins.coarser())
-    before = [fields.invariants for fields in run.reconstructed(0)]
+    before = run.both(run.invariants, 0)
     for index in range(1, times.size):
-        after = [fields.invariants for fields in run.reconstructed(index)]
+        after = run.both(run.invariants, index)
         for flow, *both in zip(flows, before, after):
             flow.add(*both, times[index] - times[index - 1], (before[1].scale + after[1].scale) / 2)
         before = after

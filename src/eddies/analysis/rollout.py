@@ -3,14 +3,15 @@
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from eddies.analysis.spectra import band_ratios, spectrum_error
 from eddies.analysis.velocity_gradients import Invariants
 
-SHOWN = 3  # spectra of a rollout in a report
+SHOWN = 3   # spectra of a rollout in a report
+PLANES = 4  # planes of a rollout in a report
 Table = Mapping[str, np.ndarray]  # columns wavenumber (shells,), time (m,), energy or others (m, shells)
 
 
@@ -59,16 +60,9 @@ class Pair:
 
 
 @dataclass(frozen=True)
-class Reconstruction:
-    """Quantities reconstructed from particles at one time, in the same way for model and truth.
+class Plane:
+    """Velocity (3, n, n) and magnitude of the vorticity (n, n), [y, x] in the plane z = pi, made of particles."""
 
-    Parameters
-    ----------
-    invariants : of the velocity gradient at the particles.
-    velocity, vorticity : (3, n, n) and magnitude (n, n), [y, x] in the plane z = pi.
-    """
-
-    invariants: Invariants
     velocity: np.ndarray
     vorticity: np.ndarray
 
@@ -116,7 +110,8 @@ class Rollout:
         release of the tracers.
     reference : scales of the ground truth.
     spectra : energy (shells,) by frame, of "model" and "truth": least squares for the modes of the particles' velocity.
-    reconstructions : by frame, of "model" and "truth"; None without a kernel.
+    invariants, planes : of the reconstructed velocity gradient at the particles, and of the reconstructed field; by
+        frame, of "model" and "truth". None without a kernel.
     outside_training : share of the pairs outside the training range, (frames,), where it was counted.
     closure : columns over the frames on the solves for the resolved velocity, where there were any.
     reconstructed_by : the form of the reconstructions in words.
@@ -129,7 +124,8 @@ class Rollout:
     flow: Table
     reference: Mapping[str, float]
     spectra: Mapping[str, Mapping[int, np.ndarray]]
-    reconstructions: Mapping[str, Mapping[int, Reconstruction]] | None
+    invariants: Mapping[str, Mapping[int, Invariants]] | None
+    planes: Mapping[str, Mapping[int, Plane]] | None = None
     outside_training: np.ndarray | None = None
     closure: Table | None = None
     without_truth: str = ""
@@ -196,19 +192,23 @@ class Rollout:
         return Pair(float(common.times[index]), self.model.read(int(common.model[index]), column),
                     self.truth.read(int(common.truth[index]), column))
 
-    def reconstructed(self, index: int) -> tuple[Reconstruction, Reconstruction]:
-        """Reconstructions of model and truth at a common frame."""
-        assert self.reconstructions is not None
-        return (self.reconstructions["model"][int(self.common.model[index])],
-                self.reconstructions["truth"][int(self.common.truth[index])])
+    def both(self, measures: Mapping[str, Mapping[int, Any]], index: int) -> tuple[Any, Any]:
+        """Values of model and truth at a common frame, of `invariants`, `planes` or `spectra`."""
+        return measures["model"][int(self.common.model[index])], measures["truth"][int(self.common.truth[index])]
+
+    @property
+    def late(self) -> np.ndarray:
+        """The frames of the model in the second half of the time before it broke."""
+        frames = self.before_broken("model")
+        return frames[self.model.times[frames] >= self.model.times[frames[-1]] / 2]
 
     def spectral(self) -> np.ndarray:
         """The common frames at which the spectrum of the flow is stored."""
         return np.flatnonzero(self._has_flow(self.common.times))
 
-    def shown_spectra(self) -> np.ndarray:
-        """A few of these frames, from the first to the last."""
-        return _spread(self.spectral(), SHOWN)
+    def shown_spectra(self, several: bool = True) -> np.ndarray:
+        """A few of these frames, from the first to the last, or only the last."""
+        return _spread(self.spectral(), SHOWN) if several else self.spectral()[-1:]
 
     def late_spectra(self) -> np.ndarray:
         """Frames of the model over which its spectrum is averaged, in the second half before it broke.
@@ -224,8 +224,7 @@ class Rollout:
     def spectra_at(self, index: int) -> SpectraAt:
         """The spectra at a common frame, with the flow's at the nearest time; only the shells that all of them have."""
         common = self.common
-        model, truth = (self.spectra[of][int(frames[index])]
-                        for of, frames in (("model", common.model), ("truth", common.truth)))
+        model, truth = self.both(self.spectra, index)
         nearest = int(np.argmin(np.abs(self.flow["time"] - (self.start_time + common.times[index]))))
         shells = min(len(model), self.flow["wavenumber"].size)
         return SpectraAt(float(common.times[index]), model[:shells], truth[:shells],

@@ -47,7 +47,7 @@ def section(run: Rollout, span: StationarySpan) -> Section:
         shown.notices.append("The rollout is not compared: the model has no finite frame.")
         return shown
     times = run.model.times[frames]
-    late = frames[times >= times[-1] / 2]
+    late = run.late
     model = averages(run.model, late, turnover, "model")
     flow, deviation = filtered_energy(run, span)
     wavenumber, spectra, error = mean_spectra(run, span)
@@ -56,9 +56,8 @@ def section(run: Rollout, span: StationarySpan) -> Section:
                for column in ("velocity", "acceleration")}
     divergence = {column: kl_divergence(*(bin_probabilities(values, EDGES[column]) for values in both))
                   for column, both in samples.items()}
-    qr_kl = None if run.reconstructions is None else invariant_divergence(
-        [run.reconstructions["model"][int(frame)].invariants for frame in late],
-        run.reconstructions["truth"][0].invariants)
+    qr_kl = None if run.invariants is None else invariant_divergence(
+        [run.invariants["model"][int(frame)] for frame in late], run.invariants["truth"][0])
     shown.text = (
         f"The model is forced with a power of {run.powers[0]:.3g} per mass. Its averages from "
         f"{run.model.times[late[0]] / turnover:.3g} to {times[-1] / turnover:.3g} T are compared with those of the "
@@ -127,7 +126,7 @@ def forced_rollout(series: tuple[np.ndarray, np.ndarray], flow: tuple[float, flo
     series: time / T and energy of the model. flow: mean and deviation of its energy. spectra: wavenumber, flow, model.
     accelerations: flow and model, standardised.
     """
-    figure, ((energy, spectrum, density),) = panels(1, 3, (3.7, 3.2))
+    figure, ((energy, spectrum, density),) = panels(1, 3, (3.6, 3.1))
     mean, deviation = flow
     energy.axhspan(mean - deviation, mean + deviation, color=TRUTH, alpha=0.2, linewidth=0)
     energy.axhline(mean, color=TRUTH, label="stationary flow")

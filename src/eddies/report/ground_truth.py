@@ -3,14 +3,12 @@
 from collections.abc import Mapping
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from eddies.report.figures import (DNS, FILTERED, FOURTH, GUIDE, MODEL, POSITIVE, SECOND, SIGNED, TRUTH, colour_bar,
-                                   guide_power_law, largest, legend_below, letter, mark_time, note,
+from eddies.report.figures import (BAR, DNS, FILTERED, FOURTH, GUIDE, MODEL, POSITIVE, SECOND, SIGNED, TRUTH,
+                                   colour_bar, guide_power_law, largest, legend_below, letter, mark_time, note,
                                    number_wavenumbers, panels, show_plane, styled)
 from eddies.report.page import Metric, Section
-from eddies.spectral.mode_operators import gaussian_transfer
 
 Table = Mapping[str, np.ndarray]
 
@@ -18,14 +16,14 @@ Table = Mapping[str, np.ndarray]
 HISTORY = (
     ("Kinetic energy", r"$\frac{1}{2}\langle u\cdot u\rangle$", (("energy", None, DNS, "-"),)),
     ("Dissipation", "energy rate", (
-        ("dissipation_rate", r"dissipation $\varepsilon$", TRUTH, "-"),
+        ("dissipation_rate", "dissipation", TRUTH, "-"),
         ("injection_rate", "injection", FOURTH, "--"))),
     ("Taylor Reynolds number", r"$Re_\lambda$", (("reynolds_lambda", None, DNS, "-"),)),
     ("Resolution", r"$k_{\max}\,\eta$", (("kmax_eta", None, DNS, "-"),)),
     ("Compressibility", "fraction", (
         ("mach_turbulent", r"$M_t$", TRUTH, "-"),
         ("density_rms", r"$\rho_{rms}/\rho_0$", MODEL, "--"),
-        ("compressible_fraction", "energy fraction", SECOND, "-."))),
+        ("compressible_fraction", "energy", SECOND, "-."))),
     ("Longitudinal gradient", "moment", (
         ("skewness", "skewness", TRUTH, "-"),
         ("flatness", "flatness", MODEL, "--"))),
@@ -65,16 +63,14 @@ def section(statistics: Table, spectra: Table, reference: Mapping[str, float], p
         f"From t = {times[0]:.3g} to {times[-1]:.3g}. Energy {when}: {at['energy']:.3g}; dissipation rate: "
         f"{at['dissipation_rate']:.3g}.")
     frame = -1 if released is None else int(np.argmin(np.abs(spectra["time"])))
-    energy, filtered = spectra["energy"][frame], spectra.get("filtered")
-    scales = {"dissipation_rate": float(statistics["dissipation_rate"][row]),
-              "kolmogorov_length": reference["kolmogorov_length"], "filter_width": reference.get("filter_width")}
-    caption = f"At t = {times[row]:.3g}; η = {scales['kolmogorov_length']:.3g}."
-    if filtered is not None:
-        filtered = filtered[frame]
-        caption += (f" The filter of width d = {scales['filter_width']:.3g} keeps {filtered.sum() / energy.sum():.1%} "
-                    "of the energy.")
+    energy, filtered, width = spectra["energy"][frame], None, reference.get("filter_width")
+    caption = f"At t = {times[row]:.3g}; η = {reference['kolmogorov_length']:.3g}."
+    if "filtered" in spectra:
+        filtered = spectra["filtered"][frame]
+        caption += (f" The filter of width d = {width:.3g} keeps {filtered.sum() / energy.sum():.1%} of the energy. "
+                    "Dotted: its wavenumber k_d = π/d.")
     shown.add_figure("spectra", "Energy spectrum of the ground truth",
-                     energy_spectra(spectra["wavenumber"], energy, filtered, scales), caption)
+                     energy_spectra(spectra["wavenumber"], energy, filtered, width), caption)
     shown.add_figure("fields", "Velocity and vorticity", field_planes(**planes),
                      f"Plane z = π of the last stored {field_name} field.")
     return shown
@@ -87,7 +83,7 @@ def statistics_history(statistics: Table, release: float | None) -> Figure:
     known = {name for name, values in statistics.items() if np.isfinite(values).any()}
     shown = [(title, label, [line for line in lines if line[0] in known]) for title, label, lines in HISTORY]
     shown = [panel for panel in shown if panel[2]]
-    figure, axes = panels(-(-len(shown) // 3), 3, (3.5, 2.6))
+    figure, axes = panels(-(-len(shown) // 3), 3, (3.6, 2.7), below=0.2)
     for axis, (title, label, lines) in zip(axes.flat, shown):
         for column, name, colour, style in lines:
             values = statistics[column]
@@ -110,61 +106,33 @@ def statistics_history(statistics: Table, release: float | None) -> Figure:
 
 @styled
 def energy_spectra(wavenumber: np.ndarray, energy: np.ndarray, filtered: np.ndarray | None,
-                   scales: Mapping[str, float]) -> Figure:
-    """Draw the energy spectrum at one time, the compensated spectrum eps^(-2/3) k^(5/3) E(k), and the filter.
+                   filter_width: float | None) -> Figure:
+    """Draw the energy spectra (shells,) of the flow and of the filtered flow at one time.
 
-    Arrays (shells,); `filtered` is None for a run without tracers. There is no compensated spectrum without viscosity
-    or with three shells or fewer.
+    Without tracers `filtered` and `filter_width` are None.
     """
     inside = (wavenumber >= 1) & (energy > 1e-12 * energy.max())
     k, spectrum = wavenumber[inside], energy[inside]
-    compensated = scales["kolmogorov_length"] > 0 and k.size > 3
-    figure, axes = panels(1, 1 + compensated + (filtered is not None), (3.7, 3.2))
-    _energy_panel(axes[0, 0], k, spectrum, None if filtered is None else filtered[inside])
-    if compensated:
-        _compensated_panel(axes[0, 1], k, spectrum, scales)
+    figure, ((axis,),) = panels(1, 1, (5.0, 3.6))
+    axis.loglog(k, spectrum, color=DNS, label="DNS", marker="o" if k.size < 8 else None)
     if filtered is not None:
-        axes[0, 0].legend(loc="lower left")
-        _transfer_panel(axes[0, -1], k, filtered[inside] / spectrum, scales["filter_width"])
-    for axis in axes.flat:
-        number_wavenumbers(axis)
-    letter(axes.flat)
-    return figure
-
-
-def _energy_panel(axis: Axes, k: np.ndarray, energy: np.ndarray, filtered: np.ndarray | None) -> None:
-    axis.loglog(k, energy, color=DNS, label="DNS", marker="o" if k.size < 8 else None)
-    if filtered is not None:
-        axis.loglog(k, filtered, color=FILTERED, linestyle="--", label="filtered DNS")
+        axis.loglog(k, filtered[inside], color=FILTERED, linestyle="--", label="filtered DNS")
+        axis.axvline(np.pi / filter_width, color=GUIDE, linestyle=":", linewidth=1)
+        note(axis, "$k_d$", (np.pi / filter_width, 0.02), ("data", "axes fraction"), (3, 2))
     guide = k[(k >= 2) & (k <= max(6, k.max() / 4))]
     if guide.size > 2:
-        guide_power_law(axis, guide, 1.6 * energy[k == guide[0]][0], -5 / 3, r"$k^{-5/3}$")
-    axis.set(title="Energy spectrum", xlabel="wavenumber $k$", ylabel="$E(k)$",
-             ylim=(max(energy.min() / 2, 1e-8 * energy.max()), 4 * energy.max()))
-
-
-def _compensated_panel(axis: Axes, k: np.ndarray, energy: np.ndarray, scales: Mapping[str, float]) -> None:
-    compensated = k ** (5 / 3) * energy / scales["dissipation_rate"] ** (2 / 3)
-    axis.loglog(k * scales["kolmogorov_length"], compensated, color=DNS)
-    axis.axhspan(1.5, 1.64, color=GUIDE, alpha=0.35, linewidth=0)
-    note(axis, "1.5–1.64, high Re", (0.97, 1.64), ("axes fraction", "data"), (0, 2), ha="right", fontsize=8.5)
-    axis.set(title="Compensated", xlabel=r"$k\,\eta$", ylabel=r"$\varepsilon^{-2/3}k^{5/3}E(k)$",
-             ylim=(max(compensated.min() / 1.5, 1e-3), 2.5 * max(compensated.max(), 1.64)))
-
-
-def _transfer_panel(axis: Axes, k: np.ndarray, ratio: np.ndarray, width: float) -> None:
-    axis.semilogx(k, gaussian_transfer(k**2, width) ** 2, color=FILTERED, label=r"$\exp(-k^2d^2/12)$")
-    axis.semilogx(k, ratio, "o", color=TRUTH, markersize=4, markerfacecolor="none", label="measured")
-    axis.axvline(np.pi / width, color=GUIDE, linestyle=":", linewidth=1)
-    note(axis, r"$k=\pi/d$", (np.pi / width, 0.02), ("data", "axes fraction"), (3, 2), fontsize=8.5)
-    axis.set(title="Filter", xlabel="wavenumber $k$", ylabel="filtered energy / DNS energy", ylim=(-0.03, 1.08))
-    axis.legend(loc="upper right")
+        guide_power_law(axis, guide, 1.6 * spectrum[k == guide[0]][0], -5 / 3, r"$k^{-5/3}$")
+    axis.set(xlabel="wavenumber $k$", ylabel="$E(k)$",
+             ylim=(max(spectrum.min() / 2, 1e-8 * spectrum.max()), 4 * spectrum.max()))
+    axis.legend(loc="lower left")
+    number_wavenumbers(axis)
+    return figure
 
 
 @styled
 def field_planes(velocity: np.ndarray, vorticity: np.ndarray) -> Figure:
     """Draw planes [y, x] of u_x and the vorticity magnitude."""
-    figure, axes = panels(1, 2, (3.9, 3.1))
+    figure, axes = panels(1, 2, (4.4, 3.54), right=BAR)
     limit = largest(velocity)
     image = show_plane(axes[0, 0], velocity, (-limit, limit), SIGNED)
     colour_bar(figure, image, axes[0, :1], "$u_x$")

@@ -1,12 +1,12 @@
-"""The section on smoothing kernels: shapes (the paper's Fig. 1), reconstructed fields (Fig. 2), training."""
+"""The section on smoothing kernels: shapes (the paper's Fig. 1) and reconstructed fields (Fig. 2)."""
 
 from collections.abc import Mapping
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from eddies.report.figures import (DNS, FOURTH, MODEL, SECOND, SIGNED, THIRD, TRUTH, colour_bar, largest, letter,
-                                   panels, show_plane, styled)
+from eddies.report.figures import (BAR, DNS, MODEL, SECOND, SIGNED, THIRD, colour_bar, largest, letter, panels,
+                                   show_plane, styled)
 from eddies.report.page import Metric, Section
 
 KERNELS = {  # name in the files: label, colour, line style
@@ -15,7 +15,6 @@ KERNELS = {  # name in the files: label, colour, line style
     "cubic_spline": ("cubic spline", DNS, "-."),
     "wendland": ("Wendland C$^2$", SECOND, ":"),
 }
-LOSSES = {"loss": DNS, "velocity": TRUTH, "gradient": FOURTH, "normalization": SECOND}
 ERRORS = {  # what is compared, by name in the files: start of the key in the report, name in words
     "learned": ("", "learned kernel"),
     "learned_no_gradient": ("no_gradient_", "learned without L_g"),
@@ -49,7 +48,7 @@ def shapes(kernels: Mapping[str, np.ndarray]) -> Figure:
 def reconstructed_planes(slices: Mapping[str, np.ndarray], errors: Mapping[str, float]) -> Figure:
     """Draw planes [y, x] of u_x and du_x/dx, truth and reconstructions, with one colour scale a row."""
     names = [name for name in KERNELS if f"velocity_{name}" in slices and name != "wendland"]
-    figure, axes = panels(2, 1 + len(names), (2.7, 2.75), sharex=True, sharey=True)
+    figure, axes = panels(2, 1 + len(names), (2.665, 2.675), right=BAR, sharex=True, sharey=True)
     rows = (("velocity", "$u_x$"), ("gradient", r"$\partial u_x/\partial x$"))
     for row, (quantity, symbol) in zip(axes, rows):
         truth = slices[f"truth_{quantity}"]
@@ -66,24 +65,8 @@ def reconstructed_planes(slices: Mapping[str, np.ndarray], errors: Mapping[str, 
     return figure
 
 
-@styled
-def training_history(history: Mapping[str, np.ndarray]) -> Figure:
-    """Draw the losses of both trained kernels over the step; columns LOSS_KERNEL."""
-    figure, ((axis,),) = panels(1, 1, (7.5, 3.2))
-    for name in ("learned", "learned_no_gradient"):
-        kernel, _, style = KERNELS[name]
-        for loss, colour in LOSSES.items():
-            values = history.get(f"{loss}_{name}")
-            if values is not None and np.any(values > 0):
-                axis.semilogy(history["step"], values, color=colour, linestyle=style, linewidth=1.2,
-                              label=f"{'total' if loss == 'loss' else loss}, {kernel}")
-    axis.set(xlabel="training step", ylabel="loss")
-    axis.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    return figure
-
-
 def section(support: float, kernels: Mapping[str, np.ndarray], slices: Mapping[str, np.ndarray],
-            errors: Mapping[str, float], history: Mapping[str, np.ndarray]) -> Section:
+            errors: Mapping[str, float]) -> Section:
     """Return the section from the tables of the product; errors are those on an unseen field."""
     def error(key: str, label: str, column: str) -> Metric:
         return Metric(key, label, float(errors[column]) if column in errors else None, "this kernel was not compared")
@@ -103,6 +86,4 @@ def section(support: float, kernels: Mapping[str, np.ndarray], slices: Mapping[s
         reconstructed_planes(slices, errors),
         "Plane z = π of an unseen frame. Numbers in titles: normalised error over the whole field. Learned kernel: "
         f"velocity {errors['velocity_error_learned']:.3f}, gradient {errors['gradient_error_learned']:.3f}.")
-    shown.add_figure("kernel-training", "Training of the kernels", training_history(history),
-                     f"{int(history['step'][-1])} steps.")
     return shown

@@ -1,4 +1,4 @@
-"""Learning curves: losses, validation error, learning rate and gradient over a training."""
+"""Learning curves: losses and validation error over a training."""
 
 from collections.abc import Mapping
 
@@ -7,7 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from eddies.clock import duration
-from eddies.report.figures import DNS, FOURTH, GUIDE, MODEL, SECOND, THIRD, TRUTH, letter, panels, styled
+from eddies.report.figures import (DNS, FOURTH, GUIDE, MODEL, SECOND, THIRD, TRUTH, legend_at_foot, letter, panels,
+                                   styled)
 
 LOSSES = (
     ("loss", "total", DNS), ("trajectory_loss", "trajectory $L_t$", MODEL),
@@ -20,7 +21,7 @@ SMOOTHED = 0.04  # share of a phase's steps over which noisy curves are averaged
 
 @styled
 def curves(history: Mapping[str, np.ndarray]) -> Figure:
-    """Draw four curves over the steps of a training. All phases have the same width, with dotted lines between them.
+    """Draw losses and validation errors over the steps of a training. All phases are equally wide.
 
     history: columns (steps,). A loss that is not used in a step is NaN; a loss that is never used has no column.
     """
@@ -28,29 +29,18 @@ def curves(history: Mapping[str, np.ndarray]) -> Figure:
     _, index, count = np.unique(history["phase"], return_inverse=True, return_counts=True)
     before = np.cumsum(count) - count
     history = {**history, "place": index + (np.arange(len(index)) - before[index] + 1) / count[index]}
-    figure, axes = panels(2, 2, (4.6, 3.0), sharex=True)
-    (losses, errors), (rates, gradients) = axes
+    figure, axes = panels(1, 2, (5.3, 3.2), below=0.15, foot=0.5)
+    losses, errors = axes[0]
     for name, label, colour in LOSSES:
         if name in history and np.any(history[name] > 0):
             _noisy(losses, history, name, colour, label)
     losses.set(title="Losses", ylabel="loss", yscale="log")
     _validation(errors, history)
-    for number in np.unique(history["phase"]):
-        chosen = history["phase"] == number
-        rates.plot(history["place"][chosen], history["learning_rate"][chosen], color=MODEL, marker=_marker(chosen))
-    rates.set(title="Learning rate", ylabel="learning rate", yscale="log")
-    _noisy(gradients, history, "gradient_norm", MODEL, None)
-    gradients.set(title="Norm of the gradient", ylabel="norm", yscale="log")
     for axis in axes.flat:
         _mark_phases(axis, history)
-    figure.legend(*losses.get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    legend_at_foot(figure, losses, 4)
     letter(axes.flat)
     return figure
-
-
-def _marker(steps: np.ndarray) -> str | None:
-    """Return a marker for a single step, which makes no line."""
-    return "." if np.count_nonzero(steps) == 1 else None
 
 
 def _mark_phases(axis: Axes, history: Mapping[str, np.ndarray]) -> None:
@@ -62,7 +52,7 @@ def _mark_phases(axis: Axes, history: Mapping[str, np.ndarray]) -> None:
     shown = np.unique(np.searchsorted(history["place"], wanted - 1e-9))
     labels = [f"{int(history['step'][row]) + 1}\n{duration(history['seconds'][row])}" for row in shown]
     axis.set_xticks([0, *history["place"][shown]], ["0", *labels])
-    axis.set_xlabel("steps and wall time" if axis.get_subplotspec().is_last_row() else "")
+    axis.set_xlabel("steps and wall time")
 
 
 def _validation(axis: Axes, history: Mapping[str, np.ndarray]) -> None:
@@ -83,7 +73,7 @@ def _validation(axis: Axes, history: Mapping[str, np.ndarray]) -> None:
         axis.set_ylim(0, 1.1 * highest)
 
 
-def _noisy(axis: Axes, history: Mapping[str, np.ndarray], name: str, colour: str, label: str | None) -> None:
+def _noisy(axis: Axes, history: Mapping[str, np.ndarray], name: str, colour: str, label: str) -> None:
     """Draw a faint curve of single steps and, over it, its running mean within each phase."""
     values = history[name]
     for number in np.unique(history["phase"]):
@@ -94,5 +84,6 @@ def _noisy(axis: Axes, history: Mapping[str, np.ndarray], name: str, colour: str
         axis.plot(place, chosen, color=colour, alpha=0.25, linewidth=0.6)
         width = max(int(SMOOTHED * len(chosen)), 1)
         mean = np.convolve(chosen, np.full(width, 1 / width), mode="valid")
-        axis.plot(place[width - 1:], mean, color=colour, label=label, linewidth=1.4, marker=_marker(used))
-        label = None
+        # A single step makes no line.
+        axis.plot(place[width - 1:], mean, color=colour, linewidth=1.4, marker="." if len(chosen) == 1 else None)
+    axis.plot([], [], color=colour, label=label)

@@ -1,7 +1,6 @@
 """The section on the model: a-priori errors and PDFs (the paper's Fig. 3), training, coefficients, other flows."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,7 @@ from matplotlib.figure import Figure
 
 from eddies.analysis.pdfs import bin_edges, bin_probabilities, kl_divergence, standardized
 from eddies.report.figures import (DNS, FOURTH, GUIDE, MODEL, SECOND, draw_pdfs, legend_below, letter, note, panels,
-                                   plain_log_ticks, styled)
+                                   styled)
 from eddies.report.learning import curves
 from eddies.report.page import Metric, Section, shown
 
@@ -36,19 +35,6 @@ TRAINING = {
     "training_steps": "optimiser steps of the training, by phase",
     "training_error": "validation error at the end of each phase",
 }
-
-
-@dataclass(frozen=True)
-class FlowErrors:
-    """A-priori errors of a model on one flow: name of the flow, its M_t at the release of the tracers, the table."""
-
-    name: str
-    mach: float | None
-    table: Table
-
-    def unseen(self, column: str) -> np.ndarray:
-        """Errors at the times after the training window."""
-        return self.table[column][self.table["delay"] > 0]
 
 
 def section(description: Mapping[str, Any], table: Table, acceleration: Table, density_rate: Table | None,
@@ -118,24 +104,23 @@ def _written(coefficient: Mapping[str, Any]) -> str:
     return learned if coefficient["unit"] == "1" else f"{learned}, that is {value} {coefficient['unit']}"
 
 
-def add_source(part: Section, this: FlowErrors, source: FlowErrors) -> None:
-    """Add errors over the Mach number for a model whose weights come from another flow, or a notice."""
-    if None in (this.mach, source.mach) or not len(source.unseen("acceleration_error")):
-        part.notices.append(f"{source.name} or this flow has no Mach number, or {source.name} stores no error after "
-                            "its training window. There is no figure over the Mach number. Train the model again, "
-                            "with a window below 1.")
-        return
-    part.metrics += [
-        Metric("mach_turbulent", "turbulent Mach number M_t", this.mach),
-        Metric("source_mach_turbulent", "M_t of the flow that the model was trained on", source.mach),
-        Metric("source_acceleration_error", "mean acceleration error in that flow, after the training window",
-               float(source.unseen("acceleration_error").mean())),
-        Metric("unseen_acceleration_error", "mean acceleration error in this flow",
-               float(this.unseen("acceleration_error").mean()))]
-    part.add_figure(
-        "figure-3b-mach", "A-priori error over the Mach number (the paper's Fig. 3)", over_mach([this, source]),
-        f"Trained in {source.name} at M_t = {source.mach:.3f}. The model uses only the scales of this flow, which has "
-        f"M_t = {this.mach:.3f}. Points: mean over the unseen times of a flow; bars: smallest and largest.")
+def source_metrics(mach: float | None, errors: Table, source_mach: float | None,
+                   source_errors: Table) -> list[Metric]:
+    """Return M_t and the mean error after the training window, of this flow and of the one that the weights come from.
+
+    errors, source_errors: the tables of a-priori errors. An M_t is None for an incompressible fluid.
+    """
+    def unseen(table: Table) -> float | None:
+        chosen = table["acceleration_error"][table["delay"] > 0]
+        return float(chosen.mean()) if len(chosen) else None
+
+    incompressible, seen = "an incompressible fluid has none", "no error after the training window is stored"
+    return [Metric("mach_turbulent", "turbulent Mach number M_t", mach, incompressible),
+            Metric("source_mach_turbulent", "M_t of the flow that the model was trained on", source_mach,
+                   incompressible),
+            Metric("source_acceleration_error", "mean acceleration error in that flow, after the training window",
+                   unseen(source_errors), seen),
+            Metric("unseen_acceleration_error", "mean acceleration error in this flow", unseen(errors), seen)]
 
 
 @styled
@@ -144,7 +129,7 @@ def a_priori(table: Table, acceleration: Table, density_rate: Table | None) -> F
 
     table: columns (frames,). acceleration: truth and predicted (m, 3). density_rate: the same (m,), or None.
     """
-    figure, axes = panels(1, 2 if density_rate is None else 3, (3.9, 3.5))
+    figure, axes = panels(1, 2 if density_rate is None else 3, (3.6, 3.8), below=0.95)
     _errors_panel(axes[0, 0], table)
     for axis, sample, title, symbol in zip(axes[0, 1:], (acceleration, density_rate), ("Acceleration", "Density rate"),
                                            (r"$a$", r"$\dot\rho$")):
@@ -161,7 +146,7 @@ def _errors_panel(axis: Axes, table: Table) -> None:
     axis.axhline(1, color=GUIDE, linestyle=":", linewidth=1.2, label="no model")
     if seen:
         axis.axvspan(delay.min() - 0.03 * np.ptp(delay), 0, color="#eeeeee", zorder=0)
-        note(axis, "training", (delay.min(), 0.86), ("data", "axes fraction"), (0, 0), va="top")
+        note(axis, "training", (delay.min(), 1), ("data", "axes fraction"), (0, 0), va="top", fontsize=8)
     drawn = [each for each in ERRORS if each[0] in table]
     for column, label, colour, style, marker in drawn:
         axis.plot(delay, table[column], color=colour, linestyle=style, marker=marker, markersize=4, label=label)
@@ -169,28 +154,3 @@ def _errors_panel(axis: Axes, table: Table) -> None:
              ylim=(0, max(1.1, *(1.05 * table[column].max() for column, *_ in drawn))),
              xlabel="delay after the training window" if seen else "time after the release of the tracers")
     legend_below(axis, 1)
-
-
-@styled
-def over_mach(flows: Sequence[FlowErrors]) -> Figure:
-    """Draw the mean error over the unseen times of each flow, with bars from the smallest to the largest."""
-    figure, ((axis,),) = panels(1, 1, (5.2, 4.0))
-    flows = sorted(flows, key=lambda flow: flow.mach)
-    mach = np.array([flow.mach for flow in flows])
-    for (column, label, colour, *_), marker, apart in ((ERRORS[0], "o", 0.99), (ERRORS[-1], "s", 1.01)):
-        if any(column not in flow.table for flow in flows):
-            continue
-        errors = [flow.unseen(column) for flow in flows]
-        mean = np.array([each.mean() for each in errors])
-        spread = np.array([[each.mean() - each.min(), each.max() - each.mean()] for each in errors]).T
-        axis.errorbar(apart * mach, mean, spread, color=colour, marker=marker, markersize=5, capsize=3, linewidth=1.2,
-                      label=label)
-    axis.axhline(1, color=GUIDE, linestyle=":", linewidth=1.2)
-    note(axis, "no model", (1, 1), ("axes fraction", "data"), (-2, -11), ha="right")
-    for index, flow in enumerate(flows):
-        note(axis, flow.name, (flow.mach, 0.02 + 0.06 * index), ("data", "axes fraction"), (0, 0), ha="center")
-    axis.set(title="A-priori error", xlabel="turbulent Mach number $M_t$", ylabel="normalised L2, acceleration",
-             xscale="log", xlim=(0.7 * mach[0], mach[-1] / 0.7), ylim=(0, 1.1))
-    plain_log_ticks(axis.xaxis)
-    legend_below(axis, 2)
-    return figure

@@ -8,9 +8,9 @@ from eddies.analysis import against_truth, disorder
 from eddies.analysis.errors import normalized_l2
 from eddies.analysis.lagrangian import differences, of_both
 from eddies.analysis.pdfs import kl_divergence
-from eddies.analysis.rollout import Pair, Rollout
+from eddies.analysis.rollout import PLANES, Pair, Rollout
 from eddies.measures import MEASURES
-from eddies.report import invariants, rollout_figures
+from eddies.report import rollout_figures
 from eddies.report.page import Metric, Section
 
 MAIN = ("turnovers", "energy_ratio", "velocity_error", "spectrum_error", "velocity_kl", "acceleration_kl",
@@ -23,7 +23,6 @@ METHODS = {
                 "velocity, closure: {closure}",
 }
 WITHOUT_KERNEL = "it needs velocity gradients from the smoothing kernel, and there is no kernel.h5"
-PLANES = 4  # number of velocity planes over time
 
 
 def moved_by(attributes: Mapping[str, float | str]) -> str:
@@ -32,8 +31,11 @@ def moved_by(attributes: Mapping[str, float | str]) -> str:
     return METHODS.get(name, name).format_map(attributes)
 
 
-def section(run: Rollout) -> Section:
-    """Return the section with the paper's Figs. 4 to 9, Lagrangian statistics and disorder."""
+def section(run: Rollout, main: bool = True) -> Section:
+    """Return the section with the paper's Figs. 4 to 9, Lagrangian statistics and disorder.
+
+    Without `main` the section has all numbers, but only the figures by which variants are compared.
+    """
     steps = f"time step {float(run.attributes['time_step']):.3g}" if "time_step" in run.attributes else "without a step"
     method = moved_by(run.attributes)
     text = (f"Moved by: {method}. Integrator: {run.attributes['integrator']}, {steps}. "
@@ -63,15 +65,15 @@ def section(run: Rollout) -> Section:
                    "tracers.")
     shown.notices += _notices(run, last)
     shown.metrics.append(Metric("last_common_time", "last common time / T", last / run.turnover))
-    _add_particles(shown, run)
-    if run.reconstructions is not None:
-        _add_planes(shown, run)
-        invariants.add(shown, run)
+    _add_particles(shown, run, main)
+    if run.invariants is not None:
+        _add_planes(shown, run, main)
+        _add_invariants(shown, run, main)
     else:
         shown.metrics += [Metric(key, key.replace("_", " "), None, WITHOUT_KERNEL) for key in ("qr_kl", "qr_kl_floor")]
-    _add_spectra(shown, run)
-    _add_paths(shown, run)
-    _add_disorder(shown, run)
+    _add_spectra(shown, run, main)
+    _add_paths(shown, run, main)
+    _add_disorder(shown, run, main)
     shown.illustrations.sort(key=lambda illustration: illustration.name)
     return shown
 
@@ -111,14 +113,16 @@ def _notices(run: Rollout, last: float) -> list[str]:
     return notices
 
 
-def _add_planes(shown: Section, run: Rollout) -> None:
-    both = [(float(run.common.times[index]), *run.reconstructed(index)) for index in run.common.spread(PLANES)]
+def _add_planes(shown: Section, run: Rollout, main: bool) -> None:
+    both = [(float(run.common.times[index]), *run.both(run.planes, index)) for index in run.common.spread(PLANES)]
     planes = [Pair(time, model.velocity[0], truth.velocity[0]) for time, model, truth in both]
     shown.add_figure(
         "figure-4-velocity", "Velocity over time (the paper's Fig. 4)",
         rollout_figures.velocity_planes(planes, run.turnover),
         f"u_x in the plane z = π. Top: true tracers; bottom: model; both from {run.reconstructed_by}. "
         f"Relative difference in the last plane: {normalized_l2(planes[-1].model, planes[-1].truth):.3f}.")
+    if not main:
+        return
     time, model, truth = both[-1]
     rotation = Pair(time, model.vorticity, truth.vorticity)
     energy = Pair(time, *(np.sum(each.velocity**2, axis=0) / 2 for each in (model, truth)))
@@ -130,7 +134,25 @@ def _add_planes(shown: Section, run: Rollout) -> None:
         f"model / truth: vorticity {ratios[0]:.2f}, energy {ratios[1]:.2f}.")
 
 
-def _add_particles(shown: Section, run: Rollout) -> None:
+def _add_invariants(shown: Section, run: Rollout, main: bool) -> None:
+    """Add joint PDFs of the invariants Q and R of the velocity gradient at the last common time, and their mean motion.
+    """
+    statistics = against_truth.last_invariants(run)
+    shown.metrics += [
+        Metric("qr_kl", "KL divergence of the Q–R joint PDF", statistics.divergence),
+        Metric("qr_kl_floor", "KL divergence between two samples of the true Q–R plane, of the same size",
+               statistics.floor)]
+    flows = against_truth.conditional_flows(run, statistics.bins) if main else None
+    shown.add_figure(
+        "figure-7-invariants", "Invariants Q and R of the velocity gradient (the paper's Fig. 7)",
+        rollout_figures.invariant_plane(statistics, flows),
+        f"Joint PDF at t = {run.common.times[-1] / run.turnover:.2f} T, in steps of half a decade. KL divergence: "
+        f"{statistics.divergence:.2g}; between samples of the truth: {statistics.floor:.2g}. Orange: Vieillefosse "
+        "line. Units: the truth's ⟨Q_w⟩ = ⟨W:W⟩/2."
+        + (" Bottom: mean motion over all frames until then." if flows else ""))
+
+
+def _add_particles(shown: Section, run: Rollout, main: bool) -> None:
     errors, common = against_truth.error_series(run), run.common
     final = {name: float(values[-1]) for name, values in errors.items()}
     model = against_truth.particle_series(run.model, np.arange(run.model.times.size))
@@ -140,7 +162,8 @@ def _add_particles(shown: Section, run: Rollout) -> None:
     early = min(run.turnover / 2, float(errors["time"][-1]))
     early_error, early_without = (float(np.interp(early, errors["time"], errors[name]))
                                   for name in ("velocity_error", "no_force"))
-    pairs = {column: [run.pair(index, column) for index in common.spread(3)] for column in against_truth.EDGES}
+    times = common.spread(3) if main else [-1]
+    pairs = {column: [run.pair(index, column) for index in times] for column in against_truth.EDGES}
     floors = {column: against_truth.sampling_floor(pairs[column][-1], edges)
               for column, edges in against_truth.EDGES.items()}
     accelerations = pairs["acceleration"][-1]
@@ -174,9 +197,9 @@ def _add_particles(shown: Section, run: Rollout) -> None:
         "Dotted: an error as large as the velocity itself.")
 
 
-def _add_spectra(shown: Section, run: Rollout) -> None:
+def _add_spectra(shown: Section, run: Rollout, main: bool) -> None:
     """Add spectra; numbers are those at the last common time for which the flow's spectrum is stored."""
-    cutoff, series = run.filter_wavenumber, [run.spectra_at(index) for index in run.shown_spectra()]
+    cutoff, series = run.filter_wavenumber, [run.spectra_at(index) for index in run.shown_spectra(main)]
     last = series[-1]
     errors = {name: last.error(name, cutoff) for name in ("model", "truth")}
     shown.metrics += [
@@ -196,11 +219,13 @@ def _add_spectra(shown: Section, run: Rollout) -> None:
         f"tracers {errors['truth']:.3f}.")
 
 
-def _add_paths(shown: Section, run: Rollout) -> None:
+def _add_paths(shown: Section, run: Rollout, main: bool) -> None:
     """Add Lagrangian statistics over all common frames."""
     model, truth = of_both(run.model, run.truth, run.common, run.length)
     errors = differences(model, truth)
     shown.metrics += [Metric(key, MEASURES[key], value, "it needs several frames") for key, value in errors.items()]
+    if not main:
+        return
     shown.add_figure(
         "lagrangian", "Lagrangian statistics", rollout_figures.path_statistics(model, truth, run.turnover),
         f"Over {truth.times[-1] / run.turnover:.2f} T. A, C: correlations. D: variance of a component. B, E: second "
@@ -213,18 +238,20 @@ def _add_paths(shown: Section, run: Rollout) -> None:
             ("shape of tetrads", "tetrad_shape_error"))) + ".")
 
 
-def _add_disorder(shown: Section, run: Rollout) -> None:
+def _add_disorder(shown: Section, run: Rollout, main: bool) -> None:
     """Add distances at the last common time, and the variance of counts over all frames before the model broke."""
     both = {"model": run.model, "truth": run.truth}
     position = run.pair(-1, "position")
     distances = {name: disorder.distance_probabilities(getattr(position, name), run.length) for name in both}
-    counts = {name: disorder.count_variance_series(frames, run.before_broken(name), run.length)
-              for name, frames in both.items()}
     divergence, drift = kl_divergence(distances["truth"], distances["model"]), disorder.drifts(run)
     shown.metrics += [
         Metric("nearest_distance_kl", "KL divergence of the nearest-neighbour distance PDF", divergence),
         *(Metric(key, MEASURES[key], values) for key, values in drift.items()),
     ]
+    if not main:
+        return
+    counts = {name: disorder.count_variance_series(frames, run.before_broken(name), run.length)
+              for name, frames in both.items()}
     shown.add_figure(
         "particle-disorder", "Disorder of the particles",
         rollout_figures.particle_disorder(distances, counts, run.turnover),

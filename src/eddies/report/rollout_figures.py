@@ -1,18 +1,22 @@
-"""Figures of a rollout and the true tracers: planes, particle PDFs, spectra, errors over time, paths, disorder."""
+"""Figures of a rollout and the true tracers: the paper's Figs. 4 to 9, Lagrangian statistics, disorder."""
 
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from eddies.analysis import disorder
-from eddies.analysis.against_truth import EDGES, pdf_divergence
+from eddies.analysis.against_truth import EDGES, InvariantStatistics, pdf_divergence
 from eddies.analysis.lagrangian import PathStatistics
 from eddies.analysis.rollout import Pair, SpectraAt
-from eddies.report.figures import (DNS, FILTERED, FOURTH, GUIDE, MODEL, POSITIVE, SIGNED, TRUTH, colour_bar,
-                                   draw_pdfs, guide_power_law, largest, letter, note, number_wavenumbers, panels,
-                                   show_plane, styled)
+from eddies.analysis.velocity_gradients import ConditionalVelocity, vieillefosse_line
+from eddies.report.figures import (BAR, DNS, FILTERED, FOURTH, GUIDE, MODEL, POSITIVE, SIGNED, TRUTH, colour_bar,
+                                   draw_pdfs, guide_power_law, largest, legend_at_foot, letter, note,
+                                   number_wavenumbers, panels, plain_log_ticks, show_plane, styled)
 
+FEWEST = 8  # particles that a cell of the plane of Q and R needs before its mean motion is drawn
 LINES = {"truth": {"label": "true tracers", "color": TRUTH},
          "model": {"label": "model", "color": MODEL, "linestyle": "--"}}
 
@@ -20,7 +24,7 @@ LINES = {"truth": {"label": "true tracers", "color": TRUTH},
 @styled
 def velocity_planes(pairs: Sequence[Pair], turnover: float) -> Figure:
     """Draw u_x in planes [y, x] over time, truth above and model below, with one colour scale."""
-    figure, axes = panels(2, len(pairs), (2.7, 2.6), sharex=True, sharey=True)
+    figure, axes = panels(2, len(pairs), (2.665, 2.675), right=BAR, sharex=True, sharey=True)
     limit = largest(*(pair.truth for pair in pairs))
     for column, pair in zip(axes.T, pairs):
         image = show_plane(column[0], pair.truth, (-limit, limit), SIGNED)
@@ -37,7 +41,7 @@ def velocity_planes(pairs: Sequence[Pair], turnover: float) -> Figure:
 @styled
 def vorticity_and_energy(vorticity: Pair, energy: Pair) -> Figure:
     """Draw planes [y, x] of vorticity magnitude and kinetic energy, truth and model, with one colour scale a row."""
-    figure, axes = panels(2, 2, (3.2, 3.0), sharex=True, sharey=True)
+    figure, axes = panels(2, 2, (3.65, 3.295), right=BAR, sharex=True, sharey=True)
     for row, pair, label in zip(axes, (vorticity, energy), (r"$|\omega|$", r"$\frac{1}{2}|u|^2$")):
         limit = largest(pair.truth)
         image = show_plane(row[0], pair.truth, (0, limit), POSITIVE)
@@ -89,7 +93,12 @@ def errors_over_time(model: Mapping[str, np.ndarray], truth: Mapping[str, np.nda
 @styled
 def particle_pdfs(pairs: Mapping[str, Sequence[Pair]], turnover: float) -> Figure:
     """Draw PDFs of all components of "velocity" and "acceleration", given as a Pair of (n, 3) for each time."""
-    figure, axes = panels(2, len(pairs["velocity"]), (3.3, 2.8), sharex="row", sharey="row")
+    times = len(pairs["velocity"])
+    if times > 1:
+        figure, axes = panels(2, times, (3.5, 2.6), foot=0.3, sharex="row", sharey="row")
+    else:
+        figure, axes = panels(1, 2, (4.6, 3.0), foot=0.3)
+        axes = axes.T
     for row, quantity in zip(axes, ("velocity", "acceleration")):
         for axis, pair in zip(row, pairs[quantity]):
             draw_pdfs(axis, pair.truth, pair.model, EDGES[quantity])
@@ -97,7 +106,7 @@ def particle_pdfs(pairs: Mapping[str, Sequence[Pair]], turnover: float) -> Figur
             axis.set_title(f"$t = {pair.time / turnover:.2f}\\,T$,  KL {divergence:.2g}")
             axis.set_xlabel(f"${quantity[0]}$ / standard deviation of the truth")
         row[0].set_ylabel(f"{quantity} PDF")
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncol=3)
+    legend_at_foot(figure, axes[0, 0], 3)
     letter(axes.flat)
     return figure
 
@@ -110,7 +119,8 @@ def energy_spectra(series: Sequence[SpectraAt], flow: Mapping[str, np.ndarray], 
     `flow` is a table with time (m,), wavenumber (k,), energy and filtered (m, k). The times of the model count from
     start_time.
     """
-    figure, axes = panels(1, len(series), (3.6, 3.5), sharex=True, sharey=True)
+    size = (3.5, 3.2) if len(series) > 1 else (5.6, 3.6)
+    figure, axes = panels(1, len(series), size, foot=0.3, sharex=True, sharey=True)
     known = flow["wavenumber"] >= 1
     for axis, at in zip(axes.flat, series):
         nearest = int(np.argmin(np.abs(flow["time"] - (start_time + at.time))))
@@ -128,7 +138,7 @@ def energy_spectra(series: Sequence[SpectraAt], flow: Mapping[str, np.ndarray], 
     peak, top = max(at.truth[1:].max() for at in series), 1.5 * series[0].wavenumber[-1]
     guide_power_law(axes[0, 0], (2, min(10, 0.7 * top)), 2.2 * peak, -5 / 3, r"$k^{-5/3}$")
     axes[0, 0].set(ylabel="$E(k)$", ylim=(1e-6 * peak, 6 * peak), xlim=(0.9, max(top, 2)))
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncol=4)
+    legend_at_foot(figure, axes[0, 0], 4)
     letter(axes.flat)
     return figure
 
@@ -136,7 +146,7 @@ def energy_spectra(series: Sequence[SpectraAt], flow: Mapping[str, np.ndarray], 
 @styled
 def path_statistics(model: PathStatistics, truth: PathStatistics, turnover: float) -> Figure:
     """Draw correlations and increments of velocities, accelerations, and the spreading of pairs and tetrads."""
-    figure, axes = panels(3, 3, (3.5, 2.8))
+    figure, axes = panels(3, 3, (3.6, 2.6))
     (memory, structure, accelerations), (variance, flatness, pairs), (sizes, shapes, unused) = axes
     for run, name in ((truth, "truth"), (model, "model")):
         line, time, lags = LINES[name], run.times / turnover, run.lags / turnover
@@ -194,3 +204,65 @@ def particle_disorder(distances: Mapping[str, np.ndarray], counts: Mapping[str, 
     variance.set(title="Variance of counts", ylabel="relative to random points", xlabel="time $t/T$", ylim=(0, None))
     letter(axes.flat)
     return figure
+
+
+@styled
+def invariant_plane(statistics: InvariantStatistics,
+                    flows: tuple[ConditionalVelocity, ConditionalVelocity] | None) -> Figure:
+    """Draw joint PDFs of (R, Q), and below them the conditional mean (dR/dt, dQ/dt) from `flows` of model and truth.
+
+    Arrows show directions on the page; colour is the speed |(dR/dt, dQ/dt)| in the units of the axes.
+    """
+    names = "true tracers", "model"
+    figure, axes = panels(1 if flows is None else 2, 2, (4.3, 3.2), right=BAR + 0.1, sharex=True, sharey=True)
+    bins = statistics.bins
+    across, up = _centres(bins.third)[-2], _centres(bins.second)[-2]
+    densities = [bins.density(cells) for cells in (statistics.truth, statistics.model)]
+    # Levels are half a decade apart, from the peak of the truth down to the density of a single particle.
+    peak, single = (np.log10(extreme) for extreme in (densities[0].max(), densities[0][densities[0] > 0].min()))
+    levels = 10.0 ** (np.arange(np.floor(2 * peak), 2 * single, -1)[:8][::-1] / 2)
+    for axis, density, name in zip(axes[0], densities, names):
+        # The outer cells also count all values beyond them. An empty cell has no logarithm.
+        shown = np.maximum(density[1:-1, 1:-1], 1e-3 * levels[0])
+        filled = axis.contourf(_centres(bins.third)[1:-1], _centres(bins.second)[1:-1], shown, levels, cmap="YlGnBu",
+                               norm=LogNorm(levels[0], levels[-1]), extend="max")
+        axis.set_title(f"joint PDF, {name}")
+    bar = colour_bar(figure, filled, axes[0], "joint PDF", extend="neither")
+    bar.set_ticks(levels[::2], labels=[f"{level:.0e}" for level in levels[::2]])
+    if flows is not None:
+        speeds = np.concatenate([np.hypot(*flow.mean(FEWEST)).ravel() for flow in flows])
+        speeds = speeds[speeds > 0]
+        norm = LogNorm(*np.quantile(speeds, (0.02, 0.98))) if speeds.size else None
+        for axis, flow, name in zip(axes[1], flows[::-1], names):
+            arrows = _draw_arrows(axis, flow, norm, 0.97 * across, 0.97 * up)
+            axis.set_title(f"mean motion, {name}")
+        bar = colour_bar(figure, arrows, axes[1], "speed")
+        plain_log_ticks(bar.ax.yaxis)
+    third = np.linspace(-across, across, 401)
+    for axis in axes.flat:
+        axis.plot(third, vieillefosse_line(third), color=MODEL, linewidth=1.3)
+        axis.axhline(0, color=GUIDE, linewidth=0.6, zorder=0)
+        axis.axvline(0, color=GUIDE, linewidth=0.6, zorder=0)
+        axis.set(xlim=(-across, across), ylim=(-up, up))
+    for axis in axes[:, 0]:
+        axis.set_ylabel(r"$Q\,/\,\langle Q_w\rangle$")
+    for axis in axes[-1]:
+        axis.set_xlabel(r"$R\,/\,\langle Q_w\rangle^{3/2}$")
+    letter(axes.flat)
+    return figure
+
+
+def _draw_arrows(axis: Axes, flow: ConditionalVelocity, norm: LogNorm | None, third_limit: float, second_limit: float):
+    """Draw arrows of equal length in the cells within the limits, so that the frame cuts no arrow."""
+    third, second = np.meshgrid(_centres(flow.bins.third), _centres(flow.bins.second))
+    inside = (np.abs(third) < third_limit) & (np.abs(second) < second_limit)
+    second_rate, third_rate = (rate[inside] for rate in flow.mean(FEWEST))
+    across, up = third_rate / np.ptp(flow.bins.third), second_rate / np.ptp(flow.bins.second)
+    length = np.hypot(across, up)
+    length[length == 0] = np.nan
+    return axis.quiver(third[inside], second[inside], across / length, up / length, np.hypot(second_rate, third_rate),
+                       norm=norm, cmap="cividis", pivot="middle", scale=20, width=0.006, headwidth=4)
+
+
+def _centres(edges: np.ndarray) -> np.ndarray:
+    return (edges[1:] + edges[:-1]) / 2

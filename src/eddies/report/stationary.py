@@ -21,7 +21,7 @@ def stationary_state(statistics: Mapping[str, np.ndarray], span: StationarySpan)
 
     statistics: columns (samples,) of the whole run.
     """
-    figure, axes = panels(1, 3, (3.7, 3.2))
+    figure, axes = panels(1, 3, (3.6, 3.3), below=0.22)
     turnovers, (first, last) = statistics["turnovers"], span.columns["turnovers"][[0, -1]]
     balance, components, spectrum = axes.flat
     balance.plot(turnovers, statistics["energy"], color=DNS, label="energy")

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from matplotlib.figure import Figure
 
-from eddies.report.figures import GUIDE, letter, panels, plain_log_ticks, styled
+from eddies.report.figures import GUIDE, legend_at_foot, letter, panels, plain_log_ticks, styled
 from eddies.report.page import Metric, Section
 
 NO_CHANGE = 1e-16  # drawn for a change of 0, which a logarithmic axis cannot show
@@ -36,7 +36,7 @@ def section(found: Mapping[str, float | str], trials: Trials) -> Section:
 @styled
 def convergence(found: Mapping[str, float | str], trials: Trials, size: str) -> Figure:
     """Draw the change by halving the step over the step, and the error over the seconds of a turnover."""
-    figure, ((change, error),) = panels(1, 2, (4.6, 3.2))
+    figure, ((change, error),) = panels(1, 2, (4.6, 3.1), foot=0.3)
     for name, columns in trials.items():
         changes = np.maximum(columns["difference"][1:], NO_CHANGE)
         change.loglog(columns["size"][:-1], changes, marker="o", markersize=3, label=name)
@@ -51,6 +51,6 @@ def convergence(found: Mapping[str, float | str], trials: Trials, size: str) -> 
     for axis in (change.xaxis, change.yaxis, error.xaxis, error.yaxis):  # trials may lie close together
         low, high = axis.get_data_interval()
         axis.set_view_interval(low / 2, high * 2, ignore=True)
-    figure.legend(*change.get_legend_handles_labels(), loc="outside lower center", ncols=5)
+    legend_at_foot(figure, change, 5)
     letter((change, error))
     return figure

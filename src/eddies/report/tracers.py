@@ -61,7 +61,7 @@ def tracers(found: TracerStatistics, scales: Mapping[str, float]) -> Figure:
     viscous = scales["viscosity"] > 0
     time_unit, time_name = (scales["kolmogorov_time"], r"t_\eta") if viscous else (scales["eddy_turnover_time"], "T")
     length, length_name = (scales["kolmogorov_length"], r"\eta") if viscous else (scales["integral_scale"], "L")
-    figure, axes = panels(2, 2, (4.6, 3.1))
+    figure, axes = panels(2, 2, (4.6, 2.9))
     energy, acceleration, memory, spreading = axes.flat
     _energy_panel(energy, found, scales["eddy_turnover_time"])
     centres = (EDGES[1:] + EDGES[:-1]) / 2

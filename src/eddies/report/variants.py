@@ -122,12 +122,11 @@ def _with_spread(row: Row, column: str) -> Any:
 def scatter(table: ErrorAgainstTime, measures: Sequence[str]) -> Figure:
     """Draw error against wall seconds per turnover, with one panel for each measure."""
     columns = min(len(measures), 2)
-    size = (6.7, 5.0) if columns == 2 else (9.3, 6.0)
-    figure, axes = panels(-(-len(measures) // columns), columns, size)
+    figure, axes = panels(-(-len(measures) // columns), columns, (5.4, 4.2) if columns == 2 else (9.3, 6.0), foot=0.35)
+    FigureCanvasAgg(figure)  # measures the names of points
     for axis in axes.flat[len(measures):]:
         axis.remove()
-    used = list(zip(axes.flat, measures))
-    for axis, measure in used:
+    for axis, measure in zip(axes.flat, measures):
         _draw_panel(axis, table, measure)
     letter(axes.flat[:len(measures)])
     styles = [Line2D([], [], color=colour, marker=marker, linestyle="", label=kind)
@@ -135,17 +134,7 @@ def scatter(table: ErrorAgainstTime, measures: Sequence[str]) -> Figure:
     if table.stopped():
         styles.append(Line2D([], [], color=DNS, marker="x", linestyle="", label="unstable, at this time"))
     styles.append(Line2D([], [], color=GUIDE, linestyle="--", label="Pareto front"))
-    figure.legend(handles=styles, loc="outside lower center", ncols=min(len(styles), 5 if columns == 1 else 8))
-    FigureCanvasAgg(figure)
-    figure.draw_without_rendering()
-    figure.set_layout_engine("none")  # so that places in pixels stay the same
-    for axis, measure in used:
-        rows, stopped = table.finished(measure), table.stopped()
-        places = [(row[COST], row[measure]) for row in rows] + [(row[COST], _top(axis)) for row in stopped]
-        names = [row["label"] for row in rows] + [f"{row['label']} {row['stopped_at']:.2g} T" for row in stopped]
-        bold = [row["name"] == table.subject for row in [*rows, *stopped]]
-        if places:
-            name_points(axis, axis.transData.transform(places), names, bold)
+    figure.legend(handles=styles, loc="lower center", ncols=8, columnspacing=1.2, handletextpad=0.4)
     return figure
 
 
@@ -153,7 +142,8 @@ def _draw_panel(axis: Axes, table: ErrorAgainstTime, measure: str) -> None:
     rows, stopped = table.finished(measure), table.stopped()
     axis.set_xscale("log")
     axis.set_yscale("log")
-    _set_limits(axis, [row[COST] for row in [*rows, *stopped]], [row[measure] for row in rows])
+    costs = [row[key] for row in [*rows, *stopped] for key in (COST, "wall_seconds_low", "wall_seconds_high")]
+    _set_limits(axis, costs, [row[measure] for row in rows])
     for row in rows:
         colour, marker = table.looks[row["kind"]]
         chosen = row["name"] == table.subject
@@ -169,6 +159,10 @@ def _draw_panel(axis: Axes, table: ErrorAgainstTime, measure: str) -> None:
     axis.plot([rows[index][COST] for index in front], [rows[index][measure] for index in front], color=GUIDE,
               linestyle="--", linewidth=1.2, zorder=1)
     axis.set(xlabel="wall seconds per turnover T", ylabel=in_symbols(MEASURES[measure]))
+    places = [(row[COST], row[measure]) for row in rows] + [(row[COST], _top(axis)) for row in stopped]
+    names = [row["label"] for row in rows] + [f"{row['label']} {row['stopped_at']:.2g} T" for row in stopped]
+    if places:
+        name_points(axis, places, names, [row["name"] == table.subject for row in [*rows, *stopped]])
 
 
 def in_symbols(words: str) -> str:
@@ -193,29 +187,26 @@ def _top(axis: Axes) -> float:
 
 
 def name_points(axis: Axes, points: np.ndarray, names: Sequence[str], bold: Sequence[bool]) -> list[Bbox]:
-    """Write a name beside each point (n, 2), in pixels, and return the boxes of the names, in pixels.
+    """Write a name beside each point (n, 2) of a panel with fixed limits, and return the boxes of the names, in pixels.
 
     Each name takes the nearest height, to the right or left of its point, at which it covers no other name or point. A
-    thin line ties a name that is far away to its point. The layout of the figure must be fixed.
+    thin line ties a name that is far away to its point.
     """
-    renderer, scale, boxes = axis.figure.canvas.get_renderer(), axis.figure.dpi / 72, []
-    taken = [Bbox([point - 5 * scale, point + 5 * scale]) for point in points]
+    renderer, reach, frame = axis.figure.canvas.get_renderer(), 5 * axis.figure.dpi / 72, axis.bbox
+    taken = [Bbox([pixel - reach, pixel + reach]) for pixel in axis.transData.transform(points)]
     heights = sorted(range(-150, 151, 3), key=abs)
+    line = {"arrowstyle": "-", "color": "#8a8a8a", "linewidth": 0.6, "shrinkA": 0, "shrinkB": 3}
     for point, name, heavy in zip(points, names, bold):
-        line = {"arrowstyle": "-", "color": "#8a8a8a", "linewidth": 0.6, "shrinkA": 0, "shrinkB": 3}
-        text = axis.annotate(name, point, xycoords="figure pixels", xytext=(0, 0), textcoords="offset points",
-                             va="center", fontsize=8.5, fontweight="bold" if heavy else "normal", arrowprops=line,
-                             path_effects=[patheffects.withStroke(linewidth=2, foreground="white")], zorder=5,
-                             annotation_clip=False)
+        text = axis.annotate(name, point, xytext=(0, 0), textcoords="offset points", va="center", fontsize=8.5,
+                             fontweight="bold" if heavy else "normal", arrowprops=line, annotation_clip=False, zorder=5,
+                             path_effects=[patheffects.withStroke(linewidth=2, foreground="white")])
         for height, (side, alignment) in product(heights, ((1, "left"), (-1, "right"))):
             text.set(position=(side * (8 + abs(height) / 4), height), horizontalalignment=alignment)
             text.update_positions(renderer)
             box = Text.get_window_extent(text)  # that of the annotation includes the line
-            free = not any(box.overlaps(other) for other in taken)
-            if free and axis.bbox.x0 <= box.x0 and box.x1 <= axis.bbox.x1 and (
-                    axis.bbox.y0 <= box.y0 and box.y1 <= axis.bbox.y1):
+            inside = frame.x0 <= box.x0 and box.x1 <= frame.x1 and frame.y0 <= box.y0 and box.y1 <= frame.y1
+            if inside and not any(box.overlaps(other) for other in taken):
                 break
         text.arrow_patch.set_visible(abs(height) > 9)
         taken.append(box)
-        boxes.append(box)
-    return boxes
+    return taken[len(points):]

@@ -33,8 +33,8 @@ TEXTBOOK = {"cubic_spline": "cubic spline", "wendland": "Wendland kernel"}
 class Judged:
     """A number and its mark.
 
-    `error` is compared with the two `limits`. `within` writes a limit for the table. `words` name the number in the
-    table, `short` names it in sentences. `beside` describes the baseline.
+    `error` is compared with the largest error that is good and the largest that is fair. `within` writes these limits
+    for the table. `words` name the number in the table, `short` names it in sentences, `beside` describes the baseline.
     """
 
     key: str
@@ -42,7 +42,8 @@ class Judged:
     short: str
     value: float
     error: float
-    limits: tuple[float, float]
+    good: float
+    fair: float
     beside: str = ""
     within: str = "≤{:.2g}"
     judged: bool = True
@@ -52,14 +53,14 @@ class Judged:
         """good, fair, poor, or "not judged"."""
         if not self.judged:
             return "not judged"
-        return GOOD if self.error <= self.limits[0] else FAIR if self.error <= self.limits[1] else POOR
+        return GOOD if self.error <= self.good else FAIR if self.error <= self.fair else POOR
 
     @property
     def metric(self) -> Metric:
         """A row of the table."""
-        good, fair = (self.within.format(limit) for limit in self.limits)
-        return Metric(self.key, self.words, {"this run": self.value, "verdict": self.mark, "beside it": self.beside,
-                                             "good": good, "fair": fair})
+        return Metric(self.key, self.words, {
+            "this run": self.value, "verdict": self.mark, "beside it": self.beside,
+            "good": self.within.format(self.good), "fair": self.within.format(self.fair)})
 
 
 def arranged(sections: Sequence[Section], warned: bool) -> list[Section]:
@@ -80,7 +81,7 @@ def section(sections: Mapping[str, Section], warned: bool) -> Section:
     numbers = {key: {metric.key: metric.value for metric in each.metrics} for key, each in sections.items()}
     rollout, model, kernel = (numbers.get(key, {}) for key in ("rollout", "model", "kernel"))
     of_rollout, of_model, of_kernel = [*_rollout(rollout)], [*_model(model)], [*_kernel(kernel)]
-    text = [*_on_rollout(rollout, of_rollout),
+    text = [*_sentences(rollout, of_rollout),
             *(f"Model: {each.short} {each.value:.2g}, {each.mark} ({each.beside})." for each in of_model),
             *(f"Learned kernel: {each.short} {each.value:.2g}, {KERNEL_WORDS[each.mark]} the "
               f"{each.beside.replace(': ', ' (')})." for each in of_kernel)]
@@ -92,19 +93,16 @@ def section(sections: Mapping[str, Section], warned: bool) -> Section:
     return Section(KEY, "Verdict", " ".join(text), metrics=[each.metric for each in of_rollout + of_model + of_kernel])
 
 
-def _on_rollout(numbers: Mapping[str, Any], judged: Sequence[Judged]) -> Iterator[str]:
+def _sentences(numbers: Mapping[str, Any], judged: Sequence[Judged]) -> Iterator[str]:
     """Yield sentences on the rollout."""
     if not numbers:
         yield "There is no rollout to judge."
         return
     if not numbers.get("stable"):
         yield f"Poor: the rollout did not reach its end ({numbers.get('status')}). Only earlier frames are compared."
-    if numbers.get("two_flows"):
-        yield ("The rollout is not judged by the true tracers: its forcing differs from theirs, so they are in two "
-               "different flows.")
-        return
     if not judged:
-        yield "The rollout cannot be compared with the truth."
+        yield ("The rollout is not judged by the true tracers: its forcing differs from theirs, so they are in two "
+               "different flows." if numbers.get("two_flows") else "The rollout cannot be compared with the truth.")
         return
     marked = {mark: [each.short for each in judged if each.mark == mark] for mark in (POOR, FAIR, GOOD)}
     worst_first = [f"{mark} in {', '.join(names)}" for mark, names in marked.items() if names]
@@ -117,25 +115,24 @@ def _on_rollout(numbers: Mapping[str, Any], judged: Sequence[Judged]) -> Iterato
 
 
 def _rollout(numbers: Mapping[str, Any]) -> Iterator[Judged]:
-    if numbers.get("two_flows"):
+    if numbers.get("two_flows") or numbers.get("energy_ratio") is None:
         return
-    error, without = numbers.get("early_velocity_error"), numbers.get("early_velocity_error_no_force")
+    error, without = numbers["early_velocity_error"], numbers["early_velocity_error_no_force"]
     if error is not None and without:
-        limits = (BESIDE_NO_FORCE[0] * without, BESIDE_NO_FORCE[1] * without)
         yield Judged("velocity", f"velocity error by particle after {numbers['early_time']:.2g} T", "velocities", error,
-                     error, limits, f"no force: {without:.2g}", judged=without >= LEAST_BASELINE)
-    ratio, without = numbers.get("energy_ratio"), numbers.get("energy_ratio_no_force")
-    if ratio is not None:
-        yield Judged("energy", "kinetic energy at the end, model / truth", "energy", ratio, abs(ratio - 1), ENERGY,
-                     "" if without is None else f"no force: {without:.3g}", "±{:.2g}")
+                     error, *(limit * without for limit in BESIDE_NO_FORCE), f"no force: {without:.2g}",
+                     judged=without >= LEAST_BASELINE)
+    ratio = numbers["energy_ratio"]
+    yield Judged("energy", "kinetic energy at the end, model / truth", "energy", ratio, abs(ratio - 1), *ENERGY,
+                 f"no force: {numbers['energy_ratio_no_force']:.3g}", "±{:.2g}")
     for key, words, short, limits in (
             ("spectrum_error", "spectrum error at the end, rms of ln(E/E_filtered)", "spectrum", SPECTRUM),
             ("acceleration_kl", "KL divergence of accelerations at the end", "accelerations", DIVERGENCE),
             ("qr_kl", "KL divergence of the Q–R plane at the end", "velocity gradients", DIVERGENCE)):
-        error, floor = numbers.get(key), numbers.get(f"{key}_floor")
-        if error is not None:
-            raised = tuple(max(limit, times * (floor or 0.0)) for limit, times in zip(limits, FLOORS))
-            yield Judged(key, words, short, error, error, raised, "" if floor is None else f"truth itself: {floor:.2g}")
+        error, floor = numbers[key], numbers[f"{key}_floor"]
+        if None not in (error, floor):
+            yield Judged(key, words, short, error, error, *(max(limit, times * floor) for limit, times in zip(
+                limits, FLOORS)), f"truth itself: {floor:.2g}")
 
 
 def _model(numbers: Mapping[str, Any]) -> Iterator[Judged]:
@@ -144,17 +141,17 @@ def _model(numbers: Mapping[str, Any]) -> Iterator[Judged]:
         baseline, beside = 1.0, "no model: 1"
         if gradient is not None and gradient < 1:
             baseline, beside = gradient, f"exact filtered pressure gradient: {gradient:.2g}"
-        limits = (BESIDE_GRADIENT[0] * baseline, BESIDE_GRADIENT[1] * baseline)
         yield Judged("acceleration_error", "model: acceleration error at the true state",
-                     "acceleration error at the true state", error, error, limits, beside)
+                     "acceleration error at the true state", error, error,
+                     *(limit * baseline for limit in BESIDE_GRADIENT), beside)
 
 
 def _kernel(numbers: Mapping[str, Any]) -> Iterator[Judged]:
     for field in ("velocity", "gradient"):
-        known = {key: numbers[f"{key}_{field}_error"] for key in TEXTBOOK if numbers.get(f"{key}_{field}_error")}
+        baselines = {words: numbers[f"{key}_{field}_error"] for key, words in TEXTBOOK.items()
+                     if numbers.get(f"{key}_{field}_error")}
         error = numbers.get(f"{field}_error")
-        if error is not None and known:
-            best = min(known, key=lambda key: known[key])
-            limits = (BESIDE_TEXTBOOK[0] * known[best], BESIDE_TEXTBOOK[1] * known[best])
+        if error is not None and baselines:
+            best = min(baselines, key=baselines.get)
             yield Judged(f"kernel_{field}_error", f"kernel: error of the {field} field", f"{field} error", error, error,
-                         limits, f"{TEXTBOOK[best]}: {known[best]:.2g}")
+                         *(limit * baselines[best] for limit in BESIDE_TEXTBOOK), f"{best}: {baselines[best]:.2g}")

@@ -44,6 +44,7 @@ from eddies.workflows.variant_rows import COLUMNS, ROLLOUT, machine, notes, numb
 from eddies.workflows.variants import Place, rollouts
 
 if TYPE_CHECKING:
+    from eddies.analysis.rollout import Rollout
     from eddies.workflows.rollout.measured import MeasuredRollout  # needs torch
 
 log = logging.getLogger("eddies")
@@ -178,55 +179,63 @@ def _make(stored: Run, comm: Comm, alone: Comm, stop: StopRequest,
           draw: bool = True) -> tuple[dict[str, Page], dict[str, Row]]:
     """Make the pages and the rows of all variants. Return the pages that this rank made, and all rows.
 
-    The variants are taken in groups of as many as there are ranks. All ranks measure the rollouts of a group together;
-    then each rank makes the page and the row of one variant. Raises Stopped, between groups, when `stop` asks for it.
+    All ranks measure each rollout together, for the rank that makes its page and its row. Raises Stopped, between
+    rollouts, when `stop` asks for it.
     """
     names = list(stored.pages) + [name for name in stored.places if name not in stored.pages]
-    made, rows, truths, scanned = {}, {}, {}, {}
-
-    def make(name: str, measured: Sequence[MeasuredRollout]) -> None:
-        if name in stored.pages:
-            page = read_page(stored.pages[name], alone, measured[0] if measured else None, scanned, name != names[0])
-            if draw:
-                page.draw(page.sections)
-            made[name] = page
-        if stored.main:
-            places = stored.places[name]
-            realised = [numbers(each) for each in measured] if len(measured) == len(places) else []
-            rows[name] = row(stored.scene, name, places, realised, alone)
-
-    for start in range(0, len(names), comm.size):
-        group = names[start:start + comm.size]
-        with ExitStack() as files:
-            measured: dict[str, list[MeasuredRollout]] = {name: [] for name in group}
-            for root, name in enumerate(group):
-                for where in stored.measured(name):
-                    from eddies.workflows.rollout.measured import open_together  # needs torch
-                    opened = files.enter_context(open_together(where, comm, alone))
-                    opened.measure(comm, root, where == stored.pages.get(name), truths)
-                    measured[name].append(opened)
+    makers, made, rows, truths, scanned = _makers(names, comm.size), {}, {}, {}, {}
+    with ExitStack() as files:
+        measured: dict[str, list[MeasuredRollout]] = {name: [] for name in names}
+        for name in names:
+            for where in stored.measured(name):
+                from eddies.workflows.rollout.measured import open_together  # needs torch
+                opened = files.enter_context(open_together(where, comm, alone))
+                shown = where == stored.pages.get(name)
+                opened.measure(comm, makers[name], shown, shown and name == stored.main, truths)
+                measured[name].append(opened)
             stop.check()
-            on_all_ranks(comm, lambda: [in_files(alone, stored.directory, lambda: make(name, measured[name]))
-                                        for name in group[comm.rank:comm.rank + 1]], ProductError)
+
+        def make(name: str) -> None:
+            if name in stored.pages:
+                page = made[name] = read_page(stored.pages[name], alone, next(iter(measured[name]), None), scanned,
+                                              main=name == stored.main)
+                if draw:
+                    page.draw(page.sections)
+            if stored.main:
+                places = stored.places[name]
+                realised = [numbers(each) for each in measured[name]] if len(measured[name]) == len(places) else []
+                rows[name] = row(stored.scene, name, places, realised, alone)
+
+        on_all_ranks(comm, lambda: [in_files(alone, stored.directory, lambda: make(name))
+                                    for name in names if makers[name] == comm.rank], ProductError)
     return made, {name: found for part in comm.allgather(rows) for name, found in part.items()}
 
 
+def _makers(names: Sequence[str], ranks: int) -> dict[str, int]:
+    """Return the rank that makes each page. The main page, the first, takes about as long as three others."""
+    found, load = {}, [0] * ranks
+    for number, name in enumerate(names):
+        found[name] = load.index(min(load))
+        load[found[name]] += 1 if number else 3
+    return found
+
+
 def read_page(directory: Path, alone: Comm, measured: MeasuredRollout | None, scanned: dict[Path, str],
-              own: bool) -> Page:
+              main: bool) -> Page:
     """Read the products of a run directory and return its page, with figures that are not drawn.
 
-    scanned: results of the search for numbers that are not finite, by file, which are used and added to. own: make no
-    sections on products that are links to other directories.
+    scanned: results of the search for numbers that are not finite, by file, which are used and added to. The main page
+    shows everything. Others have fewer figures, and no sections on products that are links to other directories.
     """
     page = Page(directory, read_stage_seconds(directory))
     readers = {
         "ground_truth": _ground_truth_sections,
         "kernel": lambda file, page: [kernel.section(read_json(file, "description")["support"], **{
-            name: read_table(file, name) for name in ("kernels", "slices", "errors", "history")})],
-        "model": _model_sections,
+            name: read_table(file, name) for name in ("kernels", "slices", "errors")})],
+        "model": lambda file, page: [_model_section(file, page, main)],
         "step": lambda file, page: [steps.section(read_attributes(file, "found"), {
             name: read_table(file, f"trials/{name}") for name in file["trials"]})],
-        "rollout": lambda file, page: _rollout_sections(measured.rollout, page)}
+        "rollout": lambda file, page: _rollout_sections(measured.rollout, page, main)}
     for kind in KINDS:
         path = directory / f"{kind}.h5"
         if not path.exists():
@@ -241,7 +250,7 @@ def read_page(directory: Path, alone: Comm, measured: MeasuredRollout | None, sc
             if kind == "ground_truth" and "stationary" in file:
                 with contextlib.suppress(ProductError):  # its section says so
                     page.stationary = read_stationary_span(file)
-            if not (own and path.is_symlink()):
+            if main or not path.is_symlink():
                 page.sections += _sections_or_notice(kind, page, lambda: readers[kind](file, page))
     if not page.provenance:
         raise ProductError(f"{directory}: holds none of {', '.join(f'{kind}.h5' for kind in KINDS)}; "
@@ -302,7 +311,7 @@ def _ground_truth_sections(file: File, page: Page) -> list[Section]:
     return sections
 
 
-def _model_sections(file: File, page: Page) -> list[Section]:
+def _model_section(file: File, page: Page, main: bool) -> Section:
     provenance = page.provenance["model"]
     tables = {name: read_table(file, name) if name in file else None for name in (
         "a_priori", "acceleration_sample", "density_rate_sample", "history", "source_a_priori")}
@@ -311,15 +320,16 @@ def _model_sections(file: File, page: Page) -> list[Section]:
         others = [path if reached is None else f"{path} (M_t = {reached:.3f})"
                   for path, reached in source["truths"].items()]
     part = model.section(read_json(file, "description"), tables["a_priori"], tables["acceleration_sample"],
-                         tables["density_rate_sample"], tables["history"], source and source["path"], others)
+                         tables["density_rate_sample"], tables["history"] if main else None,
+                         source and source["path"], others)
     if source and tables["source_a_priori"] is not None:
-        model.add_source(part, model.FlowErrors("this flow", provenance["mach_turbulent"], tables["a_priori"]),
-                         model.FlowErrors(source["path"], source["mach_turbulent"], tables["source_a_priori"]))
-    return [part]
+        part.metrics += model.source_metrics(provenance["mach_turbulent"], tables["a_priori"],
+                                             source["mach_turbulent"], tables["source_a_priori"])
+    return part
 
 
-def _rollout_sections(measured: Any, page: Page) -> list[Section]:
-    sections = [rollout.section(measured)]
+def _rollout_sections(measured: Rollout, page: Page, main: bool) -> list[Section]:
+    sections = [rollout.section(measured, main)]
     if measured.forced and page.stationary is not None and len(measured.truth.times):
         sections.append(forced.section(measured, page.stationary))
     return sections

@@ -45,10 +45,10 @@ def values_of(run):
     """All measures that a rollout holds, as bytes, by quantity, name and frame."""
     found = {("spectra", of, frame): energy.tobytes()
              for of in run.spectra for frame, energy in run.spectra[of].items()}
-    for of in run.reconstructions:
-        for frame, each in run.reconstructions[of].items():
-            found["reconstructions", of, frame] = b"".join(np.asarray(value).tobytes() for value in (
-                each.invariants.second, each.invariants.third, each.invariants.scale, each.velocity, each.vorticity))
+    for quantity in ("invariants", "planes"):
+        for of, by_frame in getattr(run, quantity).items():
+            for frame, each in by_frame.items():
+                found[quantity, of, frame] = b"".join(np.asarray(value).tobytes() for value in vars(each).values())
     return found
 
 
@@ -83,18 +83,19 @@ def test_ranks_that_share_the_work_find_what_one_finds(comm, directory):
             for quantity, of, frame in found:
                 getattr(run, quantity)[of][frame]
             assert values_of(run) == found
-        # Spectra of three frames and of the second half of the model; reconstructions of all frames.
+        # Spectra of three frames and of the second half of the model; gradients of all frames; four planes.
         assert {frame for quantity, of, frame in found if (quantity, of) == ("spectra", "truth")} == {0, 2, 4}
         assert {frame for quantity, of, frame in found if (quantity, of) == ("spectra", "model")} == {0, 2, 4, 6, 7, 8}
         for of, count in (("model", 9), ("truth", 6)):
-            assert sum((quantity, whose) == ("reconstructions", of) for quantity, whose, _ in found) == count
+            assert sum((quantity, whose) == ("invariants", of) for quantity, whose, _ in found) == count
+            assert sum((quantity, whose) == ("planes", of) for quantity, whose, _ in found) == 4
     comm.Barrier()
 
 
 @pytest.mark.mpi(1)
 def test_accuracy_needs_no_more_than_the_last_frame(comm, directory, work):
     with open_rollout(directory, comm) as measured:
-        measured.measure(comm, whole=False)
+        measured.measure(comm, page=False, every_frame=False)
         assert sorted(set(work)) == [("model", 5), ("truth", 5)]
         before = list(work)
         found = accuracy(measured.rollout)
@@ -152,7 +153,7 @@ def test_without_ground_truth_or_kernel_there_are_fewer_measures(comm, directory
     (directory / "kernel.h5").unlink()
     with open_rollout(directory, comm) as measured:
         measured.measure(comm)
-        assert measured.rollout.reconstructions is None and measured.exported["fields"] == {}
+        assert measured.rollout.invariants is None and measured.exported["fields"] == {}
         assert set(measured.groups) == {"particles/truth", "spectra_of_model", "spectra_of_truth"}
         assert accuracy(measured.rollout)["qr_kl"] is None
     (directory / "ground_truth.h5").unlink()

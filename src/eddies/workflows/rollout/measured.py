@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from eddies.analysis.rollout import Reconstruction, Rollout
+from eddies.analysis.rollout import PLANES, Plane, Rollout
 from eddies.analysis.velocity_gradients import Invariants
 from eddies.io.hdf5 import ProductError, open_product, read_attributes, read_table
 from eddies.io.provenance import read_provenance
@@ -27,7 +27,7 @@ from eddies.workflows.rollout.particle_measures import (GRADIENT, FieldsOfPartic
 
 log = logging.getLogger("eddies")
 
-Task = tuple[str, str, int]  # "spectra" or "reconstructions", "model" or "truth", frame
+Task = tuple[str, str, int]  # "spectra", "invariants" or "planes", "model" or "truth", frame
 #: Measures of true tracers by ground truth, kernel, quantity and frame. The rank that measured one holds its value, the
 #: others hold None.
 TruthMeasures = dict[tuple[Path, Path | None, str, int], Any]
@@ -144,20 +144,25 @@ class MeasuredRollout:
                                                   lambda frame, run=run: self.fields.gradients(run, frame))
         return found
 
-    def measure(self, comm: Comm, root: int = 0, whole: bool = True, known: TruthMeasures | None = None) -> None:
+    def measure(self, comm: Comm, root: int = 0, page: bool = True, every_frame: bool = True,
+                known: TruthMeasures | None = None) -> None:
         """Measure a share of the frames on each rank and collect everything on rank `root`; all ranks call it.
 
-        whole: measure what the page shows, otherwise only what `accuracy` needs. known: measures of true tracers from
-        earlier calls, which are used and added to. ProductError on all ranks if one of them cannot read a frame.
+        page: measure what a page shows, otherwise only what `accuracy` needs. every_frame: for a main page, measure the
+        velocity gradient at all common frames and spectra at several. known: measures of true tracers from earlier
+        calls, which are used and added to. ProductError on all ranks if one of them cannot read a frame.
         """
         if self._solver is None:
             return
         known = {} if known is None else known
         prepare_torch("cpu", comm)
-        tasks = on_all_ranks(comm, lambda: self._tasks(whole), ProductError)
+        tasks = on_all_ranks(comm, lambda: self._tasks(page, every_frame), ProductError)
         new = [task for task in tasks if self._key(task) not in known]
         own = on_all_ranks(comm, lambda: {(quantity, of, frame): getattr(self.rollout, quantity)[of][frame]
                                           for quantity, of, frame in new[comm.rank::comm.size]}, ProductError)
+        for maker in (self._solver, self.fields):
+            if maker is not None:
+                maker.forget()  # many rollouts are open at a time
         for task in new:
             if task[1] == "truth":
                 known[self._key(task)] = own.get(task)
@@ -169,23 +174,24 @@ class MeasuredRollout:
         if complaints and comm.rank == 0:
             log.info("report: %s", complaints[0] + (f" ({len(complaints)} such solves)" if complaints[1:] else ""))
 
-    def _tasks(self, whole: bool) -> list[Task]:
+    def _tasks(self, page: bool, every_frame: bool) -> list[Task]:
         """List the measures to make; empty if nothing is compared."""
         run = self.rollout
         try:
             common = run.common
         except ValueError:
             return []
-        last = len(common.times) - 1
-        shown = run.shown_spectra() if whole else np.intersect1d(run.spectral(), last)
-        frames = {"model": common.model, "truth": common.truth}
-        tasks = [("spectra", of, int(frame)) for of in frames for frame in frames[of][shown]]
-        if whole and run.forced and self._stationary:
-            tasks += [("spectra", "model", int(frame)) for frame in run.late_spectra()]
+        every = np.arange(len(common.times))
+        chosen = {"spectra": run.shown_spectra(every_frame) if page else np.intersect1d(run.spectral(), every[-1])}
         if self.fields is not None:
-            beyond = whole and run.forced and self._stationary  # the forced section also uses later frames
-            tasks += [("reconstructions", of, int(frame)) for of in frames
-                      for frame in (run.before_broken(of) if beyond else frames[of] if whole else frames[of][-1:])]
+            chosen["invariants"] = every if every_frame else every[-1:]
+            chosen["planes"] = common.spread(PLANES if page else 0)
+        tasks = [(quantity, of, int(frame)) for quantity, rows in chosen.items()
+                 for of, frames in (("model", common.model), ("truth", common.truth)) for frame in frames[rows]]
+        if page and run.forced and self._stationary:
+            tasks += [("spectra", "model", int(frame)) for frame in run.late_spectra()]
+            if self.fields is not None:
+                tasks += [("invariants", "truth", 0), *(("invariants", "model", int(frame)) for frame in run.late)]
         return list(dict.fromkeys(tasks))
 
     def _key(self, task: Task) -> Any:
@@ -193,7 +199,7 @@ class MeasuredRollout:
         quantity, of, frame = task
         if of == "model":
             return task
-        kernel = (self._directory / "kernel.h5").resolve() if quantity == "reconstructions" else None
+        kernel = (self._directory / "kernel.h5").resolve() if quantity != "spectra" else None
         return (self._directory / "ground_truth.h5").resolve(), kernel, quantity, int(self.rollout.truth.frames[frame])
 
 
@@ -238,10 +244,12 @@ def open_rollout(directory: Path, alone: Comm) -> Iterator[MeasuredRollout]:
         solver = ParticleSpectra(ground.scales, model.length, alone)
         both = {"model": model, "truth": truth}
         spectra = {name: OnDemand(lambda frame, name=name: solver.of(both[name], frame, name)) for name in both}
-        reconstructions = None if fields is None else {
-            name: OnDemand(lambda frame, run=run: Reconstruction(
-                Invariants.of(fields.gradients(run, frame)), *fields.plane(run, frame)))
-            for name, run in both.items()}
+        invariants = planes = None
+        if fields is not None:
+            invariants = {name: OnDemand(lambda frame, run=run: Invariants.of(fields.gradients(run, frame)))
+                          for name, run in both.items()}
+            planes = {name: OnDemand(lambda frame, run=run: Plane(*fields.plane(run, frame)))
+                      for name, run in both.items()}
         rollout = Rollout(attributes, model, truth, model.length, read_table(truth_file, "spectra"), ground.reference,
-                          spectra, reconstructions, **tables, reconstructed_by=fields.form.words if fields else "")
+                          spectra, invariants, planes, **tables, reconstructed_by=fields.form.words if fields else "")
         yield MeasuredRollout(rollout, provenance, directory, fields, solver, "stationary" in truth_file)

@@ -55,6 +55,10 @@ class FieldsOfParticles:
         vorticity = antisymmetric.square().sum((1, 2)).div(2).sqrt()
         return self._by_component(velocity, 2), as_numpy(vorticity).reshape([self.slab.planes] * 2)
 
+    def forget(self) -> None:
+        """Free the results that are kept."""
+        self._kept.clear()
+
     def _once(self, name: str, particles: Frames, frame: int, make: Callable[[], Any]) -> Any:
         key = id(particles), frame
         if name not in self._kept or self._kept[name][0] != key:
@@ -129,6 +133,10 @@ class ParticleSpectra:
         found = ResolvedVelocity.on_slabs(SlabDecomposition(self.alone, self.length, cells), units, dtype=torch.float32)
         found.most_iterations = MOST_ITERATIONS
         return found
+
+    def forget(self) -> None:
+        """Free the grid of the solves; it is made again when it is needed."""
+        self.__dict__.pop("_resolution", None)
 
     def of(self, particles: Frames, frame: int, whose: str) -> np.ndarray:
         """E(k) of the shells 0, 1, ... whose modes are all resolved, at least two. `whose` names the particles."""
