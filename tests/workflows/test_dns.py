@@ -175,8 +175,8 @@ def test_an_incompressible_start_from_a_compressible_flow_is_solenoidal(comm, fo
     sound = ["initial.kind=sound-wave", "initial.amplitude=0.01", "flow.fluid=compressible", "flow.sound_speed=10"]
     path = followed("sound", load_scene("taylor-green", small + sound))
     scene = load_scene("taylor-green", [*small, "initial.kind=file", f"initial.path={path}"])
-    fluid = build_fluid(scene, comm)
-    state = initial_state(scene, fluid)
+    fluid = build_fluid(scene.flow, scene.forcing, comm)
+    state = initial_state(scene.initial, scene.seed, fluid)
     assert np.abs(fluid.grid.divergence(state)).max(initial=0) < 1e-16
 
 
@@ -233,11 +233,11 @@ def test_a_start_of_the_users_that_is_no_velocity_and_one_that_makes_no_sound(co
     own("own_flow", OWN_FLOW)
     scene = load_scene("taylor-green", [*OWN, "initial.kind=own_flow:flat"])
     with pytest.raises(SceneError, match=r"returned an array \(3, 4, 4, 3\)"):
-        initial_state(scene, build_fluid(scene, comm))
+        initial_state(scene.initial, scene.seed, build_fluid(scene.flow, scene.forcing, comm))
     scene = load_scene("taylor-green", ["flow.cells=16", "flow.fluid=compressible", "flow.sound_speed=10",
                                         "initial.kind=own_flow:jet"])
-    fluid = build_fluid(scene, comm)
-    state = initial_state(scene, fluid)
+    fluid = build_fluid(scene.flow, scene.forcing, comm)
+    state = initial_state(scene.initial, scene.seed, fluid)
     assert state.shape == (4, *fluid.grid.spectral_shape) and np.abs(state[3]).max() < 1e-16  # a jet has no pressure
 
 

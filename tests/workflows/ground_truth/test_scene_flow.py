@@ -62,8 +62,8 @@ def start(comm, path, *overrides):
     """Fluid and state at time 0 of a scene that starts from a file."""
     comm.Barrier()
     scene = load_scene("taylor-green", [f"flow.cells={CELLS}", "initial.kind=file", f"initial.path={path}", *overrides])
-    fluid = build_fluid(scene, comm)
-    return fluid, initial_state(scene, fluid)
+    fluid = build_fluid(scene.flow, scene.forcing, comm)
+    return fluid, initial_state(scene.initial, scene.seed, fluid)
 
 
 @pytest.fixture

@@ -98,7 +98,9 @@ def most_disk(work: Iterable[tuple[Scene, str]]) -> float:
 
 def trajectory_bytes(scene: Scene, frames: int) -> int:
     """Size of frames of tracers (position, velocity, images of the box and density) and of filtered fields."""
-    tracers, whole = scene.tracers, whole_cells(largest_wavenumber(scene)) ** 3 * len(whole_frames(scene, frames))
+    tracers = scene.tracers
+    stored = whole_frames(scene.simulation, scene.training, tracers.field_every, frames)
+    whole = whole_cells(largest_wavenumber(scene)) ** 3 * len(stored)
     points = tracers.cells**3 * math.ceil(frames / tracers.field_every) + whole
     return frames * tracers.particles * (2 * 24 + 6 + 8 * scene.flow.compressible) + 4 * fields(scene) * points
 

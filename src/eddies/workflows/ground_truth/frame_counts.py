@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from eddies.scene.scene import Scene, SceneError, Training
+from eddies.scene.scene import Scene, SceneError, Simulation, Tracers, Training
 
 HELD_OUT = 0.1               # share of the training window that validates, at its end; at least the longest horizon
 KERNEL_FIELDS = 4            # filtered fields that the kernel is trained on
@@ -24,7 +24,7 @@ def check_frames(stages: Sequence[str], scene: Scene, seen: float, frames: int) 
             trained_frames(scene.training, frames, at_fields)
         between_frames(frames, at_fields)
     if "simulate" in stages:
-        rollout_start(scene, seen, frames, at_fields)
+        rollout_start(scene.simulation, scene.tracers, seen, frames, at_fields)
 
 
 def last_seen(window: float, frames: int) -> int:
@@ -69,25 +69,27 @@ def between_frames(frames: int, at_fields: Sequence[int]) -> list[int]:
     return usable
 
 
-def rollout_start(scene: Scene, seen: float, frames: int, at_fields: Sequence[int]) -> int:
-    """The first frame with a filtered field at or after the start that the scene asks for, or after the part that the
-    model was trained on. Raises SceneError without a later frame to compare with."""
-    wanted = _frame_at(scene.simulation.start, seen, frames)
-    last = frames - 2 - round(scene.simulation.frame_interval / scene.tracers.frame_interval)
+def rollout_start(settings: Simulation, tracers: Tracers, seen: float, frames: int, at_fields: Sequence[int]) -> int:
+    """The first frame with a filtered field at or after [simulation] start, or after the part that the model was
+    trained on. Raises SceneError without a later frame to compare with."""
+    wanted = _frame_at(settings.start, seen, frames)
+    last = frames - 2 - round(settings.frame_interval / tracers.frame_interval)
     usable = [frame for frame in at_fields if wanted <= frame <= last]
     if not usable:
         raise SceneError(f"[simulation] start: after frame {wanted} of {frames} no filtered field is followed by "
-                         f"ground truth to compare with, {scene.simulation.frame_interval:g} later; lower start, "
+                         f"ground truth to compare with, {settings.frame_interval:g} later; lower start, "
                          "frame_interval, [training] window or [tracers] field_every, or raise [tracers] turnovers")
     return usable[0]
 
 
-def whole_frames(scene: Scene, frames: int) -> set[int]:
-    """The frames at which the unfiltered state is stored for coarse grids: where rollouts start, and the earliest frame
-    from which rollouts start where the model is not trained on this ground truth."""
-    fractions = () if scene.simulation is None else (0.0, scene.simulation.start)
-    every, seen = scene.tracers.field_every, scene.training.window if scene.training else 0.0
-    return {math.ceil(_frame_at(fraction, seen, frames) / every) * every for fraction in fractions}
+def whole_frames(settings: Simulation | None, training: Training | None, every: int, frames: int) -> set[int]:
+    """The frames at which the unfiltered state is stored for coarse grids; filtered fields are stored `every` frames.
+
+    Rollouts start at these frames: at the start of [simulation], and, where the model is not trained on this ground
+    truth, at the earliest frame.
+    """
+    starts, seen = (0.0, settings.start) if settings else (), training.window if training else 0.0
+    return {math.ceil(_frame_at(start, seen, frames) / every) * every for start in starts}
 
 
 def whole_cells(cutoff: int) -> int:
