@@ -216,10 +216,6 @@ def check_inputs(step: Step, comm: Comm, making: Collection[tuple[str, Path]] = 
     weights = scene.model.weights_file if "train" in stages and scene.model is not None else None
     if weights is not None and ("train", weights.parent) not in making:
         read_source(scene, comm)
-    if "train" in stages and scene.training is not None and scene.training.truths is not None:
-        from eddies.workflows.learned.truths import truth_problems  # imports torch
-        for problem in truth_problems(scene, comm, step.holder("dns")):
-            raise SceneError(f"{scene.name}: {problem}")
     for needed in scene.inputs(stages[0]):
         holder = step.holder(needed.name)
         if (needed.name, holder) in making:

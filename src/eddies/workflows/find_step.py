@@ -36,7 +36,7 @@ from eddies.pipeline import STAGES
 from eddies.scene.integrators import MOST_COURANT, SCHEMES
 from eddies.scene.scene import BOX_LENGTH, Scene, SceneError, Simulation
 from eddies.workflows.ground_truth.truth import GroundTruth
-from eddies.workflows.rollout.method import METHODS, Method, Step, make_method
+from eddies.workflows.rollout.method import METHODS, Method, TimeStep, make_method
 from eddies.workflows.run_directory.fingerprints import stage_provenance
 
 log = logging.getLogger("eddies")
@@ -62,7 +62,7 @@ class Trial:
     error : rms of the final velocity minus the true one, relative to the true one; nan if the rollout failed.
     """
 
-    step: Step
+    step: TimeStep
     seconds: float
     velocity: np.ndarray | None = None
     error: float = np.nan
@@ -85,8 +85,7 @@ class Stretch:
 
     def __init__(self, truth: GroundTruth, interval: float, every: int) -> None:
         self.truth, self.turnover = truth, float(truth.reference["eddy_turnover_time"])
-        whole = [int(np.argmin(np.abs(truth.times - at))) for at in truth.states.times]
-        self.frame = min((frame for frame in whole if frame > 0), default=1)
+        self.frame = min((frame for frame in truth.at_states if frame > 0), default=1)
         most = (len(truth.times) - 1 - self.frame) // every
         count = min(max(round(TURNOVERS * self.turnover / interval), 1), most)
         self.stops = np.arange(1, count + 1) * interval
@@ -115,15 +114,15 @@ class Ladder:
     integrator, first, evaluations : name, longest step, and evaluations of the rates in a step.
     """
 
-    def __init__(self, tried: Callable[[Stretch, Step], Trial], stretches: Sequence[Stretch], integrator: str,
+    def __init__(self, tried: Callable[[Stretch, TimeStep], Trial], stretches: Sequence[Stretch], integrator: str,
                  first: float, evaluations: int) -> None:
         self._tried, self._stretches, self.integrator = tried, stretches, integrator
         self._first, self.evaluations = first, evaluations
         self.trials: dict[int, Trial] = {}  # by rung
 
-    def step(self, rung: int) -> Step:
+    def step(self, rung: int) -> TimeStep:
         """The step of a rung."""
-        return Step(self.integrator, self._first / 2**rung)
+        return TimeStep(self.integrator, self._first / 2**rung)
 
     def __getitem__(self, rung: int) -> Trial:
         if rung not in self.trials:
@@ -199,7 +198,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     paths = [directory / STAGES["dns"].file, *settings.confirming_files]
     stop = stop or StopRequest(comm)
 
-    def tried(stretch: Stretch, step: Step) -> Trial:
+    def tried(stretch: Stretch, step: TimeStep) -> Trial:
         return short_rollout(make_method(scene, step, stretch.truth, stretch.frame, directory), step, stretch, stop)
 
     with ExitStack() as files, torch.no_grad():
@@ -247,7 +246,7 @@ def integrators(settings: Simulation, span: float) -> Iterator[tuple[str, float,
         yield name, span if scheme.dense else settings.frame_interval, scheme.evaluations
 
 
-def short_rollout(method: Method, step: Step, stretch: Stretch, stop: StopRequest) -> Trial:
+def short_rollout(method: Method, step: TimeStep, stretch: Stretch, stop: StopRequest) -> Trial:
     """Advance a method with a step through a stretch of the ground truth; collective. Raises Stopped on request."""
     comm, total = stretch.truth.decomposition.comm, stretch.truth.total
     method.frame(0.0)  # the rates at the start, which the first step uses

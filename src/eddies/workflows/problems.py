@@ -239,9 +239,11 @@ def _unfit_files(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str
             prepare_torch(scene.device, comm)
     except UserError as error:
         yield str(error)
-    if model is not None and scene.training is not None and scene.training.truths is not None:
+    if model is not None and model.path is None and scene.training.truths is not None:
         from eddies.workflows.learned.truths import truth_problems  # imports torch
-        yield from (f"{scene.name}: {problem}" for problem in truth_problems(scene, comm, step.holder("dns")))
+        own_file = step.holder("dns") / STAGES["dns"].file
+        for problem in truth_problems(scene.training, scene.tracers, model.reads, own_file, comm):
+            yield f"{scene.name}: {problem}"
 
 
 # ---- reasons to doubt a result

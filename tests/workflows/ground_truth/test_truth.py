@@ -79,7 +79,8 @@ def test_columns_and_scales_are_those_that_are_stored(comm, path, density):
     ("particles/tracers/velocity/value", (2, -1, 0), lambda truth: truth.particles(2)),
     ("particles/tracers/density/value", (3, 0), lambda truth: truth.particles(3)),
     ("fields/filtered/velocity", (0, 0, -1, 0, 0),
-     lambda truth: truth.field(0, "velocity", SlabDecomposition(truth.decomposition.comm, LENGTH, truth.fields.cells))),
+     lambda truth: truth.planes(truth.fields, 0, "velocity", SlabDecomposition(
+         truth.decomposition.comm, LENGTH, truth.fields.cells))),
 ])
 @pytest.mark.mpi(2, timeout=30)
 def test_a_value_that_is_not_finite_is_refused_by_all_ranks(comm, path, density, dataset, where, ask):

@@ -20,10 +20,9 @@ from eddies.stages import Step, check_inputs
 from eddies.workflows import dns, train
 from eddies.workflows.foreseen.ranks import most_ranks, rank_problems
 from eddies.workflows.ground_truth.frame_counts import rollout_start
-from eddies.workflows.ground_truth.truth import load_frame
 from eddies.workflows.learned import transfer
 from eddies.workflows.learned.source import ModelDefinition
-from eddies.workflows.learned.training_data import model_for, training_data
+from eddies.workflows.learned.training_data import load_frame, model_for, training_data
 from eddies.workflows.learned.truths import open_truths, truth_problems
 from eddies.workflows.rollout.eulerian_run import EulerianRun
 from eddies.workflows.rollout.particle_run import forcing_of

@@ -25,6 +25,7 @@ from eddies.particles.flow_units import MEAN_DENSITY, measured_scales
 from eddies.scene.scene import BOX_LENGTH, Tracers
 from eddies.spectral.spectral_grid import SpectralGrid, regrid
 from eddies.workflows.ground_truth.frame_counts import whole_cells
+from eddies.workflows.run_directory.saved_modes import restored_modes, saved_modes
 
 
 @dataclass
@@ -75,17 +76,14 @@ class FlowRun:
 
     def state_dict(self) -> dict[str, Any]:
         """The state for a checkpoint, with that of the tracers."""
-        grid = self.fluid.grid
-        modes = Block(self.state, int(grid.column_starts[grid.decomposition.rank]), grid.modes, axis=2)
+        modes = saved_modes(self.fluid.grid, self.state)
         return {"phase": self.phase, "modes": modes, "clock": self.clock.state_dict(),
                 "step_limit": self.step_limit.state_dict(), "watch": self.watch.state_dict(),
                 **self.history.state_dict(), **(self.tracers.state_dict() if self.tracers else {})}
 
     def load_state_dict(self, saved: Checkpoint) -> None:
         """Continue from a checkpoint, made on any number of ranks. Tracers read their part themselves."""
-        grid = self.fluid.grid
-        starts, rank = grid.column_starts, grid.decomposition.rank
-        self.phase, self.state = saved["phase"], saved.read("modes", starts[rank], starts[rank + 1], axis=2)
+        self.phase, self.state = saved["phase"], restored_modes(self.fluid.grid, saved, 4)
         self.clock.load_state_dict(saved["clock"])
         self.step_limit.load_state_dict(saved["step_limit"])
         self.watch.load_state_dict(saved["watch"])

@@ -19,7 +19,7 @@ from eddies.pipeline import STAGES
 from eddies.scene.scene import BOX_LENGTH, Scene
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.learned.a_priori import evaluate, evaluation_frames
-from eddies.workflows.learned.model import with_weights
+from eddies.workflows.learned.model import load_model
 from eddies.workflows.learned.source import ModelDefinition, ModelSource, read_source
 from eddies.workflows.run_directory.fingerprints import stage_provenance
 
@@ -37,8 +37,7 @@ def run(scene: Scene, comm: Comm, directory: Path) -> None:
     slab, device = SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes), prepare_torch(scene.device, comm)
     with open_product(comm, directory / STAGES["dns"].file, "ground_truth") as file:
         truth = GroundTruth(file, slab, device)
-        model = with_weights(definition, comm, source.description, source.weights, source.path, truth.scales).to(device)
-        model = model.forced(truth.forcing)
+        model = load_model(definition, comm, source.path, truth.scales).to(device).forced(truth.forcing)
         dtype = next((parameter.dtype for parameter in model.parameters()), torch.float64)
         last = truth.last_frame_seen(scene.seen_in(directory))
         tables = evaluate(truth, model, evaluation_frames(truth), last, dtype)

@@ -57,14 +57,14 @@ METHODS: dict[str, Callable[..., Method]] = {"learned": LearnedRun, "none": Ball
 
 
 @dataclass(frozen=True)
-class Step:
+class TimeStep:
     """Integrator and longest time step of a rollout; for a coarse grid "etdrk4" and the Courant number."""
 
     integrator: str
     size: float
 
 
-def make_method(scene: Scene, step: Step | None, truth: GroundTruth, start: int, directory: Path) -> Method:
+def make_method(scene: Scene, step: TimeStep | None, truth: GroundTruth, start: int, directory: Path) -> Method:
     """The method of a scene, starting at a frame of the truth. A given `step` replaces that of the scene; collective.
 
     With a given step the limit that the resolved velocity sets to steps is ignored.

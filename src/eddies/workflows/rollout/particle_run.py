@@ -26,8 +26,8 @@ from eddies.pipeline import STAGES
 from eddies.scene.scene import Forcing as ForcingSection
 from eddies.scene.scene import Scene
 from eddies.scene.terms import Forcing
-from eddies.workflows.ground_truth.truth import GroundTruth, particles_for
-from eddies.workflows.learned.model import load_model
+from eddies.workflows.ground_truth.truth import GroundTruth
+from eddies.workflows.learned.model import load_model, particles_for
 from eddies.workflows.learned.source import ModelDefinition
 from eddies.workflows.rollout.saved_particles import particle_state, restored_particles
 
