@@ -16,7 +16,6 @@ from eddies.learning.losses import relative_error
 from eddies.parallel.reduction import global_sum
 from eddies.particles.model import FORCING
 from eddies.scene.scene import SceneError, load_scene
-from eddies.stages import Step, check_inputs
 from eddies.workflows import dns, train
 from eddies.workflows.foreseen.ranks import most_ranks, rank_problems
 from eddies.workflows.ground_truth.frame_counts import rollout_start
@@ -24,6 +23,7 @@ from eddies.workflows.learned import transfer
 from eddies.workflows.learned.source import ModelDefinition
 from eddies.workflows.learned.training_data import load_frame, model_for, training_data
 from eddies.workflows.learned.truths import open_truths, truth_problems
+from eddies.workflows.problems import Context, refuse
 from eddies.workflows.rollout.eulerian_run import EulerianRun
 from eddies.workflows.rollout.particle_run import forcing_of
 from tests.changed_product import changed
@@ -224,7 +224,7 @@ def test_a_rollout_is_forced_like_its_truth_and_starts_after_the_training_window
         # Each frame has a field. The first frame has no rates.
         for each, start in ((scene, ends), (trained_on(scene, other), 1)):
             seen = each.seen_in(tmp_path / "own")
-            assert rollout_start(each, seen, len(truth.times), truth.at_fields) == start
+            assert rollout_start(each.simulation, each.tracers, seen, len(truth.times), truth.at_fields) == start
         assert ends > 2
 
 
@@ -255,11 +255,11 @@ def test_unfit_truths_are_refused_before_any_work(comm, tmp_path):
             dns.run(replace(scene, spin_up=None, forcing=None), comm, other)
         read_density = ['model={preset = "paper"}'] if case == "no density" else []
         scene = trained_on(scene_of(tmp_path, *read_density), own, other)
-        (problem,) = truth_problems(scene, comm, own)
-        assert problem.startswith(f'[training] truths: "{other}"') and message in problem
         # The run itself makes its own ground truth, which is named too.
+        (problem,) = truth_problems(scene.training, scene.tracers, scene.model.reads, own / "ground_truth.h5", comm)
+        assert problem.startswith(f'[training] truths: "{other}"') and message in problem
         with pytest.raises(SceneError, match=r"own: \[training\] truths: "):
-            check_inputs(Step(scene, ("train",), own), comm)
+            refuse(scene, Context(comm, ("train",), own))
 
 
 @pytest.mark.mpi(1)
