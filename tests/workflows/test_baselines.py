@@ -8,7 +8,7 @@ from mpi4py import MPI
 
 from eddies.io.weights import load_weights
 from eddies.report.rollout import moved_by
-from eddies.scene.scene import BOX_LENGTH, SceneError, load_scene
+from eddies.scene.scene import SceneError, load_scene
 from eddies.workflows import dns, train
 from eddies.workflows import simulate as stage
 from eddies.workflows.rollout.measured import open_rollout
