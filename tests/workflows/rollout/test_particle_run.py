@@ -188,14 +188,19 @@ def test_a_rollout_that_goes_wrong_ends_there_and_keeps_its_frames(comm, small_p
 
 @pytest.mark.usefixtures("no_figures", "quick_solves")
 @pytest.mark.mpi(2)
-@pytest.mark.parametrize("fluid, model, weights", [
-    ("compressible", '[model]\npreset = "paper"\n[model.pairs]\nhidden = [4]\n[model.density-flux]\nhidden = [4]', 10),
-    ("compressible", '[model]\nterms = ["pressure", "viscosity"]', 0),
-    ("incompressible", '[model]\npreset = "resolved + pairs"\n[model.pairs]\nhidden = [4]', None)],
-    ids=["paper", "nothing to learn", "no density"])
-def test_models_are_trained_run_and_reported(comm, tmp_path, fluid, model, weights):
-    """The published system, a model without parameters, and a model of an incompressible flow without a density."""
-    scene, compressible = prepared(comm, tmp_path, fluid, model), fluid == "compressible"
+@pytest.mark.parametrize("fluid, model, weights, removals", [
+    ("compressible", '[model]\npreset = "paper"\n[model.pairs]\nhidden = [4]\n[model.density-flux]\nhidden = [4]', 10,
+     []),
+    ("compressible", '[model]\nterms = ["pressure", "viscosity"]', 0, []),
+    ("incompressible", '[model]\npreset = "resolved + pairs"\n[model.pairs]\nhidden = [4]', None,
+     ["kernel", "training.field_weight", "training.combined_steps"])],
+    ids=["paper", "nothing to learn", "no density and no kernel"])
+def test_models_are_trained_run_and_reported(comm, tmp_path, fluid, model, weights, removals):
+    """The published system, a model without parameters, and a model of an incompressible flow without a density in a
+    scene without [kernel]."""
+    scene = prepared(comm, tmp_path, fluid, model, removals=removals)
+    compressible = fluid == "compressible"
+    assert ("train-kernel" in scene.stages) == (not removals)
     terms, learns_density = scene.model.terms, "density-flux" in scene.model.terms
     train.run(scene, comm, tmp_path)
     simulate.run(with_method(scene, "learned", step=0.03), comm, tmp_path)  # with frames between steps
@@ -208,7 +213,9 @@ def test_models_are_trained_run_and_reported(comm, tmp_path, fluid, model, weigh
     attributes, tables, columns = read_rollout(comm, tmp_path)
     assert attributes["status"] == "complete" and ("density" in columns) == learns_density
     assert ("outside_training" in tables) == ("pairs" in terms)
-    metrics = reported(comm, tmp_path, "kernel.h5")
+    metrics = reported(comm, tmp_path, *([] if removals else ["kernel.h5"]))
+    assert metrics["rollout"]["qr_kl"] is metrics["rollout"]["qr_kl_floor"] is None
+    assert metrics["rollout"]["spectrum_error"] > 0
     assert (metrics["model"]["density_rate_error"] is not None) == learns_density and metrics["rollout"]["stable"]
     assert metrics["rollout"]["method"] == f"the model, terms {', '.join(terms)}"
 
