@@ -24,7 +24,7 @@ from eddies.workflows.rollout.course import Course, frame_layout
 from eddies.workflows.rollout.method import TimeStep, make_method
 from eddies.workflows.rollout.particle_run import forcing_of
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
-from eddies.workflows.run_directory.found_step import read_found_step, step_path
+from eddies.workflows.run_directory.work import read_found_step, step_path
 
 log = logging.getLogger("eddies")
 

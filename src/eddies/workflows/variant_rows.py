@@ -19,8 +19,7 @@ from eddies.parallel.communicator import Comm
 from eddies.pipeline import STAGES
 from eddies.scene.scene import Eulerian, Scene
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint
-from eddies.workflows.run_directory.found_step import read_found_step, step_path
-from eddies.workflows.run_directory.work import FAILURE
+from eddies.workflows.run_directory.work import FAILURE, read_found_step, step_path
 from eddies.workflows.variants import Place
 
 if TYPE_CHECKING:

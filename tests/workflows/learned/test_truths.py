@@ -18,7 +18,7 @@ from eddies.particles.model import FORCING
 from eddies.scene.scene import SceneError, load_scene
 from eddies.workflows import dns, train
 from eddies.workflows.foreseen.ranks import most_ranks, rank_problems
-from eddies.workflows.ground_truth.frame_counts import rollout_start
+from eddies.workflows.ground_truth.frame_counts import last_seen, rollout_start
 from eddies.workflows.learned import transfer
 from eddies.workflows.learned.source import ModelDefinition
 from eddies.workflows.learned.training_data import load_frame, model_for, training_data
@@ -218,7 +218,7 @@ def test_a_rollout_is_forced_like_its_truth_and_starts_after_the_training_window
                             (0.3, 0.3)):
             forcing = forcing_of(power, scene.forcing, truth)
             assert (forcing and forcing.injection_rate) == rate
-        ends = truth.last_frame_seen(scene.training.window)
+        ends = last_seen(scene.training.window, len(truth.times))
         coarse = EulerianRun(scene, truth, ends, tmp_path, CPU)
         assert coarse.fluid.forcing.injection_rate == 1.0 and coarse.fluid.forcing.wavenumber == 2.0
         # Each frame has a field. The first frame has no rates.

@@ -25,7 +25,6 @@ from eddies.particles.flow_units import MEAN_DENSITY, measured_scales
 from eddies.scene.scene import BOX_LENGTH, Tracers
 from eddies.spectral.spectral_grid import SpectralGrid, regrid
 from eddies.workflows.ground_truth.frame_counts import whole_cells
-from eddies.workflows.run_directory.saved_modes import restored_modes, saved_modes
 
 
 @dataclass
@@ -233,3 +232,14 @@ def frame_layout(settings: Tracers, compressible: bool, cutoff: int) -> FrameLay
         columns, variables = columns | {"density": ()}, variables | {"density": 1}
     return FrameLayout(settings.particles, BOX_LENGTH, {"tracers": columns}, np.float64, {
         "filtered": FieldLayout(settings.cells, variables), "unfiltered": FieldLayout(whole_cells(cutoff), variables)})
+
+
+def saved_modes(grid: SpectralGrid, modes: np.ndarray) -> Block:
+    """Modes (..., kz, ky, kx) of a grid for a checkpoint. Ranks share the axis ky."""
+    return Block(modes, int(grid.column_starts[grid.decomposition.rank]), grid.modes, axis=modes.ndim - 2)
+
+
+def restored_modes(grid: SpectralGrid, saved: Checkpoint, dimensions: int) -> np.ndarray:
+    """The part of this rank in the block "modes" of a checkpoint, an array of so many dimensions."""
+    start, stop = grid.column_starts[grid.decomposition.rank:][:2]
+    return saved.read("modes", int(start), int(stop), axis=dimensions - 2)

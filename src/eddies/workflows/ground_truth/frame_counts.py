@@ -28,8 +28,8 @@ def check_frames(stages: Sequence[str], scene: Scene, seen: float, frames: int) 
 
 
 def last_seen(window: float, frames: int) -> int:
-    """The last frame of the training window, which is a fraction of the ground truth."""
-    return max(int(window * (frames - 1)), 1)
+    """The last frame of the training window, which is a fraction of the ground truth; 0 without a window."""
+    return max(int(window * (frames - 1)), 1) if window > 0 else 0
 
 
 def last_trained_on(settings: Training, frames: int) -> int:
@@ -99,4 +99,4 @@ def whole_cells(cutoff: int) -> int:
 
 def _frame_at(fraction: float | None, seen: float, frames: int) -> int:
     """The frame at a fraction of the ground truth, at least 1; for None the end of the part that is seen."""
-    return max(last_seen(seen, frames) if fraction is None else int(fraction * (frames - 1)), 1)
+    return max(last_seen(seen if fraction is None else fraction, frames), 1)

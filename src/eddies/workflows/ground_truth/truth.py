@@ -17,7 +17,6 @@ from eddies.parallel.migration import id_block, migrate
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.flow_units import RATES, ReferenceScales
 from eddies.scene.terms import Forcing
-from eddies.workflows.ground_truth.frame_counts import last_seen
 
 Result = TypeVar("Result")
 
@@ -105,10 +104,6 @@ class GroundTruth:
         first = round(float(points[0, 2]) * cells / self.decomposition.length) if planes else 0
         field = self._together(lambda: self.fields.read(index, "velocity", first, first + planes))
         return field.reshape(3, -1).T.astype(np.float64)
-
-    def last_frame_seen(self, window: float) -> int:
-        """The last frame of the training window, a fraction of the ground truth; 0 without a window."""
-        return last_seen(window, len(self.times)) if window > 0 else 0
 
     def block(self, frame: int, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
         """The named columns, or all, of this rank's block of ids at a frame."""

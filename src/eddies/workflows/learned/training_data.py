@@ -24,7 +24,7 @@ from eddies.particles.resolved_velocity import ResolvedVelocity
 from eddies.particles.smoothing_kernels import SmoothingKernel
 from eddies.scene.scene import BOX_LENGTH, Training
 from eddies.workflows.foreseen.ranks import ALLOWED_VELOCITY
-from eddies.workflows.ground_truth.frame_counts import last_trained_on, trained_frames
+from eddies.workflows.ground_truth.frame_counts import last_seen, last_trained_on, trained_frames
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.learned.model import initial_model, particles_for
 from eddies.workflows.learned.source import ModelDefinition
@@ -52,7 +52,7 @@ class TrainingData:
         self.dtype = getattr(torch, settings.precision)
         self.model = model_for(definition, truth, self.dtype, like)
         self.longest = max(settings.horizons.frames) if settings.horizons else 0
-        self.last = truth.last_frame_seen(settings.window)
+        self.last = last_seen(settings.window, len(truth.times))
         self.learned = last_trained_on(settings, len(truth.times))
         self.usable, self.held_out = trained_frames(settings, len(truth.times), truth.at_fields)
 

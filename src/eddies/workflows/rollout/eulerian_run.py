@@ -28,10 +28,10 @@ from eddies.scene.scene import Eulerian, Scene, SceneError
 from eddies.spectral.mode_operators import gaussian_transfer
 from eddies.spectral.spectral_grid import SpectralGrid, regrid
 from eddies.time_stepping import ETDRK4
+from eddies.workflows.ground_truth.flow_run import restored_modes, saved_modes
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.rollout.particle_run import forcing_of
 from eddies.workflows.rollout.saved_particles import restored_rows, saved_rows
-from eddies.workflows.run_directory.saved_modes import restored_modes, saved_modes
 
 # A flow is unstable if its energy exceeds that of its start by this factor.
 RUNAWAY_ENERGY = 100.0

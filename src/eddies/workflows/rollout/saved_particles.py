@@ -15,7 +15,7 @@ from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition, block_starts
 from eddies.particles.integrators import Integrator
 from eddies.particles.particle_set import ParticleSet, as_numpy
-from eddies.workflows.run_directory.saved_modes import restored_modes, saved_modes
+from eddies.workflows.ground_truth.flow_run import restored_modes, saved_modes
 
 MEMORY, BUILT_AT = "memory ", "built at"
 
