@@ -21,7 +21,7 @@ from eddies.scene.scene import BOX_LENGTH, Model, SceneError, load_scene
 from eddies.workflows import report, simulate, train
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.rollout.method import METHODS, make_method
-from eddies.workflows.rollout.particle_run import SOLVES, LearnedRun
+from eddies.workflows.rollout.particle_run import SOLVES, ParticleRun
 from tests.workflows.small_rollout import OWN_METHOD, prepared, scales_of, scene_text, with_method, write_model
 
 pytestmark = pytest.mark.usefixtures("quick_spectra")
@@ -243,7 +243,7 @@ def test_a_method_of_the_users(comm, small_products, linked, own):
 
 @pytest.mark.mpi(1)
 def test_solves_that_do_not_converge_are_logged_once_and_all_counted(comm, caplog):
-    run = LearnedRun.__new__(LearnedRun)
+    run = ParticleRun.__new__(ParticleRun)
     run.comm, run._solves = comm, {name: [] for name in SOLVES}
     with caplog.at_level(logging.INFO, logger="eddies"):
         for solves in ([(3, 1e-3, True)], [(3, 1e-3, True), (300, 0.02, False)], [(300, 0.04, False)]):

@@ -15,7 +15,7 @@ from eddies.particles.particle_set import ParticleSet
 from eddies.scene.scene import Scene
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.rollout.eulerian_run import EulerianRun
-from eddies.workflows.rollout.particle_run import BallisticRun, LearnedRun, ParticleRun
+from eddies.workflows.rollout.particle_run import ParticleRun
 
 
 class Method(Protocol):
@@ -53,7 +53,7 @@ class Method(Protocol):
 
 
 #: The classes behind the words of [simulation] method.
-METHODS: dict[str, Callable[..., Method]] = {"learned": LearnedRun, "none": BallisticRun, "eulerian": EulerianRun}
+METHODS: dict[str, Callable[..., Method]] = {"learned": ParticleRun, "none": ParticleRun, "eulerian": EulerianRun}
 
 
 @dataclass(frozen=True)
