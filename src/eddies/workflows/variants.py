@@ -18,10 +18,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from eddies.io.provenance import product_fingerprint
 from eddies.pipeline import STAGES
 from eddies.scene.scene import REALISATION, Scene, SceneError
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint
-from eddies.workflows.run_directory.work import is_done
 
 # Stages whose products variants share if their settings agree.
 SHARED = ("dns", "train-kernel")
@@ -60,7 +60,7 @@ class Step:
         self.directory.mkdir(parents=True, exist_ok=True)
         for stage, holder in self.links.items():
             path, product = self.directory / STAGES[stage].file, holder / STAGES[stage].file
-            if path.is_symlink() or not is_done(stage, self.scene, self.directory):
+            if path.is_symlink() or product_fingerprint(path) != stage_fingerprint(self.scene, stage):
                 path.unlink(missing_ok=True)
                 if product.exists():
                     path.symlink_to(os.path.relpath(product.resolve(), self.directory.resolve()))

@@ -84,13 +84,6 @@ def find_work(stages: Sequence[str], scene: Scene, directory: Path) -> Work:
     return Work(directory, frozenset(done), frozenset(begun), frozenset(useless), tuple(lost), tuple(changes))
 
 
-def is_done(stage: str, scene: Scene, directory: Path) -> bool:
-    """Whether the product of a stage is complete and was made with the same settings; on one rank."""
-    if STAGES[stage].product is None:
-        return False
-    return product_provenance(directory / STAGES[stage].file).get("fingerprint") == stage_fingerprint(scene, stage)
-
-
 def step_path(settings: Simulation, directory: Path) -> Path | None:
     """The file of the step that a rollout takes: of its run directory or of [simulation] step_from; None if the step is
     a number."""
