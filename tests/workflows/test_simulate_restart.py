@@ -130,8 +130,8 @@ def test_splits_on_several_ranks(comm, case_of, monkeypatch, name):
 
 
 @pytest.mark.mpi(2)
-def test_a_stopped_rollout_continues_and_leaves_nothing_else(comm, case_of):
-    scene, directory = case_of("default")
+def test_a_stopped_rollout_continues_and_leaves_nothing_else(comm, small_products, linked):
+    scene, directory = with_method(small_products[0], "learned", step=0.03, turnovers=0.11), linked(small_products[1])
     names = {path.name for path in directory.iterdir()}
     simulate.run(scene, comm, directory)
     whole = product(comm, directory)

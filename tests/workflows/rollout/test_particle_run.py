@@ -22,7 +22,7 @@ from eddies.workflows import report, simulate, train
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.rollout.method import METHODS, make_method
 from eddies.workflows.rollout.particle_run import SOLVES, ParticleRun
-from tests.workflows.small_rollout import OWN_METHOD, prepared, scales_of, scene_text, with_method, write_model
+from tests.workflows.small_rollout import OWN_METHOD, prepared, scales_of, scene_text, with_method
 
 pytestmark = pytest.mark.usefixtures("quick_spectra")
 
@@ -49,28 +49,11 @@ def rolled_out(comm, directory, scene, **keys):
 
 
 @pytest.mark.usefixtures("quick_solves")
-@pytest.mark.mpi(2)
-def test_units_are_those_of_the_release_whatever_follows(comm, tmp_path):
-    """A flow that is followed twice as long gives exactly the same rollout."""
-    found = []
-    for name, turnovers in (("short", 0.1), ("long", 0.2)):
-        scene = prepared(comm, tmp_path / name, turnovers=turnovers)
-        release = scales_of(comm, tmp_path / name)
-        write_model(comm, tmp_path / name, scene, release)
-        method, particles, acceleration = method_of(comm, tmp_path / name, scene, 3)
-        assert method.flow.scales == method.model.flow.scales == release
-        found.append((release, particles, acceleration))
-    (scales, particles, acceleration), (other, more, again) = found
-    assert scales == other and acceleration.abs().max() > 0 and torch.equal(acceleration, again)
-    assert torch.equal(particles.id, more.id) and torch.equal(particles.density, more.density)
-
-
-@pytest.mark.usefixtures("quick_solves")
 @pytest.mark.mpi(1)
 @pytest.mark.parametrize("name", METHODS)
 def test_every_method_runs_with_the_units_of_the_release(comm, small_products, linked, name):
-    scene, directory = with_method(small_products[0], name, start=0.5), linked(small_products[1])
-    method, particles, acceleration = method_of(comm, directory, scene, 3)
+    scene, directory = with_method(small_products[0], name), linked(small_products[1])
+    method, particles, acceleration = method_of(comm, directory, scene, 1)  # a frame with the unfiltered flow
     assert getattr(method, "scales", scales_of(comm, directory)) == scales_of(comm, directory)
     assert (particles.density is not None) == method.has_density == (name == "learned")
     assert len(acceleration) == 6**3 and bool(torch.isfinite(acceleration).all())
@@ -131,7 +114,7 @@ def test_frames_between_steps_of_free_particles_lie_on_straight_lines(comm, smal
 @pytest.mark.mpi(1)
 def test_frames_of_long_steps_are_those_of_short_ones(comm, small_products, linked, monkeypatch):
     for name in ("tolerance", "tolerance_foreseen"):
-        monkeypatch.setattr(ResolvedVelocity, name, 1e-8)
+        monkeypatch.setattr(ResolvedVelocity, name, 1e-6)
     scene, directory, found = small_products[0], linked(small_products[1]), {}
     for step in (0.01, 0.03, 0.1):
         attributes, tables, found[step] = rolled_out(comm, directory, scene, step=step, precision="float64")
@@ -141,7 +124,7 @@ def test_frames_of_long_steps_are_those_of_short_ones(comm, small_products, link
         between = [abs(time / step - round(time / step)) > 1e-9 for time in 0.04 * np.arange(4)]
         closure = tables["closure"]
         assert np.array_equal(closure["solves"], [1, *3 * np.diff(reached)] + np.array(between))
-        assert (closure["most_iterations"] <= closure["iterations"]).all() and closure["residual"].max() < 1e-8
+        assert (closure["most_iterations"] <= closure["iterations"]).all() and closure["residual"].max() < 1e-6
         assert not closure["not_converged"].any()
     short = found[0.01]
     for step in (0.03, 0.1):
@@ -244,7 +227,7 @@ def test_a_method_of_the_users(comm, small_products, linked, own):
 @pytest.mark.mpi(1)
 def test_solves_that_do_not_converge_are_logged_once_and_all_counted(comm, caplog):
     run = ParticleRun.__new__(ParticleRun)
-    run.comm, run._solves = comm, {name: [] for name in SOLVES}
+    run.comm, run.seen, run._solves = comm, None, {name: [] for name in SOLVES}
     with caplog.at_level(logging.INFO, logger="eddies"):
         for solves in ([(3, 1e-3, True)], [(3, 1e-3, True), (300, 0.02, False)], [(300, 0.04, False)]):
             run.dynamics = SimpleNamespace(resolution=SimpleNamespace(solves=solves))
