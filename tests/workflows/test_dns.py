@@ -196,7 +196,8 @@ def test_a_start_of_the_users_that_is_no_velocity_and_one_that_makes_no_sound(co
 
     with pytest.raises(SceneError, match=r"returned an array \(3, 4, 4, 3\)"):
         started(*OWN, "initial.kind=own_flow:flat")
-    grid, state = started("flow.cells=16", "flow.fluid=compressible", "flow.sound_speed=10", "initial.kind=own_flow:jet")
+    sound = ["flow.fluid=compressible", "flow.sound_speed=10"]
+    grid, state = started("flow.cells=16", *sound, "initial.kind=own_flow:jet")
     assert state.shape == (4, *grid.spectral_shape) and np.abs(state[3]).max() < 1e-16  # a jet has no pressure
 
 

@@ -16,7 +16,7 @@ from eddies.particles.smoothing_kernels import KernelNetwork
 from eddies.scene.scene import Model, SceneError, load_scene
 from eddies.scene.terms import PRESETS
 from eddies.workflows.learned.model import (initial_model, load_form, load_kernel, load_model,
-                                             require_same_parameters)
+                                            require_same_parameters)
 from eddies.workflows.learned.source import ModelDefinition
 from eddies.workflows.run_directory.fingerprints import stage_provenance
 from eddies.workflows.train_kernel import keep_form

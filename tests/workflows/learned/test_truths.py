@@ -260,8 +260,8 @@ def test_unfit_truths_are_refused_before_any_work(comm, tmp_path):
         return found
 
     assert "nowhere/ground_truth.h5: no such file" in problem_with(scene_of(tmp_path), tmp_path / "nowhere")
-    assert "is named twice" in problem_with(scene_of(tmp_path, "training.frames=6"), tmp_path / "own",
-                                           tmp_path / "own")
+    more_frames = scene_of(tmp_path, "training.frames=6")
+    assert "is named twice" in problem_with(more_frames, tmp_path / "own", tmp_path / "own")
     for case, (overrides, change, message) in REFUSED.items():
         copied(tmp_path / "own", tmp_path / case)
         with changed(tmp_path / case / "ground_truth.h5") as file:

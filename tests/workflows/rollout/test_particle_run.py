@@ -26,6 +26,7 @@ from tests.workflows.small_rollout import OWN_METHOD, prepared, scales_of, scene
 
 pytestmark = pytest.mark.usefixtures("quick_spectra")
 
+
 def method_of(comm, directory, scene, start):
     with open_product(comm, directory / "ground_truth.h5", "ground_truth") as file:
         truth = GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes))
