@@ -18,6 +18,7 @@ from eddies.errors import UserError
 from eddies.io.checkpoint import CheckpointDirectory
 from eddies.io.errors import WriteError
 from eddies.io.hdf5 import in_files, open_product
+from eddies.io.provenance import product_fingerprint
 from eddies.io.run_lock import RunInUse, RunTakenOver, lock_directory, refuse_if_held
 from eddies.io.new_files import LARGEST_BYTES, has_single_writer, write_files
 from eddies.parallel.broadcast import on_first_rank, require_same
@@ -31,7 +32,7 @@ from eddies.workflows.foreseen.storage import in_units
 from eddies.workflows.learned.source import read_source
 from eddies.workflows.problems import Context, check_ground_truth, memory_of_node, problems
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
-from eddies.workflows.run_directory.work import FAILURE, SECONDS, Work, find_work, is_done, stage_seconds
+from eddies.workflows.run_directory.work import FAILURE, SECONDS, Work, find_work, stage_seconds
 from eddies.workflows.variants import Step, check_unseen, steps
 
 log = logging.getLogger("eddies")
@@ -218,17 +219,14 @@ def check_inputs(step: Step, comm: Comm, making: Collection[tuple[str, Path]] = 
     weights = scene.model.weights_file if "train" in stages and scene.model is not None else None
     if weights is not None and ("train", weights.parent) not in making:
         read_source(scene, comm)
-    if "train" in stages and scene.training is not None and scene.training.truths is not None:
-        from eddies.workflows.learned.truths import truth_problems  # imports torch
-        for problem in truth_problems(scene, comm, step.holder("dns")):
-            raise SceneError(f"{scene.name}: {problem}")
     for needed in scene.inputs(stages[0]):
         holder = step.holder(needed.name)
         if (needed.name, holder) in making:
             continue
         with open_product(comm, holder / needed.file, needed.product):
             pass
-        if not on_first_rank(comm, partial(is_done, needed.name, scene, holder)):
+        made_with = on_first_rank(comm, partial(product_fingerprint, holder / needed.file))
+        if made_with != stage_fingerprint(scene, needed.name):
             raise SceneError(f"{holder / needed.file}: was made with other settings than this scene's; run "
                              f"`eddies {needed.name} --overwrite` with these, or give `eddies {stages[0]}` the "
                              "same --set as then")

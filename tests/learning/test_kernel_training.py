@@ -36,7 +36,7 @@ def fit(comm, support=2.4 * SPACING, steps=4, rates=(1e-3, 1e-3)):
     return sample, network, [trainer.step(optimizer, step) for step in range(steps)]
 
 
-@pytest.mark.mpi(2, 3)
+@pytest.mark.mpi(3)
 def test_training_is_the_same_on_any_number_of_ranks(comm):
     from mpi4py import MPI
 
@@ -48,7 +48,7 @@ def test_training_is_the_same_on_any_number_of_ranks(comm):
         assert torch.allclose(parameter, other, rtol=1e-8, atol=1e-12)
 
 
-@pytest.mark.mpi(1, 3)
+@pytest.mark.mpi(3)
 def test_a_zero_field_has_an_error_of_one(comm):
     sample = sample_of(comm, 2.4 * SPACING)
     assert sample.errors_of(0 * sample.field, 0 * sample.gradient) == pytest.approx((1, 1), rel=1e-12)

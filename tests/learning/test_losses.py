@@ -14,7 +14,7 @@ def my_share(comm, whole):
     return whole[np.arange(len(whole)) % owners == comm.rank] if comm.rank < owners else whole[:0]
 
 
-@pytest.mark.mpi(1, 3)
+@pytest.mark.mpi(3)
 def test_shares_of_the_mean_square_add_up(comm):
     error = np.random.default_rng(1).standard_normal((101, 3))
     own = torch.from_numpy(my_share(comm, error))
@@ -24,7 +24,7 @@ def test_shares_of_the_mean_square_add_up(comm):
     assert found["single"] == pytest.approx((error**2).mean(), rel=1e-6)
 
 
-@pytest.mark.mpi(2, 3)
+@pytest.mark.mpi(3)
 def test_histogram_and_gradient_are_those_of_one_rank(comm):
     from mpi4py import MPI
     values = 2 * np.random.default_rng(2).standard_normal((200, 3))
@@ -60,7 +60,7 @@ def test_divergence_of_known_histograms():
     assert float(kullback_leibler(p, p.flip(0))) == pytest.approx(0.1 * np.log(1.5), rel=1e-4)
 
 
-@pytest.mark.mpi(1, 2, 3)
+@pytest.mark.mpi(2, 3)
 def test_adam_takes_the_same_steps_on_any_number_of_ranks(comm):
     from mpi4py import MPI
     target = np.random.default_rng(4).standard_normal((60, 2))

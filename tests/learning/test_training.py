@@ -46,9 +46,8 @@ def numbers(training):
     return {"weight": weight(training), **columns}
 
 
-@pytest.mark.mpi(1, 2)
-@pytest.mark.parametrize("best, patience", [(None, None), (2, None), (2, 3)],
-                         ids=["best at the end", "best after two steps", "of little patience"])
+@pytest.mark.mpi(2)
+@pytest.mark.parametrize("best, patience", [(None, None), (2, 3)], ids=["best at the end", "of little patience"])
 def test_a_training_restored_at_any_step_is_bitwise_the_one_never_stopped(comm, best, patience):
     def begun():
         training = training_of(comm, best and (lambda: abs(training.optimizer.taken - best)), patience=patience)
@@ -107,7 +106,7 @@ def test_a_phase_without_validation_ends_with_its_last_state(comm):
     assert training.cost[0]["error"] is None
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_a_loss_that_is_not_finite_ends_the_training_on_all_ranks(comm):
     training = training_of(comm)
     with torch.no_grad():

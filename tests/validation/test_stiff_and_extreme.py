@@ -113,8 +113,8 @@ def test_a_run_that_diverges_says_so_at_the_step_and_names_the_limit(comm, tmp_p
     with pytest.raises(FlowDiverged, match=f"Broken: {limit.split(',')[0]}, .* stable up to 2.[78]") as caught:
         dns.run(scene, comm, tmp_path)
     assert isinstance(caught.value, UserError)
-    fluid = build_fluid(scene, comm)
-    states = [initial_state(scene, fluid)]
+    fluid = build_fluid(scene.flow, scene.forcing, comm)
+    states = [initial_state(scene.initial, scene.seed, fluid)]
     energies = [quadratic_energy(fluid, states[0])]
     with np.errstate(all="ignore"):
         while energies[-1] <= GROWTH * min(energies):

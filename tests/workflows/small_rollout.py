@@ -93,16 +93,17 @@ def scene_text(fluid="compressible", model=MODEL, start=0.3, turnovers=0.14, sid
     return SCENE.format(fluid=fluid, sound=sound, model=model, start=start, turnovers=turnovers, side=side)
 
 
-def prepared(comm, directory, *args, overrides=(), **keys):
-    """The scene, with its ground truth and an untrained kernel in a directory."""
+def prepared(comm, directory, *args, overrides=(), removals=(), **keys):
+    """The scene, with its ground truth and, with [kernel], an untrained kernel in a directory."""
     path = directory / "own.toml"
     if comm.rank == 0:
         directory.mkdir(parents=True, exist_ok=True)
         path.write_text(scene_text(*args, **keys))
     comm.Barrier()
-    scene = load_scene(path, overrides)
+    scene = load_scene(path, overrides, removals)
     dns.run(scene, comm, directory)
-    write_kernel(comm, directory, scene)
+    if scene.kernel:
+        write_kernel(comm, directory, scene)
     return scene
 
 

@@ -1,17 +1,17 @@
 """Rollouts without a learned force: free particles, WCSPH, and a coarse Eulerian flow."""
 
 import logging
-import shutil
-import tempfile
-from pathlib import Path
 
 import numpy as np
 import pytest
+from mpi4py import MPI
 
+from eddies.io.weights import load_weights
 from eddies.report.rollout import moved_by
-from eddies.scene.scene import BOX_LENGTH, SceneError, load_scene
+from eddies.scene.scene import SceneError, load_scene
+from eddies.workflows import dns, train
+from eddies.workflows import simulate as stage
 from eddies.workflows.rollout.measured import open_rollout
-from tests.small_scene import TINY
 from tests.workflows.small_rollout import write_kernel
 
 pytestmark = pytest.mark.usefixtures("quick_spectra")
@@ -43,11 +43,9 @@ SMOOTHED = ['model.terms=["continuity", "wcsph"]', "training.steps=0", "training
 
 
 @pytest.fixture(scope="module")
-def made(comm):
-    """A directory with the scene, its ground truth and an untrained kernel; the same on all ranks."""
-    from eddies.workflows import dns
-
-    folder = Path(comm.bcast(tempfile.mkdtemp() if comm.rank == 0 else None))
+def made(comm, shared_folder):
+    """A folder with the scene, its ground truth and an untrained kernel."""
+    folder = shared_folder()
     if comm.rank == 0:
         (folder / "baseline.toml").write_text(SCENE)
     comm.Barrier()
@@ -55,31 +53,21 @@ def made(comm):
     dns.run(scene, comm, folder)
     write_kernel(comm, folder, scene)
     comm.Barrier()
-    yield folder
-    comm.Barrier()
-    if comm.rank == 0:
-        shutil.rmtree(folder)
+    return folder
 
 
 @pytest.fixture
-def folder(comm, made, tmp_path):
+def folder(made, linked):
     """A new run directory with links to these."""
-    if comm.rank == 0:
-        for path in made.iterdir():
-            (tmp_path / path.name).symlink_to(path)
-    comm.Barrier()
-    return tmp_path
+    return linked(made)
 
 
 def simulate(comm, folder, *overrides):
-    from eddies.workflows import simulate as stage
     stage.run(load_scene(folder / "baseline.toml", overrides), comm, folder)
 
 
 def read(folder):
     """Attributes, times, and columns (frames, particles, ...) of model and truth by name, on rank 0."""
-    from mpi4py import MPI
-
     with open_rollout(folder, MPI.COMM_SELF) as measured:
         runs = measured.particles
         columns = {name: {column: np.array([run.read(frame, column) for frame in range(len(run.times))])
@@ -92,26 +80,8 @@ def energy(columns):
     return 0.5 * (columns["velocity"] ** 2).sum(axis=(1, 2)) / columns["velocity"].shape[1]
 
 
-@pytest.mark.mpi(1, 2)
-def test_particles_without_a_force_keep_their_velocity(comm, folder):
-    simulate(comm, folder)
-    if comm.rank == 0:
-        attributes, times, columns = read(folder)
-        model, truth = columns["model"], columns["truth"]
-        assert attributes["status"] == "complete" and moved_by(attributes).startswith("no force")
-        assert np.array_equal(model["velocity"], np.broadcast_to(truth["velocity"][0], model["velocity"].shape))
-        assert not model["acceleration"].any() and "density" not in model
-        path = truth["position"][0] + times[-1] * truth["velocity"][0] - model["position"][-1]
-        # Positions are stored in single precision.
-        assert np.abs(path - BOX_LENGTH * np.rint(path / BOX_LENGTH)).max() < 2e-6
-    comm.Barrier()
-
-
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_an_untrained_model_of_smoothed_particles_keeps_momentum_and_integrates_its_density(comm, folder):
-    from eddies.io.weights import load_weights
-    from eddies.workflows import train
-
     train.run(load_scene(folder / "baseline.toml", SMOOTHED), comm, folder)
     _, weights = load_weights(comm, folder / "model.h5", "model")
     assert sorted(map(float, weights.values())) == [1, 1, 2]  # c in units of the fluid's, alpha, beta
@@ -159,8 +129,6 @@ def test_a_grid_of_the_resolution_of_the_truth_is_the_truth(comm, folder, fluid,
 @pytest.mark.mpi(2)
 @pytest.mark.parametrize("equations, closure", [("unfiltered", "dynamic-smagorinsky"), ("filtered", "dynamic-mixed")])
 def test_particles_follow_the_coarse_flow(comm, folder, equations, closure):
-    from mpi4py import MPI
-
     form = [*COARSE, f"eulerian.equations={equations}", f"eulerian.closure={closure}"]
     simulate(comm, folder, *form)
     if comm.rank == 0:
@@ -217,14 +185,3 @@ def test_an_unstable_coarse_flow_ends_the_rollout(comm, folder, caplog):
 def test_a_start_without_the_stored_flow_is_refused(comm, folder):
     with pytest.raises(SceneError, match="starts at 0.154 of the ground truth, .* at 0.0769;"):
         simulate(comm, folder, *COARSE, "simulation.start=0.2", "simulation.turnovers=0.1")
-
-
-@pytest.mark.parametrize("overrides, limit", [
-    (["simulation.method=none"], None),
-    (["simulation.method=eulerian"], "ghost planes of the coarse grid"),
-])
-def test_ranks_are_limited_by_what_the_method_needs_alone(overrides, limit):
-    from eddies.workflows.foreseen.ranks import most_ranks
-    alone = ("particles' reach", "filtered fields", "resolved velocity", "coarse grid")
-    found = [reason for reason in most_ranks(load_scene(TINY, overrides)) if any(part in reason for part in alone)]
-    assert len(found) == (limit is not None) and all(reason.startswith(limit) for reason in found)

@@ -10,25 +10,17 @@ from eddies.io.hdf5 import open_product, read_attributes, read_table
 from eddies.scene.scene import SceneError
 from eddies.workflows import find_step, simulate
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint
-from tests.workflows.small_rollout import prepared, with_method
+from tests.workflows.small_rollout import OWN_METHOD, prepared, with_method
 
 # The error of the velocity is a constant plus a part of first order in the step.
-OWN_METHOD = """
-import torch
+FIRST_ORDER = OWN_METHOD + """
 
-from eddies.particles.particle_set import ParticleSet
+class FirstOrder(Swept):
+    slope = SLOPE
 
-
-class FirstOrder:
-    needs = ()
-    has_density = False
-    slope = {slope}
-
-    def __init__(self, scene, truth, start, directory, device):
-        self.time, self.longest = 0.0, scene.simulation.step
-        columns = truth.particles(start)
-        columns.pop("density", None)
-        self.particles = ParticleSet.from_numpy(columns)
+    def __init__(self, scene, *rest):
+        super().__init__(scene, *rest)
+        self.longest = scene.simulation.step
 
     def advance(self, until, number):
         self.time += min(until - self.time, self.longest)
@@ -36,22 +28,22 @@ class FirstOrder:
     def frame(self, time):
         velocity = self.particles.velocity + self.slope * self.longest
         return ParticleSet(self.particles.id, self.particles.position, velocity), torch.zeros_like(velocity)
-
-    def status(self):
-        return ""
-
-    def series(self):
-        return {{}}
-
-    def description(self):
-        return {{"integrator": "first order", "terms": ""}}
 """
 
 
-def searched(scene, method="none"):
+@pytest.fixture
+def own_method(comm, own):
+    """A function that writes the method with a slope, and returns its import path."""
+    def write(slope):
+        own("first_order", FIRST_ORDER.replace("SLOPE", str(slope)))
+        return "first_order:FirstOrder"
+
+    return write
+
+
+def searched(scene, method="none", **keys):
     """The scene with a step that is to be found."""
-    scene = with_method(scene, method)
-    return replace(scene, simulation=replace(scene.simulation, step="converged", integrator="rk2"))
+    return with_method(scene, method, step="converged", integrator="rk2", **keys)
 
 
 def sizes_and_errors(comm, scene, directory, turnovers, slope):
@@ -83,14 +75,14 @@ def found_step(comm, scene, directory):
 
 
 @pytest.mark.mpi(1, 2)
-def test_the_step_is_the_longest_whose_half_changes_little_of_the_error(comm, tmp_path, own):
+def test_the_step_is_the_longest_whose_half_changes_little_of_the_error(comm, small_products, linked, own_method):
     """The error of the method is a + b h, so that halving the step changes b h / 2. In a weaker flow the same error is
     a larger share, and the step must converge there too."""
-    own("first_order", OWN_METHOD.format(slope=3.0))
-    scene, weaker = searched(prepared(comm, tmp_path), "first_order:FirstOrder"), tmp_path / "weaker"
+    directory = linked(small_products[1])
+    scene, weaker = searched(small_products[0], own_method(3.0)), directory / "weaker"
     prepared(comm, weaker, overrides=["initial.amplitude=0.2"])
-    found, trials = found_step(comm, scene, tmp_path)
-    sizes, errors, rms = sizes_and_errors(comm, scene, tmp_path, found["turnovers"], 3.0)
+    found, trials = found_step(comm, scene, directory)
+    sizes, errors, rms = sizes_and_errors(comm, scene, directory, found["turnovers"], 3.0)
     assert found["size"] == pytest.approx(first_converged(sizes, errors, rms, 3.0)) and found["integrator"] == "rk2"
     assert found["confirmed_on"] == 0
     assert trials["size"] == pytest.approx(sizes[:len(trials["size"])])
@@ -99,27 +91,18 @@ def test_the_step_is_the_longest_whose_half_changes_little_of_the_error(comm, tm
 
     both = replace(scene, simulation=replace(scene.simulation, confirmed_on=(str(weaker),)))
     assert stage_fingerprint(both, "find-step") != stage_fingerprint(scene, "find-step")
-    confirmed, _ = found_step(comm, both, tmp_path)
+    confirmed, _ = found_step(comm, both, directory)
     least = first_converged(*sizes_and_errors(comm, scene, weaker, found["turnovers"], 3.0), 3.0)
     assert least < found["size"] and confirmed["size"] < found["size"] and confirmed["confirmed_on"] == 1
 
 
-@pytest.mark.mpi(1)
-def test_a_ground_truth_of_other_particles_confirms_nothing(comm, tmp_path):
-    scene = searched(prepared(comm, tmp_path))
-    prepared(comm, tmp_path / "more", side=7)
-    other = replace(scene, simulation=replace(scene.simulation, confirmed_on=(str(tmp_path / "more"),)))
-    with pytest.raises(SceneError, match="confirmed_on: .*ground_truth.h5 holds 343 particles, not 216"):
-        find_step.run(other, comm, tmp_path)
-
-
 def ladder(comm, integrator, evaluations, seconds, error):
-    """Rollouts whose velocity is 1 + error(h), with an error of 0.3, so that ends within 0.06 have converged."""
+    """Rollouts whose velocity is 1.3 + error(h) and should be 1, so that ends within 0.06 have converged."""
     stretch = object.__new__(find_step.Stretch)
     stretch.truth, stretch.end = SimpleNamespace(decomposition=SimpleNamespace(comm=comm)), np.ones((4, 3))
 
     def tried(stretch, step):
-        return find_step.Trial(step, seconds / step.size, np.full((4, 3), 1 + error(step.size)), 0.3)
+        return find_step.Trial(stretch, step, seconds / step.size, np.full((4, 3), 1.3 + error(step.size)))
 
     return find_step.Ladder(tried, [stretch], integrator, 0.32, evaluations)
 
@@ -148,23 +131,25 @@ def test_an_integrator_of_cheap_evaluations_is_tried_with_shorter_steps(comm):
 
 
 @pytest.mark.mpi(1, 2)
-def test_a_rollout_takes_the_step_that_was_found(comm, tmp_path):
+def test_a_rollout_takes_the_step_that_was_found(comm, small_products, linked):
     """Without a force any step is exact, so the first is taken: the whole of the short rollout."""
-    scene = searched(prepared(comm, tmp_path))
-    find_step.run(scene, comm, tmp_path)
-    simulate.run(scene, comm, tmp_path)
-    with open_product(comm, tmp_path / "step.h5", "step") as file:
+    scene, directory = searched(small_products[0]), linked(small_products[1])
+    find_step.run(scene, comm, directory)
+    simulate.run(scene, comm, directory)
+    with open_product(comm, directory / "step.h5", "step") as file:
         found = read_attributes(file, "found")
-    with open_product(comm, tmp_path / "rollout.h5", "rollout") as file:
+    with open_product(comm, directory / "rollout.h5", "rollout") as file:
         rollout = read_attributes(file, "rollout")
     assert found["difference"] < 1e-12 and found["size"] >= scene.simulation.frame_interval
     assert rollout["time_step"] == pytest.approx(found["size"])
 
 
 @pytest.mark.mpi(1)
-def test_without_a_converged_step_a_number_is_asked_for(comm, tmp_path, own):
-    own("never_converges", OWN_METHOD.format(slope=1e9))
-    scene = searched(prepared(comm, tmp_path), "never_converges:FirstOrder")
+def test_without_a_converged_step_or_with_other_particles_there_is_no_step(comm, small_products, linked, own_method):
+    directory = linked(small_products[1])
     with pytest.raises(SceneError, match='step = "converged": no step down to'):
-        find_step.run(scene, comm, tmp_path)
-    assert not (tmp_path / "step.h5").exists()
+        find_step.run(searched(small_products[0], own_method(1e9)), comm, directory)
+    prepared(comm, directory / "more", side=7)
+    with pytest.raises(SceneError, match="confirmed_on: .*ground_truth.h5 holds 343 particles, not 216"):
+        find_step.run(searched(small_products[0], confirmed_on=(str(directory / "more"),)), comm, directory)
+    assert not (directory / "step.h5").exists()

@@ -1,12 +1,9 @@
 """The tiny scene from DNS to report through the command line, on two ranks."""
 
 import dataclasses
-import html
 import json
 import math
 import re
-import shutil
-import tempfile
 from pathlib import Path
 
 import h5py
@@ -31,16 +28,12 @@ def numbers(metrics):
 
 
 @pytest.fixture(scope="module")
-def run_directory(comm):
-    """One run for all tests of this module, in the same folder on both ranks."""
-    folder = comm.bcast(tempfile.mkdtemp() if comm.rank == 0 else None)
-    directory = Path(folder) / "tiny"
+def run_directory(comm, shared_folder):
+    """One run for all tests of this module."""
+    directory = shared_folder() / "tiny"
     assert run_cli("run", TINY, "--output", directory) == 0
     comm.Barrier()
-    yield directory
-    comm.Barrier()
-    if comm.rank == 0:
-        shutil.rmtree(folder)
+    return directory
 
 
 def test_metrics_are_finite_and_within_bounds(run_directory):
@@ -85,7 +78,7 @@ def test_what_check_foresees_is_what_was_run(run_directory):
     course = rollout_in(scene.simulation, rollout["eddy_turnover_time"], expected.rollout_step)
     assert (course.steps, course.evaluations) == (rollout["steps"], rollout["evaluations"]) == (9, 28)
     assert expected.mach == pytest.approx(measured, rel=0.5)
-    whole = len(whole_frames(scene, frames))
+    whole = len(whole_frames(scene.simulation, scene.training, scene.tracers.field_every, frames))
     sizes = {"ground_truth": trajectory_bytes(scene.flow, scene.tracers, frames, whole),
              "rollout": rollout_bytes(scene.tracers.particles, course.intervals + 1),
              "kernel": disk(scene, "train-kernel").kept, "model": disk(scene, "train").kept}
@@ -117,7 +110,7 @@ def test_pairs_outside_the_training_data_are_counted(run_directory):
     assert shown["rollout"]["outside_training"] == share.max()
 
 
-def test_weights_that_come_along_are_as_good_as_their_card_says(comm, run_directory, tmp_path):
+def test_weights_that_come_along_are_as_good_as_their_card_says(run_directory, linked, tmp_path):
     """On a flow that differs only by round-off from that of the training."""
     page = (Path(__file__).parents[2] / "docs/training.md").read_text()
     card = {name: float(error) for name, error in re.findall(r"^\| `(eddies:.+?)` \|.*\| ([\d.]+) \|$", page, re.M)}
@@ -125,10 +118,7 @@ def test_weights_that_come_along_are_as_good_as_their_card_says(comm, run_direct
     for name, error in card.items():
         with h5py.File(WEIGHTS / f"{name.removeprefix(COME_ALONG)}.h5") as file:
             assert f"{file['a_priori/acceleration_error'][-1]:.3f}" == f"{error:.3f}", name
-    if comm.rank == 0:
-        for name in ("ground_truth.h5", "kernel.h5"):
-            (tmp_path / name).symlink_to(run_directory / name)
-    comm.Barrier()
+    linked(run_directory / "ground_truth.h5", run_directory / "kernel.h5")
     assert run_cli("train", TINY, "--set", "model.preset=resolved", "--set", "model.path=eddies:tiny",
                    "--output", tmp_path) == 0
     with h5py.File(tmp_path / "model.h5") as file:
@@ -136,40 +126,16 @@ def test_weights_that_come_along_are_as_good_as_their_card_says(comm, run_direct
         assert file["source_a_priori/acceleration_error"][-1] == pytest.approx(card["eddies:tiny"], rel=0.01)
 
 
-def provenance_of(directory):
+def test_products_say_what_they_were_made_from(run_directory):
     found = {}
     for name in ("ground_truth", "kernel", "model", "rollout"):
-        with h5py.File(directory / f"{name}.h5") as file:
+        with h5py.File(run_directory / f"{name}.h5") as file:
             found[name] = json.loads(file.attrs["provenance"])
-    return found
-
-
-def test_products_say_what_they_were_made_from(run_directory):
-    found = provenance_of(run_directory)
     ids = {name: origin["id"] for name, origin in found.items()}
     assert len({*ids.values()}) == 4 and json.loads((run_directory / "report" / "metrics.json").read_text())[
         "warnings"] == []
     for number, origin in enumerate(found.values()):
         assert origin["made_from"] == dict(list(ids.items())[:number])
-
-
-@pytest.mark.usefixtures("no_figures")
-def test_a_new_ground_truth_beside_an_old_model_is_a_warning(comm, run_directory, tmp_path, capfd):
-    assert run_cli("dns", TINY, "--set", "seed=2", "--output", tmp_path) == 0
-    if comm.rank == 0:
-        for name in ("kernel", "model", "rollout"):
-            shutil.copy(run_directory / f"{name}.h5", tmp_path)
-    comm.Barrier()
-    capfd.readouterr()
-    assert run_cli("report", tmp_path) == 0
-    comm.Barrier()
-    warnings = json.loads((tmp_path / "report" / "metrics.json").read_text())["warnings"]
-    log, page = capfd.readouterr().out, (tmp_path / "report" / "index.html").read_text()
-    stages = {"kernel": "train-kernel", "model": "train", "rollout": "simulate"}
-    for (name, stage), warning in zip(stages.items(), warnings, strict=True):
-        assert warning.startswith(f"{name}.h5") and "another ground_truth.h5" in warning
-        assert "(seed = 1, now 2)" in warning and f"`eddies {stage}`" in warning
-        assert log.count(f"warning: report: {warning}\n") == (comm.rank == 0) and html.escape(warning) in page
 
 
 @pytest.mark.usefixtures("no_figures")

@@ -47,9 +47,6 @@ def test_the_state_of_every_stage(comm, tmp_path, capfd):
     assert "stopped at step 40, can continue" in lines["train"] and lines["simulate"].endswith("to do")
     (tmp_path / "one/scene.toml").write_text("[flow]\n")
     assert "[flow]" in next(status_lines(tmp_path / "one"))
-
-
-def test_a_directory_without_a_run_is_an_error(tmp_path):
     with pytest.raises(UserError, match="holds no run"):
         list(status_lines(tmp_path / "nowhere"))
 
@@ -91,7 +88,7 @@ def test_variants_of_one_run_are_compared(comm, tmp_path, capfd):
     assert "older than the products" in list(status_lines(tmp_path))[-1]
 
 
-@pytest.mark.mpi(1, 2)
+@pytest.mark.mpi(2)
 def test_damaged_products_are_found(comm, tmp_path, capfd):
     """Also of variants. A link is not another product, and a product of an older version has no checksums."""
     if comm.rank == 0:

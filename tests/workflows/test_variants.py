@@ -10,7 +10,7 @@ import pytest
 import eddies
 from eddies.io.weights import load_weights
 from eddies.scene.scene import load_scene
-from eddies.workflows import product_warnings
+from eddies.workflows import product_warnings, simulate
 from eddies.workflows.rollout.measured import TrueParticles, open_rollout
 from eddies.workflows.rollout.particle_measures import FieldsOfParticles, ParticleSpectra
 from eddies.workflows.variants import rollouts, steps
@@ -152,22 +152,44 @@ def test_a_variant_in_another_flow_makes_its_own_ground_truth(folder):
     assert run_cli("simulate", "own.toml", "--overwrite") == 0
     assert [path.is_symlink() for path in truths] == [False, True, False]
     assert truths[0].read_bytes() == shared != truths[2].read_bytes()
-    (folder / "fresh.toml").write_text((folder / "own.toml").read_text())
-    eddies.run(load_scene("fresh.toml"), stages=["dns", "simulate"])
-    assert (folder / "runs/fresh/b/rollout.h5").exists()
 
 
 @pytest.mark.mpi(2, timeout=300)
 @pytest.mark.usefixtures("undrawn")
-def test_variants_are_run_measured_and_kept(comm, folder, capfd):
-    out = folder / "out"
+def test_variants_are_run_measured_and_kept(comm, folder, capfd, monkeypatch):
+    """One that fails does not end the others, and is run again."""
+    out, whole = folder / "out", simulate.run
+
+    def failing(scene, *rest):
+        if scene.name == "longer-steps":
+            raise eddies.SceneError("no such thing")
+        whole(scene, *rest)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(simulate, "run", failing)
+        assert run_cli("run", "small.toml", "--output", "out") == 2
+    assert comm.rank > 0 or "variants failed: longer-steps (no such thing)" in capfd.readouterr().err
+    comm.Barrier()
+    rows = rows_of(out)[1]
+    assert rows["longer-steps"]["status"] == "failed: no such thing" and rows["no-force"]["status"] == "complete"
+    before = {path: path.stat().st_mtime_ns for path in out.glob("*/*.h5")}
+    capfd.readouterr()
+    comm.Barrier()
+    if comm.rank == 0:
+        (out / "no-force/rollout.h5").unlink()
+    comm.Barrier()
+    assert run_cli("run", "small.toml", "--set", "variant.learned.simulation.step=0.04", "--output", "out") == 2
+    assert comm.rank > 0 or "(simulation.step = 0.05, now 0.04)" in capfd.readouterr().err
     assert run_cli("run", "small.toml", "--output", "out") == 0
     comm.Barrier()
-    record, rows = rows_of(out)
-    check_rows(rows)
+    assert [str(path.relative_to(out)) for path, time in before.items() if path.stat().st_mtime_ns != time] == [
+        "no-force/rollout.h5"]
+    record, again = rows_of(out)
+    assert again["learned"]["velocity_error_early"] == rows["learned"]["velocity_error_early"]
+    check_rows(again)
     assert record["machine"]["ranks"] == 2 and record["machine"]["cores"] >= 1 and record["machine"]["processor"]
     assert 0 < record["flow"]["kolmogorov_length"] < record["flow"]["filter_width"]
-    for name in rows:
+    for name in again:
         assert (out / name / "kernel.h5").resolve() == out / "kernel.h5" and (out / name / "scene.toml").exists()
         assert (out / name / "report/index.html").exists()
     assert (out / "longer-steps/model.h5").resolve() == out / "learned/model.h5"
@@ -176,21 +198,7 @@ def test_variants_are_run_measured_and_kept(comm, folder, capfd):
     assert 'href="../no-force/report/index.html"' in page
     assert 'href="../../report/index.html"' in (out / "no-force/report/index.html").read_text()
     metrics = eddies.open_run(out).variant("no-force").metrics
-    assert metrics["rollout"]["energy_ratio"] == pytest.approx(rows["no-force"]["energy_ratio"], rel=1e-6)
-    before = {path: path.stat().st_mtime_ns for path in out.glob("*/*.h5")}
-    capfd.readouterr()
-    comm.Barrier()
-    if comm.rank == 0:
-        (out / "no-force/rollout.h5").unlink()
-    comm.Barrier()
-    assert run_cli("run", "small.toml", "--set", "variant.longer-steps.simulation.step=0.12", "--output", "out") == 2
-    assert comm.rank > 0 or "(simulation.step = 0.1, now 0.12)" in capfd.readouterr().err
-    assert run_cli("run", "small.toml", "--variant", "no-force", "--output", "out") == 0
-    comm.Barrier()
-    assert [str(path.relative_to(out)) for path, time in before.items() if path.stat().st_mtime_ns != time] == [
-        "no-force/rollout.h5"]
-    again = rows_of(out)[1]
-    assert all(again[name]["velocity_error_early"] == rows[name]["velocity_error_early"] for name in rows)
+    assert metrics["rollout"]["energy_ratio"] == pytest.approx(again["no-force"]["energy_ratio"], rel=1e-6)
 
 
 def check_rows(rows):
@@ -213,9 +221,10 @@ def check_rows(rows):
 
 @pytest.mark.mpi(2, timeout=300)
 @pytest.mark.usefixtures("undrawn", "quick_spectra")
-def test_each_truth_is_measured_and_read_once(comm, folder, monkeypatch):
-    """On all ranks together, for any number of variants and pages."""
-    measured, scanned, truths = [], [], 2
+def test_realisations_that_no_training_has_seen(comm, folder, monkeypatch):
+    """One training and a rollout on each realisation. The table has mean and standard deviation of both. All ranks
+    together measure and read each truth once, for any number of variants and pages."""
+    measured, scanned, alone = [], [], comm.Split(comm.rank)
 
     def counted(method):
         def measure(self, particles, frame, *more):
@@ -225,29 +234,23 @@ def test_each_truth_is_measured_and_read_once(comm, folder, monkeypatch):
             return method(self, particles, frame, *more)
         return measure
 
-    for cls, method in ((FieldsOfParticles, "gradients"), (ParticleSpectra, "of")):
-        monkeypatch.setattr(cls, method, counted(getattr(cls, method)))
-    monkeypatch.setattr(product_warnings, "stored_numbers", lambda file: scanned.append(file.filename) or ())
-    assert run_cli("run", "unseen.toml", "--output", "out") == 0
+    with monkeypatch.context() as patch:
+        for cls, method in ((FieldsOfParticles, "gradients"), (ParticleSpectra, "of")):
+            patch.setattr(cls, method, counted(getattr(cls, method)))
+        patch.setattr(product_warnings, "stored_numbers", lambda file: scanned.append(file.filename) or ())
+        assert run_cli("run", "unseen.toml", "--output", "out") == 0
     together = [each for some in comm.allgather(measured) for each in some]
-    assert len(set(together)) == len(together) and len({path for _, path, _ in together}) == truths
+    assert len(set(together)) == len(together) and len({path for _, path, _ in together}) == 2
     assert {name for name, *_ in together} == {"FieldsOfParticles", "ParticleSpectra"}
     read = [os.path.realpath(path) for path in scanned]
     assert len(set(read)) == len(read) > 0
-
-
-@pytest.mark.mpi(1, timeout=300)
-@pytest.mark.usefixtures("undrawn", "quick_spectra")
-def test_realisations_that_no_training_has_seen(comm, folder):
-    """One training and a rollout on each realisation. The table has mean and standard deviation of both."""
-    assert run_cli("run", "unseen.toml", "--output", "out") == 0
     out = folder / "out"
     assert sorted(str(path.relative_to(out)) for path in out.glob("**/model.h5")) == [
         f"{name}/{where}model.h5" for name in ("learned", "longer-steps")
         for where in ("", "realisation-5/", "realisation-6/")]
     assert (out / "longer-steps/model.h5").resolve() == out / "learned/model.h5"
     assert not (out / "learned/rollout.h5").exists()
-    weights = [load_weights(comm, path, "model")[1] for path in out.glob("**/model.h5")]
+    weights = [load_weights(alone, path, "model")[1] for path in out.glob("**/model.h5")]
     assert all(np.array_equal(one[name], values) for one in weights for name, values in weights[0].items())
     record, rows = rows_of(out)
     (summary,) = (sentence for sentence in record["summary"] if "keeps the velocity error after" in sentence)
@@ -257,34 +260,17 @@ def test_realisations_that_no_training_has_seen(comm, folder):
         assert row["realisations"] == 2 and row["status"] == "complete"
         both = []
         for seed in (5, 6):
-            with open_rollout(out / name / f"realisation-{seed}", comm) as measured:
-                pair = measured.rollout.pair(-1, "velocity")
-                model, truth = pair.model, pair.truth
+            with open_rollout(out / name / f"realisation-{seed}", alone) as rollout:
+                pair = rollout.rollout.pair(-1, "velocity")
                 # The start is the first frame with a filtered field.
-                assert measured.rollout.start_time == pytest.approx(0.1)
-            both.append(np.sum(model**2, dtype=float) / np.sum(truth**2, dtype=float))
+                assert rollout.rollout.start_time == pytest.approx(0.1)
+                both.append(np.sum(pair.model**2, dtype=float) / np.sum(pair.truth**2, dtype=float))
         assert row["energy_ratio"] == pytest.approx(np.mean(both), rel=1e-6)
         assert row["energy_ratio_spread"] == pytest.approx(abs(both[0] - both[1]) / 2**0.5, rel=1e-4)
         assert both[0] != both[1]
-    assert {"error-against-run-time", "figure-9-errors"} <= {*eddies.open_run(out).figures}
-    out.rename(folder / "moved")
-    assert run_cli("simulate", "unseen.toml", "--output", "moved") == 0  # no work of other settings
-
-
-@pytest.mark.mpi(2, timeout=120)
-@pytest.mark.usefixtures("undrawn", "quick_spectra")
-def test_a_variant_that_fails_does_not_end_the_others(comm, folder, capfd, monkeypatch):
-    from eddies.workflows import simulate
-    whole = simulate.run
-
-    def failing(scene, *rest):
-        if scene.name == "longer-steps":
-            raise eddies.SceneError("no such thing")
-        whole(scene, *rest)
-
-    monkeypatch.setattr(simulate, "run", failing)
-    assert run_cli("run", "small.toml", "--output", "out", "--unset", "variant.stops") == 2
-    assert comm.rank > 0 or "variants failed: longer-steps (no such thing)" in capfd.readouterr().err
     comm.Barrier()
-    rows = rows_of(folder / "out")[1]
-    assert rows["longer-steps"]["status"] == "failed: no such thing" and rows["no-force"]["status"] == "complete"
+    if comm.rank == 0:
+        assert {"error-against-run-time", "figure-9-errors"} <= {*eddies.open_run(out).figures}
+        out.rename(folder / "moved")
+    comm.Barrier()
+    assert run_cli("simulate", "unseen.toml", "--output", "moved") == 0  # no work of other settings

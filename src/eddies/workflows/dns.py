@@ -44,11 +44,11 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     """
     directory = Path(directory)
     guard = Guard(comm, directory / STAGES["dns"].checkpoints, stage_fingerprint(scene, "dns"), stop)
-    saved, fluid = guard.checkpoints.newest(), build_fluid(scene, comm)
-    state = initial_state(scene, fluid) if saved is None else None
-    flow = FlowRun(fluid, state, STEPPERS[scene.time.stepper](fluid), build_step_limit(scene, fluid.grid),
-                   FlowHistory(fluid), guard, phase="start" if scene.spin_up is None else "spin-up",
-                   max_step=scene.time.max_step)
+    saved, fluid = guard.checkpoints.newest(), build_fluid(scene.flow, scene.forcing, comm)
+    state = initial_state(scene.initial, scene.seed, fluid) if saved is None else None
+    flow = FlowRun(fluid, state, STEPPERS[scene.time.stepper](fluid),
+                   build_step_limit(scene.time, scene.flow, fluid.grid), FlowHistory(fluid), guard,
+                   phase="start" if scene.spin_up is None else "spin-up", max_step=scene.time.max_step)
     if saved is not None:
         flow.load_state_dict(saved)
         log.info("dns: continues from step %d, time %.4g", flow.clock.steps, flow.clock.time)
@@ -64,7 +64,8 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                 check_span(scene.time, span, flow.step_limit.bound(flow.state, flow.clock), scene.tracers)
             layout = frame_layout(scene.tracers, fluid.compressible, fluid.grid.cutoff)
             with FrameSegments(comm, guard.checkpoints.path, layout, saved.files if saved is not None else ()) as parts:
-                tracers = TracerRun(flow, parts, scene.tracers, scene.seed, partial(whole_frames, scene), saved)
+                whole = partial(whole_frames, scene.simulation, scene.training, scene.tracers.field_every)
+                tracers = TracerRun(flow, parts, scene.tracers, scene.seed, whole, saved)
                 tracers.follow()
                 parts.assemble(file)
             scales = scales_of(tracers.released) | tracers.scales()

@@ -41,19 +41,18 @@ def run(run_directory: Path, output: Path, comm: Comm, layout: str = "vtkhdf") -
 
 
 def _export(run_directory: Path, output: Path, alone: Comm, layout: str) -> None:
-    written, (export, what, maker) = 0, LAYOUTS[layout]
+    written = 0
     for kind, opened in (("ground_truth", _ground_truth), ("rollout", _rollout)):
         if (run_directory / f"{kind}.h5").exists():
             with opened(run_directory, alone) as (series, provenance):
                 for group, name in ((group, name) for group in series for name in series[group]):
                     case = f"{kind}-{group}-{name}"
-                    if not len(series[group][name].times):
-                        log.info("export: %s/%s of %s.h5 has no frames", group, name, kind)
-                    else:
-                        written += export(output, case, group, series[group][name], provenance)
+                    written += _write(output, case, group, series[group][name], provenance, layout == "lagrangebench")
     if not written:
+        what, scene = (("particles that make a data set", " with a scene that has [tracers]")
+                       if layout == "lagrangebench" else ("fields or particles", ""))
         raise ProductError(f"{run_directory}: holds no {what}, which would be in "
-                           f"{' and '.join(f'{kind}.h5' for kind in PRODUCTS)}; run {maker} first")
+                           f"{' and '.join(f'{kind}.h5' for kind in PRODUCTS)}; run `eddies dns SCENE`{scene} first")
 
 
 @contextmanager
@@ -72,30 +71,22 @@ def _rollout(run_directory: Path, alone: Comm) -> Iterator[tuple[Series, Provena
         yield measured.exported, measured.provenance
 
 
-def _write_vtkhdf(output: Path, case: str, group: str, series: Any, provenance: Provenance) -> bool:
-    """Write a series as a VTKHDF file; returns whether it was written."""
-    path = output / f"{case}.vtkhdf"
-    if group == "fields":
+def _write(output: Path, case: str, group: str, series: Any, provenance: Provenance, data_set: bool) -> bool:
+    """Write a series as a VTKHDF file, or particles as a data set; returns whether it was written."""
+    if not len(series.times):
+        log.info("export: %s is left out: has no frames", case)
+        return False
+    if data_set and group == "fields":
+        return False
+    if data_set and (problem := shortcoming(series)):
+        log.warning("export: %s is left out: %s", case, problem)
+        return False
+    path = output / (case if data_set else f"{case}.vtkhdf")
+    if data_set:
+        write_dataset(path, series, case, provenance)
+    elif group == "fields":
         write_images(path, series, BOX_LENGTH, provenance)
     else:
         write_points(path, series, provenance)
-    log.info("export: %s, %d steps", path, len(series.times))
+    log.info("export: %s, %d frames", path, len(series.times))
     return True
-
-
-def _write_dataset(output: Path, case: str, group: str, series: Any, provenance: Provenance) -> bool:
-    """Write particles as a data set; returns whether it was written."""
-    if group == "fields":
-        return False
-    if problem := shortcoming(series):
-        log.warning("export: %s is left out: %s", case, problem)
-        return False
-    write_dataset(output / case, series, case, provenance)
-    log.info("export: %s, %d frames", output / case, len(series.times))
-    return True
-
-
-# Layouts: the function that writes a series, the series that it can write, and the command that makes them.
-LAYOUTS = {"vtkhdf": (_write_vtkhdf, "fields or particles", "`eddies dns SCENE`"),
-           "lagrangebench": (_write_dataset, "particles that make a data set",
-                             "`eddies dns SCENE` with a scene that has [tracers]")}

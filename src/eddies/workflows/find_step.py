@@ -20,6 +20,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +37,7 @@ from eddies.pipeline import STAGES
 from eddies.scene.integrators import MOST_COURANT, SCHEMES
 from eddies.scene.scene import BOX_LENGTH, Scene, SceneError, Simulation
 from eddies.workflows.ground_truth.truth import GroundTruth
-from eddies.workflows.rollout.method import METHODS, Method, Step, make_method
+from eddies.workflows.rollout.method import METHODS, Method, TimeStep, make_method
 from eddies.workflows.run_directory.fingerprints import stage_provenance
 
 log = logging.getLogger("eddies")
@@ -48,29 +49,6 @@ OF_ERROR, OF_VELOCITY = 0.02, 1e-4
 HALVINGS = 12
 # Another integrator replaces the best one if it needs less than this share of its time. Measured times vary.
 CHEAPER = 0.9
-
-
-@dataclass(frozen=True)
-class Trial:
-    """A short rollout.
-
-    Parameters
-    ----------
-    step : its step.
-    seconds : wall time of a turnover, without storing.
-    velocity : the final velocity in order of id; None if the rollout failed.
-    error : rms of the final velocity minus the true one, relative to the true one; nan if the rollout failed.
-    """
-
-    step: Step
-    seconds: float
-    velocity: np.ndarray | None = None
-    error: float = np.nan
-
-    @property
-    def tolerance(self) -> float:
-        """The difference d below which twice the step has converged: e^2 + d^2 = (1.02 e)^2 with the error e."""
-        return max(math.sqrt((1 + OF_ERROR) ** 2 - 1) * self.error, OF_VELOCITY)
 
 
 class Stretch:
@@ -85,24 +63,50 @@ class Stretch:
 
     def __init__(self, truth: GroundTruth, interval: float, every: int) -> None:
         self.truth, self.turnover = truth, float(truth.reference["eddy_turnover_time"])
-        whole = [int(np.argmin(np.abs(truth.times - at))) for at in truth.states.times]
-        self.frame = min((frame for frame in whole if frame > 0), default=1)
+        self.frame = min((frame for frame in truth.at_states if frame > 0), default=1)
         most = (len(truth.times) - 1 - self.frame) // every
         count = min(max(round(TURNOVERS * self.turnover / interval), 1), most)
         self.stops = np.arange(1, count + 1) * interval
         self.end = truth.block(self.frame + count * every, ("velocity",))["velocity"]
 
-    def distance(self, one: Trial | None, other: Trial | None) -> float:
-        """Distance of the final velocities of two trials; nan if one is missing or failed. Collective."""
-        if one is None or other is None or one.velocity is None or other.velocity is None:
-            return np.nan
-        return self.error(one.velocity, other.velocity)
-
-    def error(self, one: np.ndarray, other: np.ndarray) -> float:
+    def distance(self, one: np.ndarray, other: np.ndarray) -> float:
         """Rms of the difference of two final velocities, relative to that of the true final velocity; collective."""
         sums = np.array([np.sum((one.astype(np.float64) - other) ** 2), np.sum(self.end.astype(np.float64) ** 2)])
         square, size = global_sum(self.truth.decomposition.comm, sums)
         return float(np.sqrt(square / size))
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A short rollout with a step.
+
+    Parameters
+    ----------
+    stretch : the part of a ground truth that it covers.
+    seconds : wall time of a turnover, without storing.
+    velocity : the final velocity in order of id; None if the rollout failed.
+    """
+
+    stretch: Stretch
+    step: TimeStep
+    seconds: float
+    velocity: np.ndarray | None = None
+
+    @cached_property
+    def error(self) -> float:
+        """Distance of the final velocity from the true one; nan if the rollout failed. The first use is collective."""
+        return np.nan if self.velocity is None else self.stretch.distance(self.velocity, self.stretch.end)
+
+    def distance(self, other: Trial | None) -> float:
+        """Distance of the final velocities of two trials; nan if the other is missing or one failed. Collective."""
+        if other is None or other.velocity is None or self.velocity is None:
+            return np.nan
+        return self.stretch.distance(self.velocity, other.velocity)
+
+    @property
+    def tolerance(self) -> float:
+        """The difference d below which twice the step has converged: e^2 + d^2 = (1.02 e)^2 with the error e."""
+        return max(math.sqrt((1 + OF_ERROR) ** 2 - 1) * self.error, OF_VELOCITY)
 
 
 class Ladder:
@@ -115,46 +119,41 @@ class Ladder:
     integrator, first, evaluations : name, longest step, and evaluations of the rates in a step.
     """
 
-    def __init__(self, tried: Callable[[Stretch, Step], Trial], stretches: Sequence[Stretch], integrator: str,
+    def __init__(self, tried: Callable[[Stretch, TimeStep], Trial], stretches: Sequence[Stretch], integrator: str,
                  first: float, evaluations: int) -> None:
         self._tried, self._stretches, self.integrator = tried, stretches, integrator
         self._first, self.evaluations = first, evaluations
         self.trials: dict[int, Trial] = {}  # by rung
 
-    def step(self, rung: int) -> Step:
+    def size(self, rung: int) -> float:
         """The step of a rung."""
-        return Step(self.integrator, self._first / 2**rung)
+        return self._first / 2**rung
 
     def __getitem__(self, rung: int) -> Trial:
         if rung not in self.trials:
-            self.trials[rung] = self._tried(self._stretches[0], self.step(rung))
+            self.trials[rung] = self._tried(self._stretches[0], TimeStep(self.integrator, self.size(rung)))
         return self.trials[rung]
 
-    def distance(self, one: Trial | None, other: Trial | None) -> float:
-        """Distance of the final velocities of two trials on the first stretch; nan if one is missing or failed."""
-        return self._stretches[0].distance(one, other)
-
     def difference(self, rung: int) -> float:
-        """Distance of the rollout on a rung from that with twice the step; nan without one of them."""
-        return self.distance(self.trials.get(rung), self.trials.get(rung - 1))
+        """Distance of the rollout on a rung from that with twice the step; nan if the latter was not tried."""
+        return self[rung].distance(self.trials.get(rung - 1))
 
     def table(self) -> dict[str, list[float]]:
         """The trials, the longest step first."""
-        rungs = sorted(self.trials)
-        trials = [self.trials[rung] for rung in rungs]
-        return {"size": [trial.step.size for trial in trials],
-                "seconds_per_turnover": [trial.seconds for trial in trials],
-                "error": [trial.error for trial in trials],
-                "difference": [self.difference(rung) for rung in rungs]}
+        trials = {rung: self.trials[rung] for rung in sorted(self.trials)}
+        return {"size": [trial.step.size for trial in trials.values()],
+                "seconds_per_turnover": [trial.seconds for trial in trials.values()],
+                "error": [trial.error for trial in trials.values()],
+                "difference": [self.difference(rung) for rung in trials]}
 
     def converged(self, rung: int) -> bool:
         """Whether a step has converged on all ground truths."""
         whole, half = self[rung], self[rung + 1]
-        if not self.distance(whole, half) < half.tolerance:
+        if not whole.distance(half) < half.tolerance:
             return False
         for number, stretch in enumerate(self._stretches[1:], 1):
             coarser, finer = (self._tried(stretch, trial.step) for trial in (whole, half))
-            if not stretch.distance(coarser, finer) < finer.tolerance:
+            if not coarser.distance(finer) < finer.tolerance:
                 log.info("find-step: %s %.4g has not converged on ground truth %d of %d", self.integrator,
                          whole.step.size, number, len(self._stretches) - 1)
                 return False
@@ -175,15 +174,14 @@ def cheapest(ladders: Sequence[Ladder]) -> tuple[Ladder, int] | None:
 
 def cheaper(ladder: Ladder, best: Ladder, of_best: int) -> int | None:
     """The longest converged step of a ladder, if it costs less than the best step so far."""
-    most = best.evaluations / best.step(of_best).size
-    shortest = max((rung for rung in range(HALVINGS) if ladder.evaluations / ladder.step(rung).size <= most),
-                   default=-1)
+    most = best.evaluations / best.size(of_best)
+    shortest = max((rung for rung in range(HALVINGS) if ladder.evaluations / ladder.size(rung) <= most), default=-1)
     most_seconds = CHEAPER * best[of_best].seconds
     # The cost of an evaluation varies: a corrected Verlet step, or a solve that starts from a good guess, is cheap.
     while 0 <= shortest < HALVINGS and 2 * ladder[shortest].seconds < most_seconds:
         shortest += 1
     rung, right = shortest, best[of_best + 1]
-    while rung >= 0 and ladder.distance(ladder[rung], right) <= right.tolerance:
+    while rung >= 0 and ladder[rung].distance(right) <= right.tolerance:
         rung -= 1
     return next((rung for rung in range(rung + 1, shortest + 1)
                  if ladder[rung].seconds < most_seconds and ladder.converged(rung)), None)
@@ -199,7 +197,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
     paths = [directory / STAGES["dns"].file, *settings.confirming_files]
     stop = stop or StopRequest(comm)
 
-    def tried(stretch: Stretch, step: Step) -> Trial:
+    def tried(stretch: Stretch, step: TimeStep) -> Trial:
         return short_rollout(make_method(scene, step, stretch.truth, stretch.frame, directory), step, stretch, stop)
 
     with ExitStack() as files, torch.no_grad():
@@ -247,7 +245,7 @@ def integrators(settings: Simulation, span: float) -> Iterator[tuple[str, float,
         yield name, span if scheme.dense else settings.frame_interval, scheme.evaluations
 
 
-def short_rollout(method: Method, step: Step, stretch: Stretch, stop: StopRequest) -> Trial:
+def short_rollout(method: Method, step: TimeStep, stretch: Stretch, stop: StopRequest) -> Trial:
     """Advance a method with a step through a stretch of the ground truth; collective. Raises Stopped on request."""
     comm, total = stretch.truth.decomposition.comm, stretch.truth.total
     method.frame(0.0)  # the rates at the start, which the first step uses
@@ -260,10 +258,10 @@ def short_rollout(method: Method, step: Step, stretch: Stretch, stop: StopReques
     seconds = comm.bcast((time.perf_counter() - began) * stretch.turnover / max(method.time, 1e-300))
     if complaint is not None:
         log.info("find-step: %s %.4g: %s", step.integrator, step.size, complaint)
-        return Trial(step, seconds)
+        return Trial(stretch, step, seconds)
     particles, _ = method.frame(float(stretch.stops[-1]))
     columns = particles.to_numpy()
     velocity = IdOrder(comm, columns["id"], total).apply(columns["velocity"])
-    error = stretch.error(velocity, stretch.end)
-    log.info("find-step: %s %.4g: error %.4f, %.3g s a turnover", step.integrator, step.size, error, seconds)
-    return Trial(step, seconds, velocity, error)
+    trial = Trial(stretch, step, seconds, velocity)
+    log.info("find-step: %s %.4g: error %.4f, %.3g s a turnover", step.integrator, step.size, trial.error, seconds)
+    return trial

@@ -190,7 +190,8 @@ def _too_few_frames(step: Step, turbulence: Turbulence, made: Collection[Path]) 
     frames = max(math.ceil(longest / scene.tracers.frame_interval), 1) + 1
     if frames <= MOST_STEPS:
         try:
-            check_frames(step.stages, scene, scene.seen_in(step.holder("dns")), frames)
+            check_frames(step.stages, scene.tracers, scene.own_training, scene.simulation,
+                         scene.seen_in(step.holder("dns")), frames)
         except SceneError as error:
             yield (f"with at most {frames} frames, as expected of [tracers] turnovers = {scene.tracers.turnovers:g}: "
                    f"{error}")
@@ -241,9 +242,11 @@ def _unfit_files(step: Step, comm: Comm, made: Collection[Path]) -> Iterator[str
             prepare_torch(scene.device, comm)
     except UserError as error:
         yield str(error)
-    if model is not None and scene.training is not None and scene.training.truths is not None:
+    if model is not None and model.path is None and scene.training.truths is not None:
         from eddies.workflows.learned.truths import truth_problems  # imports torch
-        yield from (f"{scene.name}: {problem}" for problem in truth_problems(scene, comm, step.holder("dns")))
+        own_file = step.holder("dns") / STAGES["dns"].file
+        for problem in truth_problems(scene.training, scene.tracers, model.reads, own_file, comm):
+            yield f"{scene.name}: {problem}"
 
 
 # ---- reasons to doubt a result
@@ -395,7 +398,8 @@ def check_ground_truth(stages: Sequence[str], scene: Scene, comm: Comm, director
     ranks call it."""
     path = directory / STAGES["dns"].file
     with open_product(comm, path, "ground_truth") as file:
-        check_frames(stages, scene, scene.seen_in(directory), len(Trajectory(file, "tracers").times))
+        check_frames(stages, scene.tracers, scene.own_training, scene.simulation, scene.seen_in(directory),
+                     len(Trajectory(file, "tracers").times))
         if {"train", "simulate"} & {*stages}:
             from eddies.workflows.ground_truth.truth import GroundTruth  # imports torch
             truth = GroundTruth(file, SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes))

@@ -11,20 +11,20 @@ import torch
 from eddies.clock import pace_in_words
 from eddies.io.frame_segments import FrameSegments
 from eddies.io.checkpoint import Guard
-from eddies.io.hdf5 import create_product, open_product, read_attributes, write_attributes, write_table
+from eddies.io.hdf5 import create_product, open_product, write_attributes, write_table
 from eddies.parallel.communicator import Comm
 from eddies.parallel.slab import SlabDecomposition
 from eddies.parallel.stop import StopRequest
 from eddies.particles.devices import prepare_torch
 from eddies.pipeline import STAGES
 from eddies.scene.scene import BOX_LENGTH, Scene
-from eddies.scene.sections import CONVERGED
 from eddies.workflows.ground_truth.frame_counts import rollout_start
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.rollout.course import Course, frame_layout
-from eddies.workflows.rollout.method import Step, make_method
+from eddies.workflows.rollout.method import TimeStep, make_method
 from eddies.workflows.rollout.particle_run import forcing_of
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint, stage_provenance
+from eddies.workflows.run_directory.work import read_found_step, step_path
 
 log = logging.getLogger("eddies")
 
@@ -41,12 +41,11 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                   " of the rollout")
     with open_product(comm, directory / STAGES["dns"].file, "ground_truth") as truth_file, torch.no_grad():
         truth = GroundTruth(truth_file, slab, device)
-        start = rollout_start(scene, scene.seen_in(directory), len(truth.times), truth.at_fields)
+        start = rollout_start(settings, scene.tracers, scene.seen_in(directory), len(truth.times), truth.at_fields)
         step = None
-        if settings.step == CONVERGED:
-            with open_product(comm, scene.step_file or directory / STAGES["find-step"].file, "step") as file:
-                found = read_attributes(file, "found")
-            step = Step(found["integrator"], found["size"])
+        if (path := step_path(settings, directory)) is not None:
+            found, _ = read_found_step(path, comm)
+            step = TimeStep(found["integrator"], found["size"])
         method = make_method(scene, step, truth, start, directory)
         saved = guard.checkpoints.newest()
         layout = frame_layout(truth.total, slab.length, method.has_density)

@@ -12,7 +12,7 @@ from eddies.io.checkpoint import checkpoints_in
 from eddies.io.checksums import ATTRIBUTE, find_damage, open_to_read
 from eddies.io.errors import ProductError, make_again
 from eddies.io.hdf5 import in_files
-from eddies.io.provenance import product_provenance
+from eddies.io.provenance import product_fingerprint, product_provenance
 from eddies.io.run_lock import find_lock
 from eddies.parallel.broadcast import on_first_rank
 from eddies.parallel.communicator import Comm
@@ -20,7 +20,7 @@ from eddies.pipeline import STAGES
 from eddies.scene.scene import SceneError, load_scene
 from eddies.workflows.foreseen.storage import in_units
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint
-from eddies.workflows.run_directory.work import changed_settings, is_done, of_other_settings, stage_seconds
+from eddies.workflows.run_directory.work import changed_settings, of_other_settings, stage_seconds
 from eddies.workflows.variants import Step, steps
 
 SCENE, PAGE = "scene.toml", Path("report") / "index.html"
@@ -117,7 +117,7 @@ def stage_state(name: str, step: Step) -> str:
     stage, scene = STAGES[name], step.scene
     product = step.directory / stage.file
     checkpoints = checkpoints_in(step.directory / stage.checkpoints) if stage.checkpoints else []
-    if is_done(name, scene, step.directory):
+    if product_fingerprint(product) == stage_fingerprint(scene, name):
         return f"complete, {in_units(product.stat().st_size)}"
     if checkpoints:
         fits = stage_fingerprint(scene, name) in [fingerprint for _, fingerprint in checkpoints]

@@ -16,6 +16,7 @@ from eddies.parallel.stop import StopRequest
 from eddies.particles.devices import prepare_torch
 from eddies.pipeline import STAGES
 from eddies.scene.scene import Scene
+from eddies.workflows.ground_truth.frame_counts import last_seen
 from eddies.workflows.learned import transfer
 from eddies.workflows.learned.a_priori import evaluate, evaluation_frames
 from eddies.workflows.learned.model import load_kernel
@@ -55,7 +56,7 @@ def run(scene: Scene, comm: Comm, directory: str | Path, stop: StopRequest | Non
                      sum(p.numel() for p in model.parameters()))
         own = next((each.model for each in data if each.truth is truth), None)
         # Where only other ground truths are trained on, no part of the run's own is seen.
-        last = truth.last_frame_seen(settings.window if own is not None else 0.0)
+        last = last_seen(settings.window if own is not None else 0.0, len(truth.times))
         guard = Guard(comm, directory / STAGES["train"].checkpoints, stage_fingerprint(scene, "train"), stop,
                       " of the training")
         history, cost, curves = {}, [], None

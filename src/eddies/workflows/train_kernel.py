@@ -102,7 +102,7 @@ def keep_form(comm: Comm, path: Path, form: str | None, provenance: Mapping[str,
 def load_sample(truth: GroundTruth, index: int, support: float) -> KernelSample:
     """A filtered field with its exact gradient, and the particles at its time."""
     slab = truth.decomposition
-    velocity = truth.field(index, "velocity")
+    velocity = truth.planes(truth.fields, index, "velocity", slab)
     grid = SpectralGrid(slab, cutoff=(slab.planes - 1) // 2)
     derivatives = np.stack([grid.backward(grid.gradient(component)) for component in grid.forward(velocity)])
     columns = migrate(slab, truth.block(truth.at_fields[index], ("position", "velocity")))

@@ -12,15 +12,14 @@ import numpy as np
 
 from eddies.analysis.accuracy import accuracy
 from eddies.cores import threads
-from eddies.io.hdf5 import open_product, read_attributes, read_table
+from eddies.io.hdf5 import open_product
 from eddies.io.provenance import environment, read_json
 from eddies.measures import MEASURES, finite
 from eddies.parallel.communicator import Comm
 from eddies.pipeline import STAGES
 from eddies.scene.scene import Eulerian, Scene
-from eddies.scene.sections import CONVERGED
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint
-from eddies.workflows.run_directory.work import FAILURE
+from eddies.workflows.run_directory.work import FAILURE, read_found_step, step_path
 from eddies.workflows.variants import Place
 
 if TYPE_CHECKING:
@@ -101,11 +100,9 @@ def before(place: Place, alone: Comm) -> dict[str, Any]:
         if phases is not None:
             found["training_seconds"] = float(sum(phase["seconds"] for phase in phases))
             found["training_steps"] = sum(phase["steps"] for phase in phases)
-    path = place.scene.step_file or place.directory / STAGES["find-step"].file
-    if place.scene.simulation.step == CONVERGED and path.exists():
-        with open_product(alone, path, "step") as file:
-            step = read_attributes(file, "found")
-            tried = read_table(file, f"trials/{step['integrator']}")
+    path = step_path(place.scene.simulation, place.directory)
+    if path is not None and path.exists():
+        step, tried = read_found_step(path, alone)
         twice = tried["error"][np.isclose(tried["size"], 2 * step["size"])]
         found |= zip(SEARCH, (step["integrator"], step["size"], step["seconds"], step["error"],
                               step["error_with_half"], float(twice[0]) if len(twice) else None))

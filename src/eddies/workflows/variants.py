@@ -18,10 +18,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from eddies.io.provenance import product_fingerprint
 from eddies.pipeline import STAGES
 from eddies.scene.scene import REALISATION, Scene, SceneError
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint
-from eddies.workflows.run_directory.work import is_done
 
 # Stages whose products variants share if their settings agree.
 SHARED = ("dns", "train-kernel")
@@ -60,7 +60,7 @@ class Step:
         self.directory.mkdir(parents=True, exist_ok=True)
         for stage, holder in self.links.items():
             path, product = self.directory / STAGES[stage].file, holder / STAGES[stage].file
-            if path.is_symlink() or not is_done(stage, self.scene, self.directory):
+            if path.is_symlink() or product_fingerprint(path) != stage_fingerprint(self.scene, stage):
                 path.unlink(missing_ok=True)
                 if product.exists():
                     path.symlink_to(os.path.relpath(product.resolve(), self.directory.resolve()))
@@ -76,21 +76,21 @@ class Place:
 
 def rollouts(scene: Scene, directory: Path) -> dict[str, list[Place]]:
     """The rollouts of each variant, one for each realisation. A scene without variants counts as one variant."""
-    return {name or scene.name: rollouts_of(scene, name, directory) for name in scene.variant or (None,)}
-
-
-def rollouts_of(scene: Scene, name: str | None, directory: Path) -> list[Place]:
-    """The rollouts of one variant. The name None stands for a scene without variants."""
-    own, where = scene.variant[name] if name else scene.without_variants, directory / (name or "")
-    if scene.realisations is None:
-        return [Place(own, where)]
-    model = own.model if "train" in own.stages else None
-    if model is not None and model.path is None:
-        model = replace(model, path=str(where))
-    step_from = str(where) if own.simulation.finds_step else own.simulation.step_from
-    simulation = replace(own.simulation, start=0.0, step_from=step_from, confirmed_on=None)
-    return [Place(replace(own, seed=seed, model=model, training=None, simulation=simulation),
+    found = {}
+    for name in scene.variant or (None,):
+        own, where = scene.variant[name] if name else scene.without_variants, directory / (name or "")
+        if scene.realisations is None:
+            found[name or scene.name] = [Place(own, where)]
+            continue
+        model = own.model if "train" in own.stages else None
+        if model is not None and model.path is None:
+            model = replace(model, path=str(where))
+        step_from = str(where) if own.simulation.finds_step else own.simulation.step_from
+        simulation = replace(own.simulation, start=0.0, step_from=step_from, confirmed_on=None)
+        found[name or scene.name] = [
+            Place(replace(own, seed=seed, model=model, training=None, simulation=simulation),
                   where / f"{REALISATION}{seed}") for seed in scene.realisations]
+    return found
 
 
 def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[str] = ()) -> list[Step]:
@@ -119,7 +119,8 @@ def steps(scene: Scene, stages: Sequence[str], directory: Path, names: Sequence[
             own = replace(own, simulation=replace(own.simulation, confirmed_on=tuple(map(str, realisations))))
         trained = ("train",) if not seeds or own.model is not None and own.model.path is None else ()
         planned.append((name, Place(own, directory / (name or "")), (*SHARED, *trained, "find-step")))
-    for together in zip(*(rollouts_of(scene, name, directory) for name in chosen)):
+    places = rollouts(scene, directory)
+    for together in zip(*(places[name or scene.name] for name in chosen)):
         planned += [(name, place, (*SHARED, *(("train",) if seeds else ()), "simulate"))
                     for name, place in zip(chosen, together)]
     found: list[Step] = []

@@ -63,14 +63,14 @@ def test_speeds_and_steps_are_those_of_the_flow_at_its_start(comm):
     for name, changes in (("taylor-green", []), ("abc", ["initial.wavenumber=2"]), ("shear-wave", []),
                           ("tracers-only", ["tracers.particles_per_side=8"])):
         scene = load_scene(name, [*sound, *changes])
-        fluid = build_fluid(scene, comm)
-        state = initial_state(scene, fluid)
+        fluid = build_fluid(scene.flow, scene.forcing, comm)
+        state = initial_state(scene.initial, scene.seed, fluid)
         energy = sum(component_energies(fluid.grid, state[:3]).values())
         assert estimate(scene).rms_speed == pytest.approx(np.sqrt(2 * energy), rel=1e-6)
         assert estimate(scene).mach == pytest.approx(np.sqrt(2 * energy) / 10, rel=1e-6)
         if name in ("taylor-green", "abc"):
             scene = replace(scene, time=Time(duration=1e9, max_step=1e3))
-            taken = build_step_limit(scene, fluid.grid)(state, Clock())
+            taken = build_step_limit(scene.time, scene.flow, fluid.grid)(state, Clock())
             assert estimate(scene).step == pytest.approx(taken)
 
 
@@ -102,7 +102,8 @@ def test_runs_take_the_steps_and_bytes_that_are_expected(comm, folder, overrides
     assert rollout.evaluations == found.get("evaluations", 0)
     with h5py.File(folder / "ground_truth.h5") as file:
         frames = len(file["particles/tracers/time"])
-    flow, tracers, whole = scene.flow, scene.tracers, len(whole_frames(scene, frames))
+    flow, tracers, whole = scene.flow, scene.tracers, len(whole_frames(scene.simulation, scene.training, scene.tracers.field_every,
+                                                                  frames))
     # A third of files this small is headers and text.
     for name, size in (("rollout", rollout_bytes(tracers.particles, rollout.intervals + 1)),
                        ("ground_truth", trajectory_bytes(flow, tracers, frames, whole))):
@@ -132,9 +133,9 @@ def test_memory_of_a_step_is_as_expected(comm, fluid):
     changes = ["flow.cells=48", f"flow.fluid={fluid}", "initial.kind=taylor-green"]
     scene = load_scene("taylor-green", changes + (["flow.sound_speed=10"] if fluid == "compressible" else []))
     tracemalloc.start()
-    equation = build_fluid(scene, comm)
-    stepper, state = ETDRK4(equation), initial_state(scene, equation)
-    stepper(state, build_step_limit(scene, equation.grid)(state, Clock()))
+    equation = build_fluid(scene.flow, scene.forcing, comm)
+    stepper, state = ETDRK4(equation), initial_state(scene.initial, scene.seed, equation)
+    stepper(state, build_step_limit(scene.time, scene.flow, equation.grid)(state, Clock()))
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     expected = flow_memory(scene.flow, scene.tracers, comm.size) - FLOW_PROCESS

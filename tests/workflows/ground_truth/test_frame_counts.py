@@ -17,9 +17,10 @@ FRAMES = 101
 def test_the_whole_flow_is_stored_where_rollouts_start(changes):
     scene = load_scene("hit-small", changes)
     every = scene.tracers.field_every
-    start = rollout_start(scene, scene.seen_in(scene.directory), FRAMES, range(0, FRAMES, every))
-    assert whole_frames(scene, FRAMES) == {every, start}
-    assert whole_frames(load_scene("tracers-only"), FRAMES) == set()
+    seen = scene.seen_in(scene.directory)
+    start = rollout_start(scene.simulation, scene.tracers, seen, FRAMES, range(0, FRAMES, every))
+    assert whole_frames(scene.simulation, scene.training, every, FRAMES) == {every, start}
+    assert whole_frames(None, None, every, FRAMES) == set()
 
 
 @pytest.mark.parametrize("window, horizons, held_out", [
@@ -40,7 +41,7 @@ def test_the_field_loss_uses_frames_with_a_field_one_frame_later():
         scene = load_scene("hit-small", ["training.field_target=flow", "training.window=0.5",
                                          f"tracers.field_every={every}"])
         with pytest.raises(SceneError, match=f"field_target.*{which}; lower .tracers. field_every"):
-            check_frames(["train"], scene, scene.training.window, FRAMES)
+            check_frames(["train"], scene.tracers, scene.training, scene.simulation, scene.training.window, FRAMES)
 
 
 @pytest.mark.parametrize("frames, every", [
@@ -50,7 +51,7 @@ def test_a_rollout_starts_at_the_first_field_that_truth_follows(frames, every):
     at_fields = range(0, frames, every)
     usable = [frame for frame in at_fields if frame >= max(int(0.5 * (frames - 1)), 1) and frame + 5 <= frames - 2]
     if usable:
-        assert rollout_start(tiny, 0.5, frames, at_fields) == usable[0]
+        assert rollout_start(tiny.simulation, tiny.tracers, 0.5, frames, at_fields) == usable[0]
     else:
         with pytest.raises(SceneError, match="start: after frame"):
-            rollout_start(tiny, 0.5, frames, at_fields)
+            rollout_start(tiny.simulation, tiny.tracers, 0.5, frames, at_fields)

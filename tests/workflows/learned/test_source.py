@@ -13,7 +13,7 @@ from eddies.particles.flow_units import ReferenceScales
 from eddies.scene.rules import quoted
 from eddies.scene.scene import Model, SceneError, load_scene
 from eddies.stages import Step, check_inputs
-from eddies.workflows.learned.model import with_weights
+from eddies.workflows.learned.model import load_model
 from eddies.workflows.learned.source import ModelDefinition, read_source
 from tests.small_scene import TINY, one_model
 
@@ -126,7 +126,7 @@ def test_weights_of_the_first_version_are_read(comm, name, base):
     found = one_model(base, [*changes, f"model.path=eddies:{name}"])
     source = read_source(found, comm)
     scales = ReferenceScales(**source.description["scales"])
-    model = with_weights(ModelDefinition.of(found), comm, source.description, source.weights, source.path, scales)
+    model = load_model(ModelDefinition.of(found), comm, source.path, scales)
     assert {key: value.shape for key, value in source.weights.items()} == {
         key: tuple(value.shape) for key, value in model.state_dict().items()}
 

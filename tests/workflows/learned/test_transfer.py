@@ -1,18 +1,18 @@
 """A trained model on another flow."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
+from eddies.io.weights import save_weights
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.flow_units import ReferenceScales
 from eddies.particles.particle_set import ParticleSet
 from eddies.scene.scene import BOX_LENGTH, load_scene
-from eddies.workflows.learned.model import initial_model, with_weights
+from eddies.workflows.learned.model import initial_model, load_model
 from eddies.workflows.learned.source import ModelDefinition, ModelSource
 from eddies.workflows.learned.transfer import trained_on
 from tests.small_scene import TINY
@@ -24,15 +24,15 @@ SCALES = ReferenceScales(filter_width=BOX_LENGTH / 6, spacing=BOX_LENGTH / 12, v
 
 @pytest.mark.mpi(1)
 @pytest.mark.parametrize("preset, weight", [("paper", 1e-5), ("resolved + pairs", 1e-4), ("resolved", 1e-6)])
-def test_the_same_flow_in_other_units_gets_the_same_force_in_those_units(comm, preset, weight):
+def test_the_same_flow_in_other_units_gets_the_same_force_in_those_units(comm, tmp_path, preset, weight):
     """Twice as fast, and with four times the fluctuations of density at the same speed of sound."""
     definition = ModelDefinition.of(load_scene(TINY, [f"model.preset={preset}"]))
     model = initial_model(definition, SCALES, comm).float()
     weights = {name: tensor.numpy() for name, tensor in model.state_dict().items()}
     other = replace(SCALES, velocity=1.8, density=0.08, acceleration=6.8, density_rate=0.4,
                     viscosity=2 * SCALES.viscosity)
-    description = json.loads(json.dumps(definition.describe(SCALES)))
-    adopted = with_weights(definition, comm, description, weights, "model.h5", other)
+    save_weights(comm, tmp_path / "model.h5", "model", definition.describe(SCALES), weights, {})
+    adopted = load_model(definition, comm, tmp_path / "model.h5", other)
     assert adopted.flow.scales == other and adopted.flow.cutoff == model.flow.cutoff
     assert all(parameter.dtype == torch.float32 for parameter in adopted.parameters())
 

@@ -16,15 +16,14 @@ from eddies.learning.losses import relative_error
 from eddies.parallel.reduction import global_sum
 from eddies.particles.model import FORCING
 from eddies.scene.scene import SceneError, load_scene
-from eddies.stages import Step, check_inputs
 from eddies.workflows import dns, train
 from eddies.workflows.foreseen.ranks import most_ranks, rank_problems
-from eddies.workflows.ground_truth.frame_counts import rollout_start
-from eddies.workflows.ground_truth.truth import load_frame
+from eddies.workflows.ground_truth.frame_counts import last_seen, rollout_start
 from eddies.workflows.learned import transfer
 from eddies.workflows.learned.source import ModelDefinition
-from eddies.workflows.learned.training_data import model_for, training_data
+from eddies.workflows.learned.training_data import load_frame, model_for, training_data
 from eddies.workflows.learned.truths import open_truths, truth_problems
+from eddies.workflows.problems import Context, refuse
 from eddies.workflows.rollout.eulerian_run import EulerianRun
 from eddies.workflows.rollout.particle_run import forcing_of
 from tests.changed_product import changed
@@ -219,48 +218,56 @@ def test_a_rollout_is_forced_like_its_truth_and_starts_after_the_training_window
                             (0.3, 0.3)):
             forcing = forcing_of(power, scene.forcing, truth)
             assert (forcing and forcing.injection_rate) == rate
-        ends = truth.last_frame_seen(scene.training.window)
+        ends = last_seen(scene.training.window, len(truth.times))
         coarse = EulerianRun(scene, truth, ends, tmp_path, CPU)
         assert coarse.fluid.forcing.injection_rate == 1.0 and coarse.fluid.forcing.wavenumber == 2.0
         # Each frame has a field. The first frame has no rates.
         for each, start in ((scene, ends), (trained_on(scene, other), 1)):
             seen = each.seen_in(tmp_path / "own")
-            assert rollout_start(each, seen, len(truth.times), truth.at_fields) == start
+            assert rollout_start(each.simulation, each.tracers, seen, len(truth.times), truth.at_fields) == start
         assert ends > 2
 
 
+def halve_times(file):
+    file["particles/tracers/position/time"][...] /= 2
+
+
+# Changes of the scene, a change of the other ground truth, and what is said of it.
 REFUSED = {
-    "no such file": ([], "nowhere", "nowhere/ground_truth.h5: no such file"),
-    "twice": ([], "own", "is named twice"),
-    "another filter": (["tracers.filter_width=1.2"], "other", "its filter is 1.14591559 mean spacings wide"),
-    "no density": (["flow.fluid=incompressible", "flow.sound_speed=none", 'model.terms=["pressure"]'], "other",
+    "another filter": ([], lambda file: file["reference"].attrs.modify("filter_width", 1.2),
+                       "its filter is 1.14591559 mean spacings wide"),
+    "no density": (['model={preset = "paper"}'], lambda file: file["particles/tracers"].pop("density"),
                    "holds no density"),
-    "other frames": (["tracers.frame_interval=0.01"], "other", "its frames are 0.01 apart"),
-    "fewer particles": (["tracers.particles_per_side=4", "training.batch=9"], "other", "holds 64 particles"),
-    "too short": (["tracers.turnovers=0.01"], "other", "[training] window = 0.5: holds 1 frames"),
-    "no tracers": (None, "other", "holds no tracers"),
+    "other frames": ([], halve_times, "its frames are 0.01 apart"),
+    "fewer particles": (["tracers.particles_per_side=7", "training.batch=300"], None, "holds 216 particles"),
+    "too short": (["training.window=0.05", "simulation.start=0.5"], None, "[training] window = 0.05: holds 1 frames"),
+    "no tracers": ([], lambda file: file["particles"].pop("tracers"), "holds no tracers"),
 }
 
 
 @pytest.mark.mpi(1)
 def test_unfit_truths_are_refused_before_any_work(comm, tmp_path):
-    made(comm, tmp_path, runs=())
-    for case, (overrides, name, message) in REFUSED.items():
-        own, other = tmp_path / case / "own", tmp_path / case / name
-        if name == "other":
-            other.mkdir(parents=True)
-            scene = scene_of(tmp_path, *(overrides or ()))
-            if overrides is None:
-                scene = replace(scene, tracers=None, model=None, training=None, simulation=None,
-                                time=replace(scene.time, duration=0.01))
-            dns.run(replace(scene, spin_up=None, forcing=None), comm, other)
-        read_density = ['model={preset = "paper"}'] if case == "no density" else []
-        scene = trained_on(scene_of(tmp_path, *read_density), own, other)
-        (problem,) = truth_problems(scene, comm, own)
-        assert problem.startswith(f'[training] truths: "{other}"') and message in problem
-        # The run itself makes its own ground truth, which is named too.
+    made(comm, tmp_path)
+
+    def problem_with(scene, *others):
+        """What is said of another ground truth; the run itself makes its own, which is named too."""
+        own = tmp_path / "new"
+        scene = trained_on(scene, own, *others)
         with pytest.raises(SceneError, match=r"own: \[training\] truths: "):
-            check_inputs(Step(scene, ("train",), own), comm)
+            refuse(scene, Context(comm, ("train",), own))
+        found, = truth_problems(scene.training, scene.tracers, scene.model.reads, own / "ground_truth.h5", comm)
+        assert found.startswith(f'[training] truths: "{others[-1]}"')
+        return found
+
+    assert "nowhere/ground_truth.h5: no such file" in problem_with(scene_of(tmp_path), tmp_path / "nowhere")
+    more_frames = scene_of(tmp_path, "training.frames=6")
+    assert "is named twice" in problem_with(more_frames, tmp_path / "own", tmp_path / "own")
+    for case, (overrides, change, message) in REFUSED.items():
+        copied(tmp_path / "own", tmp_path / case)
+        with changed(tmp_path / case / "ground_truth.h5") as file:
+            if change is not None:
+                change(file)
+        assert message in problem_with(scene_of(tmp_path, *overrides), tmp_path / case), case
 
 
 @pytest.mark.mpi(1)

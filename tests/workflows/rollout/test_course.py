@@ -74,23 +74,19 @@ class Falling(Standing):
         return "fell"
 
 
-@pytest.mark.mpi(1)
-def test_without_timed_steps_there_are_no_times(comm, tmp_path):
-    """The first two steps are a warm-up. A step that fails has neither a time nor a length."""
-    timed = {"seconds_per_step", "seconds_per_step_low", "seconds_per_step_high"}
-    found = [course_of(comm, tmp_path, count=1, interval=interval).run() for interval in (0.25, 0.2)]
-    assert [outcome["steps"] for outcome in found] == [3, 2]
-    assert quartiles([1.0, 2.0, 3.0, 4.0, 5.0]) == dict(zip(sorted(timed), (3.0, 4.0, 2.0)))
-    assert timed < found[0].keys() and not timed & found[1].keys() and found[1]["time_step"] == pytest.approx(0.1)
-    fallen = course_of(comm, tmp_path, method=Falling).run()
-    assert fallen == {"status": "stopped: fell", "time": 0.0, "steps": 0}
-
-
 @pytest.mark.mpi(2)
-def test_times_of_another_number_of_ranks_are_dropped(comm, tmp_path):
+def test_times_are_those_of_timed_steps_on_the_same_ranks(comm, tmp_path):
+    """The first two steps are a warm-up. A step that fails has neither a time nor a length."""
+    alone, place = comm.Split(comm.rank), tmp_path / f"rank-{comm.rank}"
+    timed = {"seconds_per_step", "seconds_per_step_low", "seconds_per_step_high"}
+    found = [course_of(alone, place, count=1, interval=interval).run() for interval in (0.25, 0.2)]
+    assert [outcome["steps"] for outcome in found] == [3, 2]
+    assert timed < found[0].keys() and not timed & found[1].keys() and found[1]["time_step"] == pytest.approx(0.1)
+    assert quartiles([1.0, 2.0, 3.0, 4.0, 5.0]) == dict(zip(sorted(timed), (3.0, 4.0, 2.0)))
+    fallen = course_of(alone, place, method=Falling).run()
+    assert fallen == {"status": "stopped: fell", "time": 0.0, "steps": 0}
     with pytest.raises(Stopped):
         course_of(comm, tmp_path / "run", 5).run()
-    alone = comm.Split(comm.rank)
     if comm.rank == 0:
         course = course_of(alone, tmp_path / "run")
         assert course.steps == 5 and course.seconds == []
@@ -112,9 +108,8 @@ class Carried(Standing):
 
 
 @pytest.mark.mpi(1, 3)
-@pytest.mark.parametrize("density", [True, False])
-def test_a_frame_holds_the_particles_of_the_method_in_order_of_id(comm, tmp_path, density):
-    total, length = 7, 2 * np.pi
+def test_a_frame_holds_the_particles_of_the_method_in_order_of_id(comm, tmp_path):
+    total, length, density = 7, 2 * np.pi, comm.size == 3
     guard = Guard(comm, tmp_path / "checkpoints", "settings", StopAtStep(comm, 10**9))
     with FrameSegments(comm, tmp_path / "checkpoints", frame_layout(total, length, density)) as segments:
         course = Course(Carried(comm, total, density), segments, 2, 0.1, guard, None)

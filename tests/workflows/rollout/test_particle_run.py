@@ -21,15 +21,10 @@ from eddies.scene.scene import BOX_LENGTH, Model, SceneError, load_scene
 from eddies.workflows import report, simulate, train
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.rollout.method import METHODS, make_method
-from eddies.workflows.rollout.particle_run import SOLVES, LearnedRun
-from tests.workflows.small_rollout import OWN_METHOD, prepared, scales_of, scene_text, with_method, write_model
+from eddies.workflows.rollout.particle_run import SOLVES, ParticleRun
+from tests.workflows.small_rollout import OWN_METHOD, prepared, scales_of, scene_text, with_method
 
 pytestmark = pytest.mark.usefixtures("quick_spectra")
-
-WITHOUT_DENSITY = {
-    "resolved": '[model]\nterms = ["pressure", "stress", "damping", "relaxation"]',
-    "pairs": '[model]\npreset = "resolved + pairs"\n[model.pairs]\nhidden = [4]',
-}
 
 
 def method_of(comm, directory, scene, start):
@@ -38,13 +33,6 @@ def method_of(comm, directory, scene, start):
         method = make_method(scene, None, truth, start, directory)
         with torch.no_grad():
             return method, *method.frame(0.0)
-
-
-def untrained(comm, directory, side=6):
-    """A scene with all products that a rollout needs. Half of the inputs of its model are outside the training."""
-    scene = prepared(comm, directory, side=side)
-    write_model(comm, directory, scene, scales_of(comm, directory, side), 0.5)
-    return scene
 
 
 def read_rollout(comm, directory):
@@ -62,48 +50,29 @@ def rolled_out(comm, directory, scene, **keys):
 
 
 @pytest.mark.usefixtures("quick_solves")
-@pytest.mark.mpi(2)
-def test_units_are_those_of_the_release_whatever_follows(comm, tmp_path):
-    """A flow that is followed twice as long gives exactly the same rollout."""
-    found = []
-    for name, turnovers in (("short", 0.1), ("long", 0.2)):
-        scene = prepared(comm, tmp_path / name, turnovers=turnovers)
-        release = scales_of(comm, tmp_path / name)
-        write_model(comm, tmp_path / name, scene, release)
-        method, particles, acceleration = method_of(comm, tmp_path / name, scene, 3)
-        assert method.flow.scales == method.model.flow.scales == release
-        found.append((release, particles, acceleration))
-    (scales, particles, acceleration), (other, more, again) = found
-    assert scales == other and acceleration.abs().max() > 0 and torch.equal(acceleration, again)
-    assert torch.equal(particles.id, more.id) and torch.equal(particles.density, more.density)
-
-
-@pytest.mark.usefixtures("quick_solves")
 @pytest.mark.mpi(1)
-def test_every_method_runs_with_the_units_of_the_release(comm, tmp_path):
-    scene = prepared(comm, tmp_path, start=0.5)
-    write_model(comm, tmp_path, scene, scales_of(comm, tmp_path))
-    for method in METHODS:
-        own = with_method(scene, method)
-        made, particles, acceleration = method_of(comm, tmp_path, own, 3)
-        assert getattr(made, "scales", scales_of(comm, tmp_path)) == scales_of(comm, tmp_path)
-        assert (particles.density is not None) == made.has_density == (method == "learned")
-        assert len(acceleration) == 6**3 and bool(torch.isfinite(acceleration).all())
-        assert bool(acceleration.any()) == (method != "none")
-        if method == "none":
-            assert made.dynamics.neighborhood is None and made.dynamics.resolution is None
-        simulate.run(own, comm, tmp_path)
-        attributes, _, columns = read_rollout(comm, tmp_path)
-        assert attributes["status"] == "complete" and attributes["method"] == method
-        assert ("density" in columns) == (method == "learned")
-        assert attributes.get("terms") == {"learned": ", ".join(scene.model.terms), "none": "none"}.get(method)
+@pytest.mark.parametrize("name", METHODS)
+def test_every_method_runs_with_the_units_of_the_release(comm, small_products, linked, name):
+    scene, directory = with_method(small_products[0], name), linked(small_products[1])
+    method, particles, acceleration = method_of(comm, directory, scene, 1)  # a frame with the unfiltered flow
+    assert getattr(method, "scales", scales_of(comm, directory)) == scales_of(comm, directory)
+    assert (particles.density is not None) == method.has_density == (name == "learned")
+    assert len(acceleration) == 6**3 and bool(torch.isfinite(acceleration).all())
+    assert bool(acceleration.any()) == (name != "none")
+    if name == "none":
+        assert method.dynamics.neighborhood is None and method.dynamics.resolution is None
+    simulate.run(scene, comm, directory)
+    attributes, _, columns = read_rollout(comm, directory)
+    assert attributes["status"] == "complete" and attributes["method"] == name
+    assert ("density" in columns) == (name == "learned")
+    assert attributes.get("terms") == {"learned": ", ".join(scene.model.terms), "none": "none"}.get(name)
 
 
 @pytest.mark.mpi(2)
-def test_particles_on_a_coarse_grid_may_move_as_far_as_the_courant_number(comm, tmp_path):
-    scene = with_method(prepared(comm, tmp_path), "eulerian")
+def test_particles_on_a_coarse_grid_may_move_as_far_as_the_courant_number(comm, small_products):
+    scene = with_method(small_products[0], "eulerian")
     scene = replace(scene, time=replace(scene.time, courant=1.9))
-    method, *_ = method_of(comm, tmp_path, scene, 1)  # a frame with the unfiltered flow
+    method, *_ = method_of(comm, small_products[1], scene, 1)  # a frame with the unfiltered flow
     spline, slab = method.tracers.field.spline, method.tracers.decomposition
     for planes in (-1.9, slab.count + 0.9):
         place = (slab.start + planes) * slab.spacing % BOX_LENGTH
@@ -111,17 +80,15 @@ def test_particles_on_a_coarse_grid_may_move_as_far_as_the_courant_number(comm, 
 
 
 @pytest.mark.usefixtures("quick_solves")
-@pytest.mark.mpi(2, 3)
-def test_the_rollout_is_the_same_on_any_number_of_ranks(comm, tmp_path):
+@pytest.mark.mpi(2)
+def test_the_rollout_is_the_same_on_any_number_of_ranks(comm, small_products, linked):
     """With frames between steps and at their ends."""
     from mpi4py import MPI
 
-    scene = with_method(untrained(comm, tmp_path, side=9), "learned", precision="float64", turnovers=0.1, step=0.03)
-    found = []
+    scene, directory, found = small_products[0], linked(small_products[1]), []
     for communicator in (comm, MPI.COMM_SELF):
         if communicator is comm or comm.rank == 0:
-            simulate.run(scene, communicator, tmp_path)
-            found.append(read_rollout(communicator, tmp_path))
+            found.append(rolled_out(communicator, directory, scene, precision="float64", turnovers=0.1, step=0.03))
         comm.Barrier()
     if comm.rank == 0:
         (_, tables, columns), (_, tables_alone, alone) = found
@@ -130,11 +97,11 @@ def test_the_rollout_is_the_same_on_any_number_of_ranks(comm, tmp_path):
         assert np.array_equal(share, tables_alone["outside_training"]["share"]) and share.max() > 0
 
 
-@pytest.mark.mpi(1, 2)
-def test_frames_between_steps_of_free_particles_lie_on_straight_lines(comm, tmp_path):
-    scene = prepared(comm, tmp_path)
+@pytest.mark.mpi(2)
+def test_frames_between_steps_of_free_particles_lie_on_straight_lines(comm, small_products, linked):
+    scene, directory = small_products[0], linked(small_products[1])
     for step in (0.03, 0.1):
-        attributes, tables, columns = rolled_out(comm, tmp_path, scene, method="none", step=step)
+        attributes, tables, columns = rolled_out(comm, directory, scene, method="none", step=step)
         assert not tables and np.allclose(columns["time"], 0.04 * np.arange(4))
         assert attributes["steps"] == -(-0.12 // step) and attributes["time_step"] == pytest.approx(step)
         straight = columns["position"][0] + columns["time"][:, None, None] * columns["velocity"][0]
@@ -146,12 +113,12 @@ def test_frames_between_steps_of_free_particles_lie_on_straight_lines(comm, tmp_
 
 
 @pytest.mark.mpi(1)
-def test_frames_of_long_steps_are_those_of_short_ones(comm, tmp_path, monkeypatch):
+def test_frames_of_long_steps_are_those_of_short_ones(comm, small_products, linked, monkeypatch):
     for name in ("tolerance", "tolerance_foreseen"):
         monkeypatch.setattr(ResolvedVelocity, name, 1e-8)
-    scene, found = untrained(comm, tmp_path), {}
+    scene, directory, found = small_products[0], linked(small_products[1]), {}
     for step in (0.01, 0.03, 0.1):
-        attributes, tables, found[step] = rolled_out(comm, tmp_path, scene, step=step, precision="float64")
+        attributes, tables, found[step] = rolled_out(comm, directory, scene, step=step, precision="float64")
         # Three stages, and the end of the last step. Frames between steps are not counted.
         assert attributes["evaluations"] == 3 * attributes["steps"] + 1 and attributes["status"] == "complete"
         reached = np.ceil(np.arange(4) * 0.04 / step - 1e-9)
@@ -169,22 +136,22 @@ def test_frames_of_long_steps_are_those_of_short_ones(comm, tmp_path, monkeypatc
 
 
 @pytest.mark.mpi(1)
-def test_steps_are_as_short_as_the_resolved_velocity_needs(comm, tmp_path, monkeypatch):
+def test_steps_are_as_short_as_the_resolved_velocity_needs(comm, small_products, linked, monkeypatch):
     """The rms velocity, which changes little, moves particles by 0.05 radians of the shortest wave."""
     monkeypatch.setitem(INTEGRATORS, "rk3", partial(RungeKutta, scheme=replace(SCHEMES["rk3"], angle=0.05)))
-    attributes, _, columns = rolled_out(comm, tmp_path, untrained(comm, tmp_path), step=0.5)
-    scales = scales_of(comm, tmp_path)
+    directory = linked(small_products[1])
+    attributes, _, columns = rolled_out(comm, directory, small_products[0], step=0.5)
+    scales = scales_of(comm, directory)
     highest = int(resolved_wavenumber(scales.spacing, scales.filter_width, scales.kolmogorov_length))
     assert attributes["status"] == "complete" and attributes["steps"] > 2
     assert attributes["time_step"] * highest * columns["velocity"][0].std() == pytest.approx(0.05, rel=0.2)
 
 
-def reported(comm, directory, remove=("kernel.h5",)):
+def reported(comm, directory, *remove):
     """The numbers of the report, without untrained products, which have nothing to show."""
     comm.Barrier()
-    if comm.rank == 0:
-        for name in remove:
-            (directory / name).unlink()
+    for name in remove if comm.rank == 0 else ():
+        (directory / name).unlink()
     comm.Barrier()
     report.run(directory, comm)
     comm.Barrier()
@@ -193,25 +160,31 @@ def reported(comm, directory, remove=("kernel.h5",)):
 
 @pytest.mark.usefixtures("no_figures", "quick_solves")
 @pytest.mark.mpi(2)
-def test_a_rollout_that_goes_wrong_ends_there_and_keeps_its_frames(comm, tmp_path):
-    simulate.run(with_method(untrained(comm, tmp_path), "learned", injection=1e6), comm, tmp_path)
-    attributes, _, columns = read_rollout(comm, tmp_path)
+def test_a_rollout_that_goes_wrong_ends_there_and_keeps_its_frames(comm, small_products, linked):
+    directory = linked(small_products[1])
+    simulate.run(with_method(small_products[0], "learned", injection=1e6), comm, directory)
+    attributes, _, columns = read_rollout(comm, directory)
     assert attributes["status"].startswith("stopped: step") and "nearest particle" in attributes["status"]
     assert len(columns["time"]) >= 1
-    metrics = reported(comm, tmp_path, ("kernel.h5", "model.h5"))
+    metrics = reported(comm, directory, "kernel.h5", "model.h5")
     assert not metrics["rollout"]["stable"] and metrics["rollout"]["status"] == attributes["status"]
 
 
 @pytest.mark.usefixtures("no_figures", "quick_solves")
 @pytest.mark.mpi(2)
-@pytest.mark.parametrize("fluid, model, weights", [
-    ("compressible", '[model]\npreset = "paper"\n[model.pairs]\nhidden = [4]\n[model.density-flux]\nhidden = [4]', 10),
-    ("compressible", '[model]\nterms = ["pressure", "viscosity"]', 0),
-    ("incompressible", WITHOUT_DENSITY["resolved"], None),
-    ("incompressible", WITHOUT_DENSITY["pairs"], None)], ids=["paper", "nothing to learn", "resolved", "pairs"])
-def test_models_are_trained_run_and_reported(comm, tmp_path, fluid, model, weights):
-    """The published system, a model without parameters, and models that need no density in an incompressible flow."""
-    scene, compressible = prepared(comm, tmp_path, fluid, model), fluid == "compressible"
+@pytest.mark.parametrize("fluid, model, weights, removals", [
+    ("compressible", '[model]\npreset = "paper"\n[model.pairs]\nhidden = [4]\n[model.density-flux]\nhidden = [4]', 10,
+     []),
+    ("compressible", '[model]\nterms = ["pressure", "viscosity"]', 0, []),
+    ("incompressible", '[model]\npreset = "resolved + pairs"\n[model.pairs]\nhidden = [4]', None,
+     ["kernel", "training.field_weight", "training.combined_steps"])],
+    ids=["paper", "nothing to learn", "no density and no kernel"])
+def test_models_are_trained_run_and_reported(comm, tmp_path, fluid, model, weights, removals):
+    """The published system, a model without parameters, and a model of an incompressible flow without a density in a
+    scene without [kernel]."""
+    scene = prepared(comm, tmp_path, fluid, model, removals=removals)
+    compressible = fluid == "compressible"
+    assert ("train-kernel" in scene.stages) == (not removals)
     terms, learns_density = scene.model.terms, "density-flux" in scene.model.terms
     train.run(scene, comm, tmp_path)
     simulate.run(with_method(scene, "learned", step=0.03), comm, tmp_path)  # with frames between steps
@@ -224,7 +197,9 @@ def test_models_are_trained_run_and_reported(comm, tmp_path, fluid, model, weigh
     attributes, tables, columns = read_rollout(comm, tmp_path)
     assert attributes["status"] == "complete" and ("density" in columns) == learns_density
     assert ("outside_training" in tables) == ("pairs" in terms)
-    metrics = reported(comm, tmp_path)
+    metrics = reported(comm, tmp_path, *([] if removals else ["kernel.h5"]))
+    assert metrics["rollout"]["qr_kl"] is metrics["rollout"]["qr_kl_floor"] is None
+    assert metrics["rollout"]["spectrum_error"] > 0
     assert (metrics["model"]["density_rate_error"] is not None) == learns_density and metrics["rollout"]["stable"]
     assert metrics["rollout"]["method"] == f"the model, terms {', '.join(terms)}"
 
@@ -236,14 +211,15 @@ def test_terms_that_read_the_density_are_refused_in_an_incompressible_flow(tmp_p
         load_scene(path)
 
 
-@pytest.mark.mpi(1, 2)
-def test_a_method_of_the_users(comm, tmp_path, own):
+@pytest.mark.mpi(2)
+def test_a_method_of_the_users(comm, small_products, linked, own):
+    directory = linked(small_products[1])
     if comm.rank == 0:
         own("own_method", OWN_METHOD)
     comm.Barrier()
-    scene = replace(prepared(comm, tmp_path), model=Model(preset="resolved"))
-    simulate.run(with_method(scene, "own_method:Swept"), comm, tmp_path)
-    attributes, tables, columns = read_rollout(comm, tmp_path)
+    scene = replace(small_products[0], model=Model(preset="resolved"))
+    simulate.run(with_method(scene, "own_method:Swept"), comm, directory)
+    attributes, tables, columns = read_rollout(comm, directory)
     assert attributes["method"] == "own_method:Swept" and attributes["terms"] == "wind" and "wind" in tables
     assert attributes["status"] == "complete" and len(columns["time"]) > 1 and "density" not in columns
     assert np.array_equal(columns["velocity"][-1], np.broadcast_to(np.float32([0.5, 0, -1]), (216, 3)))
@@ -251,8 +227,8 @@ def test_a_method_of_the_users(comm, tmp_path, own):
 
 @pytest.mark.mpi(1)
 def test_solves_that_do_not_converge_are_logged_once_and_all_counted(comm, caplog):
-    run = LearnedRun.__new__(LearnedRun)
-    run.comm, run._solves = comm, {name: [] for name in SOLVES}
+    run = ParticleRun.__new__(ParticleRun)
+    run.comm, run.seen, run._solves = comm, None, {name: [] for name in SOLVES}
     with caplog.at_level(logging.INFO, logger="eddies"):
         for solves in ([(3, 1e-3, True)], [(3, 1e-3, True), (300, 0.02, False)], [(300, 0.04, False)]):
             run.dynamics = SimpleNamespace(resolution=SimpleNamespace(solves=solves))

@@ -78,8 +78,10 @@ def disk(scene: Scene, stage: str) -> Disk:
         checkpoints = (KEPT + 1) * state  # with the one that is written
         if tracers is None:
             return Disk(statistics + 4 * flow.components * flow.cells**3, checkpoints)
-        during, after = (trajectory_bytes(flow, tracers, frames, len(whole_frames(scene, frames)))
-                         for frames in (intervals or 0, (intervals or 0) + 1))
+        during, after = (
+            trajectory_bytes(flow, tracers, frames,
+                             len(whole_frames(scene.simulation, scene.training, tracers.field_every, frames)))
+            for frames in (intervals or 0, (intervals or 0) + 1))
         return Disk(None if intervals is None else statistics + after, checkpoints + during)
     if stage == "train-kernel":  # planes of five reconstructions, velocity and gradient
         return Disk(PRODUCT_BYTES + 80 * tracers.cells**2 + 64 * scene.kernel.steps)

@@ -75,17 +75,14 @@ class FlowRun:
 
     def state_dict(self) -> dict[str, Any]:
         """The state for a checkpoint, with that of the tracers."""
-        grid = self.fluid.grid
-        modes = Block(self.state, int(grid.column_starts[grid.decomposition.rank]), grid.modes, axis=2)
+        modes = saved_modes(self.fluid.grid, self.state)
         return {"phase": self.phase, "modes": modes, "clock": self.clock.state_dict(),
                 "step_limit": self.step_limit.state_dict(), "watch": self.watch.state_dict(),
                 **self.history.state_dict(), **(self.tracers.state_dict() if self.tracers else {})}
 
     def load_state_dict(self, saved: Checkpoint) -> None:
         """Continue from a checkpoint, made on any number of ranks. Tracers read their part themselves."""
-        grid = self.fluid.grid
-        starts, rank = grid.column_starts, grid.decomposition.rank
-        self.phase, self.state = saved["phase"], saved.read("modes", starts[rank], starts[rank + 1], axis=2)
+        self.phase, self.state = saved["phase"], restored_modes(self.fluid.grid, saved, 4)
         self.clock.load_state_dict(saved["clock"])
         self.step_limit.load_state_dict(saved["step_limit"])
         self.watch.load_state_dict(saved["watch"])
@@ -235,3 +232,14 @@ def frame_layout(settings: Tracers, compressible: bool, cutoff: int) -> FrameLay
         columns, variables = columns | {"density": ()}, variables | {"density": 1}
     return FrameLayout(settings.particles, BOX_LENGTH, {"tracers": columns}, np.float64, {
         "filtered": FieldLayout(settings.cells, variables), "unfiltered": FieldLayout(whole_cells(cutoff), variables)})
+
+
+def saved_modes(grid: SpectralGrid, modes: np.ndarray) -> Block:
+    """Modes (..., kz, ky, kx) of a grid for a checkpoint. Ranks share the axis ky."""
+    return Block(modes, int(grid.column_starts[grid.decomposition.rank]), grid.modes, axis=modes.ndim - 2)
+
+
+def restored_modes(grid: SpectralGrid, saved: Checkpoint, dimensions: int) -> np.ndarray:
+    """The part of this rank in the block "modes" of a checkpoint, an array of so many dimensions."""
+    start, stop = grid.column_starts[grid.decomposition.rank:][:2]
+    return saved.read("modes", int(start), int(stop), axis=dimensions - 2)

@@ -9,27 +9,28 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from eddies.scene.scene import Scene, SceneError, Training
+from eddies.scene.scene import SceneError, Simulation, Tracers, Training
 
 HELD_OUT = 0.1               # share of the training window that validates, at its end; at least the longest horizon
 KERNEL_FIELDS = 4            # filtered fields that the kernel is trained on
 TESTED_FRAMES, TESTED_PARTICLES = 9, 20_000  # of the a-priori test, which stores the rates of the particles
 
 
-def check_frames(stages: Sequence[str], scene: Scene, seen: float, frames: int) -> None:
-    """Raise SceneError where one of the stages finds too few frames."""
-    at_fields = range(0, frames, scene.tracers.field_every)
+def check_frames(stages: Sequence[str], tracers: Tracers, training: Training | None, simulation: Simulation | None,
+                 seen: float, frames: int) -> None:
+    """Raise SceneError where one of the stages finds too few frames; `training` is None for weights of another run."""
+    at_fields = range(0, frames, tracers.field_every)
     if "train" in stages:
-        if scene.model.path is None and seen > 0:
-            trained_frames(scene.training, frames, at_fields)
+        if training is not None and seen > 0:
+            trained_frames(training, frames, at_fields)
         between_frames(frames, at_fields)
     if "simulate" in stages:
-        rollout_start(scene, seen, frames, at_fields)
+        rollout_start(simulation, tracers, seen, frames, at_fields)
 
 
 def last_seen(window: float, frames: int) -> int:
-    """The last frame of the training window, which is a fraction of the ground truth."""
-    return max(int(window * (frames - 1)), 1)
+    """The last frame of the training window, which is a fraction of the ground truth; 0 without a window."""
+    return max(int(window * (frames - 1)), 1) if window > 0 else 0
 
 
 def last_trained_on(settings: Training, frames: int) -> int:
@@ -69,25 +70,27 @@ def between_frames(frames: int, at_fields: Sequence[int]) -> list[int]:
     return usable
 
 
-def rollout_start(scene: Scene, seen: float, frames: int, at_fields: Sequence[int]) -> int:
-    """The first frame with a filtered field at or after the start that the scene asks for, or after the part that the
-    model was trained on. Raises SceneError without a later frame to compare with."""
-    wanted = _frame_at(scene.simulation.start, seen, frames)
-    last = frames - 2 - round(scene.simulation.frame_interval / scene.tracers.frame_interval)
+def rollout_start(settings: Simulation, tracers: Tracers, seen: float, frames: int, at_fields: Sequence[int]) -> int:
+    """The first frame with a filtered field at or after [simulation] start, or after the part that the model was
+    trained on. Raises SceneError without a later frame to compare with."""
+    wanted = _frame_at(settings.start, seen, frames)
+    last = frames - 2 - round(settings.frame_interval / tracers.frame_interval)
     usable = [frame for frame in at_fields if wanted <= frame <= last]
     if not usable:
         raise SceneError(f"[simulation] start: after frame {wanted} of {frames} no filtered field is followed by "
-                         f"ground truth to compare with, {scene.simulation.frame_interval:g} later; lower start, "
+                         f"ground truth to compare with, {settings.frame_interval:g} later; lower start, "
                          "frame_interval, [training] window or [tracers] field_every, or raise [tracers] turnovers")
     return usable[0]
 
 
-def whole_frames(scene: Scene, frames: int) -> set[int]:
-    """The frames at which the unfiltered state is stored for coarse grids: where rollouts start, and the earliest frame
-    from which rollouts start where the model is not trained on this ground truth."""
-    fractions = () if scene.simulation is None else (0.0, scene.simulation.start)
-    every, seen = scene.tracers.field_every, scene.training.window if scene.training else 0.0
-    return {math.ceil(_frame_at(fraction, seen, frames) / every) * every for fraction in fractions}
+def whole_frames(settings: Simulation | None, training: Training | None, every: int, frames: int) -> set[int]:
+    """The frames at which the unfiltered state is stored for coarse grids; filtered fields are stored `every` frames.
+
+    Rollouts start at these frames: at the start of [simulation], and, where the model is not trained on this ground
+    truth, at the earliest frame.
+    """
+    starts, seen = (0.0, settings.start) if settings else (), training.window if training else 0.0
+    return {math.ceil(_frame_at(start, seen, frames) / every) * every for start in starts}
 
 
 def whole_cells(cutoff: int) -> int:
@@ -97,4 +100,4 @@ def whole_cells(cutoff: int) -> int:
 
 def _frame_at(fraction: float | None, seen: float, frames: int) -> int:
     """The frame at a fraction of the ground truth, at least 1; for None the end of the part that is seen."""
-    return max(last_seen(seen, frames) if fraction is None else int(fraction * (frames - 1)), 1)
+    return max(last_seen(seen if fraction is None else fraction, frames), 1)

@@ -19,41 +19,37 @@ from eddies.io.flow_states import StoredStates, VelocityCubes, open_states
 from eddies.parallel.broadcast import on_all_ranks
 from eddies.parallel.communicator import Comm
 from eddies.parallel.slab import SlabDecomposition
-from eddies.scene.scene import BOX_LENGTH, Initial, Scene, SceneError
+from eddies.scene.scene import BOX_LENGTH, Flow, Forcing, Initial, SceneError, Time
 from eddies.spectral.spectral_grid import SpectralGrid, regrid
 
 log = logging.getLogger("eddies")
 
 
-def build_fluid(scene: Scene, comm: Comm) -> Fluid:
-    """The fluid of a scene on its grid, with its forcing."""
-    flow = scene.flow
+def build_fluid(flow: Flow, forcing: Forcing | None, comm: Comm) -> Fluid:
+    """The fluid of [flow] on its grid, with the forcing of [forcing]."""
     grid = SpectralGrid(SlabDecomposition(comm, BOX_LENGTH, flow.cells), flow.precision)
-    forcing = None
-    if scene.forcing is not None:
-        forcing = LinearForcing(grid, scene.forcing.injection_rate, scene.forcing.wavenumber)
+    forced = LinearForcing(grid, forcing.injection_rate, forcing.wavenumber) if forcing is not None else None
     kind = load(flow.fluid) if is_path(flow.fluid) else FLUIDS[flow.fluid]
-    return kind(grid, flow.viscosity, flow.sound_speed if flow.compressible else math.inf, forcing)
+    return kind(grid, flow.viscosity, flow.sound_speed if flow.compressible else math.inf, forced)
 
 
-def build_step_limit(scene: Scene, grid: SpectralGrid) -> CourantLimit | FixedStep:
+def build_step_limit(time: Time, flow: Flow, grid: SpectralGrid) -> CourantLimit | FixedStep:
     """The choice of the time step: fixed, or by the Courant number, with sound for the explicit stepper only."""
-    time = scene.time
     if time.step is not None:
         return FixedStep(time.step)
-    explicit_sound = scene.flow.sound_speed if time.explicit and scene.flow.compressible else 0.0
+    explicit_sound = flow.sound_speed if time.explicit and flow.compressible else 0.0
     return CourantLimit(grid, time.courant, time.max_step, explicit_sound)
 
 
-def initial_state(scene: Scene, fluid: Fluid) -> np.ndarray:
+def initial_state(initial: Initial, seed: int, fluid: Fluid) -> np.ndarray:
     """The modes of the initial state: velocity, and for a compressible fluid s = ln(rho / rho_0)."""
-    initial, grid = scene.initial, fluid.grid
+    grid = fluid.grid
     if initial.flow.from_file:
         return _state_from_file(initial, fluid)
     if is_path(initial.kind):
-        velocity = _velocity_of_user(initial, scene.seed, grid)
+        velocity = _velocity_of_user(initial, seed, grid)
     else:
-        velocity = INITIAL_FLOWS[initial.kind](grid, initial, scene.seed)
+        velocity = INITIAL_FLOWS[initial.kind](grid, initial, seed)
     if not fluid.compressible:
         return velocity
     if initial.flow.sound:

@@ -18,7 +18,9 @@ from eddies.particles.particle_set import ParticleSet, as_numpy
 from eddies.spectral.interpolation import SplineInterpolation
 from eddies.spectral.spectral_grid import SpectralGrid
 from eddies.workflows.ground_truth.frame_counts import TESTED_FRAMES, TESTED_PARTICLES, between_frames
-from eddies.workflows.ground_truth.truth import GroundTruth, load_frame, particles_for
+from eddies.workflows.ground_truth.truth import GroundTruth
+from eddies.workflows.learned.model import particles_for
+from eddies.workflows.learned.training_data import load_frame
 
 
 def evaluation_frames(truth: GroundTruth) -> np.ndarray:
@@ -87,7 +89,7 @@ def _pressure_force(truth: GroundTruth, index: int, particles: ParticleSet) -> t
     at = truth.at_fields.index(index)
     slab = SlabDecomposition(truth.decomposition.comm, truth.decomposition.length, truth.fields.cells)
     grid = SpectralGrid(slab, cutoff=(slab.planes - 1) // 2)
-    planes = truth.field(at, "density", slab)
+    planes = truth.planes(truth.fields, at, "density", slab)
     force = -truth.scales.sound_speed**2 * grid.gradient(grid.forward(np.log(planes))[0])
     spline = SplineInterpolation(grid, "quintic")
     columns = migrate(slab, {name: as_numpy(getattr(particles, name)) for name in ("id", "position")})

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
-import logging
 from collections.abc import Mapping
+from dataclasses import replace
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -17,20 +19,20 @@ from eddies.io.hdf5 import ProductError
 from eddies.io.weights import load_weights
 from eddies.parallel.broadcast import first_complaint, share_text
 from eddies.parallel.communicator import Comm
-from eddies.parallel.reduction import any_rank
 from eddies.particles.flow_units import ReferenceScales
 from eddies.particles.forms import Form
 from eddies.particles.model import LagrangianModel, build_model
+from eddies.particles.particle_set import ParticleSet
 from eddies.particles.smoothing_kernels import HermiteKernel, KernelNetwork
 from eddies.scene.scene import SceneError
 from eddies.scene.terms import TermError
 from eddies.workflows.learned.source import ModelDefinition
 
-log = logging.getLogger("eddies")
+SHAPELESS = "without a shape"  # summary of a parameter of a lazy module
 
 
 def initial_model(definition: ModelDefinition, scales: ReferenceScales, comm: Comm) -> LagrangianModel:
-    """The model with initial parameters, equal on all ranks, for a flow of these scales; collective.
+    """The model with initial parameters, for a flow of these scales; collective.
 
     Raises SceneError if a class of the user is not a term, cannot be made, or differs between ranks.
     """
@@ -38,65 +40,40 @@ def initial_model(definition: ModelDefinition, scales: ReferenceScales, comm: Co
         model = build_model(definition.model.settings, definition.model.terms, definition.units(scales))
     except TermError as error:
         raise SceneError(f"[model] terms: {error}") from None
-    take_from_first_rank(model, comm)
+    require_same_parameters(model, comm)
     return model
 
 
-def take_from_first_rank(model: nn.Module, comm: Comm) -> None:
-    """Copy parameters and buffers of rank 0 to all ranks, with a warning if they differed; collective.
-
-    Raises SceneError on all ranks if names, shapes, types or `requires_grad` differ between ranks, or if a parameter
-    has no shape yet.
-    """
-    own = {**dict(model.named_parameters()), **dict(model.named_buffers())}
-    forms = {name: _form(tensor) for name, tensor in own.items()}
-    first = json.loads(share_text(comm, json.dumps(forms)))
-    wrong = next((name for name in {**first, **forms} if first.get(name) != forms.get(name)), None)
-    complaint = first_complaint(comm, wrong and (
-        f"[model] terms: {wrong} is {forms.get(wrong, 'missing')} on rank {comm.rank} and "
-        f"{first.get(wrong, 'missing')} on rank 0; make it the same on all ranks"))
+def require_same_parameters(model: nn.Module, comm: Comm) -> None:
+    """Raise SceneError on all ranks if a parameter or buffer is not the same on all ranks, or has no shape yet;
+    collective."""
+    own = [[name, _summary(tensor)] for name, tensor in (*model.named_parameters(), *model.named_buffers())]
+    first = json.loads(share_text(comm, json.dumps(own)))
+    differing = next(((mine or other)[0] for mine, other in zip_longest(own, first) if mine != other), None)
+    shapeless = next((name for name, summary in own if summary == SHAPELESS), None)
+    complaint = first_complaint(comm, differing and (
+        f"{differing} differs on rank {comm.rank} from that on rank 0, in its order, type, shape or initial values; "
+        "draw random numbers from a generator with the seed of the flow (flow.seed)"))
+    if complaint is None and shapeless is not None:
+        complaint = f"{shapeless} has no shape yet, as in a lazy module; give the module its sizes"
     if complaint is not None:
-        raise SceneError(complaint)
-    shapeless = next((name for name in first if is_lazy(own[name])), None)
-    if shapeless is not None:
-        raise SceneError(f"[model] terms: {shapeless} has no shape yet, as in a lazy module; give the module its sizes")
-    differing = []
-    for name in first:  # ranks may have registered them in different orders
-        values = own[name].detach().cpu().contiguous()
-        given = values.clone()
-        comm.Bcast(_bytes(given))
-        if any_rank(comm, not np.array_equal(_bytes(given), _bytes(values))):
-            differing.append(name)
-            with torch.no_grad():
-                own[name].copy_(given)
-    if differing and comm.rank == 0:
-        log.warning("model: initial values of %s differ between ranks; all ranks take those of rank 0. Draw random "
-                    "numbers from a generator with the seed of the flow (flow.seed)", ", ".join(differing))
+        raise SceneError(f"[model] terms: {complaint}")
 
 
-def _form(tensor: torch.Tensor) -> str:
+def _summary(tensor: torch.Tensor) -> str:
+    """A text that tells whether tensors are the same; works for types that numpy or MPI lack."""
     if is_lazy(tensor):
-        return "without a shape"
-    fixed = isinstance(tensor, nn.Parameter) and not tensor.requires_grad
-    return f"{tensor.dtype} {list(tensor.shape)}" + (" that is not trained" if fixed else "")
-
-
-def _bytes(tensor: torch.Tensor) -> np.ndarray:
-    """The memory of a tensor as bytes, without a copy; works for types that numpy or MPI lack."""
-    return tensor.reshape(-1).view(torch.uint8).numpy()
+        return SHAPELESS
+    content = tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy()
+    return f"{tensor.dtype} {list(tensor.shape)} {tensor.requires_grad} {hashlib.sha256(content).hexdigest()}"
 
 
 def load_model(definition: ModelDefinition, comm: Comm, path: str | Path, scales: ReferenceScales) -> LagrangianModel:
-    """The model with the weights of a file, for a flow of these scales; all ranks call it.
+    """The model with the weights of a file, in their precision, for a flow of these scales; all ranks call it.
 
     Raises ProductError if the file cannot be read or holds weights of another model.
     """
-    return with_weights(definition, comm, *load_weights(comm, path, "model"), path, scales)
-
-
-def with_weights(definition: ModelDefinition, comm: Comm, description: Mapping[str, Any],
-                 weights: Mapping[str, np.ndarray], path: str | Path, scales: ReferenceScales) -> LagrangianModel:
-    """The model with weights that were read from `path`, in their precision; collective."""
+    description, weights = load_weights(comm, path, "model")
     for key, wanted, trained in definition.differences(description):
         raise ProductError(f"{path}: was trained with {key} = {trained}, and the scene has {wanted}; run "
                            "`eddies train` again, or set the key to that")
@@ -109,6 +86,12 @@ def with_weights(definition: ModelDefinition, comm: Comm, description: Mapping[s
     model.to(getattr(torch, precision))
     model.load_state_dict({name: torch.from_numpy(np.asarray(tensor)) for name, tensor in weights.items()})
     return model
+
+
+def particles_for(model: LagrangianModel, columns: dict[str, np.ndarray], device: torch.device) -> ParticleSet:
+    """The true particles as a start for a model; with their density only if the model integrates it."""
+    particles = ParticleSet.from_numpy(columns, device)
+    return particles if model.integrates_density else replace(particles, density=None)
 
 
 def load_kernel(comm: Comm, path: str | Path, device: torch.device | str = "cpu") -> HermiteKernel:

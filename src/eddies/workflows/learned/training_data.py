@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -11,21 +12,24 @@ import torch
 
 from eddies.analysis.lagrangian import evenly
 from eddies.clock import ProgressLine
-from eddies.learning.force_training import ForceTrainer, LossWeights, TrainingFrame
+from eddies.learning.force_training import FieldLater, ForceTrainer, LossWeights, TrainingFrame
 from eddies.learning.rollout_training import RolloutTrainer, TrainingWindow
 from eddies.particles.dynamics import ParticleDynamics
 from eddies.particles.integrators import INTEGRATORS
 from eddies.particles.model import LagrangianModel
+from eddies.particles.particle_field import grid_points
 from eddies.particles.particle_set import ParticleSet
 from eddies.particles.periodic_box import PeriodicBox
 from eddies.particles.resolved_velocity import ResolvedVelocity
 from eddies.particles.smoothing_kernels import SmoothingKernel
 from eddies.scene.scene import BOX_LENGTH, Training
 from eddies.workflows.foreseen.ranks import ALLOWED_VELOCITY
-from eddies.workflows.ground_truth.frame_counts import last_trained_on, trained_frames
-from eddies.workflows.ground_truth.truth import GroundTruth, load_frame
-from eddies.workflows.learned.model import initial_model
+from eddies.workflows.ground_truth.frame_counts import last_seen, last_trained_on, trained_frames
+from eddies.workflows.ground_truth.truth import GroundTruth
+from eddies.workflows.learned.model import initial_model, particles_for
 from eddies.workflows.learned.source import ModelDefinition
+
+log = logging.getLogger("eddies")
 
 
 class TrainingData:
@@ -48,7 +52,7 @@ class TrainingData:
         self.dtype = getattr(torch, settings.precision)
         self.model = model_for(definition, truth, self.dtype, like)
         self.longest = max(settings.horizons.frames) if settings.horizons else 0
-        self.last = truth.last_frame_seen(settings.window)
+        self.last = last_seen(settings.window, len(truth.times))
         self.learned = last_trained_on(settings, len(truth.times))
         self.usable, self.held_out = trained_frames(settings, len(truth.times), truth.at_fields)
 
@@ -131,3 +135,38 @@ def training_data(definition: ModelDefinition, settings: Training, truths: Seque
         count = len(range(number, settings.frames, len(truths)))
         data.append(TrainingData(definition, settings, truth, count, data[0].model if data else None))
     return data
+
+
+def load_frame(truth: GroundTruth, index: int, model: LagrangianModel, dtype: torch.dtype,
+               with_field: bool = False) -> TrainingFrame:
+    """A frame with its true rates, and `with_field` also the filtered field one frame later; collective.
+
+    The particles have the true density if the model integrates the density.
+    """
+    columns = truth.particles_with_rates(int(index))
+    rates = {name: torch.from_numpy(columns[name]).to(truth.device, dtype)
+             for name in ("acceleration", "density_rate") if name in columns}
+    dynamics = ParticleDynamics(truth.decomposition, model, skin=0.0, dtype=dtype)
+    later = _field_after(truth, int(index), dtype) if with_field else None
+    frame = TrainingFrame(dynamics, particles_for(model, columns, truth.device), rates["acceleration"],
+                          rates.get("density_rate"), later)
+    solves = [] if dynamics.resolution is None else dynamics.resolution.solves
+    for iterations, residual, converged in solves:
+        if not converged and truth.decomposition.comm.rank == 0:
+            log.warning("frame %d: a solve for the resolved velocity did not converge in %d iterations, residual %.1e",
+                        index, iterations, residual)
+    return frame
+
+
+def _field_after(truth: GroundTruth, frame: int, dtype: torch.dtype) -> FieldLater:
+    """The filtered field one frame after a frame, and the positions of the particles at that time."""
+    slab, device = truth.decomposition, truth.device
+    columns = truth.window(frame, 1)  # rows as in `particles_with_rates`
+    position, later = (torch.from_numpy(columns[name]) for name in ("position", "position_later"))
+    # Stored positions are wrapped into the box; these continue from the positions of the frame.
+    moved = position + PeriodicBox(slab.length).displacement(later[:, 0], position)
+    points = grid_points(slab, truth.fields.cells)
+    field = torch.from_numpy(truth.field_at(frame + 1, points))
+    return FieldLater(moved.to(device), torch.from_numpy(columns["velocity_later"][:, 0]).to(device, dtype),
+                      float(truth.times[frame + 1] - truth.times[frame - 1]), points.to(device),
+                      field.to(device, dtype))

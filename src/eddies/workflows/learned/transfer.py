@@ -17,9 +17,10 @@ from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.devices import prepare_torch
 from eddies.pipeline import STAGES
 from eddies.scene.scene import BOX_LENGTH, Scene
+from eddies.workflows.ground_truth.frame_counts import last_seen
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.learned.a_priori import evaluate, evaluation_frames
-from eddies.workflows.learned.model import with_weights
+from eddies.workflows.learned.model import load_model
 from eddies.workflows.learned.source import ModelDefinition, ModelSource, read_source
 from eddies.workflows.run_directory.fingerprints import stage_provenance
 
@@ -37,10 +38,9 @@ def run(scene: Scene, comm: Comm, directory: Path) -> None:
     slab, device = SlabDecomposition(comm, BOX_LENGTH, scene.tracers.planes), prepare_torch(scene.device, comm)
     with open_product(comm, directory / STAGES["dns"].file, "ground_truth") as file:
         truth = GroundTruth(file, slab, device)
-        model = with_weights(definition, comm, source.description, source.weights, source.path, truth.scales).to(device)
-        model = model.forced(truth.forcing)
+        model = load_model(definition, comm, source.path, truth.scales).to(device).forced(truth.forcing)
         dtype = next((parameter.dtype for parameter in model.parameters()), torch.float64)
-        last = truth.last_frame_seen(scene.seen_in(directory))
+        last = last_seen(scene.seen_in(directory), len(truth.times))
         tables = evaluate(truth, model, evaluation_frames(truth), last, dtype)
         mach = truth.reference.get("mach_turbulent")
         description = definition.describe(truth.scales) | {"coefficients": model.learned_coefficients}

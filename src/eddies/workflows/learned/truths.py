@@ -15,9 +15,8 @@ from eddies.io.hdf5 import File, open_product
 from eddies.io.trajectories import Trajectory
 from eddies.parallel.communicator import Comm
 from eddies.parallel.slab import SlabDecomposition
-from eddies.pipeline import STAGES
 from eddies.scene.rules import quoted
-from eddies.scene.scene import BOX_LENGTH, Scene, Tracers, Training
+from eddies.scene.scene import BOX_LENGTH, Tracers, Training
 from eddies.workflows.ground_truth.frame_counts import trained_frames
 from eddies.workflows.ground_truth.truth import GroundTruth
 
@@ -34,22 +33,21 @@ def open_truths(own_file: Path, named: Sequence[Path], tracers: Tracers, comm: C
         yield own, [own if path.resolve() == own_file.resolve() else opened(path) for path in named or (own_file,)]
 
 
-def truth_problems(scene: Scene, comm: Comm, directory: Path) -> list[str]:
-    """Reasons why [training] truths cannot be used, one line each; all ranks call it.
+def truth_problems(settings: Training, tracers: Tracers, reads: Collection[str], own_file: Path,
+                   comm: Comm) -> list[str]:
+    """Reasons why [training] truths cannot be used with terms that read `reads`, one line each; all ranks call it.
 
-    The ground truth of the run itself is not examined, because it may not exist yet.
+    The ground truth of the run itself, `own_file`, is not examined, because it may not exist yet.
     """
-    if scene.training is None or scene.training.truths is None or scene.model.path is not None:
-        return []
-    own, problems, seen = (directory / STAGES["dns"].file).resolve(), [], set()
-    for name, path in zip(scene.training.truths, scene.training.truth_files):
+    own, problems, seen = own_file.resolve(), [], set()
+    for name, path in zip(settings.truths or (), settings.truth_files):
         place, file = f"[training] truths: {quoted(name)}", path.resolve()
         if file in seen:
             problems.append(f"{place}: is named twice; name each ground truth once")
         elif file != own:
             try:
                 with open_product(comm, path, "ground_truth") as opened:
-                    found = _problems_of(opened, scene.training, scene.tracers, scene.model.reads, comm)
+                    found = _problems_of(opened, settings, tracers, reads, comm)
                     problems += [f"{place}: {problem}" for problem in found]
             except UserError as error:
                 problems.append(f"{place}: {error}")

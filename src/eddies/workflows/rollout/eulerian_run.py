@@ -18,7 +18,7 @@ from eddies.flow.navier_stokes import FLUIDS, Fluid
 from eddies.flow.stability import quadratic_energy
 from eddies.flow.subgrid import Closure, DynamicStress, EddyDamping, SpectralViscosity, StressModel
 from eddies.flow.tracers import FilteredField, TracerParticles
-from eddies.io.checkpoint import Block, Checkpoint
+from eddies.io.checkpoint import Checkpoint
 from eddies.io.weights import load_weights
 from eddies.parallel.migration import migrate
 from eddies.parallel.slab import SlabDecomposition
@@ -28,6 +28,7 @@ from eddies.scene.scene import Eulerian, Scene, SceneError
 from eddies.spectral.mode_operators import gaussian_transfer
 from eddies.spectral.spectral_grid import SpectralGrid, regrid
 from eddies.time_stepping import ETDRK4
+from eddies.workflows.ground_truth.flow_run import restored_modes, saved_modes
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.rollout.particle_run import forcing_of
 from eddies.workflows.rollout.saved_particles import restored_rows, saved_rows
@@ -128,15 +129,14 @@ class EulerianRun:
     def state_dict(self) -> dict[str, Any]:
         """The state for a checkpoint; collective."""
         grid = self.fluid.grid
-        modes = Block(self.state, int(grid.column_starts[grid.decomposition.rank]), grid.modes, axis=2)
-        return {"modes": modes, "clock": self.clock.state_dict(), "flow_seconds": self.flow_seconds,
+        return {"modes": saved_modes(grid, self.state), "clock": self.clock.state_dict(),
+                "flow_seconds": self.flow_seconds,
                 **saved_rows(grid.decomposition.comm, self.tracers.columns)}
 
     def load_state_dict(self, saved: Checkpoint) -> None:
         """Inverse of `state_dict`, exact on the same number of ranks; collective."""
         grid = self.fluid.grid
-        starts, rank = grid.column_starts, grid.decomposition.rank
-        self.state = saved.read("modes", int(starts[rank]), int(starts[rank + 1]), axis=2)
+        self.state = restored_modes(grid, saved, 4)
         self.clock.load_state_dict(saved["clock"])
         self.flow_seconds = saved["flow_seconds"]
         columns, _ = restored_rows(grid.decomposition, saved)
@@ -184,8 +184,7 @@ def initial_state(truth: GroundTruth, fluid: Fluid, filter_passed: float, frame:
     is not stored at that frame.
     """
     grid, series = fluid.grid, truth.states
-    at = [index for index, time in enumerate(series.times) if abs(time - truth.times[frame]) < 1e-9]
-    if not at:
+    if frame not in truth.at_states:
         stored = ", ".join(f"{time / truth.times[-1]:.3g}" for time in series.times) or "no time"
         raise SceneError(
             f'[simulation] method = "eulerian": the rollout starts at {truth.times[frame] / truth.times[-1]:.3g} of the'
@@ -194,13 +193,16 @@ def initial_state(truth: GroundTruth, fluid: Fluid, filter_passed: float, frame:
     slab = SlabDecomposition(grid.decomposition.comm, grid.decomposition.length, series.cells)
     whole = SpectralGrid(slab, grid.precision, (series.cells - 1) // 2)
 
+    def stored_planes(variable: str) -> np.ndarray:
+        return truth.planes(series, truth.at_states.index(frame), variable, slab)
+
     def kept(values: np.ndarray) -> np.ndarray:
         return regrid(whole, grid, whole.forward(values.astype(whole.real)))
 
-    velocity = kept(truth.state(at[0], "velocity", slab))
+    velocity = kept(stored_planes("velocity"))
     velocity *= gaussian_transfer(grid.wavenumber_squared, filter_passed).astype(grid.real)
     if not fluid.compressible:
         return grid.solenoidal(velocity)
     if filter_passed:
         return np.concatenate([velocity, balanced_density(grid, velocity, fluid.sound_speed)[None]])
-    return np.concatenate([velocity, kept(np.log(truth.state(at[0], "density", slab)))])
+    return np.concatenate([velocity, kept(np.log(stored_planes("density")))])

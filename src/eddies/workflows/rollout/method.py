@@ -15,7 +15,7 @@ from eddies.particles.particle_set import ParticleSet
 from eddies.scene.scene import Scene
 from eddies.workflows.ground_truth.truth import GroundTruth
 from eddies.workflows.rollout.eulerian_run import EulerianRun
-from eddies.workflows.rollout.particle_run import BallisticRun, LearnedRun, ParticleRun
+from eddies.workflows.rollout.particle_run import ParticleRun
 
 
 class Method(Protocol):
@@ -53,18 +53,18 @@ class Method(Protocol):
 
 
 #: The classes behind the words of [simulation] method.
-METHODS: dict[str, Callable[..., Method]] = {"learned": LearnedRun, "none": BallisticRun, "eulerian": EulerianRun}
+METHODS: dict[str, Callable[..., Method]] = {"learned": ParticleRun, "none": ParticleRun, "eulerian": EulerianRun}
 
 
 @dataclass(frozen=True)
-class Step:
+class TimeStep:
     """Integrator and longest time step of a rollout; for a coarse grid "etdrk4" and the Courant number."""
 
     integrator: str
     size: float
 
 
-def make_method(scene: Scene, step: Step | None, truth: GroundTruth, start: int, directory: Path) -> Method:
+def make_method(scene: Scene, step: TimeStep | None, truth: GroundTruth, start: int, directory: Path) -> Method:
     """The method of a scene, starting at a frame of the truth. A given `step` replaces that of the scene; collective.
 
     With a given step the limit that the resolved velocity sets to steps is ignored.

@@ -26,8 +26,8 @@ from eddies.pipeline import STAGES
 from eddies.scene.scene import Forcing as ForcingSection
 from eddies.scene.scene import Scene
 from eddies.scene.terms import Forcing
-from eddies.workflows.ground_truth.truth import GroundTruth, particles_for
-from eddies.workflows.learned.model import load_model
+from eddies.workflows.ground_truth.truth import GroundTruth
+from eddies.workflows.learned.model import load_model, particles_for
 from eddies.workflows.learned.source import ModelDefinition
 from eddies.workflows.rollout.saved_particles import particle_state, restored_particles
 
@@ -41,33 +41,35 @@ SOLVES = "solves", "iterations", "most_iterations", "residual", "not_converged"
 
 
 class ParticleRun:
-    """The particles of a frame of the ground truth, moved by a model.
+    """The particles of a frame of the ground truth, moved by the trained model of the run directory, or by no force.
 
-    The units are the scales of the flow at the release of the tracers, as in training. A subclass makes the model
-    (`build`) and may limit the deviation of the density from the mean (`largest_deviation`).
+    The units are the scales of the flow at the release of the tracers, as in training. `seen` is the range of network
+    inputs in the training, None without networks. `limited` tells whether the resolved velocity limits the step; it is
+    false if the step was found by rollouts. Particles without forces have no neighbour list and send no message.
     """
-
-    largest_deviation = np.inf
-    seen: FeatureRange | None = None
-    #: whether the resolved velocity limits the step; false if the step was found by rollouts
-    limited = True
 
     def __init__(self, scene: Scene, truth: GroundTruth, start: int, directory: Path, device: torch.device) -> None:
         definition, forcing = ModelDefinition.of(scene), forcing_of(scene.simulation.injection, scene.forcing, truth)
         self.settings, self.comm, self.scales = scene.simulation, truth.decomposition.comm, truth.scales
         self.flow, dtype = definition.units(self.scales), getattr(torch, self.settings.precision)
-        self.model = self.build(definition, directory).forced(forcing).to(dtype=dtype, device=device)
+        model, deviation, self.limited = LagrangianModel({}, self.flow), np.inf, True
+        self.seen: FeatureRange | None = None
+        if "model" in self.settings.needs:
+            path = directory / STAGES["train"].file
+            model = load_model(definition, self.comm, path, self.scales)
+            if model.integrates_density and self.scales.density is not None:
+                deviation = RUNAWAY_DENSITY * self.scales.density
+            if model.networks:
+                with open_product(self.comm, path, "model") as file:
+                    self.seen = FeatureRange(**read_table(file, "feature_range"))
+        self.model = model.forced(forcing).to(dtype=dtype, device=device)
         self.dynamics = ParticleDynamics(truth.decomposition, self.model, self.settings.skin * self.flow.cutoff, dtype)
         self.integrator = INTEGRATORS[self.settings.scheme.name](self.dynamics)
         self.particles, self.total = particles_for(self.model, truth.particles(start), device), truth.total
         self._before: Moment | None = None
-        self.limits = Limits(RUNAWAY_SPEED * self.scales.velocity, self.scales.density_mean, self.largest_deviation)
+        self.limits = Limits(RUNAWAY_SPEED * self.scales.velocity, self.scales.density_mean, deviation)
         self._shares_outside: list[float] = []
         self._solves: dict[str, list[float]] = {name: [] for name in SOLVES}
-
-    def build(self, definition: ModelDefinition, directory: Path) -> LagrangianModel:
-        """The model without forcing; collective."""
-        raise NotImplementedError
 
     @property
     def has_density(self) -> bool:
@@ -180,27 +182,6 @@ class ParticleRun:
         """Integrator, terms, whether they integrate a density, and the number of evaluations of the rates."""
         return {"integrator": self.settings.scheme.name, "terms": ", ".join(self.model.terms) or "none",
                 "integrates_density": self.model.integrates_density, "evaluations": self.dynamics.evaluations}
-
-
-class LearnedRun(ParticleRun):
-    """Particles moved by the trained model of the run directory."""
-
-    def build(self, definition: ModelDefinition, directory: Path) -> LagrangianModel:
-        path = directory / STAGES["train"].file
-        model = load_model(definition, self.comm, path, self.scales)
-        if model.integrates_density and self.scales.density is not None:
-            self.largest_deviation = RUNAWAY_DENSITY * self.scales.density
-        if model.networks:
-            with open_product(self.comm, path, "model") as file:
-                self.seen = FeatureRange(**read_table(file, "feature_range"))
-        return model
-
-
-class BallisticRun(ParticleRun):
-    """Particles without forces, which keep their velocity. There is no neighbour list and no message."""
-
-    def build(self, definition: ModelDefinition, directory: Path) -> LagrangianModel:
-        return LagrangianModel({}, self.flow)
 
 
 def forcing_of(power: str | float, section: ForcingSection | None, truth: GroundTruth) -> Forcing | None:

@@ -15,9 +15,9 @@ from eddies.parallel.reduction import global_sum
 from eddies.parallel.slab import SlabDecomposition, block_starts
 from eddies.particles.integrators import Integrator
 from eddies.particles.particle_set import ParticleSet, as_numpy
+from eddies.workflows.ground_truth.flow_run import restored_modes, saved_modes
 
 MEMORY, BUILT_AT = "memory ", "built at"
-MODES_AXIS = 4  # ky, the axis along which ranks share the modes (moments, 2, 3, kz, ky, kx) of the resolved velocity
 
 
 def saved_rows(comm: Comm, columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
@@ -53,9 +53,8 @@ def particle_state(particles: ParticleSet, integrator: Integrator) -> dict[str, 
     state = {"time": dynamics.time, "evaluations": dynamics.evaluations,
              **saved_rows(dynamics.decomposition.comm, columns)}
     if dynamics.resolution is not None:
-        values, grid = dynamics.resolution.state_dict(), dynamics.resolution.grid
-        modes = Block(as_numpy(values["modes"]), int(grid.spectral.column_starts[dynamics.decomposition.rank]),
-                      grid.spectral.modes, MODES_AXIS)
+        values = dynamics.resolution.state_dict()
+        modes = saved_modes(dynamics.resolution.grid.spectral, as_numpy(values["modes"]))
         solves = [(int(iterations), float(residual), bool(converged))
                   for iterations, residual, converged in dynamics.resolution.solves]
         state |= {"closure": {"times": values["times"].tolist(), "speed": float(values["speed"]), "solves": solves},
@@ -69,9 +68,9 @@ def restored_particles(saved: Checkpoint, integrator: Integrator, device: torch.
     dynamics = integrator.dynamics
     slab, state = dynamics.decomposition, {"time": torch.tensor(saved["time"], dtype=torch.float64)}
     if dynamics.resolution is not None:
-        starts, closure = dynamics.resolution.grid.spectral.column_starts, saved["closure"]
-        modes = saved.read("modes", int(starts[slab.rank]), int(starts[slab.rank + 1]), MODES_AXIS)
-        state |= {"modes": torch.from_numpy(modes), "times": torch.tensor(closure["times"], dtype=torch.float64),
+        closure = saved["closure"]
+        modes = torch.from_numpy(restored_modes(dynamics.resolution.grid.spectral, saved, 6))
+        state |= {"modes": modes, "times": torch.tensor(closure["times"], dtype=torch.float64),
                   "speed": torch.tensor(closure["speed"], dtype=torch.float64)}
         dynamics.resolution.solves = [tuple(solve) for solve in closure["solves"]]
     dynamics.load_state_dict(state)

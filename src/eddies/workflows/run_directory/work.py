@@ -10,15 +10,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from eddies.clock import duration
 from eddies.errors import UserError
 from eddies.io.checkpoint import checkpoints_in
 from eddies.io.checksums import open_to_read
 from eddies.io.errors import ProductError, unreadable
+from eddies.io.hdf5 import open_product, read_attributes, read_table
 from eddies.io.provenance import product_provenance
+from eddies.parallel.communicator import Comm
 from eddies.pipeline import STAGES, Stage
 from eddies.scene.rules import quoted
-from eddies.scene.scene import Scene
+from eddies.scene.scene import Scene, Simulation
+from eddies.scene.sections import CONVERGED
 from eddies.workflows.run_directory.fingerprints import stage_fingerprint
 
 SECONDS = "stage_seconds.json"
@@ -79,11 +84,19 @@ def find_work(stages: Sequence[str], scene: Scene, directory: Path) -> Work:
     return Work(directory, frozenset(done), frozenset(begun), frozenset(useless), tuple(lost), tuple(changes))
 
 
-def is_done(stage: str, scene: Scene, directory: Path) -> bool:
-    """Whether the product of a stage is complete and was made with the same settings; on one rank."""
-    if STAGES[stage].product is None:
-        return False
-    return product_provenance(directory / STAGES[stage].file).get("fingerprint") == stage_fingerprint(scene, stage)
+def step_path(settings: Simulation, directory: Path) -> Path | None:
+    """The file of the step that a rollout takes: of its run directory or of [simulation] step_from; None if the step is
+    a number."""
+    if settings.step != CONVERGED:
+        return None
+    return Path(settings.step_from or directory) / STAGES["find-step"].file
+
+
+def read_found_step(path: Path, comm: Comm) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """The attributes of a found step, and the trials with its integrator; all ranks call it."""
+    with open_product(comm, path, "step") as file:
+        found = read_attributes(file, "found")
+        return found, read_table(file, f"trials/{found['integrator']}")
 
 
 def stage_seconds(directory: Path) -> dict[str, float]:
