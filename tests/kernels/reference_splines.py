@@ -1,8 +1,9 @@
-"""Splines by numpy: a class with the methods of `eddies.kernels.splines.Splines`."""
+"""Splines by numpy and scipy: a class with the methods of `eddies.kernels.splines.Splines`."""
 
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.interpolate import BSpline
 
 from eddies.kernels.splines import MisplacedPoint, PaddedPlanes
 
@@ -53,29 +54,11 @@ class Splines:
     def _stencils(self, derivative: int | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Rows (n, s) of the splines in flattened planes, and their values or derivatives (n, s) along one axis."""
         cells, width = self._padded.cells, self.degree + 1
-        along = [spline_weights(self.degree, fraction) for fraction in self._fraction.T]
+        element, places = BSpline.basis_element(np.arange(width + 1)), np.arange(self.degree, -1, -1)
+        along = [element(fraction[:, None] + places) for fraction in self._fraction.T]
         if derivative is not None:
-            along[derivative] = spline_slopes(self.degree, self._fraction[:, derivative]) / self._padded.spacing
+            along[derivative] = element(self._fraction[:, derivative, None] + places, 1) / self._padded.spacing
         x, y, z = ((first[:, None] + np.arange(width)) for first in self._first.T)
         rows = (z[:, :, None, None] * cells + y[:, None, :, None] % cells) * cells + x[:, None, None, :] % cells
         weights = along[2][:, :, None, None] * along[1][:, None, :, None] * along[0][:, None, None, :]
         return rows.reshape(len(rows), width**3), weights.reshape(len(rows), width**3)
-
-
-def spline_weights(degree: int, fraction: np.ndarray) -> np.ndarray:
-    """B-spline weights (n, degree + 1) of points at `fraction` (n,) of a cell, by the recursion of de Boor."""
-    weights = np.ones((len(fraction), 1))
-    for order in range(1, degree + 1):
-        # Distance of the point from the left end of each of the `order` overlapping splines.
-        left = fraction[:, None] + np.arange(order - 1, -1, -1)
-        following = np.zeros((len(fraction), order + 1))
-        following[:, :-1] += weights * (order - left)
-        following[:, 1:] += weights * left
-        weights = following / order
-    return weights
-
-
-def spline_slopes(degree: int, fraction: np.ndarray) -> np.ndarray:
-    """Derivatives (n, degree + 1) of the weights by `fraction`: differences of the weights of the next lower degree."""
-    lower = spline_weights(degree - 1, fraction)
-    return np.pad(lower, ((0, 0), (1, 0))) - np.pad(lower, ((0, 0), (0, 1)))

@@ -44,14 +44,13 @@ def averages_by_torch(field, kernel):
     return [volume, on_grid[0], *on_grid, *on_particles]
 
 
-@pytest.mark.mpi(1, 2, 3)
-@pytest.mark.parametrize("neighbors", [60, 3])
-@pytest.mark.parametrize("dtype, rounding", [(torch.float64, 1e-11), (torch.float32, 2e-4)])
-@pytest.mark.parametrize("kind", KERNELS)
+@pytest.mark.mpi(1, 3)
+@pytest.mark.parametrize("kind, dtype, rounding, neighbors", [
+    ("cubic spline", torch.float64, 1e-11, 60), ("wendland", torch.float32, 2e-4, 60),
+    ("tabulated", torch.float64, 1e-11, 60), ("tabulated", torch.float32, 2e-4, 60),
+    ("wendland", torch.float64, 1e-11, 3)])
 def test_averages_are_those_of_torch(comm, library, monkeypatch, kind, dtype, rounding, neighbors):
     """Also with so few neighbours that some points have none, and gradients are quotients of small numbers."""
-    if neighbors == 3 and dtype == torch.float32:
-        pytest.skip("of one neighbour at the very edge of the kernel single precision tells nothing")
     slab = SlabDecomposition(comm, LENGTH, 15)
     position = torch.from_numpy(release(slab, 3, 12, "random")["position"])
     support = LENGTH / 12 * (neighbors / (4 / 3 * np.pi)) ** (1 / 3)
@@ -60,8 +59,7 @@ def test_averages_are_those_of_torch(comm, library, monkeypatch, kind, dtype, ro
         kernel = KERNELS[kind](support)
     monkeypatch.setattr("eddies.particles.pairs.library", lambda: library)
     monkeypatch.setattr("eddies.particles.particle_field.library", lambda: library)
-    found, expected = averages(field, kernel), averages_by_torch(field, kernel)
-    for one, other in zip(found, expected, strict=True):
+    for one, other in zip(averages(field, kernel), averages_by_torch(field, kernel), strict=True):
         assert one.shape == other.shape
         assert (one - other).abs().max() <= rounding * other.abs().max() > 0
 

@@ -132,7 +132,7 @@ def dynamics_of(slab, lagrangian, skin=0.2, iterations=None, tolerance=None, **o
         resolution = dynamics.resolution
         resolution.iterations = iterations
         if tolerance is not None:
-            resolution.tolerance = resolution.tolerance_foreseen = resolution.tolerance_adjoint = tolerance
+            resolution.tolerance = resolution.tolerance_predicted = resolution.tolerance_adjoint = tolerance
     return dynamics
 
 
