@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from eddies.kernels.copies import ColumnCopies, PlaneCopies
+from eddies.kernels.copies import PlaneCopies
 from eddies.spectral import fourier_passes
 from tests.spectral import test_spectral_grid as transforms
 from tests.validation.flows import make_grid
@@ -46,29 +46,3 @@ def test_modes_that_are_not_conjugate_by_round_off_are_averaged(library):
     block[0, 0, 1, 0], block[0, 0, 4, 0] = 1 + 2j, 1.5 - 1j  # ky = 1 and -1 at kx = 0
     packed = copies.pack(copies.described_blocks([block]), slice(0, 2))[0, 0]
     assert packed[1, 0] == 1.25 + 1.5j and packed[4, 0] == 1.25 - 1.5j
-
-
-def test_arrays_of_another_kind_are_refused(library):
-    planes, columns = (kind(library, 12, 3, np.complex128) for kind in (PlaneCopies, ColumnCopies))
-    blocks = planes.described_blocks([noise(1, np.complex128, 3, 7, 7, 4)])
-
-    def array(*shape, dtype=np.complex128):
-        return planes.described(noise(1, dtype, *shape))
-
-    def column(*shape, dtype=np.complex128):
-        return columns.described_column(noise(1, dtype, *shape))
-
-    for call in (
-            lambda: planes.described_blocks([noise(1, np.complex64, 3, 7, 7, 4)]),
-            lambda: planes.described(np.zeros((2, 3, 4))[..., ::2]),
-            lambda: planes.unpack(array(1, 11, 9), blocks, 0, slice(0, 2)),
-            lambda: planes.unpack(array(1, 12, 9, dtype=np.complex64), blocks, 0, slice(0, 2)),
-            lambda: planes.pack(planes.described_blocks([noise(1, np.complex128, 3, 7, 6, 4)]), slice(0, 2)),
-            lambda: next(planes.filled(noise(1, np.complex128, 1, 1, 7, 6), None, array(1, 12, 9))),
-            lambda: planes.join(array(1, 2, 12, 12), 0, slice(0, 2), array(1, 12, 12)),
-            lambda: columns.described_column(np.zeros((2, 4, 4), np.complex128)[:, :, ::2]),
-            lambda: columns.fill(array(1, 7, 4, 4), 0, slice(0, 3), array(6), column(12, 3, 4)),
-            lambda: columns.fill(array(1, 7, 4, 4), 0, slice(0, 3), None, column(12, 2, 4)),
-            lambda: columns.fill(array(1, 7, 4, 4), 0, slice(0, 3), None, column(12, 3, 4, dtype=np.complex64))):
-        with pytest.raises(ValueError, match="needed"):
-            call()

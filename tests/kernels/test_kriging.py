@@ -90,16 +90,3 @@ def test_weighted_sums(library, rows, dtype):
         expected = own[row][:, None].astype(float) * field[:9]
         np.add.at(expected, np.repeat(np.arange(9), counts), others[row][:, None].astype(float) * field[senders])
         assert np.allclose(sums[..., row], expected, rtol=0, atol=200 * np.finfo(dtype).eps, equal_nan=True)
-
-
-def test_arrays_of_another_kind_are_refused(library):
-    for displacement in (np.zeros((2, 3)), np.zeros((3, 3)), np.zeros((3, 4))[:, ::2]):
-        with pytest.raises(ValueError, match="needed"):
-            kriging_weights(library, np.array([0, 2]), displacement, SUPPORT, NOISE, 1.0, np.ones(3))
-    arrays = {"offsets": np.array([0, 2]), "senders": np.array([1, 2]), "own": [np.zeros(1)], "weights": [np.zeros(2)],
-              "field": np.zeros((3, 1))}
-    for changed in ({"field": np.zeros((3, 1), np.float32)}, {"field": np.zeros((3, 2))[:, ::2]},
-                    {"senders": np.array([1, 2], np.int32)}, {"own": [np.zeros(3)]}, {"weights": [np.zeros(3)]},
-                    {"offsets": np.array([0, 3])}):
-        with pytest.raises(ValueError, match="needed"):
-            weighted_sums(library, **arrays | changed)

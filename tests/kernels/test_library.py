@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pyfftw
 import pytest
 
@@ -52,6 +53,13 @@ def test_a_library_of_other_sources_is_refused(elsewhere):
 def test_the_best_instruction_set_is_taken():
     available = module.instruction_sets()
     assert available[0] == "plain" and module.library() is module.load(available[-1])
+
+
+def test_arrays_of_another_shape_type_or_layout_are_refused():
+    module.require(np.zeros((2, 3)), (2, 3), np.float64)
+    for array in (np.zeros((3, 2)), np.zeros((2, 3), np.float32), np.zeros((3, 2)).T, np.zeros((2, 6))[:, ::2]):
+        with pytest.raises(ValueError, match="needed"):
+            module.require(array, (2, 3), np.float64)
 
 
 def printed(program, **environment):

@@ -48,21 +48,3 @@ def test_one_iteration(library, close, shape, kind, of_sums, of_modes):
     products = [np.sum(multiplicity * (one * other.conj()).real)
                 for one, other in ((made, exact["modes"]), (residual, inverse * residual))]
     assert sums == pytest.approx(products, abs=of_sums * 3 * np.prod(shape))
-
-
-def test_nan_stays_nan(library):
-    passes, _, inverse, vectors = set_up(library, (9, 5, 5))
-    for name in VECTORS:
-        spoiled = {**vectors, name: vectors[name].copy()}
-        spoiled[name][1, 4, 2, 3] = np.nan
-        sums, results = run(passes, inverse, spoiled)
-        assert np.isnan(sums).any() or any(np.isnan(vector).any() for vector in results.values()), name
-
-
-def test_arrays_of_another_kind_are_refused(library):
-    passes, weights, inverse, vectors = set_up(library, (9, 5, 5))
-    for spoiled in (vectors["given"][:2], vectors["given"].astype(np.complex64), vectors["given"][..., ::-1]):
-        with pytest.raises(ValueError, match="needed"):
-            passes.turn(1.0, inverse, vectors["residual"], spoiled)
-    with pytest.raises(ValueError, match="sizes"):
-        ModePasses(library, [np.ones(5)] * 3, *weights[1:])

@@ -5,7 +5,6 @@ import pytest
 import torch
 
 from eddies.flow.tracers import release
-from eddies.kernels.reconstruction import GridPlanes, sums_on_grid, kernel_numbers
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.particle_field import ParticleField
 from eddies.particles.reconstruction import reconstruct_with_gradient
@@ -62,9 +61,3 @@ def test_averages_are_those_of_torch(comm, library, monkeypatch, kind, dtype, ro
     for one, other in zip(averages(field, kernel), averages_by_torch(field, kernel), strict=True):
         assert one.shape == other.shape
         assert (one - other).abs().max() <= rounding * other.abs().max() > 0
-
-
-def test_wrong_columns_are_refused(library):
-    with pytest.raises(ValueError, match="four are needed"):
-        sums_on_grid(library, GridPlanes(8, 0.1, 0, 8, True), kernel_numbers(0.2, np.ones((1, 4))), np.zeros((5, 3)),
-                     np.zeros((5, 3)))

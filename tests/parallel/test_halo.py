@@ -12,12 +12,9 @@ LENGTH = 2 * np.pi
 WIDTH = 0.8
 
 
-@pytest.mark.parametrize("total, parts", [(10, 3), (2, 3), (0, 2), (7, 7)])
-def test_blocks_are_contiguous_complete_and_differ_by_at_most_one(total, parts):
-    starts = block_starts(total, parts)
-    sizes = np.diff(starts)
-    assert starts[0] == 0 and starts[-1] == total
-    assert sizes.max() - sizes.min() <= 1
+def test_blocks_differ_by_at_most_one():
+    for total, parts, starts in ((10, 3, [0, 4, 7, 10]), (2, 3, [0, 1, 2, 2]), (0, 2, [0, 0, 0])):
+        assert block_starts(total, parts).tolist() == starts
 
 
 @pytest.mark.mpi(1, 3)
@@ -49,8 +46,8 @@ def test_ghosts_are_exactly_the_images_within_the_width(comm, squeeze):
             z = position[:, 2] + shift
             near = ((z >= slab.lower - WIDTH) & (z < slab.lower)) | ((z >= slab.upper) & (z < slab.upper + WIDTH))
             expected += [(i, z[i]) for i in np.flatnonzero(near)]
-    found = zip(halo.forward(particles["id"]), halo.forward_positions(particles["position"])[:, 2])
-    assert np.allclose(sorted(found), sorted(expected), atol=1e-12) if expected else halo.count == 0
+    ghosts = zip(halo.forward(particles["id"]), halo.forward_positions(particles["position"])[:, 2])
+    assert np.allclose(sorted(ghosts), sorted(expected), atol=1e-12) if expected else halo.count == 0
 
 
 @pytest.mark.mpi(1, 2, 3)
@@ -83,8 +80,8 @@ def test_adjoint_of_ghost_planes_is_the_transpose(comm):
     for part in parts:
         part[...] = random.standard_normal(part.shape)
     forward = sum(np.sum(part * weight) for part, weight in zip(halo.forward(planes), parts))
-    found, expected = global_sum(comm, np.array([forward, np.sum(planes * halo.adjoint(parts))]))
-    assert found == pytest.approx(expected, rel=1e-12)
+    left, right = global_sum(comm, np.array([forward, np.sum(planes * halo.adjoint(parts))]))
+    assert left == pytest.approx(right, rel=1e-12)
 
 
 @pytest.mark.mpi(3)
