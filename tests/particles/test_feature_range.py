@@ -4,9 +4,8 @@ import torch
 from mpi4py import MPI
 
 from eddies.particles import context
-from eddies.particles.dense_network import DenseNetwork
 from eddies.particles.feature_range import FeatureRange, pair_features
-from tests.particles.configurations import CUTOFF, SCALES, by_torch, distributed, dynamics_of, model, state
+from tests.particles.configurations import CUTOFF, SCALES, distributed, dynamics_of, model, state
 
 
 def blocks(comm, speed=1.0):
@@ -29,24 +28,6 @@ def test_pairs_of_the_training_lie_inside_the_range_and_faster_ones_outside(comm
     assert seen.share_outside(comm, blocks(comm)) == 0
     shares = [ranges[1].share_outside(group, blocks(group, speed=3.0)) for group in (comm, MPI.COMM_SELF)]
     assert 0.02 < shares[0] == shares[1] < 0.9
-
-
-@pytest.mark.mpi(1)
-def test_features_are_the_inputs_of_the_networks(comm, monkeypatch):
-    slab, particles = distributed(comm, *state())
-    dynamics = dynamics_of(slab, model(pairs=dict(inputs=("distance", "approach")), density_flux={}))
-    by_torch(monkeypatch)
-    inputs, forward = [], DenseNetwork.forward
-
-    def recording(network, features):
-        inputs.append(features)
-        return forward(network, features)
-
-    monkeypatch.setattr(DenseNetwork, "forward", recording)
-    with torch.no_grad():
-        dynamics.rates(particles)
-    features, = pair_features(dynamics, particles)
-    assert torch.equal(features, torch.cat(inputs)) and len(features) == 2 + 5
 
 
 @pytest.mark.mpi(1, 2)

@@ -181,15 +181,3 @@ def test_particles_have_the_density_that_terms_gave_last(comm, name, stored):
     # The last evaluation is less than a step away.
     assert torch.allclose(end.density, expected, rtol=0, atol=0.1 * float((expected - 1).abs().max()))
     assert 0 < (end.density - 1).abs().max() < 0.1
-
-
-@pytest.mark.mpi(2)
-@pytest.mark.parametrize("name", ["verlet", "rk3"])
-def test_an_unused_density_changes_nothing(comm, name):
-    position, velocity, density = state()
-    ends = []
-    for columns in ((position, velocity), (position, velocity, density)):
-        slab, particles = distributed(comm, *columns)
-        ends.append(run(name, dynamics_of(slab, model(MODELS["resolved"]), 0.1, iterations=3), particles, 0.1, 3))
-    assert ends[0].density is None and torch.equal(ends[1].density, density[ends[1].id])
-    assert torch.equal(ends[0].velocity, ends[1].velocity) and torch.equal(ends[0].position, ends[1].position)

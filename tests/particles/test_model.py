@@ -54,46 +54,31 @@ class LinearPairs(PairTerm):
 
 
 @pytest.mark.mpi(1, 2)
-def test_stored_linear_terms_give_their_rates_at_any_parameters(comm):
-    """Rates of all particles and of some rows, with a user's sum over pairs among the terms."""
+def test_stored_linear_terms_give_their_rates_and_gradients_at_any_parameters(comm):
+    """For all particles and for some rows, with a user's sum over pairs and a network that reads the density."""
     slab, particles = distributed(comm, *state())
     linear = model({word: SETTINGS.get(word, {}) for word in LINEAR})
     pairs = build_model({"LinearPairs": declared(("pairs",))}, [f"{__name__}:LinearPairs"], FLOW)
-    lagrangian = LagrangianModel({**linear.terms, **pairs.terms, **model(PAIR_MODELS["paper"]).terms}, FLOW)
+    lagrangian = LagrangianModel({**linear.terms, **pairs.terms, **model(pairs={}).terms}, FLOW)
     dynamics = dynamics_of(slab, lagrangian)
     kept = lagrangian.linear_rates(dynamics.context(particles))
     assert set(kept) == {*LINEAR, "LinearPairs"}
-    for seed in (1, 2):
+    for seed, rows in ((1, None), (2, torch.tensor([7, 3, 3, 12]))):
         randomised(lagrangian, seed)
-        for rows in (None, torch.tensor([7, 3, 3, 12])):
-            direct = dynamics.rates(particles, rows)
-            assert_same_rates(dynamics.rates(particles, rows, kept), direct)
-            assert len(direct.acceleration) == (len(particles) if rows is None else 4)
-
-
-@pytest.mark.mpi(2)
-@pytest.mark.parametrize("name", ["pairs with density", "resolved"])
-def test_rates_and_gradients_with_stored_terms_are_those_without(comm, name):
-    slab, particles = distributed(comm, *state())
-    lagrangian = model({**MODELS[name], **SETTINGS})
-    dynamics = dynamics_of(slab, lagrangian)
-    kept = lagrangian.linear_rates(dynamics.context(particles))
-    assert set(kept) == set(lagrangian.terms) - {"pairs"}
-    randomised(lagrangian)
-    rows, results = torch.tensor([2, 31, 5]), []
-    density = dynamics.rates(particles, kept=kept).density
-    for chosen in ({}, {"kept": kept}):
-        rates = dynamics.rates(particles, rows, **chosen)
-        loss = rates.acceleration.square().sum() + (0 if rates.density is None else 100 * rates.density.sum())
-        parameters = list(lagrangian.parameters())
-        gradients = [part.numpy().copy() for part in torch.autograd.grad(loss, parameters, materialize_grads=True)]
-        sum_flat(comm, gradients)
-        results.append((rates, gradients))
-    assert_same_rates(results[1][0], results[0][0])
-    for kept_gradient, gradient in zip(results[1][1], results[0][1]):
-        assert np.abs(kept_gradient - gradient).max() <= 1e-11 * max(np.abs(gradient).max(), 1e-10)
-    if density is not None:  # training computes the density once
-        assert_same_rates(dynamics.rates(particles, rows, kept, density.detach()), results[0][0])
+        results = []
+        for chosen in ({}, {"kept": kept}):
+            rates = dynamics.rates(particles, rows, **chosen)
+            loss = rates.acceleration.square().sum() + 100 * rates.density.sum()
+            gradients = torch.autograd.grad(loss, list(lagrangian.parameters()), materialize_grads=True)
+            gradients = [part.numpy().copy() for part in gradients]
+            sum_flat(comm, gradients)
+            results.append((rates, gradients))
+        (direct, expected), (stored, gradients) = results
+        assert_same_rates(stored, direct)
+        for gradient, reference in zip(gradients, expected):
+            assert np.abs(gradient - reference).max() <= 1e-11 * max(np.abs(reference).max(), 1e-10)
+    # Training computes the density once.
+    assert_same_rates(dynamics.rates(particles, rows, kept, stored.density.detach()), direct)
 
 
 class Quadratic(Term):

@@ -105,12 +105,11 @@ def test_a_rank_without_particles_takes_part_there_and_back(comm):
 
 
 @pytest.mark.mpi(2)
-@pytest.mark.parametrize("z, complaint", [(np.nan, "not finite"), (1.5, "shorten the time step")])
-def test_all_ranks_refuse_a_particle_beyond_the_ghost_planes(comm, z, complaint):
+def test_all_ranks_refuse_a_particle_beyond_the_ghost_planes(comm):
     slab, particles, _ = in_known_flow(comm)
     if comm.rank == 1:
-        particles.position[0, 2] = slab.upper + z * slab.spacing
-    with pytest.raises(HaloError, match=complaint):
+        particles.position[0, 2] = slab.upper + 1.5 * slab.spacing
+    with pytest.raises(HaloError, match="shorten the time step"):
         dynamics_of(slab, lagrangian(), fixed_ranks=True).rates(particles)
 
 
