@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from eddies.kernels.kriging import MOST_NEIGHBORS, kriging_weights, weighted_sums
-from eddies.particles.kriging import NOISE, Covariance
+from eddies.particles.kriging import NOISE, covariance
 from eddies.particles.neighbor_list import NeighborList
 from eddies.particles.periodic_box import PeriodicBox
 from tests.kernels.reference_kriging import solved
@@ -25,9 +25,8 @@ def pairs(count, dtype, seed=1):
 
 
 def weights(library, offsets, displacement, width=WIDTH, sited=True):
-    covariance = Covariance.of_filtered_turbulence(width)
     return kriging_weights(library, np.asarray(offsets), np.ascontiguousarray(displacement.T.numpy()), SUPPORT, NOISE,
-                           covariance.slowest, np.array(covariance.amplitudes), sited)
+                           *covariance(width), sited)
 
 
 @pytest.mark.parametrize("count, width, sited, dtype", [
@@ -35,9 +34,9 @@ def weights(library, offsets, displacement, width=WIDTH, sited=True):
     (120, WIDTH, True, torch.float64), (60, WIDTH, True, torch.float32), (60, WIDTH / 30, True, torch.float64)])
 def test_weights(library, count, width, sited, dtype):
     """Neighbours up to 1.2 filter widths away, where a series replaces the widest Gaussian, and farther."""
-    listed, covariance = pairs(count, dtype), Covariance.of_filtered_turbulence(width)
+    listed = pairs(count, dtype)
     compiled = weights(library, listed.offsets, listed.displacement, width, sited)
-    expected = solved(listed.offsets, listed.displacement, SUPPORT, covariance, sited)
+    expected = solved(listed.offsets, listed.displacement, SUPPORT, width, sited)
     for one, other in zip(compiled if sited else compiled[1:], expected if sited else expected[1:]):
         assert len(one) == len(other) == 10
         for row, of_row in zip(one, other):
@@ -67,7 +66,7 @@ def test_too_many_neighbours_give_nan_for_that_receiver_only(library, dtype):
     displacement = torch.cat([few.displacement, away])
     of_few = weights(library, few.offsets, few.displacement)
     for own, others in (weights(library, offsets, displacement),
-                        solved(offsets, displacement, SUPPORT, Covariance.of_filtered_turbulence(WIDTH))):
+                        solved(offsets, displacement, SUPPORT, WIDTH)):
         own, others = np.stack([*own]), np.stack([*others])
         assert np.isnan(own[:, -1]).all() and np.isnan(others[:, listed:]).all()
         # Receivers share vectors in another way, so that sums in single precision may round differently.

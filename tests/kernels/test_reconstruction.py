@@ -6,6 +6,7 @@ import torch
 
 from eddies.flow.tracers import release
 from eddies.parallel.slab import SlabDecomposition
+from eddies.particles.exchanges import with_ghosts
 from eddies.particles.particle_field import ParticleField
 from eddies.particles.reconstruction import reconstruct_with_gradient
 from eddies.particles.smoothing_kernels import CubicSpline, KernelNetwork, WendlandC2
@@ -37,7 +38,7 @@ def averages(field, kernel):
 def averages_by_torch(field, kernel):
     at_points, at_particles = (field._neighbors_of(points).pairs(points, field._position, dtype=field.dtype)
                                for points in (field.points, field.owned))
-    volume = field._with_ghosts(1 / at_particles.sum(kernel.value(at_particles.distance)))
+    volume = with_ghosts(field.halo, 1 / at_particles.sum(kernel.value(at_particles.distance)))
     on_grid, on_particles = (reconstruct_with_gradient(kernel, pairs, volume, field._velocity)
                              for pairs in (at_points, at_particles))
     return [volume, on_grid[0], *on_grid, *on_particles]

@@ -8,7 +8,6 @@ from eddies.flow.tracers import release
 from eddies.parallel.reduction import global_max
 from eddies.parallel.slab import SlabDecomposition
 from eddies.particles.forms import DEGREES, Form
-from eddies.particles.kriging import Covariance
 from eddies.particles.particle_field import RIDGE, ParticleField
 from eddies.particles.smoothing_kernels import CubicSpline, HermiteKernel, WendlandC2
 from tests.kernels.reference_kriging import solved
@@ -104,8 +103,7 @@ def test_forms_are_those_of_dense_equations(comm, name, dtype, rounding):
         elif name == "average":
             exact, slope = (volume[near].numpy() * weight) @ value / (volume[near].numpy() @ weight), None
         elif name == "kriging":
-            covariance = Covariance.of_filtered_turbulence(2 * SPACING)
-            weights = solved([0, len(away)], -away, SUPPORT, covariance, sited=False)[1]
+            weights = solved([0, len(away)], -away, SUPPORT, 2 * SPACING, sited=False)[1]
             exact, slope = weights[0] @ value, (weights[1:4] @ value).T
         else:
             y = away / SUPPORT

@@ -78,5 +78,5 @@ def weighted_sums(library: ctypes.CDLL, offsets: np.ndarray, senders: np.ndarray
     of_own, of_weights = (np.array([address(row) for row in some], np.uint64) for some in (own, weights))
     given = _Sums(receivers, rows, field.shape[1], address(offsets), address(senders),
                   address(of_own) if sited else None, *map(address, (of_weights, field, result)))
-    getattr(library, f"told_{dtype}")(ctypes.byref(given))
+    getattr(library, f"weighted_sums_{dtype}")(ctypes.byref(given))
     return result

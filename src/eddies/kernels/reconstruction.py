@@ -31,7 +31,7 @@ class _Reconstruction(ctypes.Structure):
 
 class _Fit(ctypes.Structure):
     _fields_ = (members(INT, "receivers periodic_z") + members(NUMBER, "length volume ridge")
-                + members(ADDRESS, "offsets senders receiver position value kernel found"))
+                + members(ADDRESS, "offsets senders receiver position value kernel result"))
 
 
 def kernel_numbers(support: float, pieces: np.ndarray, signed: bool = False) -> tuple[float, ...]:
@@ -79,8 +79,8 @@ def fitted(library: ctypes.CDLL, box: Box, degree: int, numbers: tuple[float, ..
     kernel = np.array(numbers)
     offsets, senders = (np.ascontiguousarray(rows, np.int64) for rows in (offsets, senders))
     receivers, positions, values = (np.ascontiguousarray(a, np.float64) for a in (receivers, positions, values))
-    found = np.empty((len(receivers), 4, 3))
+    result = np.empty((len(receivers), 4, 3))
     given = _Fit(len(receivers), box.periodic_z, box.length, volume, ridge,
-                 *map(address, (offsets, senders, receivers, positions, values, kernel, found)))
+                 *map(address, (offsets, senders, receivers, positions, values, kernel, result)))
     getattr(library, FITS[degree])(ctypes.byref(given))
-    return found
+    return result

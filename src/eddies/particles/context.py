@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -33,14 +32,27 @@ REGULARISATION = 1e-3
 UNDECLARED = 'no term of this model reads "{}": add it to the `reads` of the settings'
 
 
-class PairSum(Protocol):
-    """A sum over pairs: a pair term (see PairTerm), or the moments that several terms share."""
+class PairSum:
+    """A sum of `pair_values` over the neighbours within the radius of interaction.
 
-    width: int
-    mutual: bool
-    parity: Tensor
+    Attributes
+    ----------
+    width : largest number of values held for a pair at once; it determines how many pairs are taken together.
+    mutual : whether j gets from i what i gets from j times `parity`. Each pair is then evaluated once.
+    parity : (components,), 1 or -1.
+    """
 
-    def pair_values(self, pairs: ScaledPairs) -> Tensor: ...
+    width = 8
+    mutual = False
+    parity: Tensor = torch.ones(1)
+
+    def pair_values(self, pairs: ScaledPairs) -> Tensor:
+        """Values to sum over neighbours, (components, m). They must vanish beyond the radius of interaction."""
+        raise NotImplementedError(f"{type(self).__name__} has no pair_values(pairs)")
+
+    def compiled(self, context: Context) -> CompiledSum | None:
+        """The same sum for the compiled library, or None. Each class must define it itself; it is not inherited."""
+        return None
 
 
 @dataclass(frozen=True)
@@ -177,8 +189,8 @@ class Context:
         local, flow, owned = self.local, self.flow, len(self.particles)
         wanted = np.zeros(len(local.position), bool)
         wanted[slice(owned) if self.rows is None else self.rows.numpy()] = True
-        space = PairSpace(local.box.length, local.box.periodic_z, flow.cutoff, flow.scales.filter_width,
-                          flow.scales.velocity, mutual)
+        box = local.neighborhood.box
+        space = PairSpace(box.length, box.periodic_z, flow.cutoff, flow.scales.filter_width, flow.scales.velocity, mutual)
         velocity = self.column("velocity") if any(each.reads_velocity for each in summands.values()) else None
         sums = compiled_sums(space, list(summands.values()), [summand.parity for summand in summands], local.position,
                              velocity, wanted, self.dtype)
@@ -215,10 +227,10 @@ class Context:
             yield self._pairs(block)
 
 
-class _SharedMoments:
+class _SharedMoments(PairSum):
     """The sums of `Moments`: w, then the entries of w x x^T."""
 
-    width, mutual, parity = 8, True, torch.ones(7)
+    mutual, parity = True, torch.ones(7)
 
     def pair_values(self, pairs: ScaledPairs) -> Tensor:
         return torch.stack([pairs.weight, *moments.products(pairs.weight * pairs.x, pairs.x)])

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from eddies.particles.pairs import Pairs
-from eddies.particles.smoothing_kernels import SmoothingKernel
+from eddies.particles.smoothing_kernels import SmoothingKernel, over_distance
 
 
 def volumes(kernel: SmoothingKernel, pairs: Pairs) -> Tensor:
@@ -43,9 +43,7 @@ def reconstruct_with_gradient(kernel: SmoothingKernel, pairs: Pairs, sender_volu
     """
     volume, value, distance = pairs.at_senders(sender_volumes), pairs.at_senders(sender_values).T, pairs.distance
     average, factor = _average(kernel, pairs, volume, value)
-    # At distance zero both slope and displacement vanish.
-    divisor = torch.where(distance > 0, distance, torch.ones_like(distance))
-    gradient = (volume * kernel.derivative(distance) / divisor) * pairs.displacement.T
+    gradient = volume * over_distance(kernel.derivative(distance), distance) * pairs.displacement.T
     deviation = value - average.T.contiguous().index_select(1, pairs.segment)
     products = deviation.unsqueeze(1) * gradient.unsqueeze(0)
     sums = pairs.sum(products.flatten(0, 1).T).reshape(pairs.count, *products.shape[:2])

@@ -147,7 +147,7 @@ def test_frames_between_steps_of_free_particles_lie_on_straight_lines(comm, tmp_
 
 @pytest.mark.mpi(1)
 def test_frames_of_long_steps_are_those_of_short_ones(comm, tmp_path, monkeypatch):
-    for name in ("tolerance", "tolerance_foreseen"):
+    for name in ("tolerance", "tolerance_predicted"):
         monkeypatch.setattr(ResolvedVelocity, name, 1e-8)
     scene, found = untrained(comm, tmp_path), {}
     for step in (0.01, 0.03, 0.1):

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor, nn
 
-from eddies.particles.context import Context
+from eddies.particles.context import Context, PairSum
 from eddies.particles.flow_units import FlowUnits
-from eddies.particles.pairs import CompiledSum, ScaledPairs
 from eddies.particles.rates import Rates
 from eddies.scene.terms import TermBase, TermSettings
 
@@ -72,32 +70,14 @@ class Term(nn.Module, TermBase):
         raise NotImplementedError(f"{type(self).__name__} has no forward(context)")
 
 
-class PairTerm(Term):
-    """A term that sums `pair_values` over the neighbours within the radius of interaction.
+class PairTerm(Term, PairSum):
+    """A term that is a sum over pairs; see PairSum. `needs_moments` tells whether `rates_of` uses `context.moments`.
 
     The sums of several such terms are taken together over the same pairs. If terms give a density that others read,
     there are two such passes. The rates belong to the requested particles, in training some of the owned ones.
-
-    Attributes
-    ----------
-    width : largest number of values held for a pair at once; it determines how many pairs are taken together.
-    needs_moments : whether `rates_of` uses `context.moments`.
-    mutual : whether j gets from i what i gets from j times `parity`. Each pair is then evaluated once.
-    parity : (components,), 1 or -1.
     """
 
-    width = 8
     needs_moments = False
-    mutual = False
-    parity: Tensor = torch.ones(1)
-
-    def pair_values(self, pairs: ScaledPairs) -> Tensor:
-        """Values to sum over neighbours, (components, m). They must vanish beyond the radius of interaction."""
-        raise NotImplementedError(f"{type(self).__name__} has no pair_values(pairs)")
-
-    def compiled(self, context: Context) -> CompiledSum | None:
-        """The same sum for the compiled library, or None. Each class must define it itself; it is not inherited."""
-        return None
 
     def rates_of(self, sums: Tensor, context: Context) -> Rates:
         """Contribution from the sums (components, k) over each particle's neighbours."""
