@@ -9,7 +9,7 @@ from eddies.particles.context import Context
 from eddies.particles.flow_units import FlowUnits
 from eddies.particles.pairs import CompiledSum, ScaledPairs
 from eddies.particles.rates import Rates
-from eddies.particles.terms.pair_basis import (
+from eddies.particles.terms.pair_network import (
     SMALL, acceleration, along_separation, compiled_switches, density_rate, separation_direction, window,
 )
 from eddies.particles.terms.term import Coefficient, PairTerm
