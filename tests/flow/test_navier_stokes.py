@@ -3,8 +3,9 @@ import pytest
 from mpi4py import MPI
 
 from eddies.clock import Clock
+from eddies.errors import UserError
 from eddies.flow import initial_fields
-from eddies.flow.forcing import ForcingError, LinearForcing
+from eddies.flow.forcing import LinearForcing
 from eddies.flow.history import FlowHistory
 from eddies.flow.navier_stokes import CompressibleFluid, IncompressibleFluid
 from eddies.flow.statistics import component_energies, compressible_budget, gradient_moments, turbulence_scales
@@ -143,7 +144,7 @@ def test_forcing_does_not_amplify_what_no_real_field_has(comm):
 def test_a_flow_without_energy_at_the_forced_modes_is_refused(comm):
     grid = make_grid(comm, 16, "float32")
     velocity = initial_fields.taylor_green(grid, 1.0)
-    with pytest.raises(ForcingError, match="wavenumber = 1.5"):
+    with pytest.raises(UserError, match="wavenumber = 1.5"):
         LinearForcing(grid, 0.5, 1.5).add(velocity, np.zeros_like(velocity))
     LinearForcing(grid, 0.5, 2.0).add(velocity, np.zeros_like(velocity))
     LinearForcing(grid, 0.0, 1.5).add(velocity, np.zeros_like(velocity))

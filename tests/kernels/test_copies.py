@@ -40,6 +40,14 @@ def noise(seed, dtype, *shape):
     return (random.standard_normal(shape) + 1j * random.standard_normal(shape)).astype(dtype)
 
 
+@pytest.mark.mpi(1)
+def test_arrays_of_another_shape_are_refused(comm):
+    grid = make_grid(comm, 12)
+    for transform, shape in ((grid.forward, grid.spectral_shape), (grid.backward, grid.physical_shape)):
+        with pytest.raises(ValueError, match="needed"):
+            transform(np.zeros((1, *shape)))
+
+
 def test_modes_that_are_not_conjugate_by_round_off_are_averaged(library):
     """Otherwise f would leak into g."""
     copies, block = PlaneCopies(library, 8, 2, np.complex128), np.zeros((1, 2, 5, 3), complex)
