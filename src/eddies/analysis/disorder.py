@@ -19,7 +19,6 @@ CELL = 2.0  # side of the cells in which particles are counted, in mean spacings
 
 
 def mean_spacing(total: int, length: float) -> float:
-    """length / total^(1/3)."""
     return length / total ** (1 / 3)
 
 

@@ -29,11 +29,9 @@ class CourantLimit:
         return min(ladder_step(self.largest, self._bound), clock.remaining)
 
     def state_dict(self) -> dict[str, float]:
-        """Return the last measured bound, for a checkpoint."""
         return {"bound": self._bound}
 
     def load_state_dict(self, state: dict[str, float]) -> None:
-        """Restore the last measured bound."""
         self._bound = state["bound"]
 
     def bound(self, state: np.ndarray, clock: Clock) -> float:
@@ -51,7 +49,6 @@ class FixedStep:
         self.step = step
 
     def __call__(self, state: np.ndarray, clock: Clock) -> float:
-        """Return the next step."""
         # A remainder that differs from the step by round-off is a full step: another size would need new operators.
         return self.step if clock.remaining > self.step * (1 - 1e-6) else clock.remaining
 
@@ -63,5 +60,4 @@ class FixedStep:
         """Restore nothing."""
 
     def bound(self, state: np.ndarray, clock: Clock) -> float:
-        """Return the step."""
         return self.step

@@ -55,11 +55,9 @@ class _Copies:
         self._cells, self._cutoff, self._kept = cells, cutoff, 2 * cutoff + 1
 
     def described_blocks(self, blocks: Sequence[np.ndarray]) -> _Blocks:
-        """Blocks as the other methods take them."""
         return _Blocks(blocks, self.exchanged_axis, self._dtype)
 
     def described(self, array: np.ndarray) -> _Array:
-        """An array as the other methods take it."""
         return _Array(array)
 
     def _function(self, name: str, *arguments: type) -> Callable[..., None]:

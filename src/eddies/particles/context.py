@@ -91,7 +91,6 @@ class Context:
 
     @property
     def local(self) -> LocalParticles:
-        """The particles that this rank sees, ghosts included."""
         if self._local is None:
             raise TermError(UNDECLARED.format("pairs"))
         return self._local
@@ -149,7 +148,7 @@ class Context:
     # ---- sums over pairs
 
     def pair_sums(self, term: PairSum) -> Tensor:
-        """Sums (components, k) of a term's pair values over each particle's neighbours; collective."""
+        """Sums (components, k) of a term over the neighbours of each particle; collective."""
         if term not in self._sums:
             self.sum_pairs([term])
         return self._sums[term]
@@ -190,7 +189,8 @@ class Context:
         wanted = np.zeros(len(local.position), bool)
         wanted[slice(owned) if self.rows is None else self.rows.numpy()] = True
         box = local.neighborhood.box
-        space = PairSpace(box.length, box.periodic_z, flow.cutoff, flow.scales.filter_width, flow.scales.velocity, mutual)
+        space = PairSpace(box.length, box.periodic_z, flow.cutoff, flow.scales.filter_width, flow.scales.velocity,
+                          mutual)
         velocity = self.column("velocity") if any(each.reads_velocity for each in summands.values()) else None
         sums = compiled_sums(space, list(summands.values()), [summand.parity for summand in summands], local.position,
                              velocity, wanted, self.dtype)

@@ -78,7 +78,7 @@ class ParticleDynamics:
             self.resolution.forget()
 
     def state_dict(self) -> dict[str, Tensor]:
-        """State that later evaluations depend on, besides the particles: the time and the closure's predictions."""
+        """The time and the predictions of the closure, on which later evaluations depend."""
         resolved = {} if self.resolution is None else self.resolution.state_dict()
         return {"time": torch.tensor(self.time, dtype=torch.float64), **resolved}
 
@@ -139,7 +139,6 @@ class ParticleDynamics:
 
     def context(self, particles: ParticleSet, rows: Tensor | None = None, density: Tensor | None = None,
                 time: float | None = None) -> Context:
-        """Context for the evaluation of terms at these particles; collective."""
         if self.neighborhood is not None:
             self.neighborhood.update(particles)
             if self._local is None or not self._local.fit(particles.position):

@@ -79,7 +79,6 @@ class ReferenceScales:
         return value
 
     def to_dict(self) -> dict[str, float | None]:
-        """The scales by name, ready for JSON."""
         return {name: None if value is None else float(value) for name, value in asdict(self).items()}
 
 
@@ -116,16 +115,16 @@ class FlowUnits:
 
     @property
     def particle_mass(self) -> float:
-        """Mass of a particle: mass of the fluid over the number of particles."""
+        """Mass of the fluid over the number of particles."""
         return self.scales.density_mean * self.scales.spacing**3
 
 
 def measured_scales(comm: Comm, at: Columns, after: Columns, interval: float) -> dict[str, float]:
     """Root mean squares over all particles, of one component of vectors; collective.
 
-    velocity_rms and acceleration_rms, and with a density density_rms (of its fluctuation) and density_rate_rms. Values
-    are those of the frame `at`; rates are differences to the frame `after`, an `interval` later. Frames are this rank's
-    rows of `velocity` (n, 3) and, optionally, `density` (n,), of the same particles.
+    velocity_rms and density_rms (of the fluctuation) at the frame `at`; acceleration_rms and density_rate_rms from the
+    change to the frame `after`, an `interval` later. Frames are this rank's rows of `velocity` (n, 3) and, optionally,
+    `density` (n,), of the same particles.
     """
     scales = {}
     for name, rate in RATES.items():

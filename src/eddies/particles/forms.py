@@ -38,12 +38,10 @@ class Form:
 
     @property
     def words(self) -> str:
-        """The form in words, for reports."""
         return WORDS[self.name]
 
     @property
     def support(self) -> float:
-        """Radius h within which particles contribute."""
         return self.kernel.support
 
     def of(self, field: ParticleField) -> Reconstructed:

@@ -35,7 +35,7 @@ class LocalParticles:
 
     def fit(self, owned: Tensor) -> bool:
         """Whether they belong to this unchanged tensor of owned positions, the present halo and list, and the present
-        recording of gradients. The answer is the same on all ranks."""
+        recording of gradients; the same on all ranks."""
         return self._owned is owned and self._state == self._state_of(owned)
 
     def _state_of(self, owned: Tensor) -> tuple[int, int, bool]:
@@ -52,11 +52,10 @@ class LocalParticles:
 
     @property
     def neighbors(self) -> NeighborList:
-        """The neighbour list of these rows."""
         return self.neighborhood.neighbors
 
     def kriging(self, filter_width: float, dtype: torch.dtype) -> Kriging:
-        """Kriging among neighbours at all owned particles, for fields that have passed a filter of this width."""
+        """Kriging among neighbours at all owned particles, for fields that have passed a filter."""
         if self._kriging is None:
             position = self.position.detach()
             pairs = self.neighbors.pairs(position[: len(self._owned)], position, dtype=dtype)
@@ -127,7 +126,6 @@ class Neighborhood:
         return self._neighbors
 
     def local(self, position: Tensor) -> LocalParticles:
-        """The particles that this rank sees, with present positions (n, 3) of the owned ones."""
         return LocalParticles(position, self)
 
     def column(self, owned: Tensor) -> Tensor:

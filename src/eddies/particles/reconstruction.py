@@ -21,16 +21,11 @@ def volumes(kernel: SmoothingKernel, pairs: Pairs) -> Tensor:
 
 
 def reconstruct(kernel: SmoothingKernel, pairs: Pairs, sender_volumes: Tensor, sender_values: Tensor) -> Tensor:
-    """Average <A>(x) = sum_j V_j A_j W(x - x_j) / sum_j V_j W(x - x_j) at the receivers: (count, components).
+    """Average <A>(x) = sum_j V_j A_j W(x - x_j) / sum_j V_j W(x - x_j) at the receivers x: (count, components).
 
     A kernel with a mean volume gives the numerator alone, Eq. 6. The result is zero where no particle lies within the
-    support.
-
-    Parameters
-    ----------
-    kernel : its support must not exceed the cutoff of the pairs.
-    pairs : the receivers are the points x. A particle that is a receiver must be among its own neighbours.
-    sender_volumes, sender_values : (s,) and (s, components), V and A of all local particles.
+    support. The volumes V (s,) and values A (s, components) are those of all local particles. A particle that is a
+    receiver must be among its own neighbours.
     """
     return _average(kernel, pairs, pairs.at_senders(sender_volumes), pairs.at_senders(sender_values).T)[0]
 

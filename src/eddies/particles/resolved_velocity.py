@@ -99,7 +99,6 @@ class ResolvedFlow:
 
     @property
     def filter_transfer(self) -> Tensor:
-        """Transfer function G of the filter for each mode (kz, ky, kx)."""
         return self.grid.filter_transfer(self.filter_width)
 
     @cached_property
@@ -263,7 +262,7 @@ class ResolvedVelocity:
         return worth * self._carried(near.velocity + step * rate, step, mean)
 
     def forget(self) -> None:
-        """Start the next solve from zero."""
+        """Discard predictions: the next solve starts from zero."""
         self._moments: list[_Moment] = []
         self.solves, self.latest = [], None
         #: rms u' of a component of the resolved velocity last remembered; 0 before
@@ -277,7 +276,6 @@ class ResolvedVelocity:
                 "speed": torch.tensor(self.speed, dtype=torch.float64)}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Inverse of `state_dict`."""
         modes = state["modes"].to(self.grid.dtype.to_complex())
         self._moments = [_Moment(float(time), *pair) for time, pair in zip(state["times"], modes)]
         self.speed = float(state["speed"])
@@ -310,11 +308,10 @@ class ResolvedVelocity:
         return self.equations.solve(flow.points, right, count, enough, self.iterations, self.most_iterations)
 
     def _adjoint(self, flow: ResolvedFlow) -> Callable[[Tensor], Tensor]:
-        """Function from the gradient by modes of the minimum to the gradient by the descent there.
+        """Function from the gradient by modes of the minimum to the gradient by the descent d(u; x, v) there.
 
-        It follows from the implicit function theorem. The descent d(u; x, v) vanishes at the minimum and changes with u
-        by -A, so du = A^-1 dd. A is symmetric in the inner product that weights modes by their multiplicity m. Its
-        transpose is therefore m A (1/m).
+        d vanishes at the minimum and changes with u by -A, so du = A^-1 dd (implicit function theorem). A is symmetric
+        in the inner product that weights modes by their multiplicity m. Its transpose is therefore m A (1/m).
         """
         grid, count = self.grid, float(global_sum(self.grid.decomposition.comm, len(flow.relative_velocity)))
 

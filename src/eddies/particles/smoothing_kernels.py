@@ -157,7 +157,6 @@ class HermiteKernel:
         return distance < self.support, cell, torch.clamp(position - cell, max=1)
 
     def _at(self, cell: Tensor) -> list[Tensor]:
-        """The coefficients of each cell."""
         flat = cell.flatten()
         return [coefficient.index_select(0, flat).reshape(cell.shape) for coefficient in self._coefficients]
 

@@ -1,5 +1,5 @@
-"""Learned networks of pairs, the force and the density rate of Eqs. 3 and 4; and the weights, directions and scaling that
-all sums over neighbours share."""
+"""Learned networks of pairs, the force and the density rate of Eqs. 3 and 4; and what all sums over pairs share: weights,
+directions and scaling."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def density_rate(sums: Tensor, settings: PairSum, context: Context) -> Rates:
 
 
 def acceleration(scaled: Tensor, context: Context) -> Tensor:
-    """Dimensionless acceleration (3, k) in the units of the flow, (k, 3)."""
+    """Dimensionless acceleration (3, k) in the units of the flow: (k, 3)."""
     return (context.flow.scales.acceleration * scaled.T).to(context.particles.velocity.dtype)
 
 
@@ -131,7 +131,6 @@ class PairNetwork(PairTerm):
         return pairs.invariants(self.settings.inputs, self.mutual)
 
     def pair_values(self, pairs: ScaledPairs) -> Tensor:
-        """w NN_1 b_1 and w NN_2 b_2, (6, m)."""
         along_x, along_v = window(pairs, self.settings) * self.network(self.features(pairs))
         v = pairs.v / (safe_norm(pairs.v, dim=0) + SMALL) if self.settings.basis == "unit" else pairs.v
         return torch.cat([along_x * separation_direction(pairs, self.settings), along_v * v])
@@ -164,11 +163,9 @@ class DensityFlux(PairTerm):
         self.parity = torch.full((1,), -1.0 if settings.sign else 1.0)
 
     def features(self, pairs: ScaledPairs) -> Tensor:
-        """Inputs of the network, (features, m)."""
         return pairs.invariants(self.settings.inputs, symmetric=False)
 
     def pair_values(self, pairs: ScaledPairs) -> Tensor:
-        """w NN_rho, times the sign, (1, m)."""
         flux = window(pairs, self.settings) * self.network(self.features(pairs))
         if not self.settings.sign:
             return flux

@@ -14,15 +14,10 @@ from eddies.scene.terms import TermBase, TermSettings
 
 @dataclass(frozen=True)
 class Coefficient:
-    """A learned coefficient of a term, for reports.
+    """A learned coefficient of a term, for reports: symbol, dimensionless parameter(s), and their effect in words.
 
-    Parameters
-    ----------
-    name : its symbol.
-    learned : the dimensionless parameter, a number or several.
-    value : the same in `unit`, for the flow that the term was made for.
-    unit : in L, T and M (eddies.io.quantities); "1" for a pure number.
-    meaning : its effect, in words.
+    `value` is the parameter in `unit` for the flow of the term. Units are in L, T and M (eddies.io.quantities); "1" for
+    a pure number.
     """
 
     name: str
@@ -43,13 +38,8 @@ class Term(nn.Module, TermBase):
 
     A user's term derives from it, declares on its class of `Settings` what it reads and gives, and computes its
     contribution in `forward`, in the units of `context.flow`. All ranks evaluate a term together, also ranks without
-    particles.
-
-    Attributes
-    ----------
-    Settings : class of the settings, a frozen dataclass derived from TermSettings.
-    linear : true if the rates at given particles are a linear function of the parameters plus a constant. Training then
-        stores the effect of each parameter at a moment instead of computing it at every step.
+    particles. A term is `linear` if the rates at given particles are a linear function of the parameters plus a
+    constant. Training then stores the effect of each parameter at a moment instead of computing it at every step.
     """
 
     Settings: type[TermSettings] = TermSettings
@@ -84,5 +74,4 @@ class PairTerm(Term, PairSum):
         raise NotImplementedError(f"{type(self).__name__} has no rates_of(sums, context)")
 
     def forward(self, context: Context) -> Rates:
-        """Contribution to the requested particles; collective."""
         return self.rates_of(context.pair_sums(self), context)
