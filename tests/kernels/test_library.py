@@ -91,7 +91,7 @@ def test_kernels_share_the_threads_of_the_transforms(threads, runtime):
 
 PAGE_FAULTS = """
 import resource
-from eddies.kernels.memory import keep_freed_memory
+from eddies.kernels.library import keep_freed_memory
 {keep}
 for round in range(20):
     block = b"1" * 2**24

@@ -197,9 +197,9 @@ class Context:
         return [each[:, :owned] if self.rows is None else each.index_select(1, self.rows) for each in sums]
 
     def _torch_sums(self, summands: Sequence[PairSum]) -> Sequence[Tensor]:
+        together = self.rows is not None or torch.is_grad_enabled()
         blocks = []
-        for block in self._blocks(summands):
-            pairs = self._pairs(block)
+        for pairs in [self._pairs(self.rows)] if together else self.pairs_in_blocks(max(s.width for s in summands)):
             values = [summand.pair_values(pairs) for summand in summands]
             blocks.append(pairs.pairs.sum(torch.cat(values).T).T)
         return torch.cat(blocks, dim=1).split([len(value) for value in values])
@@ -209,21 +209,13 @@ class Context:
         pairs = self.local.neighbors.pairs(position[: len(self.particles)], position, block, self.dtype)
         return ScaledPairs(pairs, self.column, self.flow)
 
-    def _blocks(self, summands: Sequence[PairSum]) -> Iterator[Tensor | slice | None]:
-        """Receivers to take together: as many as fit the cache, or all if a gradient is recorded."""
-        if self.rows is not None or torch.is_grad_enabled():
-            yield self.rows
-            return
-        yield from self.blocks(max(summand.width for summand in summands))
+    def pairs_in_blocks(self, width: int) -> Iterator[ScaledPairs]:
+        """All pairs, in both orders, of consecutive particles. A block, with `width` numbers a pair, fits the cache.
 
-    def blocks(self, width: int) -> Iterator[slice]:
-        """Consecutive particles whose pairs, with `width` numbers each, fit the cache; at least one block."""
+        There is at least one block.
+        """
         together = max(PAIR_VALUES_TOGETHER[self.particles.position.device.type] // width, 1)
-        yield from self.local.neighbors.blocks(together)
-
-    def scaled_pairs(self, width: int) -> Iterator[ScaledPairs]:
-        """All pairs, in both orders, in such blocks."""
-        for block in self.blocks(width):
+        for block in self.local.neighbors.blocks(together):
             yield self._pairs(block)
 
 

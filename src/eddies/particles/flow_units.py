@@ -62,13 +62,10 @@ class ReferenceScales:
 
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():
-            if value is None:
-                continue
-            if name in MAY_VANISH and not (math.isfinite(value) and value >= 0):
-                raise ScaleError(f"reference scale {name} = {value}: must be finite and not negative; start from "
-                                 "another flow ([initial])")
-            if name not in MAY_VANISH and not (math.isfinite(value) and value > 0):
-                raise ScaleError(f"reference scale {name} = {value}: must be finite and positive, as a model is made "
+            vanishes = name in MAY_VANISH and value == 0
+            if value is not None and not vanishes and not (math.isfinite(value) and value > 0):
+                sign = "not negative" if name in MAY_VANISH else "positive"
+                raise ScaleError(f"reference scale {name} = {value}: must be finite and {sign}, as a model is made "
                                  "dimensionless by it; start from a flow that moves and changes ([initial], [forcing])")
 
     def required(self, name: str) -> float:

@@ -58,11 +58,11 @@ def kriging_weights(pairs: Pairs, support: float, filter_width: float,
     """Kriging weights: the best linear estimate sum_j w_j f_j of a field and its derivatives, w = K^-1 b.
 
     K_jk = C(|x_j - x_k|), `covariance`, plus the noise NOISE / max(1 - (r/support)^4, 1e-4) of each particle on the
-    diagonal. r is its distance, so that neighbours at the support enter and leave without a jump. If the receiver is a particle
-    (`sited`), its own value f_i is among the f_j. In the row of the field b is then 1 for the particle and 0 for its
-    neighbours. The result is w_i times the difference of f_i and the neighbours' estimate. In the rows of derivatives
-    b is the derivative of C(|x - x_j|) by x. The mean of f is unknown. A multiple of K^-1 1 is subtracted so that the
-    weights add up to zero (ordinary kriging).
+    diagonal. r is its distance, so that neighbours at the support enter and leave without a jump. If the receiver is a
+    particle (`sited`), its own value f_i is among the f_j. In the row of the field b is then 1 for the particle and 0
+    for its neighbours. The result is w_i times the difference of f_i and the neighbours' estimate. In the rows of
+    derivatives b is the derivative of C(|x - x_j|) by x. The mean of f is unknown. A multiple of K^-1 1 is subtracted
+    so that the weights add up to zero (ordinary kriging).
 
     Returns
     -------

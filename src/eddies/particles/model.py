@@ -90,18 +90,15 @@ class LagrangianModel(nn.Module):
         return "density_rate" in self.gives
 
     @property
-    def regresses_density(self) -> bool:
-        """Whether a density rate is learned from the rates at single moments."""
-        return self.learns_density and not any(term.settings.learns_through_horizons for term in self._giving_rate)
-
-    @property
     def learns_density(self) -> bool:
         """Whether a density rate has learned parameters."""
-        return any(True for term in self._giving_rate for _ in term.parameters())
+        return any("density_rate" in term.settings.gives and list(term.parameters()) for term in self.terms.values())
 
     @property
-    def _giving_rate(self) -> list[Term]:
-        return [term for term in self.terms.values() if "density_rate" in term.settings.gives]
+    def regresses_density(self) -> bool:
+        """Whether a density rate is learned from the rates at single moments."""
+        return self.learns_density and not any("density_rate" in term.settings.gives
+                                               and term.settings.learns_through_horizons for term in self.terms.values())
 
     @property
     def networks(self) -> list[PairTerm]:

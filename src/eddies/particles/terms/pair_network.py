@@ -1,5 +1,5 @@
-"""Learned networks of pairs, the force and the density rate of Eqs. 3 and 4; and what all sums over pairs share: weights,
-directions and scaling."""
+"""Learned networks of pairs, the force and the density rate of Eqs. 3 and 4; and the weights, directions and scaling of
+all sums over pairs."""
 
 from __future__ import annotations
 
