@@ -57,8 +57,8 @@ class _Copies:
     def described_blocks(self, blocks: Sequence[np.ndarray]) -> _Blocks:
         return _Blocks(blocks, self.exchanged_axis, self._dtype)
 
-    def described(self, array: np.ndarray) -> _Array:
-        return _Array(array)
+    def described(self, array: np.ndarray, gaps: bool = False) -> _Array:
+        return _Array(array, gaps)
 
     def _function(self, name: str, *arguments: type) -> Callable[..., None]:
         precision = "float64" if self._dtype == np.complex128 else "float32"
@@ -70,8 +70,8 @@ class _Copies:
 class ColumnCopies(_Copies):
     """Copies between modes, columns and blocks for transforms along z.
 
-    Modes have shape (c, kz, y, x). Columns (z, rows, x) hold some rows of y of one component. Blocks (c, z, y, x) are
-    what ranks exchange; they follow each other in z.
+    Modes have shape (c, kz, y, x). Columns (z, rows, x) hold some rows of y of one component, and may have gaps between
+    successive z. Blocks (c, z, y, x) are what ranks exchange; they follow each other in z.
     """
 
     exchanged_axis = 1
@@ -82,10 +82,6 @@ class ColumnCopies(_Copies):
         self._store = self._function("store_column", *5 * [INT], ADDRESS, NUMBER, ADDRESS)
         self._send = self._function("send_column", ADDRESS, *4 * [INT], ADDRESS)
         self._receive = self._function("receive_column", ADDRESS, *4 * [INT], ADDRESS)
-
-    def described_column(self, column: np.ndarray) -> _Array:
-        """A column as the other methods take it; each z is contiguous, with any gap before the next."""
-        return _Array(column, gaps=True)
 
     def fill(self, modes: _Array, component: int, rows: slice, factors: _Array | None, column: _Array) -> None:
         """Copy modes, times factors (kz) if given, to a column."""

@@ -54,7 +54,8 @@ class ColumnPass:
         if key not in self._plans:
             given, result = (self._zeros(key[1]) for _ in range(2))
             plan = _plan(given, result, 0, direction)
-            self._plans[key] = ColumnPlan(plan, *map(self.copies.described_column, (given, result)))
+            described = (self.copies.described(column, gaps=True) for column in (given, result))
+            self._plans[key] = ColumnPlan(plan, *described)
         return self._plans[key]
 
     def _zeros(self, rows: int) -> np.ndarray:
