@@ -14,7 +14,7 @@ from tests.validation.flows import make_grid
 def test_a_restored_limit_keeps_its_step_until_the_next_measurement(comm):
     grid = make_grid(comm, 8)
     slow, fast, clock = taylor_green(grid, 1.0), taylor_green(grid, 4.0), Clock()
-    limit, restored, fresh = (CourantLimit(grid, 0.5, 1.0, every=8) for _ in range(3))
+    limit, restored, fresh = (CourantLimit(grid, 0.5, 1.0) for _ in range(3))
     step = limit(slow, clock)
     clock.steps = 3  # the next measurement is at step 8, although the flow is faster now
     restored.load_state_dict(limit.state_dict())

@@ -85,7 +85,7 @@ class DynamicStress(StressModel):
     width d the first filter is Gaussian of width d, ^ is Gaussian of width 2 d, and r = 5.
     """
 
-    def __init__(self, grid: SpectralGrid, filter_width: float = 0.0, with_gradient: bool = False) -> None:
+    def __init__(self, grid: SpectralGrid, filter_width: float, with_gradient: bool = False) -> None:
         super().__init__(grid, 0.0, filter_width if with_gradient else 0.0)
         if filter_width:
             self.test, self.ratio = gaussian_transfer(grid.wavenumber_squared, 2 * filter_width).astype(grid.real), 5.0

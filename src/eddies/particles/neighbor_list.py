@@ -88,7 +88,7 @@ class NeighborList:
         receiver, segment, sender = (index.index_select(0, near) for index in (receiver, segment, sender))
         components = self._difference(receivers, senders, receiver, sender)
         displacement = torch.stack([component.to(dtype) for component in components])
-        return Pairs(receiver, segment, sender, displacement.T, safe_norm(displacement, dim=0), len(numbers))
+        return Pairs(receiver, segment, sender, displacement.T, safe_norm(displacement), len(numbers))
 
     def _compiled_pairs(self, receivers: Tensor, senders: Tensor, numbers: Tensor, dtype: torch.dtype) -> Pairs:
         kind = np.dtype(str(dtype).removeprefix("torch."))

@@ -155,7 +155,7 @@ class ScaledPairs:
         if "distance" in names:
             features.append(self.distance)
         if "speed" in names:
-            features.append(safe_norm(self.v, dim=0))
+            features.append(safe_norm(self.v))
         if "approach" in names:
             features.append(self.approach)
         return torch.stack(features)

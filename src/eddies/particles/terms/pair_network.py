@@ -132,7 +132,7 @@ class PairNetwork(PairTerm):
 
     def pair_values(self, pairs: ScaledPairs) -> Tensor:
         along_x, along_v = window(pairs, self.settings) * self.network(self.features(pairs))
-        v = pairs.v / (safe_norm(pairs.v, dim=0) + SMALL) if self.settings.basis == "unit" else pairs.v
+        v = pairs.v / (safe_norm(pairs.v) + SMALL) if self.settings.basis == "unit" else pairs.v
         return torch.cat([along_x * separation_direction(pairs, self.settings), along_v * v])
 
     def compiled(self, context: Context) -> CompiledSum | None:
