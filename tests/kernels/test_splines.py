@@ -31,9 +31,10 @@ def parts(cells, components=3, kind=np.float64):
 
 
 def by_scipy(degree, positions, planes, cells):
-    """Values (n, c) of the splines at positions."""
-    x, y, z = positions.T / SPACING
-    places = np.stack([BELOW + z % cells, y, x])
+    """Values (n, c) of the splines at positions. The first of their planes is one of the first `cells` planes."""
+    (x, y, z), before = positions.T / SPACING, (degree - 1) // 2
+    first = (np.floor(z) - before + BELOW) % cells
+    places = np.stack([first + before + z - np.floor(z), y % cells, x % cells])
     return np.stack([map_coordinates(component, places, order=degree, mode="grid-wrap", prefilter=False)
                      for component in np.concatenate(planes, axis=1).astype(float)], axis=1)
 
