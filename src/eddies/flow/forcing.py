@@ -57,8 +57,8 @@ class LinearForcing:
         total = self.grid.sum_modes((np.abs(velocity) ** 2).sum(axis=0))
         if forced <= SILENT[self.grid.precision] * total:
             raise UserError("[forcing]: the flow has no energy at 0 < |k| < wavenumber = "
-                               f"{self.wavenumber:g}, which linear forcing could amplify; start from a flow with "
-                               "energy there, raise wavenumber, or remove [forcing]")
+                            f"{self.wavenumber:g}, which linear forcing could amplify; start from a flow with "
+                            "energy there, raise wavenumber, or remove [forcing]")
         self._checked = True
 
     def _forced_modes(self, velocity: np.ndarray) -> np.ndarray:

@@ -97,8 +97,9 @@ class LagrangianModel(nn.Module):
     @property
     def regresses_density(self) -> bool:
         """Whether a density rate is learned from the rates at single moments."""
-        return self.learns_density and not any("density_rate" in term.settings.gives
-                                               and term.settings.learns_through_horizons for term in self.terms.values())
+        through_horizons = any("density_rate" in term.settings.gives and term.settings.learns_through_horizons
+                               for term in self.terms.values())
+        return self.learns_density and not through_horizons
 
     @property
     def networks(self) -> list[PairTerm]:

@@ -30,7 +30,7 @@ def accelerations(comm, lagrangian):
     return by_id(comm, particles, found.acceleration, len(POSITION)).numpy()
 
 
-@pytest.mark.mpi(1, 3)
+@pytest.mark.mpi(2)
 def test_the_force_is_that_of_the_filtered_equations(comm):
     """The error is that of 60 random neighbours. Without its stress the force is another. Ranks do not matter."""
     force = accelerations(comm, equations())
